@@ -1,0 +1,65 @@
+# Everything lives in .venv; `make` or `make setup` makes it, and the other goals call that first.
+#   make demo   trains the built-in scene         make test   all tests        make lint   ruff and mypy
+#   make bench  times the kernels; options go into ARGS, for example: make bench ARGS="--json bench.json"
+
+BIN := .venv/bin
+READY := .venv/.ready
+PYTEST = $(BIN)/pytest
+export XDG_RUNTIME_DIR ?= /tmp
+
+.PHONY: setup demo test bench lint
+setup: $(READY)
+
+# torch first: where there is no CUDA device, by exact version, so that an index with CPU builds can offer its own
+# ("2.13.0+cpu" counts as 2.13.0). A torch that is already in .venv stays.
+$(READY): pyproject.toml | $(BIN)/pip
+	@$(BIN)/python -c 'import torch' 2>/dev/null || \
+	  if [ -e /dev/nvidia0 ] || [ "$$(uname)" = Darwin ]; then $(BIN)/pip install torch; \
+	  else $(BIN)/pip install torch==2.13.0; fi
+	@echo "Installing lapgs_wgpu into .venv"
+	@$(BIN)/pip install --quiet --editable '.[dev]'
+	@$(HAS_ADAPTER) || { $(INSTALL_MESA) && $(HAS_ADAPTER); } || { echo "$$NO_ADAPTER" >&2; exit 1; }
+	@touch $@
+
+$(BIN)/pip:
+	@for python in $(PYTHON) python3 python3.11 python3.12 python3.13 python3.14; do \
+	  $$python -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && break; python=; \
+	done; \
+	[ "$$python" ] || { echo "$$NO_PYTHON" >&2; exit 1; }; \
+	$$python -c 'import ensurepip' 2>/dev/null || { echo "$$NO_VENV" >&2; exit 1; }; \
+	$$python -m venv .venv
+
+HAS_ADAPTER = $(BIN)/python -c 'from lapgs_wgpu import list_devices; raise SystemExit(not list_devices())'
+MESA = apt-get install -y mesa-vulkan-drivers libvulkan1
+INSTALL_MESA = { echo "No Vulkan adapter: installing Mesa's software driver"; command -v apt-get >/dev/null && \
+  if [ "$$(id -u)" = 0 ]; then $(MESA) || { apt-get update && $(MESA); }; \
+  else sudo $(MESA) || { sudo apt-get update && sudo $(MESA); }; fi; }
+export NO_ADAPTER = No Vulkan, Metal or D3D12 adapter was found. Install your graphics card's driver, or Mesa's software\
+  driver, and run make again. On Debian and Ubuntu: sudo apt-get update && sudo $(MESA)
+export NO_PYTHON = Python 3.11 or newer was not found. Install it, or name one: make setup PYTHON=/path/to/python3
+export NO_VENV = This Python cannot make virtual environments. On Debian and Ubuntu: sudo apt-get install -y python3-venv
+
+demo: $(READY)
+	$(BIN)/lapgs-train demo --data synthetic --out runs/demo --overwrite
+	@echo "Pictures of the test views: runs/demo/eval/*.png (ground truth, rendering, 4 x error)."
+	@echo "The scene: runs/demo/checkpoint.ply, which any viewer of 3D Gaussian splats opens as a still."
+
+bench: $(READY)
+	$(BIN)/python tests/bench $(ARGS)
+
+lint: $(READY)
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+
+# What the kernels compute must not depend on the device's shape: on Mesa's software driver three subgroup sizes are
+# tried (its shader cache ignores the width), and on any adapter what LAPGS_TEST_DEVICE names (tests/conftest.py).
+# The whole suite comes last, so that its closing line is the last.
+test: $(READY)
+	@if $(BIN)/python -c 'from lapgs_wgpu import list_devices; raise SystemExit("llvmpipe" not in list_devices()[0].name)'; \
+	then for width in 128 256 512; do echo "== kernel tests, vectors of $$width bits"; \
+	  LP_NATIVE_VECTOR_WIDTH=$$width MESA_SHADER_CACHE_DISABLE=true $(PYTEST) -m kernels || exit 1; done; fi
+	@for name in no-subgroups default-limits gpu-shape staging; do echo "== kernel tests, $$name"; \
+	  LAPGS_TEST_DEVICE=$$name $(PYTEST) -m kernels || exit 1; done
+	@echo "== all tests"
+	@$(PYTEST)
