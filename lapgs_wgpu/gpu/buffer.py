@@ -1,0 +1,179 @@
+"""Buffers on the device, and the way of arrays to and from them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import wgpu
+from numpy.typing import NDArray
+
+from .shader import TABLE_TYPES, TABLE_WIDTH
+
+if TYPE_CHECKING:
+    from .device import Device
+
+_STORAGE = wgpu.BufferUsage.STORAGE | wgpu.BufferUsage.UNIFORM | wgpu.BufferUsage.COPY_SRC | wgpu.BufferUsage.COPY_DST
+_SMALL = 1 << 16  # bytes that go through the queue where buffers cannot be mapped
+_MAPPABLE = wgpu.BufferUsage.MAP_READ | wgpu.BufferUsage.MAP_WRITE
+
+
+@dataclass
+class _Texture:
+    texture: Any
+    view: Any
+    rows: int
+    state: tuple[int, int, int] = (-1, 0, 0)  # version, offset and size of what was copied
+
+
+class Buffer:
+    """A storage or uniform buffer of `nbytes` (rounded up to 16), zero at first.
+
+    Where the device can map its own memory (CPU and integrated devices) reading and writing is one copy by the
+    processor; elsewhere it goes through staging buffers that live as long as the buffer.
+    """
+
+    def __init__(self, device: Device, nbytes: int, label: str) -> None:
+        self.device = device
+        self.label = label
+        self.nbytes = max(16, (nbytes + 15) & ~15)
+        if self.nbytes > device.limits["max-buffer-size"]:
+            limit = device.limits["max-buffer-size"]
+            raise MemoryError(f"buffer {label!r} needs {self.nbytes} bytes, but a buffer of this device holds {limit}")
+        usage = _STORAGE | (_MAPPABLE if device.mappable else 0)
+        self.wgpu_buffer = device.wgpu_device.create_buffer(label=label, size=self.nbytes, usage=usage)
+        self.version = 0  # counts the writes, so that a texture made from the buffer is known to be out of date
+        self._textures: dict[str, _Texture] = {}
+        self._upload: Any = None
+        self._download: Any = None
+
+    def write(self, array: NDArray[Any], offset: int = 0) -> None:
+        """Copy an array into the buffer, `offset` bytes (a multiple of 8) from its start."""
+        data = np.ascontiguousarray(array).reshape(-1).view(np.uint8)
+        if offset + data.nbytes > self.nbytes:
+            raise ValueError(f"{self.label}: {offset + data.nbytes} bytes do not fit into {self.nbytes}")
+        if data.nbytes == 0:
+            return
+        self.version += 1
+        if self.device.mappable:
+            self._fill(self.wgpu_buffer, data, offset)
+        elif data.nbytes <= _SMALL:
+            self.device.queue.write_buffer(self.wgpu_buffer, offset, data)
+        else:
+            if self._upload is None:
+                usage = wgpu.BufferUsage.MAP_WRITE | wgpu.BufferUsage.COPY_SRC
+                self._upload = self.device.wgpu_device.create_buffer(size=self.nbytes, usage=usage)
+            self._fill(self._upload, data, offset)
+            encoder = self.device.wgpu_device.create_command_encoder()
+            size = (data.nbytes + 3) & ~3
+            encoder.copy_buffer_to_buffer(self._upload, offset, self.wgpu_buffer, offset, size)
+            self.device.queue.submit([encoder.finish()])
+
+    @staticmethod
+    def _fill(target: Any, data: NDArray[np.uint8], offset: int) -> None:
+        target.map_sync("WRITE", offset, (data.nbytes + 7) & ~7)
+        target.write_mapped(data, offset)
+        target.unmap()
+
+    def texture(self, encoder: Any, texel_format: str, offset: int, size: int) -> Any:
+        """A texture view of `size` bytes from `offset` on, row after row of TABLE_WIDTH texels.
+
+        The copy is recorded in `encoder` where the buffer has changed since the last one; no pass may be open then.
+        """
+        texel = next(nbytes for name, nbytes, _ in TABLE_TYPES.values() if name == texel_format)
+        count = size // texel
+        rows = -(-count // TABLE_WIDTH)
+        held = self._textures.get(texel_format)
+        if held is None or held.rows < rows:
+            texture = self.device.wgpu_device.create_texture(
+                label=self.label,
+                size=(TABLE_WIDTH, rows, 1),
+                format=texel_format,
+                usage=wgpu.TextureUsage.STORAGE_BINDING | wgpu.TextureUsage.COPY_DST,
+            )
+            held = self._textures[texel_format] = _Texture(texture, texture.create_view(), rows)
+        if held.state != (self.version, offset, size):
+            held.state = (self.version, offset, size)
+            pitch = TABLE_WIDTH * texel
+            full, rest = divmod(count, TABLE_WIDTH)
+            for row, width, height in ((0, TABLE_WIDTH, full), (full, rest, 1)):
+                if width and height:
+                    encoder.copy_buffer_to_texture(
+                        {
+                            "buffer": self.wgpu_buffer,
+                            "offset": offset + row * pitch,
+                            "bytes_per_row": pitch,
+                            "rows_per_image": height,
+                        },
+                        {"texture": held.texture, "origin": (0, row, 0)},
+                        (width, height, 1),
+                    )
+        return held.view
+
+    def read(self, dtype: str, shape: tuple[int, ...], offset: int = 0) -> NDArray[Any]:
+        """A copy of `shape` elements of `dtype` from `offset` bytes (a multiple of 8) on. Waits for the device."""
+        return read_all([(self, dtype, shape, offset)])[0]
+
+
+def read_all(requests: list[tuple[Buffer, str, tuple[int, ...], int]]) -> list[NDArray[Any]]:
+    """Read several buffers with one wait: each request is (buffer, dtype, shape, offset in bytes)."""
+    sources = []
+    encoder = None
+    for buffer, dtype, shape, offset in requests:
+        nbytes = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
+        size = max(8, (nbytes + 7) & ~7)
+        if offset + size > buffer.nbytes:
+            raise ValueError(f"{buffer.label}: reading {offset + size} bytes of {buffer.nbytes}")
+        if buffer.device.mappable:
+            sources.append((buffer.wgpu_buffer, offset, size, nbytes))
+            continue
+        if buffer._download is None:
+            usage = wgpu.BufferUsage.MAP_READ | wgpu.BufferUsage.COPY_DST
+            buffer._download = buffer.device.wgpu_device.create_buffer(size=buffer.nbytes, usage=usage)
+        encoder = encoder or buffer.device.wgpu_device.create_command_encoder()
+        encoder.copy_buffer_to_buffer(buffer.wgpu_buffer, offset, buffer._download, offset, size)
+        sources.append((buffer._download, offset, size, nbytes))
+    if encoder is not None:
+        requests[0][0].device.queue.submit([encoder.finish()])
+    out = []
+    for (source, offset, size, nbytes), (_, dtype, shape, _) in zip(sources, requests, strict=True):
+        source.map_sync("READ_NOSYNC", offset, size)
+        view = np.frombuffer(source.read_mapped(offset, size, copy=False), dtype=np.uint8)
+        array = view[:nbytes].copy().view(dtype).reshape(shape)
+        del view
+        source.unmap()
+        out.append(array)
+    return out
+
+
+class BufferPool:
+    """Named buffers that grow and never shrink, so that a training step allocates nothing in steady state."""
+
+    def __init__(self, device: Device) -> None:
+        self.device = device
+        self._buffers: dict[str, Buffer] = {}
+        self._constants: dict[str, bytes] = {}
+
+    def get(self, name: str, nbytes: int) -> Buffer:
+        """The buffer of this name with room for at least `nbytes`; its content is lost when it has to grow."""
+        buffer = self._buffers.get(name)
+        if buffer is None or buffer.nbytes < nbytes:
+            buffer = self._buffers[name] = Buffer(self.device, nbytes, name)
+        return buffer
+
+    def constant(self, name: str, content: bytes) -> Buffer:
+        """A small buffer with this content, written only when the content changes.
+
+        It must not change between the recording of a command that reads it and that command's submission.
+        """
+        buffer = self.get(f"constant {name}", len(content))
+        if self._constants.get(name) != content:
+            buffer.write(np.frombuffer(content, np.uint8))
+            self._constants[name] = content
+        return buffer
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes held by all buffers of the pool."""
+        return sum(buffer.nbytes for buffer in self._buffers.values())

@@ -1,0 +1,143 @@
+"""Choosing an adapter and opening it."""
+
+from __future__ import annotations
+
+import functools
+import os
+from dataclasses import dataclass
+from typing import Any
+
+from ..errors import NoAdapterError
+
+# Features that the kernels can use. Each is requested only where the adapter has it, and each has a fallback.
+_WANTED_FEATURES = ("subgroup", "mappable-primary-buffers", "timestamp-query")
+
+# The WebGPU default limits, to which every kernel keeps; larger bindings are used where the adapter has them.
+_DEFAULT_LIMITS = {
+    "max-storage-buffers-per-shader-stage": 8,
+    "max-storage-buffer-binding-size": 128 << 20,
+    "max-buffer-size": 256 << 20,
+    "max-compute-workgroup-storage-size": 16384,
+    "max-compute-invocations-per-workgroup": 256,
+    "max-compute-workgroups-per-dimension": 65535,
+}
+_RAISED_LIMITS = ("max-storage-buffer-binding-size", "max-buffer-size", "max-storage-textures-per-shader-stage")
+
+INSTALL_HINT = (
+    "install a Vulkan driver for your graphics card, or Mesa's software driver: "
+    "sudo apt-get install -y mesa-vulkan-drivers libvulkan1"
+)
+
+
+@dataclass(frozen=True)
+class DeviceInfo:
+    """What is known of an adapter before it is opened. kind: cpu, integrated, discrete, virtual or other."""
+
+    name: str
+    kind: str
+    backend: str
+    driver: str
+
+
+@functools.cache
+def _instance() -> Any:
+    """wgpu's instance, without the validation dispatch that wgpu otherwise adds before each indirect dispatch."""
+    os.environ.setdefault("XDG_RUNTIME_DIR", "/tmp")  # Mesa warns on stderr where it is not set
+    import wgpu
+    from wgpu.backends.wgpu_native.extras import set_instance_extras
+
+    set_instance_extras(flags=["Empty"])
+    return wgpu.gpu
+
+
+def _adapters() -> list[tuple[DeviceInfo, Any]]:
+    found = []
+    for adapter in _instance().enumerate_adapters_sync():
+        info = adapter.info
+        if info["backend_type"] == "OpenGL":  # the same hardware again, with less of what the kernels need
+            continue
+        kinds = {"CPU": "cpu", "IntegratedGPU": "integrated", "DiscreteGPU": "discrete"}
+        kind = kinds.get(info["adapter_type"], "other")
+        found.append((DeviceInfo(info["device"], kind, info["backend_type"], info["description"]), adapter))
+    order = ("discrete", "integrated", "other", "cpu")
+    return sorted(found, key=lambda pair: order.index(pair[0].kind))
+
+
+def list_devices() -> list[DeviceInfo]:
+    """The adapters of this machine, the one that is chosen by default first."""
+    return [info for info, _ in _adapters()]
+
+
+class Device:
+    """An opened adapter.
+
+    queue and wgpu_device are wgpu's objects. subgroup_size is 0 where subgroups are unavailable.
+    textures: tables are read through textures (see gpu/shader), which is far faster on Mesa's software driver.
+    mappable: buffers can be mapped where they are (CPU and integrated devices), without a staging copy.
+    """
+
+    def __init__(self, adapter: Any, info: DeviceInfo, *, subgroups: bool = True, default_limits: bool = False) -> None:
+        self.info = info
+        features = {name for name in _WANTED_FEATURES if name in adapter.features}
+        if not subgroups:
+            features.discard("subgroup")
+        limits = dict(_DEFAULT_LIMITS)
+        if not default_limits:
+            limits |= {name: adapter.limits[name] for name in _RAISED_LIMITS}
+        for name, needed in limits.items():
+            if adapter.limits[name] < needed:
+                raise NoAdapterError(
+                    f"the adapter {info.name!r} offers {name} = {adapter.limits[name]}, but {needed} is needed: "
+                    "choose another with --device"
+                )
+        self.wgpu_device = adapter.request_device_sync(required_features=sorted(features), required_limits=limits)
+        self.queue = self.wgpu_device.queue
+        self.limits = limits
+        self.features = features
+        self.is_cpu = info.kind == "cpu"
+        self.mappable = "mappable-primary-buffers" in features and info.kind in ("cpu", "integrated")
+        self.textures = self.is_cpu and limits.get("max-storage-textures-per-shader-stage", 0) >= 8
+        self.kernel_cache: dict[Any, Any] = {}
+
+    @functools.cached_property
+    def subgroup_size(self) -> int:
+        """Lanes of a subgroup, measured by a kernel, since what adapters report of it is unreliable; 0 without."""
+        if "subgroup" not in self.features:
+            return 0
+        from .buffer import Buffer
+        from .kernel import Commands, Kernel
+
+        # A workgroup of 64 lanes, as the rasteriser's GPU shape has it: each lane reports the size it sees.
+        result = Buffer(self, 64 * 4, "subgroup_sizes")
+        with Commands(self) as commands:
+            commands.dispatch(Kernel.get(self, "probe_subgroup"), 1, sizes=result)
+        sizes = set(result.read("uint32", (64,)).tolist())
+        return sizes.pop() if len(sizes) == 1 else 0
+
+    @property
+    def max_binding(self) -> int:
+        """The largest range of a buffer, in bytes, that a kernel can see."""
+        return int(self.limits["max-storage-buffer-binding-size"])
+
+
+def _matches(info: DeviceInfo, wanted: str) -> bool:
+    return wanted.lower() in (info.kind, info.backend.lower()) or wanted.lower() in info.name.lower()
+
+
+@functools.cache
+def open_device(name: str | None = None) -> Device:
+    """Open an adapter: by a part of its name, by kind (cpu, integrated, discrete), or the best one.
+
+    name: also taken from the environment variable LAPGS_DEVICE where it is None. One Device a name and process.
+    Raises NoAdapterError.
+    """
+    name = name or os.environ.get("LAPGS_DEVICE") or None
+    adapters = _adapters()
+    if not adapters:
+        raise NoAdapterError(f"no Vulkan, Metal or D3D12 adapter was found on this machine: {INSTALL_HINT}")
+    chosen = [pair for pair in adapters if name is None or _matches(pair[0], name)]
+    if not chosen:
+        there = ", ".join(f"{info.name!r} ({info.kind})" for info, _ in adapters)
+        raise NoAdapterError(f"no adapter matches --device {name!r}; this machine has: {there}")
+    info, adapter = chosen[0]
+    return Device(adapter, info)

@@ -1,0 +1,129 @@
+"""Exclusive scan and stable radix sort on the device, with lengths that only the device knows."""
+
+from __future__ import annotations
+
+import struct
+
+from .buffer import Buffer, BufferPool
+from .device import Device
+from .kernel import Commands, Kernel
+
+_BLOCK_ITEMS = 2048  # common/block.wgsl
+_SORT_BLOCK_ITEMS = 2048  # common/sort.wgsl: 128 lanes x 16 elements
+
+
+class Scan:
+    """Exclusive prefix sums of u32.
+
+    source: "values"; "flags" adds 1 for each value that is not zero; "gather" adds values[indices[i]].
+    """
+
+    def __init__(self, device: Device, pool: BufferPool, name: str, source: str = "values") -> None:
+        self._pool, self._name = pool, name
+        defines = {"SCAN_LANES": 8 if device.is_cpu else 256} | ({} if source == "values" else {source.upper(): 1})
+        self._reduce = Kernel.get(device, "scan_reduce", **defines)
+        self._blocks = Kernel.get(device, "scan_blocks", SCAN_LANES=defines["SCAN_LANES"])
+        self._apply = Kernel.get(device, "scan_apply", **defines)
+
+    def __call__(
+        self,
+        commands: Commands,
+        *,
+        length: Buffer,
+        capacity: int,
+        values: Buffer,
+        prefix: Buffer,
+        total: Buffer,
+        indices: Buffer | None = None,
+    ) -> None:
+        """prefix[i] = sum of the first i elements, total[0] = sum of all; elements = length[0] <= capacity."""
+        count = -(-capacity // _BLOCK_ITEMS)
+        sums = self._pool.get(f"{self._name} block sums", 4 * count)
+        uniform = self._pool.constant(f"{self._name} blocks", self._blocks.uniform("Blocks", count=count))
+        source = {"length": length, "values": values} | ({} if indices is None else {"indices": indices})
+        commands.dispatch(self._reduce, count, **source, block_sums=sums)
+        commands.dispatch(self._blocks, 1, blocks=uniform, block_sums=sums, total=total)
+        commands.dispatch(self._apply, count, **source, block_sums=sums, prefix=prefix)
+
+
+class RadixSort:
+    """A stable sort of u32 keys with a u32 payload, least significant digit first.
+
+    lane_runs: the shape for CPU devices (digits of up to 8 bits, a run of elements a lane); otherwise 4-bit digits
+    ranked in workgroups. Both give the same result.
+    """
+
+    def __init__(self, device: Device, pool: BufferPool, name: str, *, lane_runs: bool) -> None:
+        self._device, self._pool, self._name, self._lane_runs = device, pool, name, lane_runs
+        self._scan = Scan(device, pool, name)
+
+    def __call__(
+        self,
+        commands: Commands,
+        *,
+        length: Buffer,
+        capacity: int,
+        bits: int,
+        keys: Buffer,
+        payload: Buffer | None,
+    ) -> tuple[Buffer, Buffer]:
+        """Sort the first length[0] <= capacity elements by the lowest `bits` bits of their keys.
+
+        payload None stands for 0, 1, 2, ... Returns the buffers that hold the sorted keys and payload; `keys` and
+        `payload` are used as scratch and lose their content.
+        """
+        widest = 8 if self._lane_runs else 4
+        passes = -(-bits // widest)
+        width = -(-bits // passes) if self._lane_runs else widest
+        digits = 1 << width
+        if self._lane_runs:
+            owners = 8 * min(128, max(4, capacity // (8 * 4096)))
+        else:
+            owners = -(-capacity // _SORT_BLOCK_ITEMS)
+        counters = self._pool.get(f"{self._name} counters", 4 * digits * owners)
+        places = self._pool.get(f"{self._name} places", 4 * digits * owners)
+        counter_count = self._pool.constant(f"{self._name} counter count", struct.pack("<I", digits * owners))
+        ignored = self._pool.get(f"{self._name} total", 4)
+        keys_out = self._pool.get(f"{self._name} keys", 4 * capacity)
+        payload_out = self._pool.get(f"{self._name} payload", 4 * capacity)
+        second_payload = payload or self._pool.get(f"{self._name} second payload", 4 * capacity)
+        shape = {"LANE_RUNS": 1} if self._lane_runs else {}
+        groups = owners // 8 if self._lane_runs else owners
+        count_kernel = Kernel.get(self._device, "sort_count", **shape)
+        for step in range(passes):
+            uniform = self._pool.constant(
+                f"{self._name} pass {step}",
+                count_kernel.uniform("Sort", shift=step * width, digits=digits, owners=owners, capacity=capacity),
+            )
+            commands.dispatch(
+                count_kernel,
+                groups,
+                sort=uniform,
+                length=length,
+                keys=keys,
+                counters=counters,
+            )
+            self._scan(
+                commands,
+                length=counter_count,
+                capacity=digits * owners,
+                values=counters,
+                prefix=places,
+                total=ignored,
+            )
+            iota = step == 0 and payload is None
+            source = {} if iota else {"payload": second_payload}
+            commands.dispatch(
+                Kernel.get(self._device, "sort_scatter", **shape, **({"IOTA": 1} if iota else {})),
+                groups,
+                sort=uniform,
+                length=length,
+                keys=keys,
+                counters=places,
+                keys_out=keys_out,
+                payload_out=payload_out,
+                **source,
+            )
+            keys, keys_out = keys_out, keys
+            second_payload, payload_out = payload_out, second_payload
+        return keys, second_payload

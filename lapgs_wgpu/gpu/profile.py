@@ -1,0 +1,67 @@
+"""The time that each pass takes on the device, by timestamps that the device itself writes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import wgpu
+
+from .buffer import Buffer
+from .device import Device
+
+
+class Profile:
+    """Takes the time of each dispatch of the Commands to which it is given.
+
+    capacity: how many dispatches it can hold until `read`. Raises RuntimeError where the device has no timestamps.
+    """
+
+    def __init__(self, device: Device, capacity: int = 1024) -> None:
+        if "timestamp-query" not in device.features:
+            raise RuntimeError(
+                f"{device.info.name} has no timestamps (feature timestamp-query): passes cannot be timed"
+            )
+        self.capacity = capacity
+        self._names: list[str] = []
+        self._queries = device.wgpu_device.create_query_set(type="timestamp", count=2 * capacity)
+        resolve = wgpu.BufferUsage.QUERY_RESOLVE | wgpu.BufferUsage.COPY_SRC
+        self._resolved = device.wgpu_device.create_buffer(label="timestamps", size=16 * capacity, usage=resolve)
+        self._ticks = Buffer(device, 16 * capacity, "timestamps to read")
+        self._tick_nanoseconds = _timestamp_period(device)
+
+    def record(self, name: str) -> dict[str, Any]:
+        """wgpu's `timestamp_writes` for a compute pass of this name."""
+        first = 2 * len(self._names)
+        if len(self._names) == self.capacity:
+            raise RuntimeError(f"a Profile of {self.capacity} dispatches is full: read() it earlier, or make it larger")
+        self._names.append(name)
+        return {
+            "query_set": self._queries,
+            "beginning_of_pass_write_index": first,
+            "end_of_pass_write_index": first + 1,
+        }
+
+    def resolve(self, encoder: Any) -> None:
+        """Record the copy of all timestamps so far to where `read` finds them."""
+        count = 2 * len(self._names)
+        if count:
+            encoder.resolve_query_set(self._queries, 0, count, self._resolved, 0)
+            encoder.copy_buffer_to_buffer(self._resolved, 0, self._ticks.wgpu_buffer, 0, 8 * count)
+
+    def read(self) -> list[tuple[str, float]]:
+        """Each dispatch's name and milliseconds, in order. Waits for the device; the profile is empty afterwards."""
+        if not self._names:
+            return []
+        ticks = self._ticks.read("uint64", (len(self._names), 2))
+        # Differences first: the clock itself has more digits than a float holds.
+        milliseconds = (ticks[:, 1] - ticks[:, 0]).astype(np.float64) * self._tick_nanoseconds * 1e-6
+        names, self._names = self._names, []
+        return list(zip(names, milliseconds.tolist(), strict=True))
+
+
+def _timestamp_period(device: Device) -> float:
+    """Nanoseconds a tick: 1 on most devices, but not on all. wgpu-py has no name of its own for it."""
+    from wgpu.backends.wgpu_native import lib
+
+    return float(lib.wgpuQueueGetTimestampPeriod(device.queue._internal))

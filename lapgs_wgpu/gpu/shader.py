@@ -1,0 +1,205 @@
+"""Composing WGSL from the files in shaders/: imports, conditions, unrolled loops; and reading its bindings back.
+
+Directives, each on a line of its own:
+    #import common/frame            the text of shaders/common/frame.wgsl, once
+    #ifdef NAME / #ifndef NAME / #else / #endif
+    #table N name: type             a read-only array at binding N (f32, u32, or vec2, vec4 of them), read by name_at(i)
+    #unroll i COUNT / #end          COUNT copies of the lines between, `$i` or `$(i)` replaced by 0, 1, ...
+`$NAME` elsewhere is replaced by the value of the define NAME; upper case for defines, lower case for loop variables.
+Loops are unrolled here and not by the driver because naga adds a counter to each loop, which hides its trip count from
+the driver's own unrolling.
+
+A table is a storage buffer, or, with the define TEXTURES, a storage texture of TABLE_WIDTH texels a row: on many
+processors Mesa's software driver reads a texel of four words in a tenth of the time that it takes to read one word of
+a buffer (docs/results.md).
+"""
+
+from __future__ import annotations
+
+import functools
+import re
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import resources
+
+Defines = Mapping[str, int]
+
+_DIRECTIVE = re.compile(r"^\s*#(\w+)\s*(.*?)\s*$")
+_BINDING = re.compile(
+    r"@group\(0\)\s*@binding\((\d+)\)\s*var<\s*(uniform|storage)\s*(?:,\s*(read|read_write)\s*)?>\s*(\w+)\s*:\s*([^;]+);"
+)
+_TEXTURE = re.compile(r"@group\(0\)\s*@binding\((\d+)\)\s*var\s+(\w+)\s*:\s*texture_storage_2d<(\w+),\s*read>;")
+_TABLE = re.compile(r"(\d+)\s+(\w+)\s*:\s*(\S+)")
+TABLE_WIDTH = 4096
+# type -> (texture format, bytes, components of a texel that hold it)
+TABLE_TYPES = {
+    "f32": ("r32float", 4, ".x"),
+    "u32": ("r32uint", 4, ".x"),
+    "vec2<f32>": ("rg32float", 8, ".xy"),
+    "vec2<u32>": ("rg32uint", 8, ".xy"),
+    "vec4<f32>": ("rgba32float", 16, ""),
+    "vec4<u32>": ("rgba32uint", 16, ""),
+}
+_MEMBER = re.compile(r"(\w+)\s*:\s*([\w<>]+)")
+# type -> (alignment, size, struct format), by the WGSL specification's layout rules
+_LAYOUT = {
+    "f32": (4, 4, "f"),
+    "u32": (4, 4, "I"),
+    "i32": (4, 4, "i"),
+    "vec2<f32>": (8, 8, "2f"),
+    "vec2<u32>": (8, 8, "2I"),
+    "vec3<f32>": (16, 12, "3f"),
+    "vec4<f32>": (16, 16, "4f"),
+    "vec4<u32>": (16, 16, "4I"),
+    "mat4x4<f32>": (16, 64, "16f"),
+}
+
+
+class ShaderError(Exception):
+    """A shader that cannot be composed, or a dispatch that does not match it: a programming error."""
+
+
+@dataclass(frozen=True)
+class Binding:
+    """One resource of a shader: its number in group 0, its name, kind and WGSL type."""
+
+    number: int
+    name: str
+    kind: str  # "uniform", "read", "read_write" or "texture"
+    type: str  # of a texture its format
+
+
+@functools.cache
+def shader_text(name: str) -> str:
+    """The text of shaders/<name>.wgsl."""
+    file = resources.files("lapgs_wgpu.shaders").joinpath(*(name + ".wgsl").split("/"))
+    if not file.is_file():
+        raise ShaderError(f"there is no shader file shaders/{name}.wgsl")
+    return file.read_text(encoding="utf-8")
+
+
+def compose(name: str, defines: Defines) -> str:
+    """The complete WGSL of shaders/<name>.wgsl under the given defines."""
+    imported: set[str] = set()
+
+    def expand(file: str) -> list[str]:
+        return _expand_lines(shader_text(file).splitlines(), file)
+
+    def _expand_lines(lines: list[str], file: str) -> list[str]:
+        out: list[str] = []
+        conditions: list[bool] = []
+        i = 0
+        while i < len(lines):
+            line = lines[i]
+            i += 1
+            directive = _DIRECTIVE.match(line)
+            word, argument = directive.groups() if directive else ("", "")
+            if word in ("ifdef", "ifndef"):
+                conditions.append((argument in defines) == (word == "ifdef"))
+            elif word == "else":
+                conditions[-1] = not conditions[-1]
+            elif word == "endif":
+                conditions.pop()
+            elif not all(conditions):
+                continue
+            elif word == "import":
+                if argument not in imported:
+                    imported.add(argument)
+                    out += expand(argument)
+            elif word == "table":
+                out.append(_table(argument, "TEXTURES" in defines, file))
+            elif word == "unroll":
+                variable, count = argument.split()
+                end = _matching_end(lines, i, file)
+                body = _expand_lines(lines[i:end], file)
+                for k in range(int(_substitute(count, defines, file))):
+                    out += [re.sub(rf"\$\({variable}\)|\${variable}\b", str(k), text) for text in body]
+                i = end + 1
+            elif word:
+                raise ShaderError(f"shaders/{file}.wgsl: unknown directive #{word}")
+            else:
+                out.append(_substitute(line, defines, file) if "$" in line else line)
+        if conditions:
+            raise ShaderError(f"shaders/{file}.wgsl: #ifdef without #endif")
+        return out
+
+    return "\n".join(expand(name)) + "\n"
+
+
+def _table(argument: str, texture: bool, file: str) -> str:
+    parts = _TABLE.fullmatch(argument)
+    if parts is None or parts[3] not in TABLE_TYPES:
+        raise ShaderError(f"shaders/{file}.wgsl: cannot read #table {argument}")
+    number, name, kind = parts.groups()
+    declaration = f"@group(0) @binding({number}) var"
+    if not texture:
+        return (
+            f"{declaration}<storage, read> {name}: array<{kind}>;\n"
+            f"fn {name}_at(i: u32) -> {kind} {{ return {name}[i]; }}"
+        )
+    texel_format, _, components = TABLE_TYPES[kind]
+    texel = f"textureLoad({name}, vec2(i % {TABLE_WIDTH}u, i / {TABLE_WIDTH}u))"
+    return (
+        f"{declaration} {name}: texture_storage_2d<{texel_format}, read>;\n"
+        f"fn {name}_at(i: u32) -> {kind} {{ return {texel}{components}; }}"
+    )
+
+
+def _matching_end(lines: list[str], start: int, file: str) -> int:
+    depth = 1
+    for i in range(start, len(lines)):
+        directive = _DIRECTIVE.match(lines[i])
+        if directive and directive[1] == "unroll":
+            depth += 1
+        elif directive and directive[1] == "end":
+            depth -= 1
+            if depth == 0:
+                return i
+    raise ShaderError(f"shaders/{file}.wgsl: #unroll without #end")
+
+
+def _substitute(text: str, defines: Defines, file: str) -> str:
+    def value(match: re.Match[str]) -> str:
+        name = match[1]
+        if name.islower():  # a loop variable of an #unroll further out
+            return match[0]
+        if name not in defines:
+            raise ShaderError(f"shaders/{file}.wgsl needs a value for {name}")
+        return str(defines[name])
+
+    return re.sub(r"\$(\w+)", value, text)
+
+
+def reflect(source: str) -> dict[str, Binding]:
+    """The bindings of group 0 in composed WGSL, by name."""
+    found = {}
+    for number, space, access, name, kind in _BINDING.findall(source):
+        found[name] = Binding(
+            int(number), name, "uniform" if space == "uniform" else (access or "read"), "".join(kind.split())
+        )
+    for number, name, texel_format in _TEXTURE.findall(source):
+        found[name] = Binding(int(number), name, "texture", texel_format)
+    return found
+
+
+def pack(source: str, struct_name: str, values: Mapping[str, object]) -> bytes:
+    """The bytes of a WGSL struct, each member taken from `values` by name (matrices column by column)."""
+    body = re.search(rf"struct\s+{struct_name}\s*{{(.*?)}}", source, re.S)
+    if body is None:
+        raise ShaderError(f"no struct {struct_name} in the shader")
+    members = _MEMBER.findall(re.sub(r"//[^\n]*", "", body[1]))
+    if {name for name, _ in members} != set(values):
+        difference = {name for name, _ in members} ^ set(values)
+        raise ShaderError(f"struct {struct_name}: members that only one side has: {sorted(difference)}")
+    out = bytearray()
+    largest = 4
+    for name, kind in members:
+        alignment, _, code = _LAYOUT[kind]
+        largest = max(largest, alignment)
+        out += bytes(-len(out) % alignment)
+        value = values[name]
+        numbers = [value] if isinstance(value, (int, float)) else list(value)  # type: ignore[call-overload]
+        out += struct.pack("<" + code, *numbers)
+    out += bytes(-len(out) % max(16, largest))  # uniform buffers come in units of 16 bytes
+    return bytes(out)

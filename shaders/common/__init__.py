@@ -1,0 +1,1 @@
+"""WGSL that several passes import."""

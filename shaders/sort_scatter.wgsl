@@ -1,0 +1,104 @@
+// Radix sort, per digit 2 of 2: moves each element to its place. Stable: owners and their elements keep their order.
+#import common/index
+#import common/sort
+
+// [digit][owner], exclusive prefix sums
+#table 3 counters: u32
+@group(0) @binding(4) var<storage, read_write> keys_out: array<u32>;
+@group(0) @binding(5) var<storage, read_write> payload_out: array<u32>;
+
+#ifdef LANE_RUNS
+#ifndef IOTA
+#table 6 payload: vec4<u32>
+#endif
+
+@compute @workgroup_size(8)
+fn main(@builtin(global_invocation_id) id: vec3<u32>) {
+    let lane = id.x;
+    for (var d = 0u; d < sort.digits; d++) {
+        my_counters[d] = counters_at(d * sort.owners + lane);
+    }
+    let count = elements();
+    let items = run(lane);
+    for (var i = items.x; i < items.y; i++) {
+        let four = keys_at(i);
+#ifdef IOTA
+        let carried = 4u * i + vec4(0u, 1u, 2u, 3u);
+#else
+        let carried = payload_at(i);
+#endif
+#unroll k 4
+        if (4u * i + $(k)u < count) {
+            let d = digit(four[$k]);
+            let place = my_counters[d];
+            my_counters[d] = place + 1u;
+            keys_out[place] = four[$k];
+            payload_out[place] = carried[$k];
+        }
+#end
+    }
+}
+#else
+#ifndef IOTA
+#table 6 payload: u32
+#endif
+
+const SEGMENTS = LANES / DIGITS;            // each lane adds up one digit over one segment of the lanes
+const SEGMENT_LANES = LANES / SEGMENTS;
+
+var<workgroup> ranks: array<u32, DIGITS * LANES>;
+var<workgroup> segment_sums: array<u32, LANES>;
+
+@compute @workgroup_size(128)
+fn main(
+    @builtin(workgroup_id) group: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let block = workgroup_number(group, groups);
+    for (var d = 0u; d < DIGITS; d++) {
+        ranks[d * LANES + lane] = 0u;
+    }
+    workgroupBarrier();
+    let first = (block * LANES + lane) * LANE_ITEMS;
+    let last = min(first + LANE_ITEMS, elements());
+    for (var i = first; i < last; i++) {
+        ranks[digit(keys_at(i)) * LANES + lane] += 1u;
+    }
+    workgroupBarrier();
+    let my_digit = lane / SEGMENTS;
+    let my_segment = lane % SEGMENTS;
+    let start = my_digit * LANES + my_segment * SEGMENT_LANES;
+    var sum = 0u;
+    for (var k = start; k < start + SEGMENT_LANES; k++) {
+        let count = ranks[k];
+        ranks[k] = sum;
+        sum += count;
+    }
+    segment_sums[lane] = sum;
+    workgroupBarrier();
+    var before = 0u;
+    if (block < sort.owners) {
+        before = counters_at(my_digit * sort.owners + block);
+    }
+    for (var k = my_digit * SEGMENTS; k < lane; k++) {
+        before += segment_sums[k];
+    }
+    for (var k = start; k < start + SEGMENT_LANES; k++) {
+        ranks[k] += before;
+    }
+    workgroupBarrier();
+    for (var i = first; i < last; i++) {
+        let key = keys_at(i);
+        let rank = digit(key) * LANES + lane;
+        let place = ranks[rank];
+        ranks[rank] = place + 1u;
+        keys_out[place] = key;
+#ifdef IOTA
+        payload_out[place] = i;
+#else
+        payload_out[place] = payload_at(i);
+#endif
+    }
+}
+#endif
