@@ -1,0 +1,69 @@
+"""The pinhole camera that every pass and every reader of data shares."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera in OpenCV axes: x right, y down, z forward.
+
+    K: (3, 3) float64 intrinsics in pixels; pixel (column, row) has its centre at (column + 0.5, row + 0.5).
+    T_cam_world: (4, 4) float64 rigid transform from world to camera coordinates.
+    width, height: image size in pixels.
+    """
+
+    K: NDArray[np.float64]
+    T_cam_world: NDArray[np.float64]
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "K", np.asarray(self.K, dtype=np.float64))
+        object.__setattr__(self, "T_cam_world", np.asarray(self.T_cam_world, dtype=np.float64))
+        if self.K.shape != (3, 3) or self.T_cam_world.shape != (4, 4):
+            raise ValueError(
+                f"Camera needs K of (3, 3) and T_cam_world of (4, 4), got {self.K.shape} and {self.T_cam_world.shape}"
+            )
+        if not (np.isfinite(self.K).all() and np.isfinite(self.T_cam_world).all()):
+            raise ValueError("Camera: K and T_cam_world must be finite")
+        if self.width < 1 or self.height < 1:
+            raise ValueError(f"Camera: width and height must be at least 1, got {self.width}x{self.height}")
+
+    @property
+    def position(self) -> NDArray[np.float64]:
+        """(3,) the camera's centre in world coordinates."""
+        R, t = self.T_cam_world[:3, :3], self.T_cam_world[:3, 3]
+        return -R.T @ t
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The same view on an image of another size."""
+        scale = np.diag([width / self.width, height / self.height, 1.0])
+        return Camera(scale @ self.K, self.T_cam_world, width, height)
+
+    @staticmethod
+    def looking_at(
+        position: NDArray[np.float64] | list[float],
+        target: NDArray[np.float64] | list[float],
+        *,
+        up: NDArray[np.float64] | list[float],
+        fov_x: float,
+        width: int,
+        height: int,
+    ) -> Camera:
+        """A camera at `position` that looks at `target`; `up` is up in the image, fov_x in radians, square pixels."""
+        eye = np.asarray(position, dtype=np.float64)
+        forward = np.asarray(target, dtype=np.float64) - eye
+        forward /= np.linalg.norm(forward)
+        right = np.cross(forward, np.asarray(up, dtype=np.float64))
+        right /= np.linalg.norm(right)
+        R = np.stack([right, np.cross(forward, right), forward])
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = R, -R @ eye
+        focal = 0.5 * width / np.tan(0.5 * fov_x)
+        K = np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
+        return Camera(K, T, width, height)

@@ -1,0 +1,25 @@
+// The geometry of one Gaussian under one camera. `project` and `project_bwd` share it.
+#import common/constants
+#import common/frame
+
+fn rotation(q: vec4<f32>) -> mat3x3<f32> {   // q = (w, x, y, z), of unit length
+    let w = q.x; let x = q.y; let y = q.z; let z = q.w;
+    return mat3x3<f32>(   // columns
+        1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y),
+        2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x),
+        2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y));
+}
+
+fn view_rotation(frame: Frame) -> mat3x3<f32> {
+    return mat3x3<f32>(frame.view[0].xyz, frame.view[1].xyz, frame.view[2].xyz);
+}
+
+// x/z and y/z are held within the image and a margin before they enter the Jacobian (gsplat's rule), because the linear
+// approximation of the projection has no meaning far outside.
+struct JacobianLimits { low: vec2<f32>, high: vec2<f32> }
+
+fn jacobian_limits(frame: Frame) -> JacobianLimits {
+    let size = vec2<f32>(frame.size);
+    let margin = FRUSTUM_MARGIN * 0.5 * size / frame.focal;
+    return JacobianLimits(-frame.center / frame.focal - margin, (size - frame.center) / frame.focal + margin);
+}

@@ -1,0 +1,75 @@
+// Projects each Gaussian: culling, the 2-D covariance and its inverse, and the number of tiles that it touches.
+#import common/gaussian
+#import common/index
+#import common/splat
+#import common/tile
+
+@group(0) @binding(0) var<uniform> frame: Frame;
+#table 1 means: f32
+#table 2 quats: vec4<f32>
+#table 3 scales: f32
+#table 4 opacities: f32
+@group(0) @binding(5) var<storage, read_write> splats: array<vec4<f32>>;
+@group(0) @binding(6) var<storage, read_write> tile_counts: array<u32>;
+
+@compute @workgroup_size(64)
+fn main(
+    @builtin(workgroup_id) group: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let i = workgroup_number(group, groups) * 64u + lane;
+    if (i >= frame.gaussians) {
+        return;
+    }
+    splats[i * SPLAT_STRIDE] = vec4(0.0);
+    splats[i * SPLAT_STRIDE + 1u] = vec4(0.0);
+    splats[i * SPLAT_STRIDE + 2u] = vec4(0.0);   // radius 0: invisible
+    tile_counts[i] = 0u;
+
+    let mean = vec3(means_at(3u * i), means_at(3u * i + 1u), means_at(3u * i + 2u));
+    let camera = (frame.view * vec4(mean, 1.0)).xyz;
+    let opacity = opacities_at(i);
+    let q = quats_at(i);
+    let norm = dot(q, q);
+    // Written so that NaN fails each test.
+    if (!(camera.z > NEAR) || !(opacity >= ALPHA_MIN) || !(norm > 0.0)) {
+        return;
+    }
+
+    let limits = jacobian_limits(frame);
+    let xy = clamp(camera.xy / camera.z, limits.low, limits.high);
+    let jacobian = frame.focal / camera.z;
+    let scale = vec3(scales_at(3u * i), scales_at(3u * i + 1u), scales_at(3u * i + 2u));
+    let R = view_rotation(frame) * rotation(q * inverseSqrt(norm));
+    // Rows of J R S: the half axes of the Gaussian in the image.
+    let axes_x = jacobian.x * scale * vec3(R[0].x - xy.x * R[0].z, R[1].x - xy.x * R[1].z, R[2].x - xy.x * R[2].z);
+    let axes_y = jacobian.y * scale * vec3(R[0].y - xy.y * R[0].z, R[1].y - xy.y * R[1].z, R[2].y - xy.y * R[2].z);
+    let xx = dot(axes_x, axes_x) + DILATION;
+    let xyc = dot(axes_x, axes_y);
+    let yy = dot(axes_y, axes_y) + DILATION;
+    // The determinant without cancellation: |u x v|^2 is never negative.
+    let normal = cross(axes_x, axes_y);
+    let det = dot(normal, normal) + DILATION * (xx + yy - DILATION);
+    if (!(det > 0.0) || !(det < 1e30)) {
+        return;
+    }
+    let conic = vec3(yy, -xyc, xx) / det;
+    let mean2d = frame.focal * camera.xy / camera.z + frame.center;
+    let e = make_ellipse(mean2d, conic, det, log2(opacity));
+    let size = vec2<f32>(frame.size);
+    if (!all(mean2d + e.extent > vec2(0.0)) || !all(mean2d - e.extent < size)) {
+        return;
+    }
+
+    var count = 0u;
+    let rows = tile_rows(e, frame.band);
+    for (var row = rows.x; row < rows.y; row++) {
+        let columns = tile_columns(e, row, frame.tiles.x);
+        count += columns.y - columns.x;
+    }
+    tile_counts[i] = count;
+    splats[i * SPLAT_STRIDE] = vec4(mean2d, conic.xy);
+    splats[i * SPLAT_STRIDE + 1u] = vec4(conic.z, log2(opacity), 0.0, 0.0);
+    splats[i * SPLAT_STRIDE + 2u] = vec4(0.0, camera.z, ceil(max(e.extent.x, e.extent.y)), det);
+}

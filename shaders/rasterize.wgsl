@@ -1,0 +1,125 @@
+// Draws the image: each tile's splats front to back, until no pixel of the tile sees any further.
+@group(0) @binding(0) var<uniform> frame: Frame;
+@group(0) @binding(1) var<storage, read_write> ranges: array<vec4<u32>>;
+#table 2 slots: u32
+#table 3 slot_ids: u32
+#table 4 splats: vec4<f32>
+@group(0) @binding(5) var<storage, read_write> image: array<f32>;   // planes red, green, blue, transmittance (, depth)
+#import common/index
+#import common/raster
+
+#ifndef SUBGROUPS
+var<workgroup> seeing: array<u32, LANES>;
+#endif
+
+@compute @workgroup_size($LANES)
+fn main(
+    @builtin(workgroup_id) group: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let tile = workgroup_number(group, groups);
+    if (tile >= (frame.band.y - frame.band.x) * frame.tiles.x) {
+        return;
+    }
+    let my = place(lane);
+    let corner = vec2(tile % frame.tiles.x * u32($TILE_W), (tile / frame.tiles.x + frame.band.x) * u32($TILE_H));
+    let origin = vec2<f32>(corner) + 0.5;
+    let x = f32(my.column);
+    let y = f32(my.row);
+
+    // Transmittance; its sign turns negative where the pixel has stopped.
+    var T: array<f32, ROWS>;
+    var red: array<f32, ROWS>;
+    var green: array<f32, ROWS>;
+    var blue: array<f32, ROWS>;
+#ifdef DEPTH
+    var depth: array<f32, ROWS>;
+#endif
+#unroll r $ROWS
+    T[$r] = select(-1.0, 1.0, corner.x + my.column < frame.size.x && corner.y + my.row + $(r)u < frame.size.y);
+#end
+
+    let range = ranges[tile];
+    var first = range.x;
+    while (first < range.y) {
+        var mine = empty();
+        if (first + lane < range.y) {
+            mine = load(slot_ids_at(slots_at(first + lane)), origin);
+        }
+        let count = min(range.y - first, u32(LANES));
+#ifndef SUBGROUPS
+        batch[lane] = mine;
+        workgroupBarrier();
+#endif
+        for (var j = 0u; j < count; j++) {
+#ifdef SUBGROUPS
+            let s = hand_round(mine, j);
+#else
+            let s = batch[j];
+#endif
+            let dx = x - s.mean.x;
+            let dy = y - s.mean.y;
+            let base = fma(s.a * dx, dx, s.log2_opacity);
+            let slope = s.b * dx;
+#unroll r $ROWS
+            {
+                let v = dy + $r.0;
+                let log2_alpha = fma(v, fma(s.c, v, slope), base);
+                let alpha = select(0.0, min(ALPHA_MAX, power_of_two(log2_alpha)), log2_alpha >= LOG2_ALPHA_MIN);
+                let t = T[$r];
+                let weight = t * alpha;
+                let next = t - weight;
+                let stop = next <= TRANSMITTANCE_MIN;
+                let w = select(weight, 0.0, stop);
+                T[$r] = select(next, -abs(t), stop);
+                red[$r] = fma(w, s.color.x, red[$r]);
+                green[$r] = fma(w, s.color.y, green[$r]);
+                blue[$r] = fma(w, s.color.z, blue[$r]);
+#ifdef DEPTH
+                depth[$r] = fma(w, s.depth, depth[$r]);
+#endif
+            }
+#end
+        }
+        first += count;
+        var open = T[0] > 0.0;
+#unroll r $ROWS
+        open = open || T[$r] > 0.0;
+#end
+#ifdef SUBGROUPS
+        if (!subgroupAny(open)) {
+            break;
+        }
+#else
+        seeing[lane] = select(0u, 1u, open);
+        workgroupBarrier();
+        var any_open = 0u;
+        for (var k = 0u; k < u32(LANES); k++) {
+            any_open |= seeing[k];
+        }
+        workgroupBarrier();
+        if (any_open == 0u) {
+            break;
+        }
+#endif
+    }
+    if (lane == 0u) {
+        ranges[tile].z = first;   // the backward pass stops here, too
+    }
+
+    let pixels = frame.size.x * frame.size.y;
+#unroll r $ROWS
+    if (corner.x + my.column < frame.size.x && corner.y + my.row + $(r)u < frame.size.y) {
+        let pixel = (corner.y + my.row + $(r)u) * frame.size.x + corner.x + my.column;
+        let t = abs(T[$r]);
+        image[pixel] = red[$r] + t * frame.background.x;
+        image[pixels + pixel] = green[$r] + t * frame.background.y;
+        image[2u * pixels + pixel] = blue[$r] + t * frame.background.z;
+        image[3u * pixels + pixel] = t;
+#ifdef DEPTH
+        image[4u * pixels + pixel] = depth[$r];
+#endif
+    }
+#end
+}

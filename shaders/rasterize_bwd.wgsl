@@ -1,0 +1,228 @@
+// The gradient of the image for each intersection, front to back, summed over the tile's pixels in a fixed order and
+// written to the intersection's own slot, so that no atomics are needed and every run gives the same bits.
+//
+// Per pixel: T, and `rest`, what the splats not yet passed (and the background) add to sum(image * d_image). Then
+//   d_loss / d_alpha = T (color . d_color) - rest_after / (1 - alpha).
+// A record holds the moments of v = alpha d_loss/d_alpha over the pixels (1, x, y, x^2, x y, y^2, relative to the mean),
+// since the gradients of opacity, mean and conic are linear in them; red, green, blue; depth.
+@group(0) @binding(0) var<uniform> frame: Frame;
+@group(0) @binding(1) var<storage, read> ranges: array<vec4<u32>>;
+#table 2 slots: u32
+#table 3 slot_ids: u32
+#table 4 splats: vec4<f32>
+// image as the forward pass left it; d_image: planes red, green, blue, alpha (, depth)
+#table 5 image: f32
+#table 6 d_image: f32
+@group(0) @binding(7) var<storage, read_write> records: array<f32>;        // 8 a slot: the moments, red, green
+@group(0) @binding(8) var<storage, read_write> record_tails: array<f32>;   // blue of each slot (, then depth of each)
+#import common/index
+#import common/raster
+
+#ifdef SUBGROUPS
+// One step of a transposed reduction: of two values each lane keeps one and gives the other to its partner.
+fn exchange(keep_second: bool, first: f32, second: f32, distance: u32) -> f32 {
+    let given = select(second, first, keep_second);
+    return select(first, second, keep_second) + subgroupShuffleXor(given, distance);
+}
+
+fn subgroup_sum(value: f32) -> f32 {   // always in the same order, which subgroupAdd does not promise
+    var sum = value + subgroupShuffleXor(value, 1u);
+    sum += subgroupShuffleXor(sum, 2u);
+    sum += subgroupShuffleXor(sum, 4u);
+#ifdef LANES_16
+    sum += subgroupShuffleXor(sum, 8u);
+#endif
+#ifdef LANES_32
+    sum += subgroupShuffleXor(sum, 16u);
+#endif
+    return sum;
+}
+#else
+#ifdef DEPTH
+const VALUES = 10u;
+#else
+const VALUES = 9u;
+#endif
+var<workgroup> partials: array<array<f32, LANES>, VALUES>;
+#endif
+
+@compute @workgroup_size($LANES)
+fn main(
+    @builtin(workgroup_id) group: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let tile = workgroup_number(group, groups);
+    if (tile >= (frame.band.y - frame.band.x) * frame.tiles.x) {
+        return;
+    }
+    let my = place(lane);
+    let corner = vec2(tile % frame.tiles.x * u32($TILE_W), (tile / frame.tiles.x + frame.band.x) * u32($TILE_H));
+    let origin = vec2<f32>(corner) + 0.5;
+    let x = f32(my.column);
+    let y = f32(my.row);
+    let pixels = frame.size.x * frame.size.y;
+
+    var T: array<f32, ROWS>;
+    var rest: array<f32, ROWS>;
+    var d_red: array<f32, ROWS>;
+    var d_green: array<f32, ROWS>;
+    var d_blue: array<f32, ROWS>;
+#ifdef DEPTH
+    var d_depth: array<f32, ROWS>;
+#endif
+#unroll r $ROWS
+    T[$r] = -1.0;
+    if (corner.x + my.column < frame.size.x && corner.y + my.row + $(r)u < frame.size.y) {
+        let pixel = (corner.y + my.row + $(r)u) * frame.size.x + corner.x + my.column;
+        T[$r] = 1.0;
+        d_red[$r] = d_image_at(pixel);
+        d_green[$r] = d_image_at(pixels + pixel);
+        d_blue[$r] = d_image_at(2u * pixels + pixel);
+        // alpha = 1 - transmittance
+        rest[$r] = image_at(pixel) * d_red[$r] + image_at(pixels + pixel) * d_green[$r] + image_at(2u * pixels + pixel) * d_blue[$r]
+            - image_at(3u * pixels + pixel) * d_image_at(3u * pixels + pixel);
+#ifdef DEPTH
+        d_depth[$r] = d_image_at(4u * pixels + pixel);
+        rest[$r] += image_at(4u * pixels + pixel) * d_depth[$r];
+#endif
+    }
+#end
+
+    let range = ranges[tile];
+    for (var first = range.x; first < range.z; first += u32(LANES)) {
+        var mine = empty();
+        var slot = 0u;
+        var my_blue = 0.0;
+        var my_depth = 0.0;
+        if (first + lane < range.y) {
+            slot = slots_at(first + lane);
+            mine = load(slot_ids_at(slot), origin);
+        }
+        let count = min(range.y - first, u32(LANES));
+#ifndef SUBGROUPS
+        batch[lane] = mine;
+        workgroupBarrier();
+#endif
+        for (var j = 0u; j < count; j++) {
+#ifdef SUBGROUPS
+            let s = hand_round(mine, j);
+            let s_slot = subgroupShuffle(slot, j);
+#else
+            let s = batch[j];
+            let s_slot = slots_at(first + j);
+#endif
+            let dx = x - s.mean.x;
+            let dy = y - s.mean.y;
+            let base = fma(s.a * dx, dx, s.log2_opacity);
+            let slope = s.b * dx;
+            var m0 = 0.0;   // moments of v over the lane's rows: 1, y, y^2
+            var m1 = 0.0;
+            var m2 = 0.0;
+            var g_red = 0.0;
+            var g_green = 0.0;
+            var g_blue = 0.0;
+            var g_depth = 0.0;
+#unroll r $ROWS
+            {
+                let v = dy + $r.0;
+                let log2_alpha = fma(v, fma(s.c, v, slope), base);
+                let unclamped = power_of_two(log2_alpha);
+                let alpha = select(0.0, min(ALPHA_MAX, unclamped), log2_alpha >= LOG2_ALPHA_MIN);
+                let t = T[$r];
+                let weight = t * alpha;
+                let next = t - weight;
+                let stop = next <= TRANSMITTANCE_MIN;
+                let w = select(weight, 0.0, stop);
+                T[$r] = select(next, -abs(t), stop);
+                var value = fma(s.color.x, d_red[$r], fma(s.color.y, d_green[$r], s.color.z * d_blue[$r]));
+#ifdef DEPTH
+                value = fma(s.depth, d_depth[$r], value);
+                g_depth = fma(w, d_depth[$r], g_depth);
+#endif
+                rest[$r] = fma(-w, value, rest[$r]);
+                let d_alpha = t * value - rest[$r] / (1.0 - alpha);
+                let moment = select(alpha * d_alpha, 0.0, stop || unclamped > ALPHA_MAX);
+                m0 += moment;
+                m1 = fma(moment, v, m1);
+                m2 = fma(moment * v, v, m2);
+                g_red = fma(w, d_red[$r], g_red);
+                g_green = fma(w, d_green[$r], g_green);
+                g_blue = fma(w, d_blue[$r], g_blue);
+            }
+#end
+            let mx = m0 * dx;
+#ifdef SUBGROUPS
+            // Eight values over eight lanes: afterwards lane k holds the sum of the k-th; then over the other lanes.
+            let bit0 = (lane & 1u) != 0u;
+            let bit1 = (lane & 2u) != 0u;
+            let bit2 = (lane & 4u) != 0u;
+            let v01 = exchange(bit0, m0, mx, 1u);
+            let v23 = exchange(bit0, m1, mx * dx, 1u);
+            let v45 = exchange(bit0, m1 * dx, m2, 1u);
+            let v67 = exchange(bit0, g_red, g_green, 1u);
+            var value = exchange(bit2, exchange(bit1, v01, v23, 2u), exchange(bit1, v45, v67, 2u), 4u);
+            let blue = subgroup_sum(g_blue);
+            my_blue = select(my_blue, blue, lane == j);
+#ifdef DEPTH
+            let depth = subgroup_sum(g_depth);
+            my_depth = select(my_depth, depth, lane == j);
+#endif
+#ifdef LANES_16
+            value += subgroupShuffleXor(value, 8u);
+#endif
+#ifdef LANES_32
+            value += subgroupShuffleXor(value, 16u);
+#endif
+            if (lane < 8u) {
+                records[s_slot * 8u + lane] = value;
+            }
+#else
+            partials[0][lane] = m0;
+            partials[1][lane] = mx;
+            partials[2][lane] = m1;
+            partials[3][lane] = mx * dx;
+            partials[4][lane] = m1 * dx;
+            partials[5][lane] = m2;
+            partials[6][lane] = g_red;
+            partials[7][lane] = g_green;
+            partials[8][lane] = g_blue;
+#ifdef DEPTH
+            partials[9][lane] = g_depth;
+#endif
+            workgroupBarrier();
+            for (var k = lane; k < VALUES; k += u32(LANES)) {
+                var sum = 0.0;
+                for (var other = 0u; other < u32(LANES); other++) {
+                    sum += partials[k][other];
+                }
+                if (k < 8u) {
+                    records[s_slot * 8u + k] = sum;
+                } else {
+                    record_tails[(k - 8u) * frame.capacity + s_slot] = sum;
+                }
+            }
+            workgroupBarrier();
+#endif
+        }
+#ifdef SUBGROUPS
+        if (lane < count) {   // each lane keeps the last values of its own splat, to write them for all at once
+            record_tails[slot] = my_blue;
+#ifdef DEPTH
+            record_tails[frame.capacity + slot] = my_depth;
+#endif
+        }
+#endif
+    }
+    // What no pixel of the tile sees has no gradient.
+    for (var i = range.z + lane; i < range.y; i += u32(LANES)) {
+        let slot = slots_at(i);
+#unroll k 8
+        records[slot * 8u + $(k)u] = 0.0;
+#end
+        record_tails[slot] = 0.0;
+#ifdef DEPTH
+        record_tails[frame.capacity + slot] = 0.0;
+#endif
+    }
+}
