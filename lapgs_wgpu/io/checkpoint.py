@@ -1,0 +1,88 @@
+"""The checkpoint: one .ply file that any splat viewer opens as a still, and that carries the motion behind it.
+
+After the Gaussians of a 3DGS .ply stands one more element, `lapgs4d`, whose rows of one uint are a safetensors file
+(docs/format.md). Equal models give equal bytes; nothing in the file is ever executed.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Any, BinaryIO, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.io.atomic import atomic_write
+from lapgs_wgpu.io.ply import StillGaussians, ply_header, read_vertices, vertex_rows
+from lapgs_wgpu.io.ply_header import Element, PathLike, open_ply
+from lapgs_wgpu.io.tensors import pack_tensors, unpack_tensors
+
+VERSION = 1
+_ELEMENT = "lapgs4d"
+
+
+class Checkpoint(NamedTuple):
+    """still: the Gaussians at the reference time. tensors and metadata: the motion, both empty for a static scene."""
+
+    still: StillGaussians
+    tensors: dict[str, NDArray[Any]]
+    metadata: dict[str, str]
+
+
+def write_checkpoint(
+    path: PathLike, still: StillGaussians, tensors: Mapping[str, NDArray[Any]], metadata: Mapping[str, str]
+) -> None:
+    """Write a checkpoint. Atomic; equal arguments give equal bytes, on every machine.
+
+    tensors: float, int or uint arrays of any shape. Raises InputError when the file cannot be written or a value is
+    NaN or infinite.
+    """
+    rows = vertex_rows(still, path)
+    try:
+        buffers = pack_tensors(tensors, metadata)
+    except InputError as error:
+        raise InputError(f"{path}: not written, because {error}") from error
+    size = sum(map(len, buffers))
+    words = -(-size // 4)
+    trailer = f"element {_ELEMENT} {words}\ncomment {_ELEMENT} v{VERSION} safetensors {size}\nproperty uint word\n"
+    with atomic_write(path) as file:
+        file.write(ply_header(len(still), trailer))
+        for buffer in (rows.data, *buffers, b"\0" * (4 * words - size)):
+            file.write(buffer)
+
+
+def read_checkpoint(path: PathLike) -> Checkpoint:
+    """A checkpoint, or any 3DGS .ply: then tensors and metadata are empty and the scene is static.
+
+    Raises InputError when the file is neither, is damaged, or holds NaN or infinity.
+    """
+    with open_ply(path) as (file, elements):
+        still = read_vertices(file, elements, path)
+        if _ELEMENT not in elements:
+            return Checkpoint(still, {}, {})
+        return Checkpoint(still, *_read_payload(file, elements[_ELEMENT], path))
+
+
+def _read_payload(file: BinaryIO, element: Element, path: PathLike) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
+    comments = [comment for comment in element.comments if comment.startswith(f"{_ELEMENT} ")]
+    found = re.fullmatch(rf"{_ELEMENT} v([0-9]{{1,9}}) safetensors ([0-9]{{1,18}})", comments[0]) if comments else None
+    if found is None or element.properties != {"word": np.dtype("<u4")}:
+        raise InputError(
+            f"{path}: its element {_ELEMENT} lacks the line 'comment {_ELEMENT} v{VERSION} safetensors BYTES' or the "
+            "one property 'uint word'; the file is damaged"
+        )
+    version, size = int(found[1]), int(found[2])
+    if version != VERSION:
+        raise InputError(
+            f"{path}: its element {_ELEMENT} has version {version}, and this program reads version {VERSION}; "
+            "use the program that wrote the file"
+        )
+    if not 0 <= 4 * element.count - size < 4:
+        raise InputError(
+            f"{path}: its element {_ELEMENT} declares {size} bytes of safetensors in {element.count} words of 4 bytes; "
+            "the file is damaged"
+        )
+    file.seek(element.offset)
+    return unpack_tensors(file, size, f"{path}: element {_ELEMENT}")

@@ -1,0 +1,210 @@
+"""Still Gaussians in a .ply file, in the layout of 3DGS ("Inria's"), which every splat viewer opens.
+
+Layout: binary little-endian rows of one Gaussian each, parameters before their activations; docs/format.md has it byte
+by byte. Properties are found by name, for other programs order them otherwise and add their own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.io.atomic import atomic_write
+from lapgs_wgpu.io.ply_header import Element, PathLike, open_ply
+
+Floats = NDArray[np.float32]
+
+MAX_LOG_SCALE = 44.0  # exp(2 * 44) still fits in float32: the variance is finite
+_BLOCK_BYTES = 1 << 20  # rows are converted in blocks that stay in the cache
+
+
+@dataclass(frozen=True, eq=False)
+class StillGaussians:
+    """N Gaussians at one moment, as stored: before the activations. Everything is float32.
+
+    means: (N, 3) world units. sh: (N, K, 3) spherical harmonics, K = (degree + 1)^2 coefficients, degree 0 to 3.
+    opacity_logits: (N,), opacity = sigmoid. log_scales: (N, 3), standard deviation in world units = exp.
+    quats: (N, 4) wxyz, any non-zero length.
+    """
+
+    means: Floats
+    sh: Floats
+    opacity_logits: Floats
+    log_scales: Floats
+    quats: Floats
+
+    def __post_init__(self) -> None:
+        n = len(self.means)
+        if self.sh.ndim != 3 or self.sh.shape[1] not in (1, 4, 9, 16):
+            raise ValueError(f"sh has shape {self.sh.shape}, not (N, K, 3) with K of 1, 4, 9 or 16")
+        shapes = {"means": (n, 3), "opacity_logits": (n,), "log_scales": (n, 3), "quats": (n, 4)}
+        for name, shape in (shapes | {"sh": (n, self.sh.shape[1], 3)}).items():
+            array = getattr(self, name)
+            if array.shape != shape or array.dtype != np.float32:
+                raise ValueError(f"{name} is {array.dtype} {array.shape}, not float32 {shape}")
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def sh_degree(self) -> int:
+        return int(self.sh.shape[1] ** 0.5) - 1
+
+
+def _names(rest: int) -> list[str]:
+    """The properties that are read, in the order of 3DGS, with `rest` SH coefficients above degree 0 (all channels)."""
+    return [
+        "x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{i}" for i in range(rest)), "opacity",
+        "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3",
+    ]  # fmt: skip
+
+
+_WRITTEN_NAMES = [*_names(0)[:3], "nx", "ny", "nz", *_names(45)[3:]]
+
+
+def read_ply(path: PathLike) -> StillGaussians:
+    """The Gaussians of any 3DGS .ply: properties in any order, SH degree 0 to 3, further scalar properties skipped.
+
+    Raises InputError when the file is not such a file, is damaged, or holds a value that cannot be rendered. Needs
+    memory for about twice the Gaussians.
+    """
+    with open_ply(path) as (file, elements):
+        return read_vertices(file, elements, path)
+
+
+def write_ply(path: PathLike, still: StillGaussians) -> None:
+    """Write Gaussians with exactly the 62 properties of 3DGS, SH padded with zeros to degree 3. Atomic.
+
+    Raises InputError when the file cannot be written or a value could not be read back.
+    """
+    rows = vertex_rows(still, path)
+    with atomic_write(path) as file:
+        file.write(ply_header(len(still)))
+        file.write(rows.data)
+
+
+def ply_header(count: int, trailer: str = "") -> bytes:
+    """The header for `count` Gaussians; `trailer` holds the lines of further elements."""
+    properties = "".join(f"property float {name}\n" for name in _WRITTEN_NAMES)
+    # Some viewers look for the count on the third line: nothing may come between.
+    return f"ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{properties}{trailer}end_header\n".encode()
+
+
+def vertex_rows(still: StillGaussians, path: PathLike) -> Floats:
+    """(N, 62) little-endian rows as 3DGS stores them. Raises InputError where `path` could not be read back."""
+    if len(still) == 0:
+        raise InputError(f"{path}: not written, because it would hold 0 Gaussians; at least 1 is needed")
+    rest = still.sh.shape[1] - 1
+    rows = np.zeros((len(still), 62), "<f4")  # 3:6 are the normals, which 3DGS leaves at 0
+    rows[:, 0:3] = still.means
+    rows[:, 6:9] = still.sh[:, 0]
+    for channel in range(3):  # channel-major: all of red, then green, then blue
+        rows[:, 9 + 15 * channel :][:, :rest] = still.sh[:, 1:, channel]
+    rows[:, 54] = still.opacity_logits
+    rows[:, 55:58] = still.log_scales
+    rows[:, 58:62] = still.quats
+    _check_values(rows, _WRITTEN_NAMES, f"{path}: not written, because")
+    return rows
+
+
+def read_vertices(file: BinaryIO, elements: dict[str, Element], path: PathLike) -> StillGaussians:
+    """The Gaussians of an opened file: see read_ply."""
+    if "vertex" not in elements:
+        raise InputError(f"{path}: has no element vertex, so it holds no Gaussians; give a 3DGS .ply file")
+    vertex = elements["vertex"]
+    rest = _rest_count(vertex, path)
+    names = _names(rest)
+    values = _read_columns(file, vertex, names, path)
+    _check_values(values, names, f"{path}:")
+    end = 6 + rest  # of the colours
+    sh = np.empty((len(values), 1 + rest // 3, 3), np.float32)
+    sh[:, 0] = values[:, 3:6]
+    for channel in range(3):  # channel-major: all of red, then green, then blue
+        sh[:, 1:, channel] = values[:, 6 + channel * rest // 3 : 6 + (channel + 1) * rest // 3]
+    return StillGaussians(
+        means=values[:, 0:3].copy(),
+        sh=sh,
+        opacity_logits=values[:, end].copy(),
+        log_scales=values[:, end + 1 : end + 4].copy(),
+        quats=values[:, end + 4 : end + 8].copy(),
+    )
+
+
+def _rest_count(vertex: Element, path: PathLike) -> int:
+    """The number of f_rest_* properties of a complete, known layout."""
+    properties = vertex.properties
+    if "packed_position" in properties:
+        raise InputError(
+            f"{path}: is in PlayCanvas's compressed layout (property packed_position), which is not read; "
+            "convert it to an uncompressed .ply first, for example with SuperSplat or splat-transform"
+        )
+    rest = sum(name.startswith("f_rest_") for name in properties)
+    if rest not in (0, 9, 24, 45):
+        raise InputError(
+            f"{path}: has {rest} properties f_rest_*, where spherical harmonics of degree 0 to 3 have 0, 9, 24 or 45"
+        )
+    missing = [name for name in _names(rest) if name not in properties]
+    if missing:
+        more = f" and {len(missing) - 5} more" if len(missing) > 5 else ""
+        raise InputError(
+            f"{path}: its element vertex lacks the property {', '.join(missing[:5])}{more} "
+            f"({len(properties)} properties found): it is not a 3DGS .ply file"
+        )
+    if vertex.count == 0:
+        raise InputError(f"{path}: holds 0 Gaussians; at least 1 is needed")
+    return rest
+
+
+def _read_columns(file: BinaryIO, vertex: Element, names: list[str], path: PathLike) -> Floats:
+    """(N, len(names)) float32: the named properties of every row."""
+    offsets, offset = {}, 0
+    for name, dtype in vertex.properties.items():
+        offsets[name] = offset
+        offset += dtype.itemsize
+    row = np.dtype(
+        {
+            "names": names,
+            "formats": [vertex.properties[name] for name in names],
+            "offsets": [offsets[name] for name in names],
+            "itemsize": vertex.stride,
+        }
+    )
+    values = np.empty((vertex.count, len(names)), np.float32)
+    block = max(1, _BLOCK_BYTES // vertex.stride)
+    file.seek(vertex.offset)
+    for start in range(0, vertex.count, block):
+        wanted = min(block, vertex.count - start)
+        rows = np.fromfile(file, row, wanted)
+        if len(rows) != wanted:
+            raise InputError(f"{path}: became shorter while it was read, at row {start + len(rows)} of {vertex.count}")
+        with np.errstate(all="ignore"):  # a double beyond float32 becomes Inf, which _check_values names
+            for column, name in enumerate(names):
+                values[start : start + wanted, column] = rows[name]
+    return values
+
+
+def _check_values(values: Floats, names: list[str], where: str) -> None:
+    """Raise InputError unless every value (N, len(names)) is finite, and stays so once it is activated."""
+
+    def refuse(bad: NDArray[np.bool_], what: str) -> None:
+        if bad.any():
+            raise InputError(
+                f"{where} {what} in {np.count_nonzero(bad)} of {len(bad)} rows, first in row {np.flatnonzero(bad)[0]} "
+                "(counted from 0); the file is damaged or its training diverged"
+            )
+
+    finite = np.isfinite(values)
+    for column in np.flatnonzero(~finite.all(axis=0)):
+        refuse(~finite[:, column], f"property {names[column]} is NaN or infinite")
+    for name, column in zip(names[-7:-4], values.T[-7:-4], strict=True):
+        refuse(column > MAX_LOG_SCALE, f"property {name} (log scale) is over {MAX_LOG_SCALE:g}")
+    with np.errstate(over="ignore", under="ignore"):
+        squared_length = np.square(values[:, -4:]).sum(axis=1)
+    refuse(
+        ~np.isfinite(squared_length) | (squared_length == 0),
+        "the quaternion rot_0..3 has a length that cannot be normalised in float32",
+    )

@@ -1,0 +1,153 @@
+"""Named arrays in the safetensors format, with bytes that depend on nothing but the content.
+
+The safetensors package itself writes its metadata in a random order, so two equal models would differ. Reading by hand
+is as short, allocates nothing that the bytes do not pay for, and can say what is wrong. Format:
+https://github.com/huggingface/safetensors#format
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from typing import Any, BinaryIO, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lapgs_wgpu.errors import InputError
+
+Array = NDArray[Any]
+
+MAX_HEADER_BYTES = 1 << 20
+_DTYPES = {
+    "F64": "<f8", "F32": "<f4", "F16": "<f2", "I64": "<i8", "I32": "<i4", "I16": "<i2", "I8": "|i1", "U64": "<u8",
+    "U32": "<u4", "U16": "<u2", "U8": "|u1",
+}  # fmt: skip
+_NAMES = {np.dtype(code): name for name, code in _DTYPES.items()}
+_METADATA = "__metadata__"
+
+
+class _Spec(NamedTuple):
+    begin: int  # bytes from the end of the header
+    end: int
+    name: str
+    dtype: np.dtype[Any]
+    shape: tuple[int, ...]
+
+
+def pack_tensors(tensors: Mapping[str, Array], metadata: Mapping[str, str]) -> list[bytes | memoryview]:
+    """The buffers which, written one after another, are a safetensors file. Floats must be finite.
+
+    Tensors stand by falling item size, then by name, so that each is aligned; metadata by key. Equal input gives equal
+    bytes. Raises InputError when a value is NaN or infinite, ValueError for a type that the format lacks.
+    """
+    header: dict[str, Any] = {_METADATA: dict(sorted(metadata.items()))} if metadata else {}
+    buffers: list[bytes | memoryview] = []
+    begin = 0
+    for name, array in sorted(tensors.items(), key=lambda item: (-item[1].dtype.itemsize, item[0])):
+        dtype = array.dtype.newbyteorder("<")
+        if dtype not in _NAMES or name == _METADATA:
+            raise ValueError(f"tensor {name!r} of type {array.dtype} cannot be stored")
+        _check_finite(array, f"tensor {name!r} cannot be stored:")
+        header[name] = {"dtype": _NAMES[dtype], "shape": array.shape, "data_offsets": (begin, begin + array.nbytes)}
+        buffers.append(np.asarray(array, dtype, order="C").reshape(-1).view(np.uint8).data)
+        begin += array.nbytes
+    text = json.dumps(header, ensure_ascii=False, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 8)
+    if len(text) > MAX_HEADER_BYTES:
+        raise ValueError(f"the names and metadata take {len(text)} bytes, over the limit of {MAX_HEADER_BYTES}")
+    return [len(text).to_bytes(8, "little") + text, *buffers]
+
+
+def unpack_tensors(file: BinaryIO, size: int, where: str) -> tuple[dict[str, Array], dict[str, str]]:
+    """The tensors and the metadata of the safetensors file that is the next `size` bytes of `file` (a file on disk).
+
+    Takes as much memory as `size`, and at most some tens of MB for the header. Raises InputError, which begins with
+    `where`, unless every size agrees with every other and every float is finite.
+    """
+    if size < 8:
+        raise InputError(f"{where}: has {size} bytes, where the shortest safetensors file has 10; the file is damaged")
+    length = int.from_bytes(file.read(8), "little")
+    limit = min(size - 8, MAX_HEADER_BYTES)
+    if length > limit:
+        raise InputError(f"{where}: declares a header of {length} bytes, of at most {limit}; the file is damaged")
+    header = _parse_json(file.read(length), where)
+    metadata = header.pop(_METADATA, {})
+    if not isinstance(metadata, dict) or not all(isinstance(text, str) for text in metadata.values()):
+        raise InputError(f"{where}: its {_METADATA} is not a table of texts; the file is damaged")
+    specs = sorted(_parse_entry(name, entry, where) for name, entry in header.items())
+    _check_cover(specs, size - 8 - length, where)
+    return {spec.name: _read_array(file, spec, where) for spec in specs}, metadata
+
+
+def _parse_json(data: bytes, where: str) -> dict[str, Any]:
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        table = dict(pairs)
+        if len(table) != len(pairs):
+            raise ValueError("a name stands twice")
+        return table
+
+    try:
+        header = json.loads(data.decode(), object_pairs_hook=unique)
+        json.dumps(header, ensure_ascii=False).encode()  # half a surrogate pair could not be printed later
+    except (ValueError, RecursionError) as error:
+        reason = "nested too deeply" if isinstance(error, RecursionError) else str(error)[:120]
+        raise InputError(f"{where}: its header is not valid JSON ({reason}); the file is damaged") from error
+    if not isinstance(header, dict):
+        raise InputError(f"{where}: its header is not a JSON table; the file is damaged")
+    return header
+
+
+def _parse_entry(name: str, entry: Any, where: str) -> _Spec:
+    def sizes(value: Any, most: int) -> bool:
+        return isinstance(value, list) and len(value) <= most and all(type(i) is int and 0 <= i < 2**53 for i in value)
+
+    where = f"{where}: tensor {name[:80]!r}"
+    if not isinstance(entry, dict) or entry.keys() != {"dtype", "shape", "data_offsets"}:
+        raise InputError(f"{where} is not declared by dtype, shape and data_offsets; the file is damaged")
+    code, shape, offsets = entry["dtype"], entry["shape"], entry["data_offsets"]
+    if not isinstance(code, str) or code not in _DTYPES:
+        raise InputError(f"{where} has the unknown dtype {str(code)[:40]!r}; known are {', '.join(_DTYPES)}")
+    if not sizes(shape, 8) or not sizes(offsets, 2) or len(offsets) != 2:
+        raise InputError(f"{where} has a shape of {str(shape)[:80]} at bytes {str(offsets)[:80]}; the file is damaged")
+    dtype = np.dtype(_DTYPES[code])
+    needed = math.prod(shape) * dtype.itemsize
+    if needed != offsets[1] - offsets[0] or math.prod(max(i, 1) for i in shape) >= 2**53:
+        raise InputError(
+            f"{where} of shape {shape} and dtype {code} needs {needed} bytes, but its data_offsets {offsets} "
+            f"hold {offsets[1] - offsets[0]}; the file is damaged"
+        )
+    return _Spec(offsets[0], offsets[1], name, dtype, tuple(shape))
+
+
+def _check_cover(specs: list[_Spec], size: int, where: str) -> None:
+    """The tensors must follow one another without gap or overlap and end with the data."""
+    position = 0
+    for spec in specs:
+        if spec.begin != position:
+            raise InputError(
+                f"{where}: tensor {spec.name[:80]!r} begins at byte {spec.begin}, but the one before it ends at "
+                f"{position}; the file is damaged"
+            )
+        position = spec.end
+    if position != size:
+        raise InputError(f"{where}: its tensors end at byte {position}, its data at {size}; the file is damaged")
+
+
+def _read_array(file: BinaryIO, spec: _Spec, where: str) -> Array:
+    count = math.prod(spec.shape)
+    array = np.fromfile(file, spec.dtype, count)
+    if len(array) != count:
+        raise InputError(f"{where}: became shorter while it was read, in tensor {spec.name[:80]!r}")
+    _check_finite(array, f"{where}: tensor {spec.name[:80]!r}")
+    return array.reshape(spec.shape)
+
+
+def _check_finite(array: Array, what: str) -> None:
+    if array.dtype.kind == "f" and not (finite := np.isfinite(array)).all():
+        bad = np.flatnonzero(~finite)
+        raise InputError(
+            f"{what} is NaN or infinite in {len(bad)} of {array.size} values, first in value {bad[0]} (counted from "
+            "0); the file is damaged or its training diverged"
+        )

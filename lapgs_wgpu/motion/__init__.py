@@ -1,0 +1,1 @@
+"""How Gaussians move: the hash encoder, the deformation field, the 4D scene."""

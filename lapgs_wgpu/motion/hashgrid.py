@@ -1,0 +1,313 @@
+"""Multi-resolution hash grids (Instant-NGP's, with the resolutions of Grid4D; paper eq. 1): encoding and its gradient.
+
+The tables belong to torch; the kernels run on the device. A step has one time, so a grid with a time axis is first
+cut at that time wherever that is cheaper than looking up the planes around it for each point.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from ..gpu.buffer import Buffer, BufferPool, read_all
+from ..gpu.device import Device
+from ..gpu.kernel import Commands, Kernel
+
+_SLICE_CELLS = 1 << 14  # a level with more cells a plane than this is looked up directly, not cut
+_DISPATCH_POINTS = 1 << 15  # with lane_levels: Mesa's software driver ends a shader's loops after 65,535 rounds
+_LEVEL_WORDS = 12  # common/hashgrid.wgsl: struct Level
+TIME = 3  # the axis number of time
+
+
+def option(default: Any, help_text: str) -> Any:
+    """A field of a configuration, with the help that lapgs-train --help shows."""
+    return field(default=default, metadata={"help": help_text})
+
+
+@dataclass(frozen=True)
+class HashConfig:
+    """The shape of a grid."""
+
+    levels: int = option(16, "number of levels")
+    base: tuple[int, int, int] = option((16, 16, 16), "entries along each axis of the coarsest level")
+    finest: tuple[int, int, int] = option((2048, 2048, 2048), "entries along each axis of the finest level")
+    table_log2: int = option(19, "a level has at most 2^this entries, beyond which it is hashed")
+
+
+@dataclass(frozen=True)
+class Level:
+    """scale: cells along each axis, a real number; resolution: entries along each axis; first: its first entry."""
+
+    scale: tuple[float, float, float]
+    resolution: tuple[int, int, int]
+    entries: int
+    first: int
+
+    @property
+    def dense(self) -> bool:
+        return math.prod(self.resolution) <= self.entries
+
+
+def make_levels(config: HashConfig) -> list[Level]:
+    """The levels of a grid: the resolution grows geometrically along each axis."""
+    levels, first = [], 0
+    for number in range(config.levels):
+        share = number / max(1, config.levels - 1)
+        exact = [a * (b / a) ** share for a, b in zip(config.base, config.finest, strict=True)]
+        resolution = [math.ceil(size - 1e-9) for size in exact]
+        entries = min(1 << config.table_log2, math.prod(resolution))
+        x, y, z = exact
+        levels.append(Level((x - 1, y - 1, z - 1), (resolution[0], resolution[1], resolution[2]), entries, first))
+        first += entries
+    return levels
+
+
+class HashGrid(nn.Module):
+    """One grid over three of the axes x, y, z (0 to 2) and t (3, only as the last). table: (entries, 2) float32."""
+
+    def __init__(self, config: HashConfig, axes: tuple[int, int, int], generator: torch.Generator) -> None:
+        super().__init__()
+        self.axes = axes
+        self.levels = make_levels(config)
+        entries = self.levels[-1].first + self.levels[-1].entries
+        self.table = nn.Parameter(torch.empty(entries, 2).uniform_(-1e-4, 1e-4, generator=generator))
+
+    @property
+    def features(self) -> int:
+        """Length of a point's encoding."""
+        return 2 * len(self.levels)
+
+    @property
+    def sliced(self) -> list[int]:
+        """The levels that are cut at the time of the step."""
+        if self.axes[2] != TIME:
+            return []
+        cells = [level.resolution[0] * level.resolution[1] for level in self.levels]
+        return [i for i, level in enumerate(self.levels) if level.dense and cells[i] <= _SLICE_CELLS]
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Some levels of a grid that are handled alike."""
+
+    grid: int
+    sliced: bool
+    count: int
+    levels: Buffer
+    cells: int  # of the largest plane
+    entries: int  # of all slices together
+
+
+class HashEncoder:
+    """Encodes points with several grids at once on one device. axes and levels are fixed; tables come with each call.
+
+    lane_levels: the shape of the backward pass for CPU devices; otherwise fixed-point atomics.
+    """
+
+    def __init__(self, device: Device, grids: list[HashGrid], bound: float, *, lane_levels: bool | None = None) -> None:
+        self.device, self.grids, self.bound = device, grids, bound
+        self.pool = BufferPool(device)
+        self._lane_levels = device.is_cpu if lane_levels is None else lane_levels
+        self._parts: list[_Part] = []
+        for number, grid in enumerate(grids):
+            sliced = grid.sliced
+            direct = [i for i in range(len(grid.levels)) if i not in sliced]
+            for chosen, cut in ((sliced, True), (direct, False)):
+                if chosen:
+                    self._parts.append(self._part(number, chosen, cut))
+
+    def _part(self, number: int, chosen: list[int], sliced: bool) -> _Part:
+        levels = self.grids[number].levels
+        words = np.zeros((len(chosen), _LEVEL_WORDS), np.uint32)
+        slices = largest = 0
+        for row, i in zip(words, chosen, strict=True):
+            level = levels[i]
+            row[:3] = np.asarray(level.scale, np.float32).view(np.uint32)
+            row[4:8] = (*level.resolution, level.entries)
+            row[8:12] = (level.first, slices, i, level.dense)
+            cells = level.resolution[0] * level.resolution[1]
+            largest = max(largest, cells)
+            slices += cells
+        buffer = Buffer(self.device, words.nbytes, f"levels {number} {'sliced' if sliced else 'direct'}")
+        buffer.write(words)
+        return _Part(number, sliced, len(chosen), buffer, largest, slices if sliced else 0)
+
+    def __call__(self, points: Tensor, time: float = 0.0) -> list[Tensor]:
+        """Encode points (N, 3), world units, at a time in [0, 1]: one (N, 2 x levels) tensor a grid.
+
+        Differentiable in the tables, not in the points (the encoder sees sg[mean]). A point outside the box
+        [-bound, bound]^3 has zero features.
+        """
+        outputs = _Encode.apply(self, points.detach(), time, *[grid.table for grid in self.grids])
+        return list(outputs)
+
+    # One call on the device -----------------------------------------------------------------------------------------
+
+    def _uniform(self, part: _Part, points: int, time: float, fixed_scale: float = 1.0, first: int = 0) -> Buffer:
+        axes = self.grids[part.grid].axes
+        content = Kernel.get(self.device, "hashgrid_slice", SLICED=1, CORNERS=4).uniform(
+            "Grid",
+            points=points,
+            levels=part.count,
+            all_levels=len(self.grids[part.grid].levels),
+            first_point=first,
+            last_point=min(points, first + _DISPATCH_POINTS),
+            axes=(*axes, 0),
+            time=time,
+            bound=self.bound,
+            fixed_scale=fixed_scale,
+        )
+        return self.pool.constant(f"grid {part.grid} {part.sliced} {first}", content)
+
+    @staticmethod
+    def _defines(part: _Part) -> dict[str, int]:
+        return {"SLICED": 1, "CORNERS": 4} if part.sliced else {"CORNERS": 8}
+
+    def encode(self, points: Tensor, time: float, tables: list[Tensor]) -> list[Tensor]:
+        """The forward pass without autograd."""
+        n = len(points)
+        if n == 0:
+            return [points.new_zeros((0, grid.features)) for grid in self.grids]
+        point_buffer = self._upload("points", torch.nn.functional.pad(points, (0, 1)))
+        table_buffers = [self._upload(f"table {i}", table) for i, table in enumerate(tables)]
+        outputs = [self.pool.get(f"encoding {i}", 4 * n * grid.features) for i, grid in enumerate(self.grids)]
+        with Commands(self.device) as commands:
+            for part in self._parts:
+                uniform = self._uniform(part, n, time)
+                features = table_buffers[part.grid]
+                defines = self._defines(part)
+                if part.sliced:
+                    slices = self.pool.get(f"slices {part.grid}", 8 * part.entries)
+                    commands.dispatch_grid(
+                        Kernel.get(self.device, "hashgrid_slice", **defines),
+                        (-(-part.cells // 64), part.count),
+                        grid=uniform,
+                        levels=part.levels,
+                        features=features,
+                        slices=slices,
+                    )
+                    features = slices
+                commands.dispatch(
+                    Kernel.get(self.device, "hashgrid", **defines),
+                    -(-n // 512) * part.count,
+                    grid=uniform,
+                    levels=part.levels,
+                    points=point_buffer,
+                    features=features,
+                    encoding=outputs[part.grid],
+                )
+        arrays = read_all([(b, "float32", (n, g.features), 0) for b, g in zip(outputs, self.grids, strict=True)])
+        return [torch.from_numpy(array).to(points.device) for array in arrays]
+
+    def backward(self, points: Tensor, time: float, d_encodings: list[Tensor]) -> list[Tensor]:
+        """The gradients of the tables."""
+        n = len(points)
+        if n == 0:
+            return [torch.zeros_like(grid.table) for grid in self.grids]
+        point_buffer = self._upload("points", torch.nn.functional.pad(points, (0, 1)))
+        d_buffers = [self._upload(f"d_encoding {i}", d) for i, d in enumerate(d_encodings)]
+        d_tables = [self.pool.get(f"d_table {i}", 8 * len(grid.table)) for i, grid in enumerate(self.grids)]
+        # The largest sum that can occur stays below 2^61 in fixed point.
+        largest = max(float(d.abs().max()) for d in d_encodings)
+        fixed_scale = 2.0 ** math.floor(61 - math.log2(max(largest, 1e-30) * n)) if largest < math.inf else 1.0
+        with Commands(self.device) as commands:
+            for buffer in d_tables:
+                commands.clear(buffer)
+            for part in self._parts:
+                inputs = {
+                    "grid": self._uniform(part, n, time, min(fixed_scale, 2.0**120)),
+                    "levels": part.levels,
+                    "points": point_buffer,
+                    "d_encoding": d_buffers[part.grid],
+                }
+                target = d_tables[part.grid]
+                if part.sliced:
+                    target = self.pool.get(f"d_slices {part.grid}", 8 * part.entries)
+                    commands.clear(target)
+                if self._lane_levels:
+                    self._add_lanes(commands, part, n, time, inputs, target)
+                else:
+                    self._add_fixed(commands, part, n, inputs, target)
+                if part.sliced:
+                    commands.dispatch_grid(
+                        Kernel.get(self.device, "hashgrid_slice_bwd", **self._defines(part)),
+                        (-(-part.cells // 64), part.count),
+                        grid=inputs["grid"],
+                        levels=part.levels,
+                        d_slices=target,
+                        d_features=d_tables[part.grid],
+                    )
+        arrays = read_all([(b, "float32", tuple(g.table.shape), 0) for b, g in zip(d_tables, self.grids, strict=True)])
+        return [torch.from_numpy(array).to(points.device) for array in arrays]
+
+    def _add_lanes(
+        self, commands: Commands, part: _Part, n: int, time: float, inputs: dict[str, Buffer], out: Buffer
+    ) -> None:
+        kernel = Kernel.get(self.device, "hashgrid_bwd", LANE_LEVELS=1, **self._defines(part))
+        for first in range(0, n, _DISPATCH_POINTS):
+            inputs["grid"] = self._uniform(part, n, time, first=first)
+            commands.dispatch(kernel, -(-2 * part.count // 8), **inputs, d_features=out)
+
+    def _add_fixed(self, commands: Commands, part: _Part, n: int, inputs: dict[str, Buffer], out: Buffer) -> None:
+        fixed = self.pool.get(f"d_fixed {part.grid} {part.sliced}", 2 * out.nbytes)
+        commands.clear(fixed)
+        kernel = Kernel.get(self.device, "hashgrid_bwd", **self._defines(part))
+        commands.dispatch(kernel, -(-n // 64) * part.count, **inputs, d_fixed=fixed)
+        unfix = Kernel.get(self.device, "hashgrid_unfix", **self._defines(part))
+        commands.dispatch(unfix, -(-out.nbytes // 256), grid=inputs["grid"], d_fixed=fixed, d_features=out)
+
+    def _upload(self, name: str, tensor: Tensor) -> Buffer:
+        array = tensor.detach().to("cpu", torch.float32).contiguous().numpy()
+        buffer = self.pool.get(name, array.nbytes)
+        buffer.write(array)
+        return buffer
+
+
+class _Encode(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, encoder: HashEncoder, points: Tensor, time: float, *tables: Tensor) -> tuple[Tensor, ...]:
+        ctx.encoder, ctx.time = encoder, time
+        ctx.save_for_backward(points)
+        return tuple(encoder.encode(points, time, list(tables)))
+
+    @staticmethod
+    def backward(ctx: Any, *d_encodings: Tensor) -> tuple[Tensor | None, ...]:
+        (points,) = ctx.saved_tensors
+        return (None, None, None, *ctx.encoder.backward(points, ctx.time, list(d_encodings)))
+
+
+def encode_reference(grid: HashGrid, table: Tensor, points: Tensor, time: float, bound: float) -> Tensor:
+    """The plain-torch twin: (N, 2 x levels) in the table's precision; cells are found in float32 as on the device."""
+    columns = [(points[:, axis] + bound) / (2 * bound) if axis != TIME else None for axis in grid.axes]
+    unit = torch.stack([torch.full_like(points[:, 0], time) if c is None else c for c in columns], dim=1)
+    inside = ((unit >= 0) & (unit <= 1)).all(dim=1)
+    primes = (1, 2654435761, 805459861)
+    encodings = []
+    for level, rows in zip(grid.levels, table.split([level.entries for level in grid.levels]), strict=True):
+        p = torch.where(inside[:, None], unit * torch.tensor(level.scale, dtype=unit.dtype), 0.0)
+        low = p.floor()
+        fraction = (p - low).to(table.dtype)
+        up = fraction * fraction * (3 - 2 * fraction)
+        base = low.long()
+        total = table.new_zeros((len(points), 2))
+        for corner in range(8):
+            weight = inside.to(table.dtype)
+            at = []
+            for axis in range(3):
+                high = (corner >> axis) & 1
+                weight = weight * (up[:, axis] if high else 1 - up[:, axis])
+                at.append((base[:, axis] + high).clamp(max=level.resolution[axis] - 1))
+            x, y, z = at
+            if level.dense:
+                index = x + level.resolution[0] * (y + level.resolution[1] * z)
+            else:
+                hashed = [((a * prime) & 0xFFFFFFFF) for a, prime in zip(at, primes, strict=True)]
+                index = (hashed[0] ^ hashed[1] ^ hashed[2]) % level.entries
+            total = total + weight[:, None] * rows[index]
+        encodings.append(total)
+    return torch.cat(encodings, dim=1)

@@ -1,0 +1,46 @@
+// Encodes points: two features a level, interpolated between the corners of the cell in which a point lies.
+#import common/hashgrid
+#import common/index
+
+@group(0) @binding(0) var<uniform> grid: Grid;
+@group(0) @binding(1) var<storage, read> levels: array<Level>;
+// (N, 4): x, y, z, -
+#table 2 points: vec4<f32>
+#table 3 features: vec2<f32>
+// the table, or its slices
+@group(0) @binding(4) var<storage, read_write> encoding: array<f32>;         // (N, 2 x levels of the grid)
+
+const LANES = 64u;
+const LANE_POINTS = 8u;   // so that a level's description is loaded once for several points
+
+@compute @workgroup_size(64)
+fn main(
+    @builtin(workgroup_id) group: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let number = workgroup_number(group, groups);
+    let blocks = (grid.points + LANES * LANE_POINTS - 1u) / (LANES * LANE_POINTS);
+    if (number >= blocks * grid.levels) {
+        return;
+    }
+    let level = levels[number / blocks];
+#ifdef SLICED
+    let first = level.place.y;
+#else
+    let first = level.place.x;
+#endif
+    for (var k = 0u; k < LANE_POINTS; k++) {
+        let i = (number % blocks * LANE_POINTS + k) * LANES + lane;
+        if (i < grid.points) {
+            let cell = find_cell(unit_point(points_at(i).xyz, grid), level);
+            var sum = vec2(0.0);
+#unroll c $CORNERS
+            sum += cell.weight[$c] * features_at(first + cell.index[$c]);
+#end
+            let at = 2u * (i * grid.all_levels + level.place.z);
+            encoding[at] = sum.x;
+            encoding[at + 1u] = sum.y;
+        }
+    }
+}

@@ -1,0 +1,79 @@
+// The gradient of a grid's table, or of its slices. Each of its entries is a sum over many points, and the same to the
+// last bit on every run:
+// LANE_LEVELS, for devices of few wide cores: a lane owns one feature of a level and adds the points in their order.
+// Otherwise: a lane owns a point and adds in 64-bit fixed point, whose sum does not depend on the order.
+#import common/hashgrid
+#import common/index
+
+@group(0) @binding(0) var<uniform> grid: Grid;
+@group(0) @binding(1) var<storage, read> levels: array<Level>;
+// (N, 4): x, y, z, -
+#table 2 points: vec4<f32>
+// (N, levels of the grid)
+#table 3 d_encoding: vec2<f32>
+
+fn first_entry(level: Level) -> u32 {
+#ifdef SLICED
+    return level.place.y;
+#else
+    return level.place.x;
+#endif
+}
+
+#ifdef LANE_LEVELS
+@group(0) @binding(4) var<storage, read_write> d_features: array<f32>;   // two an entry; zero before
+
+@compute @workgroup_size(8)
+fn main(@builtin(global_invocation_id) id: vec3<u32>) {
+    if (id.x >= 2u * grid.levels) {
+        return;
+    }
+    let level = levels[id.x / 2u];
+    let feature = id.x & 1u;
+    for (var i = grid.first_point; i < grid.last_point; i++) {
+        let cell = find_cell(unit_point(points_at(i).xyz, grid), level);
+        let gradient = d_encoding_at(i * grid.all_levels + level.place.z)[feature];
+#unroll c $CORNERS
+        d_features[2u * (first_entry(level) + cell.index[$c]) + feature] += cell.weight[$c] * gradient;
+#end
+    }
+}
+#else
+@group(0) @binding(4) var<storage, read_write> d_fixed: array<atomic<u32>>;   // low and high word of each feature; zero before
+
+fn add_fixed(at: u32, value: f32) {
+    // |value| x fixed_scale < 2^62: two words by splitting the float, which loses nothing below its own last bit.
+    let magnitude = abs(value) * grid.fixed_scale;
+    let upper = floor(magnitude / 4294967296.0);
+    var low = u32(magnitude - upper * 4294967296.0);
+    var high = u32(upper);
+    if (value < 0.0) {   // two's complement
+        low = ~low + 1u;
+        high = ~high + select(0u, 1u, low == 0u);
+    }
+    let before = atomicAdd(&d_fixed[at], low);
+    atomicAdd(&d_fixed[at + 1u], high + select(0u, 1u, before + low < before));
+}
+
+@compute @workgroup_size(64)
+fn main(
+    @builtin(workgroup_id) group: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let number = workgroup_number(group, groups);
+    let blocks = (grid.points + 63u) / 64u;
+    let i = number % blocks * 64u + lane;
+    if (number >= blocks * grid.levels || i >= grid.points) {
+        return;
+    }
+    let level = levels[number / blocks];
+    let first = first_entry(level);
+    let cell = find_cell(unit_point(points_at(i).xyz, grid), level);
+    let gradient = d_encoding_at(i * grid.all_levels + level.place.z);
+#unroll c $CORNERS
+    add_fixed(4u * (first + cell.index[$c]), cell.weight[$c] * gradient.x);
+    add_fixed(4u * (first + cell.index[$c]) + 2u, cell.weight[$c] * gradient.y);
+#end
+}
+#endif

@@ -1,0 +1,24 @@
+// Spreads the gradient of a slice over the two planes of the table from which it was blended.
+#import common/hashgrid
+
+@group(0) @binding(0) var<uniform> grid: Grid;
+@group(0) @binding(1) var<storage, read> levels: array<Level>;
+#table 2 d_slices: vec2<f32>
+@group(0) @binding(3) var<storage, read_write> d_features: array<vec2<f32>>;   // zero before
+
+@compute @workgroup_size(64)
+fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
+    let level = levels[group.y];
+    let cell = group.x * 64u + lane;
+    let plane = level.resolution.x * level.resolution.y;
+    if (cell >= plane) {
+        return;
+    }
+    let p = grid.time * level.scale.z;
+    let up = smooth_weight(vec3(p - floor(p))).x;
+    let low = u32(floor(p));
+    let high = min(low + 1u, level.resolution.z - 1u);
+    let gradient = d_slices_at(level.place.y + cell);
+    d_features[level.place.x + low * plane + cell] += (1.0 - up) * gradient;
+    d_features[level.place.x + high * plane + cell] += up * gradient;
+}
