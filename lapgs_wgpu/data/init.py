@@ -1,0 +1,37 @@
+"""Where Gaussians start when a capture brings no points: random means, and scales from the distances between them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+NEIGHBOURS = 3
+MIN_SCALE = float(np.sqrt(1e-7))  # 3DGS's bound on the squared distance: keeps the log-scale of duplicate points finite
+
+
+def random_points(n: int, low: float, high: float, seed: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """n points drawn uniformly from the cube [low, high]^3: means (n, 3) in world units, colours (n, 3) RGB in [0, 1].
+
+    All colours are mid-grey, as in 3DGS (but for its noise of 1/255): nothing is known about them yet.
+    """
+    if n < 1 or not low < high:
+        raise ValueError(f"random_points needs n >= 1 and low < high, got n = {n}, low = {low}, high = {high}")
+    means = np.random.default_rng(seed).uniform(low, high, (n, 3)).astype(np.float32)
+    return means, np.full((n, 3), 0.5, dtype=np.float32)
+
+
+def initial_scales(points: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Root mean squared distance to the 3 nearest neighbours, world units, at least MIN_SCALE.
+
+    points: (n, 3), n >= 1. Returns (n,). Up to three points use the neighbours there are; a single one gets 1.
+    Source: 3DGS (Kerbl et al. 2023), section 5.2, which takes the mean squared distance in its code.
+    """
+    if points.ndim != 2 or points.shape[1] != 3 or len(points) < 1:
+        raise ValueError(f"initial_scales needs points of (n, 3) with n >= 1, got {points.shape}")
+    if len(points) == 1:
+        return np.ones(1, dtype=np.float32)
+    tree = cKDTree(points)
+    nth_nearest = range(2, min(NEIGHBOURS + 1, len(points)) + 1)  # the first is the point itself
+    distances, _ = tree.query(points, k=nth_nearest)
+    return np.maximum(np.sqrt(np.mean(distances**2, axis=1)), MIN_SCALE).astype(np.float32)

@@ -1,0 +1,143 @@
+"""What every reader of captures produces: views with lazily decoded 8-bit pixels, and a byte-bounded cache for them."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property
+from threading import Lock
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.splat.camera import Camera
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One picture of a capture: where and when it was taken, and how to get its pixels.
+
+    name: unique within its dataset and safe as a file name, such as "train_007".
+    camera: its size is that of the pixels.
+    time: in [0, 1] over the clip.
+    source: what errors call the pixels: a file, or a video and its frame.
+    pixels: decodes them, each time anew and from any thread: (height, width, 3) RGB or (height, width, 4) straight
+        (not premultiplied) RGBA, uint8. Raises InputError where they cannot be read.
+    """
+
+    name: str
+    camera: Camera
+    time: float
+    source: str
+    pixels: Callable[[], NDArray[np.uint8]]
+
+    def load(self) -> NDArray[np.uint8]:
+        """Decode: (H, W, 3) RGB or (H, W, 4) straight RGBA, uint8, read-only. Raises InputError."""
+        image = self.pixels()
+        size = (self.camera.height, self.camera.width)
+        if image.dtype != np.uint8 or image.shape not in {(*size, 3), (*size, 4)}:
+            raise InputError(
+                f"{self.source}: expected {size[1]}x{size[0]} pixels of 3 or 4 channels in 8 bit, "
+                f"got an array of {image.shape} {image.dtype}; was the file replaced while it was in use?"
+            )
+        image.setflags(write=False)
+        return image
+
+
+@dataclass(frozen=True, eq=False)
+class Dataset:
+    """A capture: the views to train on and the views held out for testing, all of which share one time axis."""
+
+    name: str
+    train: tuple[View, ...]
+    test: tuple[View, ...]
+
+    @cached_property
+    def extent(self) -> float:
+        """1.1 times the largest distance of a training camera from their mean, world units; 0 where all coincide."""
+        centres = np.stack([view.camera.position for view in self.train])
+        return 1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
+
+    @cached_property
+    def times(self) -> NDArray[np.float64]:
+        """(T,) the distinct training times, ascending."""
+        return np.unique([view.time for view in self.train])
+
+
+def composite(image: NDArray[np.uint8], background: ArrayLike) -> NDArray[np.uint8]:
+    """Lay straight RGBA over a background colour, rounded to the nearest 8-bit value (truncating would darken by 0.5).
+
+    image: (H, W, 4) uint8, or (H, W, 3), which has no transparency and is returned as it is.
+    background: (3,) in [0, 1]. Returns (H, W, 3) uint8.
+    """
+    if image.shape[2] == 3:
+        return image
+    below = np.asarray(background, dtype=np.float32)
+    if below.shape != (3,) or not ((below >= 0) & (below <= 1)).all():
+        raise ValueError(f"background must be three numbers in [0, 1], got {below}")
+    alpha = image[..., 3:].astype(np.float32)
+    mixed = image[..., :3] * alpha + (255.0 - alpha) * (255.0 * below)
+    return np.floor(mixed / 255.0 + 0.5).astype(np.uint8)
+
+
+class ImageCache:
+    """Decoded views, the most recently used first to stay, within a bound in bytes. Safe to use from many threads.
+
+    max_bytes: bound on the pixels that are kept; a picture larger than this is handed out and not kept.
+    workers: threads that decode what `prefetch` names. Each can hold one picture beyond the bound while it decodes.
+    """
+
+    def __init__(self, max_bytes: int, *, workers: int = 1) -> None:
+        self.max_bytes = max_bytes
+        self._lock = Lock()
+        self._entries: OrderedDict[View, Future[NDArray[np.uint8]]] = OrderedDict()
+        self._bytes = 0
+        self._pool = ThreadPoolExecutor(workers, thread_name_prefix="decode")
+
+    @property
+    def used_bytes(self) -> int:
+        """Bytes of pixels kept at present."""
+        return self._bytes
+
+    def get(self, view: View) -> NDArray[np.uint8]:
+        """The view's pixels as `View.load` gives them. A view asked for by several threads is decoded once."""
+        with self._lock:
+            entry = self._entries.get(view)
+            if entry is not None:
+                self._entries.move_to_end(view)
+            else:
+                mine = self._entries[view] = Future()
+        if entry is not None:
+            return entry.result()
+        try:
+            image = view.load()
+        except BaseException as error:
+            with self._lock:  # so that a later call tries again
+                del self._entries[view]
+            mine.set_exception(error)
+            raise
+        mine.set_result(image)
+        with self._lock:
+            self._bytes += image.nbytes
+            self._evict()
+        return image
+
+    def prefetch(self, views: Iterable[View]) -> None:
+        """Decode views ahead of need on the worker threads. What fails here is reported by `get`."""
+        for view in views:
+            self._pool.submit(self.get, view)
+
+    def close(self) -> None:
+        """Drop what is queued and wait for the decodes under way."""
+        self._pool.shutdown(cancel_futures=True)
+
+    def _evict(self) -> None:
+        for view, entry in list(self._entries.items()):
+            if self._bytes <= self.max_bytes:
+                return
+            if entry.done():
+                self._bytes -= entry.result().nbytes
+                del self._entries[view]
