@@ -1,0 +1,201 @@
+"""The commands. Users' mistakes end in one sentence on stderr and exit code 2; 3 means that there is no adapter."""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import json
+import sys
+import typing
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NoReturn
+
+from lapgs_wgpu.errors import InputError, NoAdapterError
+from lapgs_wgpu.gpu.device import list_devices
+
+if typing.TYPE_CHECKING:
+    from lapgs_wgpu.data import Dataset
+    from lapgs_wgpu.train.config import Config
+
+# Short names for the keys that are given most often.
+SHORTCUTS = {"data.path": "--data", "schedule.steps": "--steps", "field.kind": "--field"}
+SYNTHETIC = "synthetic"
+INTERRUPTED = 130  # the shell's code for a process that Ctrl-C ended
+
+USAGE = "lapgs-train PRESET --data DIR [--out RUN] [--KEY VALUE ...]"
+DESCRIPTION = """\
+Train a moving scene on the pictures of a folder, on any Vulkan, Metal or D3D12 adapter.
+
+  lapgs-train demo --data synthetic             the built-in scene, in minutes on a CPU
+  lapgs-train tiny --data DIR                   a D-NeRF scene at 200x200, sized for a CPU
+  lapgs-train dnerf --data DIR --out RUN        the same with the paper's pictures and schedule
+  lapgs-train RUN/config.toml --out RUN2        the same training once more
+  lapgs-train --eval RUN                        measure RUN/checkpoint.ply on the test views again
+
+The run folder then holds config.toml, log.jsonl, metrics.json, checkpoint.ply (which any 3DGS viewer opens as a still)
+and eval/ with pictures: ground truth | rendering | 4 x error."""
+
+
+def train_command(arguments: Sequence[str] | None = None) -> int:
+    """lapgs-train: returns the exit code."""
+    return _guarded("lapgs-train", _train, list(sys.argv[1:] if arguments is None else arguments))
+
+
+def _guarded(name: str, command: Callable[[list[str]], None], arguments: list[str]) -> int:
+    try:
+        command(arguments)
+    except NoAdapterError as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        return 2 if list_devices() else 3  # an adapter that is not there, or none at all
+    except InputError as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        return 2
+    except OSError as error:  # a full disk, a folder that may not be written to
+        print(f"{name}: {error}.", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt as error:
+        print(f"{name}: {error or 'interrupted.'}", file=sys.stderr)
+        return INTERRUPTED
+    return 0
+
+
+def _train(arguments: list[str]) -> None:
+    if "--list-devices" in arguments:
+        for info in list_devices():
+            print(f"{info.name}  ({info.kind}, {info.backend}, {info.driver})")
+        return
+    from lapgs_wgpu.gpu.device import open_device  # what follows needs torch, which takes seconds to import
+    from lapgs_wgpu.train.loop import check_run_folder, train
+    from lapgs_wgpu.train.presets import config_keys, load_config
+
+    given = _parse(arguments)
+    overrides = {key.name: given[key.name] for key in config_keys() if key.name in given}
+    if given["eval"]:
+        _evaluate(Path(given["eval"]), given["device"], overrides)
+        return
+    if given["preset"] is None:
+        raise InputError("name a preset, such as tiny, and the data to train on; lapgs-train --help says more.")
+    config = load_config(given["preset"], overrides)
+    out = Path(given["out"] or f"runs/{_scene_name(config)}-{Path(given['preset']).stem}")
+    check_run_folder(out, overwrite=given["overwrite"])
+    device = open_device(given["device"])
+    config, dataset = _open_data(config, out.parent / SYNTHETIC)
+    train(config, dataset, out, device=device, overwrite=given["overwrite"])
+    _report(out)
+
+
+def _evaluate(run: Path, device_name: str | None, overrides: dict[str, str | list[str]]) -> None:
+    from lapgs_wgpu.gpu.device import open_device
+    from lapgs_wgpu.motion.scene import load
+    from lapgs_wgpu.train.loop import evaluate_run
+    from lapgs_wgpu.train.presets import load_config
+
+    for name in ("config.toml", "checkpoint.ply"):
+        if not (run / name).is_file():
+            raise InputError(f"{run / name} does not exist; --eval needs the folder of a finished run.")
+    config = load_config(str(run / "config.toml"), overrides)
+    device = open_device(device_name)
+    config, dataset = _open_data(config, run.parent / SYNTHETIC)
+    scene = load(run / "checkpoint.ply", device)
+    try:
+        training = json.loads((run / "metrics.json").read_text())["training"]
+    except (OSError, ValueError, KeyError, TypeError):
+        training = {"steps": int(scene.metadata.get("step", 0))}
+    evaluate_run(run, scene, dataset, config.data.background, training)
+    _report(run)
+
+
+def _report(run: Path) -> None:
+    metrics = json.loads((run / "metrics.json").read_text())
+    views, size = len(metrics["views"]), metrics["size"]
+    print(
+        f"{run}: {metrics['psnr']:.2f} dB PSNR, {metrics['ssim']:.4f} SSIM on {views} test views of "
+        f"{size[0]}x{size[1]}, {metrics['gaussians']} Gaussians"
+    )
+
+
+def _scene_name(config: Config) -> str:
+    return Path(config.data.path).resolve().name or "scene"
+
+
+def _open_data(config: Config, synthetic: Path) -> tuple[Config, Dataset]:
+    """The dataset, and the configuration with the folder in which it lies. synthetic: where the built-in scene goes."""
+    import dataclasses
+
+    from lapgs_wgpu.data import load_dataset
+    from lapgs_wgpu.data.synthetic import write_synthetic
+
+    path, size = config.data.path, config.data.size
+    if not path.isprintable():
+        raise InputError(f"{path!r} holds characters that config.toml cannot record; rename the folder.")
+    if not path:
+        raise InputError(f"name the folder of the scene with --data DIR, or take --data {SYNTHETIC}.")
+    folder = write_synthetic(synthetic) if path == SYNTHETIC else Path(path)
+    dataset = load_dataset(folder)
+    camera = dataset.train[0].camera
+    if 0 < size < max(camera.width, camera.height):
+        dataset = load_dataset(folder, image_size=size)
+    data = dataclasses.replace(config.data, path=str(folder.resolve()))
+    return dataclasses.replace(config, data=data), dataset
+
+
+_METAVARS = {int: "INT", float: "FLOAT", str: "TEXT", bool: "true|false"}
+
+
+class _HelpFormatter(argparse.RawDescriptionHelpFormatter):
+    def __init__(self, prog: str) -> None:
+        super().__init__(prog, max_help_position=32, width=120)
+
+
+class _Parser(argparse.ArgumentParser):
+    """argparse, with its mistakes told in our way."""
+
+    def error(self, message: str) -> NoReturn:
+        raise InputError(f"{message}; lapgs-train --help lists the options.")
+
+
+def _parse(arguments: list[str]) -> dict[str, typing.Any]:
+    from lapgs_wgpu.train.presets import config_keys, did_you_mean, load_config, preset_names
+
+    shown = next((word for word in arguments if word in preset_names()), "dnerf")
+    preset = load_config(shown)
+    parser = _Parser(
+        "lapgs-train",
+        usage=USAGE,
+        description=DESCRIPTION,
+        formatter_class=_HelpFormatter,
+        allow_abbrev=False,
+    )
+    parser.add_argument(
+        "preset", nargs="?", metavar="PRESET", help=f"{', '.join(preset_names())}, or a .toml file, e.g. a run's"
+    )
+    parser.add_argument("--out", metavar="RUN", help="run folder, new or empty [runs/SCENE-PRESET]")
+    parser.add_argument("--overwrite", action="store_true", help="replace the run that lies in the run folder")
+    parser.add_argument("--device", metavar="NAME", help="part of an adapter's name, or cpu, integrated, discrete")
+    parser.add_argument("--list-devices", action="store_true", help="list the adapters, the default one first")
+    parser.add_argument("--eval", metavar="RUN", help="measure a finished run again, on the data it was trained on")
+    groups: dict[str, argparse._ArgumentGroup] = {}
+    for name, kind, about in config_keys():
+        section = name.split(".")[0] if "." in name else "general"
+        if section not in groups:
+            groups[section] = parser.add_argument_group(f"{section} [value of the preset {shown}]")
+        entries = len(typing.get_args(kind)) if typing.get_origin(kind) is tuple else None
+        value = functools.reduce(getattr, name.split("."), preset)
+        text = " ".join(map(str, value)) if isinstance(value, tuple) else str(value)
+        groups[section].add_argument(
+            *([SHORTCUTS[name]] if name in SHORTCUTS else []),
+            f"--{name}",
+            dest=name,
+            nargs=entries,
+            metavar=_METAVARS.get(kind) or ("INT" if entries else "|".join(typing.get_args(kind))),
+            default=argparse.SUPPRESS,
+            help=f"{about} [{text}]".replace("%", "%%"),
+        )
+    known, unknown = parser.parse_known_args(arguments)
+    if unknown:
+        word = unknown[0].split("=")[0]
+        options = [name for action in parser._actions for name in action.option_strings]
+        what = f"there is no option {word}" if word.startswith("-") else f"{word!r} is one word too many"
+        raise InputError(f"{what}{did_you_mean(word, options) or '; lapgs-train --help lists the options'}.")
+    return vars(known)

@@ -1,0 +1,1 @@
+"""The trainer: configuration, losses, optimiser, density control, evaluation."""

@@ -1,0 +1,176 @@
+"""The configuration of a training: frozen dataclasses without defaults, whose values stand in the presets (configs/).
+
+Each key carries the text that lapgs-train --help shows of it.
+"""
+
+# ruff: noqa: RUF009 (described() makes a dataclass field)
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from lapgs_wgpu.motion.field import FieldConfig
+
+Background = Literal["black", "white", "random"]
+
+
+def described(text: str, default: Any = dataclasses.MISSING) -> Any:
+    """A key of the configuration with its help text; one without a default must stand in every preset."""
+    return dataclasses.field(default=default, metadata={"help": text})
+
+
+@dataclass(frozen=True)
+class DataConfig:
+    """What is trained on."""
+
+    size: int = described("longer side in pixels to which larger pictures are shrunk; 0 keeps them as they are")
+    background: Background = described(
+        "what transparent pictures are laid on; random is another colour at each step, and black when measuring"
+    )
+    cache_gb: float = described("bound on the decoded pictures that are kept in memory, in gigabytes")
+    path: str = described('folder of the scene, or "synthetic", the built-in scene, written beside the run', "")
+
+
+@dataclass(frozen=True)
+class PointsConfig:
+    """The Gaussians at the start."""
+
+    count: int = described("how many")
+    box: float = described("half side of the cube around the origin in which they lie at random, world units")
+    opacity: float = described("of each, between 0 and 1")
+
+    def __post_init__(self) -> None:
+        if self.count < 1 or self.box <= 0 or not 0 < self.opacity < 1:
+            raise ValueError(
+                "count must be at least 1, box above 0 and opacity between 0 and 1, "
+                f"got {self.count}, {self.box:g} and {self.opacity:g}"
+            )
+
+
+@dataclass(frozen=True)
+class ScheduleConfig:
+    """When things happen."""
+
+    steps: int = described("length of the training, one picture a step")
+    warm_up: int = described("steps at the start during which nothing moves")
+    sh_interval: int = described("steps after which the degree of the spherical harmonics grows by one, up to 3")
+
+    def __post_init__(self) -> None:
+        if self.steps < 1 or self.sh_interval < 1:
+            raise ValueError(f"steps and sh_interval must be at least 1, got {self.steps} and {self.sh_interval}")
+
+
+@dataclass(frozen=True)
+class Rate:
+    """A learning rate that goes from start to end exponentially and then stays there."""
+
+    start: float = described("at the beginning")
+    end: float = described("at the end")
+    steps: int = described("steps from start to end, counted from the beginning of the training")
+
+    def __post_init__(self) -> None:
+        if not (0 < self.start < math.inf and 0 < self.end < math.inf and self.steps >= 1):
+            raise ValueError(
+                "a learning rate needs start and end above 0 and steps of at least 1, "
+                f"got {self.start:g}, {self.end:g} and {self.steps}"
+            )
+
+    def at(self, step: int) -> float:
+        """The rate of a step, which are counted from 1."""
+        share = min(step / self.steps, 1.0)
+        return self.start ** (1 - share) * self.end**share
+
+
+@dataclass(frozen=True)
+class RatesConfig:
+    """Adam's learning rates, for each parameter of the Gaussians and for the field's hash tables and its MLP."""
+
+    means: Rate = described("learning rate of the positions, world units a step")
+    log_scales: float = described("learning rate of the logarithms of the scales")
+    quats: float = described("learning rate of the quaternions")
+    opacity_logits: float = described("learning rate of the opacities' logits")
+    sh_dc: float = described("learning rate of the colours' constant part")
+    sh_rest: float = described("learning rate of the colours' other spherical harmonics")
+    hash: Rate = described("learning rate of the field's hash tables")
+    mlp: Rate = described("learning rate of the field's other weights")
+
+    def __post_init__(self) -> None:
+        self.schedules()
+
+    def schedules(self) -> dict[str, Rate]:
+        """Parameter name, or group of the field -> schedule."""
+        rates = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return {name: rate if isinstance(rate, Rate) else Rate(rate, rate, 1) for name, rate in rates.items()}
+
+
+@dataclass(frozen=True)
+class DensityConfig:
+    """When and how the number of Gaussians changes."""
+
+    start: int = described("step after which it changes")
+    stop: int = described("step from which on it stays, and opacities are not reset any more")
+    interval: int = described("steps from one change to the next")
+    gradient: float = described(
+        "mean length of the loss's gradient by the place on the image from which on a Gaussian is cloned or split; "
+        "in normalised device coordinates, in which an image is 2 wide and 2 high"
+    )
+    split_size: float = described(
+        "largest standard deviation up to which a Gaussian is cloned, beyond which split; in extents of the cameras"
+    )
+    min_opacity: float = described("Gaussians below it are removed")
+    max_screen_radius: float = described(
+        "Gaussians that were larger on an image are removed, in pixels, from the first reset on; 0 for no bound"
+    )
+    max_world_size: float = described(
+        "Gaussians of a larger standard deviation are removed, in extents of the cameras, from the first reset on; "
+        "0 for no bound"
+    )
+    reset_interval: int = described("steps from one reset of the opacities to the next")
+    reset_opacity: float = described("what opacities are lowered to")
+
+    def __post_init__(self) -> None:
+        if self.interval < 1 or self.reset_interval < 1:
+            raise ValueError(
+                f"interval and reset_interval must be at least 1 step, got {self.interval} and {self.reset_interval}"
+            )
+        if self.split_size <= 0 or not (0 < self.reset_opacity < 1 and 0 <= self.min_opacity < 1):
+            raise ValueError(
+                "split_size must be above 0, reset_opacity and min_opacity between 0 and 1, "
+                f"got {self.split_size:g}, {self.reset_opacity:g} and {self.min_opacity:g}"
+            )
+
+    def changes_at(self, step: int) -> bool:
+        """Whether Gaussians are cloned, split and pruned after this step (counted from 1)."""
+        return self.start < step < self.stop and step % self.interval == 0
+
+    def resets_at(self, step: int) -> bool:
+        """Whether opacities are lowered after this step."""
+        return step < self.stop and step % self.reset_interval == 0
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """What is minimised."""
+
+    ssim: float = described("share w of the structural similarity in (1 - w) L1 + w (1 - SSIM)")
+
+    def __post_init__(self) -> None:
+        if self.ssim > 1:
+            raise ValueError(f"ssim is a share and must be at most 1, got {self.ssim:g}")
+
+
+@dataclass(frozen=True)
+class Config:
+    """All that a training depends on, besides the pictures."""
+
+    data: DataConfig
+    points: PointsConfig
+    field: FieldConfig
+    schedule: ScheduleConfig
+    rates: RatesConfig
+    density: DensityConfig
+    loss: LossConfig
+    seed: int = described("of every random draw")

@@ -1,0 +1,129 @@
+"""Density control, as in 3DGS (Kerbl et al. 2023, section 5.2): Gaussians are cloned, split, pruned and dimmed.
+
+Everything works on a mapping of rows: name -> (N, ...) tensor, of which means, log_scales, quats and opacity_logits
+are looked at; whatever else a Gaussian carries is inherited by its children.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.splat.rasterize import Rendering
+from lapgs_wgpu.splat.reference import rotation
+from lapgs_wgpu.train.config import DensityConfig
+
+CHILDREN = 2  # of a split Gaussian
+SHRINK = 0.8 * CHILDREN  # how much smaller the children are
+
+Rows = Mapping[str, Tensor]
+
+
+class Statistics:
+    """What was seen of N Gaussians since the last change of their number.
+
+    gradients (N,): sum of the lengths of the image gradients, in normalised device coordinates. views (N,): how often
+    each was visible. radii (N,): the largest radius on an image, in pixels.
+    """
+
+    def __init__(self, count: int, device: torch.device) -> None:
+        self.gradients = torch.zeros(count, device=device)
+        self.views = torch.zeros(count, device=device)
+        self.radii = torch.zeros(count, device=device)
+
+    def add(self, rendering: Rendering, camera: Camera) -> None:
+        """Take in a rendering after its backward pass."""
+        pixels = rendering.means2d.grad
+        if pixels is None:
+            raise ValueError("Statistics.add needs a rendering whose means2d have a gradient: call backward() first")
+        to_ndc = pixels.new_tensor([camera.width / 2, camera.height / 2])
+        visible = rendering.radii > 0
+        self.gradients += torch.where(visible, (pixels * to_ndc).norm(dim=1), 0.0)
+        self.views += visible
+        self.radii = torch.maximum(self.radii, rendering.radii.to(self.radii.dtype))
+
+    @property
+    def mean_gradients(self) -> Tensor:
+        """(N,) mean over the views in which a Gaussian was visible; 0 for those never seen."""
+        return self.gradients / self.views.clamp(min=1)
+
+
+class Change(NamedTuple):
+    """keep: (N,) which Gaussians stay. added: rows (M, ...) to append. cloned, split, pruned: how many, for the log."""
+
+    keep: Tensor
+    added: dict[str, Tensor]
+    cloned: int
+    split: int
+    pruned: int
+
+
+@torch.no_grad()
+def densify(
+    rows: Rows,
+    statistics: Statistics,
+    config: DensityConfig,
+    extent: float,
+    generator: torch.Generator,
+    *,
+    bound_sizes: bool,
+) -> Change:
+    """What becomes of the Gaussians: small ones with a large gradient are doubled, large ones split, faint ones go.
+
+    extent: of the cameras, world units. generator: where the children of a split are drawn from, on the CPU.
+    bound_sizes: whether the bounds on screen and world size hold, which they do after the first opacity reset.
+    """
+    wanted = statistics.mean_gradients >= config.gradient
+    large = rows["log_scales"].amax(dim=1) > math.log(config.split_size * extent)
+    clone = wanted & ~large
+    split = wanted & large
+    clones = {name: row[clone] for name, row in rows.items()}
+    children = split_rows({name: row[split] for name, row in rows.items()}, generator)
+    born = {name: torch.cat([clones[name], children[name]]) for name in rows}
+
+    # A Gaussian that was just born has not been seen on any image.
+    prune = prunable(rows, statistics.radii, config, extent, bound_sizes=bound_sizes)
+    unseen = torch.zeros_like(born["opacity_logits"])
+    stillborn = prunable(born, unseen, config, extent, bound_sizes=bound_sizes)
+    return Change(
+        keep=~(split | prune),
+        added={name: row[~stillborn] for name, row in born.items()},
+        cloned=int(clone.sum()),
+        split=int(split.sum()),
+        pruned=int((prune & ~split).sum()) + int(stillborn.sum()),
+    )
+
+
+def split_rows(parents: Rows, generator: torch.Generator) -> dict[str, Tensor]:
+    """Two children (2 N, ...) for each of N parents: drawn from the parent as a distribution, and 1.6 times smaller."""
+    rows = {name: row.repeat(CHILDREN, *[1] * (row.ndim - 1)) for name, row in parents.items()}
+    normal = torch.randn(rows["means"].shape, generator=generator).to(rows["means"].device)
+    offset = rotation(rows["quats"]) @ (normal * rows["log_scales"].exp())[:, :, None]
+    rows["means"] = rows["means"] + offset[:, :, 0]
+    rows["log_scales"] = rows["log_scales"] - math.log(SHRINK)
+    return rows
+
+
+def prunable(rows: Rows, radii: Tensor, config: DensityConfig, extent: float, *, bound_sizes: bool) -> Tensor:
+    """(N,) which Gaussians are too faint, or too large (radii: (N,) largest so far on an image, pixels)."""
+    prune = rows["opacity_logits"] < _logit(config.min_opacity)
+    if bound_sizes and config.max_screen_radius > 0:
+        prune |= radii > config.max_screen_radius
+    if bound_sizes and config.max_world_size > 0:
+        prune |= rows["log_scales"].amax(dim=1) > math.log(config.max_world_size * extent)
+    return prune
+
+
+@torch.no_grad()
+def reset_opacities(opacity_logits: Tensor, limit: float) -> Tensor:
+    """Opacity logits (N,) lowered to those of `limit` where they are above."""
+    return opacity_logits.clamp(max=_logit(limit))
+
+
+def _logit(opacity: float) -> float:
+    return math.log(opacity / (1 - opacity)) if opacity > 0 else -math.inf

@@ -1,0 +1,104 @@
+"""What a training tells while it runs: one progress line on the terminal, and log.jsonl in the run's folder."""
+
+from __future__ import annotations
+
+import json
+import platform
+import subprocess
+import sys
+import time
+from collections import deque
+from importlib import metadata
+from pathlib import Path
+from types import TracebackType
+from typing import TextIO
+
+from lapgs_wgpu.gpu.device import Device
+
+INTERVAL = 50  # steps from one line of log.jsonl to the next, over which loss and PSNR are averaged
+TERMINAL_SECONDS = 0.25  # from one redraw of the progress line to the next
+FILE_SECONDS = 15.0  # the same where stderr is no terminal, and each is a line of its own
+
+
+class Log:
+    """Progress of a training, step by step. A context manager.
+
+    path: log.jsonl, written anew. Each line holds step, loss, psnr (dB, training views) and gaussians, which repeat
+    from run to run, and under "timing" seconds and steps_per_second, which do not.
+    """
+
+    def __init__(self, path: Path, steps: int, terminal: TextIO | None = None) -> None:
+        self._steps = steps
+        self._terminal = terminal or sys.stderr
+        self._file = path.open("w", encoding="utf-8")
+        self._recent: deque[tuple[float, float]] = deque(maxlen=INTERVAL)
+        self._start = self._shown = time.perf_counter()
+        self._times: deque[float] = deque([self._start], maxlen=INTERVAL + 1)
+
+    def __enter__(self) -> Log:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        if self._terminal.isatty():
+            self._terminal.write("\n")
+        self._file.close()
+
+    @property
+    def seconds(self) -> float:
+        """Since the start."""
+        return time.perf_counter() - self._start
+
+    def step(self, step: int, loss: float, psnr: float, gaussians: int) -> None:
+        """Take in a step that is done (counted from 1)."""
+        now = time.perf_counter()
+        self._recent.append((loss, psnr))
+        self._times.append(now)
+        rate = (len(self._times) - 1) / max(now - self._times[0], 1e-9)
+        last = step == self._steps
+        if step % INTERVAL == 0 or last:
+            mean_loss, mean_psnr = (sum(values) / len(self._recent) for values in zip(*self._recent, strict=True))
+            line = {
+                "step": step,
+                "loss": round(mean_loss, 7),
+                "psnr": round(mean_psnr, 4),
+                "gaussians": gaussians,
+                "timing": {"seconds": round(now - self._start, 3), "steps_per_second": round(rate, 3)},
+            }
+            self._file.write(json.dumps(line) + "\n")
+            self._file.flush()
+        on_terminal = self._terminal.isatty()
+        if last or now - self._shown >= (TERMINAL_SECONDS if on_terminal else FILE_SECONDS):
+            self._shown = now
+            smooth = sum(psnr for _, psnr in self._recent) / len(self._recent)
+            left = (self._steps - step) / rate
+            text = (
+                f"step {step}/{self._steps}  {smooth:5.2f} dB  {gaussians} Gaussians  "
+                f"{rate:.1f} steps/s  {_clock(left)} left"
+            )
+            self._terminal.write(f"\r\x1b[2K{text}" if on_terminal else f"{text}\n")
+            self._terminal.flush()
+
+
+def _clock(seconds: float) -> str:
+    minutes, seconds = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes}:{seconds:02d}"
+
+
+def environment(device: Device) -> dict[str, str]:
+    """With what a run was made: versions, adapter and driver, and the git revision where the code is a checkout."""
+    packages = ("lapgs-wgpu", "torch", "wgpu", "numpy")
+    found = {name.replace("-", "_"): metadata.version(name) for name in packages}
+    found |= {"python": platform.python_version(), "system": f"{platform.system()} {platform.machine()}"}
+    found |= {"adapter": device.info.name, "backend": device.info.backend, "driver": device.info.driver}
+    checkout = Path(__file__).parents[2]
+    if (checkout / ".git").exists():
+        command = ["git", "-C", str(checkout), "describe", "--always", "--dirty", "--abbrev=12"]
+        try:
+            done = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
+            found["revision"] = done.stdout.strip()
+        except (OSError, subprocess.SubprocessError):
+            pass  # no git here, or not ours to read: the versions must do
+    return found

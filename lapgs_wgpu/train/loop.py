@@ -1,0 +1,215 @@
+"""The training, from top to bottom: a configuration and a capture become a scene and its run folder."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from functools import partial
+from pathlib import Path
+from types import FrameType
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lapgs_wgpu.data.init import initial_scales, random_points
+from lapgs_wgpu.data.views import Dataset, ImageCache, View, composite
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.gpu.device import Device, open_device
+from lapgs_wgpu.io.atomic import atomic_write
+from lapgs_wgpu.motion.scene import Scene4D, draw
+from lapgs_wgpu.train.config import Background, Config, PointsConfig
+from lapgs_wgpu.train.densify import Statistics, densify, reset_opacities
+from lapgs_wgpu.train.evaluate import COLOURS, evaluate, write_metrics
+from lapgs_wgpu.train.log import Log, environment
+from lapgs_wgpu.train.losses import photometric_loss, psnr
+from lapgs_wgpu.train.optimise import Optimiser
+from lapgs_wgpu.train.presets import write_toml
+
+MAX_SH_DEGREE = 3
+AHEAD = 4  # pictures that are decoded before they are needed
+RUN_FILES = ("config.toml", "log.jsonl", "metrics.json", "checkpoint.ply", "eval")
+
+
+def train(
+    config: Config,
+    dataset: Dataset,
+    out: str | Path,
+    *,
+    device: Device | None = None,
+    overwrite: bool = False,
+) -> Scene4D:
+    """Train on a dataset, evaluate on its test views, and leave config.toml, log.jsonl, metrics.json, checkpoint.ply
+    and eval/ in the folder `out`, which must be new or empty, or hold an earlier run when `overwrite` is set.
+
+    device: the default adapter where None. The same configuration, pictures, adapter and driver give the same
+    checkpoint to the last byte. Raises InputError before anything is written where the input is not usable, and
+    KeyboardInterrupt after Ctrl-C, when the checkpoint of the last whole step has been written.
+    """
+    out = Path(out)
+    check_run_folder(out, overwrite=overwrite)
+    device = device or open_device()
+    generator = torch.Generator().manual_seed(config.seed)
+    scene = Scene4D.from_points(
+        *initial_points(config.points, config.seed),
+        config.field,
+        opacity=config.points.opacity,
+        device=device,
+        seed=config.seed,
+    )
+    optimiser = Optimiser(
+        scene.parameters, scene.field.parameter_groups() if scene.field else {}, config.rates.schedules()
+    )
+    # Cameras that all stand at one place have no extent; the scene's own size must serve.
+    extent = dataset.extent or config.points.box
+    statistics = Statistics(len(scene), scene.parameters["means"].device)
+    pictures = Pictures(dataset.train, config.data.background, config.data.cache_gb, generator)
+    schedule, density = config.schedule, config.density
+
+    start_run_folder(out, config, device)
+    with Log(out / "log.jsonl", schedule.steps) as log, pictures, _interruptible() as interrupted:
+        for step in range(1, schedule.steps + 1):
+            view, target, background = pictures.draw()
+            gaussians = scene.canonical() if step <= schedule.warm_up else scene.at(view.time)
+            rendering = draw(gaussians, view.camera, background, device, depth=False)
+            loss = photometric_loss(rendering.image, target, config.loss.ssim)
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step(step)
+
+            # After the optimiser's step, so that no gradient is lost with the rows that change.
+            if step < density.stop:
+                statistics.add(rendering, view.camera)
+            if density.changes_at(step):
+                change = densify(
+                    scene.parameters,
+                    statistics,
+                    density,
+                    extent,
+                    generator,
+                    bound_sizes=step > density.reset_interval,
+                )
+                optimiser.edit_rows(change.keep, change.added)
+                statistics = Statistics(len(scene), scene.parameters["means"].device)
+            if density.resets_at(step):
+                logits = reset_opacities(scene.parameters["opacity_logits"], density.reset_opacity)
+                optimiser.reset("opacity_logits", logits)
+            if step % schedule.sh_interval == 0:
+                scene.sh_degree = min(scene.sh_degree + 1, MAX_SH_DEGREE)
+
+            log.step(step, loss.item(), psnr(rendering.image.detach(), target), len(scene))
+            if interrupted.is_set():
+                break
+        seconds = log.seconds
+
+    scene.save(out / "checkpoint.ply", {"scene": dataset.name, "background": config.data.background, "step": str(step)})
+    if interrupted.is_set():
+        raise KeyboardInterrupt(f"stopped after step {step} of {schedule.steps}; {out / 'checkpoint.ply'} holds it.")
+    evaluate_run(out, scene, dataset, config.data.background, {"steps": step, "seconds": round(seconds, 3)})
+    return scene
+
+
+def evaluate_run(
+    out: Path, scene: Scene4D, dataset: Dataset, background: Background, training: dict[str, float]
+) -> dict[str, object]:
+    """Evaluate on the test views, and write metrics.json and eval/ of a run folder; returns the metrics."""
+    (out / "eval").mkdir(exist_ok=True)
+    metrics = {**evaluate(scene, dataset.test, background, out / "eval"), "training": training}
+    write_metrics(out / "metrics.json", metrics)
+    return metrics
+
+
+def check_run_folder(out: Path, *, overwrite: bool) -> None:
+    """InputError where a run cannot be written there."""
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out} is a file; name a folder for the run with --out.")
+    if overwrite or not out.exists():
+        return
+    if any(out.iterdir()):
+        raise InputError(f"{out} is not empty; name another folder with --out, or replace its run with --overwrite.")
+
+
+def start_run_folder(out: Path, config: Config, device: Device) -> None:
+    """Make the folder, free of an earlier run's files, and write config.toml."""
+    out.mkdir(parents=True, exist_ok=True)
+    for name in RUN_FILES:
+        if (out / name).is_dir():
+            shutil.rmtree(out / name)
+        else:
+            (out / name).unlink(missing_ok=True)
+    table = {**dataclasses.asdict(config), "record": environment(device)}
+    with atomic_write(out / "config.toml") as file:
+        file.write(write_toml(table).encode())
+
+
+def initial_points(
+    config: PointsConfig, seed: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """Random Gaussians in the box: points (N, 3), colours (N, 3) and scales (N,)."""
+    points, colours = random_points(config.count, -config.box, config.box, seed)
+    return points, colours, initial_scales(points)
+
+
+class Pictures:
+    """Training views in random order without replacement, epoch after epoch. A context manager.
+
+    generator: where the order, and random backgrounds, are drawn from.
+    """
+
+    def __init__(
+        self, views: tuple[View, ...], background: Background, cache_gb: float, generator: torch.Generator
+    ) -> None:
+        self._colour = None if background == "random" else torch.full((3,), COLOURS[background])
+        self._views = views if self._colour is None else tuple(_on_background(v, self._colour.numpy()) for v in views)
+        self._cache = ImageCache(int(cache_gb * 1e9))
+        self._generator = generator
+        self._order: list[View] = []
+
+    def __enter__(self) -> Pictures:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._cache.close()
+
+    def draw(self) -> tuple[View, Tensor, Tensor]:
+        """The next view, its picture (H, W, 3) in [0, 1] and the background (3,) that it lies on."""
+        if not self._order:
+            self._order = [self._views[i] for i in torch.randperm(len(self._views), generator=self._generator).tolist()]
+        view = self._order.pop(0)
+        self._cache.prefetch(self._order[:AHEAD])
+        colour = torch.rand(3, generator=self._generator) if self._colour is None else self._colour
+        pixels = composite(self._cache.get(view), colour.numpy())
+        return view, torch.from_numpy(pixels.astype(np.float32) / 255), colour
+
+
+def _on_background(view: View, colour: NDArray[np.float32]) -> View:
+    """The view without transparency, so that it is laid on its background once and not at every step."""
+    return dataclasses.replace(view, pixels=partial(_flat, view, colour))
+
+
+def _flat(view: View, colour: NDArray[np.float32]) -> NDArray[np.uint8]:
+    return composite(view.load(), colour)
+
+
+@contextmanager
+def _interruptible() -> Iterator[threading.Event]:
+    """An event that Ctrl-C sets, instead of an exception in the middle of a step; the second Ctrl-C is one."""
+    interrupted = threading.Event()
+
+    def note(signum: int, frame: FrameType | None) -> None:
+        interrupted.set()
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    before = None
+    with suppress(ValueError):  # only the main thread may listen to signals
+        before = signal.signal(signal.SIGINT, note)
+    try:
+        yield interrupted
+    finally:
+        if before is not None:
+            signal.signal(signal.SIGINT, before)
