@@ -1,0 +1,68 @@
+"""The hash encoder at the `dnerf` preset's sizes, against its plain-torch twin in the same run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from measure import Timing, timed
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.motion.field import FieldConfig, Grid4DField
+from lapgs_wgpu.motion.hashgrid import HashEncoder, encode_reference
+
+TIME = 0.37
+
+
+@dataclass(frozen=True)
+class EncoderReport:
+    """forward, forward_backward: our kernels through autograd. twin_...: the same in torch alone, in float32."""
+
+    points: int
+    levels: int
+    entries: int
+    forward: Timing
+    forward_backward: Timing
+    twin_forward: Timing
+    twin_forward_backward: Timing
+    largest_difference: float  # of the gradients, relative to the largest gradient of a grid's table
+
+
+def bench_encoder(device: Device, config: FieldConfig, means: NDArray[np.float32], repeat: int) -> EncoderReport:
+    """Encode the means with all four grids of the field."""
+    grids = Grid4DField(config, device, seed=0).grids
+    encoder = HashEncoder(device, grids, config.bound)
+    tables = [grid.table for grid in grids]
+    points = torch.from_numpy(means)
+    generator = torch.Generator().manual_seed(0)
+    d_encodings = [torch.randn(len(points), grid.features, generator=generator) for grid in grids]
+
+    def kernels() -> list[Tensor]:
+        return encoder(points, TIME)
+
+    def twin() -> list[Tensor]:
+        return [encode_reference(grid, grid.table, points, TIME, config.bound) for grid in grids]
+
+    def gradients(encode: Callable[[], list[Tensor]]) -> list[Tensor]:
+        return list(torch.autograd.grad(encode(), tables, d_encodings))
+
+    def forward(encode: Callable[[], list[Tensor]]) -> Callable[[], object]:
+        return torch.no_grad()(encode)
+
+    pairs = zip(gradients(kernels), gradients(twin), strict=True)
+    differences = [float((ours - theirs).abs().max() / theirs.abs().max()) for ours, theirs in pairs]
+    twin_repeat = max(1, repeat // 3)  # it takes seconds, and has run once to be compared
+    return EncoderReport(
+        points=len(points),
+        levels=sum(len(grid.levels) for grid in grids),
+        entries=sum(len(table) for table in tables),
+        forward=timed(forward(kernels), repeat),
+        forward_backward=timed(lambda: gradients(kernels), repeat),
+        twin_forward=timed(forward(twin), twin_repeat, warm_up=0),
+        twin_forward_backward=timed(lambda: gradients(twin), twin_repeat, warm_up=0),
+        largest_difference=max(differences),
+    )

@@ -1,0 +1,113 @@
+"""Wall-clock times, and what a call does to the device: dispatches, bytes moved, read-backs."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+from unittest import mock
+
+from wgpu.backends.wgpu_native import GPUBuffer
+
+from lapgs_wgpu.gpu.buffer import Buffer
+from lapgs_wgpu.gpu.kernel import Commands
+
+Event = tuple[str, Any]
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Milliseconds of several runs."""
+
+    median: float
+    minimum: float
+    runs: int
+
+
+def summary(milliseconds: list[float]) -> Timing:
+    return Timing(statistics.median(milliseconds), min(milliseconds), len(milliseconds))
+
+
+def timed(function: Callable[[], object], repeat: int, *, warm_up: int = 2) -> Timing:
+    """The time of `function`, which has to wait for the device itself."""
+    milliseconds = []
+    for run in range(warm_up + repeat):
+        start = time.perf_counter()
+        function()
+        if run >= warm_up:
+            milliseconds.append(1e3 * (time.perf_counter() - start))
+    return summary(milliseconds)
+
+
+@dataclass(frozen=True)
+class Traffic:
+    """Between host and device. A read-back is one wait, however many buffers are then read.
+
+    read_backs_before_sort: those that come before the work up to the last pass of a radix sort was submitted.
+    """
+
+    dispatches: int
+    submissions: int
+    uploaded_bytes: int
+    downloaded_bytes: int
+    read_backs: int
+    read_backs_before_sort: int
+
+
+def traffic(function: Callable[[], object]) -> Traffic:
+    """What one call of `function` does. Nothing else may use the device meanwhile."""
+    with recording() as events:
+        function()
+    return count(events)
+
+
+def count(events: list[Event]) -> Traffic:
+    """Add up what `recording` saw."""
+    kinds = [kind for kind, _ in events]
+    sorts = [i for i, event in enumerate(events) if event == ("dispatch", "sort_scatter")]
+    sorted_at = kinds.index("submit", sorts[-1]) if sorts else 0
+    read_backs = [i for i, kind in enumerate(kinds) if kind == "read" and kinds[i - 1 : i] != ["read"]]
+    return Traffic(
+        dispatches=kinds.count("dispatch"),
+        submissions=kinds.count("submit"),
+        uploaded_bytes=sum(value for kind, value in events if kind == "write"),
+        downloaded_bytes=sum(value for kind, value in events if kind == "read"),
+        read_backs=len(read_backs),
+        read_backs_before_sort=sum(i < sorted_at for i in read_backs),
+    )
+
+
+@contextmanager
+def recording() -> Iterator[list[Event]]:
+    """A list of events, in order: ("dispatch", shader), ("submit", None), ("write", bytes), ("read", bytes)."""
+    events: list[Event] = []
+    dispatch_grid, leave, write, map_sync = Commands.dispatch_grid, Commands.__exit__, Buffer.write, GPUBuffer.map_sync
+
+    def counted_dispatch(self: Commands, kernel: Any, groups: tuple[int, int], **buffers: Any) -> None:
+        if min(groups) > 0:
+            events.append(("dispatch", kernel.name))
+        dispatch_grid(self, kernel, groups, **buffers)
+
+    def counted_leave(self: Commands, *error: Any) -> None:
+        events.append(("submit", None))
+        leave(self, *error)
+
+    def counted_write(self: Buffer, array: Any, offset: int = 0) -> None:
+        events.append(("write", array.nbytes))
+        write(self, array, offset)
+
+    def counted_map(self: Any, mode: str, offset: int = 0, size: int | None = None) -> None:
+        if mode.startswith("READ"):
+            events.append(("read", self.size if size is None else size))
+        map_sync(self, mode, offset, size)
+
+    with (
+        mock.patch.object(Commands, "dispatch_grid", counted_dispatch),
+        mock.patch.object(Commands, "__exit__", counted_leave),
+        mock.patch.object(Buffer, "write", counted_write),
+        mock.patch.object(GPUBuffer, "map_sync", counted_map),
+    ):
+        yield events

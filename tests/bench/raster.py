@@ -1,0 +1,126 @@
+"""The rasteriser: each pass by the device's own clock, the whole from outside."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import defaultdict
+from typing import Any
+
+import numpy as np
+import torch
+from measure import Timing, Traffic, summary, timed, traffic
+from numpy.typing import NDArray
+
+from lapgs_wgpu import Camera, rasterize
+from lapgs_wgpu.gpu.buffer import Buffer, read_all
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.profile import Profile
+from lapgs_wgpu.splat.rasterizer import GaussianBuffers, Rasterizer
+
+NAMES = ("means", "quats", "scales", "opacities", "colors")
+
+
+@dataclasses.dataclass(frozen=True)
+class PassTime:
+    """All dispatches of one shader in a forward and backward pass together."""
+
+    shader: str
+    dispatches: int
+    milliseconds: Timing
+
+
+@dataclasses.dataclass(frozen=True)
+class RasterReport:
+    """forward, forward_backward: with everything on the device, until it is done. torch_...: the same through
+    `rasterize` and autograd, every input and output exchanged with torch."""
+
+    gaussians: int
+    size: int
+    intersections: int
+    shape: dict[str, Any]
+    passes: list[PassTime]
+    forward: Timing
+    forward_backward: Timing
+    torch_forward: Timing
+    torch_forward_backward: Timing
+    torch_traffic: Traffic
+
+
+def bench_raster(device: Device, arrays: dict[str, NDArray[np.float32]], camera: Camera, repeat: int) -> RasterReport:
+    """Time the scene on the device. The gradient of the image is random, of unit variance."""
+    rasterizer = Rasterizer(device)
+    means, quats, scales, opacities, colors = (_buffer(device, name, arrays[name]) for name in NAMES)
+    gaussians = GaussianBuffers(len(arrays["means"]), means, quats, scales, opacities, colors, None, 1)
+    rng = np.random.default_rng(1)
+    gradient = rng.standard_normal((4, camera.height, camera.width), np.float32)
+    d_image = _buffer(device, "d_image", gradient)
+
+    def forward() -> None:
+        while True:
+            rasterizer.draw(gaussians, camera)
+            if not rasterizer.grow():  # which waits
+                return
+
+    def forward_backward() -> None:
+        rasterizer.draw(gaussians, camera)
+        rasterizer.backward(d_image)
+        rasterizer.grow()
+
+    forward()
+    whole = timed(forward, repeat), timed(forward_backward, repeat)
+    intersections = sum(int(count[0]) for count in read_all(rasterizer.needed_requests()))
+    passes = []
+    if "timestamp-query" in device.features:
+        passes = _passes(device, rasterizer, gaussians, camera, d_image, repeat)
+
+    inputs = [torch.from_numpy(arrays[name]).requires_grad_() for name in NAMES]
+    d_rgb = torch.from_numpy(gradient[:3]).permute(1, 2, 0).contiguous()
+
+    def torch_draw() -> torch.Tensor:
+        means, quats, scales, opacities, colors = inputs
+        return rasterize(means, quats, scales, opacities, colors, camera, device=device).image
+
+    def torch_forward() -> None:
+        with torch.no_grad():
+            torch_draw()
+
+    def torch_forward_backward() -> None:
+        torch.autograd.grad(torch_draw(), inputs, d_rgb)
+
+    torch_whole = timed(torch_forward, repeat), timed(torch_forward_backward, repeat)
+    return RasterReport(
+        gaussians.count,
+        camera.width,
+        intersections,
+        dataclasses.asdict(rasterizer.shape),
+        passes,
+        forward=whole[0],
+        forward_backward=whole[1],
+        torch_forward=torch_whole[0],
+        torch_forward_backward=torch_whole[1],
+        torch_traffic=traffic(torch_forward_backward),
+    )
+
+
+def _buffer(device: Device, name: str, array: NDArray[np.float32]) -> Buffer:
+    buffer = Buffer(device, array.nbytes, name)
+    buffer.write(array)
+    return buffer
+
+
+def _passes(
+    device: Device, rasterizer: Rasterizer, gaussians: GaussianBuffers, camera: Camera, d_image: Buffer, repeat: int
+) -> list[PassTime]:
+    profile = Profile(device)
+    times: dict[str, list[float]] = {}
+    counts: dict[str, int] = {}
+    for _ in range(2 + repeat):
+        rasterizer.draw(gaussians, camera, profile=profile)
+        rasterizer.backward(d_image, profile=profile)
+        run: dict[str, list[float]] = defaultdict(list)
+        for shader, milliseconds in profile.read():
+            run[shader].append(milliseconds)
+        for shader, parts in run.items():
+            times.setdefault(shader, []).append(sum(parts))
+            counts[shader] = len(parts)
+    return [PassTime(shader, counts[shader], summary(runs[2:])) for shader, runs in times.items()]

@@ -1,0 +1,67 @@
+"""The device of the kernel tests, in the configuration that the environment variable LAPGS_TEST_DEVICE names.
+
+The tests marked `kernels` hold in each of them:
+    for name in default no-subgroups default-limits gpu-shape staging; do
+        LAPGS_TEST_DEVICE=$name pytest -m kernels
+    done
+"""
+
+from __future__ import annotations
+
+# Before torch: it tells torch's threads how to wait, which is read once, when torch is imported.
+import lapgs_wgpu  # noqa: F401
+
+# isort: split
+import dataclasses
+import os
+from collections.abc import Callable
+
+import pytest
+import torch
+
+from lapgs_wgpu.gpu.device import Device, _adapters, _matches
+from lapgs_wgpu.splat import rasterize as rasterize_module
+from lapgs_wgpu.splat.rasterizer import Rasterizer
+
+# What the adapter is taken for, and how it is opened.
+CONFIGURATIONS: dict[str, tuple[str | None, dict[str, bool]]] = {
+    "default": (None, {}),
+    "no-subgroups": (None, {"subgroups": False}),
+    "default-limits": (None, {"default_limits": True}),
+    "gpu-shape": ("integrated", {}),  # tables in buffers, the GPU shapes of rasteriser, sort and hash gradients
+    "staging": ("discrete", {}),  # the same, and no buffer can be mapped where it is
+}
+
+
+def open_test_device(configuration: str) -> Device:
+    """The adapter that LAPGS_DEVICE names, else the first, in one of the CONFIGURATIONS."""
+    kind, switches = CONFIGURATIONS[configuration]
+    wanted = os.environ.get("LAPGS_DEVICE", "")
+    info, adapter = next(pair for pair in _adapters() if not wanted or _matches(pair[0], wanted))
+    return Device(adapter, dataclasses.replace(info, kind=kind or info.kind), **switches)
+
+
+def pytest_configure() -> None:
+    torch.set_num_threads(1)  # the tensors are small, and the software driver needs the processor
+
+
+@pytest.fixture(scope="session")
+def configuration() -> str:
+    return os.environ.get("LAPGS_TEST_DEVICE", "default")
+
+
+@pytest.fixture(scope="session")
+def device(configuration: str) -> Device:
+    """One for all tests, so that each kernel is compiled once."""
+    return open_test_device(configuration)
+
+
+@pytest.fixture
+def use(monkeypatch: pytest.MonkeyPatch) -> Callable[[Rasterizer], Rasterizer]:
+    """Makes `rasterize` draw with the given Rasterizer until the test ends."""
+
+    def replace(rasterizer: Rasterizer) -> Rasterizer:
+        monkeypatch.setattr(rasterize_module, "rasterizer_of", lambda device: rasterizer)
+        return rasterizer
+
+    return replace

@@ -1,0 +1,143 @@
+"""Presets and overrides: values, round trip, and one clear sentence for each mistake."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.motion.field import FieldConfig
+from lapgs_wgpu.train.config import Config, Rate
+from lapgs_wgpu.train.presets import config_keys, load_config, preset_names, write_toml
+
+
+def write(path: Path, text: str) -> str:
+    path.write_text(text)
+    return str(path)
+
+
+def test_dnerf_is_the_papers_schedule() -> None:
+    config = load_config("dnerf")
+    assert (config.schedule.steps, config.schedule.warm_up, config.schedule.sh_interval) == (50_000, 3000, 1000)
+    assert config.rates.means == Rate(8e-4, 8e-6, 35_000)
+    assert config.rates.hash == Rate(8e-3, 8e-5, 45_000)
+    assert config.rates.mlp == Rate(8e-4, 1.6e-6, 45_000)
+    rates = config.rates
+    assert (rates.sh_dc, rates.sh_rest, rates.opacity_logits) == (2.5e-3, 1.25e-4, 0.05)
+    assert (rates.log_scales, rates.quats) == (5e-3, 1e-3)
+    density = config.density
+    assert (density.start, density.stop, density.interval, density.gradient) == (500, 15_000, 100, 2e-4)
+    assert (density.min_opacity, density.max_screen_radius, density.max_world_size) == (0.005, 20, 0.1)
+    assert (density.reset_interval, density.reset_opacity) == (3000, 0.01)
+    assert (config.points.count, config.points.box, config.points.opacity) == (100_000, 1.3, 0.1)
+    assert (config.data.background, config.seed, config.loss.ssim) == ("black", 0, 0.2)
+    assert config.field == FieldConfig()
+
+
+@pytest.mark.parametrize("name", preset_names())
+def test_configuration_survives_toml(name: str, tmp_path: Path) -> None:
+    config = load_config(name, {"data.path": 'C:\\a "b" \u00e4', "field.static.base": ["3", "4", "5"]})
+    table = dataclasses.asdict(config) | {"record": {"driver": "x", "anything": "\x7f\n"}}
+    again = load_config(write(tmp_path / "config.toml", write_toml(table)))
+    assert again == config
+    assert again.field.static.base == (3, 4, 5)
+
+
+def test_every_key_can_be_overridden_and_has_a_help_text() -> None:
+    for key in config_keys():
+        assert key.help, key.name
+    keys = {key.name for key in config_keys()}
+    assert {"seed", "data.path", "field.temporal.finest", "rates.means.start", "density.gradient"} <= keys
+
+
+def test_overrides() -> None:
+    given: dict[str, str | list[str]] = {"schedule.steps": "7", "rates.means.end": "1e-7", "data.background": "white"}
+    config = load_config("dnerf", given)
+    assert config.schedule.steps == 7
+    assert config.rates.means == Rate(8e-4, 1e-7, 35_000)
+    assert config.data.background == "white"
+    assert config == dataclasses.replace(
+        load_config("dnerf"), schedule=config.schedule, rates=config.rates, data=config.data
+    )
+
+
+def test_base_gives_what_a_file_leaves_out(tmp_path: Path) -> None:
+    config = load_config(write(tmp_path / "mine.toml", 'base = "tiny"\n[schedule]\nsteps = 9\n'))
+    tiny = load_config("tiny")
+    assert config == dataclasses.replace(tiny, schedule=dataclasses.replace(tiny.schedule, steps=9))
+
+
+def test_presets_are_complete_without_defaults_in_the_code() -> None:
+    optional = {field.name for field in dataclasses.fields(Config) if field.default is not dataclasses.MISSING}
+    assert not optional
+
+
+@pytest.mark.parametrize(
+    ("preset", "message"),
+    [
+        ("tinny", "did you mean tiny?"),
+        ("zzz", "there are "),
+        ("missing.toml", "does not exist"),
+    ],
+)
+def test_unknown_preset(preset: str, message: str) -> None:
+    with pytest.raises(InputError) as caught:
+        load_config(preset)
+    assert preset in str(caught.value)
+    assert message in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("steps = ", "cannot be read as TOML"),
+        ("steps = 5", "no key steps"),
+        ('base = "dnerf"\n[schedule]\nstepz = 5', "no key schedule.stepz; did you mean steps?"),
+        ('base = "dnerf"\n[schedule]\nsteps = "5"', "schedule.steps must be a whole number, got '5'"),
+        ('base = "dnerf"\n[schedule]\nsteps = 5.0', "schedule.steps must be a whole number, got 5.0"),
+        ('base = "dnerf"\n[schedule]\nsteps = true', "schedule.steps must be a whole number, got True"),
+        ('base = "dnerf"\n[schedule]\nsteps = 0', "at least 1, got 0"),
+        ('base = "dnerf"\nschedule = 5', "schedule must be a table, got 5"),
+        ('base = "dnerf"\nseed = -1', "seed must lie between 0 and 2147483647, got -1"),
+        ('base = "dnerf"\n[loss]\nssim = nan', "loss.ssim must lie between 0 and 2147483647, got nan"),
+        ('base = "dnerf"\n[loss]\nssim = 1.5', "at most 1, got 1.5"),
+        ('base = "dnerf"\n[field.static]\nbase = [1, 2]', "field.static.base must be 3 numbers, got [1, 2]"),
+        ('base = "dnerf"\n[data]\nbackground = "blak"', "must be black or white or random, got 'blak'"),
+        ('base = "dnerf"\n[rates.means]\nstart = 0', "rates.means: a learning rate needs start and end above 0"),
+        ('base = "dnerf"\n[points]\nopacity = 1.0', "opacity between 0 and 1"),
+        ('base = "dnerf"\n[density]\ninterval = 0', "at least 1 step"),
+        ("[data]\nsize = 1", 'start the file with base = "dnerf"'),
+        ("base = 3", "base must be the name of a preset, got 3"),
+        ('base = "nerf"', "there is no preset 'nerf'; did you mean dnerf?"),
+    ],
+)
+def test_mistakes_in_a_file(text: str, message: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError) as caught:
+        load_config(write(tmp_path / "mine.toml", text))
+    assert message in str(caught.value)
+
+
+def test_a_base_that_leads_back(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    write(path, f'base = "{path}"')
+    with pytest.raises(InputError, match="leads back to itself"):
+        load_config(str(path))
+
+
+@pytest.mark.parametrize(
+    ("key", "text", "message"),
+    [
+        ("schedule.stepz", "5", "no option --schedule.stepz; did you mean schedule.steps?"),
+        ("schedule.steps", "many", "--schedule.steps must be a whole number, got 'many'"),
+        ("rates.means.start", "fast", "--rates.means.start must be a number, got 'fast'"),
+        ("field.kind", "grid5d", "did you mean grid4d?"),
+        ("field.static.base", ["1", "2", "x"], "--field.static.base must be a whole number, got 'x'"),
+        ("seed", "1\nfoo = 2", "--seed must be a whole number"),
+    ],
+)
+def test_mistakes_in_an_override(key: str, text: str | list[str], message: str) -> None:
+    with pytest.raises(InputError) as caught:
+        load_config("tiny", {key: text})
+    assert message in str(caught.value)

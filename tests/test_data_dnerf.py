@@ -1,0 +1,325 @@
+"""The D-NeRF reader: geometry, sizes and times of what is right; one clear sentence for each thing that is wrong."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from lapgs_wgpu.data import composite, load_dataset
+from lapgs_wgpu.errors import InputError
+
+WIDTH, HEIGHT, FOV_X = 12, 8, 1.0
+SHARED = Path(__file__).parents[2] / "shared" / "data"
+
+Scene = dict[str, Any]  # split -> the transforms file's object
+
+
+def camera_to_world(turn: float) -> list[list[float]]:
+    """A camera at distance 4 from the origin that looks at it, in OpenGL axes, turned about z."""
+    c, s = math.cos(turn), math.sin(turn)
+    return [[-s, 0, c, 4 * c], [c, 0, s, 4 * s], [0, 1, 0, 0], [0, 0, 0, 1]]
+
+
+def make_scene(folder: Path, change: Callable[[Path, Scene], None] | None = None, *, mode: str = "RGBA") -> Path:
+    """Write a scene of 3 training views and 1 test view of random pixels, then let `change` spoil it."""
+    rng = np.random.default_rng(0)
+    scene: Scene = {}
+    for split, count in (("train", 3), ("test", 1)):
+        (folder / split).mkdir(parents=True)
+        frames: list[dict[str, Any]] = []
+        for i in range(count):
+            pixels = rng.integers(0, 256, (HEIGHT, WIDTH, 4 if mode == "RGBA" else 3), dtype=np.uint8)
+            Image.fromarray(pixels).save(folder / split / f"r_{i:03d}.png")
+            frames.append({"file_path": f"./{split}/r_{i:03d}", "transform_matrix": camera_to_world(i)})
+        for i, frame in enumerate(frames):
+            frame["time"] = (i + 0.5) / count
+        scene[split] = {"camera_angle_x": FOV_X, "frames": frames}
+    if change:
+        change(folder, scene)
+    for split, data in scene.items():
+        (folder / f"transforms_{split}.json").write_text(data if isinstance(data, str) else json.dumps(data))
+    return folder
+
+
+def test_splits_names_times(tmp_path: Path) -> None:
+    data = load_dataset(make_scene(tmp_path / "toy"))
+    assert data.name == "toy"
+    assert [view.name for view in data.train] == ["train_000", "train_001", "train_002"]
+    assert [view.name for view in data.test] == ["test_000"]
+    assert not {view.source for view in data.train} & {view.source for view in data.test}
+    np.testing.assert_allclose(data.times, [1 / 6, 0.5, 5 / 6])
+    assert data.test[0].time == 0.5
+
+
+def test_extent_is_of_training_cameras(tmp_path: Path) -> None:
+    data = load_dataset(make_scene(tmp_path / "toy"))
+    centres = np.array([[4 * math.cos(i), 4 * math.sin(i), 0] for i in range(3)])
+    expected = 1.1 * np.linalg.norm(centres - centres.mean(axis=0), axis=1).max()
+    assert data.extent == pytest.approx(expected, rel=1e-12)
+
+
+def test_axes_and_field_of_view_of_wide_pictures(tmp_path: Path) -> None:
+    """OpenGL's camera on the x axis: world y is to the right, z is up, and the horizontal angle spans the width."""
+    camera = load_dataset(make_scene(tmp_path / "toy")).train[0].camera
+    np.testing.assert_allclose(camera.position, [4, 0, 0], atol=1e-12)
+    edge = 4 * math.tan(FOV_X / 2)
+    for point, pixel in [
+        ((0, 0, 0), (WIDTH / 2, HEIGHT / 2)),
+        ((0, edge, 0), (WIDTH, HEIGHT / 2)),
+        ((0, 0, edge), (WIDTH / 2, HEIGHT / 2 - WIDTH / 2)),  # square pixels: one focal length on both axes
+    ]:
+        p = camera.K @ (camera.T_cam_world @ [*point, 1])[:3]
+        assert p[2] == pytest.approx(4)
+        np.testing.assert_allclose(p[:2] / p[2], pixel, atol=1e-9)
+
+
+def test_pixels_are_those_of_the_file(tmp_path: Path) -> None:
+    view = load_dataset(make_scene(tmp_path / "toy")).train[1]
+    pixels = view.load()
+    assert pixels.dtype == np.uint8
+    np.testing.assert_array_equal(pixels, np.asarray(Image.open(tmp_path / "toy/train/r_001.png")))
+
+
+@pytest.mark.parametrize(("image_size", "size"), [(12, (12, 8)), (6, (6, 4)), (5, (5, 3)), (1, (1, 1))])
+def test_shrinking_keeps_the_view(tmp_path: Path, image_size: int, size: tuple[int, int]) -> None:
+    full = load_dataset(make_scene(tmp_path / "toy")).train[0]
+    view = load_dataset(tmp_path / "toy", image_size=image_size).train[0]
+    assert (view.camera.width, view.camera.height) == size
+    assert view.load().shape == (size[1], size[0], 4)
+    scale = np.array([size[0] / WIDTH, size[1] / HEIGHT, 1])
+    np.testing.assert_allclose(view.camera.K, full.camera.K * scale[:, None])
+
+
+def test_shrinking_averages_what_is_seen(tmp_path: Path) -> None:
+    """Over any background, the shrunk picture is the mean of the pixels it replaces: premultiplied, no dark fringes."""
+    make_scene(tmp_path / "toy")
+    full = load_dataset(tmp_path / "toy").train
+    half = load_dataset(tmp_path / "toy", image_size=WIDTH // 2).train
+    for background in ((0, 0, 0), (1, 1, 1), (0.2, 0.9, 0.4)):
+        for a, b in zip(full, half, strict=True):
+            seen = composite(a.load(), background).reshape(HEIGHT // 2, 2, WIDTH // 2, 2, 3).mean(axis=(1, 3))
+            assert np.abs(composite(b.load(), background) - seen).max() < 3
+
+
+def test_transparent_colour_does_not_bleed(tmp_path: Path) -> None:
+    def change(folder: Path, scene: Scene) -> None:
+        pixels = np.zeros((HEIGHT, WIDTH, 4), dtype=np.uint8)
+        pixels[::2, ::2] = 255  # one opaque white pixel in four, the others transparent black
+        Image.fromarray(pixels).save(folder / "train/r_000.png")
+
+    pixels = load_dataset(make_scene(tmp_path / "toy", change), image_size=WIDTH // 2).train[0].load()
+    np.testing.assert_array_equal(pixels, np.broadcast_to([255, 255, 255, 64], pixels.shape))
+
+
+def test_pictures_without_transparency(tmp_path: Path) -> None:
+    assert load_dataset(make_scene(tmp_path / "toy", mode="RGB")).train[0].load().shape == (HEIGHT, WIDTH, 3)
+
+
+def test_times_left_out_are_even(tmp_path: Path) -> None:
+    def change(folder: Path, scene: Scene) -> None:
+        for data in scene.values():
+            for frame in data["frames"]:
+                del frame["time"]
+
+    data = load_dataset(make_scene(tmp_path / "toy", change))
+    assert [view.time for view in data.train] == [0, 0.5, 1]
+    assert [view.time for view in data.test] == [0]
+
+
+def test_file_path_may_carry_its_suffix(tmp_path: Path) -> None:
+    def change(folder: Path, scene: Scene) -> None:
+        for frame in scene["train"]["frames"]:
+            frame["file_path"] += ".png"
+
+    assert load_dataset(make_scene(tmp_path / "toy", change)).train[2].load().shape == (HEIGHT, WIDTH, 4)
+
+
+def test_validation_frames_are_not_read(tmp_path: Path) -> None:
+    folder = make_scene(tmp_path / "toy")
+    (folder / "transforms_val.json").write_text("spoilt")
+    assert len(load_dataset(folder).train) == 3
+
+
+def frame_with(**fields: Any) -> Callable[[Path, Scene], None]:
+    """Give the second training frame other fields."""
+    return lambda folder, scene: scene["train"]["frames"][1].update(fields)
+
+
+def frame_without(field: str) -> Callable[[Path, Scene], None]:
+    return lambda folder, scene: scene["train"]["frames"][1].pop(field)
+
+
+def scene_with(**fields: Any) -> Callable[[Path, Scene], None]:
+    return lambda folder, scene: scene["train"].update(fields)
+
+
+def text_instead(text: str) -> Callable[[Path, Scene], None]:
+    return lambda folder, scene: scene.update(train=text)
+
+
+def matrix(row: int, column: int, value: Any) -> Callable[[Path, Scene], None]:
+    rows = camera_to_world(1)
+    rows[row][column] = value
+    return frame_with(transform_matrix=rows)
+
+
+def times_axes(factors: list[float]) -> Callable[[Path, Scene], None]:
+    rows = np.array(camera_to_world(1))
+    rows[:3, :3] *= factors
+    return frame_with(transform_matrix=rows.tolist())
+
+
+def sheared() -> Callable[[Path, Scene], None]:
+    rows = np.array(camera_to_world(1))
+    rows[:3, 0] = (rows[:3, 0] + 0.1 * rows[:3, 1]) / math.hypot(1, 0.1)
+    return frame_with(transform_matrix=rows.tolist())
+
+
+def other_size(folder: Path, scene: Scene) -> None:
+    Image.new("RGBA", (10, 7)).save(folder / "test/r_000.png")
+
+
+def sixteen_bit(folder: Path, scene: Scene) -> None:
+    Image.fromarray(np.zeros((HEIGHT, WIDTH), dtype=np.uint16)).save(folder / "train/r_001.png")
+
+
+def cut(folder: Path, scene: Scene) -> None:
+    path = folder / "train/r_001.png"
+    path.write_bytes(path.read_bytes()[:-30])
+
+
+def flip_a_bit(folder: Path, scene: Scene) -> None:
+    path = folder / "train/r_001.png"
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+
+
+def picture_a_folder(folder: Path, scene: Scene) -> None:
+    (folder / "train/r_001.png").unlink()
+    (folder / "train/r_001.png").mkdir()
+
+
+def no_picture(folder: Path, scene: Scene) -> None:
+    (folder / "train/r_001.png").write_text("hello")
+
+
+FRAME = ["transforms_train.json", "frame 1"]
+PICTURE = ["r_001.png"]
+BAD: dict[str, tuple[Callable[[Path, Scene], Any], list[str]]] = {
+    "no training file": (lambda folder, scene: scene.pop("train"), ["transforms_train.json", "does not exist"]),
+    "no test file": (lambda folder, scene: scene.pop("test"), ["transforms_test.json", "does not exist"]),
+    "not JSON": (text_instead('{\n"camera_angle_x": 1,\n"frames": [}'), ["transforms_train.json", "line 3, column 12"]),
+    "empty file": (text_instead(""), ["transforms_train.json", "line 1"]),
+    "deep JSON": (text_instead("[" * 100_000), ["transforms_train.json"]),
+    "huge integer": (text_instead('{"camera_angle_x": 1' + "0" * 5000 + "}"), ["transforms_train.json"]),
+    "not an object": (text_instead("[1, 2]"), ["transforms_train.json", "a list of 2"]),
+    "no angle": (lambda folder, scene: scene["train"].pop("camera_angle_x"), ["no field camera_angle_x"]),
+    "angle of text": (scene_with(camera_angle_x="wide"), ["camera_angle_x", '"wide"']),
+    "angle in degrees": (scene_with(camera_angle_x=39.6), ["camera_angle_x", "radians", "39.6"]),
+    "angle of zero": (scene_with(camera_angle_x=0), ["camera_angle_x", "got 0"]),
+    "angle of a denormal": (scene_with(camera_angle_x=1e-320), ["camera_angle_x"]),
+    "angle of NaN": (scene_with(camera_angle_x=math.nan), ["camera_angle_x", "nan"]),
+    "no frames": (lambda folder, scene: scene["train"].pop("frames"), ["no field frames"]),
+    "empty frames": (scene_with(frames=[]), ["frames", "at least one"]),
+    "frames of text": (scene_with(frames="r_000"), ["frames", '"r_000"']),
+    "frame of a number": (scene_with(frames=[3]), ["frame 0", "got 3"]),
+    "no file_path": (frame_without("file_path"), [*FRAME, "no field file_path"]),
+    "file_path of a number": (frame_with(file_path=7), [*FRAME, "file_path", "got 7"]),
+    "file_path with a zero": (frame_with(file_path="a\0b"), [*FRAME, "file_path"]),
+    "file_path too long": (frame_with(file_path="x" * 5000), [*FRAME, "does not exist"]),
+    "picture absent": (frame_with(file_path="./train/r_777"), ["r_777.png", *FRAME, "does not exist"]),
+    "picture a folder": (picture_a_folder, [*PICTURE, *FRAME, "does not exist"]),
+    "picture of text": (no_picture, [*PICTURE, "not a readable picture"]),
+    "picture cut short": (cut, [*PICTURE, "not a readable picture"]),
+    "picture with a wrong bit": (flip_a_bit, [*PICTURE, "not a readable picture"]),
+    "picture of 16 bit": (sixteen_bit, [*PICTURE, "8 bits"]),
+    "sizes mixed": (other_size, ["test/r_000.png", "10x7", "train/r_000.png", "12x8"]),
+    "time of one frame missing": (frame_without("time"), [*FRAME, "no field time", "2 of 3"]),
+    "time above 1": (frame_with(time=1.5), [*FRAME, "time", "[0, 1]", "1.5"]),
+    "time below 0": (frame_with(time=-0.01), [*FRAME, "time", "[0, 1]", "-0.01"]),
+    "time of NaN": (frame_with(time=math.nan), [*FRAME, "time", "nan"]),
+    "time of text": (frame_with(time="0.5"), [*FRAME, "time", '"0.5"']),
+    "time of true": (frame_with(time=True), [*FRAME, "time", "true"]),
+    "no matrix": (frame_without("transform_matrix"), [*FRAME, "no field transform_matrix"]),
+    "matrix of 3 rows": (frame_with(transform_matrix=camera_to_world(1)[:3]), [*FRAME, "a list of 3"]),
+    "matrix of ragged rows": (frame_with(transform_matrix=[[1]] * 4), [*FRAME, "transform_matrix", "4 numbers"]),
+    "matrix of text": (matrix(0, 3, "4"), [*FRAME, "transform_matrix", '"4"']),
+    "matrix of null": (matrix(0, 3, None), [*FRAME, "transform_matrix", "null"]),
+    "matrix with NaN": (matrix(2, 1, math.nan), [*FRAME, "transform_matrix", "nan", "row 2, column 1"]),
+    "matrix with infinity": (matrix(0, 3, math.inf), [*FRAME, "transform_matrix", "inf", "row 0, column 3"]),
+    "matrix with 1e300": (matrix(0, 0, 1e300), [*FRAME, "transform_matrix", "1e+300", "row 0, column 0"]),
+    "matrix with a huge integer": (matrix(0, 3, 10**400), [*FRAME, "transform_matrix", "row 0, column 3"]),
+    "matrix transposed": (frame_with(transform_matrix=np.transpose(camera_to_world(1)).tolist()), [*FRAME, "0 0 0 1"]),
+    "matrix of zeros": (times_axes([0, 0, 0]), [*FRAME, "transform_matrix", "zero scale"]),
+    "matrix scaled": (times_axes([2, 2, 2]), [*FRAME, "transform_matrix", "rotation", "lengths 2 2 2"]),
+    "matrix sheared": (sheared(), [*FRAME, "transform_matrix", "rotation", "0.0995"]),
+    "matrix left-handed": (times_axes([1, 1, -1]), [*FRAME, "transform_matrix", "left-handed"]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_scene_is_refused_in_one_sentence(tmp_path: Path, name: str) -> None:
+    change, words = BAD[name]
+    folder = make_scene(tmp_path / "toy", change)
+    with pytest.raises(InputError) as caught:
+        load_dataset(folder)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert message.endswith(".")
+    assert len(message) < 5500 if "long" in name else len(message) < 400
+    for word in [str(folder), *words]:
+        assert word in message
+
+
+@pytest.mark.parametrize("image_size", [0, -3, 13])
+def test_image_size_out_of_range(tmp_path: Path, image_size: int) -> None:
+    with pytest.raises(InputError, match=rf"image size {image_size} .* 1 and 12"):
+        load_dataset(make_scene(tmp_path / "toy"), image_size=image_size)
+
+
+def test_folder_missing_a_file_or_of_another_kind(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="nowhere does not exist"):
+        load_dataset(tmp_path / "nowhere")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="file is not a folder"):
+        load_dataset(tmp_path / "file")
+    make_scene(tmp_path / "scenes/hook")
+    with pytest.raises(InputError, match=r"expected transforms_train\.json.*scenes hook"):
+        load_dataset(tmp_path / "scenes")
+
+
+def test_picture_lost_or_spoilt_after_opening_is_named(tmp_path: Path) -> None:
+    views = load_dataset(make_scene(tmp_path / "toy")).train
+    (tmp_path / "toy/train/r_000.png").unlink()
+    cut(tmp_path / "toy", {})
+    for view, file in zip(views, ("r_000.png", "r_001.png"), strict=False):
+        with pytest.raises(InputError, match=rf"{file} cannot be decoded"):
+            view.load()
+
+
+@pytest.mark.parametrize("scene", ["dnerf/bouncingballs", "dnerf/hook", "dnerf/jumpingjacks", "rendered/swing"])
+def test_published_scenes(scene: str) -> None:
+    if not (SHARED / scene).is_dir():
+        pytest.skip("scenes not at hand")
+    data = load_dataset(SHARED / scene, image_size=200)
+    assert len(data.train) == len(data.times) >= 100
+    assert len(data.test) == 20
+    assert (data.times[0], data.times[-1]) == (0, 1)
+    assert 4 < data.extent < 8
+    for view in data.train + data.test:  # the cameras stand on a sphere about the origin and look at it
+        assert np.linalg.norm(view.camera.position) == pytest.approx(4.03, abs=0.04)
+        origin = view.camera.T_cam_world[:3, 3]
+        np.testing.assert_allclose(origin[:2], 0, atol=1e-5)
+        assert origin[2] > 0
+    pixels = data.test[0].load()
+    assert pixels.shape == (200, 200, 4)
+    assert pixels[..., 3].max() == 255
+    assert 0.02 < (pixels[..., 3] > 127).mean() < 0.8

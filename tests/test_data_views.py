@@ -1,0 +1,159 @@
+"""Views, compositing and the image cache."""
+
+from __future__ import annotations
+
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+from lapgs_wgpu.data import Dataset, ImageCache, View, composite
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.splat.camera import Camera
+
+CAMERA = Camera.looking_at([0, -4, 0], [0, 0, 0], up=[0, 0, 1], fov_x=0.7, width=5, height=4)
+BYTES = 5 * 4 * 4
+
+
+class Source:
+    """Pixels that count how often they were decoded."""
+
+    def __init__(self, value: int = 0, gate: threading.Event | None = None) -> None:
+        self.value, self.gate, self.decodes = value, gate, 0
+        self.lock = threading.Lock()
+
+    def __call__(self) -> np.ndarray:
+        with self.lock:
+            self.decodes += 1
+        if self.gate:
+            assert self.gate.wait(10)
+        return np.full((4, 5, 4), self.value, dtype=np.uint8)
+
+
+def view_of(source: Source, name: str = "train_000", time: float = 0.0) -> View:
+    return View(name=name, camera=CAMERA, time=time, source=f"{name}.png", pixels=source)
+
+
+def test_composite_rounds_to_nearest() -> None:
+    colour, alpha = (a.ravel() for a in np.meshgrid(np.arange(256), np.arange(256)))
+    image = np.stack([colour, colour, colour, alpha], axis=-1).astype(np.uint8)[None]
+    for background in ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (0.25, 0.5, 0.75)):
+        got = composite(image, background)[0]
+        exact = colour * alpha / 255
+        for channel, b in enumerate(background):
+            assert np.abs(got[:, channel] - (exact + 255 * b * (1 - alpha / 255))).max() <= 0.5 + 1e-4
+    assert composite(image, (0, 0, 0)).dtype == np.uint8
+
+
+def test_composite_ends() -> None:
+    opaque = np.array([[[10, 20, 30, 255]]], dtype=np.uint8)
+    clear = np.array([[[10, 20, 30, 0]]], dtype=np.uint8)
+    np.testing.assert_array_equal(composite(opaque, (1, 1, 1))[0, 0], [10, 20, 30])
+    np.testing.assert_array_equal(composite(clear, (1, 0.5, 0))[0, 0], [255, 128, 0])
+    np.testing.assert_array_equal(composite(opaque[..., :3], (1, 1, 1)), opaque[..., :3])
+    for background in ((0, 0), (0, 0, 2), (0, 0, float("nan"))):
+        with pytest.raises(ValueError, match="background"):
+            composite(opaque, background)
+
+
+@pytest.mark.parametrize(
+    "pixels", [np.zeros((5, 4, 4), np.uint8), np.zeros((4, 5, 2), np.uint8), np.zeros((4, 5, 3), np.float32)]
+)
+def test_view_refuses_pixels_of_another_shape(pixels: np.ndarray) -> None:
+    view = View("train_000", CAMERA, 0.0, "clip.mp4 frame 7", lambda: pixels)
+    with pytest.raises(InputError, match=r"clip\.mp4 frame 7: expected 5x4"):
+        view.load()
+
+
+def test_extent_and_times() -> None:
+    views = tuple(view_of(Source(), f"train_{i}", time) for i, time in enumerate((0.5, 0.0, 0.5)))
+    data = Dataset("toy", views, ())
+    np.testing.assert_array_equal(data.times, [0.0, 0.5])
+    assert data.extent == 0
+
+
+def test_cache_keeps_the_most_recently_used() -> None:
+    sources = [Source(i) for i in range(3)]
+    views = [view_of(source) for source in sources]
+    cache = ImageCache(2 * BYTES)
+    for index, decodes in [
+        (0, (1, 0, 0)),
+        (1, (1, 1, 0)),
+        (0, (1, 1, 0)),
+        (2, (1, 1, 1)),
+        (0, (1, 1, 1)),
+        (1, (1, 2, 1)),
+    ]:
+        assert cache.get(views[index])[0, 0, 0] == index
+        assert tuple(source.decodes for source in sources) == decodes
+        assert cache.used_bytes <= 2 * BYTES
+    with pytest.raises(ValueError, match="read-only"):
+        cache.get(views[0])[0] = 1
+    cache.close()
+
+
+def test_cache_without_room_still_serves() -> None:
+    source = Source(9)
+    view = view_of(source)
+    cache = ImageCache(BYTES - 1)
+    assert cache.get(view)[0, 0, 0] == cache.get(view)[0, 0, 0] == 9
+    assert source.decodes == 2
+    assert cache.used_bytes == 0
+    cache.close()
+
+
+def test_cache_decodes_once_for_many_threads() -> None:
+    gate = threading.Event()
+    source = Source(5, gate)
+    view = view_of(source)
+    cache = ImageCache(BYTES)
+    with ThreadPoolExecutor(8) as pool:
+        results = [pool.submit(cache.get, view) for _ in range(8)]
+        gate.set()
+        assert all(result.result(10)[0, 0, 0] == 5 for result in results)
+    assert source.decodes == 1
+    cache.close()
+
+
+def test_cache_bound_holds_under_threads() -> None:
+    sources = [Source(i) for i in range(10)]
+    views = [view_of(source) for source in sources]
+    cache = ImageCache(3 * BYTES, workers=4)
+    cache.prefetch(views)
+    rng = np.random.default_rng(0)
+    with ThreadPoolExecutor(8) as pool:
+        order = rng.integers(0, 10, 400)
+        for i, image in zip(order, pool.map(lambda i: cache.get(views[i]), order), strict=True):
+            assert (image == i).all()
+    cache.close()
+    assert 0 < cache.used_bytes <= 3 * BYTES
+
+
+def test_prefetched_views_are_not_decoded_again() -> None:
+    sources = [Source(i) for i in range(3)]
+    views = [view_of(source) for source in sources]
+    cache = ImageCache(3 * BYTES)
+    cache.prefetch(views)
+    for view in views:
+        cache.get(view)
+    cache.close()
+    assert [source.decodes for source in sources] == [1, 1, 1]
+
+
+def test_failures_are_raised_by_get_and_not_kept() -> None:
+    broken = [True]
+
+    def pixels() -> np.ndarray:
+        if broken[0]:
+            raise InputError("r_000.png cannot be decoded.")
+        return np.zeros((4, 5, 3), dtype=np.uint8)
+
+    view = View("train_000", CAMERA, 0.0, "r_000.png", pixels)
+    cache = ImageCache(BYTES)
+    cache.prefetch([view])
+    with pytest.raises(InputError, match="r_000"):
+        cache.get(view)
+    broken[0] = False
+    assert cache.get(view).shape == (4, 5, 3)
+    cache.close()

@@ -1,0 +1,187 @@
+"""Choosing an adapter and opening it."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from typing import Any
+
+import pytest
+
+from lapgs_wgpu.errors import NoAdapterError
+from lapgs_wgpu.gpu import device as module
+from lapgs_wgpu.gpu.device import Device, DeviceInfo, list_devices, open_device
+
+DISCRETE = DeviceInfo("Fast Card 9000", "discrete", "Vulkan", "v1")
+INTEGRATED = DeviceInfo("Chip Graphics", "integrated", "Vulkan", "v2")
+SOFTWARE = DeviceInfo("llvmpipe (LLVM 15.0.6, 256 bits)", "cpu", "Vulkan", "v3")
+
+
+@pytest.fixture
+def opened(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """open_device over three made-up adapters; it returns the info of the one that it would open."""
+    found = [(DISCRETE, None), (INTEGRATED, None), (SOFTWARE, None)]
+    monkeypatch.setattr(module, "_adapters", lambda: found)
+    monkeypatch.setattr(module, "Device", lambda adapter, info: info)
+    monkeypatch.delenv("LAPGS_DEVICE", raising=False)
+    return open_device.__wrapped__
+
+
+# Which adapter
+
+
+def test_the_best_adapter_is_the_default(opened: Any) -> None:
+    assert opened() == DISCRETE
+    assert opened(None) == DISCRETE
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("cpu", SOFTWARE),
+        ("integrated", INTEGRATED),
+        ("discrete", DISCRETE),
+        ("CPU", SOFTWARE),
+        ("llvmpipe", SOFTWARE),
+        ("chip", INTEGRATED),
+        ("card 9000", DISCRETE),
+        ("vulkan", DISCRETE),
+    ],
+)
+def test_choosing_by_kind_name_or_backend(opened: Any, name: str, expected: DeviceInfo) -> None:
+    assert opened(name) == expected
+
+
+def test_the_environment_chooses_where_nothing_else_does(opened: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("LAPGS_DEVICE", "llvm")
+    assert opened() == SOFTWARE
+    assert opened("integrated") == INTEGRATED
+    monkeypatch.setenv("LAPGS_DEVICE", "")
+    assert opened() == DISCRETE
+
+
+def test_an_unknown_name_lists_what_is_there(opened: Any) -> None:
+    with pytest.raises(NoAdapterError) as caught:
+        opened("quantum")
+    message = str(caught.value)
+    assert "'quantum'" in message
+    for info in (DISCRETE, INTEGRATED, SOFTWARE):
+        assert f"{info.name!r} ({info.kind})" in message
+    assert "\n" not in message
+
+
+def test_no_adapter_at_all_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_adapters", list)
+    for name in (None, "cpu"):
+        with pytest.raises(NoAdapterError, match=r"no Vulkan, Metal or D3D12 adapter .* mesa-vulkan-drivers"):
+            open_device.__wrapped__(name)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the Vulkan loader's variables mean nothing here")
+def test_a_machine_without_a_driver_really_has_no_adapter() -> None:
+    program = (
+        "from lapgs_wgpu.gpu.device import list_devices, open_device\n"
+        "from lapgs_wgpu.errors import NoAdapterError\n"
+        "assert list_devices() == []\n"
+        "try: open_device()\n"
+        "except NoAdapterError as error: print('refused:', error)"
+    )
+    nowhere = {"VK_DRIVER_FILES": "/nowhere.json", "VK_ICD_FILENAMES": "/nowhere.json"}
+    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=os.environ | nowhere)
+    assert run.returncode == 0, run.stderr
+    assert run.stdout.startswith("refused: no Vulkan, Metal or D3D12 adapter")
+
+
+class _Adapter:
+    """What an adapter of wgpu says of itself."""
+
+    def __init__(self, name: str, kind: str, backend: str = "Vulkan", **limits: int) -> None:
+        self.info = {"device": name, "adapter_type": kind, "backend_type": backend, "description": "driver"}
+        self.features = {"subgroup", "shader-float32-atomic", "mappable-primary-buffers"}
+        self.limits = dict.fromkeys((*module._DEFAULT_LIMITS, *module._RAISED_LIMITS), 1 << 30) | limits
+        self.requests: list[dict[str, Any]] = []
+
+    def request_device_sync(self, **request: Any) -> Any:
+        self.requests.append(request)
+        return type("FakeDevice", (), {"queue": None})()
+
+
+def test_adapters_are_ordered_and_opengl_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    kinds = [("soft", "CPU"), ("odd", "Unknown"), ("big", "DiscreteGPU"), ("small", "IntegratedGPU")]
+    adapters = [_Adapter(*kind) for kind in kinds] + [_Adapter("big", "DiscreteGPU", "OpenGL")]
+    instance = type("Instance", (), {"enumerate_adapters_sync": lambda self: adapters})()
+    monkeypatch.setattr(module, "_instance", lambda: instance)
+    assert [(info.name, info.kind, info.backend) for info in list_devices()] == [
+        ("big", "discrete", "Vulkan"),
+        ("small", "integrated", "Vulkan"),
+        ("odd", "other", "Vulkan"),
+        ("soft", "cpu", "Vulkan"),
+    ]
+
+
+# What is asked of it
+
+
+def test_only_features_with_a_use_are_requested_and_no_float_atomics() -> None:
+    adapter = _Adapter("soft", "CPU")
+    Device(adapter, SOFTWARE)
+    assert adapter.requests[0]["required_features"] == ["mappable-primary-buffers", "subgroup"]
+    Device(adapter, SOFTWARE, subgroups=False)
+    assert adapter.requests[1]["required_features"] == ["mappable-primary-buffers"]
+
+
+def test_limits_are_the_webgpu_defaults_and_larger_bindings() -> None:
+    adapter = _Adapter("soft", "CPU")
+    Device(adapter, SOFTWARE, default_limits=True)
+    Device(adapter, SOFTWARE)
+    default, raised = (request["required_limits"] for request in adapter.requests)
+    assert default["max-storage-buffers-per-shader-stage"] == raised["max-storage-buffers-per-shader-stage"] == 8
+    assert default["max-storage-buffer-binding-size"] == 128 << 20
+    assert default.get("max-storage-textures-per-shader-stage", 4) == 4
+    assert raised["max-storage-buffer-binding-size"] == 1 << 30
+
+
+def test_an_adapter_below_the_limits_is_refused() -> None:
+    adapter = _Adapter("tiny", "IntegratedGPU", **{"max-compute-workgroup-storage-size": 8192})
+    expected = "'Chip Graphics' offers max-compute-workgroup-storage-size = 8192, but 16384"
+    with pytest.raises(NoAdapterError, match=expected):
+        Device(adapter, INTEGRATED)
+
+
+def test_only_devices_that_share_memory_are_mapped() -> None:
+    adapter = _Adapter("any", "CPU")
+    assert Device(adapter, SOFTWARE).mappable
+    assert Device(adapter, INTEGRATED).mappable
+    assert not Device(adapter, DISCRETE).mappable
+    adapter.features.discard("mappable-primary-buffers")
+    assert not Device(adapter, SOFTWARE).mappable
+
+
+# This machine's
+
+
+def test_this_machine_has_an_adapter() -> None:
+    found = list_devices()
+    assert found
+    assert all(info.kind in ("discrete", "integrated", "other", "cpu") for info in found)
+
+
+def test_one_device_a_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    kind = list_devices()[0].kind
+    assert open_device(kind) is open_device(kind)
+    assert open_device(kind).info == list_devices()[0]
+
+
+@pytest.mark.kernels
+def test_subgroup_size_is_measured(device: Device, configuration: str) -> None:
+    assert "shader-float32-atomic" not in device.features
+    if configuration == "no-subgroups" or "subgroup" not in device.features:
+        assert device.subgroup_size == 0
+        return
+    width = re.search(r"llvmpipe .*, (\d+) bits", device.info.name)
+    if width:  # Mesa's software driver runs 32 bits a lane
+        assert device.subgroup_size == int(width[1]) // 32
+    else:
+        assert device.subgroup_size in (0, 4, 8, 16, 32, 64, 128)

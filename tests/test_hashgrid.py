@@ -1,0 +1,280 @@
+"""The hash encoder's kernels against its plain-torch twin."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from scenes import relative
+from torch import Tensor
+
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.motion.hashgrid import TIME, HashConfig, HashEncoder, HashGrid, encode_reference, make_levels
+
+pytestmark = pytest.mark.kernels
+
+BOUND = 1.5
+both_shapes = pytest.mark.parametrize("lane_levels", [True, False], ids=["lane levels", "fixed point"])
+
+# Each with a way of its own through the kernels.
+GRIDS: dict[str, tuple[HashConfig, tuple[int, int, int]]] = {
+    "dense": (HashConfig(3, (4, 5, 6), (9, 8, 7)), (0, 1, 2)),
+    "hashed": (HashConfig(5, (4, 4, 4), (60, 50, 40), table_log2=9), (0, 1, 2)),
+    "sliced": (HashConfig(9, (4, 4, 4), (20, 16, 12)), (0, 1, TIME)),
+    "sliced and hashed": (HashConfig(4, (6, 6, 6), (40, 30, 30), table_log2=11), (1, 2, TIME)),
+    "too large to slice": (HashConfig(3, (8, 8, 4), (200, 150, 9)), (0, 2, TIME)),
+    "one level": (HashConfig(1, (7, 7, 7), (7, 7, 7)), (0, 1, 2)),
+    "flat in time": (HashConfig(2, (8, 8, 2), (16, 16, 2)), (0, 1, TIME)),
+}
+
+
+def make_grids(*names: str) -> list[HashGrid]:
+    """With features of size 1, where training starts at 1e-4."""
+    generator = torch.Generator().manual_seed(0)
+    grids = [HashGrid(*GRIDS[name], generator) for name in names]
+    for grid in grids:
+        torch.nn.init.normal_(grid.table, generator=generator)
+    return grids
+
+
+def random_points(count: int, seed: int = 0) -> Tensor:
+    """Most of them inside the box; some outside, some on its faces, edges and corners."""
+    generator = torch.Generator().manual_seed(seed)
+    points = BOUND * 2.2 * (torch.rand(count, 3, generator=generator) - 0.5)
+    points[::17] = points[::17].sign() * BOUND
+    points[5::23, 1] = BOUND
+    points[7::29, 2] = -BOUND
+    return points
+
+
+def run(encoder: HashEncoder, points: Tensor, time: float, seed: int = 0) -> tuple[list[Tensor], list[Tensor]]:
+    """Encodings, and the gradients of the tables for random gradients of the encodings."""
+    for grid in encoder.grids:
+        grid.table.grad = None
+    encodings = encoder(points, time)
+    generator = torch.Generator().manual_seed(seed)
+    torch.autograd.backward(encodings, [torch.randn(*e.shape, generator=generator) for e in encodings])
+    gradients = [grid.table.grad for grid in encoder.grids]
+    return [e.detach() for e in encodings], [torch.empty(0) if g is None else g for g in gradients]
+
+
+def run_reference(
+    grids: list[HashGrid], points: Tensor, time: float, seed: int = 0
+) -> tuple[list[Tensor], list[Tensor]]:
+    tables = [grid.table.detach().double().requires_grad_() for grid in grids]
+    encodings = [encode_reference(g, t, points, time, BOUND) for g, t in zip(grids, tables, strict=True)]
+    generator = torch.Generator().manual_seed(seed)
+    upstream = [torch.randn(*e.shape, generator=generator).double() for e in encodings]
+    return [e.detach() for e in encodings], list(torch.autograd.grad(encodings, tables, upstream))
+
+
+def check(encoder: HashEncoder, points: Tensor, time: float) -> None:
+    encodings, gradients = run(encoder, points, time)
+    expected, expected_gradients = run_reference(encoder.grids, points, time)
+    for found, exact in zip(encodings, expected, strict=True):
+        assert found.shape == exact.shape
+        torch.testing.assert_close(found.double(), exact, rtol=0, atol=2e-5)  # cells are found in float32
+    for found, exact in zip(gradients, expected_gradients, strict=True):
+        assert found.shape == exact.shape
+        assert relative(found, exact) < 2e-6
+
+
+# Against the twin
+
+
+@both_shapes
+@pytest.mark.parametrize("name", GRIDS)
+def test_each_kind_of_grid(device: Device, lane_levels: bool, name: str) -> None:
+    encoder = HashEncoder(device, make_grids(name), BOUND, lane_levels=lane_levels)
+    for time in (0.0, 0.37, 1.0):
+        check(encoder, random_points(700), time)
+
+
+@both_shapes
+def test_several_grids_at_once(device: Device, lane_levels: bool) -> None:
+    grids = make_grids("dense", "sliced", "sliced and hashed", "too large to slice", "hashed")
+    encoder = HashEncoder(device, grids, BOUND, lane_levels=lane_levels)
+    check(encoder, random_points(2000), 0.613)
+
+
+@both_shapes
+@pytest.mark.parametrize("count", [0, 1, 2, 63, 64, 65, 511, 512, 513])
+def test_any_number_of_points(device: Device, lane_levels: bool, count: int) -> None:
+    encoder = HashEncoder(device, make_grids("sliced", "hashed"), BOUND, lane_levels=lane_levels)
+    check(encoder, 0.5 * random_points(count, seed=count), 0.9)
+
+
+@both_shapes
+def test_all_points_in_one_cell(device: Device, lane_levels: bool) -> None:
+    """A few entries take the sums of all points."""
+    encoder = HashEncoder(device, make_grids("sliced", "hashed"), BOUND, lane_levels=lane_levels)
+    check(encoder, 0.2 + 1e-4 * random_points(3000), 0.5)
+
+
+def test_the_levels_go_every_way() -> None:
+    """That the grids above are what their names say."""
+    grids = dict(zip(GRIDS, make_grids(*GRIDS), strict=True))
+    assert all(level.dense for level in grids["dense"].levels)
+    assert not all(level.dense for level in grids["hashed"].levels)
+    assert len(grids["sliced"].sliced) == 9
+    mixed = grids["sliced and hashed"]
+    assert 0 < len(mixed.sliced) < len(mixed.levels)
+    assert {level.dense for i, level in enumerate(mixed.levels) if i not in mixed.sliced} == {False}
+    large = grids["too large to slice"]
+    assert {level.dense for i, level in enumerate(large.levels) if i not in large.sliced} == {True}
+    assert not grids["dense"].sliced
+
+
+# Known values
+
+
+def corner(*place: int, resolution: int) -> list[float]:
+    return [BOUND * (2 * p / (resolution - 1) - 1) for p in place]
+
+
+def test_entries_are_met_at_the_corners(device: Device) -> None:
+    grid = make_grids("one level")[0]
+    points = torch.tensor([corner(x, y, z, resolution=7) for z in range(7) for y in range(7) for x in range(7)])
+    (found,) = HashEncoder(device, [grid], BOUND)(points.clamp(-BOUND, BOUND))
+    torch.testing.assert_close(found, grid.table.detach(), rtol=0, atol=1e-4)
+
+
+def test_interpolation_is_smooth_and_keeps_constants(device: Device) -> None:
+    """Weights f^2 (3 - 2f) along each axis."""
+    grid = make_grids("one level")[0]
+    with torch.no_grad():
+        table = grid.table.view(7, 7, 7, 2)  # z, y, x
+        table[..., 0], table[..., 1] = 1.0, 0.0
+        table[:, :, 3, 1] = 1.0  # a wall at the fourth entry along x
+    share = torch.linspace(0, 1, 11)
+    x = BOUND * (2 * (2 + share) / 6 - 1)
+    points = torch.stack([x, 0.3 * torch.ones(11), -0.7 * torch.ones(11)], dim=1)
+    (found,) = HashEncoder(device, [grid], BOUND)(points)
+    torch.testing.assert_close(found[:, 0], torch.ones(11), rtol=0, atol=1e-6)
+    torch.testing.assert_close(found[:, 1], share * share * (3 - 2 * share), rtol=0, atol=1e-5)
+
+
+@both_shapes
+def test_nothing_outside_the_box(device: Device, lane_levels: bool) -> None:
+    inside = 0.9 * BOUND * (torch.rand(50, 3) - 0.5)
+    beyond = torch.tensor([[1.01, 0, 0], [0, -1.01, 0], [0, 0, 5.0], [-3, 3, -3], [math.nan, 0, 0], [0, math.inf, 0]])
+    encoder = HashEncoder(device, make_grids("dense", "sliced"), BOUND, lane_levels=lane_levels)
+    alone = run(encoder, inside, 0.3)
+    found, gradients = run(encoder, torch.cat([inside, BOUND * beyond]), 0.3)
+    # "sliced" covers x, y and time alone: z may be anything there.
+    over_xy = torch.tensor([False, False, True, False, False, False])
+    assert not found[0][50:].any()
+    assert not found[1][50:][~over_xy].any()
+    assert found[1][50:][over_xy].any()
+    for encoding, expected in zip(found, alone[0], strict=True):
+        assert torch.equal(encoding[:50], expected)
+    assert all(gradient.isfinite().all() for gradient in gradients)
+
+
+def test_levels_grow_from_the_coarsest_to_the_finest() -> None:
+    levels = make_levels(HashConfig(5, (4, 6, 8), (64, 6, 128), table_log2=12))
+    assert levels[0].resolution == (4, 6, 8)
+    assert levels[-1].resolution == (64, 6, 128)
+    assert [level.resolution[0] for level in levels] == [4, 8, 16, 32, 64]
+    assert [level.first for level in levels] == [sum(other.entries for other in levels[:i]) for i in range(5)]
+    assert all(level.entries == min(4096, math.prod(level.resolution)) for level in levels)
+
+
+# The same bits
+
+
+@both_shapes
+def test_the_same_bits_again(device: Device, lane_levels: bool) -> None:
+    names = ("sliced", "sliced and hashed", "too large to slice", "hashed")
+    points = random_points(3000)
+    encoder = HashEncoder(device, make_grids(*names), BOUND, lane_levels=lane_levels)
+    first = run(encoder, points, 0.4)
+    run(encoder, random_points(5000, seed=1), 0.9)
+    run(encoder, random_points(10, seed=2), 0.0)
+    again = run(encoder, points, 0.4)
+    fresh = run(HashEncoder(device, make_grids(*names), BOUND, lane_levels=lane_levels), points, 0.4)
+    for other in (again, fresh):
+        for a, b in zip((*first[0], *first[1]), (*other[0], *other[1]), strict=True):
+            assert torch.equal(a, b)
+
+
+def test_fixed_point_does_not_depend_on_the_order(device: Device) -> None:
+    """Integer sums: the points in any order give the same bits, which sums of floats do not."""
+    points, names = random_points(3000), ("hashed", "sliced")
+    order = torch.randperm(3000, generator=torch.Generator().manual_seed(0))
+    encoder = HashEncoder(device, make_grids(*names), BOUND, lane_levels=False)
+    upstream = [torch.randn(3000, grid.features, generator=torch.Generator().manual_seed(1)) for grid in encoder.grids]
+    forwards = encoder.backward(points, 0.4, upstream)
+    shuffled = encoder.backward(points[order], 0.4, [d[order] for d in upstream])
+    assert torch.equal(forwards[0], shuffled[0])
+    assert torch.equal(forwards[1], shuffled[1])
+
+
+def test_both_shapes_agree(device: Device) -> None:
+    """64-bit fixed point keeps what float32 keeps."""
+    names = ("sliced", "too large to slice", "hashed")
+    results = []
+    for lane_levels in (True, False):
+        encoder = HashEncoder(device, make_grids(*names), BOUND, lane_levels=lane_levels)
+        results.append(run(encoder, random_points(3000), 0.4))
+    (encodings, gradients), (other_encodings, other_gradients) = results
+    assert all(torch.equal(a, b) for a, b in zip(encodings, other_encodings, strict=True))
+    for a, b in zip(gradients, other_gradients, strict=True):
+        assert relative(b, a) < 1e-6
+
+
+@pytest.mark.parametrize("size", [1e-30, 1e-12, 1.0, 1e12, 1e30])
+@both_shapes
+def test_gradients_of_any_size(device: Device, lane_levels: bool, size: float) -> None:
+    encoder = HashEncoder(device, make_grids("sliced", "hashed"), BOUND, lane_levels=lane_levels)
+    points = random_points(500)
+    upstream = [torch.randn(500, grid.features, generator=torch.Generator().manual_seed(1)) for grid in encoder.grids]
+    plain = encoder.backward(points, 0.4, upstream)
+    scaled = encoder.backward(points, 0.4, [size * d for d in upstream])
+    for a, b in zip(plain, scaled, strict=True):
+        assert relative(b.double() / size, a) < 1e-5
+    assert not any(d.any() for d in encoder.backward(points, 0.4, [0 * d for d in upstream]))
+
+
+@both_shapes
+def test_small_gradients_beside_large_ones(device: Device, lane_levels: bool) -> None:
+    """Seven orders of magnitude between points: the small ones are still there, each in its own entries."""
+    encoder = HashEncoder(device, make_grids("dense"), BOUND, lane_levels=lane_levels)
+    points = torch.tensor([[-1.4, -1.4, -1.4], [1.4, 1.4, 1.4]])
+    upstream = torch.ones(2, encoder.grids[0].features)
+    upstream[1] *= 1e-7
+    (found,) = encoder.backward(points, 0.0, [upstream])
+    alone = encoder.backward(points[1:], 0.0, [upstream[1:]])[0]
+    rows = alone.abs().sum(1) > 0
+    rows &= encoder.backward(points[:1], 0.0, [upstream[:1]])[0].abs().sum(1) == 0
+    assert rows.any()
+    torch.testing.assert_close(found[rows], alone[rows], rtol=1e-5, atol=0)
+
+
+# As part of torch
+
+
+def test_gradients_reach_the_tables_and_not_the_points(device: Device) -> None:
+    grids = make_grids("dense", "sliced")
+    encoder = HashEncoder(device, grids, BOUND)
+    points = random_points(100).requires_grad_()
+    first, _ = encoder(points, 0.2)
+    first.square().sum().backward()
+    assert points.grad is None
+    assert grids[0].table.grad is not None
+    assert grids[0].table.grad.any()
+    second = grids[1].table.grad
+    assert second is None or not second.any()
+
+
+def test_tables_are_read_anew_at_each_call(device: Device) -> None:
+    grids = make_grids("dense", "sliced")
+    encoder = HashEncoder(device, grids, BOUND)
+    points = random_points(50)
+    before = [e.detach() for e in encoder(points, 0.2)]
+    with torch.no_grad():
+        for grid in grids:
+            grid.table *= 2
+    for a, b in zip(before, encoder(points, 0.2), strict=True):
+        torch.testing.assert_close(2 * a, b.detach())

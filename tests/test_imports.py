@@ -1,0 +1,118 @@
+"""What may import what: gpu <- splat <- motion <- train <- cli, with data and io as leaves; and what `import` does."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import lapgs_wgpu
+
+PACKAGE = Path(lapgs_wgpu.__file__).parent
+
+# For each part of the package, the parts that it may import besides itself. A dotted name allows that module alone.
+ALLOWED = {
+    "errors": set(),
+    "gpu": {"errors"},
+    "splat": {"errors", "gpu"},
+    "motion": {"errors", "gpu", "splat", "io"},
+    "data": {"errors", "splat.camera"},
+    "io": {"errors"},
+    "train": {"errors", "gpu", "splat", "motion", "data", "io"},
+    "cli": {"errors", "gpu", "splat", "motion", "data", "io", "train"},
+}
+FILES = sorted(file.relative_to(PACKAGE) for file in PACKAGE.rglob("*.py"))
+
+
+def part_of(file: Path) -> str:
+    """The part of the package to which a file belongs."""
+    return file.parts[0].removesuffix(".py")
+
+
+def imports(file: Path) -> list[str]:
+    """The package's own modules that a file imports anywhere, dotted, without the package's name."""
+    found = []
+    folder = ("lapgs_wgpu", *file.parent.parts)
+    for node in ast.walk(ast.parse((PACKAGE / file).read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            base = folder[: len(folder) - node.level + 1] if node.level else ()
+            module = ".".join((*base, *((node.module,) if node.module else ())))
+            found += [f"{module}.{alias.name}" for alias in node.names]
+    return [name.removeprefix("lapgs_wgpu.") for name in found if name.split(".")[0] == "lapgs_wgpu"]
+
+
+def test_every_part_has_a_rule() -> None:
+    parts = {part_of(file) for file in FILES} - {"__init__", "__main__"}
+    assert {"gpu", "splat", "motion", "data", "io"} <= parts
+    assert parts - {"shaders", "configs", "viewer"} <= set(ALLOWED)
+
+
+@pytest.mark.parametrize("file", [file for file in FILES if part_of(file) in ALLOWED], ids=str)
+def test_imports_go_downwards(file: Path) -> None:
+    part = part_of(file)
+    allowed = ALLOWED[part] | {part}
+    for name in imports(file):
+        assert any(name == each or name.startswith(f"{each}.") for each in allowed), f"{part} must not import {name}"
+
+
+def test_the_rule_sees_imports(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Relative ones, absolute ones, and those inside functions."""
+    (tmp_path / "splat").mkdir()
+    (tmp_path / "splat" / "odd.py").write_text(
+        "from . import camera\nfrom ..gpu.device import Device\nfrom .. import train\nimport lapgs_wgpu.io.ply\n"
+        "def f():\n    from lapgs_wgpu.motion import field\nimport numpy\nfrom .camera import Camera\n"
+    )
+    monkeypatch.setattr(sys.modules[__name__], "PACKAGE", tmp_path)
+    expected = ["splat.camera", "gpu.device.Device", "train", "io.ply", "motion.field", "splat.camera.Camera"]
+    assert sorted(imports(Path("splat/odd.py"))) == sorted(expected)
+
+
+# What `import` does
+
+
+def run(program: str) -> str:
+    done = subprocess.run([sys.executable, "-W", "error", "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    return done.stdout
+
+
+def test_import_is_light_and_silent() -> None:
+    assert run("import lapgs_wgpu") == ""
+    loaded = run("import sys, lapgs_wgpu; print(*sys.modules)").split()
+    assert not {"torch", "wgpu", "numpy", "scipy"} & set(loaded)
+
+
+@pytest.mark.parametrize("module", ["errors", "io.checkpoint", "splat.camera", "data.dnerf"])
+def test_readers_need_neither_torch_nor_a_device(module: str) -> None:
+    loaded = run(f"import sys, lapgs_wgpu.{module}; print(*sys.modules)").split()
+    assert not {"torch", "wgpu"} & set(loaded)
+
+
+def test_torchs_threads_are_told_to_sleep() -> None:
+    assert run("import os, lapgs_wgpu; print(os.environ['OMP_WAIT_POLICY'])").strip() == "PASSIVE"
+    chosen = "import os; os.environ['OMP_WAIT_POLICY'] = 'ACTIVE'; import lapgs_wgpu; "
+    assert run(chosen + "print(os.environ['OMP_WAIT_POLICY'])").strip() == "ACTIVE", "what the user chose stands"
+
+
+def test_no_module_opens_a_device_when_imported() -> None:
+    modules = ["lapgs_wgpu." + ".".join(file.with_suffix("").parts) for file in FILES if file.name[0] != "_"]
+    program = (
+        f"import importlib\nfor name in {modules!r}: importlib.import_module(name)\n"
+        "from lapgs_wgpu.gpu import device\nprint(device._instance.cache_info().currsize)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == "0"
+
+
+def test_public_names_are_there() -> None:
+    for name in lapgs_wgpu.__all__:
+        assert getattr(lapgs_wgpu, name).__name__ == name
+    with pytest.raises(AttributeError, match="module 'lapgs_wgpu' has no attribute 'no_such_name'"):
+        _ = lapgs_wgpu.no_such_name

@@ -1,0 +1,367 @@
+"""Buffers, and kernels that take them by name."""
+
+from __future__ import annotations
+
+import struct
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import open_test_device
+from numpy.typing import NDArray
+
+from lapgs_wgpu.gpu import shader
+from lapgs_wgpu.gpu.buffer import Buffer, BufferPool, read_all
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.kernel import Commands, Kernel
+from lapgs_wgpu.gpu.shader import ShaderError
+
+pytestmark = pytest.mark.kernels
+
+ADD = """
+@group(0) @binding(0) var<storage, read> a: array<u32>;
+@group(0) @binding(1) var<storage, read_write> sum: array<u32>;
+@compute @workgroup_size(1)
+fn main(@builtin(workgroup_id) group: vec3<u32>) { sum[group.x] += a[group.x]; }
+"""
+
+
+@pytest.fixture
+def wgsl(monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
+    """Shader files by name, besides those on disk."""
+    texts: dict[str, str] = {"add": ADD}
+    on_disk = shader.shader_text
+    monkeypatch.setattr(shader, "shader_text", lambda name: texts[name] if name in texts else on_disk(name))
+    return texts
+
+
+@pytest.fixture(scope="module", params=["as it is", "mapped", "staged"])
+def either(device: Device, configuration: str, request: pytest.FixtureRequest) -> Device:
+    """The device, and one of each way to its memory."""
+    if request.param == "as it is":
+        return device
+    other = open_test_device(configuration)
+    if request.param == "mapped" and "mappable-primary-buffers" not in other.features:
+        pytest.skip("this adapter cannot map its buffers")
+    other.mappable = request.param == "mapped"
+    return other
+
+
+def numbers(device: Device, values: Any, label: str = "numbers", room: int = 0) -> Buffer:
+    array = np.asarray(values, np.uint32)
+    buffer = Buffer(device, max(array.nbytes, room), label)
+    buffer.write(array)
+    return buffer
+
+
+def add(device: Device) -> Kernel:
+    return Kernel(device, "add", {})
+
+
+# Binding by name
+
+
+def test_missing_and_unknown_buffers_are_named(device: Device, wgsl: dict[str, str]) -> None:
+    a = numbers(device, [1])
+    expected = r"shaders/add\.wgsl: missing buffers \['sum'\], unknown buffers \['summ'\]"
+    with Commands(device) as commands, pytest.raises(ShaderError, match=expected):
+        commands.dispatch(add(device), 1, a=a, summ=a)
+
+
+def test_what_is_not_a_buffer_is_named(device: Device, wgsl: dict[str, str]) -> None:
+    a = numbers(device, [1])
+    for given, expected in (
+        ({"a": a, "sum": np.zeros(4)}, r"add\.wgsl: sum must be a Buffer, got ndarray"),
+        ({"a": None, "sum": a}, r"add\.wgsl: a must be a Buffer, got NoneType"),
+    ):
+        with Commands(device) as commands, pytest.raises(ShaderError, match=expected):
+            commands.dispatch(add(device), 1, **given)
+
+
+def test_a_binding_beyond_the_limit_is_refused(device: Device, wgsl: dict[str, str]) -> None:
+    a = numbers(device, [1])
+    limit = device.max_binding
+    part = (a, 0, limit + 16)
+    expected = f"a of the pass add needs {limit + 16} bytes in one binding, but .* allows {limit}"
+    with Commands(device) as commands, pytest.raises(MemoryError, match=expected):
+        commands.dispatch(add(device), 1, a=part, sum=a)
+
+
+def test_a_buffer_beyond_the_limit_is_refused(device: Device) -> None:
+    limit = device.limits["max-buffer-size"]
+    with pytest.raises(MemoryError, match=f"buffer 'huge' needs .* bytes, but a buffer of this device holds {limit}"):
+        Buffer(device, limit + 1, "huge")
+
+
+def test_too_many_storage_buffers_are_counted(device: Device, wgsl: dict[str, str]) -> None:
+    declare = "@group(0) @binding({0}) var<storage, read> b{0}: array<u32>;\n"
+    wgsl["many"] = "".join(declare.format(i) for i in range(9)) + "@compute @workgroup_size(1) fn main() {}"
+    with pytest.raises(ShaderError, match=r"shaders/many\.wgsl binds 9 storage buffers; the device allows 8"):
+        Kernel(device, "many", {})
+
+
+def test_wgsl_that_does_not_compile_is_named(device: Device, wgsl: dict[str, str]) -> None:
+    wgsl["broken"] = "@compute @workgroup_size(1) fn main() { let a: u32 = 1.5; }"
+    with pytest.raises(ShaderError, match=r"shaders/broken\.wgsl does not compile"):
+        Kernel(device, "broken", {})
+
+
+def test_kernels_are_compiled_once(device: Device) -> None:
+    assert Kernel.get(device, "compact") is Kernel.get(device, "compact")
+    assert Kernel.get(device, "emit", TILE_W=8, TILE_H=8) is Kernel.get(device, "emit", TILE_H=8, TILE_W=8)
+    assert Kernel.get(device, "emit", TILE_W=8, TILE_H=8) is not Kernel.get(device, "emit", TILE_W=16, TILE_H=8)
+
+
+def test_a_part_of_a_buffer_can_be_bound(device: Device, wgsl: dict[str, str]) -> None:
+    a, total = numbers(device, range(200)), numbers(device, [0] * 4)
+    with Commands(device) as commands:
+        commands.dispatch(add(device), 3, a=(a, 256, 16), sum=total)
+    assert total.read("uint32", (4,)).tolist() == [64, 65, 66, 0]
+
+
+def test_what_is_bound_follows_a_buffer_that_grew(device: Device, wgsl: dict[str, str]) -> None:
+    """Bind groups are kept; none may outlive its buffer. More buffers than the cache holds."""
+    kernel, pool, total = add(device), BufferPool(device), numbers(device, [0] * 4)
+    for size in range(1, 100):
+        a = pool.get("a", 16 * size)
+        a.write(np.array([size], np.uint32))
+        with Commands(device) as commands:
+            commands.dispatch(kernel, 1, a=a, sum=total)
+    assert total.read("uint32", (1,))[0] == sum(range(1, 100))
+
+
+def test_uniforms_are_laid_out_as_wgsl_reads_them(device: Device, wgsl: dict[str, str]) -> None:
+    wgsl["members"] = """
+struct Mixed { a: f32, b: vec2<f32>, c: vec3<f32>, d: u32, e: vec3<f32>, f: mat4x4<f32>, g: vec2<u32>, h: i32 }
+@group(0) @binding(0) var<uniform> mixed: Mixed;
+@group(0) @binding(1) var<storage, read_write> out: array<f32>;
+@compute @workgroup_size(1)
+fn main() {
+    let m = mixed;
+    out[0] = m.a; out[1] = m.b.x; out[2] = m.b.y; out[3] = m.c.x; out[4] = m.c.y; out[5] = m.c.z; out[6] = f32(m.d);
+    out[7] = m.e.x; out[8] = m.e.y; out[9] = m.e.z; out[26] = f32(m.g.x); out[27] = f32(m.g.y); out[28] = f32(m.h);
+    for (var i = 0u; i < 16u; i++) { out[10u + i] = m.f[i / 4u][i % 4u]; }
+}
+"""
+    kernel = Kernel(device, "members", {})
+    packed = kernel.uniform("Mixed", a=0, b=(1, 2), c=(3, 4, 5), d=6, e=(7, 8, 9), f=range(10, 26), g=(26, 27), h=-28)
+    out = Buffer(device, 4 * 29, "out")
+    with Commands(device) as commands:
+        commands.dispatch(kernel, 1, mixed=BufferPool(device).constant("mixed", packed), out=out)
+    assert out.read("float32", (29,)).tolist() == [*range(28), -28]
+
+
+# Commands
+
+
+def test_dispatches_see_what_those_before_them_wrote(device: Device, wgsl: dict[str, str]) -> None:
+    a, b = numbers(device, [1, 2, 3, 4]), numbers(device, [0] * 4)
+    with Commands(device) as commands:
+        for _ in range(10):
+            commands.dispatch(add(device), 4, a=a, sum=b)
+            commands.dispatch(add(device), 4, a=b, sum=a)
+    fibonacci = [0, 1]
+    while len(fibonacci) < 22:
+        fibonacci.append(fibonacci[-1] + fibonacci[-2])
+    assert b.read("uint32", (4,)).tolist() == [fibonacci[20] * k for k in (1, 2, 3, 4)]
+
+
+def test_nothing_runs_where_the_block_fails(device: Device, wgsl: dict[str, str]) -> None:
+    a, b = numbers(device, [1]), numbers(device, [5])
+
+    def fail() -> None:
+        with Commands(device) as commands:
+            commands.dispatch(add(device), 1, a=a, sum=b)
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail()
+    assert b.read("uint32", (1,))[0] == 5
+
+
+def test_clearing_all_or_the_beginning(device: Device) -> None:
+    a, b = numbers(device, range(1, 9)), numbers(device, range(1, 9))
+    with Commands(device) as commands:
+        commands.clear(a)
+        commands.clear(b, 12)
+    assert a.read("uint32", (8,)).tolist() == [0] * 8
+    assert b.read("uint32", (8,)).tolist() == [0, 0, 0, 4, 5, 6, 7, 8]
+
+
+@pytest.mark.parametrize("groups", [0, 1, 65_535, 65_536, 70_001, 131_071])
+def test_more_groups_than_one_dimension_holds(device: Device, wgsl: dict[str, str], groups: int) -> None:
+    wgsl["visit"] = """
+#import common/index
+@group(0) @binding(0) var<storage, read_write> visits: array<atomic<u32>>;
+@compute @workgroup_size(1)
+fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
+    atomicAdd(&visits[min(workgroup_number(group, groups), arrayLength(&visits) - 1u)], 1u);
+}
+"""
+    visits = Buffer(device, 4 * 131_200, "visits")
+    with Commands(device) as commands:
+        commands.dispatch(Kernel(device, "visit", {}), groups, visits=visits)
+    seen = visits.read("uint32", (131_200,))
+    assert (seen[:groups] == 1).all()
+    assert seen[groups:].sum() <= 2  # those that fill the last row
+
+
+# Tables
+
+
+@pytest.mark.parametrize("count", [1, 4095, 4096, 4097, 20_000])
+@pytest.mark.parametrize("kind", ["f32", "u32", "vec2<f32>", "vec4<u32>"])
+def test_tables_hold_what_the_buffer_holds(device: Device, wgsl: dict[str, str], kind: str, count: int) -> None:
+    """Through textures where the device reads tables so: whole rows and a rest, and again after each kind of change."""
+    width, scalar = (int(kind[3]) if kind[0] == "v" else 1), "f32" if "f32" in kind else "u32"
+    dtype = "float32" if scalar == "f32" else "uint32"
+    wgsl["copy"] = f"""
+#table 0 source: {kind}
+@group(0) @binding(1) var<storage, read_write> target_: array<{kind}>;
+@compute @workgroup_size(64)
+fn main(@builtin(global_invocation_id) id: vec3<u32>) {{
+    if (id.x < {count}u) {{ target_[id.x] = source_at(id.x); }}
+}}
+"""
+    wgsl["double"] = f"""
+@group(0) @binding(0) var<storage, read_write> target_: array<{scalar}>;
+@compute @workgroup_size(64)
+fn main(@builtin(global_invocation_id) id: vec3<u32>) {{
+    if (id.x < {count * width}u) {{ target_[id.x] *= {scalar}(2); }}
+}}
+"""
+    copy = Kernel(device, "copy", {"TEXTURES": 1} if device.textures else {})
+    double = Kernel(device, "double", {})
+    source, target = (Buffer(device, 4 * width * count, name) for name in ("source", "target"))
+    values = np.random.default_rng(0).integers(0, 1 << 23, width * count).astype(dtype)
+
+    def run(*, change: Kernel | None) -> NDArray[Any]:
+        with Commands(device) as commands:
+            if change is not None:
+                commands.dispatch(change, -(-count * width // 64), target_=source)
+            commands.dispatch(copy, -(-count // 64), source=source, target_=target)
+        return target.read(dtype, (width * count,))
+
+    source.write(values)
+    np.testing.assert_array_equal(run(change=None), values)
+    np.testing.assert_array_equal(run(change=double), 2 * values)
+    source.write(values[:1], offset=0)
+    assert run(change=None)[0] == values[0]
+    with Commands(device) as commands:
+        commands.clear(source)
+    np.testing.assert_array_equal(run(change=None), 0 * values)
+
+
+def test_a_table_whose_copy_was_never_submitted(device: Device, wgsl: dict[str, str]) -> None:
+    """Commands that fail leave nothing behind, and no belief that something was done."""
+    wgsl["copy"] = """
+#table 0 source: u32
+@group(0) @binding(1) var<storage, read_write> target_: array<u32>;
+@compute @workgroup_size(1)
+fn main() { target_[0] = source_at(0u); }
+"""
+    copy = Kernel(device, "copy", {"TEXTURES": 1} if device.textures else {})
+    source, target = numbers(device, [7]), numbers(device, [0])
+
+    def fail() -> None:
+        with Commands(device) as commands:
+            commands.dispatch(copy, 1, source=source, target_=target)
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail()
+    with Commands(device) as commands:
+        commands.dispatch(copy, 1, source=source, target_=target)
+    assert target.read("uint32", (1,))[0] == 7
+
+
+# Reading and writing
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 5, 16_384, 16_385, 100_001])
+def test_what_is_written_is_read(either: Device, count: int) -> None:
+    """Up to 64 KiB, and beyond, where a staged write takes another way."""
+    values = np.random.default_rng(count).integers(0, 1 << 32, count, dtype=np.uint32)
+    buffer = Buffer(either, values.nbytes, "values")
+    assert not buffer.read("uint32", (count,)).any()
+    buffer.write(values)
+    np.testing.assert_array_equal(buffer.read("uint32", (count,)), values)
+    buffer.write(values[::-1])  # not contiguous
+    np.testing.assert_array_equal(buffer.read("uint32", (count,)), values[::-1])
+
+
+@pytest.mark.parametrize("count", [1, 3, 17_001])
+def test_writing_a_part_leaves_the_rest(either: Device, count: int) -> None:
+    before = np.arange(20_000, dtype=np.uint32)
+    buffer = numbers(either, before)
+    buffer.write(np.full(count, 7, np.uint32), offset=800)
+    after = buffer.read("uint32", (20_000,))
+    before[200 : 200 + count] = 7
+    np.testing.assert_array_equal(after, before)
+    np.testing.assert_array_equal(buffer.read("uint32", (3, 5), offset=792), before[198:213].reshape(3, 5))
+
+
+def test_types_and_shapes_are_kept(either: Device) -> None:
+    values = np.random.default_rng(0).standard_normal((7, 3)).astype(np.float32)
+    buffer = Buffer(either, values.nbytes, "values")
+    buffer.write(values)
+    np.testing.assert_array_equal(buffer.read("float32", (7, 3)), values)
+    buffer.write(np.zeros(0, np.float32))
+    assert buffer.read("float32", (0, 3)).shape == (0, 3)
+    np.testing.assert_array_equal(buffer.read("float32", (7, 3)), values)
+
+
+def test_what_is_read_is_a_copy(either: Device) -> None:
+    buffer = numbers(either, [1, 2, 3, 4])
+    first = buffer.read("uint32", (4,))
+    buffer.write(np.array([9, 9, 9, 9], np.uint32))
+    assert first.tolist() == [1, 2, 3, 4]
+
+
+def test_several_buffers_are_read_at_once(either: Device) -> None:
+    a, b = numbers(either, [1, 2, 3, 4, 5]), numbers(either, range(100))
+    requests = [(b, "uint32", (2,), 8), (a, "uint32", (5,), 0), (b, "uint32", (1,), 16 * 24)]
+    assert [array.tolist() for array in read_all(requests)] == [[2, 3], [1, 2, 3, 4, 5], [96]]
+
+
+def test_reading_and_writing_beyond_the_end_is_refused(either: Device) -> None:
+    buffer = numbers(either, range(4), "short")
+    with pytest.raises(ValueError, match="short: 20 bytes do not fit into 16"):
+        buffer.write(np.arange(5, dtype=np.uint32))
+    with pytest.raises(ValueError, match="short: 24 bytes do not fit into 16"):
+        buffer.write(np.arange(4, dtype=np.uint32), offset=8)
+    with pytest.raises(ValueError, match="short: reading 24 bytes of 16"):
+        buffer.read("uint32", (5,))
+
+
+def test_writes_and_kernels_take_turns(either: Device, wgsl: dict[str, str]) -> None:
+    """A write waits for the kernels before it, and a read too; with sizes for both ways of staging."""
+    kernel = add(either)
+    for count in (4, 20_000):
+        a, total = numbers(either, np.zeros(count)), numbers(either, np.zeros(count))
+        for value in range(5):
+            a.write(np.full(count, value, np.uint32))
+            with Commands(either) as commands:
+                commands.dispatch(kernel, count, a=a, sum=total)
+        assert set(total.read("uint32", (count,)).tolist()) == {10}
+
+
+# The pool
+
+
+def test_a_pool_grows_and_keeps(device: Device) -> None:
+    pool = BufferPool(device)
+    first = pool.get("a", 100)
+    assert pool.get("a", 50) is first
+    assert pool.nbytes == 112
+    assert pool.get("a", 1000) is not first
+    assert pool.nbytes == 1008
+
+
+def test_a_constant_is_written_when_it_changes(device: Device) -> None:
+    pool = BufferPool(device)
+    assert pool.constant("n", struct.pack("<I", 7)).read("uint32", (1,))[0] == 7
+    version = pool.constant("n", struct.pack("<I", 7)).version
+    assert pool.constant("n", struct.pack("<I", 7)).version == version
+    assert pool.constant("n", struct.pack("<I", 8)).read("uint32", (1,))[0] == 8
+    assert pool.constant("n", struct.pack("<4I", 8, 2, 3, 4)).read("uint32", (4,)).tolist() == [8, 2, 3, 4]

@@ -1,0 +1,257 @@
+"""The whole rasteriser, forward and backward, against its float64 twin."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from scenes import (
+    Scene,
+    Weights,
+    fragile_pixels,
+    front_camera,
+    needles,
+    oblique_camera,
+    random_scene,
+    reference_step,
+    relative,
+    step,
+)
+from torch import Tensor
+
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.splat.rasterize import rasterize
+from lapgs_wgpu.splat.rasterizer import Rasterizer
+from lapgs_wgpu.splat.shape import RasterShape, cpu_shape, gpu_shape
+
+pytestmark = pytest.mark.kernels
+
+BACKGROUND = torch.tensor([0.3, 1.0, 0.1])
+
+
+def compare(
+    device: Device,
+    scene: Scene,
+    camera: Camera,
+    *,
+    sh_degree: int | None = None,
+    background: Tensor | None = None,
+    weights: Weights | None = None,
+    fragile_share: float = 0.1,
+) -> None:
+    """Forward to 2e-5 and every group of gradients to 1e-4, without the few pixels where rounding decides."""
+    fragile = fragile_pixels(scene, camera, sh_degree)
+    assert fragile.double().mean() <= fragile_share
+    weights = (weights or Weights.random(camera)).without(fragile)
+    found = step(scene, camera, device, sh_degree=sh_degree, background=background, weights=weights)
+    expected = reference_step(scene, camera, sh_degree=sh_degree, background=background, weights=weights)
+    farthest = float(expected.depth.max()) + 1
+    for name, tolerance in (("image", 2e-5), ("alpha", 2e-5), ("depth", 2e-5 * farthest)):
+        error = float((getattr(found, name) - getattr(expected, name))[~fragile].abs().max())
+        assert error <= tolerance, f"{name}: error {error:.1e}"
+    seen = expected.radii > 0
+    assert seen.any()
+    assert torch.equal(found.radii > 0, seen)
+    assert (found.radii - expected.radii).abs().max() <= 1
+    assert relative(found.means2d[seen], expected.means2d[seen]) < 1e-5
+    for name, gradient in expected.gradients.items():
+        assert found.gradients[name].shape == gradient.shape
+        assert not found.gradients[name][~seen].any() if name != "background" else True
+        error = relative(found.gradients[name], gradient)
+        assert error < 1e-4, f"gradient of {name}: relative error {error:.1e}"
+
+
+@pytest.mark.parametrize(
+    ("count", "size", "sh_degree", "stored", "with_background"),
+    [
+        (1, (17, 9), None, None, False),
+        (1, (1, 1), 1, 4, True),
+        (7, (1, 1), None, None, True),
+        (7, (101, 61), 0, 1, True),
+        (100, (17, 9), 0, 16, False),
+        (100, (101, 61), 1, 4, False),
+        (100, (101, 61), None, None, True),
+        (1000, (17, 9), 2, 9, True),
+        (1000, (101, 61), 2, 16, False),
+        (1000, (101, 61), 3, 16, True),
+        (5000, (101, 61), 3, 16, True),
+        (5000, (101, 61), None, None, False),
+    ],
+)
+def test_random_scenes(
+    device: Device, count: int, size: tuple[int, int], sh_degree: int | None, stored: int | None, with_background: bool
+) -> None:
+    scene = random_scene(count, seed=count, sh=stored, size=0.3 if count < 10 else 0.05)
+    if count < 10:
+        scene["means"] *= 0.3  # into the image
+    background = BACKGROUND if with_background else None
+    compare(device, scene, oblique_camera(*size), sh_degree=sh_degree, background=background)
+
+
+# Scenes where one part of the mathematics weighs more than elsewhere
+
+
+def test_thin_splats(device: Device) -> None:
+    camera = front_camera(101, 61)
+    compare(device, needles(100, 1, camera, length=15.0), camera, background=BACKGROUND)
+
+
+def test_very_long_thin_splats(device: Device) -> None:
+    """300 pixels long and half a pixel wide: float32 loses digits in the exponent, and most of the small gradient by
+    the length, as in every rasteriser that takes it from the conic; but nothing that the eye or a step would see."""
+    camera = front_camera(101, 61)
+    scene = needles(40, 1, camera, length=300.0)
+    weights = Weights.random(camera).without(fragile_pixels(scene, camera))
+    found, expected = step(scene, camera, device, weights=weights), reference_step(scene, camera, weights=weights)
+    assert ((found.image - expected.image).abs() * (weights.alpha != 0)[..., None]).max() < 1e-3
+    for name in ("means2d", "opacities", "colors"):
+        assert relative(found.gradients[name], expected.gradients[name]) < 1e-3
+    assert all(gradient.isfinite().all() for gradient in found.gradients.values())
+
+
+def test_opaque_splats(device: Device) -> None:
+    """Alpha held at its largest, and pixels that stop long before their lists end."""
+    scene, camera = random_scene(600, 2, size=0.2), oblique_camera(101, 61)
+    scene["opacities"][::2] = 1.0
+    compare(device, scene, camera, background=BACKGROUND)
+
+
+def test_faint_splats(device: Device) -> None:
+    scene, camera = random_scene(600, 3, size=0.2), oblique_camera(101, 61)
+    scene["opacities"] *= 0.03
+    compare(device, scene, camera)
+
+
+def test_splats_beyond_the_frustum(device: Device) -> None:
+    """Large Gaussians beside the image, where the Jacobian's x/z and y/z are held and pass no gradient."""
+    scene, camera = random_scene(60, 4), front_camera(33, 25, 20.0)
+    sides = torch.tensor([[-2.5, 0.3], [2.5, -0.2], [0.1, 2.2], [-0.4, -2.2], [2.3, 2.0], [0.2, 0.1]])
+    scene["means"] = torch.cat([sides.repeat(10, 1), torch.full((60, 1), 1.5)], 1) + 0.4 * scene["colors"]
+    scene["scales"] = 0.5 + 10 * scene["scales"].clamp(max=0.1)
+    compare(device, scene, camera)
+
+
+def test_splats_close_to_the_camera(device: Device) -> None:
+    scene, camera = random_scene(200, 5, size=0.02, spread=0.1), front_camera(33, 25)
+    scene["means"][:, 2] = scene["means"][:, 2].abs() + 0.02
+    compare(device, scene, camera)
+
+
+def test_tiny_splats(device: Device) -> None:
+    """Smaller than a pixel: all that is left of their covariance is the dilation."""
+    compare(device, random_scene(2000, 6, size=1e-4), oblique_camera(101, 61))
+
+
+@pytest.mark.parametrize("output", Weights._fields)
+def test_a_loss_on_one_output(device: Device, output: str) -> None:
+    scene, camera = random_scene(200, 7, sh=4), oblique_camera(33, 25)
+    weights = Weights.random(camera)
+    only = weights._replace(**{name: 0 * value for name, value in weights._asdict().items() if name != output})
+    compare(device, scene, camera, sh_degree=1, background=BACKGROUND, weights=only)
+
+
+# Shapes of the kernels
+
+
+def shapes(device: Device) -> list[RasterShape]:
+    """All that this device can run, the simplest first."""
+    found = [cpu_shape(0), RasterShape(16, 16, 32, subgroups=False, lane_runs=False), gpu_shape(0)]
+    if device.subgroup_size:
+        found += [cpu_shape(device.subgroup_size), gpu_shape(device.subgroup_size)]
+    return list(dict.fromkeys(found))
+
+
+@pytest.mark.parametrize("sh_degree", [None, 1])
+def test_all_shapes_draw_the_same(device: Device, use: Callable[[Rasterizer], Any], sh_degree: int | None) -> None:
+    scene, camera = random_scene(1000, 8, sh=sh_degree and 4, size=0.08), oblique_camera(101, 61)
+    weights = Weights.random(camera).without(fragile_pixels(scene, camera, sh_degree))
+    steps = []
+    for shape in shapes(device):
+        use(Rasterizer(device, shape=shape))
+        steps.append(step(scene, camera, device, sh_degree=sh_degree, background=BACKGROUND, weights=weights))
+    first = steps[0]
+    for other in steps[1:]:
+        for name in ("image", "alpha"):
+            assert (getattr(other, name) - getattr(first, name)).abs().max() <= 1e-6
+        assert (other.depth - first.depth).abs().max() <= 5e-6
+        assert torch.equal(other.radii, first.radii)
+        for name, gradient in first.gradients.items():
+            assert relative(other.gradients[name], gradient) < 2e-5
+
+
+# The door for torch
+
+
+def test_means2d_has_the_gradient_in_pixels(device: Device) -> None:
+    """Where nothing but the place matters: moving the image's content by a pixel."""
+    scene, camera = random_scene(1, 9), front_camera(33, 25)
+    scene |= {"means": torch.tensor([[0.1, -0.2, 2.0]]), "opacities": torch.tensor([0.5])}
+    drawn = rasterize(**scene, camera=camera, device=device)
+    assert drawn.means2d.requires_grad
+    assert drawn.means2d.tolist()[0] == pytest.approx([0.1 * 20 + 16.5, -0.2 * 20 + 12.5], abs=1e-4)
+    column = torch.arange(33) + 0.5
+    (drawn.alpha * column).sum().backward()
+    assert drawn.means2d.grad is not None
+    assert drawn.means2d.grad[0, 0].item() == pytest.approx(drawn.alpha.sum().item(), rel=0.05)  # the skipped rim
+    with torch.no_grad():
+        assert not rasterize(**scene, camera=camera, device=device).means2d.requires_grad
+
+
+def test_only_what_is_asked_for_has_gradients(device: Device) -> None:
+    scene, camera = random_scene(50, 10), oblique_camera(33, 25)
+    expected = step(scene, camera, device, weights=Weights.random(camera)).gradients
+    weights = Weights.random(camera)
+    for name in scene:
+        leaf = scene[name].clone().requires_grad_()
+        drawn = rasterize(**(scene | {name: leaf}), camera=camera, device=device)
+        torch.autograd.backward([drawn.image, drawn.alpha, drawn.depth], list(weights))
+        assert leaf.grad is not None
+        assert torch.equal(leaf.grad, expected[name])
+
+
+def test_gradients_flow_on_through_torch(device: Device) -> None:
+    """Tensors that are not leaves, not contiguous, or used twice."""
+    scene, camera = random_scene(50, 11), oblique_camera(33, 25)
+    expected = step(scene, camera, device).gradients
+    log_scales = scene["scales"].log().requires_grad_()
+    means = scene["means"].t().contiguous().requires_grad_()
+    moved = scene | {"scales": log_scales.exp(), "means": means.t()}
+    weights = Weights.random(camera)
+    drawn = rasterize(**moved, camera=camera, device=device)
+    torch.autograd.backward([drawn.image, drawn.alpha, drawn.depth], list(weights))
+    torch.testing.assert_close(log_scales.grad, expected["scales"] * scene["scales"], rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(means.grad, expected["means"].t(), rtol=1e-3, atol=1e-4)
+
+
+def test_the_same_gaussian_everywhere(device: Device) -> None:
+    """Rows that share their memory."""
+    scene, camera = random_scene(1, 12, size=0.3), oblique_camera(33, 25)
+    scene["means"] *= 0.1
+    shared = {name: value.expand(5, *value.shape[1:]) for name, value in scene.items()}
+    copied = {name: value.clone() for name, value in shared.items()}
+    assert torch.equal(
+        rasterize(**shared, camera=camera, device=device).image, rasterize(**copied, camera=camera, device=device).image
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"means": torch.zeros(5, 2)}, r"means must have shape \(5, 3\), got \(5, 2\)"),
+        ({"quats": torch.zeros(4, 4)}, r"quats must have shape \(5, 4\), got \(4, 4\)"),
+        ({"scales": torch.zeros(5)}, r"scales must have shape \(5, 3\), got \(5,\)"),
+        ({"opacities": torch.zeros(5, 1)}, r"opacities must have shape \(5,\), got \(5, 1\)"),
+        ({"colors": torch.zeros(5, 4, 3)}, r"colors must have shape \(5, 3\) without sh_degree, got \(5, 4, 3\)"),
+        ({"sh_degree": 0}, r"colors must have shape \(5, K >= 1, 3\) for sh_degree 0, got \(5, 3\)"),
+        ({"colors": torch.zeros(5, 4, 3), "sh_degree": 2}, r"\(5, K >= 9, 3\) for sh_degree 2, got \(5, 4, 3\)"),
+        ({"colors": torch.zeros(5, 25, 3), "sh_degree": 4}, r"sh_degree must be 0 to 3, got 4"),
+        ({"background": torch.zeros(4)}, r"background must have shape \(3,\), got \(4,\)"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_wrong_shapes_are_named(device: Device, changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        rasterize(**(random_scene(5, 0) | changes), camera=oblique_camera(9, 9), device=device)

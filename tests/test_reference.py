@@ -1,0 +1,478 @@
+"""The float64 oracle against hand-computed pixels, a literal loop, finite differences, and textbook formulas."""
+
+from __future__ import annotations
+
+import math
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy.special import lpmv
+from torch import Tensor
+
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.splat.rasterize import Rendering
+from lapgs_wgpu.splat.reference import (
+    ALPHA_MAX,
+    ALPHA_MIN,
+    CONSTANTS,
+    DILATION,
+    NEAR,
+    TRANSMITTANCE_MIN,
+    color,
+    near_discontinuity,
+    project,
+    rasterize_reference,
+    rotation,
+    sh_basis,
+)
+
+Scene = dict[str, Tensor]
+IDENTITY = [1.0, 0.0, 0.0, 0.0]
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _float64_on_one_thread() -> Any:
+    dtype, threads = torch.get_default_dtype(), torch.get_num_threads()
+    torch.set_default_dtype(torch.float64)
+    torch.set_num_threads(1)
+    yield
+    torch.set_default_dtype(dtype)
+    torch.set_num_threads(threads)
+
+
+def front_camera(width: int = 9, height: int = 7, focal: float = 10.0) -> Camera:
+    """At the origin, looking along +z; the axis meets the centre of the middle pixel when both sizes are odd."""
+    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    return Camera(K, np.eye(4), width, height)
+
+
+def oblique_camera(width: int, height: int) -> Camera:
+    """Rotated, unequal focal lengths, a principal point off the centre."""
+    camera = Camera.looking_at([1.0, -3.0, 0.7], [0.1, 0, 0], up=[0, 0, 1], fov_x=0.8, width=width, height=height)
+    K = camera.K * np.array([[1.0, 1, 1.1], [1, 1.15, 0.93], [1, 1, 1]])
+    return Camera(K, camera.T_cam_world, width, height)
+
+
+def splats(*rows: tuple[list[float], float, float, list[float]]) -> Scene:
+    """Round Gaussians from (mean, scale, opacity, colour)."""
+    means, scales, opacities, colors = zip(*rows, strict=True)
+    return {
+        "means": torch.tensor(means, dtype=torch.float64),
+        "quats": torch.tensor([IDENTITY] * len(rows)),
+        "scales": torch.tensor(scales)[:, None].expand(-1, 3).clone(),
+        "opacities": torch.tensor(opacities),
+        "colors": torch.tensor(colors, dtype=torch.float64),
+    }
+
+
+def random_scene(count: int, seed: int, sh_degree: int | None = None, spread: float = 0.8, size: float = 0.15) -> Scene:
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    return {
+        "means": spread * normal(count, 3),
+        "quats": normal(count, 4),
+        "scales": size * torch.exp(0.6 * normal(count, 3)),
+        "opacities": torch.sigmoid(2 * normal(count)),
+        "colors": normal(count, 3).abs() if sh_degree is None else 0.5 * normal(count, (sh_degree + 1) ** 2, 3),
+    }
+
+
+# One Gaussian, by hand
+
+
+def test_single_gaussian_pixels_by_hand() -> None:
+    scene = splats(([0, 0, 2], 0.3, 0.8, [0.2, 0.5, 0.9]))
+    background = torch.tensor([1.0, 0.0, 0.5])
+    image, alpha, depth, radii, means2d = rasterize_reference(**scene, camera=front_camera(), background=background)
+    variance = (10.0 / 2 * 0.3) ** 2 + 0.3  # focal / z * scale, squared, and the dilation
+    off = 0.8 * math.exp(-0.5 * (2**2 + 1**2) / variance)
+    assert means2d.tolist() == [[4.5, 3.5]]
+    assert alpha[3, 4].item() == pytest.approx(0.8, abs=1e-14)
+    torch.testing.assert_close(image[3, 4], torch.tensor([0.2 * 0.8 + 0.2, 0.5 * 0.8, 0.9 * 0.8 + 0.5 * 0.2]))
+    assert alpha[4, 6].item() == pytest.approx(off, abs=1e-14)  # two columns right, one row down
+    assert image[4, 6, 1].item() == pytest.approx(0.5 * off, abs=1e-14)
+    assert depth[4, 6].item() == pytest.approx(2 * off, abs=1e-14)
+    assert radii.tolist() == [math.ceil(math.sqrt(2 * math.log(0.8 * 255) * variance))]
+    assert radii.dtype == torch.int32
+
+
+def test_off_axis_ellipse_by_hand() -> None:
+    """A full covariance through the Jacobian matrix, written out."""
+    camera = front_camera(21, 17, 20.0)
+    mean, scales = np.array([0.5, -0.4, 3.0]), np.array([0.1, 0.4, 0.2])
+    half = math.radians(40) / 2
+    R = np.array([[math.cos(2 * half), -math.sin(2 * half), 0], [math.sin(2 * half), math.cos(2 * half), 0], [0, 0, 1]])
+    J = np.array([[20 / 3, 0, -20 * 0.5 / 9], [0, 20 / 3, 20 * 0.4 / 9]])
+    cov = J @ R @ np.diag(scales**2) @ R.T @ J.T + 0.3 * np.eye(2)
+    centre = np.array([20 * 0.5 / 3 + 10.5, -20 * 0.4 / 3 + 8.5])
+    quat = 3.0 * torch.tensor([[math.cos(half), 0, 0, math.sin(half)]])
+    projection = project(
+        *map(torch.from_numpy, (mean[None],)), quat, torch.from_numpy(scales[None]), torch.tensor([0.7]), camera
+    )
+    a, b, c = projection.conics[0].tolist()
+    np.testing.assert_allclose(projection.means2d[0], centre, rtol=1e-14)
+    np.testing.assert_allclose([[a, b], [b, c]], np.linalg.inv(cov), rtol=1e-12)
+    np.testing.assert_allclose(projection.half_sides[0], np.sqrt(2 * math.log(0.7 * 255) * np.diag(cov)), rtol=1e-12)
+
+
+def test_jacobian_is_clamped_beyond_the_margin() -> None:
+    """Far right of the image x/z counts as (width - cx) / fx + 0.3 (width / 2) / fx in the Jacobian only."""
+    camera = Camera(np.array([[10.0, 0, 3], [0, 10, 3.5], [0, 0, 1]]), np.eye(4), 9, 7)
+    limit = (9 - 3) / 10 + 0.3 * 4.5 / 10
+    projection = project(
+        torch.tensor([[3.0, 0, 2]]), torch.tensor([IDENTITY]), torch.full((1, 3), 1.0), torch.ones(1), camera
+    )
+    J = np.array([[5, 0, -5 * limit], [0, 5, 0]])
+    a, b, c = projection.conics[0].tolist()
+    assert projection.means2d[0, 0].item() == pytest.approx(10 * 1.5 + 3)
+    np.testing.assert_allclose([[a, b], [b, c]], np.linalg.inv(J @ J.T + 0.3 * np.eye(2)), rtol=1e-12)
+
+
+def test_wxyz_rotation() -> None:
+    """w first: (w, 0, 0, z) turns about z, by 90 degrees x to y; length does not matter."""
+    about_z = rotation(torch.tensor([[1.0, 0, 0, 1], [5.0, 0, 0, 5]]))
+    expected = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    torch.testing.assert_close(about_z, expected.expand(2, 3, 3))
+    about_x = rotation(torch.tensor([[math.cos(0.3), math.sin(0.3), 0, 0]]))[0]
+    torch.testing.assert_close(about_x @ torch.tensor([0.0, 1, 0]), torch.tensor([0, math.cos(0.6), math.sin(0.6)]))
+
+
+# Compositing rules
+
+
+def test_nearer_gaussian_comes_first_and_ties_go_by_index() -> None:
+    red, green = [1.0, 0, 0], [0, 1.0, 0]
+    for rows, expected in (
+        ([([0, 0, 3], 0.3, 0.5, red), ([0, 0, 2], 0.2, 0.6, green)], (0.4 * 0.5, 0.6)),
+        ([([0, 0, 2], 0.3, 0.5, red), ([0, 0, 2], 0.3, 0.6, green)], (0.5, 0.5 * 0.6)),
+        ([([0, 0, 2], 0.3, 0.6, green), ([0, 0, 2], 0.3, 0.5, red)], (0.4 * 0.5, 0.6)),
+    ):
+        pixel = rasterize_reference(**splats(*rows), camera=front_camera()).image[3, 4]
+        assert pixel.tolist() == pytest.approx([*expected, 0.0], abs=1e-14)
+
+
+def test_pixel_stops_before_the_gaussian_that_would_pass_the_limit() -> None:
+    opacities = [0.9, 0.98, 0.96, 0.5]  # transmittance 0.1, 0.002, then 0.00008 would be too little
+    rows = [([0, 0, 2.0 + i], 0.3 * (1 + i), opacity, [0.0, 0, 1]) for i, opacity in enumerate(opacities)]
+    rows[3][3][:] = [1.0, 0, 0]  # weak enough to pass alone, yet behind the stop
+    out = rasterize_reference(**splats(*rows), camera=front_camera())
+    assert out.alpha[3, 4].item() == pytest.approx(1 - 0.002, abs=1e-14)
+    assert out.image[3, 4].tolist() == pytest.approx([0, 0, 0.998], abs=1e-14)
+    assert out.depth[3, 4].item() == pytest.approx(2 * 0.9 + 3 * 0.098, abs=1e-14)
+
+
+def test_alpha_is_clamped_and_faint_alpha_skipped() -> None:
+    scene = splats(([0, 0, 2], 0.3, 1.0, [1.0, 1, 1]))
+    scene["opacities"].requires_grad_()
+    out = rasterize_reference(**scene, camera=front_camera(31, 31))
+    assert out.alpha[15, 15].item() == pytest.approx(ALPHA_MAX, abs=1e-14)
+    assert torch.autograd.grad(out.alpha[15, 15], scene["opacities"], retain_graph=True)[0].item() == 0
+    assert torch.autograd.grad(out.alpha[15, 16], scene["opacities"])[0].item() > 0
+    variance, squared = (5 * 0.3) ** 2 + DILATION, (torch.arange(31) - 15.0) ** 2
+    squared = squared[:, None] + squared
+    reached = torch.exp(-0.5 * squared / variance) >= ALPHA_MIN
+    assert torch.equal(out.alpha > 0, reached)
+    assert reached.any()
+    assert not reached.all()
+
+
+def test_culled_gaussians_leave_no_trace() -> None:
+    seen = ([0, 0, 2.0], 0.1, 0.5, [1.0, 1, 1])
+    unseen = [
+        ([0, 0, -2.0], 0.1, 0.5, [1.0, 1, 1]),  # behind
+        ([0, 0, 0.0], 0.1, 0.5, [1.0, 1, 1]),  # in the camera itself
+        ([0, 0, NEAR], 0.1, 0.5, [1.0, 1, 1]),
+        ([0, 0, 2.0], 0.1, 0.99 * ALPHA_MIN, [1.0, 1, 1]),
+        ([0, 0, 2.0], 0.1, 0.0, [1.0, 1, 1]),
+        ([9.0, 0, 2.0], 0.1, 0.5, [1.0, 1, 1]),  # beside the image
+        ([math.nan, 0, 2.0], 0.1, 0.5, [1.0, 1, 1]),
+        ([0, math.inf, 2.0], 0.1, 0.5, [1.0, 1, 1]),
+        ([0, 0, 2.0], math.inf, 0.5, [1.0, 1, 1]),
+        ([0, 0, 2.0], 1e200, 0.5, [1.0, 1, 1]),
+        ([0, 0, 2.0], 0.1, math.nan, [1.0, 1, 1]),
+        ([0, 0, 2.0], 0.1, 0.5, [1.0, 1, 1]),
+    ]
+    alone, scene = splats(seen), splats(*unseen, seen)
+    scene["quats"][len(unseen) - 1] = 0.0
+    for group in scene.values():
+        group.requires_grad_()
+    expected, out = (rasterize_reference(**group, camera=front_camera()) for group in (alone, scene))
+    assert torch.equal(expected.image, out.image)
+    assert out.radii[:-1].count_nonzero() == 0
+    assert out.radii[-1] == expected.radii[0] > 0
+    for group in torch.autograd.grad(out.image.sum() + out.depth.sum(), list(scene.values()), allow_unused=True):
+        assert group[:-1].count_nonzero() == 0
+        assert group.isfinite().all()
+
+
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (9, 7), (17, 8)])
+def test_no_gaussians_show_the_background(width: int, height: int) -> None:
+    scene = {name: group[:0] for name, group in random_scene(1, 0).items()}
+    background = torch.tensor([0.1, 0.2, 0.3])
+    out = rasterize_reference(**scene, camera=front_camera(width, height), background=background)
+    assert torch.equal(out.image, background.expand(height, width, 3))
+    assert out.alpha.count_nonzero() == out.depth.count_nonzero() == out.radii.numel() == 0
+    assert not near_discontinuity(**scene, camera=front_camera(width, height)).any()
+
+
+# Against a literal loop
+
+
+def literal(scene: Scene, camera: Camera, background: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The conventions word by word: one pixel, one Gaussian at a time, textbook matrices, no shared code."""
+    fx, fy, cx, cy = camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]
+    W, t = camera.T_cam_world[:3, :3], camera.T_cam_world[:3, 3]
+    image, alpha, depth = np.zeros((camera.height, camera.width, 3)), *np.zeros((2, camera.height, camera.width))
+    gaussians = []
+    for mean, (w, *v), scale, opacity, colour in zip(*(group.tolist() for group in scene.values()), strict=True):
+        x, y, z = W @ np.array(mean) + t
+        if z <= 0.01:
+            continue
+        v = np.array(v) / math.sqrt(w * w + np.dot(v, v))
+        w = math.copysign(math.sqrt(max(0.0, 1 - v @ v)), w)
+        skew = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+        R = np.eye(3) + 2 * w * skew + 2 * skew @ skew  # Rodrigues
+        u_max, u_min = (camera.width - cx) / fx + 0.15 * camera.width / fx, -cx / fx - 0.15 * camera.width / fx
+        v_max, v_min = (camera.height - cy) / fy + 0.15 * camera.height / fy, -cy / fy - 0.15 * camera.height / fy
+        tx, ty = z * min(max(x / z, u_min), u_max), z * min(max(y / z, v_min), v_max)
+        J = np.array([[fx / z, 0, -fx * tx / z**2], [0, fy / z, -fy * ty / z**2]])
+        cov = J @ W @ R @ np.diag(np.square(scale)) @ R.T @ W.T @ J.T + 0.3 * np.eye(2)
+        gaussians.append(
+            (z, np.array([fx * x / z + cx, fy * y / z + cy]), np.linalg.inv(cov), opacity, np.array(colour))
+        )
+    gaussians.sort(key=lambda gaussian: gaussian[0])
+    for row in range(camera.height):
+        for column in range(camera.width):
+            T = 1.0
+            for z, centre, conic, opacity, colour in gaussians:
+                d = np.array([column + 0.5, row + 0.5]) - centre
+                density = opacity * math.exp(-0.5 * d @ conic @ d)
+                if density < 1 / 255:
+                    continue
+                a = min(0.99, density)
+                if T * (1 - a) <= 1e-4:
+                    break
+                image[row, column] += T * a * colour
+                depth[row, column] += T * a * z
+                T *= 1 - a
+            image[row, column] += T * background
+            alpha[row, column] = 1 - T
+    return image, alpha, depth
+
+
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (19, 13), (16, 8)])
+def test_equals_the_literal_loop(width: int, height: int) -> None:
+    camera = oblique_camera(width, height)
+    scene = random_scene(40, seed=3, spread=1.0, size=0.3)
+    scene["opacities"][:10] = 0.999
+    background = torch.tensor([0.3, 0.6, 0.9])
+    out = rasterize_reference(**scene, camera=camera, background=background)
+    sure = ~near_discontinuity(**scene, camera=camera, band=1e-9, gate=0.0).numpy()
+    for ours, expected in zip(out[:3], literal(scene, camera, background.numpy()), strict=True):
+        np.testing.assert_allclose(ours.numpy()[sure], expected[sure], atol=1e-12)
+    assert sure.mean() > 0.9
+    if width > 1:
+        assert out.radii.count_nonzero() < 40, "nothing was culled: the scene is too easy"
+
+
+def test_radius_bounds_the_reached_pixels_tightly() -> None:
+    camera = oblique_camera(61, 47)
+    scene = random_scene(1, seed=5, spread=0.0, size=0.2)
+    scene["opacities"][:] = 0.9
+    out = rasterize_reference(**scene, camera=camera)
+    rows, columns = out.alpha.nonzero().unbind(1)
+    reach = torch.stack([columns + 0.5 - out.means2d[0, 0], rows + 0.5 - out.means2d[0, 1]]).abs().max().item()
+    assert out.radii[0].item() - 2 <= reach <= out.radii[0].item()
+
+
+def test_image_does_not_depend_on_the_world_frame_or_the_order() -> None:
+    camera, scene = oblique_camera(23, 17), random_scene(30, seed=9)
+    before = rasterize_reference(**scene, camera=camera)
+    turn, shift = rotation(torch.tensor([[0.3, -0.5, 0.2, 0.9]]))[0], torch.tensor([3.0, -2.0, 5.0])
+    T_world = torch.eye(4)
+    T_world[:3, :3], T_world[:3, 3] = turn, shift
+    a, b, c, d = torch.tensor([0.3, -0.5, 0.2, 0.9])
+    product = torch.stack([torch.stack(row) for row in [[a, -b, -c, -d], [b, a, -d, c], [c, d, a, -b], [d, -c, b, a]]])
+    moved = scene | {"means": scene["means"] @ turn.T + shift, "quats": scene["quats"] @ product.T}
+    permuted = {name: group.flip(0) for name, group in moved.items()}
+    same_view = Camera(camera.K, camera.T_cam_world @ torch.linalg.inv(T_world).numpy(), 23, 17)
+    for other in (moved, permuted):
+        after = rasterize_reference(**other, camera=same_view)
+        torch.testing.assert_close(after.image, before.image, atol=1e-10, rtol=0)
+        torch.testing.assert_close(after.depth, before.depth, atol=1e-10, rtol=0)
+
+
+def test_float32_agrees_outside_the_discontinuities() -> None:
+    camera, scene = oblique_camera(37, 29), random_scene(300, seed=2, sh_degree=2)
+    exact = rasterize_reference(**scene, camera=camera, sh_degree=2)
+    single = rasterize_reference(**{name: group.float() for name, group in scene.items()}, camera=camera, sh_degree=2)
+    sure = ~near_discontinuity(**scene, camera=camera, sh_degree=2)
+    assert single.image.dtype == torch.float32
+    assert sure.double().mean() > 0.8
+    torch.testing.assert_close(single.image[sure].double(), exact.image[sure], atol=2e-5, rtol=0)
+
+
+# Spherical harmonics
+
+
+def directions_on_the_sphere() -> tuple[Tensor, Tensor]:
+    """Gauss-Legendre times uniform points and their weights: exact for polynomials of degree 6 and more."""
+    heights, weights = np.polynomial.legendre.leggauss(8)
+    azimuths = np.arange(16) * (2 * np.pi / 16)
+    z, phi = (grid.ravel() for grid in np.meshgrid(heights, azimuths, indexing="ij"))
+    ring = np.sqrt(1 - z * z)
+    points = np.stack([ring * np.cos(phi), ring * np.sin(phi), z], axis=-1)
+    return torch.from_numpy(points), torch.from_numpy(np.repeat(weights, 16) * 2 * np.pi / 16)
+
+
+def test_sh_basis_is_orthonormal() -> None:
+    points, weights = directions_on_the_sphere()
+    basis = sh_basis(points, 3)
+    torch.testing.assert_close(basis.T @ (weights[:, None] * basis), torch.eye(16), atol=1e-13, rtol=0)
+
+
+def test_sh_basis_equals_associated_legendre_functions() -> None:
+    """Order l, m = -l..l; sine for negative m; scipy's lpmv holds the Condon-Shortley phase."""
+    points, _ = directions_on_the_sphere()
+    x, y, z = points.numpy().T
+    phi = np.arctan2(y, x)
+    expected = []
+    for degree in range(4):
+        for m in range(-degree, degree + 1):
+            k = abs(m)
+            norm = math.sqrt((2 * degree + 1) / (4 * math.pi) * math.factorial(degree - k) / math.factorial(degree + k))
+            wave = np.sin(k * phi) if m < 0 else np.cos(k * phi)
+            expected.append((math.sqrt(2) if m else 1) * norm * lpmv(k, degree, z) * wave)
+    for degree in range(4):
+        count = (degree + 1) ** 2
+        np.testing.assert_allclose(sh_basis(points, degree), np.stack(expected[:count], axis=-1), atol=1e-13)
+
+
+def test_sh_degree_0_is_the_same_from_everywhere() -> None:
+    scene = random_scene(5, seed=1, sh_degree=3)
+    sh = 4 * scene["colors"]
+    colors = color(sh, scene["means"], oblique_camera(9, 7), 0)
+    torch.testing.assert_close(colors, (0.5 / math.sqrt(math.pi) * sh[:, 0] + 0.5).clamp(min=0))
+    assert colors.min() == 0, "no colour was cut at zero: the scene is too easy"
+
+
+def test_sh_looks_from_the_camera_to_the_mean() -> None:
+    sh = torch.zeros(1, 4, 3)
+    sh[0, 3] = 1.0  # -C1 x
+    camera = Camera.looking_at([5.0, 1, 1], [0, 1, 1], up=[0, 0, 1], fov_x=0.8, width=9, height=7)
+    assert color(sh, torch.tensor([[0.0, 1, 1]]), camera, 1)[0, 0].item() == pytest.approx(
+        0.5 + math.sqrt(0.75 / math.pi)
+    )
+
+
+@pytest.mark.parametrize(("degree", "words"), [(4, "degrees 0 to 3"), (-1, "degrees 0 to 3"), (2, "K at least 9")])
+def test_impossible_sh_degree_is_refused(degree: int, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        color(torch.zeros(1, 25 if degree == 4 else 4, 3), torch.ones(1, 3), front_camera(), degree)
+
+
+# Gradients
+
+
+def delicate_scene(sh_degree: int | None) -> tuple[Scene, Camera]:
+    """Six Gaussians that between them are clamped, skipped, stopped and beyond the frustum's margin."""
+    camera = oblique_camera(9, 7)
+    scene = random_scene(6, seed=11, sh_degree=sh_degree, spread=0.12, size=0.25)
+    scene["opacities"] = torch.tensor([1.0, 0.97, 0.96, 0.95, 0.9, 0.7])
+    scene["means"][5] = torch.tensor([2.2, 0.5, 0.1])
+    scene["scales"][0] = torch.tensor([0.8, 0.9, 0.7])
+    scene["scales"][5] = torch.tensor([0.9, 0.7, 0.8])
+    return scene, camera
+
+
+def loss(out: Rendering) -> Tensor:
+    weights = torch.sin(torch.arange(out.image.numel())).view_as(out.image)
+    return (
+        (weights * out.image).sum() + (weights[..., 0] * out.alpha).sum() + (weights[..., 1] * out.depth.square()).sum()
+    )
+
+
+def test_delicate_scene_visits_every_rule() -> None:
+    scene, camera = delicate_scene(None)
+    geometry = [scene[name] for name in ("means", "quats", "scales", "opacities")]
+    projection = project(*geometry, camera)
+    assert projection.visible.all(), "a Gaussian is culled"
+    beyond = projection.means2d[5, 0].item() / camera.width
+    assert beyond > 1.15, f"Gaussian 5 is at {beyond} image widths"
+    each = [
+        rasterize_reference(**{name: group[i : i + 1] for name, group in scene.items()}, camera=camera).alpha
+        for i in range(6)
+    ]
+    alphas = torch.stack(each)
+    assert (alphas > ALPHA_MAX - 1e-12).any(), "no clamp"
+    assert (alphas == 0).any(), "no skip"
+    assert ((1 - alphas).prod(0) <= TRANSMITTANCE_MIN).any(), "no stop"
+
+
+@pytest.mark.parametrize("with_background", [False, True])
+@pytest.mark.parametrize("sh_degree", [None, 0, 1, 2, 3])
+def test_gradcheck(sh_degree: int | None, with_background: bool) -> None:
+    scene, camera = delicate_scene(sh_degree)
+    risky = near_discontinuity(**scene, camera=camera, sh_degree=sh_degree, band=1e-4, gate=1e-5)
+    assert not risky.any(), "finite differences would cross a discontinuity"
+    inputs = scene | {"means2d_offset": torch.zeros(6, 2)}
+    if with_background:
+        inputs["background"] = torch.tensor([0.2, 0.7, 0.4])
+
+    def scalar(*groups: Tensor) -> Tensor:
+        named = dict(zip(inputs, groups, strict=True))
+        return loss(rasterize_reference(**named, camera=camera, sh_degree=sh_degree))
+
+    groups = [group.requires_grad_() for group in inputs.values()]
+    every_number = sh_degree is None  # else one random direction a group, for speed
+    assert torch.autograd.gradcheck(scalar, groups, eps=1e-6, atol=1e-6, rtol=1e-6, fast_mode=not every_number)
+    for name, gradient in zip(inputs, torch.autograd.grad(scalar(*groups), groups), strict=True):
+        assert gradient.abs().max() > 1e-3, f"{name} has no gradient: the check is empty"
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_gradcheck_of_the_colour(degree: int) -> None:
+    """Every coefficient, and the mean through the view direction."""
+    scene, camera = delicate_scene(degree)
+    groups = scene["colors"].requires_grad_(), scene["means"].requires_grad_()
+    assert torch.autograd.gradcheck(lambda sh, means: color(sh, means, camera, degree), groups)
+    if degree > 0:
+        (gradient,) = torch.autograd.grad(color(*groups, camera, degree).sum(), groups[1])
+        assert gradient.abs().max() > 0.1
+
+
+def test_near_discontinuity_sees_each_kind() -> None:
+    camera, white = front_camera(), [1.0, 1, 1]
+
+    def centre(*rows: tuple[list[float], float, float, list[float]], **kwargs: Any) -> bool:
+        return bool(near_discontinuity(**splats(*rows), camera=camera, **kwargs)[3, 4])
+
+    assert not centre(([0, 0, 2], 0.1, 0.5, white))
+    assert centre(([0, 0, 2], 0.1, ALPHA_MIN * 1.0005, white))
+    assert not centre(([0, 0, 2], 0.1, ALPHA_MIN * 1.0005, white), band=1e-4)
+    assert centre(([0, 0, 2], 0.1, ALPHA_MAX * 0.9995, white))
+    assert centre(([0, 0, 2], 0.1, 0.99, white), ([0, 0, 3], 0.1, 0.99, white), band=1e-5)  # 0.01^2 is the limit
+    assert centre(([0, 0, 2], 0.1, 0.5, white), ([0, 0, 2.000001], 0.1, 0.5, white))
+    assert not centre(([0, 0, 2], 0.1, 0.5, white), ([0, 0, 2.00001], 0.1, 0.5, white))
+    opaque = [([0, 0, 1.0 + 0.1 * i], 0.1, 0.98, white) for i in range(3)]
+    assert not centre(*opaque, ([0, 0, 2], 0.1, 0.5, white), ([0, 0, 2], 0.1, 0.5, white))  # a tie that nobody sees
+    limit = 4.5 / 10 + 0.3 * 4.5 / 10
+    assert centre(([2 * limit, 0, 2], 0.5, 0.5, white))
+    assert not centre(([2 * limit + 0.01, 0, 2], 0.5, 0.5, white))
+    black = splats(([0, 0, 2], 0.1, 0.5, white))
+    black["colors"] = torch.full((1, 1, 3), -0.5 / CONSTANTS["SH_C0"])
+    assert near_discontinuity(**black, camera=camera, sh_degree=0)[3, 4]
+
+
+def test_constants_stand_once_in_the_shader() -> None:
+    text = files("lapgs_wgpu.shaders.common").joinpath("constants.wgsl").read_text()
+    names = [line.split()[1].rstrip(":") for line in text.splitlines() if line.startswith("const")]
+    assert sorted(names) == sorted(CONSTANTS)
+    assert CONSTANTS["ALPHA_MIN"] == 1 / 255

@@ -1,0 +1,118 @@
+"""The exclusive scan against numpy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from lapgs_wgpu.gpu.buffer import Buffer, BufferPool
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.kernel import Commands
+from lapgs_wgpu.gpu.primitives import Scan
+
+pytestmark = pytest.mark.kernels
+
+Words = NDArray[np.uint32]
+UNTOUCHED = 0xDEADBEEF
+SOURCES = ["values", "flags", "gather"]
+
+
+def buffer_of(device: Device, words: Words, label: str) -> Buffer:
+    buffer = Buffer(device, words.nbytes, label)
+    buffer.write(words)
+    return buffer
+
+
+def scan(
+    device: Device,
+    values: Words,
+    *,
+    source: str,
+    length: int,
+    indices: Words | None = None,
+    capacity: int | None = None,
+) -> tuple[Words, int]:
+    """The first `length` sums and the total. Fails where anything else was written."""
+    capacity = length if capacity is None else capacity
+    pool = BufferPool(device)
+    prefix = buffer_of(device, np.full(capacity + 64, UNTOUCHED, np.uint32), "prefix")
+    total = buffer_of(device, np.full(4, UNTOUCHED, np.uint32), "total")
+    picked = {} if indices is None else {"indices": buffer_of(device, indices, "indices")}
+    with Commands(device) as commands:
+        Scan(device, pool, "test", source)(
+            commands,
+            length=buffer_of(device, np.array([length], np.uint32), "length"),
+            capacity=capacity,
+            values=buffer_of(device, values, "values"),
+            prefix=prefix,
+            total=total,
+            **picked,
+        )
+    sums = prefix.read("uint32", (capacity + 64,))
+    assert (sums[length:] == UNTOUCHED).all()
+    return sums[:length], int(total.read("uint32", (1,))[0])
+
+
+def check(
+    device: Device, values: Words, *, source: str, length: int, capacity: int | None = None, seed: int = 0
+) -> None:
+    indices = None
+    elements = values[:length]
+    if source == "gather":
+        indices = np.random.default_rng(seed).integers(0, max(1, len(values)), max(1, length)).astype(np.uint32)
+        elements = values[indices[:length]] if length else elements
+    elif source == "flags":
+        elements = (elements != 0).astype(np.uint32)
+    expected = np.concatenate([[0], np.cumsum(elements, dtype=np.uint32)])
+    sums, total = scan(device, values, source=source, length=length, indices=indices, capacity=capacity)
+    np.testing.assert_array_equal(sums, expected[:-1])
+    assert total == expected[-1]
+
+
+@pytest.mark.parametrize("length", [0, 1, 7, 2047, 2048, 2049, 4096, 100_000])
+@pytest.mark.parametrize("source", SOURCES)
+def test_lengths_around_the_blocks(device: Device, source: str, length: int) -> None:
+    values = np.random.default_rng(length).integers(0, 3, max(1, length)).astype(np.uint32)
+    check(device, values, source=source, length=length)
+
+
+@pytest.mark.parametrize("source", SOURCES)
+def test_more_blocks_than_one_workgroup_has_lanes(device: Device, source: str) -> None:
+    """The sums of the blocks are added by one workgroup, some at a time."""
+    values = np.random.default_rng(1).integers(0, 1000, 2048 * 300 + 5).astype(np.uint32)
+    check(device, values, source=source, length=len(values))
+
+
+@pytest.mark.parametrize("length", [0, 1, 2048, 5000])
+@pytest.mark.parametrize("source", SOURCES)
+def test_the_length_is_the_devices(device: Device, source: str, length: int) -> None:
+    """Buffers that hold more than there is: what lies behind the length counts for nothing."""
+    values = np.full(20_000, 0xFFFFFFFF, np.uint32)
+    values[:length] = np.arange(length)
+    check(device, values, source=source, length=length, capacity=20_000)
+
+
+def test_no_room_and_no_elements(device: Device) -> None:
+    sums, total = scan(device, np.zeros(4, np.uint32), source="values", length=0, capacity=0)
+    assert len(sums) == 0
+    assert total == 0
+
+
+def test_sums_wrap_as_unsigned_words_do(device: Device) -> None:
+    check(device, np.full(5000, 0xFFFFFFFF, np.uint32), source="values", length=5000)
+
+
+@settings(max_examples=25, deadline=None, derandomize=True)
+@given(
+    source=st.sampled_from(SOURCES),
+    length=st.integers(0, 7000),
+    spare=st.integers(0, 5000),
+    largest=st.sampled_from([1, 2, 255, 0xFFFFFFFF]),
+    seed=st.integers(0, 1000),
+)
+def test_any_length(device: Device, source: str, length: int, spare: int, largest: int, seed: int) -> None:
+    values = np.random.default_rng(seed).integers(0, largest, length + spare + 1, dtype=np.uint32, endpoint=True)
+    check(device, values, source=source, length=length, capacity=length + spare, seed=seed)

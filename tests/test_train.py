@@ -1,0 +1,232 @@
+"""The training from end to end, in the smallest size: it learns, it repeats to the last byte, it leaves a whole run."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from lapgs_wgpu.data import Dataset, load_dataset
+from lapgs_wgpu.data.synthetic import write_synthetic
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.motion.scene import Scene4D, load
+from lapgs_wgpu.train import loop
+from lapgs_wgpu.train.config import Config
+from lapgs_wgpu.train.log import Log
+from lapgs_wgpu.train.loop import Pictures, train
+from lapgs_wgpu.train.presets import load_config
+
+STEPS = 36
+SMALL: dict[str, str | list[str]] = {
+    "schedule.steps": str(STEPS),
+    "schedule.warm_up": "10",
+    "schedule.sh_interval": "12",
+    "points.count": "300",
+    "field.width": "16",
+    "field.static.levels": "3",
+    "field.static.finest": ["16", "16", "16"],
+    "field.temporal.levels": "2",
+    "density.start": "5",
+    "density.interval": "10",
+    "density.reset_interval": "25",
+    "density.stop": "34",
+}
+
+
+def configure(**overrides: str) -> Config:
+    return load_config("tiny", {**SMALL, **{name.replace("__", "."): value for name, value in overrides.items()}})
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    folder = tmp_path_factory.mktemp("data") / "scene"
+    return load_dataset(write_synthetic(folder, size=32, train_views=8, test_views=2))
+
+
+@pytest.fixture(scope="module")
+def run(dataset: Dataset, device: Device, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a finished run with motion."""
+    out = tmp_path_factory.mktemp("runs") / "first"
+    train(configure(), dataset, out, device=device)
+    return out
+
+
+def lines(run: Path) -> list[dict]:
+    return [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
+
+
+@pytest.mark.parametrize("kind", ["static", "grid4d"])
+def test_the_loss_falls(kind: str, dataset: Dataset, device: Device, tmp_path: Path) -> None:
+    losses: list[float] = []
+    original = Log.step
+
+    def note(self: Log, step: int, loss: float, psnr: float, gaussians: int) -> None:
+        losses.append(loss)
+        original(self, step, loss, psnr, gaussians)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Log, "step", note)
+        # Without a reset, after which all opacities would have to come back first.
+        train(configure(field__kind=kind, density__reset_interval="1000"), dataset, tmp_path / "run", device=device)
+    assert len(losses) == STEPS
+    assert np.mean(losses[-6:]) < 0.75 * np.mean(losses[:6])
+
+
+def test_a_run_is_whole(run: Path, dataset: Dataset) -> None:
+    assert {file.name for file in run.iterdir()} == {
+        "config.toml", "log.jsonl", "metrics.json", "checkpoint.ply", "eval",
+    }  # fmt: skip
+    assert load_config(str(run / "config.toml")) == configure()
+    record = (run / "config.toml").read_text().split("[record]")[1]
+    assert all(f"\n{key} = " in record for key in ("lapgs_wgpu", "torch", "adapter", "driver"))
+    (last,) = lines(run)
+    assert set(last) == {"step", "loss", "psnr", "gaussians", "timing"}
+    assert last["step"] == STEPS
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert metrics["training"]["steps"] == STEPS
+    assert [row["view"] for row in metrics["views"]] == [view.name for view in dataset.test]
+    assert metrics["gaussians"] == last["gaussians"]
+    for view in dataset.test:
+        assert Image.open(run / "eval" / f"{view.name}.png").size == (3 * 32, 32)
+
+
+def test_the_checkpoint_is_the_last_model(run: Path, dataset: Dataset, device: Device) -> None:
+    scene = load(run / "checkpoint.ply", device)
+    metrics = loop.evaluate(scene, dataset.test, "black")
+    stored = json.loads((run / "metrics.json").read_text())
+    assert metrics["views"] == stored["views"]
+    assert scene.sh_degree == 3
+    assert scene.metadata["background"] == "black"
+
+
+def test_a_training_repeats_to_the_last_byte(run: Path, dataset: Dataset, device: Device, tmp_path: Path) -> None:
+    train(configure(), dataset, tmp_path / "second", device=device)
+    assert (tmp_path / "second" / "checkpoint.ply").read_bytes() == (run / "checkpoint.ply").read_bytes()
+    first, second = lines(run), lines(tmp_path / "second")
+    for line in first + second:
+        del line["timing"]
+    assert first == second
+
+
+def test_another_seed_gives_another_model(run: Path, dataset: Dataset, device: Device, tmp_path: Path) -> None:
+    train(configure(seed="1", schedule__steps="3"), dataset, tmp_path / "a", device=device)
+    train(configure(seed="2", schedule__steps="3"), dataset, tmp_path / "b", device=device)
+    assert (tmp_path / "a" / "checkpoint.ply").read_bytes() != (tmp_path / "b" / "checkpoint.ply").read_bytes()
+
+
+def test_nothing_moves_during_the_warm_up(dataset: Dataset, device: Device, tmp_path: Path) -> None:
+    config = configure(schedule__steps="4")
+    scene = train(config, dataset, tmp_path / "run", device=device)
+    fresh = Scene4D.from_points(*loop.initial_points(config.points, 0), config.field, device=device)
+    assert scene.field is not None
+    assert fresh.field is not None
+    for ours, initial in zip(scene.field.parameters(), fresh.field.parameters(), strict=True):
+        assert torch.equal(ours, initial)
+    moved = train(configure(schedule__steps="4", schedule__warm_up="3"), dataset, tmp_path / "moved", device=device)
+    assert moved.field is not None
+    assert not all(
+        torch.equal(ours, initial)
+        for ours, initial in zip(moved.field.parameters(), fresh.field.parameters(), strict=True)
+    )
+
+
+def test_test_views_are_not_decoded_before_the_training_is_over(
+    dataset: Dataset, device: Device, tmp_path: Path
+) -> None:
+    def fail() -> np.ndarray:
+        assert (tmp_path / "run" / "checkpoint.ply").exists()
+        raise InputError("a test view was read")
+
+    hidden = tuple(dataclasses.replace(view, pixels=fail) for view in dataset.test)
+    with pytest.raises(InputError, match="a test view was read"):
+        train(
+            configure(schedule__steps="3"), dataclasses.replace(dataset, test=hidden), tmp_path / "run", device=device
+        )
+    assert (tmp_path / "run" / "checkpoint.ply").exists()
+
+
+def test_ctrl_c_leaves_a_whole_checkpoint(
+    dataset: Dataset, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    original = Log.step
+
+    def interrupt(self: Log, step: int, loss: float, psnr: float, gaussians: int) -> None:
+        original(self, step, loss, psnr, gaussians)
+        if step == 5:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(Log, "step", interrupt)
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt, match=r"stopped after step 5 of 36; .*checkpoint.ply holds it"):
+        train(configure(), dataset, tmp_path / "run", device=device)
+    assert load(tmp_path / "run" / "checkpoint.ply", device).metadata["step"] == "5"
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_a_run_folder_in_use_is_left_alone(dataset: Dataset, device: Device, tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(InputError, match=r"is not empty.*--overwrite"):
+        train(configure(), dataset, tmp_path, device=device)
+    with pytest.raises(InputError, match="is a file"):
+        train(configure(), dataset, tmp_path / "notes.txt", device=device, overwrite=True)
+    assert [file.name for file in tmp_path.iterdir()] == ["notes.txt"]
+
+
+def test_overwriting_replaces_a_run_and_nothing_else(dataset: Dataset, device: Device, tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+    (tmp_path / "eval").mkdir()
+    (tmp_path / "eval" / "old.png").write_text("old")
+    train(configure(schedule__steps="2"), dataset, tmp_path, device=device, overwrite=True)
+    assert (tmp_path / "notes.txt").read_text() == "mine"
+    assert not (tmp_path / "eval" / "old.png").exists()
+
+
+def test_every_picture_is_drawn_once_an_epoch(dataset: Dataset) -> None:
+    with Pictures(dataset.train, "black", 1.0, torch.Generator().manual_seed(3)) as pictures:
+        epochs = [[pictures.draw()[0].name for _ in dataset.train] for _ in range(3)]
+    assert all(sorted(epoch) == sorted(view.name for view in dataset.train) for epoch in epochs)
+    assert epochs[0] != epochs[1]
+
+
+@pytest.mark.parametrize("background", ["black", "white", "random"])
+def test_pictures_lie_on_their_background(background: str, dataset: Dataset) -> None:
+    with Pictures(dataset.train, background, 1.0, torch.Generator().manual_seed(3)) as pictures:  # type: ignore[arg-type]
+        drawn = [pictures.draw() for _ in range(4)]
+    for view, picture, colour in drawn:
+        clear = torch.from_numpy(view.load()[:, :, 3] == 0) if background == "random" else None
+        assert picture.shape == (32, 32, 3)
+        assert picture.dtype == torch.float32
+        if clear is not None:
+            assert (picture[clear] - colour).abs().max() <= 0.5 / 255 + 1e-6
+        else:
+            assert colour.tolist() == [float(background == "white")] * 3
+            assert (picture[0, 0] == colour).all()
+    if background == "random":
+        assert not torch.equal(drawn[0][2], drawn[1][2])
+
+
+def test_log_lines_and_the_progress_line(tmp_path: Path) -> None:
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    for stream in (io.StringIO(), Terminal()):
+        with Log(tmp_path / "log.jsonl", 120, stream) as log:
+            for step in range(1, 121):
+                log.step(step, 0.5 + step, 20.0, 1000)
+        text = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+        assert [line["step"] for line in text] == [50, 100, 120]
+        assert text[0]["loss"] == pytest.approx(0.5 + np.mean(range(1, 51)))
+        assert text[2]["loss"] == pytest.approx(0.5 + np.mean(range(71, 121)))
+        shown = stream.getvalue()
+        assert "step 120/120  20.00 dB  1000 Gaussians" in shown
+        assert shown.endswith("0:00 left\n")
+        assert ("\r" in shown) == stream.isatty()
