@@ -186,8 +186,8 @@ def test_bands_draw_the_same_image(
     assert rasterizer.capacity <= total // share
     for name in ("image", "alpha", "depth", "radii", "means2d"):
         assert found.bits[name] == expected.bits[name], name
-    for name, gradient in expected.gradients.items():
-        assert relative(found.gradients[name], gradient) < 1e-5
+    for name, gradient in expected.gradients.items():  # a splat's records are added band by band: other rounding
+        assert relative(found.gradients[name], gradient) < 1e-4
     same(one_step(scene, device), found)
     again = banded(device, use, total // share)
     same(one_step(scene, device), found)
