@@ -1,6 +1,6 @@
 // The gradient of a grid's table, or of its slices. Each of its entries is a sum over many points, and the same to the
 // last bit on every run:
-// LANE_LEVELS, for devices of few wide cores: a lane owns one feature of a level and adds the points in their order.
+// LANE_LEVELS, for devices of few wide cores: a lane owns a level and adds the points in their order.
 // Otherwise: a lane owns a point and adds in 64-bit fixed point, whose sum does not depend on the order.
 #import common/hashgrid
 #import common/index
@@ -21,20 +21,20 @@ fn first_entry(level: Level) -> u32 {
 }
 
 #ifdef LANE_LEVELS
-@group(0) @binding(4) var<storage, read_write> d_features: array<f32>;   // two an entry; zero before
+@group(0) @binding(4) var<storage, read_write> d_features: array<vec2<f32>>;   // zero before
 
 @compute @workgroup_size(8)
 fn main(@builtin(global_invocation_id) id: vec3<u32>) {
-    if (id.x >= 2u * grid.levels) {
+    if (id.x >= grid.levels) {
         return;
     }
-    let level = levels[id.x / 2u];
-    let feature = id.x & 1u;
+    let level = levels[id.x];
+    let first = first_entry(level);
     for (var i = grid.first_point; i < grid.last_point; i++) {
         let cell = find_cell(unit_point(points_at(i).xyz, grid), level);
-        let gradient = d_encoding_at(i * grid.all_levels + level.place.z)[feature];
+        let gradient = d_encoding_at(i * grid.all_levels + level.place.z);
 #unroll c $CORNERS
-        d_features[2u * (first_entry(level) + cell.index[$c]) + feature] += cell.weight[$c] * gradient;
+        d_features[first + cell.index[$c]] += cell.weight[$c] * gradient;
 #end
     }
 }

@@ -251,7 +251,7 @@ class HashEncoder:
         kernel = Kernel.get(self.device, "hashgrid_bwd", LANE_LEVELS=1, **self._defines(part))
         for first in range(0, n, _DISPATCH_POINTS):
             inputs["grid"] = self._uniform(part, n, time, first=first)
-            commands.dispatch(kernel, -(-2 * part.count // 8), **inputs, d_features=out)
+            commands.dispatch(kernel, -(-part.count // 8), **inputs, d_features=out)
 
     def _add_fixed(self, commands: Commands, part: _Part, n: int, inputs: dict[str, Buffer], out: Buffer) -> None:
         fixed = self.pool.get(f"d_fixed {part.grid} {part.sliced}", 2 * out.nbytes)

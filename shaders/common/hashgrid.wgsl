@@ -31,11 +31,12 @@ struct Cell {
     weight: array<f32, CORNERS>,   // all zero for a point outside the box
 }
 
-// Entry of the corner at whole-numbered coordinates: dense where the level fits into its table, else a hash.
+// Entry of the corner at whole-numbered coordinates: dense where the level fits into its table, else a hash; the number
+// of entries is then a power of two.
 fn entry(level: Level, at: vec3<u32>) -> u32 {
     let r = level.resolution;
     let dense = at.x + r.x * (at.y + r.y * at.z);
-    let hash = (at.x ^ (at.y * 2654435761u) ^ (at.z * 805459861u)) % r.w;
+    let hash = (at.x ^ (at.y * 2654435761u) ^ (at.z * 805459861u)) & (r.w - 1u);
     return select(hash, dense, level.place.w != 0u);
 }
 
