@@ -19,7 +19,7 @@ if typing.TYPE_CHECKING:
     from lapgs_wgpu.train.config import Config
 
 # Short names for the keys that are given most often.
-SHORTCUTS = {"data.path": "--data", "schedule.steps": "--steps", "field.kind": "--field"}
+SHORTCUTS = {"data.path": "--data", "schedule.steps": "--steps"}
 SYNTHETIC = "synthetic"
 INTERRUPTED = 130  # the shell's code for a process that Ctrl-C ended
 
@@ -76,7 +76,8 @@ def _train(arguments: list[str]) -> None:
         return
     if given["preset"] is None:
         raise InputError("name a preset, such as tiny, and the data to train on; lapgs-train --help says more.")
-    config = load_config(given["preset"], overrides)
+    ablate = [part.strip() for part in (given["ablate"] or "").split(",") if part.strip()]
+    config = load_config(given["preset"], overrides, field=given["field"], ablate=ablate)
     out = Path(given["out"] or f"runs/{_scene_name(config)}-{Path(given['preset']).stem}")
     check_run_folder(out, overwrite=given["overwrite"])
     device = open_device(given["device"])
@@ -156,7 +157,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _parse(arguments: list[str]) -> dict[str, typing.Any]:
-    from lapgs_wgpu.train.presets import config_keys, did_you_mean, load_config, preset_names
+    from lapgs_wgpu.train.presets import ABLATIONS, config_keys, did_you_mean, load_config, preset_names
 
     shown = next((word for word in arguments if word in preset_names()), "dnerf")
     preset = load_config(shown)
@@ -169,6 +170,15 @@ def _parse(arguments: list[str]) -> dict[str, typing.Any]:
     )
     parser.add_argument(
         "preset", nargs="?", metavar="PRESET", help=f"{', '.join(preset_names())}, or a .toml file, e.g. a run's"
+    )
+    parser.add_argument(
+        "--field",
+        metavar="NAME",
+        help="method: static (3DGS), mlp (deformable 3DGS), hexplane (4D-GS) or grid4d, each without what only the "
+        "paper's method has, or laplacian, the paper's [the preset's]",
+    )
+    parser.add_argument(
+        "--ablate", metavar="PART[,PART]", help=f"parts of the paper's method to leave out: {', '.join(ABLATIONS)}"
     )
     parser.add_argument("--out", metavar="RUN", help="run folder, new or empty [runs/SCENE-PRESET]")
     parser.add_argument("--overwrite", action="store_true", help="replace the run that lies in the run folder")

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
 
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.motion.field import FieldConfig, Grid4DField, make_field
+from lapgs_wgpu.motion.field import Deformation, FieldConfig
+from lapgs_wgpu.motion.grid_field import GridField
 from lapgs_wgpu.motion.hashgrid import HashConfig, encode_reference
+from lapgs_wgpu.motion.scene import make_field
 
 SMALL = FieldConfig(
+    kind="grid4d",
     bound=1.5,
     static=HashConfig(3, (4, 4, 4), (16, 16, 16), table_log2=9),
     temporal=HashConfig(4, (4, 4, 4), (12, 12, 8)),
@@ -20,9 +25,9 @@ SMALL = FieldConfig(
 POINTS = torch.rand(40, 3, generator=torch.Generator().manual_seed(0)) * 2.4 - 1.2
 
 
-def moving_field(device: Device, config: FieldConfig = SMALL) -> Grid4DField:
+def moving_field(device: Device, config: FieldConfig = SMALL) -> GridField:
     """With weights and tables as training might leave them."""
-    field = Grid4DField(config, device, seed=0)
+    field = GridField(config, device, seed=0)
     generator = torch.Generator().manual_seed(1)
     with torch.no_grad():
         for parameter in field.parameters():
@@ -30,8 +35,13 @@ def moving_field(device: Device, config: FieldConfig = SMALL) -> Grid4DField:
     return field
 
 
+def geometry(move: Deformation) -> list[Tensor]:
+    assert move.rotation is not None
+    return [move.rotation, move.translation, move.d_quats, move.d_scales]
+
+
 def test_nothing_moves_at_first(device: Device) -> None:
-    field = Grid4DField(SMALL, device, seed=0)
+    field = GridField(SMALL, device, seed=0)
     for t in (0.0, 0.5, 1.0):
         move = field(POINTS, t)
         assert torch.equal(move.rotation, torch.tensor([1.0, 0, 0, 0]).expand(40, 4))
@@ -42,10 +52,10 @@ def test_nothing_moves_at_first(device: Device) -> None:
 
 def test_no_points(device: Device) -> None:
     move = moving_field(device)(torch.zeros(0, 3), 0.5)
-    assert [tuple(part.shape) for part in move] == [(0, 4), (0, 3), (0, 4), (0, 3)]
+    assert [tuple(part.shape) for part in geometry(move)] == [(0, 4), (0, 3), (0, 4), (0, 3)]
 
 
-def by_hand(field: Grid4DField, points: Tensor, t: float) -> list[Tensor]:
+def by_hand(field: GridField, points: Tensor, t: float) -> list[Tensor]:
     """Grid4D's decoder written out: temporal features gated by spatial ones, hidden layers, heads."""
     time = (((2 * t - 1) * field.config.time_scale) + 1) / 2
     features = [
@@ -68,14 +78,15 @@ def by_hand(field: Grid4DField, points: Tensor, t: float) -> list[Tensor]:
 @pytest.mark.parametrize("depth", [0, 1, 2])
 @pytest.mark.parametrize("t", [0.0, 0.3, 1.0])
 def test_the_decoder_written_out(device: Device, depth: int, t: float) -> None:
-    field = moving_field(device, FieldConfig(SMALL.kind, SMALL.bound, SMALL.static, SMALL.temporal, 16, depth))
-    for found, expected in zip(field(POINTS, t), by_hand(field, POINTS, t), strict=True):
-        torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
-    torch.testing.assert_close(field(POINTS, t).rotation.norm(dim=1), torch.ones(40))
+    field = moving_field(device, replace(SMALL, depth=depth))
+    found = geometry(field(POINTS, t))
+    for part, expected in zip(found, by_hand(field, POINTS, t), strict=True):
+        torch.testing.assert_close(part, expected, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(found[0].norm(dim=1), torch.ones(40))
 
 
 def test_time_fills_a_share_of_its_axis(device: Device) -> None:
-    field = Grid4DField(SMALL, device, seed=0)
+    field = GridField(SMALL, device, seed=0)
     assert [field.grid_time(t) for t in (0.0, 0.5, 1.0)] == pytest.approx([0.05, 0.5, 0.95])
 
 
@@ -88,7 +99,7 @@ def test_motion_depends_on_time_and_place(device: Device) -> None:
 
 
 def test_every_parameter_is_in_one_group(device: Device) -> None:
-    field = Grid4DField(SMALL, device, seed=0)
+    field = GridField(SMALL, device, seed=0)
     groups = field.parameter_groups()
     assert set(groups) == {"hash", "mlp"}
     assert [id(p) for p in groups["hash"]] == [id(grid.table) for grid in field.grids]
@@ -100,7 +111,7 @@ def test_every_parameter_is_in_one_group(device: Device) -> None:
 def test_gradients_reach_every_parameter(device: Device) -> None:
     field = moving_field(device)
     points = POINTS.clone().requires_grad_()
-    torch.cat(field(points, 0.3), dim=1).square().sum().backward()
+    torch.cat(geometry(field(points, 0.3)), dim=1).square().sum().backward()
     assert points.grad is None
     for name, parameter in field.named_parameters():
         assert parameter.grad is not None, name
@@ -110,7 +121,7 @@ def test_gradients_reach_every_parameter(device: Device) -> None:
 
 def test_at_the_start_only_the_heads_learn(device: Device) -> None:
     """Zero heads hide everything before them; after one step of theirs all else has gradients, too."""
-    field = Grid4DField(SMALL, device, seed=0)
+    field = GridField(SMALL, device, seed=0)
     optimiser = torch.optim.SGD(field.parameters(), lr=0.1)
     target = torch.ones(40, 3)
     for expected in (False, True):
@@ -128,7 +139,7 @@ def test_the_gradient_is_the_derivative(device: Device) -> None:
     field = moving_field(device)
 
     def loss() -> Tensor:
-        return torch.cat(field(POINTS, 0.3), dim=1).sin().sum()
+        return torch.cat(geometry(field(POINTS, 0.3)), dim=1).sin().sum()
 
     loss().backward()
     tables = [grid.table for grid in field.grids]
@@ -147,13 +158,13 @@ def test_the_gradient_is_the_derivative(device: Device) -> None:
 
 def test_the_seed_decides_and_nothing_else(device: Device) -> None:
     torch.manual_seed(5)
-    first = Grid4DField(SMALL, device, seed=3).state_dict()
+    first = GridField(SMALL, device, seed=3).state_dict()
     torch.manual_seed(6)
-    again, other = (Grid4DField(SMALL, device, seed=seed).state_dict() for seed in (3, 4))
+    again, other = (GridField(SMALL, device, seed=seed).state_dict() for seed in (3, 4))
     assert all(torch.equal(again[name], value) for name, value in first.items())
     assert any(not torch.equal(other[name], value) for name, value in first.items())
 
 
 def test_static_scenes_have_no_field(device: Device) -> None:
     assert make_field(FieldConfig(kind="static"), device) is None
-    assert isinstance(make_field(SMALL, device), Grid4DField)
+    assert isinstance(make_field(SMALL, device), GridField)

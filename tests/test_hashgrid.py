@@ -205,8 +205,8 @@ def test_fixed_point_does_not_depend_on_the_order(device: Device) -> None:
     order = torch.randperm(3000, generator=torch.Generator().manual_seed(0))
     encoder = HashEncoder(device, make_grids(*names), BOUND, lane_levels=False)
     upstream = [torch.randn(3000, grid.features, generator=torch.Generator().manual_seed(1)) for grid in encoder.grids]
-    forwards = encoder.backward(points, 0.4, upstream)
-    shuffled = encoder.backward(points[order], 0.4, [d[order] for d in upstream])
+    forwards = encoder.backward([(points, 0.4)], upstream)
+    shuffled = encoder.backward([(points[order], 0.4)], [d[order] for d in upstream])
     assert torch.equal(forwards[0], shuffled[0])
     assert torch.equal(forwards[1], shuffled[1])
 
@@ -230,11 +230,11 @@ def test_gradients_of_any_size(device: Device, lane_levels: bool, size: float) -
     encoder = HashEncoder(device, make_grids("sliced", "hashed"), BOUND, lane_levels=lane_levels)
     points = random_points(500)
     upstream = [torch.randn(500, grid.features, generator=torch.Generator().manual_seed(1)) for grid in encoder.grids]
-    plain = encoder.backward(points, 0.4, upstream)
-    scaled = encoder.backward(points, 0.4, [size * d for d in upstream])
+    plain = encoder.backward([(points, 0.4)], upstream)
+    scaled = encoder.backward([(points, 0.4)], [size * d for d in upstream])
     for a, b in zip(plain, scaled, strict=True):
         assert relative(b.double() / size, a) < 1e-5
-    assert not any(d.any() for d in encoder.backward(points, 0.4, [0 * d for d in upstream]))
+    assert not any(d.any() for d in encoder.backward([(points, 0.4)], [0 * d for d in upstream]))
 
 
 @both_shapes
@@ -244,10 +244,10 @@ def test_small_gradients_beside_large_ones(device: Device, lane_levels: bool) ->
     points = torch.tensor([[-1.4, -1.4, -1.4], [1.4, 1.4, 1.4]])
     upstream = torch.ones(2, encoder.grids[0].features)
     upstream[1] *= 1e-7
-    (found,) = encoder.backward(points, 0.0, [upstream])
-    alone = encoder.backward(points[1:], 0.0, [upstream[1:]])[0]
+    (found,) = encoder.backward([(points, 0.0)], [upstream])
+    alone = encoder.backward([(points[1:], 0.0)], [upstream[1:]])[0]
     rows = alone.abs().sum(1) > 0
-    rows &= encoder.backward(points[:1], 0.0, [upstream[:1]])[0].abs().sum(1) == 0
+    rows &= encoder.backward([(points[:1], 0.0)], [upstream[:1]])[0].abs().sum(1) == 0
     assert rows.any()
     torch.testing.assert_close(found[rows], alone[rows], rtol=1e-5, atol=0)
 

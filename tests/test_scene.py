@@ -46,6 +46,7 @@ def moving_scene(device: Device, config: FieldConfig = CONFIG, sh_degree: int = 
         "opacity_logits": normal(count),
         "sh_dc": normal(count, 1, 3),
         "sh_rest": 0.2 * normal(count, 15, 3),
+        "dynamics": normal(count, config.dynamics_size),
     }
     scene = Scene4D(parameters, config, device, sh_degree=sh_degree)
     if scene.field is not None:
@@ -79,14 +80,17 @@ def test_gaussians_at_a_time_written_out(device: Device, t: float) -> None:
     scene = moving_scene(device)
     p, found = scene.parameters, scene.at(t)
     assert scene.field is not None
-    move = scene.field(p["means"], t)
+    move = scene.field(p["means"], t, p["dynamics"])
+    assert move.rotation is not None
+    assert move.d_dc is not None
     torch.testing.assert_close(found.means, turned(move.rotation, p["means"]) + move.translation)
     quats = p["quats"] / p["quats"].norm(dim=1, keepdim=True) + move.d_quats
     torch.testing.assert_close(found.quats, quats / quats.norm(dim=1, keepdim=True))
     torch.testing.assert_close(found.scales, (p["log_scales"].exp() + move.d_scales).clamp(min=1e-7))
     torch.testing.assert_close(found.opacities, 1 / (1 + torch.exp(-p["opacity_logits"])))
     assert found.sh_degree == 2
-    torch.testing.assert_close(found.sh, torch.cat([p["sh_dc"], p["sh_rest"][:, :8]], dim=1))
+    dc = p["sh_dc"] + move.d_dc[:, None]
+    torch.testing.assert_close(found.sh, torch.cat([dc, p["sh_rest"][:, :8]], dim=1))
     assert (found.scales > 0).all()
 
 
@@ -220,31 +224,41 @@ DAMAGE: dict[str, tuple[Callable[[dict[str, Any], dict[str, str]], object], str]
     "another type": (lambda _, m: m.update(field="[1, 2]"), "description of its field"),
     "degree in words": (lambda _, m: m.update(sh_degree="three"), "description of its field"),
     "degree 4": (lambda _, m: m.update(sh_degree="4"), "sh_degree 4 is outside 0 to 3"),
-    "unknown kind": (with_field(kind="quantum"), "unknown field 'quantum'"),
+    "unknown kind": (with_field(kind="quantum"), "kind is 'quantum'"),
     "unknown key": (with_field(colour="red"), "description of its field"),
     "a grid missing": (with_field(static=None), "description of its field"),
-    "width 0": (with_field(width=0), "out of range"),
-    "absurd width": (with_field(width=10**9), "out of range"),
+    "width 0": (with_field(width=0), "width must be 1 to 4096, got 0"),
+    "absurd width": (with_field(width=10**9), "width must be 1 to 4096"),
     "width in words": (with_field(width="wide"), "description of its field"),
     "fractional width": (with_field(width=8.5), "description of its field"),
     "fractional depth": (with_field(depth=0.5), "description of its field"),
     "true for a width": (with_field(width=True), "description of its field"),
     "fractional table": (with_grid(table_log2=18.5), "description of its field"),
     "time in words": (with_field(time_scale="slow"), "description of its field"),
-    "NaN time": (with_field(time_scale=math.nan), "out of range"),
-    "time beyond its axis": (with_field(time_scale=50.0), "out of range"),
-    "bound 0": (with_field(bound=0), "out of range"),
-    "NaN bound": (with_field(bound=math.nan), "out of range"),
-    "no levels": (with_grid(levels=0), "out of range"),
-    "absurd levels": (with_grid(levels=10**6), "out of range"),
+    "NaN time": (with_field(time_scale=math.nan), "got 1.5 and nan"),
+    "time beyond its axis": (with_field(time_scale=50.0), "got 1.5 and 50"),
+    "bound 0": (with_field(bound=0), "bound must be above 0"),
+    "NaN bound": (with_field(bound=math.nan), "got nan and 0.9"),
+    "no levels": (with_grid(levels=0), "levels must be 1 to 64"),
+    "absurd levels": (with_grid(levels=10**6), "levels must be 1 to 64"),
     "fractional levels": (with_grid(levels=2.5), "description of its field"),
-    "absurd table": (with_grid(table_log2=60), "out of range"),
-    "negative resolution": (with_grid(base=[-4, 4, 4]), "out of range"),
-    "absurd resolution": (with_grid(finest=[10**6, 8, 8]), "out of range"),
-    "two axes": (with_grid(base=[4, 4]), "out of range"),
+    "absurd table": (with_grid(table_log2=60), "table_log2 1 to 24, got 2 and 60"),
+    "negative resolution": (with_grid(base=[-4, 4, 4]), "2 to 65536 entries, got -4"),
+    "absurd resolution": (with_grid(finest=[10**6, 8, 8]), "2 to 65536 entries, got 1000000"),
+    "two axes": (with_grid(base=[4, 4]), "description of its field"),
+    "absurd planes": (
+        with_field(planes={"features": 10**6, "space": 8, "time": 8, "levels": 1}),
+        "features must be 1 to",
+    ),
+    "no dynamics": (with_field(dynamics=-1), "dynamics must be 0 to 256, got -1"),
+    "hash in words": (with_field(temporal_hash="yes"), "wrong type"),
     "other levels": (with_grid(levels=3), "has shape"),
     "other width": (with_field(width=9), "has shape"),
     "a tensor missing": (lambda t, _: t.pop("gaussians.quats"), "no tensor 'gaussians.quats'"),
+    "a dynamics row missing": (
+        lambda t, _: t.update({"gaussians.dynamics": t["gaussians.dynamics"][1:]}),
+        r"gaussians.dynamics' has shape \(59, 16\)",
+    ),
     "a weight missing": (lambda t, _: t.pop("field.heads.bias"), "no tensor 'field.heads.bias'"),
     "a row missing": (lambda t, _: t.update({"gaussians.means": t["gaussians.means"][1:]}), r"has shape \(59, 3\)"),
 }

@@ -1,6 +1,9 @@
-"""The deformation field: how each Gaussian is moved, turned and scaled at a time.
+"""What all deformation fields share: their configuration, what they are asked and what they answer.
 
-`grid4d` is Grid4D's decoder (Xu et al. 2024): temporal hash features, gated by spatial ones, then linear heads.
+A field is an nn.Module that is called as field(means, t, dynamics, nearby) -> Deformation, where means are the
+canonical ones (N, 3) in world units, which get no gradient from it; t in [0, 1]; dynamics (N, D) or None; nearby a
+Nearby or None. At first it changes nothing. Its parameter_groups() are by learning rate: "hash" (tables and planes)
+and "mlp".
 """
 
 from __future__ import annotations
@@ -8,96 +11,108 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
-import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from ..gpu.device import Device
-from .hashgrid import TIME, HashConfig, HashEncoder, HashGrid, option
+from .hashgrid import HashConfig, option
 
-FieldKind = Literal["static", "grid4d"]
+FieldKind = Literal["static", "mlp", "hexplane", "grid4d", "laplacian"]
+Motion = Literal["laplacian", "mlp"]
+Appearance = Literal["none", "color", "color+opacity"]
+MAX_WIDTH, MAX_DEPTH, MAX_COMPONENTS, MAX_DYNAMICS = 4096, 16, 256, 256
+
+
+@dataclass(frozen=True)
+class PlaneConfig:
+    """The planes of the field hexplane."""
+
+    features: int = option(32, "features of a plane")
+    space: int = option(64, "entries along a spatial axis of the coarsest planes")
+    time: int = option(75, "entries along the time axis")
+    levels: int = option(2, "sets of planes, each of twice the spatial resolution of the one before")
+
+    def __post_init__(self) -> None:
+        if not (1 <= self.features <= 256 and 2 <= self.space <= 4096 and 2 <= self.time <= 4096):
+            raise ValueError(
+                "features must be 1 to 256, space and time 2 to 4096, "
+                f"got {self.features}, {self.space} and {self.time}"
+            )
+        if not 1 <= self.levels <= 6:
+            raise ValueError(f"levels must be 1 to 6, got {self.levels}")
 
 
 @dataclass(frozen=True)
 class FieldConfig:
     """The shape of a field."""
 
-    kind: FieldKind = option("grid4d", "static (nothing moves) or grid4d")
+    kind: FieldKind = option(
+        "laplacian",
+        "static (nothing moves), mlp (deformable 3DGS), hexplane (4D-GS), grid4d (Grid4D) or laplacian (the paper's); "
+        "this key changes the field alone, --field also leaves out what belongs to the paper's method only",
+    )
     bound: float = option(
         1.6, "half side of the box that the encoder covers, world units; outside it features are zero"
     )
     static: HashConfig = field(default_factory=lambda: HashConfig(16, (16, 16, 16), (2048, 2048, 2048)))
     temporal: HashConfig = field(default_factory=lambda: HashConfig(32, (8, 8, 8), (32, 32, 16)))
+    planes: PlaneConfig = field(default_factory=PlaneConfig)
     width: int = option(256, "of the decoder")
     depth: int = option(0, "hidden layers between the fused features and the heads")
     time_scale: float = option(0.9, "share of the temporal grids' time axis that the clip fills")
+    temporal_hash: bool = option(True, "whether grid4d and laplacian have the three temporal grids")
+    motion: Motion = option(
+        "laplacian", "of the field laplacian: laplacian (a spectrum), or mlp, a decoder of features and time instead"
+    )
+    components: int = option(16, "frequencies of the spectrum")
+    dynamics: int = option(16, "length of each Gaussian's dynamics attribute with the field laplacian; 0 for none")
+    appearance: Appearance = option(
+        "color", "what the field laplacian changes besides the geometry: none, color, or color+opacity"
+    )
+
+    def __post_init__(self) -> None:
+        if not (0 < self.bound < 1e6 and 0 < self.time_scale <= 1):
+            raise ValueError(
+                "bound must be above 0 and time_scale above 0 and at most 1, "
+                f"got {self.bound:g} and {self.time_scale:g}"
+            )
+        for name, value, least, most in (
+            ("width", self.width, 1, MAX_WIDTH),
+            ("depth", self.depth, 0, MAX_DEPTH),
+            ("components", self.components, 1, MAX_COMPONENTS),
+            ("dynamics", self.dynamics, 0, MAX_DYNAMICS),
+        ):
+            if not least <= value <= most:
+                raise ValueError(f"{name} must be {least} to {most}, got {value}")
+
+    @property
+    def dynamics_size(self) -> int:
+        """Length of a Gaussian's dynamics attribute; 0 where the field has no use for it."""
+        return self.dynamics if self.kind == "laplacian" else 0
+
+
+class Nearby(NamedTuple):
+    """Where a field is asked once more, to keep it smooth: Gaussians `rows` (M,), at their means + offsets (M, 3),
+    world units, and at another time in [0, 1]. The weights are those of the two parts of the smoothness loss."""
+
+    rows: Tensor
+    offsets: Tensor
+    time: float
+    static_weight: float
+    temporal_weight: float
 
 
 class Deformation(NamedTuple):
-    """What is done to N Gaussians at a time: means are turned by `rotation` (N, 4) wxyz of unit length about the origin
-    and shifted by `translation` (N, 3); d_quats (N, 4) and d_scales (N, 3) are added to unit quaternions and scales."""
+    """What is done to N Gaussians at a time.
 
-    rotation: Tensor
+    Means are turned by `rotation` (N, 4) wxyz of unit length about the origin and shifted by `translation` (N, 3);
+    d_quats (N, 4) and d_scales (N, 3) are added to unit quaternions and to scales, d_dc (N, 3) to the colours' constant
+    part and d_opacity (N,) to the opacities' logits, None where the field leaves them as they are.
+    smoothness: a scalar, the weighted loss that keeps the field smooth; None where it was not asked for.
+    """
+
+    rotation: Tensor | None
     translation: Tensor
     d_quats: Tensor
     d_scales: Tensor
-
-
-class Grid4DField(nn.Module):
-    """Grid4D's field. With all heads at zero, as at the start, nothing moves."""
-
-    def __init__(self, config: FieldConfig, device: Device, seed: int) -> None:
-        super().__init__()
-        generator = torch.Generator().manual_seed(seed)
-        self.config = config
-        axes = ((0, 1, TIME), (1, 2, TIME), (0, 2, TIME))
-        self.static_grid = HashGrid(config.static, (0, 1, 2), generator)
-        self.temporal_grids = nn.ModuleList(HashGrid(config.temporal, three, generator) for three in axes)
-        self._encoder = HashEncoder(device, self.grids, config.bound)
-        width = config.width
-        self.spatial = _linear(self.static_grid.features, width, generator)
-        self.temporal = _linear(sum(grid.features for grid in self.grids[1:]), width, generator)
-        hidden = [layer for _ in range(config.depth) for layer in (_linear(width, width, generator), nn.ReLU())]
-        self.hidden = nn.Sequential(*hidden)
-        # One layer for all geometry heads: turn (4), shift (3), quaternion (4), scale (3).
-        self.heads = nn.Linear(width, 14)
-        nn.init.zeros_(self.heads.weight)
-        nn.init.zeros_(self.heads.bias)
-
-    @property
-    def grids(self) -> list[HashGrid]:
-        """All four, the static one first."""
-        return [self.static_grid, *(grid for grid in self.temporal_grids if isinstance(grid, HashGrid))]
-
-    def grid_time(self, t: float) -> float:
-        """A time in [0, 1] as the place on the temporal grids' time axis."""
-        return 0.5 * ((2.0 * t - 1.0) * self.config.time_scale + 1.0)
-
-    def forward(self, means: Tensor, t: float) -> Deformation:
-        """means: (N, 3) canonical, world units; no gradient reaches them from here. t in [0, 1]."""
-        static, *temporal = self._encoder(means, self.grid_time(t))
-        gate = 2.0 * torch.sigmoid(self.spatial(static)) - 1.0
-        hidden = self.hidden(torch.relu(self.temporal(torch.cat(temporal, dim=1))) * gate)
-        turn, shift, d_quats, d_scales = self.heads(hidden).split((4, 3, 4, 3), dim=1)
-        rotation = nn.functional.normalize(turn + turn.new_tensor([1.0, 0.0, 0.0, 0.0]), dim=1)
-        return Deformation(rotation, shift, d_quats, d_scales)
-
-    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        """Parameters by learning-rate group: "hash" tables and "mlp" weights."""
-        tables = [grid.table for grid in self.grids]
-        known = {id(table) for table in tables}
-        return {"hash": tables, "mlp": [p for p in self.parameters() if id(p) not in known]}
-
-
-def _linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:
-    """A linear layer with torch's own initial distribution, drawn from our generator."""
-    layer = nn.Linear(inputs, outputs)
-    reach = inputs**-0.5
-    with torch.no_grad():
-        layer.weight.uniform_(-reach, reach, generator=generator)
-        layer.bias.uniform_(-reach, reach, generator=generator)
-    return layer
-
-
-def make_field(config: FieldConfig, device: Device, seed: int = 0) -> Grid4DField | None:
-    """The field of this configuration, None for static scenes."""
-    return None if config.kind == "static" else Grid4DField(config, device, seed)
+    d_dc: Tensor | None = None
+    d_opacity: Tensor | None = None
+    smoothness: Tensor | None = None

@@ -7,6 +7,7 @@ cut at that time wherever that is cheaper than looking up the planes around it f
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -23,6 +24,8 @@ _DISPATCH_POINTS = 1 << 15  # with lane_levels: Mesa's software driver ends a sh
 _LEVEL_WORDS = 12  # common/hashgrid.wgsl: struct Level
 TIME = 3  # the axis number of time
 
+Place = tuple[Tensor, float]  # points (N, 3), world units, and a time in [0, 1]
+
 
 def option(default: Any, help_text: str) -> Any:
     """A field of a configuration, with the help that lapgs-train --help shows."""
@@ -37,6 +40,13 @@ class HashConfig:
     base: tuple[int, int, int] = option((16, 16, 16), "entries along each axis of the coarsest level")
     finest: tuple[int, int, int] = option((2048, 2048, 2048), "entries along each axis of the finest level")
     table_log2: int = option(19, "a level has at most 2^this entries, beyond which it is hashed")
+
+    def __post_init__(self) -> None:
+        if not (1 <= self.levels <= 64 and 1 <= self.table_log2 <= 24):
+            raise ValueError(f"levels must be 1 to 64 and table_log2 1 to 24, got {self.levels} and {self.table_log2}")
+        for size in (*self.base, *self.finest):
+            if not 2 <= size <= 1 << 16:
+                raise ValueError(f"base and finest must be 2 to {1 << 16} entries, got {size}")
 
 
 @dataclass(frozen=True)
@@ -143,8 +153,14 @@ class HashEncoder:
         Differentiable in the tables, not in the points (the encoder sees sg[mean]). A point outside the box
         [-bound, bound]^3 has zero features.
         """
-        outputs = _Encode.apply(self, points.detach(), time, *[grid.table for grid in self.grids])
-        return list(outputs)
+        return self.encode_all([(points, time)])[0]
+
+    def encode_all(self, places: Sequence[Place]) -> list[list[Tensor]]:
+        """Encode several sets of points, each at its own time, and exchange the tables with the device only once."""
+        detached = [(points.detach(), time) for points, time in places]
+        outputs = _Encode.apply(self, detached, *[grid.table for grid in self.grids])
+        count = len(self.grids)
+        return [list(outputs[i : i + count]) for i in range(0, len(outputs), count)]
 
     # One call on the device -----------------------------------------------------------------------------------------
 
@@ -168,82 +184,106 @@ class HashEncoder:
     def _defines(part: _Part) -> dict[str, int]:
         return {"SLICED": 1, "CORNERS": 4} if part.sliced else {"CORNERS": 8}
 
-    def encode(self, points: Tensor, time: float, tables: list[Tensor]) -> list[Tensor]:
-        """The forward pass without autograd."""
-        n = len(points)
-        if n == 0:
-            return [points.new_zeros((0, grid.features)) for grid in self.grids]
-        point_buffer = self._upload("points", torch.nn.functional.pad(points, (0, 1)))
+    def encode(self, places: Sequence[Place], tables: Sequence[Tensor]) -> list[Tensor]:
+        """The forward pass without autograd: the encodings of the first place, grid by grid, then of the second, ..."""
         table_buffers = [self._upload(f"table {i}", table) for i, table in enumerate(tables)]
-        outputs = [self.pool.get(f"encoding {i}", 4 * n * grid.features) for i, grid in enumerate(self.grids)]
-        with Commands(self.device) as commands:
-            for part in self._parts:
-                uniform = self._uniform(part, n, time)
-                features = table_buffers[part.grid]
-                defines = self._defines(part)
-                if part.sliced:
-                    slices = self.pool.get(f"slices {part.grid}", 8 * part.entries)
-                    commands.dispatch_grid(
-                        Kernel.get(self.device, "hashgrid_slice", **defines),
-                        (-(-part.cells // 64), part.count),
-                        grid=uniform,
-                        levels=part.levels,
-                        features=features,
-                        slices=slices,
-                    )
-                    features = slices
-                commands.dispatch(
-                    Kernel.get(self.device, "hashgrid", **defines),
-                    -(-n // 512) * part.count,
+        requests: list[tuple[Buffer, str, tuple[int, ...], int]] = []
+        for number, (points, time) in enumerate(places):
+            n = len(points)
+            outputs = [
+                self.pool.get(f"encoding {number} {i}", 4 * n * grid.features) for i, grid in enumerate(self.grids)
+            ]
+            requests += [(b, "float32", (n, g.features), 0) for b, g in zip(outputs, self.grids, strict=True)]
+            if n:
+                with Commands(self.device) as commands:
+                    self._encode_place(commands, self._points(number, points), n, time, table_buffers, outputs)
+        device = places[0][0].device
+        return [torch.from_numpy(array).to(device) for array in read_all(requests)]
+
+    def _encode_place(
+        self, commands: Commands, points: Buffer, n: int, time: float, tables: list[Buffer], outputs: list[Buffer]
+    ) -> None:
+        for part in self._parts:
+            uniform = self._uniform(part, n, time)
+            features = tables[part.grid]
+            defines = self._defines(part)
+            if part.sliced:
+                slices = self.pool.get(f"slices {part.grid}", 8 * part.entries)
+                commands.dispatch_grid(
+                    Kernel.get(self.device, "hashgrid_slice", **defines),
+                    (-(-part.cells // 64), part.count),
                     grid=uniform,
                     levels=part.levels,
-                    points=point_buffer,
                     features=features,
-                    encoding=outputs[part.grid],
+                    slices=slices,
                 )
-        arrays = read_all([(b, "float32", (n, g.features), 0) for b, g in zip(outputs, self.grids, strict=True)])
-        return [torch.from_numpy(array).to(points.device) for array in arrays]
+                features = slices
+            commands.dispatch(
+                Kernel.get(self.device, "hashgrid", **defines),
+                -(-n // 512) * part.count,
+                grid=uniform,
+                levels=part.levels,
+                points=points,
+                features=features,
+                encoding=outputs[part.grid],
+            )
 
-    def backward(self, points: Tensor, time: float, d_encodings: list[Tensor]) -> list[Tensor]:
-        """The gradients of the tables."""
-        n = len(points)
-        if n == 0:
-            return [torch.zeros_like(grid.table) for grid in self.grids]
-        point_buffer = self._upload("points", torch.nn.functional.pad(points, (0, 1)))
-        d_buffers = [self._upload(f"d_encoding {i}", d) for i, d in enumerate(d_encodings)]
+    def backward(self, places: Sequence[Place], d_encodings: Sequence[Tensor]) -> list[Tensor]:
+        """The gradients of the tables, from those of the encodings in the order of `encode`."""
         d_tables = [self.pool.get(f"d_table {i}", 8 * len(grid.table)) for i, grid in enumerate(self.grids)]
-        # The largest sum that can occur stays below 2^61 in fixed point.
-        largest = max(float(d.abs().max()) for d in d_encodings)
-        fixed_scale = 2.0 ** math.floor(61 - math.log2(max(largest, 1e-30) * n)) if largest < math.inf else 1.0
         with Commands(self.device) as commands:
             for buffer in d_tables:
                 commands.clear(buffer)
-            for part in self._parts:
-                inputs = {
-                    "grid": self._uniform(part, n, time, min(fixed_scale, 2.0**120)),
-                    "levels": part.levels,
-                    "points": point_buffer,
-                    "d_encoding": d_buffers[part.grid],
-                }
-                target = d_tables[part.grid]
-                if part.sliced:
-                    target = self.pool.get(f"d_slices {part.grid}", 8 * part.entries)
-                    commands.clear(target)
-                if self._lane_levels:
-                    self._add_lanes(commands, part, n, time, inputs, target)
-                else:
-                    self._add_fixed(commands, part, n, inputs, target)
-                if part.sliced:
-                    commands.dispatch_grid(
-                        Kernel.get(self.device, "hashgrid_slice_bwd", **self._defines(part)),
-                        (-(-part.cells // 64), part.count),
-                        grid=inputs["grid"],
-                        levels=part.levels,
-                        d_slices=target,
-                        d_features=d_tables[part.grid],
-                    )
+        count = len(self.grids)
+        for number, (points, time) in enumerate(places):
+            if len(points):
+                given = d_encodings[number * count : (number + 1) * count]
+                d_buffers = [self._upload(f"d_encoding {number} {i}", d) for i, d in enumerate(given)]
+                # The largest sum that can occur stays below 2^61 in fixed point.
+                largest = max(float(d.abs().max()) for d in given) if not self._lane_levels else 0.0
+                scale = (
+                    2.0 ** math.floor(61 - math.log2(max(largest, 1e-30) * len(points))) if largest < math.inf else 1.0
+                )
+                with Commands(self.device) as commands:
+                    buffer = self._points(number, points)
+                    self._add_place(commands, buffer, len(points), time, min(scale, 2.0**120), d_buffers, d_tables)
         arrays = read_all([(b, "float32", tuple(g.table.shape), 0) for b, g in zip(d_tables, self.grids, strict=True)])
-        return [torch.from_numpy(array).to(points.device) for array in arrays]
+        return [torch.from_numpy(array).to(places[0][0].device) for array in arrays]
+
+    def _add_place(
+        self,
+        commands: Commands,
+        points: Buffer,
+        n: int,
+        time: float,
+        fixed_scale: float,
+        d_encodings: list[Buffer],
+        d_tables: list[Buffer],
+    ) -> None:
+        for part in self._parts:
+            inputs = {
+                "grid": self._uniform(part, n, time, fixed_scale),
+                "levels": part.levels,
+                "points": points,
+                "d_encoding": d_encodings[part.grid],
+            }
+            target = d_tables[part.grid]
+            if part.sliced:
+                target = self.pool.get(f"d_slices {part.grid}", 8 * part.entries)
+                commands.clear(target)
+            if self._lane_levels:
+                self._add_lanes(commands, part, n, time, inputs, target)
+            else:
+                self._add_fixed(commands, part, n, inputs, target)
+            if part.sliced:
+                commands.dispatch_grid(
+                    Kernel.get(self.device, "hashgrid_slice_bwd", **self._defines(part)),
+                    (-(-part.cells // 64), part.count),
+                    grid=inputs["grid"],
+                    levels=part.levels,
+                    d_slices=target,
+                    d_features=d_tables[part.grid],
+                )
 
     def _add_lanes(
         self, commands: Commands, part: _Part, n: int, time: float, inputs: dict[str, Buffer], out: Buffer
@@ -261,6 +301,9 @@ class HashEncoder:
         unfix = Kernel.get(self.device, "hashgrid_unfix", **self._defines(part))
         commands.dispatch(unfix, -(-out.nbytes // 256), grid=inputs["grid"], d_fixed=fixed, d_features=out)
 
+    def _points(self, number: int, points: Tensor) -> Buffer:
+        return self._upload(f"points {number}", torch.nn.functional.pad(points, (0, 1)))
+
     def _upload(self, name: str, tensor: Tensor) -> Buffer:
         array = tensor.detach().to("cpu", torch.float32).contiguous().numpy()
         buffer = self.pool.get(name, array.nbytes)
@@ -270,15 +313,15 @@ class HashEncoder:
 
 class _Encode(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, encoder: HashEncoder, points: Tensor, time: float, *tables: Tensor) -> tuple[Tensor, ...]:
-        ctx.encoder, ctx.time = encoder, time
-        ctx.save_for_backward(points)
-        return tuple(encoder.encode(points, time, list(tables)))
+    def forward(ctx: Any, encoder: HashEncoder, places: Sequence[Place], *tables: Tensor) -> tuple[Tensor, ...]:
+        ctx.encoder, ctx.times = encoder, [time for _, time in places]
+        ctx.save_for_backward(*[points for points, _ in places])
+        return tuple(encoder.encode(places, tables))
 
     @staticmethod
     def backward(ctx: Any, *d_encodings: Tensor) -> tuple[Tensor | None, ...]:
-        (points,) = ctx.saved_tensors
-        return (None, None, None, *ctx.encoder.backward(points, ctx.time, list(d_encodings)))
+        places = list(zip(ctx.saved_tensors, ctx.times, strict=True))
+        return (None, None, *ctx.encoder.backward(places, d_encodings))
 
 
 def encode_reference(grid: HashGrid, table: Tensor, points: Tensor, time: float, bound: float) -> Tensor:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import typing
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -20,8 +21,11 @@ from ..io.ply import StillGaussians
 from ..splat.camera import Camera
 from ..splat.gaussians import Gaussians
 from ..splat.rasterize import Rendering, rasterize
-from .field import FieldConfig, Grid4DField, make_field
+from .field import FieldConfig, Nearby, PlaneConfig
+from .grid_field import TEMPORAL_AXES, GridField
 from .hashgrid import HashConfig, make_levels
+from .hexplane_field import HexPlaneField, plane_shapes
+from .mlp_field import MlpField
 
 SH_C0 = 0.28209479177387814
 _MIN_SCALE = 1e-7
@@ -36,11 +40,32 @@ _SHAPES = {
 }
 
 
+Field = GridField | MlpField | HexPlaneField
+
+
+def make_field(config: FieldConfig, device: Device, seed: int = 0) -> Field | None:
+    """The field of this configuration, None for static scenes."""
+    if config.kind == "static":
+        return None
+    if config.kind == "mlp":
+        return MlpField(config, seed)
+    if config.kind == "hexplane":
+        return HexPlaneField(config, seed)
+    return GridField(config, device, seed)
+
+
+def row_shapes(config: FieldConfig) -> dict[str, tuple[int, ...]]:
+    """What each Gaussian carries with this field: name -> shape of a row."""
+    size = config.dynamics_size
+    return _SHAPES | ({"dynamics": (size,)} if size else {})
+
+
 class Scene4D:
     """A moving scene.
 
     parameters: canonical Gaussians as they are optimised, each an nn.Parameter of float32: means (N, 3) world units,
-    log_scales (N, 3), quats (N, 4) wxyz of any length, opacity_logits (N,), sh_dc (N, 1, 3), sh_rest (N, 15, 3).
+    log_scales (N, 3), quats (N, 4) wxyz of any length, opacity_logits (N,), sh_dc (N, 1, 3), sh_rest (N, 15, 3), and
+    dynamics (N, D) where the field has a use for it (paper eq. 8).
     field: None where nothing moves. sh_degree: the degree in use, 0 to 3. metadata: what the checkpoint said of itself.
     """
 
@@ -53,11 +78,13 @@ class Scene4D:
         sh_degree: int = 0,
         seed: int = 0,
     ) -> None:
-        self.parameters = {name: nn.Parameter(parameters[name].detach().float().contiguous()) for name in _SHAPES}
+        self.parameters = {
+            name: nn.Parameter(parameters[name].detach().float().contiguous()) for name in row_shapes(field_config)
+        }
         self.field_config = field_config
         self.device = device
         self.sh_degree = sh_degree
-        self.field: Grid4DField | None = make_field(field_config, device, seed)
+        self.field: Field | None = make_field(field_config, device, seed)
         self.metadata: dict[str, str] = {}
 
     @staticmethod
@@ -80,6 +107,7 @@ class Scene4D:
             "opacity_logits": torch.full((n,), float(np.log(opacity / (1 - opacity)))),
             "sh_dc": (torch.as_tensor(np.asarray(colors, np.float32)) - 0.5)[:, None] / SH_C0,
             "sh_rest": torch.zeros(n, 15, 3),
+            "dynamics": torch.zeros(n, field_config.dynamics_size),
         }
         return Scene4D(parameters, field_config, device or open_device(), seed=seed)
 
@@ -103,17 +131,30 @@ class Scene4D:
 
     def at(self, t: float) -> Gaussians:
         """The Gaussians at time t in [0, 1], activated. Differentiable in `parameters` and the field's parameters."""
+        return self.deformed(t)[0]
+
+    def deformed(self, t: float, nearby: Nearby | None = None) -> tuple[Gaussians, Tensor | None]:
+        """`at`, and the loss that keeps the field smooth, where `nearby` says where to ask it once more."""
         still = self.canonical()
         if self.field is None or len(self) == 0:
-            return still
-        move = self.field(self.parameters["means"], t)
-        return Gaussians(
-            rotate(move.rotation, still.means) + move.translation,
+            return still, None
+        p = self.parameters
+        move = self.field(p["means"], t, p.get("dynamics"), nearby)
+        means, sh, opacities = still.means, still.sh, still.opacities
+        if move.rotation is not None:
+            means = rotate(move.rotation, means)
+        if move.d_dc is not None:
+            sh = torch.cat([sh[:, :1] + move.d_dc[:, None], sh[:, 1:]], dim=1)
+        if move.d_opacity is not None:
+            opacities = (p["opacity_logits"] + move.d_opacity).sigmoid()
+        moved = Gaussians(
+            means + move.translation,
             nn.functional.normalize(still.quats + move.d_quats, dim=1),
             (still.scales + move.d_scales).clamp(min=_MIN_SCALE),
-            still.opacities,
-            still.sh,
+            opacities,
+            sh,
         )
+        return moved, move.smoothness
 
     def render(self, camera: Camera, t: float, background: Tensor | None = None) -> Rendering:
         """The picture of a camera at time t in [0, 1], without gradients. background: (3,), black where None."""
@@ -127,11 +168,14 @@ class Scene4D:
         """
         with torch.no_grad():
             still = self.at(0.0)
-        sh = torch.cat([self.parameters["sh_dc"], self.parameters["sh_rest"]], dim=1)
+            sh = torch.cat([still.sh[:, :1], self.parameters["sh_rest"]], dim=1)
+            logits = self.parameters["opacity_logits"].detach()
+            if not torch.equal(still.opacities, logits.sigmoid()):
+                logits = still.opacities.logit(eps=1e-7)
         arrays = StillGaussians(
             means=still.means.numpy(force=True),
             sh=sh.numpy(force=True),
-            opacity_logits=self.parameters["opacity_logits"].numpy(force=True),
+            opacity_logits=logits.numpy(force=True),
             log_scales=still.scales.log().numpy(force=True),
             quats=still.quats.numpy(force=True),
         )
@@ -179,10 +223,9 @@ def load(path: str | os.PathLike[str], device: Device | None = None) -> Scene4D:
         config, degree = _read_header(metadata, path)
     count = len(still.means)
     parameters = {}
-    for name, shape in _SHAPES.items():
+    for name, shape in row_shapes(config).items():
         parameters[name] = _tensor(tensors, f"gaussians.{name}", (count, *shape), path)
-    if config.kind != "static":
-        _check_tables(config, tensors, path)
+    _check_sizes(config, tensors, path)
     scene = Scene4D(parameters, config, device or open_device(), sh_degree=degree)
     if scene.field is not None:
         state = scene.field.state_dict()
@@ -198,8 +241,11 @@ def _read_header(metadata: Mapping[str, str], path: str | os.PathLike[str]) -> t
         for name in ("static", "temporal"):
             grid: dict[str, Any] = values[name]
             values[name] = HashConfig(grid["levels"], tuple(grid["base"]), tuple(grid["finest"]), grid["table_log2"])
+        values["planes"] = PlaneConfig(**values["planes"])
         config, degree = FieldConfig(**values), int(metadata["sh_degree"])
-        _check_config(config, degree)
+        _check_types(config, FieldConfig())
+        if not 0 <= degree <= _MAX_DEGREE:
+            raise ValueError(f"sh_degree {degree} is outside 0 to {_MAX_DEGREE}")
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(
             f"{path}: the checkpoint's description of its field cannot be read ({type(error).__name__}: {error}): "
@@ -208,39 +254,32 @@ def _read_header(metadata: Mapping[str, str], path: str | os.PathLike[str]) -> t
     return config, degree
 
 
-def _check_config(config: FieldConfig, degree: int) -> None:
-    """Types and bounds, which keep a damaged or hostile description from asking for what makes no sense."""
-    if config.kind not in ("static", "grid4d"):
-        raise ValueError(f"unknown field {config.kind!r}")
-    if not 0 <= degree <= _MAX_DEGREE:
-        raise ValueError(f"sh_degree {degree} is outside 0 to {_MAX_DEGREE}")
-    grids = (config.static, config.temporal)
-    whole = [config.width, config.depth]
-    whole += [n for grid in grids for n in (grid.levels, grid.table_log2, *grid.base, *grid.finest)]
-    if not all(type(n) is int for n in whole) or not all(type(n) in (int, float) for n in _reals(config)):
-        raise ValueError("a number has the wrong type")
-    if not (0 < config.bound < 1e6 and 0 < config.time_scale <= 1 and 1 <= config.width <= 4096):
-        raise ValueError("bound, time_scale or width out of range")
-    if not 0 <= config.depth <= 16:
-        raise ValueError("depth out of range")
-    for grid in grids:
-        sizes = (*grid.base, *grid.finest)
-        if not (1 <= grid.levels <= 64 and 1 <= grid.table_log2 <= 24 and len(sizes) == 6):
-            raise ValueError("levels or table_log2 out of range")
-        if not all(2 <= size <= 1 << 16 for size in sizes):
-            raise ValueError("grid resolution out of range")
+def _check_types(found: Any, like: Any) -> None:
+    """That a description has the types of another one: JSON may hold anything."""
+    if dataclasses.is_dataclass(like):
+        kinds = typing.get_type_hints(type(like))
+        for field in dataclasses.fields(like):
+            value, choices = getattr(found, field.name), typing.get_args(kinds[field.name])
+            if typing.get_origin(kinds[field.name]) is Literal and value not in choices:
+                raise ValueError(f"{field.name} is {value!r}")
+            _check_types(value, getattr(like, field.name))
+    elif isinstance(like, tuple):
+        for value, entry in zip(found, like, strict=True):
+            _check_types(value, entry)
+    elif type(found) is not type(like) and not (type(like) is float and type(found) is int):
+        raise TypeError(f"{found!r} has the wrong type")
 
 
-def _reals(config: FieldConfig) -> tuple[float, float]:
-    return config.bound, config.time_scale
-
-
-def _check_tables(config: FieldConfig, tensors: Mapping[str, NDArray[Any]], path: str | os.PathLike[str]) -> None:
-    """That the tables in the file are of the sizes that the description asks for, before memory is."""
-    names = ["static_grid", *(f"temporal_grids.{i}" for i in range(3))]
-    for name, grid in zip(names, (config.static, *[config.temporal] * 3), strict=True):
-        last = make_levels(grid)[-1]
-        _tensor(tensors, f"field.{name}.table", (last.first + last.entries, 2), path)
+def _check_sizes(config: FieldConfig, tensors: Mapping[str, NDArray[Any]], path: str | os.PathLike[str]) -> None:
+    """That the large tensors in the file have the sizes that the description asks for, before memory is taken."""
+    if config.kind in ("grid4d", "laplacian"):
+        temporal = [f"temporal_grids.{i}" for i in range(len(TEMPORAL_AXES) if config.temporal_hash else 0)]
+        for name in ("static_grid", *temporal):
+            last = make_levels(config.static if name == "static_grid" else config.temporal)[-1]
+            _tensor(tensors, f"field.{name}.table", (last.first + last.entries, 2), path)
+    elif config.kind == "hexplane":
+        for i, shape in enumerate(plane_shapes(config.planes)):
+            _tensor(tensors, f"field.planes.{i}", shape, path)
 
 
 def _tensor(

@@ -12,6 +12,7 @@ import math
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from lapgs_wgpu.motion.dynamics import DynamicsMode
 from lapgs_wgpu.motion.field import FieldConfig
 
 Background = Literal["black", "white", "random"]
@@ -94,8 +95,10 @@ class RatesConfig:
     opacity_logits: float = described("learning rate of the opacities' logits")
     sh_dc: float = described("learning rate of the colours' constant part")
     sh_rest: float = described("learning rate of the colours' other spherical harmonics")
-    hash: Rate = described("learning rate of the field's hash tables")
+    dynamics: float = described("learning rate of the dynamics attributes")
+    hash: Rate = described("learning rate of the field's hash tables, or planes")
     mlp: Rate = described("learning rate of the field's other weights")
+    frequencies: Rate = described("learning rate of the spectrum's frequencies, cycles over the clip a step")
 
     def __post_init__(self) -> None:
         self.schedules()
@@ -156,10 +159,30 @@ class LossConfig:
     """What is minimised."""
 
     ssim: float = described("share w of the structural similarity in (1 - w) L1 + w (1 - SSIM)")
+    dynamics: float = described("weight of the regularisation of the dynamics attributes (paper eq. 12)")
+    dynamics_mode: DynamicsMode = described(
+        "what it does to outliers: literal (pulls them in, as the paper's equation), promote (pushes them out, as its "
+        "text) or off"
+    )
 
     def __post_init__(self) -> None:
         if self.ssim > 1:
             raise ValueError(f"ssim is a share and must be at most 1, got {self.ssim:g}")
+
+
+@dataclass(frozen=True)
+class SmoothnessConfig:
+    """The loss that keeps the field smooth: squared differences of its features at near places (Grid4D)."""
+
+    static: float = described("weight for features of place")
+    temporal: float = described("weight for features of place and time")
+    share: float = described("of the Gaussians that are compared in a step, between 0 and 1; 0 leaves the loss out")
+    reach: float = described("how far away the other place is at most along each axis, world units")
+    time_reach: float = described("how far away the other time is at most, in clips")
+
+    def __post_init__(self) -> None:
+        if self.share > 1:
+            raise ValueError(f"share must be at most 1, got {self.share:g}")
 
 
 @dataclass(frozen=True)
@@ -173,4 +196,5 @@ class Config:
     rates: RatesConfig
     density: DensityConfig
     loss: LossConfig
+    smoothness: SmoothnessConfig
     seed: int = described("of every random draw")

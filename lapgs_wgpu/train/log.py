@@ -14,6 +14,7 @@ from types import TracebackType
 from typing import TextIO
 
 from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.motion.laplacian import LaplacianMotion
 
 INTERVAL = 50  # steps from one line of log.jsonl to the next, over which loss and PSNR are averaged
 TERMINAL_SECONDS = 0.25  # from one redraw of the progress line to the next
@@ -23,8 +24,9 @@ FILE_SECONDS = 15.0  # the same where stderr is no terminal, and each is a line 
 class Log:
     """Progress of a training, step by step. A context manager.
 
-    path: log.jsonl, written anew. Each line holds step, loss, psnr (dB, training views) and gaussians, which repeat
-    from run to run, and under "timing" seconds and steps_per_second, which do not.
+    path: log.jsonl, written anew. Each line holds step, loss, psnr (dB, training views) and gaussians, and the
+    frequencies and amplitudes of the motion's spectrum where there is one, all of which repeat from run to run; and
+    under "timing" seconds and steps_per_second, which do not.
     """
 
     def __init__(self, path: Path, steps: int, terminal: TextIO | None = None) -> None:
@@ -50,7 +52,9 @@ class Log:
         """Since the start."""
         return time.perf_counter() - self._start
 
-    def step(self, step: int, loss: float, psnr: float, gaussians: int) -> None:
+    def step(
+        self, step: int, loss: float, psnr: float, gaussians: int, spectrum: LaplacianMotion | None = None
+    ) -> None:
         """Take in a step that is done (counted from 1)."""
         now = time.perf_counter()
         self._recent.append((loss, psnr))
@@ -64,6 +68,7 @@ class Log:
                 "loss": round(mean_loss, 7),
                 "psnr": round(mean_psnr, 4),
                 "gaussians": gaussians,
+                **(_spectrum(spectrum) if spectrum else {}),
                 "timing": {"seconds": round(now - self._start, 3), "steps_per_second": round(rate, 3)},
             }
             self._file.write(json.dumps(line) + "\n")
@@ -79,6 +84,11 @@ class Log:
             )
             self._terminal.write(f"\r\x1b[2K{text}" if on_terminal else f"{text}\n")
             self._terminal.flush()
+
+
+def _spectrum(motion: LaplacianMotion) -> dict[str, list[float]]:
+    values = {"frequencies": motion.frequencies.detach(), "amplitudes": motion.amplitudes()}
+    return {name: [round(value, 6) for value in tensor.tolist()] for name, tensor in values.items()}
 
 
 def _clock(seconds: float) -> str:

@@ -22,13 +22,16 @@ from lapgs_wgpu.data.views import Dataset, ImageCache, View, composite
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device, open_device
 from lapgs_wgpu.io.atomic import atomic_write
+from lapgs_wgpu.motion.dynamics import dynamics_loss
+from lapgs_wgpu.motion.field import Nearby
+from lapgs_wgpu.motion.laplacian import LaplacianMotion
 from lapgs_wgpu.motion.scene import Scene4D, draw
-from lapgs_wgpu.train.config import Background, Config, PointsConfig
+from lapgs_wgpu.train.config import Background, Config, PointsConfig, SmoothnessConfig
 from lapgs_wgpu.train.densify import Statistics, densify, reset_opacities
 from lapgs_wgpu.train.evaluate import COLOURS, evaluate, write_metrics
 from lapgs_wgpu.train.log import Log, environment
 from lapgs_wgpu.train.losses import photometric_loss, psnr
-from lapgs_wgpu.train.optimise import Optimiser
+from lapgs_wgpu.train.optimise import FrequencyOptimiser, Optimiser
 from lapgs_wgpu.train.presets import write_toml
 
 MAX_SH_DEGREE = 3
@@ -65,6 +68,8 @@ def train(
     optimiser = Optimiser(
         scene.parameters, scene.field.parameter_groups() if scene.field else {}, config.rates.schedules()
     )
+    spectrum = spectrum_of(scene)
+    frequencies = FrequencyOptimiser(spectrum, config.rates.frequencies, len(dataset.times) / 2) if spectrum else None
     # Cameras that all stand at one place have no extent; the scene's own size must serve.
     extent = dataset.extent or config.points.box
     statistics = Statistics(len(scene), scene.parameters["means"].device)
@@ -75,12 +80,22 @@ def train(
     with Log(out / "log.jsonl", schedule.steps) as log, pictures, _interruptible() as interrupted:
         for step in range(1, schedule.steps + 1):
             view, target, background = pictures.draw()
-            gaussians = scene.canonical() if step <= schedule.warm_up else scene.at(view.time)
+            if step <= schedule.warm_up:
+                gaussians, smoothness = scene.canonical(), None
+            else:
+                nearby = draw_nearby(config.smoothness, len(scene), view.time, generator)
+                gaussians, smoothness = scene.deformed(view.time, nearby)
             rendering = draw(gaussians, view.camera, background, device, depth=False)
             loss = photometric_loss(rendering.image, target, config.loss.ssim)
+            objective = loss if smoothness is None else loss + smoothness
+            if "dynamics" in scene.parameters and step > schedule.warm_up:
+                regularisation = dynamics_loss(scene.parameters["dynamics"], config.loss.dynamics_mode)
+                objective = objective + config.loss.dynamics * regularisation
             optimiser.zero_grad()
-            loss.backward()
+            objective.backward()
             optimiser.step(step)
+            if frequencies is not None:
+                frequencies.step(step)
 
             # After the optimiser's step, so that no gradient is lost with the rows that change.
             if step < density.stop:
@@ -102,7 +117,7 @@ def train(
             if step % schedule.sh_interval == 0:
                 scene.sh_degree = min(scene.sh_degree + 1, MAX_SH_DEGREE)
 
-            log.step(step, loss.item(), psnr(rendering.image.detach(), target), len(scene))
+            log.step(step, loss.item(), psnr(rendering.image.detach(), target), len(scene), spectrum)
             if interrupted.is_set():
                 break
         seconds = log.seconds
@@ -112,6 +127,23 @@ def train(
         raise KeyboardInterrupt(f"stopped after step {step} of {schedule.steps}; {out / 'checkpoint.ply'} holds it.")
     evaluate_run(out, scene, dataset, config.data.background, {"steps": step, "seconds": round(seconds, 3)})
     return scene
+
+
+def spectrum_of(scene: Scene4D) -> LaplacianMotion | None:
+    """The scene's spectrum of motion, where its field has one."""
+    motion = getattr(scene.field, "motion", None)
+    return motion if isinstance(motion, LaplacianMotion) else None
+
+
+def draw_nearby(config: SmoothnessConfig, count: int, t: float, generator: torch.Generator) -> Nearby | None:
+    """Where the field of `count` Gaussians is compared with itself in a step at time t; None where it is not."""
+    chosen = round(config.share * count)
+    if chosen == 0 or config.static == config.temporal == 0:
+        return None
+    rows = torch.randint(count, (chosen,), generator=generator)
+    offsets = config.reach * (2 * torch.rand(chosen, 3, generator=generator) - 1)
+    other = t + config.time_reach * (2 * float(torch.rand((), generator=generator)) - 1)
+    return Nearby(rows, offsets, min(max(other, 0.0), 1.0), config.static, config.temporal)
 
 
 def evaluate_run(

@@ -7,9 +7,11 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
+from lapgs_wgpu.motion.laplacian import LaplacianMotion
 from lapgs_wgpu.train.config import Rate
 
 ADAM_EPS = 1e-15  # 3DGS's: gradients of single Gaussians are tiny
+LARGEST_FREQUENCY_STEP = 0.02  # cycles over the clip
 
 
 class Optimiser:
@@ -66,3 +68,33 @@ class Optimiser:
         if state:
             self._adam.state[parameter] = {**state, **moments}
         next(group for group in self._adam.param_groups if group["name"] == name)["params"] = [parameter]
+
+
+class FrequencyOptimiser:
+    """Moves the frequencies of a spectrum along eq. 5's gradient.
+
+    Adam, but with one second moment shared by all frequencies: one for each would divide the factor 1 / sigma_k^2, by
+    which eq. 5 favours the faint components, away again. limit: the Nyquist frequency, cycles over the clip.
+    """
+
+    def __init__(self, motion: LaplacianMotion, rate: Rate, limit: float) -> None:
+        self._motion, self._rate, self._limit = motion, rate, limit
+        self._mean = torch.zeros_like(motion.frequencies)
+        self._square = 0.0
+        self._steps = 0
+
+    @torch.no_grad()
+    def step(self, step: int) -> None:
+        """Move the frequencies, if they have a gradient, at the rate of this step (counted from 1), and forget it."""
+        frequencies = self._motion.frequencies
+        if frequencies.grad is None:
+            return
+        gradient = self._motion.frequency_gradient()
+        self._steps += 1
+        self._mean = 0.9 * self._mean + 0.1 * gradient
+        self._square = 0.999 * self._square + 0.001 * float(gradient.square().mean())
+        mean = self._mean / (1 - 0.9**self._steps)
+        size = (self._square / (1 - 0.999**self._steps)) ** 0.5
+        move = self._rate.at(step) * mean / (size + ADAM_EPS)
+        frequencies.sub_(move.clamp(-LARGEST_FREQUENCY_STEP, LARGEST_FREQUENCY_STEP)).clamp_(0.0, self._limit)
+        frequencies.grad = None

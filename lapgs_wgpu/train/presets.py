@@ -16,9 +16,24 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.motion.field import FieldKind
 from lapgs_wgpu.train.config import Config
 
 Table = dict[str, Any]
+
+# What only the paper's method has, besides its field: left out with every other one.
+PAPER_ONLY = {"loss.pyramid": 0.0, "loss.ncc": 0.0, "density.split": "plain"}
+# The parts of the method that --ablate takes out, and what is set then.
+ABLATIONS: dict[str, dict[str, Any]] = {
+    "laplacian": {"field.motion": "mlp"},
+    "dynamics": {"field.dynamics": 0},
+    "split": {"density.split": "plain"},
+    "lap": {"loss.pyramid": 0.0},
+    "ncc": {"loss.ncc": 0.0},
+    "dy": {"loss.dynamics_mode": "off"},
+    "hash": {"field.temporal_hash": False},
+    "appearance": {"field.appearance": "none"},
+}
 
 LARGEST_NUMBER = 2**31 - 1  # no key has a use for more
 
@@ -29,19 +44,42 @@ def preset_names() -> list[str]:
     return sorted(Path(file.name).stem for file in files if file.name.endswith(".toml"))
 
 
-def load_config(preset: str, overrides: Mapping[str, str | list[str]] | None = None) -> Config:
+def load_config(
+    preset: str,
+    overrides: Mapping[str, str | list[str]] | None = None,
+    *,
+    field: str | None = None,
+    ablate: Iterable[str] = (),
+) -> Config:
     """A preset by name, or a .toml file by path (such as an earlier run's config.toml), with some values overridden.
 
     overrides: dotted key -> text, or texts of a tuple's entries, as they stand on a command line.
+    field: a method in short, its field without what belongs to the paper's only (PAPER_ONLY). ablate: parts of the
+    paper's method that are left out (ABLATIONS). Overrides come last.
     Raises InputError where the preset, a key or a value is not valid.
     """
     table = _read(preset)
     known = {key.name: key.kind for key in config_keys()}
+    for key, value in _shorthands(field, ablate).items():
+        _set(table, key, value)
     for key, text in (overrides or {}).items():
         if key not in known:
             raise InputError(f"there is no option --{key}{did_you_mean(key, known)}.")
         _set(table, key, _checked(known[key], _from_text(text, known[key]), f"--{key}"))
     return typing.cast(Config, _build(Config, table, preset, ""))
+
+
+def _shorthands(field: str | None, ablate: Iterable[str]) -> dict[str, Any]:
+    """Key -> value of what --field and --ablate stand for."""
+    values: dict[str, Any] = {}
+    if field is not None:
+        values["field.kind"] = _checked(FieldKind, field, "--field")
+        values |= PAPER_ONLY if field != "laplacian" else {}
+    for part in ablate:
+        if part not in ABLATIONS:
+            raise InputError(f"--ablate knows {', '.join(ABLATIONS)}, not {part!r}{did_you_mean(part, ABLATIONS)}.")
+        values |= ABLATIONS[part]
+    return values
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

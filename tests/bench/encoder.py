@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.motion.field import FieldConfig, Grid4DField
+from lapgs_wgpu.motion.field import FieldConfig, GridField
 from lapgs_wgpu.motion.hashgrid import HashEncoder, encode_reference
 
 TIME = 0.37
@@ -34,7 +34,7 @@ class EncoderReport:
 
 def bench_encoder(device: Device, config: FieldConfig, means: NDArray[np.float32], repeat: int) -> EncoderReport:
     """Encode the means with all four grids of the field."""
-    grids = Grid4DField(config, device, seed=0).grids
+    grids = GridField(config, device, seed=0).grids
     encoder = HashEncoder(device, grids, config.bound)
     tables = [grid.table for grid in grids]
     points = torch.from_numpy(means)

@@ -1,0 +1,109 @@
+"""The fields over the four-grid hash encoder: Grid4D's, and the paper's, which adds to it."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from ..gpu.device import Device
+from .field import Deformation, FieldConfig, Nearby
+from .hashgrid import TIME, HashEncoder, HashGrid
+from .laplacian import LaplacianMotion, TimeMotion
+from .layers import linear, zero_head
+
+GEOMETRY = (4, 3, 4, 3)  # outputs of the geometry heads: turn, shift, quaternion, scale
+TEMPORAL_AXES = ((0, 1, TIME), (1, 2, TIME), (0, 2, TIME))
+
+
+class GridField(nn.Module):
+    """grid4d: temporal hash features, gated by spatial ones, then linear heads (Grid4D, Xu et al. 2024; paper eq. 9).
+
+    laplacian: each Gaussian's dynamics attribute stands beside its temporal features (eq. 8), the Laplacian motion is
+    added before the heads (eq. 6), and an appearance head compensates for changes of brightness. Without these, or
+    with all of them at zero, it is grid4d.
+    """
+
+    def __init__(self, config: FieldConfig, device: Device, seed: int) -> None:
+        super().__init__()
+        generator = torch.Generator().manual_seed(seed)
+        ours = config.kind == "laplacian"
+        width = config.width
+        self.config = config
+        self.static_grid = HashGrid(config.static, (0, 1, 2), generator)
+        axes = TEMPORAL_AXES if config.temporal_hash else ()
+        self.temporal_grids = nn.ModuleList(HashGrid(config.temporal, three, generator) for three in axes)
+        self._encoder = HashEncoder(device, self.grids, config.bound)
+        static, temporal = self.static_grid.features, sum(grid.features for grid in self.grids[1:])
+        self.spatial = linear(static, width, generator)
+        self.temporal = linear(max(1, config.dynamics_size + temporal), width, generator)
+        hidden = [layer for _ in range(config.depth) for layer in (linear(width, width, generator), nn.ReLU())]
+        self.hidden = nn.Sequential(*hidden)
+        self.heads = zero_head(width, sum(GEOMETRY))
+        self.motion: LaplacianMotion | TimeMotion | None = None
+        if ours and config.motion == "laplacian":
+            self.motion = LaplacianMotion(static, width, config.components, generator)
+        elif ours:
+            self.motion = TimeMotion(static, width, generator)
+        changes = {"none": 0, "color": 3, "color+opacity": 4}[config.appearance] if ours else 0
+        self.appearance = zero_head(width, changes) if changes else None
+
+    @property
+    def grids(self) -> list[HashGrid]:
+        """The static one first."""
+        return [self.static_grid, *(grid for grid in self.temporal_grids if isinstance(grid, HashGrid))]
+
+    def grid_time(self, t: float) -> float:
+        """A time in [0, 1] as the place on the temporal grids' time axis."""
+        return 0.5 * ((2.0 * t - 1.0) * self.config.time_scale + 1.0)
+
+    def forward(
+        self, means: Tensor, t: float, dynamics: Tensor | None = None, nearby: Nearby | None = None
+    ) -> Deformation:
+        """See motion/field.py."""
+        places = [(means, self.grid_time(t))]
+        if nearby is not None:
+            places.append((means[nearby.rows] + nearby.offsets, self.grid_time(nearby.time)))
+        encoded = self._encoder.encode_all(places)
+        static, *temporal = encoded[0]
+        if self.config.dynamics_size and dynamics is not None:
+            temporal = [dynamics, *temporal]
+        temporal = temporal or [static.new_zeros((len(means), 1))]
+        gate = 2.0 * torch.sigmoid(self.spatial(static)) - 1.0
+        gated = torch.relu(self.temporal(torch.cat(temporal, dim=1))) * gate
+        turn, shift, d_quats, d_scales = self._geometry(gated, static, t).split(GEOMETRY, dim=1)
+        rotation = nn.functional.normalize(turn + turn.new_tensor([1.0, 0.0, 0.0, 0.0]), dim=1)
+        look = self.appearance(gated) if self.appearance is not None else None
+        return Deformation(
+            rotation,
+            shift,
+            d_quats,
+            d_scales,
+            look[:, :3] if look is not None else None,
+            look[:, 3] if look is not None and look.shape[1] > 3 else None,
+            _smoothness(encoded[0], encoded[1], nearby) if nearby is not None else None,
+        )
+
+    def _geometry(self, gated: Tensor, static: Tensor, t: float) -> Tensor:
+        """(N, 14) outputs of the geometry heads."""
+        if self.motion is None:
+            return self.heads(self.hidden(gated))
+        motion = self.motion(static, t)
+        if len(self.hidden):
+            return self.heads(self.hidden(gated + motion.features()))
+        return self.heads(gated) + motion.through(self.heads.weight)
+
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        """See motion/field.py. The frequencies of the spectrum are in no group: they have an optimiser of their own."""
+        tables = [grid.table for grid in self.grids]
+        apart = {id(table) for table in tables}
+        if isinstance(self.motion, LaplacianMotion):
+            apart.add(id(self.motion.frequencies))
+        return {"hash": tables, "mlp": [p for p in self.parameters() if id(p) not in apart]}
+
+
+def _smoothness(here: list[Tensor], there: list[Tensor], nearby: Nearby) -> Tensor:
+    """Grid4D's smoothness loss: the mean squared distance between the features of near places, static and temporal."""
+    far = [(b - a[nearby.rows]).square().sum() for a, b in zip(here, there, strict=True)]
+    count = max(1, len(nearby.rows))
+    temporal = torch.stack(far[1:]).sum() if len(far) > 1 else far[0].new_zeros(())
+    return (nearby.static_weight * far[0] + nearby.temporal_weight * temporal) / count

@@ -1,0 +1,89 @@
+"""The field of 4D-GS (Wu et al. 2024), the baseline `hexplane`: features from six planes of space and time."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from .field import Deformation, FieldConfig, Nearby, PlaneConfig
+from .layers import linear, zero_head
+
+PLANES = ((0, 1), (0, 2), (1, 2), (0, 3), (1, 3), (2, 3))  # pairs of x, y, z, t
+TIME = 3
+# Weights of the smoothness loss that 4D-GS trains with on D-NeRF scenes.
+SPACE_SMOOTHNESS, TIME_SMOOTHNESS, TIME_SPARSITY = 1e-4, 1e-2, 1e-4
+
+
+def plane_shapes(config: PlaneConfig) -> list[tuple[int, int, int, int]]:
+    """(1, features, second axis, first axis) of each plane, six for each resolution."""
+    shapes = []
+    for level in range(config.levels):
+        sizes = [config.space << level] * 3 + [config.time]
+        shapes += [(1, config.features, sizes[b], sizes[a]) for a, b in PLANES]
+    return shapes
+
+
+class HexPlaneField(nn.Module):
+    """Features are products over the six planes, beside each other for each resolution, decoded by small networks.
+
+    Places outside the box take the values of its border.
+    """
+
+    def __init__(self, config: FieldConfig, seed: int) -> None:
+        super().__init__()
+        generator = torch.Generator().manual_seed(seed)
+        self.bound, width = config.bound, config.width
+        self.planes = nn.ParameterList()
+        for number, shape in enumerate(plane_shapes(config.planes)):
+            # Time planes start at one, and thus without motion.
+            plane = torch.ones(shape)
+            if PLANES[number % len(PLANES)][1] != TIME:
+                plane.uniform_(0.1, 0.5, generator=generator)
+            self.planes.append(nn.Parameter(plane))
+        inputs = config.planes.features * config.planes.levels
+        layers: list[nn.Module] = [linear(inputs, width, generator)]
+        for _ in range(config.depth):
+            layers += [nn.ReLU(), linear(width, width, generator)]
+        self.trunk = nn.Sequential(*layers)
+        self.heads = nn.ModuleList(
+            nn.Sequential(nn.ReLU(), linear(width, width, generator), nn.ReLU(), zero_head(width, size))
+            for size in (3, 4, 3)
+        )
+
+    def forward(
+        self, means: Tensor, t: float, dynamics: Tensor | None = None, nearby: Nearby | None = None
+    ) -> Deformation:
+        """See motion/field.py."""
+        unit = torch.cat([means.detach() / self.bound, means.new_full((len(means), 1), 2.0 * t - 1.0)], dim=1)
+        levels = [self._features(unit, first) for first in range(0, len(self.planes), len(PLANES))]
+        hidden = self.trunk(torch.cat(levels, dim=1))
+        shift, d_quats, d_scales = (head(hidden) for head in self.heads)
+        smoothness = self._smoothness() if nearby is not None else None
+        return Deformation(None, shift, d_quats, d_scales, smoothness=smoothness)
+
+    def _features(self, unit: Tensor, first: int) -> Tensor:
+        """(N, F) at places and a time (N, 4) in [-1, 1] from the six planes from number `first` on."""
+        product: Tensor | None = None
+        for plane, pair in zip(list(self.planes)[first : first + len(PLANES)], PLANES, strict=True):
+            at = unit[None, None, :, list(pair)]
+            values = nn.functional.grid_sample(plane, at, align_corners=True, padding_mode="border")[0, :, 0].T
+            product = values if product is None else product * values
+        assert product is not None
+        return product
+
+    def _smoothness(self) -> Tensor:
+        """4D-GS's: squared second differences along the second axis of each plane, and time planes close to one."""
+        total = self.planes[0].new_zeros(())
+        for number, plane in enumerate(self.planes):
+            bend = plane[:, :, 2:] - 2 * plane[:, :, 1:-1] + plane[:, :, :-2]
+            if PLANES[number % len(PLANES)][1] == TIME:
+                total = total + TIME_SMOOTHNESS * bend.square().mean() + TIME_SPARSITY * (1 - plane).abs().mean()
+            else:
+                total = total + SPACE_SMOOTHNESS * bend.square().mean()
+        return total
+
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        """See motion/field.py."""
+        planes = list(self.planes)
+        apart = {id(plane) for plane in planes}
+        return {"hash": planes, "mlp": [p for p in self.parameters() if id(p) not in apart]}

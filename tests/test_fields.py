@@ -1,0 +1,284 @@
+"""The fields behind one interface: what each adds, what its ablations take away, and the smoothness losses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.motion.field import Deformation, FieldConfig, FieldKind, Nearby, PlaneConfig
+from lapgs_wgpu.motion.grid_field import GridField
+from lapgs_wgpu.motion.hashgrid import HashConfig, encode_reference
+from lapgs_wgpu.motion.hexplane_field import PLANES, HexPlaneField
+from lapgs_wgpu.motion.laplacian import LaplacianMotion, TimeMotion
+from lapgs_wgpu.motion.mlp_field import MlpField, octaves
+from lapgs_wgpu.motion.scene import Field, make_field
+
+OURS = FieldConfig(
+    kind="laplacian",
+    bound=1.5,
+    static=HashConfig(3, (4, 4, 4), (16, 16, 16), table_log2=9),
+    temporal=HashConfig(4, (4, 4, 4), (12, 12, 8)),
+    planes=PlaneConfig(features=4, space=6, time=8, levels=2),
+    width=16,
+    components=4,
+    dynamics=5,
+)
+KINDS: tuple[FieldKind, ...] = ("mlp", "hexplane", "grid4d", "laplacian")
+COUNT = 40
+POINTS = torch.rand(COUNT, 3, generator=torch.Generator().manual_seed(0)) * 2.4 - 1.2
+DYNAMICS = torch.randn(COUNT, 5, generator=torch.Generator().manual_seed(2))
+ROWS = torch.tensor([3, 3, 17, 30])
+NEARBY = Nearby(ROWS, torch.full((4, 3), 0.02), 0.32, static_weight=0.7, temporal_weight=0.2)
+
+
+def stirred(field: nn.Module) -> nn.Module:
+    """With weights as training might leave them."""
+    generator = torch.Generator().manual_seed(1)
+    with torch.no_grad():
+        for name, parameter in field.named_parameters():
+            if not name.endswith("frequencies"):
+                parameter.add_(torch.randn(parameter.shape, generator=generator), alpha=0.3)
+    return field
+
+
+def made(device: Device, config: FieldConfig) -> Field:
+    field = make_field(config, device, seed=0)
+    assert field is not None
+    return field
+
+
+def grid_field(device: Device, config: FieldConfig = OURS) -> GridField:
+    field = stirred(made(device, config))
+    assert isinstance(field, GridField)
+    return field
+
+
+def parts(move: Deformation) -> list[Tensor]:
+    return [part for part in move if part is not None]
+
+
+# All of them
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_nothing_changes_at_first(device: Device, kind: FieldKind) -> None:
+    move = made(device, replace(OURS, kind=kind, appearance="color+opacity"))(POINTS, 0.7, DYNAMICS)
+    if move.rotation is not None:
+        assert torch.equal(move.rotation, torch.tensor([1.0, 0, 0, 0]).expand(COUNT, 4))
+    changes = [part for part in move[1:] if part is not None]
+    assert len(changes) == (5 if kind == "laplacian" else 3)
+    assert not any(part.any() for part in changes)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_time_and_place_matter_and_all_weights_learn(device: Device, kind: FieldKind) -> None:
+    field = stirred(made(device, replace(OURS, kind=kind)))
+    points = POINTS.clone().requires_grad_()
+    early, late = field(points, 0.1, DYNAMICS), field(points, 0.9, DYNAMICS)
+    assert not torch.allclose(early.translation, late.translation)
+    assert not torch.allclose(early.translation[0], early.translation[1])
+    again = field(points, 0.1, DYNAMICS)
+    assert all(torch.equal(a, b) for a, b in zip(parts(early), parts(again), strict=True))
+    sum(part.square().sum() for part in parts(early)).backward()
+    assert points.grad is None  # the encoder sees sg[mean]
+    for name, parameter in field.named_parameters():
+        assert parameter.grad is not None, name
+        assert parameter.grad.any(), name
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_no_points(device: Device, kind: FieldKind) -> None:
+    move = made(device, replace(OURS, kind=kind))(torch.zeros(0, 3), 0.5, torch.zeros(0, 5))
+    assert {len(part) for part in parts(move)} == {0}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_seed_decides_and_nothing_else(device: Device, kind: FieldKind) -> None:
+    config = replace(OURS, kind=kind)
+    states = []
+    for noise, seed in ((5, 3), (6, 3), (7, 4)):
+        torch.manual_seed(noise)
+        field = make_field(config, device, seed)
+        assert field is not None
+        states.append(field.state_dict())
+    first, again, other = states
+    assert all(torch.equal(again[name], value) for name, value in first.items())
+    assert any(not torch.equal(other[name], value) for name, value in first.items())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_parameter_is_in_one_group_but_the_frequencies(device: Device, kind: FieldKind) -> None:
+    field = made(device, replace(OURS, kind=kind))
+    grouped = [id(p) for group in field.parameter_groups().values() for p in group]
+    expected = [id(p) for name, p in field.named_parameters() if name != "motion.frequencies"]
+    assert sorted(grouped) == sorted(expected)
+
+
+# The paper's field over Grid4D's
+
+
+def test_without_its_additions_it_is_grid4d(device: Device) -> None:
+    """A_L = 0, d = 0, no appearance head."""
+    for depth in (0, 2):
+        ours = grid_field(device, replace(OURS, appearance="none", depth=depth))
+        theirs = grid_field(device, replace(OURS, kind="grid4d", depth=depth))
+        assert isinstance(ours.motion, LaplacianMotion)
+        with torch.no_grad():
+            ours.motion.alpha.zero_()
+            ours.motion.beta.zero_()
+            weights = ours.state_dict()
+            weights["temporal.weight"] = weights["temporal.weight"][:, OURS.dynamics :]
+        theirs.load_state_dict({name: weights[name] for name in theirs.state_dict()})
+        a, b = ours(POINTS, 0.3, torch.zeros(COUNT, 5)), theirs(POINTS, 0.3)
+        for found, expected in zip(parts(a), parts(b), strict=True):
+            assert float((found - expected).detach().abs().max()) < 1e-6
+        with torch.no_grad():
+            ours.motion.alpha.fill_(0.1)
+        assert float((ours(POINTS, 0.3, torch.zeros(COUNT, 5)).translation - b.translation).detach().abs().max()) > 1e-3
+        with torch.no_grad():
+            ours.motion.alpha.zero_()
+        assert float((ours(POINTS, 0.3, DYNAMICS).translation - b.translation).detach().abs().max()) > 1e-3
+
+
+@pytest.mark.parametrize("depth", [0, 1])
+def test_the_decoder_written_out(device: Device, depth: int) -> None:
+    """Equations 6, 8 and 9, from the tables to the heads."""
+    field, t = grid_field(device, replace(OURS, depth=depth, appearance="color+opacity")), 0.3
+    weights = dict(field.named_parameters())
+    time = field.grid_time(t)
+    static, *temporal = (
+        encode_reference(grid, grid.table.double(), POINTS, time, OURS.bound).float() for grid in field.grids
+    )
+
+    def layer(name: str, x: Tensor) -> Tensor:
+        return x @ weights[f"{name}.weight"].T + weights[f"{name}.bias"]
+
+    hash_features = torch.cat([DYNAMICS, *temporal], dim=1)
+    gated = torch.relu(layer("temporal", hash_features)) * (2 * torch.sigmoid(layer("spatial", static)) - 1)
+    assert isinstance(field.motion, LaplacianMotion)
+    spectral = field.motion.series(t) * layer("motion.second", torch.relu(layer("motion.first", static)))
+    hidden = gated + spectral
+    for i in range(depth):
+        hidden = torch.relu(layer(f"hidden.{2 * i}", hidden))
+    heads, look = layer("heads", hidden), layer("appearance", gated)
+    turn = heads[:, :4] + torch.tensor([1.0, 0, 0, 0])
+    expected = [
+        turn / turn.norm(dim=1, keepdim=True),
+        heads[:, 4:7],
+        heads[:, 7:11],
+        heads[:, 11:],
+        look[:, :3],
+        look[:, 3],
+    ]
+    for found, wanted in zip(parts(field(POINTS, t, DYNAMICS)), expected, strict=True):
+        torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-4)
+
+
+def test_ablations_of_the_field(device: Device) -> None:
+    full = grid_field(device)
+    assert isinstance(full.motion, LaplacianMotion)
+    assert isinstance(grid_field(device, replace(OURS, motion="mlp")).motion, TimeMotion)
+    assert grid_field(device, replace(OURS, appearance="none"))(POINTS, 0.3, DYNAMICS).d_dc is None
+    still = grid_field(device, replace(OURS, temporal_hash=False))
+    assert len(still.grids) == 1
+    moves = [still(POINTS, t, DYNAMICS) for t in (0.1, 0.4)]
+    assert torch.equal(*[move.d_dc for move in moves])  # A_h does not know the time any more
+    assert not torch.allclose(*[move.translation for move in moves])  # L(t) does
+    bare = grid_field(device, replace(OURS, temporal_hash=False, dynamics=0))
+    assert bare(POINTS, 0.3).translation.isfinite().all()
+    assert replace(OURS, dynamics=0).dynamics_size == replace(OURS, kind="grid4d").dynamics_size == 0
+
+
+def test_dynamics_get_a_gradient(device: Device) -> None:
+    d = DYNAMICS.clone().requires_grad_()
+    grid_field(device)(POINTS, 0.3, d).translation.sum().backward()
+    assert d.grad is not None
+    assert d.grad.any(dim=1).all()
+
+
+# Smoothness
+
+
+def test_smoothness_of_grids_written_out(device: Device) -> None:
+    field = grid_field(device)
+    found = field(POINTS, 0.3, DYNAMICS, NEARBY).smoothness
+    near = POINTS[ROWS] + NEARBY.offsets
+    squares = []
+    for grid in field.grids:
+        here = encode_reference(grid, grid.table.double(), POINTS[ROWS], field.grid_time(0.3), OURS.bound)
+        there = encode_reference(grid, grid.table.double(), near, field.grid_time(0.32), OURS.bound)
+        squares.append(float((there - here).square().sum(dim=1).mean().detach()))
+    assert found is not None
+    assert float(found) == pytest.approx(0.7 * squares[0] + 0.2 * sum(squares[1:]), rel=1e-4)
+    without = field(POINTS, 0.3, DYNAMICS)
+    assert without.smoothness is None
+    assert torch.equal(without.translation, field(POINTS, 0.3, DYNAMICS, NEARBY).translation)
+    found.backward()
+    gradients = [grid.table.grad for grid in field.grids]
+    # A place that is asked for twice: its gradient by the twin.
+    tables = [grid.table.detach().clone().requires_grad_() for grid in field.grids]
+    total = torch.zeros(())
+    for number, (grid, table) in enumerate(zip(field.grids, tables, strict=True)):
+        here = encode_reference(grid, table, POINTS[ROWS], field.grid_time(0.3), OURS.bound)
+        there = encode_reference(grid, table, near, field.grid_time(0.32), OURS.bound)
+        total = total + (0.7 if number == 0 else 0.2) * (there - here).square().sum(dim=1).mean()
+    total.backward()
+    for ours, table in zip(gradients, tables, strict=True):
+        assert ours is not None
+        assert table.grad is not None
+        torch.testing.assert_close(ours, table.grad, rtol=1e-3, atol=1e-5)
+
+
+def test_smoothness_of_planes_sees_bends_only(device: Device) -> None:
+    field = made(device, replace(OURS, kind="hexplane"))
+    assert isinstance(field, HexPlaneField)
+    with torch.no_grad():
+        for number, plane in enumerate(field.planes):
+            slope = torch.linspace(0, 1, plane.shape[2])[:, None].expand(plane.shape[2:])
+            plane.copy_(torch.ones_like(plane) if PLANES[number % 6][1] == 3 else slope.expand_as(plane))
+    straight = field(POINTS, 0.3, None, NEARBY).smoothness
+    assert straight is not None
+    assert float(straight) < 1e-12
+    with torch.no_grad():
+        field.planes[3][0, 0, 4, 2] += 0.5  # x, t
+    bent = field(POINTS, 0.3, None, NEARBY).smoothness
+    assert bent is not None
+    values = 4 * 8 * 6
+    squares = 0.5**2 * (1 + 4 + 1) / (4 * 6 * 6)  # second differences 0.5, -1, 0.5 among 4 features x 6 x 6
+    assert float(bent) == pytest.approx(1e-2 * squares + 1e-4 * 0.5 / values, rel=1e-4)
+
+
+# The baselines
+
+
+def test_octaves() -> None:
+    found = octaves(torch.tensor([[0.25]]), 2)
+    assert found.tolist()[0] == pytest.approx([0.25, 0.5**0.5, 0.5**0.5, 1.0, 0.0], abs=1e-6)
+
+
+def test_the_mlp_sees_its_inputs_again_in_the_middle(device: Device) -> None:
+    field = made(device, replace(OURS, kind="mlp"))
+    assert isinstance(field, MlpField)
+    assert [layer.in_features for layer in field.layers] == [93, 16, 16, 16, 16 + 93, 16, 16, 16]  # type: ignore[union-attr]
+    assert field(POINTS, 0.3).rotation is None
+
+
+def test_planes_are_read_where_they_say(device: Device) -> None:
+    """One plane that holds its second coordinate, all others one: the feature is that coordinate."""
+    field = made(device, replace(OURS, kind="hexplane"))
+    assert isinstance(field, HexPlaneField)
+    for number, (a, b) in enumerate(PLANES):
+        with torch.no_grad():
+            for other in range(6):
+                field.planes[other].fill_(1.0)
+            plane = field.planes[number]
+            along_b = torch.linspace(-1, 1, plane.shape[2])[:, None]
+            along_a = torch.linspace(-1, 1, plane.shape[3])[None, :]
+            plane.copy_((along_b + 10 * along_a).expand_as(plane))
+        unit = torch.rand(9, 4, generator=torch.Generator().manual_seed(number)) * 2 - 1
+        found = field._features(unit, 0)
+        torch.testing.assert_close(found[:, 0], unit[:, b] + 10 * unit[:, a], rtol=1e-4, atol=1e-4)
