@@ -31,6 +31,7 @@ def test_dnerf_is_the_papers_schedule() -> None:
     assert (density.start, density.stop, density.interval, density.gradient) == (500, 15_000, 100, 2e-4)
     assert (density.min_opacity, density.max_screen_radius, density.max_world_size) == (0.005, 20, 0.1)
     assert (density.reset_interval, density.reset_opacity) == (3000, 0.01)
+    assert (density.neighbours, density.divergence_weight, density.split_quantile) == (10, 0.5, 0.3)
     assert (config.points.count, config.points.box, config.points.opacity) == (100_000, 1.3, 0.1)
     assert (config.data.background, config.seed, config.loss.ssim) == ("black", 0, 0.2)
     assert config.field == FieldConfig()
@@ -108,6 +109,9 @@ def test_unknown_preset(preset: str, message: str) -> None:
         ('base = "dnerf"\n[rates.means]\nstart = 0', "rates.means: a learning rate needs start and end above 0"),
         ('base = "dnerf"\n[points]\nopacity = 1.0', "opacity between 0 and 1"),
         ('base = "dnerf"\n[density]\ninterval = 0', "at least 1 step"),
+        ('base = "dnerf"\n[density]\nsplit = "adaptiv"', "must be plain or adaptive, got 'adaptiv'; did you mean"),
+        ('base = "dnerf"\n[density]\nneighbours = 0', "neighbours must be at least 1"),
+        ('base = "dnerf"\n[density]\nsplit_quantile = 1.1', "split_quantile between 0 and 1, got 10, 0.5 and 1.1"),
         ("[data]\nsize = 1", 'start the file with base = "dnerf"'),
         ("base = 3", "base must be the name of a preset, got 3"),
         ('base = "nerf"', "there is no preset 'nerf'; did you mean dnerf?"),

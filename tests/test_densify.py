@@ -30,7 +30,7 @@ def make_rows(scales: list[float], opacities: list[float] | None = None) -> dict
         "log_scales": torch.tensor(scales).log()[:, None] - torch.tensor([0.0, 0.5, 1.0]),
         "quats": torch.randn(n, 4, generator=generator),
         "opacity_logits": opacity.logit(),
-        "dynamics": torch.arange(n * 16.0).reshape(n, 16),  # what density control knows nothing of
+        "dynamics": torch.arange(n * 16.0).reshape(n, 16),  # which the plain split does not look at
     }
 
 

@@ -16,6 +16,7 @@ from lapgs_wgpu.motion.dynamics import DynamicsMode
 from lapgs_wgpu.motion.field import FieldConfig
 
 Background = Literal["black", "white", "random"]
+Split = Literal["plain", "adaptive"]
 
 
 def described(text: str, default: Any = dataclasses.MISSING) -> Any:
@@ -123,6 +124,18 @@ class DensityConfig:
     split_size: float = described(
         "largest standard deviation up to which a Gaussian is cloned, beyond which split; in extents of the cameras"
     )
+    split: Split = described(
+        "which of the large Gaussians of a large gradient are split: plain, all of them; adaptive, those that differ "
+        "most from their neighbours in shape and dynamics"
+    )
+    neighbours: int = described("how many nearest Gaussians the adaptive split compares one with")
+    divergence_weight: float = described(
+        "weight of the differences in dynamics against those in shape in the score of the adaptive split"
+    )
+    split_quantile: float = described(
+        "share of these Gaussians, those of the lowest scores, that the adaptive split leaves as they are, unless "
+        "their dynamics stand out"
+    )
     min_opacity: float = described("Gaussians below it are removed")
     max_screen_radius: float = described(
         "Gaussians that were larger on an image are removed, in pixels, from the first reset on; 0 for no bound"
@@ -143,6 +156,11 @@ class DensityConfig:
             raise ValueError(
                 "split_size must be above 0, reset_opacity and min_opacity between 0 and 1, "
                 f"got {self.split_size:g}, {self.reset_opacity:g} and {self.min_opacity:g}"
+            )
+        if self.neighbours < 1 or not (0 <= self.divergence_weight < math.inf and 0 <= self.split_quantile <= 1):
+            raise ValueError(
+                "neighbours must be at least 1, divergence_weight at least 0, and split_quantile between 0 and 1, "
+                f"got {self.neighbours}, {self.divergence_weight:g} and {self.split_quantile:g}"
             )
 
     def changes_at(self, step: int) -> bool:

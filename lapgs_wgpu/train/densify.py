@@ -1,7 +1,7 @@
 """Density control, as in 3DGS (Kerbl et al. 2023, section 5.2): Gaussians are cloned, split, pruned and dimmed.
 
 Everything works on a mapping of rows: name -> (N, ...) tensor, of which means, log_scales, quats and opacity_logits
-are looked at; whatever else a Gaussian carries is inherited by its children.
+are looked at, and dynamics by the adaptive split; whatever else a Gaussian carries is inherited by its children.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from torch import Tensor
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.rasterize import Rendering
 from lapgs_wgpu.splat.reference import rotation
+from lapgs_wgpu.train.adaptive_split import adaptive_split
 from lapgs_wgpu.train.config import DensityConfig
 
 CHILDREN = 2  # of a split Gaussian
@@ -75,6 +76,7 @@ def densify(
 ) -> Change:
     """What becomes of the Gaussians: small ones with a large gradient are doubled, large ones split, faint ones go.
 
+    Large ones that the adaptive split passes over stay as they are.
     extent: of the cameras, world units. generator: where the children of a split are drawn from, on the CPU.
     bound_sizes: whether the bounds on screen and world size hold, which they do after the first opacity reset.
     """
@@ -82,6 +84,8 @@ def densify(
     large = rows["log_scales"].amax(dim=1) > math.log(config.split_size * extent)
     clone = wanted & ~large
     split = wanted & large
+    if config.split == "adaptive":
+        split = adaptive_split(rows, split, config)
     clones = {name: row[clone] for name, row in rows.items()}
     children = split_rows({name: row[split] for name, row in rows.items()}, generator)
     born = {name: torch.cat([clones[name], children[name]]) for name in rows}

@@ -1,0 +1,315 @@
+"""The adaptive split: neighbours, differences in shape and dynamics, and which candidates they let through."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from lapgs_wgpu.splat.reference import rotation
+from lapgs_wgpu.train import adaptive_split as module
+from lapgs_wgpu.train.adaptive_split import (
+    adaptive_split,
+    covariances,
+    divergence,
+    nearest,
+    probabilities,
+    shape_difference,
+    split_scores,
+)
+from lapgs_wgpu.train.config import Rate
+from lapgs_wgpu.train.densify import Change, Statistics, densify
+from lapgs_wgpu.train.optimise import Optimiser
+from lapgs_wgpu.train.presets import load_config
+
+CONFIG = dataclasses.replace(load_config("dnerf").density, split="adaptive")
+EXTENT = 1.0
+
+
+def make_rows(count: int, seed: int = 0) -> dict[str, Tensor]:
+    """Gaussians of many shapes, all of them larger than split_size."""
+    generator = torch.Generator().manual_seed(seed)
+    return {
+        "means": torch.randn(count, 3, generator=generator),
+        "log_scales": torch.randn(count, 3, generator=generator).abs() - 3,
+        "quats": torch.randn(count, 4, generator=generator),
+        "opacity_logits": torch.zeros(count),
+        "dynamics": torch.randn(count, 16, generator=generator),
+    }
+
+
+def equals(count: int) -> dict[str, Tensor]:
+    """Gaussians that are equal but for their places, on a line; nobody is an outlier."""
+    rows = {name: row[:1].repeat(count, *[1] * (row.ndim - 1)) for name, row in make_rows(1).items()}
+    return rows | {"means": torch.arange(float(count))[:, None] * torch.tensor([1.0, 0.0, 0.0])}
+
+
+def everyone(rows: Mapping[str, Tensor]) -> Tensor:
+    return torch.ones(len(rows["means"]), dtype=torch.bool)
+
+
+def change(rows: Mapping[str, Tensor], gradients: Tensor) -> Change:
+    statistics = Statistics(len(gradients), torch.device("cpu"))
+    statistics.gradients, statistics.views = gradients, torch.ones_like(gradients)
+    return densify(rows, statistics, CONFIG, EXTENT, torch.Generator().manual_seed(0), bound_sizes=False)
+
+
+# Neighbours
+
+
+def test_nearest_as_by_all_distances() -> None:
+    means = torch.randn(300, 3, generator=torch.Generator().manual_seed(3))
+    of = torch.tensor([7, 0, 299, 120])
+    distances = (means[of][:, None].double() - means[None].double()).norm(dim=2)
+    distances[torch.arange(4), of] = math.inf
+    assert torch.equal(nearest(means, of, 10), distances.argsort(dim=1)[:, :10])
+
+
+def test_nearest_breaks_ties_by_number_and_leaves_itself_out() -> None:
+    means = torch.zeros(40, 3)
+    means[20:] = 5.0
+    means[:4, 0] = torch.tensor([1.0, 0.0, 1.0, -1.0])
+    assert nearest(means[:4], torch.tensor([1]), 3).tolist() == [[0, 2, 3]]
+    # Twenty at one place: whichever are found, itself never is.
+    found = nearest(means, torch.arange(20, 40), 10)
+    assert found.shape == (20, 10)
+    assert (found >= 20).all()
+    assert not (found == torch.arange(20, 40)[:, None]).any()
+    assert (found.diff(dim=1) > 0).all()
+
+
+@pytest.mark.parametrize("count", [1, 2, 5, 10])
+def test_fewer_gaussians_than_neighbours(count: int) -> None:
+    rows = make_rows(count)
+    found = nearest(rows["means"], torch.arange(count), 10)
+    assert found.shape == (count, count - 1)
+    assert all(sorted([i, *row]) == list(range(count)) for i, row in enumerate(found.tolist()))
+    scores = split_scores(rows, torch.arange(count), 10, 0.5)
+    assert scores.isfinite().all()
+    assert count > 1 or scores.tolist() == [0.0]
+    assert adaptive_split(rows, everyone(rows), CONFIG).any(), "the highest score reaches every quantile"
+
+
+# Shapes
+
+
+def test_covariances_are_those_of_the_axes() -> None:
+    quarter_turn_about_z = torch.tensor([[1.0, 0.0, 0.0, 1.0]])
+    scales = torch.tensor([[2.0, 3.0, 4.0]])
+    expected = torch.diag(torch.tensor([9.0, 4.0, 16.0]))[None]
+    assert torch.allclose(covariances(scales.log(), quarter_turn_about_z), expected, atol=1e-5)
+
+
+def test_shape_difference_by_hand() -> None:
+    own, other = torch.diag(torch.tensor([4.0, 0.0, 3.0])), torch.diag(torch.tensor([0.0, 0.0, 3.0]))
+    two = torch.stack([other, own])[None]
+    # |S - S'| = 4, |S| = 5, |S'| = 3; and none from the neighbour that is equal.
+    assert shape_difference(own[None], two).tolist() == pytest.approx([(4 / 8 + 0) / 2])
+
+
+def test_shape_difference_is_a_share() -> None:
+    needle, speck = torch.diag(torch.tensor([1.0, 0.0, 0.0])), 1e-12 * torch.eye(3)
+    lying = torch.diag(torch.tensor([0.0, 1.0, 0.0]))
+    assert shape_difference(needle[None], speck[None, None]).item() == pytest.approx(1.0)
+    assert shape_difference(needle[None], lying[None, None]).item() == pytest.approx(math.sqrt(2) / 2)
+    assert shape_difference(speck[None], speck[None, None]).item() == 0
+    assert shape_difference(0 * speck[None], 0 * speck[None, None]).item() == 0
+    rows = make_rows(200)
+    scores = split_scores(rows, torch.arange(200), 10, 0.0)
+    assert ((scores > 0) & (scores < 1)).all()
+
+
+def test_shape_difference_has_no_unit() -> None:
+    rows = make_rows(50)
+    tiny = rows | {"means": 1e-6 * rows["means"], "log_scales": rows["log_scales"] + math.log(1e-6)}
+    of = torch.arange(50)
+    assert torch.allclose(split_scores(tiny, of, 10, 0.0), split_scores(rows, of, 10, 0.0), atol=1e-5)
+
+
+def test_rotating_the_world_changes_no_score() -> None:
+    rows, of = make_rows(60), torch.arange(60)
+    turn = torch.tensor([0.3, -0.8, 0.5, 0.1])
+    w, axis = turn[:1] / turn.norm(), turn[1:] / turn.norm()
+    real, imaginary = rows["quats"][:, :1], rows["quats"][:, 1:]
+    turned = rows | {
+        "means": rows["means"] @ rotation(turn[None])[0].T,
+        "quats": torch.cat(  # the quaternions' product, turn first
+            [
+                w * real - imaginary @ axis[:, None],
+                w * imaginary + real * axis + torch.linalg.cross(axis.expand_as(imaginary), imaginary),
+            ],
+            dim=1,
+        ),
+    }
+    del rows["dynamics"], turned["dynamics"]  # so that distances between means count, too
+    assert torch.allclose(split_scores(turned, of, 10, 0.5), split_scores(rows, of, 10, 0.5), atol=1e-5)
+
+
+# Dynamics
+
+
+def test_divergence_is_zero_for_uniform_and_one_for_one_hot() -> None:
+    for count in (2, 10):
+        assert divergence(torch.full((1, count), 1 / count)).item() == pytest.approx(0, abs=1e-7)
+        assert divergence(torch.eye(count)).tolist() == pytest.approx([1.0] * count)
+    assert divergence(torch.ones(1, 1)).item() == 0
+    # (3/4) ln (3/4 : 1/2) + (1/4) ln (1/4 : 1/2), over ln 2
+    expected = (0.75 * math.log(1.5) + 0.25 * math.log(0.5)) / math.log(2)
+    assert divergence(torch.tensor([[0.75, 0.25]])).item() == pytest.approx(expected)
+
+
+def test_probabilities_by_hand() -> None:
+    # The mean weight is 1, and each is raised by a hundredth of it.
+    assert probabilities(torch.tensor([[3.0, 0.0, 1.0, 0.0]])).tolist()[0] == pytest.approx(
+        [3.01 / 4.04, 0.01 / 4.04, 1.01 / 4.04, 0.01 / 4.04], rel=1e-5
+    )
+    assert probabilities(torch.zeros(1, 4)).tolist() == [[0.25] * 4]
+
+
+def test_dynamics_count_where_shapes_are_equal() -> None:
+    rows = equals(12)
+    of = torch.tensor([0, 11])
+    assert split_scores(rows, of, 3, 0.5).tolist() == pytest.approx([0, 0], abs=1e-12)
+    rows["dynamics"][2, 0] += 1.0  # a neighbour of the first alone
+    high, low = split_scores(rows, of, 3, 0.5).tolist()
+    expected = divergence(probabilities(torch.tensor([[0.0, 1.0, 0.0]]))).item()
+    assert expected > 0.8
+    assert high == pytest.approx(0.5 * expected, rel=1e-5)
+    assert low == pytest.approx(0, abs=1e-12)
+
+
+def test_scores_add_shapes_and_dynamics() -> None:
+    rows, of = make_rows(80), torch.arange(80)
+    shapes, both, double = (split_scores(rows, of, 10, weight) for weight in (0.0, 0.5, 1.0))
+    assert (both > shapes).all()
+    assert torch.allclose(both - shapes, double - both)
+
+
+def test_without_dynamics_the_distances_between_means_count() -> None:
+    rows = equals(12)
+    del rows["dynamics"]
+    # Neighbours of the first are 1, 2 and 3 away; of one in the middle 1, 1 and 2.
+    first, middle = split_scores(rows, torch.tensor([0, 5]), 3, 1.0).tolist()
+    assert first == pytest.approx(divergence(probabilities(torch.tensor([[1.0, 2.0, 3.0]]))).item(), rel=1e-5)
+    assert middle == pytest.approx(divergence(probabilities(torch.tensor([[1.0, 1.0, 2.0]]))).item(), rel=1e-5)
+    assert adaptive_split(rows, everyone(rows), CONFIG).any()
+
+
+# Which candidates are split
+
+
+@pytest.mark.parametrize(("quantile", "count"), [(0.0, 5), (0.3, 3), (0.5, 3), (0.76, 1), (1.0, 1)])
+def test_scores_from_the_quantile_on_are_split(monkeypatch: pytest.MonkeyPatch, quantile: float, count: int) -> None:
+    rows = equals(8)
+    candidates = torch.tensor([True, False, True, True, False, True, True, False])
+    scores = torch.tensor([0.3, 0.1, 0.5, 0.2, 0.4], dtype=torch.float64)
+    monkeypatch.setattr(module, "split_scores", lambda rows, of, *_: scores)
+    split = adaptive_split(rows, candidates, dataclasses.replace(CONFIG, split_quantile=quantile))
+    highest_first = [3, 6, 0, 5, 2]
+    assert split.nonzero()[:, 0].tolist() == sorted(highest_first[:count])
+
+
+def test_the_configuration_reaches_the_scores(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = []
+
+    def scores(rows: Mapping[str, Tensor], of: Tensor, *numbers: float) -> Tensor:
+        seen.append(numbers)
+        return torch.zeros(len(of))
+
+    monkeypatch.setattr(module, "split_scores", scores)
+    rows = equals(4)
+    # Where all scores are equal, all reach the quantile.
+    assert adaptive_split(rows, everyone(rows), dataclasses.replace(CONFIG, neighbours=7, divergence_weight=0.1)).all()
+    assert seen == [(7, 0.1)]
+
+
+def test_outliers_are_split_whatever_their_score() -> None:
+    rows = make_rows(100)
+    rows["dynamics"] *= 0.01
+    candidates = torch.arange(100) % 2 == 0
+    before = adaptive_split(rows, candidates, CONFIG)
+    lowest = int(split_scores(rows, torch.arange(0, 100, 2), 10, 0.5).argmin()) * 2
+    assert not before[lowest]
+    rows["dynamics"][[lowest, lowest + 1]] = 100.0
+    after = adaptive_split(rows, candidates, CONFIG)
+    assert after[lowest]
+    assert not after[lowest + 1], "an outlier that is no candidate"
+    without = adaptive_split({name: row for name, row in rows.items() if name != "dynamics"}, candidates, CONFIG)
+    assert not without[lowest]
+
+
+def test_no_candidates() -> None:
+    rows = make_rows(5)
+    assert not adaptive_split(rows, ~everyone(rows), CONFIG).any()
+    empty = {name: row[:0] for name, row in rows.items()}
+    assert adaptive_split(empty, everyone(empty), CONFIG).shape == (0,)
+
+
+def test_the_same_rows_the_same_bits() -> None:
+    rows, of = make_rows(500), torch.arange(500)
+    assert torch.equal(split_scores(rows, of, 10, 0.5), split_scores(dict(rows), of.clone(), 10, 0.5))
+
+
+# In density control
+
+
+def test_candidates_that_are_passed_over_stay() -> None:
+    rows = make_rows(100)
+    rows["log_scales"][:10] = -9.0  # small ones, which are cloned
+    gradients = torch.where(torch.arange(100) % 4 == 3, 0.0, 1.0)
+    result = change(rows, gradients)
+    candidates = (gradients > 0) & (torch.arange(100) >= 10)
+    split = adaptive_split(rows, candidates, CONFIG)
+    assert 0 < int(split.sum()) < int(candidates.sum())
+    assert torch.equal(result.keep, ~split)
+    clones = int((gradients[:10] > 0).sum())
+    assert (result.cloned, result.split, result.pruned) == (clones, int(split.sum()), 0)
+    children = {name: row[clones:] for name, row in result.added.items()}
+    assert torch.equal(children["dynamics"], rows["dynamics"][split].repeat(2, 1))
+    assert torch.allclose(children["log_scales"], rows["log_scales"][split].repeat(2, 1) - math.log(1.6))
+
+
+def test_quantile_zero_is_the_plain_split() -> None:
+    rows, statistics = make_rows(30), Statistics(30, torch.device("cpu"))
+    statistics.gradients, statistics.views = torch.ones(30), torch.ones(30)
+    changes = [
+        densify(rows, statistics, config, EXTENT, torch.Generator().manual_seed(0), bound_sizes=False)
+        for config in (dataclasses.replace(CONFIG, split="plain"), dataclasses.replace(CONFIG, split_quantile=0.0))
+    ]
+    assert changes[0].split == 30
+    assert all(torch.equal(changes[0].added[name], changes[1].added[name]) for name in rows)
+
+
+def test_dynamics_and_their_moments_survive_clone_split_and_prune() -> None:
+    rows = make_rows(60)
+    rows["log_scales"][:10] = -9.0
+    rows["opacity_logits"][20:30] = -9.0  # pruned
+    gaussians = {name: nn.Parameter(row.clone()) for name, row in rows.items()}
+    optimiser = Optimiser(gaussians, {}, {name: Rate(1e-3, 1e-3, 1) for name in gaussians})
+    torch.stack([parameter.square().sum() for parameter in gaussians.values()]).sum().backward()
+    optimiser.step(1)
+
+    before = gaussians["dynamics"].detach().clone()
+    moments = {key: moment.clone() for key, moment in optimiser.moments("dynamics").items()}
+    result = change(gaussians, torch.ones(60))
+    assert result.cloned == 10
+    assert result.split > 0
+    assert result.pruned > 0
+    assert 0 < int(result.keep.sum()) < 60
+    optimiser.edit_rows(result.keep, result.added)
+    kept = int(result.keep.sum())
+    after = gaussians["dynamics"]
+    assert after.shape == (kept + len(result.added["means"]), 16)
+    assert torch.equal(after[:kept], before[result.keep])
+    assert torch.equal(after[kept : kept + 10], before[:10]), "clones"
+    for key, moment in optimiser.moments("dynamics").items():
+        assert moment[:kept].count_nonzero() > 0
+        assert torch.equal(moment[:kept], moments[key][result.keep])
+        assert moment[kept:].count_nonzero() == 0
+        assert len(moment) == len(after)
+    after.square().sum().backward()
+    optimiser.step(2)

@@ -1,0 +1,119 @@
+"""The dynamics attribute: who stands out, and what the loss and its gradient are, against hand computations."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from lapgs_wgpu.motion.dynamics import DynamicsMode, dynamics_loss, outliers
+
+
+def column(values: list[float]) -> Tensor:
+    """(N, 16) rows that differ in one entry."""
+    d = torch.zeros(len(values), 16)
+    d[:, 3] = torch.tensor(values)
+    return d
+
+
+def spread(last: float) -> Tensor:
+    """Seven rows of mean zero, at distances 0, 1, 1, 3, 3 from it, and the last two at this one."""
+    d = column([0.0, 1.0, -1.0, 3.0, -3.0, 0.0, 0.0])
+    d[5:, 7] = torch.tensor([last, -last])
+    return d
+
+
+def test_outliers_of_a_crafted_set() -> None:
+    # Mean 16/7, mean square 52/7: the bound is 2.286 + 1.485 = 3.77.
+    assert outliers(spread(4.0)).tolist() == [False] * 5 + [True] * 2
+    # It moves with the distances. Mean 14.8/7, mean square 43.12/7: 2.114 + 1.300 = 3.414.
+    assert outliers(spread(3.4)).tolist() == [False] * 7
+
+
+def test_the_deviation_is_of_all_rows_not_of_a_sample() -> None:
+    distances = torch.tensor([0.0, 1.0, 1.0, 3.0, 3.0, 3.6, 3.6])
+    assert distances.mean() + distances.std(correction=0) < 3.6 < distances.mean() + distances.std()
+    assert outliers(spread(3.6)).tolist() == [False] * 5 + [True] * 2
+
+
+def test_distance_is_from_the_mean_row() -> None:
+    d = spread(4.0) + torch.linspace(-3, 3, 16)
+    assert outliers(d).tolist() == [False] * 5 + [True] * 2
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 1000])
+def test_nobody_stands_out_among_equals(count: int, recwarn: pytest.WarningsRecorder) -> None:
+    # 0.1 is no binary fraction: the mean differs from each of the rows in the last bit.
+    assert outliers(torch.full((count, 16), 0.1)).tolist() == [False] * count
+    assert not recwarn.list
+
+
+def test_nobody_stands_out_where_all_are_equally_far() -> None:
+    assert not outliers(column([0.1, 0.7] * 500)).any()
+
+
+def test_literal_is_the_papers_equation() -> None:
+    d = spread(4.0).requires_grad_()
+    loss = dynamics_loss(d, "literal")
+    loss.backward()
+    assert loss.item() == pytest.approx(2 * 4.0**2 / 7)
+    expected = torch.zeros(7, 16)
+    expected[5:, 7] = torch.tensor([2 * 4.0 / 7, -2 * 4.0 / 7])  # descent goes to the mean row, which stays constant
+    assert torch.allclose(d.grad, expected, rtol=1e-6)
+
+
+def test_promote_pushes_the_same_rows_away() -> None:
+    d = spread(4.0).requires_grad_()
+    loss = dynamics_loss(d, "promote")
+    loss.backward()
+    variance = 52 / 7 - (16 / 7) ** 2
+    assert loss.item() == pytest.approx(-2 * math.log(1 + 16 / variance) / 7)
+    slope = -2 * 4.0 / (variance + 16) / 7  # the deviation is a constant
+    expected = torch.zeros(7, 16)
+    expected[5:, 7] = torch.tensor([slope, -slope])
+    assert torch.allclose(d.grad, expected, rtol=1e-5)
+
+
+def test_the_mean_row_is_constant() -> None:
+    # Its own gradient would spread over all rows where the outliers do not balance each other.
+    d = column([0.0, 0.0, 0.0, 0.0, 8.0]).requires_grad_()
+    dynamics_loss(d, "literal").backward()
+    assert d.grad[:4].count_nonzero() == 0
+    assert d.grad[4, 3].item() == pytest.approx(2 * (8 - 8 / 5) / 5)
+
+
+def test_off() -> None:
+    d = spread(4.0).requires_grad_()
+    (dynamics_loss(d, "off") + 0 * d.sum()).backward()
+    assert dynamics_loss(d, "off").item() == 0
+    assert d.grad.count_nonzero() == 0
+
+
+def test_an_unknown_mode() -> None:
+    with pytest.raises(ValueError, match="literal, promote or off, got 'pull'"):
+        dynamics_loss(spread(4.0), "pull")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("mode", ["literal", "promote"])
+@pytest.mark.parametrize("scale", [0.0, 1e-30, 1e-12, 1.0, 1e6])
+def test_finite_at_every_scale(mode: DynamicsMode, scale: float) -> None:
+    d = (scale * torch.randn(200, 16, generator=torch.Generator().manual_seed(1))).requires_grad_()
+    loss = dynamics_loss(d, mode)
+    loss.backward()
+    assert loss.isfinite()
+    assert d.grad.square().isfinite().all()  # as Adam's second moment
+    if scale == 0:
+        assert loss.item() == 0
+        assert d.grad.count_nonzero() == 0
+
+
+@pytest.mark.parametrize("mode", ["literal", "promote"])
+@pytest.mark.parametrize("count", [0, 1])
+def test_no_gaussians_and_a_single_one(mode: DynamicsMode, count: int) -> None:
+    d = torch.ones(count, 16, requires_grad=True)
+    loss = dynamics_loss(d, mode)
+    loss.backward()
+    assert loss.item() == 0
+    assert d.grad.count_nonzero() == 0
