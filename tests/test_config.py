@@ -10,7 +10,7 @@ import pytest
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.motion.field import FieldConfig
 from lapgs_wgpu.train.config import Config, Rate
-from lapgs_wgpu.train.presets import config_keys, load_config, preset_names, write_toml
+from lapgs_wgpu.train.presets import ABLATIONS, config_keys, load_config, preset_names, write_toml
 
 
 def write(path: Path, text: str) -> str:
@@ -51,6 +51,57 @@ def test_every_key_can_be_overridden_and_has_a_help_text() -> None:
         assert key.help, key.name
     keys = {key.name for key in config_keys()}
     assert {"seed", "data.path", "field.temporal.finest", "rates.means.start", "density.gradient"} <= keys
+
+
+FULL = load_config("dnerf")
+
+
+@pytest.mark.parametrize("field", ["static", "mlp", "hexplane", "grid4d"])
+def test_a_method_in_short_leaves_out_what_is_the_papers(field: str) -> None:
+    config = load_config("dnerf", field=field)
+    assert config.field == dataclasses.replace(FULL.field, kind=field)
+    assert config.field.dynamics_size == 0
+    assert (config.loss.pyramid, config.loss.ncc, config.density.split) == (0, 0, "plain")
+    assert config.loss.ssim == FULL.loss.ssim
+    assert load_config("dnerf", {"loss.ncc": "0.5"}, field=field).loss.ncc == 0.5  # what is said outright holds
+    assert load_config("dnerf", field="laplacian") == FULL
+
+
+def test_the_papers_method_is_whole() -> None:
+    assert (FULL.loss.pyramid, FULL.loss.ncc, FULL.density.split) == (0.2, 0.05, "adaptive")
+    assert (FULL.loss.dynamics, FULL.loss.dynamics_mode, FULL.field.dynamics_size) == (1e-3, "literal", 16)
+    assert FULL.rates.frequencies == Rate(1e-3, 1e-5, 45_000)
+
+
+@pytest.mark.parametrize(
+    ("part", "key", "value"),
+    [
+        ("laplacian", "field.motion", "mlp"),
+        ("dynamics", "field.dynamics", 0),
+        ("split", "density.split", "plain"),
+        ("lap", "loss.pyramid", 0),
+        ("ncc", "loss.ncc", 0),
+        ("dy", "loss.dynamics_mode", "off"),
+        ("hash", "field.temporal_hash", False),
+        ("appearance", "field.appearance", "none"),
+    ],
+)
+def test_an_ablation_changes_one_key(part: str, key: str, value: object) -> None:
+    """Of the configuration that is whole otherwise."""
+    section, name = key.split(".")
+    expected = dataclasses.replace(getattr(FULL, section), **{name: value})
+    assert expected != getattr(FULL, section)
+    assert load_config("dnerf", ablate=[part]) == dataclasses.replace(FULL, **{section: expected})
+
+
+def test_ablations_add_up_and_must_be_known() -> None:
+    config = load_config("dnerf", ablate=["lap", "hash"])
+    assert (config.loss.pyramid, config.field.temporal_hash, config.loss.ncc) == (0, False, 0.05)
+    assert set(ABLATIONS) == {"laplacian", "dynamics", "split", "lap", "ncc", "dy", "hash", "appearance"}
+    with pytest.raises(InputError, match="not 'laplace'; did you mean laplacian"):
+        load_config("dnerf", ablate=["laplace"])
+    with pytest.raises(InputError, match="did you mean hexplane"):
+        load_config("dnerf", field="hexplanes")
 
 
 def test_overrides() -> None:

@@ -7,6 +7,7 @@ import io
 import json
 import signal
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -63,14 +64,14 @@ def lines(run: Path) -> list[dict]:
     return [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
 
 
-@pytest.mark.parametrize("kind", ["static", "grid4d"])
+@pytest.mark.parametrize("kind", ["static", "mlp", "hexplane", "grid4d", "laplacian"])
 def test_the_loss_falls(kind: str, dataset: Dataset, device: Device, tmp_path: Path) -> None:
     losses: list[float] = []
     original = Log.step
 
-    def note(self: Log, step: int, loss: float, psnr: float, gaussians: int) -> None:
+    def note(self: Log, step: int, loss: float, *rest: Any) -> None:
         losses.append(loss)
-        original(self, step, loss, psnr, gaussians)
+        original(self, step, loss, *rest)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Log, "step", note)
@@ -88,7 +89,10 @@ def test_a_run_is_whole(run: Path, dataset: Dataset) -> None:
     record = (run / "config.toml").read_text().split("[record]")[1]
     assert all(f"\n{key} = " in record for key in ("lapgs_wgpu", "torch", "adapter", "driver"))
     (last,) = lines(run)
-    assert set(last) == {"step", "loss", "psnr", "gaussians", "timing"}
+    assert set(last) == {"step", "loss", "psnr", "gaussians", "frequencies", "amplitudes", "timing"}
+    assert len(last["frequencies"]) == len(last["amplitudes"]) == 16
+    assert last["frequencies"] != list(range(16))  # they are learnt
+    assert max(last["frequencies"]) <= 4  # the Nyquist frequency of 8 pictures
     assert last["step"] == STEPS
     metrics = json.loads((run / "metrics.json").read_text())
     assert metrics["training"]["steps"] == STEPS
@@ -158,8 +162,8 @@ def test_ctrl_c_leaves_a_whole_checkpoint(
 ) -> None:
     original = Log.step
 
-    def interrupt(self: Log, step: int, loss: float, psnr: float, gaussians: int) -> None:
-        original(self, step, loss, psnr, gaussians)
+    def interrupt(self: Log, step: int, *rest: Any) -> None:
+        original(self, step, *rest)
         if step == 5:
             signal.raise_signal(signal.SIGINT)
 

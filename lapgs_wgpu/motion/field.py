@@ -63,6 +63,9 @@ class FieldConfig:
         "laplacian", "of the field laplacian: laplacian (a spectrum), or mlp, a decoder of features and time instead"
     )
     components: int = option(16, "frequencies of the spectrum")
+    frequency_step: float = option(
+        1.0, "from one frequency to the next at the start, which is at 0; cycles over the clip"
+    )
     dynamics: int = option(16, "length of each Gaussian's dynamics attribute with the field laplacian; 0 for none")
     appearance: Appearance = option(
         "color", "what the field laplacian changes besides the geometry: none, color, or color+opacity"
@@ -74,6 +77,8 @@ class FieldConfig:
                 "bound must be above 0 and time_scale above 0 and at most 1, "
                 f"got {self.bound:g} and {self.time_scale:g}"
             )
+        if not 0 < self.frequency_step < 1e6:
+            raise ValueError(f"frequency_step must be above 0, got {self.frequency_step:g}")
         for name, value, least, most in (
             ("width", self.width, 1, MAX_WIDTH),
             ("depth", self.depth, 0, MAX_DEPTH),

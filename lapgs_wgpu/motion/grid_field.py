@@ -41,7 +41,9 @@ class GridField(nn.Module):
         self.heads = zero_head(width, sum(GEOMETRY))
         self.motion: LaplacianMotion | TimeMotion | None = None
         if ours and config.motion == "laplacian":
-            self.motion = LaplacianMotion(static, width, config.components, generator)
+            self.motion = LaplacianMotion(
+                static, width, config.components, generator, frequency_step=config.frequency_step
+            )
         elif ours:
             self.motion = TimeMotion(static, width, generator)
         changes = {"none": 0, "color": 3, "color+opacity": 4}[config.appearance] if ours else 0

@@ -36,16 +36,19 @@ class Factors(NamedTuple):
 class LaplacianMotion(nn.Module):
     """A_L(t) = L(t) * M(H_s), with L(t) = sum over k of alpha_k cos(2 pi f_k t) + beta_k sin(2 pi f_k t).
 
-    alpha, beta: (K, W), shared by all Gaussians; frequencies: (K,), cycles over the clip, 0 to K - 1 at first.
+    alpha, beta: (K, W), shared by all Gaussians; frequencies: (K,), cycles over the clip, at first 0, 1, ... K - 1
+    times frequency_step.
     M: two layers from the static features H_s, by which each Gaussian picks its part of the motion.
     """
 
-    def __init__(self, inputs: int, width: int, components: int, generator: torch.Generator) -> None:
+    def __init__(
+        self, inputs: int, width: int, components: int, generator: torch.Generator, *, frequency_step: float = 1.0
+    ) -> None:
         super().__init__()
         # Neither factor starts at zero: the product would have no gradient.
         self.alpha = nn.Parameter(torch.randn(components, width, generator=generator) * components**-0.5)
         self.beta = nn.Parameter(torch.randn(components, width, generator=generator) * components**-0.5)
-        self.frequencies = nn.Parameter(torch.arange(components, dtype=torch.float32))
+        self.frequencies = nn.Parameter(frequency_step * torch.arange(components, dtype=torch.float32))
         self.first = linear(inputs, width, generator)
         self.second = linear(width, width, generator)
 
