@@ -43,6 +43,14 @@ def test_distance_is_from_the_mean_row() -> None:
     assert outliers(d).tolist() == [False] * 5 + [True] * 2
 
 
+def test_distance_is_euclidean() -> None:
+    d = torch.zeros(10, 16)
+    d[0], d[1] = 1.0, -1.0  # 4 away, as there are 16 entries
+    d[2:4, 0] = torch.tensor([5.0, -5.0])
+    # Mean 18/10, mean square 82/10: the bound is 1.8 + 2.227 = 4.03.
+    assert outliers(d).nonzero()[:, 0].tolist() == [2, 3]
+
+
 @pytest.mark.parametrize("count", [0, 1, 2, 1000])
 def test_nobody_stands_out_among_equals(count: int, recwarn: pytest.WarningsRecorder) -> None:
     # 0.1 is no binary fraction: the mean differs from each of the rows in the last bit.
@@ -51,6 +59,9 @@ def test_nobody_stands_out_among_equals(count: int, recwarn: pytest.WarningsReco
 
 
 def test_nobody_stands_out_where_all_are_equally_far() -> None:
+    directions = torch.randn(500, 16, generator=torch.Generator().manual_seed(2))
+    directions /= directions.norm(dim=1, keepdim=True)  # of length 1 but for rounding
+    assert not outliers(torch.cat([directions, -directions])).any()
     assert not outliers(column([0.1, 0.7] * 500)).any()
 
 
