@@ -44,6 +44,14 @@ def load_config(preset: str, overrides: Mapping[str, str | list[str]] | None = N
     return typing.cast(Config, _build(Config, table, preset, ""))
 
 
+def build_config(preset: str, table: Table, source: str) -> Config:
+    """A preset, by name or by path, with a nested table of values laid over it.
+
+    source: where the table stands, for the text of an InputError.
+    """
+    return typing.cast(Config, _build(Config, merge(_read(preset), table), source, ""))
+
+
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """ "; did you mean X?" for a name that is close to a known one, else nothing."""
     close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.6)
@@ -98,14 +106,15 @@ def _read(preset: str, seen: tuple[str, ...] = ()) -> Table:
         return table
     if not isinstance(base, str):
         raise InputError(f"{file}: base must be the name of a preset, got {base!r}.")
-    return _merge(_read(base, (*seen, preset)), table)
+    return merge(_read(base, (*seen, preset)), table)
 
 
-def _merge(below: Table, above: Table) -> Table:
+def merge(below: Table, above: Table) -> Table:
+    """A nested table with another one laid over it."""
     merged = dict(below)
     for key, value in above.items():
         both = isinstance(value, dict) and isinstance(below.get(key), dict)
-        merged[key] = _merge(below[key], value) if both else value
+        merged[key] = merge(below[key], value) if both else value
     return merged
 
 
