@@ -60,7 +60,7 @@ def _guarded(name: str, command: Callable[[list[str]], int | None], arguments: l
         print(f"{name}: {error}.", file=sys.stderr)
         return 2
     except KeyboardInterrupt as error:
-        print(f"{name}: {error or 'interrupted.'}", file=sys.stderr)
+        print(f"{name}: {str(error) or 'interrupted.'}", file=sys.stderr)
         return INTERRUPTED
     return code or 0
 
@@ -93,6 +93,7 @@ def _train(arguments: list[str]) -> None:
 def _evaluate(run: Path, device_name: str | None, overrides: dict[str, str | list[str]]) -> None:
     from lapgs_wgpu.gpu.device import open_device
     from lapgs_wgpu.motion.scene import load
+    from lapgs_wgpu.train import plots
     from lapgs_wgpu.train.loop import evaluate_run
     from lapgs_wgpu.train.presets import load_config
 
@@ -108,6 +109,10 @@ def _evaluate(run: Path, device_name: str | None, overrides: dict[str, str | lis
     except (OSError, ValueError, KeyError, TypeError):
         training = {"steps": int(scene.metadata.get("step", 0))}
     evaluate_run(run, scene, dataset, config.data.background, training)
+    if plots.available():
+        plots.plot_run(run, scene)
+    else:
+        print(f"no plots: pip install 'lapgs-wgpu[plots]' adds them to {run / 'eval'}.", file=sys.stderr)
     _report(run)
 
 

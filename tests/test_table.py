@@ -298,7 +298,11 @@ def test_unfinished_and_changed_runs_are_trained_again(
 
 
 def test_the_table_is_written_after_every_run(
-    spec_file: Path, data: Path, trained: list[RunKey], monkeypatch: pytest.MonkeyPatch
+    spec_file: Path,
+    data: Path,
+    trained: list[RunKey],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     original, seen = table._train_in_process, []
 
@@ -310,6 +314,7 @@ def test_the_table_is_written_after_every_run(
 
     monkeypatch.setattr(table, "_train_in_process", look)
     assert make(spec_file, data) == cli.INTERRUPTED
+    assert capsys.readouterr().err.endswith("lapgs-table: stopped in run 4 of 5; the same command goes on.\n")
     assert seen == [0, 1, 2, 3]
     assert "| toys | grid4d | 1 | 25.00 | - |" in (spec_file.parent / "out" / "table.md").read_text()
 

@@ -62,7 +62,10 @@ def make_table(
             f"run {number} of {len(spec.runs)}: {run.key} ({_time_left(spec.runs, finished, failed)})", file=sys.stderr
         )
         folder = run_folder(out, run.key)
-        reason = _train_in_process(run, folders[run.folder], folder, device)
+        try:
+            reason = _train_in_process(run, folders[run.folder], folder, device)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(f"stopped in run {number} of {len(spec.runs)}; the same command goes on.") from None
         result = read_run(folder, run)
         if reason or result is None:
             failed[run.key] = reason or f"{folder} holds no finished run"
