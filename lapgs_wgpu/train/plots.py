@@ -128,7 +128,7 @@ def sample_trajectories(scene: Scene4D) -> tuple[Floats, Floats]:
 
 def training_curves(path: Path, steps: ArrayLike, loss: ArrayLike, psnr: ArrayLike, gaussians: ArrayLike) -> None:
     """Loss, PSNR and number of Gaussians over the steps, each (S,)."""
-    from matplotlib.ticker import LogFormatter
+    from matplotlib.ticker import LogLocator, NullFormatter
 
     figure = _figure(7, 7)
     panels = figure.subplots(3, 1, sharex=True)
@@ -137,8 +137,9 @@ def training_curves(path: Path, steps: ArrayLike, loss: ArrayLike, psnr: ArrayLi
         axes.plot(steps, values, color=colour, marker="." if np.size(steps) < 3 else None)
         axes.set_ylabel(label)
     panels[0].set_yscale("log")
-    panels[0].yaxis.set_major_formatter(LogFormatter())  # 0.02 rather than 2 x 10^-2
-    panels[0].yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(2, 0.4)))
+    panels[0].yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    panels[0].yaxis.set_major_formatter("{x:g}")  # 0.02 rather than 2 x 10^-2
+    panels[0].yaxis.set_minor_formatter(NullFormatter())
     panels[2].yaxis.set_major_formatter("{x:,.0f}")
     panels[2].set_ylim(bottom=0)
     panels[2].set_xlabel("training step")
