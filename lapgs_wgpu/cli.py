@@ -184,8 +184,11 @@ def _table(arguments: list[str]) -> int:
     if not given.spec:
         results = merge_results(known)
         if given.out:
-            Path(given.out).mkdir(parents=True, exist_ok=True)
-            write_results(Path(given.out), results)
+            there = Path(given.out, "results.json")
+            if there.exists() and not any(there.samefile(file) for file in given.known):
+                raise InputError(f"{there} would be lost; name it after --from, too, or take another folder.")
+            there.parent.mkdir(parents=True, exist_ok=True)
+            write_results(there.parent, results)
         print(markdown(results), end="")
         return 0
     spec, out = read_spec(Path(given.spec)), Path(given.out)

@@ -213,6 +213,9 @@ def test_results_of_several_machines_are_merged(tmp_path: Path, capsys: pytest.C
     assert "| a | x | 3 | 20.00 | 0.00 |" in shown
     assert (tmp_path / "both" / "table.md").read_text() == shown
     assert len(read_results(tmp_path / "both" / "results.json").runs) == 3
+    assert cli.table_command(["--from", files[0], "--out", str(tmp_path / "both")]) == 2
+    assert "results.json would be lost" in capsys.readouterr().err
+    assert cli.table_command(["--from", *files, str(tmp_path / "both" / "results.json"), "--out", str(tmp_path)]) == 0
     with pytest.raises(InputError, match=r"a, x, seed 0: .* two configurations"):
         merge_results([Results("a", "tiny", (result(),)), Results("b", "tiny", (result(fingerprint="g"),))])
 
@@ -350,3 +353,51 @@ def test_runs_are_trained_in_processes_and_a_failed_one_stops_no_other(
     assert (only.psnr, only.steps, only.views) == (metrics["psnr"], 3, 2)
     assert only.environment["adapter"] == metrics["environment"]["adapter"]
     assert load_config(str(run / "config.toml")).data.path == str(data / "toys")
+
+
+def test_the_built_in_scene_is_written_once(
+    tmp_path: Path, trained: list[RunKey], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written = []
+
+    def write(folder: Path) -> Path:
+        written.append(folder)
+        return folder
+
+    monkeypatch.setattr(table, "write_synthetic", write)
+    (tmp_path / "spec.toml").write_text(
+        SPEC.replace('"toys"\n', '"synthetic"\n').replace('folder = "toys"', 'folder = "synthetic"')
+    )
+    assert make(tmp_path / "spec.toml", tmp_path / "nowhere") == 0
+    assert len(trained) == 5
+    assert written == [tmp_path / "out" / ".data" / "synthetic"]
+
+
+@pytest.mark.parametrize(
+    ("script", "reason"),
+    [
+        ("echo 'step 1' >&2; kill -KILL $$", "ended by SIGKILL"),
+        ("echo 'Traceback' >&2; echo 'RuntimeError: no memory' >&2; exit 1", "RuntimeError: no memory"),
+        ("exit 7", "exit code 7"),
+        ("exit 0", "holds no finished run"),
+    ],
+)
+def test_why_a_run_failed_is_told(
+    script: str,
+    reason: str,
+    data: Path,
+    spec_file: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    python = spec_file.parent / "python"
+    python.write_text(f"#!/bin/sh\n{script}\n")
+    python.chmod(0o755)
+    monkeypatch.setattr(table.sys, "executable", str(python))
+    assert make(spec_file, data) == 1
+    shown = capsys.readouterr()
+    assert "0 of 5 runs" in shown.out
+    last = shown.err.splitlines()[-1]
+    assert last.startswith("lapgs-table: others, static, seed 5 failed: ")
+    assert last.endswith(reason)
+    assert "No run is finished yet." in (spec_file.parent / "out" / "table.md").read_text()
