@@ -238,5 +238,4 @@ def _save(figure: Figure, path: Path, title: str, panels: Sequence[Axes]) -> Non
         axes.spines[["top", "right"]].set_visible(False)
     figure.align_ylabels(panels)
     figure.suptitle(title)
-    # No version of matplotlib in the file: the same run gives the same picture.
-    figure.savefig(path, format="png", metadata={"Software": None})
+    figure.savefig(path, format="png")
