@@ -42,9 +42,14 @@ def train_command(arguments: Sequence[str] | None = None) -> int:
     return _guarded("lapgs-train", _train, list(sys.argv[1:] if arguments is None else arguments))
 
 
-def _guarded(name: str, command: Callable[[list[str]], None], arguments: list[str]) -> int:
+def table_command(arguments: Sequence[str] | None = None) -> int:
+    """lapgs-table: returns the exit code, 1 where runs failed."""
+    return _guarded("lapgs-table", _table, list(sys.argv[1:] if arguments is None else arguments))
+
+
+def _guarded(name: str, command: Callable[[list[str]], int | None], arguments: list[str]) -> int:
     try:
-        command(arguments)
+        code = command(arguments)
     except NoAdapterError as error:
         print(f"{name}: {error}", file=sys.stderr)
         return 2 if list_devices() else 3  # an adapter that is not there, or none at all
@@ -55,9 +60,9 @@ def _guarded(name: str, command: Callable[[list[str]], None], arguments: list[st
         print(f"{name}: {error}.", file=sys.stderr)
         return 2
     except KeyboardInterrupt as error:
-        print(f"{name}: {error or 'interrupted.'}", file=sys.stderr)
+        print(f"{name}: {str(error) or 'interrupted.'}", file=sys.stderr)
         return INTERRUPTED
-    return 0
+    return code or 0
 
 
 def _train(arguments: list[str]) -> None:
@@ -77,7 +82,7 @@ def _train(arguments: list[str]) -> None:
     if given["preset"] is None:
         raise InputError("name a preset, such as tiny, and the data to train on; lapgs-train --help says more.")
     ablate = [part.strip() for part in (given["ablate"] or "").split(",") if part.strip()]
-    config = load_config(given["preset"], overrides, field=given["field"], ablate=ablate)
+    config = load_config(given["preset"], overrides, method=given["field"], ablate=ablate)
     out = Path(given["out"] or f"runs/{_scene_name(config)}-{Path(given['preset']).stem}")
     check_run_folder(out, overwrite=given["overwrite"])
     device = open_device(given["device"])
@@ -89,6 +94,7 @@ def _train(arguments: list[str]) -> None:
 def _evaluate(run: Path, device_name: str | None, overrides: dict[str, str | list[str]]) -> None:
     from lapgs_wgpu.gpu.device import open_device
     from lapgs_wgpu.motion.scene import load
+    from lapgs_wgpu.train import plots
     from lapgs_wgpu.train.loop import evaluate_run
     from lapgs_wgpu.train.presets import load_config
 
@@ -104,6 +110,10 @@ def _evaluate(run: Path, device_name: str | None, overrides: dict[str, str | lis
     except (OSError, ValueError, KeyError, TypeError):
         training = {"steps": int(scene.metadata.get("step", 0))}
     evaluate_run(run, scene, dataset, config.data.background, training)
+    if plots.available():
+        plots.plot_run(run, scene)
+    else:
+        print(f"no plots: pip install 'lapgs-wgpu[plots]' adds them to {run / 'eval'}.", file=sys.stderr)
     _report(run)
 
 
@@ -141,6 +151,55 @@ def _open_data(config: Config, synthetic: Path) -> tuple[Config, Dataset]:
     return dataclasses.replace(config, data=data), dataset
 
 
+TABLE_DESCRIPTION = """\
+Train every run of a table (scenes x rows x seeds, as SPEC.toml names them) and write the table.
+
+  lapgs-table docs/tables/demo.toml --out runs/demo-table       the built-in scene
+  lapgs-table SPEC.toml --data DIR --out OUT                    once more after an interruption: the rest
+  lapgs-table --from A/results.json B/results.json              the table of runs that are done, on stdout
+
+OUT/SCENE/ROW/seedN are run folders of lapgs-train; OUT/results.json and OUT/table.md are written after every run. A run
+counts as finished when its folder, OUT/results.json or a --from file holds it in the wanted configuration."""
+
+
+def _table(arguments: list[str]) -> int:
+    parser = _Parser("lapgs-table", description=TABLE_DESCRIPTION, formatter_class=_HelpFormatter, allow_abbrev=False)
+    parser.add_argument("spec", nargs="?", metavar="SPEC.toml", help="the table, as docs/tables/demo.toml explains")
+    parser.add_argument("--data", metavar="DIR", default=".", help="where the scenes' folders lie [.]")
+    parser.add_argument("--out", metavar="OUT", help="folder of the runs and the table")
+    parser.add_argument(
+        "--from", metavar="FILE", nargs="+", default=[], dest="known", help="results.json of other runs"
+    )
+    parser.add_argument("--device", metavar="NAME", help="part of an adapter's name, or cpu, integrated, discrete")
+    parser.add_argument("--slim", action="store_true", help="drop checkpoint.ply and eval/ of each run once done")
+    given = parser.parse_args(arguments)
+    if given.spec and not given.out:
+        raise InputError("name a folder for the runs and the table with --out.")
+    if not given.spec and not given.known:
+        raise InputError("name a SPEC.toml, or --from results.json; lapgs-table --help says more.")
+    from lapgs_wgpu.train.table import make_table
+    from lapgs_wgpu.train.table_results import markdown, merge_results, read_results, write_results
+    from lapgs_wgpu.train.table_spec import read_spec
+
+    known = [read_results(Path(file)) for file in given.known]
+    if not given.spec:
+        results = merge_results(known)
+        if given.out:
+            there = Path(given.out, "results.json")
+            if there.exists() and not any(there.samefile(file) for file in given.known):
+                raise InputError(f"{there} would be lost; name it after --from, too, or take another folder.")
+            there.parent.mkdir(parents=True, exist_ok=True)
+            write_results(there.parent, results)
+        print(markdown(results), end="")
+        return 0
+    spec, out = read_spec(Path(given.spec)), Path(given.out)
+    failed = make_table(spec, Path(given.data), out, known=known, device=given.device, slim=given.slim)
+    print(f"{out / 'table.md'}: {len(spec.runs) - len(failed)} of {len(spec.runs)} runs")
+    for key, reason in failed.items():
+        print(f"lapgs-table: {key} failed: {reason}", file=sys.stderr)
+    return 1 if failed else 0
+
+
 _METAVARS = {int: "INT", float: "FLOAT", str: "TEXT", bool: "true|false"}
 
 
@@ -153,7 +212,7 @@ class _Parser(argparse.ArgumentParser):
     """argparse, with its mistakes told in our way."""
 
     def error(self, message: str) -> NoReturn:
-        raise InputError(f"{message}; lapgs-train --help lists the options.")
+        raise InputError(f"{message}; {self.prog} --help lists the options.")
 
 
 def _parse(arguments: list[str]) -> dict[str, typing.Any]:
@@ -209,3 +268,7 @@ def _parse(arguments: list[str]) -> dict[str, typing.Any]:
         what = f"there is no option {word}" if word.startswith("-") else f"{word!r} is one word too many"
         raise InputError(f"{what}{did_you_mean(word, options) or '; lapgs-train --help lists the options'}.")
     return vars(known)
+
+
+if __name__ == "__main__":  # how lapgs-table starts each run
+    sys.exit(train_command())

@@ -58,7 +58,7 @@ def test_evaluation_of_a_run_gives_the_same_figures(run: Path, capsys: pytest.Ca
     after = json.loads((run / "metrics.json").read_text())
     assert after["views"] == before["views"]
     assert after["training"] == {"steps": 3}
-    assert sorted(file.name for file in (run / "eval").iterdir()) == ["test_000.png", "test_001.png"]
+    assert sorted(file.name for file in (run / "eval").glob("*.png")) == ["test_000.png", "test_001.png"]
     assert "dB PSNR" in capsys.readouterr().out
 
 

@@ -58,13 +58,13 @@ FULL = load_config("dnerf")
 
 @pytest.mark.parametrize("field", ["static", "mlp", "hexplane", "grid4d"])
 def test_a_method_in_short_leaves_out_what_is_the_papers(field: str) -> None:
-    config = load_config("dnerf", field=field)
+    config = load_config("dnerf", method=field)
     assert config.field == dataclasses.replace(FULL.field, kind=field)
     assert config.field.dynamics_size == 0
     assert (config.loss.pyramid, config.loss.ncc, config.density.split) == (0, 0, "plain")
     assert config.loss.ssim == FULL.loss.ssim
-    assert load_config("dnerf", {"loss.ncc": "0.5"}, field=field).loss.ncc == 0.5  # what is said outright holds
-    assert load_config("dnerf", field="laplacian") == FULL
+    assert load_config("dnerf", {"loss.ncc": "0.5"}, method=field).loss.ncc == 0.5  # what is said outright holds
+    assert load_config("dnerf", method="laplacian") == FULL
 
 
 def test_the_papers_method_is_whole() -> None:
@@ -101,7 +101,7 @@ def test_ablations_add_up_and_must_be_known() -> None:
     with pytest.raises(InputError, match="not 'laplace'; did you mean laplacian"):
         load_config("dnerf", ablate=["laplace"])
     with pytest.raises(InputError, match="did you mean hexplane"):
-        load_config("dnerf", field="hexplanes")
+        load_config("dnerf", method="hexplanes")
 
 
 def test_overrides() -> None:

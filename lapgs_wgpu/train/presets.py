@@ -48,19 +48,19 @@ def load_config(
     preset: str,
     overrides: Mapping[str, str | list[str]] | None = None,
     *,
-    field: str | None = None,
+    method: str | None = None,
     ablate: Iterable[str] = (),
 ) -> Config:
     """A preset by name, or a .toml file by path (such as an earlier run's config.toml), with some values overridden.
 
     overrides: dotted key -> text, or texts of a tuple's entries, as they stand on a command line.
-    field: a method in short, its field without what belongs to the paper's only (PAPER_ONLY). ablate: parts of the
-    paper's method that are left out (ABLATIONS). Overrides come last.
+    method: a field's kind, without what belongs to the paper's method only (PAPER_ONLY). ablate: parts of the paper's
+    method that are left out (ABLATIONS). Overrides come last.
     Raises InputError where the preset, a key or a value is not valid.
     """
     table = _read(preset)
     known = {key.name: key.kind for key in config_keys()}
-    for key, value in _shorthands(field, ablate).items():
+    for key, value in _shorthands(method, ablate).items():
         _set(table, key, value)
     for key, text in (overrides or {}).items():
         if key not in known:
@@ -69,12 +69,25 @@ def load_config(
     return typing.cast(Config, _build(Config, table, preset, ""))
 
 
-def _shorthands(field: str | None, ablate: Iterable[str]) -> dict[str, Any]:
+def build_config(
+    preset: str, table: Table, source: str, *, method: str | None = None, ablate: Iterable[str] = ()
+) -> Config:
+    """A preset, by name or by path, with a nested table of values laid over it; method, ablate as in `load_config`.
+
+    source: where the table stands, for the text of an InputError.
+    """
+    base = _read(preset)
+    for key, value in _shorthands(method, ablate).items():
+        _set(base, key, value)
+    return typing.cast(Config, _build(Config, merge(base, table), source, ""))
+
+
+def _shorthands(method: str | None, ablate: Iterable[str]) -> dict[str, Any]:
     """Key -> value of what --field and --ablate stand for."""
     values: dict[str, Any] = {}
-    if field is not None:
-        values["field.kind"] = _checked(FieldKind, field, "--field")
-        values |= PAPER_ONLY if field != "laplacian" else {}
+    if method is not None:
+        values["field.kind"] = _checked(FieldKind, method, "--field")
+        values |= PAPER_ONLY if method != "laplacian" else {}
     for part in ablate:
         if part not in ABLATIONS:
             raise InputError(f"--ablate knows {', '.join(ABLATIONS)}, not {part!r}{did_you_mean(part, ABLATIONS)}.")
@@ -136,14 +149,15 @@ def _read(preset: str, seen: tuple[str, ...] = ()) -> Table:
         return table
     if not isinstance(base, str):
         raise InputError(f"{file}: base must be the name of a preset, got {base!r}.")
-    return _merge(_read(base, (*seen, preset)), table)
+    return merge(_read(base, (*seen, preset)), table)
 
 
-def _merge(below: Table, above: Table) -> Table:
+def merge(below: Table, above: Table) -> Table:
+    """A nested table with another one laid over it."""
     merged = dict(below)
     for key, value in above.items():
         both = isinstance(value, dict) and isinstance(below.get(key), dict)
-        merged[key] = _merge(below[key], value) if both else value
+        merged[key] = merge(below[key], value) if both else value
     return merged
 
 

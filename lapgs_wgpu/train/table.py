@@ -1,0 +1,175 @@
+"""Trains the runs of a table that are not finished yet, each in a process of its own, and keeps the table up to date.
+
+A process a run: the device's memory is all free again for the next one, and a run that crashes takes none with it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from datetime import timedelta
+from pathlib import Path
+from statistics import mean
+
+from lapgs_wgpu.data import load_dataset
+from lapgs_wgpu.data.synthetic import write_synthetic
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.gpu.device import open_device
+from lapgs_wgpu.io.atomic import atomic_write
+from lapgs_wgpu.train.presets import write_toml
+from lapgs_wgpu.train.table_results import Result, Results, read_results, read_run, write_results
+from lapgs_wgpu.train.table_spec import Run, RunKey, Spec
+
+SYNTHETIC = "synthetic"  # the folder of the built-in scene
+
+
+def make_table(
+    spec: Spec,
+    data: Path,
+    out: Path,
+    *,
+    known: Sequence[Results] = (),
+    device: str | None = None,
+    slim: bool = False,
+) -> dict[RunKey, str]:
+    """Train what is not finished; results.json and table.md in `out` are written anew after every run.
+
+    data: the folder in which the scenes lie. known: finished runs from elsewhere, beside those of out/results.json and
+    of the run folders out/SCENE/ROW/seedN. slim: drop checkpoint and pictures of each run that is done.
+    Returns the runs that failed, each with the reason. Raises InputError before the first training starts.
+    """
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out} is a file; name a folder for the table with --out.")
+    stored = [read_results(out / "results.json")] if (out / "results.json").exists() else []
+    finished = _finished(spec, out, [*stored, *known])
+    pending = [run for run in spec.runs if run.key not in finished]
+    folders = _scene_folders(pending, data, out)
+    if pending:
+        open_device(device)  # only to learn now, and not from every run, that it is not there
+
+    out.mkdir(parents=True, exist_ok=True)
+    _keep_others(out, stored, finished)
+    _write(spec, out, finished)
+    failed: dict[RunKey, str] = {}
+    for run in pending:
+        number = len(finished) + len(failed) + 1
+        print(
+            f"run {number} of {len(spec.runs)}: {run.key} ({_time_left(spec.runs, finished, failed)})", file=sys.stderr
+        )
+        folder = run_folder(out, run.key)
+        try:
+            reason = _train_in_process(run, folders[run.folder], folder, device)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(f"stopped in run {number} of {len(spec.runs)}; the same command goes on.") from None
+        result = read_run(folder, run)
+        if reason or result is None:
+            failed[run.key] = reason or f"{folder} holds no finished run"
+            print(f"run {number} failed: {failed[run.key]}", file=sys.stderr)
+            continue
+        finished[run.key] = result
+        _write(spec, out, finished)
+        if slim:
+            (folder / "checkpoint.ply").unlink(missing_ok=True)
+            shutil.rmtree(folder / "eval", ignore_errors=True)
+    return failed
+
+
+def run_folder(out: Path, key: RunKey) -> Path:
+    return out / key.scene / key.row / f"seed{key.seed}"
+
+
+def _finished(spec: Spec, out: Path, known: Sequence[Results]) -> dict[RunKey, Result]:
+    """The runs that need no training: listed somewhere, or lying in their folder, in the wanted configuration."""
+    listed = {(run.key, run.fingerprint): run for part in reversed(known) for run in part.runs}
+    finished = {}
+    for run in spec.runs:
+        result = listed.get((run.key, run.fingerprint)) or read_run(run_folder(out, run.key), run)
+        if result is not None:
+            finished[run.key] = result
+    return finished
+
+
+def _scene_folders(pending: Sequence[Run], data: Path, out: Path) -> dict[str, Path]:
+    """Where the scenes of these runs lie; each is opened once, so that its mistakes show before any training."""
+    folders = {}
+    for name in dict.fromkeys(run.folder for run in pending):
+        if name != SYNTHETIC:
+            folders[name] = (data / name).resolve()
+            load_dataset(folders[name])
+    if any(run.folder == SYNTHETIC for run in pending):
+        # Names of scenes start with no dot.
+        folders[SYNTHETIC] = write_synthetic(out / ".data" / SYNTHETIC).resolve()
+    return folders
+
+
+def _keep_others(out: Path, stored: Sequence[Results], finished: Mapping[RunKey, Result]) -> None:
+    """results.json is about to lose the runs that the table does not want any more; keep a copy of it then."""
+    others = [run for part in stored for run in part.runs if finished.get(run.key) != run]
+    if others:
+        with atomic_write(out / "results.before.json") as file:
+            file.write((out / "results.json").read_bytes())
+        print(
+            f"{len(others)} runs of {out / 'results.json'} are not wanted any more, or in another configuration, "
+            f"such as {others[0].key}; results.before.json keeps them.",
+            file=sys.stderr,
+        )
+
+
+def _write(spec: Spec, out: Path, finished: Mapping[RunKey, Result]) -> None:
+    ordered = tuple(finished[run.key] for run in spec.runs if run.key in finished)
+    write_results(out, Results(spec.name, spec.preset, ordered))
+
+
+def _time_left(runs: Sequence[Run], finished: Mapping[RunKey, Result], failed: Mapping[RunKey, str]) -> str:
+    """An estimate from the time that a step took: in finished runs of the same row, else in all."""
+    if not finished:
+        return "time left not known yet"
+    pace = {row: 1 / mean(r.steps_per_second for r in finished.values() if r.row == row) for _, row, _ in finished}
+    overall = mean(pace.values())
+    left = sum(
+        run.config.schedule.steps * pace.get(run.key.row, overall)
+        for run in runs
+        if run.key not in finished and run.key not in failed
+    )
+    return f"about {timedelta(seconds=round(left))} left"
+
+
+def _train_in_process(run: Run, data: Path, out: Path, device: str | None) -> str | None:
+    """lapgs-train with this configuration; what it tells goes to stderr. Returns why it failed, None if it did not."""
+    with tempfile.TemporaryDirectory() as work:
+        preset = Path(work) / "config.toml"
+        preset.write_text(write_toml(dataclasses.asdict(run.config)), encoding="utf-8")
+        command = [sys.executable, "-m", "lapgs_wgpu.cli", str(preset), f"--data={data}", f"--out={out.resolve()}"]
+        command += ["--overwrite", *([f"--device={device}"] if device else [])]
+        process = subprocess.Popen(
+            command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, errors="replace"
+        )
+        try:
+            last = _pass_on(process)
+            code = process.wait()
+        except BaseException:  # Ctrl-C: the run starts again with the next call, so nothing of it need be saved
+            process.kill()
+            process.wait()
+            raise
+    if code < 0:
+        return f"ended by {signal.Signals(-code).name}"
+    return (last.removeprefix("lapgs-train: ") or f"exit code {code}") if code else None
+
+
+def _pass_on(process: subprocess.Popen[str]) -> str:
+    """Show the lines of a process, on a terminal all in one place; returns the last one."""
+    assert process.stderr is not None
+    on_terminal = sys.stderr.isatty()
+    last = ""
+    for line in process.stderr:
+        last = line.strip() or last
+        sys.stderr.write(f"\r\x1b[2K{last}" if on_terminal else f"  {last}\n")
+        sys.stderr.flush()
+    if on_terminal:
+        sys.stderr.write("\n")
+    return last

@@ -1,0 +1,213 @@
+"""The measured runs of a table: one of a run folder, all of a results.json, and the Markdown that shows them."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import tomllib
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import mean, stdev
+from typing import Any
+
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.io.atomic import atomic_write
+from lapgs_wgpu.train.presets import Table, load_config
+from lapgs_wgpu.train.table_spec import Run, RunKey, fingerprint
+
+FORMAT = "lapgs-table 1"
+
+
+@dataclass(frozen=True)
+class Result:
+    """A finished run. seconds: of the training alone. overrides: what its configuration changed of the preset."""
+
+    scene: str
+    row: str
+    seed: int
+    fingerprint: str
+    psnr: float
+    ssim: float
+    gaussians: int
+    steps: int
+    seconds: float
+    size: list[int]
+    views: int
+    overrides: Table
+    environment: dict[str, str]
+
+    @property
+    def key(self) -> RunKey:
+        return RunKey(self.scene, self.row, self.seed)
+
+    @property
+    def steps_per_second(self) -> float:
+        return self.steps / max(self.seconds, 1e-9)
+
+
+@dataclass(frozen=True)
+class Results:
+    """What a results.json holds: the name of the table, its preset and the finished runs."""
+
+    name: str
+    preset: str
+    runs: tuple[Result, ...]
+
+
+def read_run(folder: Path, run: Run) -> Result | None:
+    """What a run folder holds; None where the run is not finished, or has another configuration."""
+    try:
+        metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+        record = tomllib.loads((folder / "config.toml").read_text(encoding="utf-8"))["record"]
+        made = fingerprint(load_config(str(folder / "config.toml")))
+        # An interrupted run that lapgs-train --eval measured has metrics, too.
+        steps, seconds = metrics["training"]["steps"], metrics["training"]["seconds"]
+        if made != run.fingerprint or steps != run.config.schedule.steps:
+            return None
+        return Result(
+            *run.key,
+            fingerprint=made,
+            psnr=metrics["psnr"],
+            ssim=metrics["ssim"],
+            gaussians=metrics["gaussians"],
+            steps=steps,
+            seconds=seconds,
+            size=metrics["size"],
+            views=len(metrics["views"]),
+            overrides=run.overrides,
+            environment=record,
+        )
+    except (OSError, ValueError, KeyError, TypeError):  # missing or damaged: it is trained again
+        return None
+
+
+def read_results(path: Path) -> Results:
+    """Read a results.json. Raises InputError."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"{path} does not exist; give a results.json that lapgs-table wrote.") from None
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path} cannot be read as JSON: {error}.") from None
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise InputError(f"{path} is no results.json of this version of lapgs-table (format {FORMAT!r}).")
+    runs = _checked(content, "runs", list, f"{path}")
+    return Results(
+        _checked(content, "name", str, f"{path}"),
+        _checked(content, "preset", str, f"{path}"),
+        tuple(_read_result(entry, f"{path}: run {number}") for number, entry in enumerate(runs, 1)),
+    )
+
+
+def _read_result(entry: Any, where: str) -> Result:
+    kinds = {"str": str, "int": int, "float": int | float, "list[int]": list}  # what is left are tables
+    return Result(
+        **{
+            field.name: _checked(entry, field.name, kinds.get(str(field.type), dict), where)
+            for field in dataclasses.fields(Result)
+        }
+    )
+
+
+def _checked(table: Any, name: str, kind: Any, where: str) -> Any:
+    if not isinstance(table, dict) or not isinstance(table.get(name), kind):
+        raise InputError(f"{where}: {name} is missing or has the wrong type; the file was damaged.")
+    return table[name]
+
+
+def merge_results(parts: Sequence[Results]) -> Results:
+    """The runs of several files, in order. InputError where they hold one run in two configurations."""
+    runs: dict[RunKey, Result] = {}
+    for part in parts:
+        for run in part.runs:
+            if runs.setdefault(run.key, run).fingerprint != run.fingerprint:
+                raise InputError(f"{run.key}: the files hold this run in two configurations; give the SPEC, too.")
+    return Results(parts[0].name, parts[0].preset, tuple(runs.values()))
+
+
+def write_results(folder: Path, results: Results) -> None:
+    """Write results.json and table.md. Atomic."""
+    with atomic_write(folder / "results.json") as file:
+        file.write((json.dumps({"format": FORMAT, **dataclasses.asdict(results)}, indent=1) + "\n").encode())
+    with atomic_write(folder / "table.md") as file:
+        file.write(markdown(results).encode())
+
+
+def markdown(results: Results) -> str:
+    """The tables: a line for each scene and row, then the means over the scenes, then with what they were made."""
+    lines = [f"## {results.name}", ""]
+    if not results.runs:
+        return "\n".join([*lines, "No run is finished yet.", ""])
+    cells: dict[tuple[str, str], list[Result]] = {}
+    for run in results.runs:
+        cells.setdefault((run.scene, run.row), []).append(run)
+    lines += _head("scene", "model", "seeds")
+    lines += [
+        _line((scene, row, str(len(runs))), _spread([run.psnr for run in runs]), _means(runs))
+        for (scene, row), runs in cells.items()
+    ]
+    scenes = {scene for scene, _ in cells}
+    if len(scenes) > 1:
+        lines += ["", "Means over the scenes; only lines with the same scenes compare.", "", *_head("model", "scenes")]
+        for row in dict.fromkeys(row for _, row in cells):
+            parts = [runs for (_, other), runs in cells.items() if other == row]
+            means = {name: mean(_means(runs)[name] for runs in parts) for name in _FORMATS}
+            lines.append(_line((row, f"{len(parts)} of {len(scenes)}"), _spread(_means_of_seeds(parts)), means))
+    return "\n".join([*lines, "", *_environments(results), ""])
+
+
+# The figures that are averaged, in the order of their columns, and how each is shown.
+_FORMATS = {
+    "psnr": "{:.2f}",
+    "ssim": "{:.4f}",
+    "gaussians": "{:,.0f}",
+    "steps_per_second": "{:.1f}",
+    "seconds": "{:,.0f}",
+}
+
+
+def _means(runs: Sequence[Result]) -> dict[str, float]:
+    return {name: mean(getattr(run, name) for run in runs) for name in _FORMATS}
+
+
+def _means_of_seeds(parts: Sequence[Sequence[Result]]) -> list[float]:
+    """For each seed that all scenes have, its mean PSNR over them."""
+    by_seed: dict[int, list[float]] = {}
+    for run in (run for runs in parts for run in runs):
+        by_seed.setdefault(run.seed, []).append(run.psnr)
+    return [mean(values) for values in by_seed.values() if len(values) == len(parts)]
+
+
+def _spread(values: Sequence[float]) -> str:
+    """The sample standard deviation, which one value does not have."""
+    return f"{stdev(values):.2f}" if len(values) > 1 else "-"
+
+
+def _head(*columns: str) -> list[str]:
+    names = [*columns, "PSNR", "±", "SSIM", "Gaussians", "steps/s", "training, s"]
+    left = sum(name in ("scene", "model") for name in columns)
+    return [f"| {' | '.join(names)} |", f"|{'|'.join(['---'] * left + ['---:'] * (len(names) - left))}|"]
+
+
+def _line(texts: Sequence[str], spread: str, means: Mapping[str, float]) -> str:
+    psnr, *others = (text.format(means[name]) for name, text in _FORMATS.items())
+    return f"| {' | '.join((*texts, psnr, spread, *others))} |"
+
+
+def _environments(results: Results) -> Iterable[str]:
+    """What the figures hold for: pictures, versions, adapter; and how many runs, where that is not the same for all."""
+    yield (
+        f"{len(results.runs)} runs of the preset `{results.preset}`. ± is the sample standard deviation of the PSNR "
+        "over the seeds; the training's time is without evaluation."
+    )
+    sizes = Counter(f"{run.views} test views of {'x'.join(map(str, run.size))}" for run in results.runs)
+    shown = ("adapter", "driver", "system", "python", "torch", "wgpu", "lapgs_wgpu", "revision")
+    made = Counter(
+        ", ".join(f"{name} {run.environment[name]}" for name in shown if name in run.environment)
+        for run in results.runs
+    )
+    for counter in (sizes, made):
+        yield ""
+        yield "; ".join(f"{text} ({n} runs)" if len(counter) > 1 else text for text, n in counter.items()) + "."

@@ -1,0 +1,170 @@
+"""What a table is made of: a TOML file that names a preset, scenes, rows (fields or ablations) and seeds.
+
+preset = "tiny"
+seeds = [0, 1, 2]
+
+[common]                          # keys of the configuration, for every run
+data.background = "black"
+
+[scenes]                          # name = folder, relative to --data; "synthetic" is the built-in scene
+toys = "synthetic"
+lego = { folder = "lego", points.box = 1.5 }
+
+[rows]                            # name = a method (--field) and what it is without (--ablate), keys of the
+grid4d = { method = "grid4d" }    # configuration, and to which scenes and seeds the row is kept
+no_ncc = { ablate = ["ncc"], scenes = ["toys"], seeds = [0], loss.pyramid = 0.1 }
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import re
+import tomllib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.train.config import Config
+from lapgs_wgpu.train.presets import Table, build_config, did_you_mean, merge
+
+_NAME = re.compile(r"\w[\w .+=-]*", re.ASCII)  # becomes the name of a folder, and a cell of a Markdown table
+
+
+class RunKey(NamedTuple):
+    """Which run of a table."""
+
+    scene: str
+    row: str
+    seed: int
+
+    def __str__(self) -> str:
+        return f"{self.scene}, {self.row}, seed {self.seed}"
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run that a table wants. folder: of the scene, relative to --data. overrides: what the spec says of it."""
+
+    key: RunKey
+    folder: str
+    config: Config
+    overrides: Table
+
+    @property
+    def fingerprint(self) -> str:
+        return fingerprint(self.config)
+
+
+@dataclass(frozen=True)
+class Spec:
+    """A table as it is wanted: its name, and every run, scene by scene."""
+
+    name: str
+    preset: str
+    runs: tuple[Run, ...]
+
+
+def read_spec(path: Path) -> Spec:
+    """Read and check a whole table: every name, key and value of each run. Raises InputError."""
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"{path} does not exist; give the .toml file that describes the table.") from None
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path} cannot be read as TOML: {error}.") from None
+    known = ("preset", "seeds", "common", "scenes", "rows")
+    for key in table:
+        if key not in known:
+            raise InputError(f"{path}: there is no key {key}{did_you_mean(key, known) or f'; known: {_list(known)}'}.")
+    preset = table.get("preset")
+    if not isinstance(preset, str):
+        raise InputError(f"{path}: preset must be the name of a preset, got {preset!r}.")
+    seeds = _seeds(table.get("seeds"), f"{path}: seeds")
+    common = _overrides(table.get("common", {}), f"{path}: common")
+    scenes = _scenes(table.get("scenes"), path)
+
+    runs: list[Run] = []
+    rows = _named_tables(table.get("rows"), f"{path}: rows")
+    for row, entry in rows.items():
+        where = f"{path}: rows.{row}"
+        if not isinstance(entry, dict):
+            raise InputError(f"{where} must be a table of keys of the configuration, got {entry!r}.")
+        row_scenes = _subset(entry.pop("scenes", list(scenes)), list(scenes), f"{where}.scenes")
+        row_seeds = _subset(_seeds(entry.pop("seeds", seeds), f"{where}.seeds"), seeds, f"{where}.seeds")
+        method, ablate = entry.pop("method", None), entry.pop("ablate", [])
+        if not isinstance(ablate, list):
+            raise InputError(f"{where}.ablate must be a list of parts, got {ablate!r}.")
+        entry = _overrides(entry, where)
+        for scene in row_scenes:
+            folder, own = scenes[scene]
+            overrides = merge(merge(common, own), entry)
+            for seed in row_seeds:
+                where = f"{path}: {scene}, {row}"
+                values = merge(overrides, {"seed": seed})
+                config = build_config(preset, values, where, method=method, ablate=ablate)
+                shown = overrides | ({"method": method} if method else {}) | ({"ablate": ablate} if ablate else {})
+                runs.append(Run(RunKey(scene, row, seed), folder, config, shown))
+    # Scene by scene, so that a table of which half is made compares all rows on half of the scenes.
+    order = list(scenes)
+    return Spec(path.stem, preset, tuple(sorted(runs, key=lambda run: order.index(run.key.scene))))
+
+
+def fingerprint(config: Config) -> str:
+    """Of all that a training depends on, but not of where its pictures lie on this machine."""
+    values = dataclasses.asdict(config)
+    del values["data"]["path"]
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _scenes(value: Any, path: Path) -> dict[str, tuple[str, Table]]:
+    """Name -> folder and overrides."""
+    scenes = {}
+    for name, entry in _named_tables(value, f"{path}: scenes").items():
+        entry = {"folder": entry} if isinstance(entry, str) else entry
+        if not isinstance(entry, dict) or not isinstance(entry.get("folder"), str):
+            raise InputError(f"{path}: scenes.{name} must be a folder, or a table with the key folder, got {entry!r}.")
+        folder = entry.pop("folder")
+        scenes[name] = (folder, _overrides(entry, f"{path}: scenes.{name}"))
+    return scenes
+
+
+def _named_tables(value: Any, where: str) -> Table:
+    if not isinstance(value, dict) or not value:
+        raise InputError(f"{where} must be a table with at least one entry, got {value!r}.")
+    for name in value:
+        if not _NAME.fullmatch(name):
+            raise InputError(f"{where}: {name!r} must be a name of letters, digits, spaces and . + = _ - only.")
+    return value
+
+
+def _overrides(value: Any, where: str) -> Table:
+    if not isinstance(value, dict):
+        raise InputError(f"{where} must be a table of keys of the configuration, got {value!r}.")
+    data = value.get("data")
+    if "seed" in value or (isinstance(data, dict) and "path" in data):
+        raise InputError(f"{where} must set neither seed nor data.path: the keys seeds and scenes do.")
+    return value
+
+
+def _seeds(value: Any, where: str) -> list[int]:
+    whole = isinstance(value, list) and all(type(seed) is int and seed >= 0 for seed in value)
+    if not whole or not value or len(set(value)) < len(value):
+        raise InputError(f"{where} must be a list of different whole numbers from 0 up, got {value!r}.")
+    return value
+
+
+def _subset(value: Any, known: list[Any], where: str) -> list[Any]:
+    if not isinstance(value, list) or not value:
+        raise InputError(f"{where} must be a list of {_list(known)}, got {value!r}.")
+    for entry in value:
+        if entry not in known:
+            raise InputError(f"{where}: {entry!r} is none of {_list(known)}.")
+    return [entry for entry in known if entry in value]
+
+
+def _list(names: Iterable[object]) -> str:
+    return ", ".join(map(str, names))

@@ -1,0 +1,403 @@
+"""lapgs-table: what a spec asks for, which runs it trains, and the table that it leaves."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from lapgs_wgpu import cli
+from lapgs_wgpu.data.synthetic import write_synthetic
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.train import table
+from lapgs_wgpu.train.presets import load_config, write_toml
+from lapgs_wgpu.train.table_results import Result, Results, markdown, merge_results, read_results, write_results
+from lapgs_wgpu.train.table_spec import Run, RunKey, fingerprint, read_spec
+
+ROOT = Path(__file__).parents[1]
+SPEC = """
+preset = "tiny"
+seeds = [3, 5]
+[common]
+schedule.steps = 3
+points.count = 50
+field.width = 8
+field.static = { levels = 1, finest = [8, 8, 8] }
+[scenes]
+toys = "toys"
+others = { folder = "toys", data.size = 12 }
+[rows]
+static = { field.kind = "static" }
+grid4d = { scenes = ["toys"], seeds = [5] }
+"""
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("data")
+    write_synthetic(folder / "toys", size=24, train_views=3, test_views=2)
+    return folder
+
+
+@pytest.fixture
+def spec_file(tmp_path: Path) -> Path:
+    file = tmp_path / "spec.toml"
+    file.write_text(SPEC)
+    return file
+
+
+def result(scene: str = "a", row: str = "x", seed: int = 0, **values: object) -> Result:
+    whole = Result(
+        scene, row, seed, "f", 20.0, 0.5, 1000, 300, 10.0, [24, 24], 2, {"field": {"kind": "static"}}, {"torch": "2"}
+    )
+    return dataclasses.replace(whole, **values)  # type: ignore[arg-type]
+
+
+# The spec
+
+
+def test_a_spec_names_every_run_with_its_configuration(spec_file: Path) -> None:
+    runs = {run.key: run for run in read_spec(spec_file).runs}
+    assert [tuple(key) for key in runs] == [
+        ("toys", "static", 3), ("toys", "static", 5), ("toys", "grid4d", 5),
+        ("others", "static", 3), ("others", "static", 5),
+    ]  # fmt: skip
+    config = runs[RunKey("others", "static", 5)].config
+    assert (config.seed, config.data.size, config.schedule.steps, config.field.kind) == (5, 12, 3, "static")
+    config = runs[RunKey("toys", "grid4d", 5)].config
+    assert (config.data.size, config.field.kind, config.field.static.levels) == (200, "grid4d", 1)
+    assert config.field.static.table_log2 == load_config("tiny").field.static.table_log2
+    assert runs[RunKey("others", "static", 5)].overrides["data"] == {"size": 12}
+
+
+def test_the_fingerprint_is_that_of_the_training_not_of_the_machine(tmp_path: Path) -> None:
+    config = load_config("tiny")
+    moved = dataclasses.replace(config, data=dataclasses.replace(config.data, path="/elsewhere"))
+    assert fingerprint(moved) == fingerprint(config)
+    assert fingerprint(dataclasses.replace(config, seed=1)) != fingerprint(config)
+    (tmp_path / "again.toml").write_text(write_toml(dataclasses.asdict(config)))
+    assert fingerprint(load_config(str(tmp_path / "again.toml"))) == fingerprint(config)
+
+
+@pytest.mark.parametrize("file", sorted((ROOT / "docs" / "tables").glob("*.toml")), ids=lambda file: file.name)
+def test_the_committed_specs_are_valid(file: Path) -> None:
+    assert read_spec(file).runs
+
+
+MISTAKES = {
+    "no TOML": ('preset = "tiny"', "preset = tiny", "cannot be read as TOML"),
+    "unknown key": ("seeds = [3, 5]", "sedes = [3, 5]", "no key sedes; did you mean seeds?"),
+    "no seeds": ("seeds = [3, 5]\n", "", "seeds must be a list of different whole numbers from 0 up, got None"),
+    "a seed twice": ("seeds = [3, 5]\n", "seeds = [3, 3]\n", "different whole numbers"),
+    "unknown preset": ('"tiny"', '"tinny"', "did you mean tiny?"),
+    "unknown key of the configuration": ("width", "widht", "no key field.widht; did you mean width?"),
+    "wrong value": ("steps = 3", 'steps = "3"', "schedule.steps must be a whole number, got '3'"),
+    "value out of range": ("steps = 3", "steps = 0", "at least 1, got 0"),
+    "wrong value in a row": ('kind = "static"', 'kind = "statik"', "did you mean static?"),
+    "wrong value of a scene": ("data.size = 12", "data.size = -1", "others, static: data.size must lie between"),
+    "unknown scene": ('scenes = ["toys"]', 'scenes = ["toy"]', "rows.grid4d.scenes: 'toy' is none of toys, others"),
+    "no such seed": ("seeds = [5]", "seeds = [4]", "rows.grid4d.seeds: 4 is none of 3, 5"),
+    "no rows": (SPEC[SPEC.index("[rows]") :], "", "rows must be a table with at least one entry"),
+    "a row that is no table": ("grid4d = {", "x = 3\ngrid4d = {", "rows.x must be a table"),
+    "a scene without a folder": ('folder = "toys"', "points.box = 1", "scenes.others must be a folder, or"),
+    "a name that is no folder": ("grid4d = {", '"../up" = {', "'../up' must be a name of letters"),
+    "the seed in a row": ('kind = "static"', 'kind = "static", seed = 1', "must set neither seed nor data.path"),
+    "the path in common": ("points.count", 'data.path = "x"\npoints.count', "must set neither seed nor data.path"),
+    "missing folder": ('\ntoys = "toys"', '\ntoys = "toyz"', "toyz does not exist"),
+}
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_mistakes_end_in_one_sentence_before_any_training(
+    name: str, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before, after, message = MISTAKES[name]
+    assert SPEC.count(before) == 1
+    (tmp_path / "spec.toml").write_text(SPEC.replace(before, after))
+    arguments = [str(tmp_path / "spec.toml"), "--data", str(data), "--out", str(tmp_path / "out")]
+    assert cli.table_command(arguments) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.count("\n") == 1, err
+    assert err.startswith("lapgs-table: ")
+    assert message in err
+    assert not (tmp_path / "out").exists()
+
+
+COMMAND_MISTAKES = {
+    "nothing": ([], "name a SPEC.toml"),
+    "no out": (["SPEC"], "--out"),
+    "missing spec": (["nowhere.toml", "--out", "OUT"], "nowhere.toml does not exist"),
+    "missing results": (["--from", "nowhere.json"], "nowhere.json does not exist"),
+    "results of something else": (["--from", "SPEC"], "cannot be read as JSON"),
+    "unknown option": (["SPEC", "--outt", "x"], "lapgs-table --help lists the options"),
+    "out is a file": (["SPEC", "--out", "SPEC"], "is a file"),
+    "unknown device": (["SPEC", "--data", "DATA", "--out", "OUT", "--device", "GTX 9999"], "'GTX 9999'"),
+}
+
+
+@pytest.mark.parametrize("name", COMMAND_MISTAKES)
+def test_mistakes_on_the_command_line(
+    name: str, data: Path, spec_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words, message = COMMAND_MISTAKES[name]
+    places = {"SPEC": str(spec_file), "OUT": str(tmp_path / "out"), "DATA": str(data)}
+    assert cli.table_command([places.get(word, word) for word in words]) == 2
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1, err
+    assert message in err
+    assert not (tmp_path / "out").exists()
+
+
+# The table
+
+
+def test_a_line_has_means_and_the_sample_standard_deviation() -> None:
+    runs = (
+        result(seed=0, psnr=20.0, seconds=10.0, gaussians=1000),
+        result(seed=1, psnr=23.0, seconds=30.0, gaussians=2001, ssim=0.7),
+        result(row="y"),
+    )
+    lines = markdown(Results("name", "tiny", runs)).splitlines()
+    assert lines[0] == "## name"
+    assert lines[2] == "| scene | model | seeds | PSNR | ± | SSIM | Gaussians | steps/s | training, s |"
+    assert lines[4] == "| a | x | 2 | 21.50 | 2.12 | 0.6000 | 1,500 | 20.0 | 20 |"
+    assert lines[5] == "| a | y | 1 | 20.00 | - | 0.5000 | 1,000 | 30.0 | 10 |"
+    assert not any("scenes |" in line for line in lines), "one scene needs no mean over scenes"
+
+
+def test_the_mean_over_scenes_weighs_scenes_alike_and_counts_them() -> None:
+    runs = (
+        result("a", seed=0, psnr=20.0), result("a", seed=1, psnr=22.0), result("a", seed=2, psnr=24.0),
+        result("b", seed=0, psnr=30.0), result("b", seed=1, psnr=34.0), result("b", "y", psnr=10.0),
+    )  # fmt: skip
+    lines = markdown(Results("name", "tiny", runs)).splitlines()
+    # Scenes: 22 and 32. Seeds that both have: 25 and 28.
+    assert "| x | 2 of 2 | 27.00 | 2.12 | 0.5000 | 1,000 | 30.0 | 10 |" in lines
+    assert "| y | 1 of 2 | 10.00 | - | 0.5000 | 1,000 | 30.0 | 10 |" in lines
+
+
+def test_results_say_with_what_they_were_made() -> None:
+    runs = (result(), result(seed=1), result(seed=2, environment={"torch": "3"}, size=[12, 12]))
+    text = markdown(Results("name", "tiny", runs))
+    assert "torch 2 (2 runs); torch 3 (1 runs)." in text
+    assert "2 test views of 24x24 (2 runs); 2 test views of 12x12 (1 runs)." in text
+
+
+def test_results_survive_the_file(tmp_path: Path) -> None:
+    results = Results("name", "tiny", (result(), result("b", seconds=3)))
+    write_results(tmp_path, results)
+    assert read_results(tmp_path / "results.json") == results
+    assert (tmp_path / "table.md").read_text() == markdown(results)
+
+
+@pytest.mark.parametrize("change", [{"format": "else"}, {"runs": 3}, {"runs": [3]}, {"runs": [{"scene": "a"}]}])
+def test_damaged_results_are_refused(change: dict, tmp_path: Path) -> None:
+    write_results(tmp_path, Results("name", "tiny", (result(),)))
+    content = json.loads((tmp_path / "results.json").read_text())
+    (tmp_path / "results.json").write_text(json.dumps({**content, **change}))
+    with pytest.raises(InputError, match=r"results.json"):
+        read_results(tmp_path / "results.json")
+
+
+def test_results_of_several_machines_are_merged(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name, results in {"a": (result(), result(seed=1)), "b": (result(seed=1), result(seed=2))}.items():
+        (tmp_path / name).mkdir()
+        write_results(tmp_path / name, Results(name, "tiny", results))
+    files = [str(tmp_path / name / "results.json") for name in ("a", "b")]
+    assert cli.table_command(["--from", *files, "--out", str(tmp_path / "both")]) == 0
+    shown = capsys.readouterr().out
+    assert "| a | x | 3 | 20.00 | 0.00 |" in shown
+    assert (tmp_path / "both" / "table.md").read_text() == shown
+    assert len(read_results(tmp_path / "both" / "results.json").runs) == 3
+    assert cli.table_command(["--from", files[0], "--out", str(tmp_path / "both")]) == 2
+    assert "results.json would be lost" in capsys.readouterr().err
+    assert cli.table_command(["--from", *files, str(tmp_path / "both" / "results.json"), "--out", str(tmp_path)]) == 0
+    with pytest.raises(InputError, match=r"a, x, seed 0: .* two configurations"):
+        merge_results([Results("a", "tiny", (result(),)), Results("b", "tiny", (result(fingerprint="g"),))])
+
+
+# The runs
+
+
+@pytest.fixture
+def trained(monkeypatch: pytest.MonkeyPatch) -> list[RunKey]:
+    """Instead of training, leaves a run folder with made-up figures, and notes here which run it was."""
+    done: list[RunKey] = []
+
+    def train(run: Run, data: Path, out: Path, device: str | None) -> None:
+        done.append(run.key)
+        (out / "eval").mkdir(parents=True, exist_ok=True)
+        (out / "checkpoint.ply").write_text("large")
+        (out / "log.jsonl").write_text("")
+        record = {"torch": "2", "adapter": "none"}
+        (out / "config.toml").write_text(write_toml({**dataclasses.asdict(run.config), "record": record}))
+        training = {"steps": run.config.schedule.steps, "seconds": 6.0}
+        metrics = {"psnr": 20.0 + run.key.seed, "ssim": 0.5, "gaussians": 50, "size": [24, 24], "views": [{}, {}]}
+        (out / "metrics.json").write_text(json.dumps({**metrics, "training": training}))
+
+    monkeypatch.setattr(table, "_train_in_process", train)
+    return done
+
+
+def make(spec_file: Path, data: Path, *more: str) -> int:
+    return cli.table_command([str(spec_file), "--data", str(data), "--out", str(spec_file.parent / "out"), *more])
+
+
+def test_finished_runs_are_not_trained_again(
+    spec_file: Path, data: Path, trained: list[RunKey], capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = spec_file.parent / "out"
+    assert make(spec_file, data) == 0
+    assert len(trained) == 5
+    shown = capsys.readouterr()
+    assert "run 1 of 5: toys, static, seed 3 (time left not known yet)" in shown.err
+    assert "run 5 of 5: others, static, seed 5 (about 0:00:06 left)" in shown.err
+    assert shown.out == f"{out / 'table.md'}: 5 of 5 runs\n"
+    assert (out / "toys" / "static" / "seed3" / "checkpoint.ply").exists()
+    tables = {name: (out / name).read_bytes() for name in ("table.md", "results.json")}
+
+    assert make(spec_file, data) == 0
+    (out / "results.json").unlink()
+    assert make(spec_file, data) == 0, "the run folders suffice"
+    shutil.rmtree(out / "toys")
+    shutil.rmtree(out / "others")
+    assert make(spec_file, data.parent / "nowhere") == 0, "results.json suffices, without the pictures, too"
+    assert len(trained) == 5
+    assert tables == {name: (out / name).read_bytes() for name in ("table.md", "results.json")}
+
+    (out / "results.json").rename(spec_file.parent / "committed.json")
+    shutil.rmtree(out)
+    assert make(spec_file, data, "--from", str(spec_file.parent / "committed.json")) == 0
+    assert len(trained) == 5
+    assert tables == {name: (out / name).read_bytes() for name in ("table.md", "results.json")}
+
+
+def test_unfinished_and_changed_runs_are_trained_again(
+    spec_file: Path, data: Path, trained: list[RunKey], capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = spec_file.parent / "out"
+    make(spec_file, data)
+    (out / "results.json").unlink()
+    (out / "toys" / "static" / "seed3" / "metrics.json").unlink()  # interrupted
+    (out / "toys" / "static" / "seed5" / "metrics.json").write_text("{")
+    interrupted = out / "others" / "static" / "seed3" / "metrics.json"  # and then measured by lapgs-train --eval
+    interrupted.write_text(interrupted.read_text().replace('"steps": 3', '"steps": 2'))
+    trained.clear()
+    assert make(spec_file, data) == 0
+    assert [tuple(key) for key in trained] == [("toys", "static", 3), ("toys", "static", 5), ("others", "static", 3)]
+
+    trained.clear()
+    capsys.readouterr()
+    spec_file.write_text(SPEC.replace("grid4d = {", "grid4d = { field.width = 16,"))
+    before = (out / "results.json").read_bytes()
+    assert make(spec_file, data) == 0
+    assert [tuple(key) for key in trained] == [("toys", "grid4d", 5)]
+    assert (out / "results.before.json").read_bytes() == before
+    assert "1 runs of" in capsys.readouterr().err
+
+
+def test_the_table_is_written_after_every_run(
+    spec_file: Path,
+    data: Path,
+    trained: list[RunKey],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    original, seen = table._train_in_process, []
+
+    def look(run: Run, data: Path, out: Path, device: str | None) -> str | None:
+        seen.append(len(read_results(spec_file.parent / "out" / "results.json").runs))
+        if len(seen) == 4:
+            raise KeyboardInterrupt
+        return original(run, data, out, device)
+
+    monkeypatch.setattr(table, "_train_in_process", look)
+    assert make(spec_file, data) == cli.INTERRUPTED
+    assert capsys.readouterr().err.endswith("lapgs-table: stopped in run 4 of 5; the same command goes on.\n")
+    assert seen == [0, 1, 2, 3]
+    assert "| toys | grid4d | 1 | 25.00 | - |" in (spec_file.parent / "out" / "table.md").read_text()
+
+
+def test_a_slim_table_keeps_the_figures_of_its_runs(spec_file: Path, data: Path, trained: list[RunKey]) -> None:
+    make(spec_file, data, "--slim")
+    out = spec_file.parent / "out"
+    kept = {file.name for file in (out / "toys" / "static" / "seed3").iterdir()}
+    assert kept == {"config.toml", "log.jsonl", "metrics.json"}
+    (out / "results.json").unlink()
+    make(spec_file, data)
+    assert len(trained) == 5
+
+
+def test_runs_are_trained_in_processes_and_a_failed_one_stops_no_other(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The real thing: two short trainings, of which the first finds a file where its folder should be."""
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "first").write_text("")
+    text = SPEC[: SPEC.index("[scenes]")].replace("[3, 5]", "[3]")
+    (tmp_path / "spec.toml").write_text(
+        f'{text}[scenes]\nfirst = "toys"\nsecond = "toys"\n[rows]\nstatic = {{ field.kind = "static" }}\n'
+    )
+    assert make(tmp_path / "spec.toml", data) == 1
+    shown = capsys.readouterr()
+    assert shown.out == f"{tmp_path / 'out' / 'table.md'}: 1 of 2 runs\n"
+    assert "lapgs-table: first, static, seed 3 failed: " in shown.err
+    assert str(tmp_path / "out" / "first") in shown.err.splitlines()[-1]
+    run = tmp_path / "out" / "second" / "static" / "seed3"
+    metrics = json.loads((run / "metrics.json").read_text())
+    (only,) = read_results(tmp_path / "out" / "results.json").runs
+    assert (only.psnr, only.steps, only.views) == (metrics["psnr"], 3, 2)
+    assert only.environment["adapter"] == metrics["environment"]["adapter"]
+    assert load_config(str(run / "config.toml")).data.path == str(data / "toys")
+
+
+def test_the_built_in_scene_is_written_once(
+    tmp_path: Path, trained: list[RunKey], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written = []
+
+    def write(folder: Path) -> Path:
+        written.append(folder)
+        return folder
+
+    monkeypatch.setattr(table, "write_synthetic", write)
+    (tmp_path / "spec.toml").write_text(
+        SPEC.replace('"toys"\n', '"synthetic"\n').replace('folder = "toys"', 'folder = "synthetic"')
+    )
+    assert make(tmp_path / "spec.toml", tmp_path / "nowhere") == 0
+    assert len(trained) == 5
+    assert written == [tmp_path / "out" / ".data" / "synthetic"]
+
+
+@pytest.mark.parametrize(
+    ("script", "reason"),
+    [
+        ("echo 'step 1' >&2; kill -KILL $$", "ended by SIGKILL"),
+        ("echo 'Traceback' >&2; echo 'RuntimeError: no memory' >&2; exit 1", "RuntimeError: no memory"),
+        ("exit 7", "exit code 7"),
+        ("exit 0", "holds no finished run"),
+    ],
+)
+def test_why_a_run_failed_is_told(
+    script: str,
+    reason: str,
+    data: Path,
+    spec_file: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    python = spec_file.parent / "python"
+    python.write_text(f"#!/bin/sh\n{script}\n")
+    python.chmod(0o755)
+    monkeypatch.setattr(table.sys, "executable", str(python))
+    assert make(spec_file, data) == 1
+    shown = capsys.readouterr()
+    assert "0 of 5 runs" in shown.out
+    last = shown.err.splitlines()[-1]
+    assert last.startswith("lapgs-table: others, static, seed 5 failed: ")
+    assert last.endswith(reason)
+    assert "No run is finished yet." in (spec_file.parent / "out" / "table.md").read_text()
