@@ -31,7 +31,7 @@ toys = "toys"
 others = { folder = "toys", data.size = 12 }
 [rows]
 static = { field.kind = "static" }
-grid4d = { scenes = ["toys"], seeds = [5] }
+grid4d = { method = "grid4d", scenes = ["toys"], seeds = [5] }
 """
 
 
@@ -73,6 +73,15 @@ def test_a_spec_names_every_run_with_its_configuration(spec_file: Path) -> None:
     assert runs[RunKey("others", "static", 5)].overrides["data"] == {"size": 12}
 
 
+def test_rows_may_name_a_method_and_parts_to_leave_out(tmp_path: Path) -> None:
+    (tmp_path / "spec.toml").write_text(SPEC + 'bare = { ablate = ["lap", "dy"], seeds = [3], scenes = ["toys"] }\n')
+    runs = {run.key: run for run in read_spec(tmp_path / "spec.toml").runs}
+    bare, grid4d = runs[RunKey("toys", "bare", 3)].config, runs[RunKey("toys", "grid4d", 5)].config
+    assert (bare.loss.pyramid, bare.loss.dynamics_mode, bare.density.split) == (0, "off", "adaptive")
+    assert (grid4d.loss.pyramid, grid4d.density.split) == (0, "plain")
+    assert runs[RunKey("toys", "bare", 3)].overrides["ablate"] == ["lap", "dy"]
+
+
 def test_the_fingerprint_is_that_of_the_training_not_of_the_machine(tmp_path: Path) -> None:
     config = load_config("tiny")
     moved = dataclasses.replace(config, data=dataclasses.replace(config.data, path="/elsewhere"))
@@ -98,6 +107,9 @@ MISTAKES = {
     "value out of range": ("steps = 3", "steps = 0", "at least 1, got 0"),
     "wrong value in a row": ('kind = "static"', 'kind = "statik"', "did you mean static?"),
     "wrong value of a scene": ("data.size = 12", "data.size = -1", "others, static: data.size must lie between"),
+    "unknown method": ('method = "grid4d"', 'method = "grid5d"', "did you mean grid4d?"),
+    "unknown part": ('method = "grid4d"', 'ablate = ["lapp"]', "did you mean lap?"),
+    "parts that are no list": ('method = "grid4d"', 'ablate = "lap"', "ablate must be a list of parts, got 'lap'"),
     "unknown scene": ('scenes = ["toys"]', 'scenes = ["toy"]', "rows.grid4d.scenes: 'toy' is none of toys, others"),
     "no such seed": ("seeds = [5]", "seeds = [4]", "rows.grid4d.seeds: 4 is none of 3, 5"),
     "no rows": (SPEC[SPEC.index("[rows]") :], "", "rows must be a table with at least one entry"),
