@@ -130,7 +130,7 @@ def ncc_loss(image: Tensor, target: Tensor) -> Tensor:
     variances = (
         (aa - mean_a * mean_a).clamp(min=0),
         (bb - mean_b * mean_b).clamp(min=0),
-    )  # rounding leaves less than 0
+    )
     return 1 - ((covariance + NCC_E) / ((variances[0] * variances[1] + NCC_TINY).sqrt() + NCC_E)).mean()
 
 
