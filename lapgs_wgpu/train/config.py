@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from lapgs_wgpu.motion.field import FieldConfig
+from lapgs_wgpu.train.losses import LossWeights
 
 Background = Literal["black", "white", "random"]
 
@@ -30,7 +31,7 @@ class DataConfig:
     background: Background = described(
         "what transparent pictures are laid on; random is another colour at each step, and black when measuring"
     )
-    cache_gb: float = described("bound on the decoded pictures that are kept in memory, in gigabytes")
+    cache_gb: float = described("bound on decoded pictures kept in memory, and on those on the device, in gigabytes")
     path: str = described('folder of the scene, or "synthetic", the built-in scene, written beside the run', "")
 
 
@@ -156,10 +157,16 @@ class LossConfig:
     """What is minimised."""
 
     ssim: float = described("share w of the structural similarity in (1 - w) L1 + w (1 - SSIM)")
+    pyramid: float = described("weight of the Laplacian pyramids' difference, which is added; 0 leaves it out")
+    ncc: float = described("weight of 1 - local cross-correlation, added once the warm-up is over; 0 leaves it out")
 
     def __post_init__(self) -> None:
         if self.ssim > 1:
             raise ValueError(f"ssim is a share and must be at most 1, got {self.ssim:g}")
+
+    def weights(self, *, warm: bool) -> LossWeights:
+        """Of the image losses' terms; warm: whether the warm-up is over."""
+        return LossWeights(1 - self.ssim, self.ssim, self.pyramid, self.ncc if warm else 0.0)
 
 
 @dataclass(frozen=True)

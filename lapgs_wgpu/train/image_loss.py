@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..gpu.buffer import Buffer, BufferPool
 from ..gpu.device import Device
@@ -21,7 +20,7 @@ _WHOLE = 1 << 14  # longer than any side of an image: a lane takes a whole row o
 
 
 class LossBuffers(NamedTuple):
-    """terms (5,) float32: L1, mean squared error, 1 - SSIM, pyramid, NCC; 0 for those of weight 0, except the first two.
+    """terms (5,) float32: L1, mean squared error, 1 - SSIM, pyramid, NCC; the last three 0 where their weight is 0.
     d_image (4, H, W) float32: the weighted loss's gradient by red, green, blue, and zeros; None where none was asked.
     """
 
@@ -39,7 +38,7 @@ class ImageLoss:
     def __init__(self, device: Device) -> None:
         self.device = device
         self.pool = BufferPool(device)
-        # On CPUs a workgroup is one vector that walks a whole row or column; GPUs need more lanes than an image has rows.
+        # On CPUs a workgroup is one vector that walks a whole row or column; GPUs need more lanes than that makes.
         self._lanes, self._run = (8, _WHOLE) if device.is_cpu else (64, 64)
 
     def record(
@@ -52,17 +51,16 @@ class ImageLoss:
         weights: LossWeights,
         *,
         gradient: bool,
-        image_planes: int = 4,
     ) -> LossBuffers:
         """Compare an image with its ground truth.
 
-        image: `image_planes` planes (H, W) of float32, first red, green, blue. truth: (H, W) u32, straight RGBA of 8
+        image: planes (4, H, W) of float32, the first three red, green, blue. truth: (H, W) u32, straight RGBA of 8
         bits, red lowest. size: (height, width). background: in [0, 1], under the ground truth, which is rounded to 8
         bits, as data/views.composite does. weights: of the terms. gradient: whether to leave it, too.
         """
         height, width = size
         frame = _Frame(self, commands, height, width, background, weights)
-        pixels = frame.pixels(image, truth, image_planes)
+        pixels = frame.pixels(image, truth)
         extra = {}
         if weights.ssim:
             extra["ssim"] = frame.ssim(pixels)
@@ -149,7 +147,7 @@ class _Frame:
         """Workgroups for so many lanes, each of which takes a run of the length."""
         return -(-lanes // self.owner._lanes), channels * self.runs(length)
 
-    def pixels(self, image: Buffer, truth: Buffer, planes: int) -> Buffer:
+    def pixels(self, image: Buffer, truth: Buffer) -> Buffer:
         pool, count = self.owner.pool, self.height * self.width
         # A copy, so that all pictures of a training go through one buffer (and one texture, and one bind group).
         held = pool.get("truth", 4 * count)
@@ -159,7 +157,7 @@ class _Frame:
             self.owner.kernel("loss_pixels"),
             self.grid(self.width, self.height),
             picture=self.picture,
-            image=(image, 0, 4 * planes * count),
+            image=(image, 0, 16 * count),
             rgba=(held, 0, max(16, 4 * count)),
             pixels=pixels,
             sums=self.sums,
@@ -242,7 +240,7 @@ class _Frame:
     def pyramid_backward(self, levels: list[_Level]) -> Buffer:
         """The gradient by the difference, from the residual up."""
         owner = self.owner
-        d_level = Buffer.__new__(Buffer)
+        d_level = levels[-1].coarse  # until there is a gradient
         for k in range(len(levels), -1, -1):
             defines, buffers = {}, dict[str, Any]()
             if k == 0:
@@ -264,13 +262,9 @@ class _Frame:
         terms = self.owner.pool.get("terms", 4 * TERMS)
         kernel = self.owner.kernel("loss_sums")
         names = ("l1", "squared", "ssim", "pyramid", "ncc")
-        ends = self.owner.pool.constant("ends", kernel.uniform("Ends", **dict(zip(names, self.ends, strict=True))))
-        self.commands.dispatch_grid(kernel, (TERMS, 1), ends=ends, sums=self.sums, terms=terms)
+        parts = dict(zip(names, zip([0, *self.ends], self.ends, strict=False), strict=True))
+        if self.flat_pyramid:
+            parts["pyramid"] = parts["l1"]
+        uniform = self.owner.pool.constant("parts", kernel.uniform("Parts", **parts))
+        self.commands.dispatch_grid(kernel, (TERMS, 1), parts=uniform, sums=self.sums, terms=terms)
         return terms
-
-
-def pack_rgba(pixels: NDArray[np.uint8]) -> NDArray[np.uint32]:
-    """(H, W) u32 of (H, W, 3) RGB or (H, W, 4) straight RGBA in 8 bits: red in the lowest byte."""
-    rgba = np.full((*pixels.shape[:2], 4), 255, np.uint8)
-    rgba[..., : pixels.shape[2]] = pixels
-    return rgba.view("<u4")[..., 0]

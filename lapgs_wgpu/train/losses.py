@@ -26,14 +26,6 @@ LUMINANCE = (0.299, 0.587, 0.114)  # Rec. 601, which is meant for gamma-encoded 
 LEAST_ERROR = 1e-10  # mean squared error that PSNR takes equal images to have: 100 dB
 
 
-def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
-    """(1 - w) L1 + w (1 - SSIM), a scalar; with w = 0.2 the loss of 3DGS (Kerbl et al. 2023)."""
-    difference = l1(image, target)
-    if ssim_weight == 0:
-        return difference
-    return (1 - ssim_weight) * difference + ssim_weight * (1 - ssim(image, target))
-
-
 class LossWeights(NamedTuple):
     """Of each term in the loss of an image; a term of weight 0 is not computed.
 
@@ -47,7 +39,7 @@ class LossWeights(NamedTuple):
 
 
 def total(image: Tensor, target: Tensor, weights: LossWeights) -> Tensor:
-    """The weighted sum of all image losses, a scalar (the paper's eq. 13 without the field's own terms)."""
+    """The weighted sum of all image losses, a scalar; with l1 0.8 and ssim 0.2 that of 3DGS (Kerbl et al. 2023)."""
     loss = weights.l1 * l1(image, target)
     if weights.ssim:
         loss = loss + weights.ssim * (1 - ssim(image, target))
@@ -118,8 +110,8 @@ def ncc_loss(image: Tensor, target: Tensor) -> Tensor:
     """1 - mean local normalised cross-correlation of the luminances, a scalar.
 
     (covariance + e) / (sqrt(variance variance + tiny) + e) over every 11x11 window that lies inside the image. Hence a
-    flat window agrees with another flat one, and brightness and contrast do not count, as long as the variances are
-    well above e. An image with a side below 11 pixels has no window: its loss is 0.
+    flat window agrees with every other (what it lacks, the other losses see), and brightness and contrast do not count,
+    as long as the variances are well above e. An image with a side below 11 pixels has no window: its loss is 0.
     """
     if min(image.shape[:2]) < NCC_WINDOW:
         return 0.0 * image.sum()
