@@ -22,7 +22,13 @@ def bench(*arguments: str | Path) -> str:
 def results(tmp_path_factory: pytest.TempPathFactory) -> dict:
     file = tmp_path_factory.mktemp("bench") / "bench.json"
     table = bench("--json", file)
-    for words in ("rasterize_bwd", "forward + backward", "0 of them before the sort", "times as fast as the twin"):
+    for words in (
+        "rasterize_bwd",
+        "forward + backward",
+        "0 of them before the sort",
+        "times as fast as the twin;",
+        "as fast as the twins",
+    ):
         assert words in table
     return json.loads(file.read_text())
 
@@ -51,6 +57,17 @@ def test_bytes_of_a_step_are_those_of_its_tensors(results: dict) -> None:
 
 def test_the_encoder_agrees_with_its_twin_at_the_sizes_that_are_timed(results: dict) -> None:
     assert results["encoder"]["largest_difference"] < 1e-5
+
+
+def test_the_losses_agree_with_their_twins(results: dict) -> None:
+    assert results["losses"]["size"] == 40
+    assert results["losses"]["difference"] < 1e-4
+
+
+def test_a_training_step_reads_back_what_its_size_does_not_depend_on(results: dict) -> None:
+    """But for the encoder's own: the image and its gradient stay on the device."""
+    step = results["step"]["traffic"]
+    assert step["read_backs_before_sort"] <= 1
 
 
 def test_the_scene_can_be_saved_for_other_rasterisers(tmp_path: Path) -> None:

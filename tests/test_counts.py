@@ -5,18 +5,25 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
+import numpy as np
 import pytest
-from scenes import Scene, oblique_camera, random_scene, step
+import torch
+from scenes import Scene, oblique_camera, random_scene
+from scenes import step as torch_step
 from stages import watch
 from wgpu.backends.wgpu_native import GPUBuffer, GPUQueue
 
 from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterize import rasterizer_of
+from lapgs_wgpu.train.losses import LossWeights
+from lapgs_wgpu.train.render_loss import TruthCache, image_loss_of, render_loss
 
 pytestmark = pytest.mark.kernels
 
 COUNT, CAMERA, DEGREE = 500, oblique_camera(101, 61), 2
-PIXELS = CAMERA.width * CAMERA.height
+PIXELS, HARMONICS = CAMERA.width * CAMERA.height, (DEGREE + 1) ** 2
+WEIGHTS = LossWeights(0.8, 0.2, pyramid=0.2, ncc=0.05)
 
 
 class Event(NamedTuple):
@@ -55,31 +62,47 @@ def events(monkeypatch: pytest.MonkeyPatch) -> list[Event]:
 @pytest.fixture(scope="module")
 def scene(device: Device) -> Scene:
     """Drawn once before, so that all buffers have their size."""
-    scene = random_scene(COUNT, 1, sh=16)
-    step(scene, CAMERA, device, sh_degree=DEGREE)
+    scene = random_scene(COUNT, 1, sh=HARMONICS)
+    torch_step(scene, CAMERA, device, sh_degree=DEGREE)
     return scene
 
 
-def test_no_read_back_before_the_image_is_drawn(device: Device, scene: Scene, events: list[Event]) -> None:
-    step(scene, CAMERA, device, sh_degree=DEGREE)
-    dispatched = [i for i, event in enumerate(events) if event.kind == "dispatch"]
-    last_of_forward = next(i for i in dispatched if events[i].name == "rasterize")
-    assert not [event for event in events[:last_of_forward] if event.kind == "read"]
-    before_sort = [event for event in events[:last_of_forward] if event.name.startswith("sort")]
-    assert before_sort
+@pytest.fixture(scope="module")
+def truths(device: Device, scene: Scene) -> TruthCache:
+    """The ground truth of a step that was taken before."""
+    truths = TruthCache(device, 1 << 20)
+    step(scene, truths, device)
+    return truths
 
 
-def test_two_read_backs_a_step(device: Device, scene: Scene, events: list[Event]) -> None:
-    """One wait for the image, one for the gradients; each reads several buffers."""
-    step(scene, CAMERA, device, sh_degree=DEGREE)
+def step(scene: Scene, truths: TruthCache, device: Device) -> None:
+    """A training step: forward, losses, backward."""
+    leaves = {name: value.clone().requires_grad_() for name, value in scene.items()}
+    gaussians = Gaussians(sh=leaves.pop("colors"), **leaves)
+    truth = truths.get("view", lambda: np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8))
+    render_loss(gaussians, CAMERA, truth, torch.zeros(3), WEIGHTS, device).loss.backward()
+
+
+def waits(events: list[Event]) -> int:
     kinds = [event.kind for event in events]
-    waits = sum(a == "read" and b != "read" for a, b in zip(kinds, [*kinds[1:], ""], strict=True))
-    assert waits == 2
+    return sum(a == "read" and b != "read" for a, b in zip(kinds, [*kinds[1:], ""], strict=True))
 
 
-def test_dispatches_a_step(device: Device, scene: Scene, events: list[Event]) -> None:
+def totals(events: list[Event]) -> dict[str, int]:
+    return {kind: sum(event.nbytes for event in events if event.kind == kind) for kind in ("read", "write")}
+
+
+def test_one_read_back_a_step(device: Device, scene: Scene, truths: TruthCache, events: list[Event]) -> None:
+    """After the last dispatch: gradients, what density control needs, losses, and whether the buffers sufficed."""
+    step(scene, truths, device)
+    assert waits(events) == 1
+    last_dispatch = max(i for i, event in enumerate(events) if event.kind == "dispatch")
+    assert not [event for event in events[:last_dispatch] if event.kind == "read"]
+
+
+def test_dispatches_a_step(device: Device, scene: Scene, truths: TruthCache, events: list[Event]) -> None:
     """By the plan: what a sort needs follows from the width of its digits, all else is counted."""
-    step(scene, CAMERA, device, sh_degree=DEGREE)
+    step(scene, truths, device)
     names = [event.name for event in events if event.kind == "dispatch"]
     shape = rasterizer_of(device).shape
     tiles = math.ceil(CAMERA.width / shape.tile_width) * math.ceil(CAMERA.height / shape.tile_height)
@@ -87,27 +110,47 @@ def test_dispatches_a_step(device: Device, scene: Scene, events: list[Event]) ->
     digits = math.ceil(32 / widest) + math.ceil(tiles.bit_length() / widest)
     assert names.count("sort_count") == names.count("sort_scatter") == digits
     assert names.count("scan_blocks") == digits + 2
-    others = [name for name in names if not name.startswith(("sort", "scan"))]
+    pyramid = [name for name in names if name.startswith("loss_pyramid")]
+    assert len(pyramid) == 3 + 3 + 4
+    others = [name for name in names if not name.startswith(("sort", "scan", "loss_pyramid"))]
     assert sorted(set(others)) == sorted(others), "a pass that runs twice"
-    assert len(others) <= 11
-    assert len(names) <= 11 + 3 * 2 + 5 * digits
+    losses = [name for name in others if name.startswith("loss")]
+    assert len(losses) <= 8
+    assert len(others) - len(losses) <= 11
+    assert len(names) - len(losses) - len(pyramid) <= 11 + 3 * 2 + 5 * digits
 
 
-def test_bytes_that_cross_over(device: Device, scene: Scene, events: list[Event]) -> None:
-    """Inputs, image and gradients once each, and next to nothing else."""
-    step(scene, CAMERA, device, sh_degree=DEGREE)
-    geometry, harmonics, splat, planes = 4 * (3 + 4 + 3 + 1), 4 * 16 * 3, 4 * 12, 4 * 5
+def test_bytes_that_cross_over_in_a_step(device: Device, scene: Scene, truths: TruthCache, events: list[Event]) -> None:
+    """Inputs and gradients once each, and next to nothing else: neither images nor their gradients nor ground truth."""
+    step(scene, truths, device)
+    geometry, harmonics, splat = 4 * (3 + 4 + 3 + 1), 4 * HARMONICS * 3, 4 * 12
+    written = COUNT * (geometry + harmonics)
+    read = COUNT * splat + COUNT * (splat + 4 * (3 + 4 + 3) + harmonics)
+    assert written <= totals(events)["write"] <= written + 2048
+    assert read <= totals(events)["read"] <= read + 256
+
+
+def test_rasterize_reads_back_twice(device: Device, scene: Scene, events: list[Event]) -> None:
+    """The rasteriser alone: one wait for the image, one for the gradients, each of several buffers."""
+    torch_step(scene, CAMERA, device, sh_degree=DEGREE)
+    assert waits(events) == 2
+    dispatched = [i for i, event in enumerate(events) if event.kind == "dispatch"]
+    last_of_forward = next(i for i in dispatched if events[i].name == "rasterize")
+    assert not [event for event in events[:last_of_forward] if event.kind == "read"]
+    geometry, harmonics, splat, planes = 4 * (3 + 4 + 3 + 1), 4 * HARMONICS * 3, 4 * 12, 4 * 5
     written = COUNT * (geometry + harmonics) + PIXELS * planes
     read = (PIXELS * planes + COUNT * splat) + COUNT * (splat + 4 * (3 + 4 + 3) + harmonics)
-    totals = {kind: sum(event.nbytes for event in events if event.kind == kind) for kind in ("read", "write")}
-    assert written <= totals["write"] <= written + 2048
-    assert read <= totals["read"] <= read + 256
+    assert written <= totals(events)["write"] <= written + 2048
+    assert read <= totals(events)["read"] <= read + 256
 
 
-def test_nothing_grows_in_steady_state(device: Device, scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_grows_in_steady_state(
+    device: Device, scene: Scene, truths: TruthCache, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """No buffer, texture, kernel or bind group is made for a step like the one before."""
-    rasterizer = rasterizer_of(device)
-    held, kernels = rasterizer.pool.nbytes, len(device.kernel_cache)
+    pools = (rasterizer_of(device).pool, image_loss_of(device).pool)
+    torch_step(scene, CAMERA, device, sh_degree=DEGREE)
+    held, kernels = [pool.nbytes for pool in pools], len(device.kernel_cache)
     made: list[str] = []
     for method in ("create_buffer", "create_texture", "create_bind_group", "create_compute_pipeline"):
         original = getattr(type(device.wgpu_device), method)
@@ -118,7 +161,9 @@ def test_nothing_grows_in_steady_state(device: Device, scene: Scene, monkeypatch
 
         monkeypatch.setattr(type(device.wgpu_device), method, spy)
     for seed in (1, 2):
-        step(scene | {"means": scene["means"] + 1e-3 * seed}, CAMERA, device, sh_degree=DEGREE)
+        moved = scene | {"means": scene["means"] + 1e-3 * seed}
+        step(moved, truths, device)
+        torch_step(moved, CAMERA, device, sh_degree=DEGREE)
     assert made == []
-    assert rasterizer.pool.nbytes == held
+    assert [pool.nbytes for pool in pools] == held
     assert len(device.kernel_cache) == kernels

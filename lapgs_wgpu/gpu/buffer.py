@@ -116,8 +116,11 @@ class Buffer:
         return read_all([(self, dtype, shape, offset)])[0]
 
 
-def read_all(requests: list[tuple[Buffer, str, tuple[int, ...], int]]) -> list[NDArray[Any]]:
-    """Read several buffers with one wait: each request is (buffer, dtype, shape, offset in bytes)."""
+Request = tuple[Buffer, str, tuple[int, ...], int]  # buffer, dtype, shape, offset in bytes
+
+
+def read_all(requests: list[Request]) -> list[NDArray[Any]]:
+    """Read several buffers with one wait."""
     sources = []
     encoder = None
     for buffer, dtype, shape, offset in requests:

@@ -157,6 +157,12 @@ class Commands:
         buffer.version += 1
         self._encoder.clear_buffer(buffer.wgpu_buffer, 0, buffer.nbytes if nbytes is None else nbytes)
 
+    def copy(self, source: Buffer, target: Buffer, nbytes: int) -> None:
+        """Copy the first `nbytes` (a multiple of 4) of one buffer to the start of another."""
+        self._end_pass()
+        target.version += 1
+        self._encoder.copy_buffer_to_buffer(source.wgpu_buffer, 0, target.wgpu_buffer, 0, nbytes)
+
     def _end_pass(self) -> None:
         if self._pass is not None:
             self._pass.end()

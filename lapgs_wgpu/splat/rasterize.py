@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import functools
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ..gpu.buffer import Buffer, read_all
+from ..gpu.buffer import Buffer, Request, read_all
 from ..gpu.device import Device, open_device
 from .camera import Camera
-from .rasterizer import SPLAT_FLOATS, GaussianBuffers, Rasterizer
+from .rasterizer import SPLAT_FLOATS, GaussianBuffers, GradientBuffers, Rasterizer
 
 
 class Rendering(NamedTuple):
@@ -25,6 +25,15 @@ class Rendering(NamedTuple):
     depth: Tensor
     radii: Tensor
     means2d: Tensor
+
+
+class Seen(Protocol):
+    """What density control needs of a `Rendering`."""
+
+    @property
+    def radii(self) -> Tensor: ...
+    @property
+    def means2d(self) -> Tensor: ...
 
 
 @functools.cache
@@ -130,14 +139,7 @@ class _Rasterize(torch.autograd.Function):
         d_planes = _upload(rasterizer, "d_image", planes)
         gradients = rasterizer.backward(d_planes)
         n = len(tensors[0])
-        requests: list[tuple[Buffer, str, tuple[int, ...], int]] = [
-            (gradients.splats, "float32", (n, SPLAT_FLOATS), 0),
-            (gradients.means, "float32", (n, 3), 0),
-            (gradients.quats, "float32", (n, 4), 0),
-            (gradients.scales, "float32", (n, 3), 0),
-        ]
-        if gradients.colors is not None:
-            requests.append((gradients.colors, "float32", tuple(tensors[4].shape), 0))
+        requests = read_requests(gradients, n, tuple(tensors[4].shape))
         d_splats, d_means, d_quats, d_scales, *d_sh = (
             torch.from_numpy(array).to(background.device) for array in read_all(requests)
         )
@@ -151,18 +153,9 @@ def _draw(
     rasterizer: Rasterizer, tensors: list[Tensor], camera: Camera, sh_degree: int | None, depth: bool
 ) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
     """Upload, draw until the buffers are large enough, read back: planes (4 or 5, H, W) and splats (N, 12)."""
-    means, quats, scales, opacities, colors, background = tensors
-    n = len(means)
-    gaussians = GaussianBuffers(
-        n,
-        _upload(rasterizer, "means", means),
-        _upload(rasterizer, "quats", quats),
-        _upload(rasterizer, "scales", scales),
-        _upload(rasterizer, "opacities", opacities),
-        _upload(rasterizer, "colors", colors),
-        sh_degree,
-        1 if sh_degree is None else colors.shape[1],
-    )
+    *shapes, background = tensors
+    n = len(shapes[0])
+    gaussians = upload_gaussians(rasterizer, shapes, sh_degree)
     red, green, blue = background.tolist()
     while True:
         image = rasterizer.draw(gaussians, camera, (red, green, blue), depth=depth)
@@ -176,6 +169,28 @@ def _draw(
         )
         if not rasterizer.fit([int(count[0]) for count in needed]):
             return planes, projected
+
+
+def upload_gaussians(rasterizer: Rasterizer, tensors: list[Tensor], sh_degree: int | None) -> GaussianBuffers:
+    """The tensors means, quats, scales, opacities and colors, on the device."""
+    names = ("means", "quats", "scales", "opacities", "colors")
+    buffers = {name: _upload(rasterizer, name, tensor) for name, tensor in zip(names, tensors, strict=True)}
+    stored = 1 if sh_degree is None else tensors[4].shape[1]
+    return GaussianBuffers(count=len(tensors[0]), sh_degree=sh_degree, sh_stored=stored, **buffers)
+
+
+def read_requests(gradients: GradientBuffers, n: int, colors: tuple[int, ...]) -> list[Request]:
+    """What to read (with `read_all`) to have gradients: splats, means, quats, scales, and colours where they are
+    spherical harmonics, which have this shape."""
+    requests: list[Request] = [
+        (gradients.splats, "float32", (n, SPLAT_FLOATS), 0),
+        (gradients.means, "float32", (n, 3), 0),
+        (gradients.quats, "float32", (n, 4), 0),
+        (gradients.scales, "float32", (n, 3), 0),
+    ]
+    if gradients.colors is not None:
+        requests.append((gradients.colors, "float32", colors, 0))
+    return requests
 
 
 def _upload(rasterizer: Rasterizer, name: str, tensor: Tensor) -> Buffer:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from ..gpu.buffer import Buffer, BufferPool, read_all
+from ..gpu.buffer import Buffer, BufferPool, Request, read_all
 from ..gpu.device import Device
 from ..gpu.kernel import Commands, Kernel
 from ..gpu.primitives import RadixSort, Scan
@@ -102,7 +102,7 @@ class Rasterizer:
         larger, or the image is cut into more bands of tile rows, and True says that it has to be drawn again."""
         return self.fit([int(n[0]) for n in read_all(self.needed_requests())])
 
-    def needed_requests(self) -> list[tuple[Buffer, str, tuple[int, ...], int]]:
+    def needed_requests(self) -> list[Request]:
         """What to read to know the last draw's number of intersections, a band at a time (for `read_all`)."""
         return [(self._needed(band), "uint32", (1,), 0) for band in range(self.bands)]
 

@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 from lapgs_wgpu.motion.dynamics import DynamicsMode
 from lapgs_wgpu.motion.field import FieldConfig
+from lapgs_wgpu.train.losses import LossWeights
 
 Background = Literal["black", "white", "random"]
 Split = Literal["plain", "adaptive"]
@@ -32,7 +33,7 @@ class DataConfig:
     background: Background = described(
         "what transparent pictures are laid on; random is another colour at each step, and black when measuring"
     )
-    cache_gb: float = described("bound on the decoded pictures that are kept in memory, in gigabytes")
+    cache_gb: float = described("bound on decoded pictures kept in memory, and on those on the device, in gigabytes")
     path: str = described('folder of the scene, or "synthetic", the built-in scene, written beside the run', "")
 
 
@@ -177,6 +178,8 @@ class LossConfig:
     """What is minimised."""
 
     ssim: float = described("share w of the structural similarity in (1 - w) L1 + w (1 - SSIM)")
+    pyramid: float = described("weight of the Laplacian pyramids' difference, which is added; 0 leaves it out")
+    ncc: float = described("weight of 1 - local cross-correlation, added once the warm-up is over; 0 leaves it out")
     dynamics: float = described("weight of the regularisation of the dynamics attributes (paper eq. 12)")
     dynamics_mode: DynamicsMode = described(
         "what it does to outliers: literal (pulls them in, as the paper's equation), promote (pushes them out, as its "
@@ -186,6 +189,10 @@ class LossConfig:
     def __post_init__(self) -> None:
         if self.ssim > 1:
             raise ValueError(f"ssim is a share and must be at most 1, got {self.ssim:g}")
+
+    def weights(self, *, warm: bool) -> LossWeights:
+        """Of the image losses' terms; warm: whether the warm-up is over."""
+        return LossWeights(1 - self.ssim, self.ssim, self.pyramid, self.ncc if warm else 0.0)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from lapgs_wgpu.splat.camera import Camera
-from lapgs_wgpu.splat.rasterize import Rendering
+from lapgs_wgpu.splat.rasterize import Seen
 from lapgs_wgpu.splat.reference import rotation
 from lapgs_wgpu.train.adaptive_split import adaptive_split
 from lapgs_wgpu.train.config import DensityConfig
@@ -37,7 +37,7 @@ class Statistics:
         self.views = torch.zeros(count, device=device)
         self.radii = torch.zeros(count, device=device)
 
-    def add(self, rendering: Rendering, camera: Camera) -> None:
+    def add(self, rendering: Seen, camera: Camera) -> None:
         """Take in a rendering after its backward pass."""
         pixels = rendering.means2d.grad
         if pixels is None:

@@ -20,19 +20,20 @@ from torch import Tensor
 from lapgs_wgpu.data.init import initial_scales, random_points
 from lapgs_wgpu.data.views import Dataset, ImageCache, View, composite
 from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.gpu.buffer import Buffer
 from lapgs_wgpu.gpu.device import Device, open_device
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.motion.dynamics import dynamics_loss
 from lapgs_wgpu.motion.field import Nearby
 from lapgs_wgpu.motion.laplacian import LaplacianMotion
-from lapgs_wgpu.motion.scene import Scene4D, draw
+from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.config import Background, Config, PointsConfig, SmoothnessConfig
 from lapgs_wgpu.train.densify import Statistics, densify, reset_opacities
 from lapgs_wgpu.train.evaluate import COLOURS, evaluate, write_metrics
 from lapgs_wgpu.train.log import Log, environment
-from lapgs_wgpu.train.losses import photometric_loss, psnr
 from lapgs_wgpu.train.optimise import FrequencyOptimiser, Optimiser
 from lapgs_wgpu.train.presets import write_toml
+from lapgs_wgpu.train.render_loss import TruthCache, render_loss
 
 MAX_SH_DEGREE = 3
 AHEAD = 4  # pictures that are decoded before they are needed
@@ -73,26 +74,29 @@ def train(
     # Cameras that all stand at one place have no extent; the scene's own size must serve.
     extent = dataset.extent or config.points.box
     statistics = Statistics(len(scene), scene.parameters["means"].device)
-    pictures = Pictures(dataset.train, config.data.background, config.data.cache_gb, generator)
+    pictures = Pictures(dataset.train, config.data.background, config.data.cache_gb, generator, device)
     schedule, density = config.schedule, config.density
 
     start_run_folder(out, config, device)
     with Log(out / "log.jsonl", schedule.steps) as log, pictures, _interruptible() as interrupted:
         for step in range(1, schedule.steps + 1):
-            view, target, background = pictures.draw()
-            if step <= schedule.warm_up:
-                gaussians, smoothness = scene.canonical(), None
-            else:
+            view, truth, background = pictures.draw()
+            moving = step > schedule.warm_up
+            if moving:
                 nearby = draw_nearby(config.smoothness, len(scene), view.time, generator)
                 gaussians, smoothness = scene.deformed(view.time, nearby)
-            rendering = draw(gaussians, view.camera, background, device, depth=False)
-            loss = photometric_loss(rendering.image, target, config.loss.ssim)
-            objective = loss if smoothness is None else loss + smoothness
-            if "dynamics" in scene.parameters and step > schedule.warm_up:
-                regularisation = dynamics_loss(scene.parameters["dynamics"], config.loss.dynamics_mode)
-                objective = objective + config.loss.dynamics * regularisation
+            else:
+                gaussians, smoothness = scene.canonical(), None
+            weights = config.loss.weights(warm=moving)
+            rendering = render_loss(gaussians, view.camera, truth, background, weights, device)
+            loss = rendering.loss
+            if smoothness is not None:
+                loss = loss + smoothness
+            if moving and "dynamics" in scene.parameters:
+                spread = dynamics_loss(scene.parameters["dynamics"], config.loss.dynamics_mode)
+                loss = loss + config.loss.dynamics * spread
             optimiser.zero_grad()
-            objective.backward()
+            loss.backward()
             optimiser.step(step)
             if frequencies is not None:
                 frequencies.step(step)
@@ -117,7 +121,7 @@ def train(
             if step % schedule.sh_interval == 0:
                 scene.sh_degree = min(scene.sh_degree + 1, MAX_SH_DEGREE)
 
-            log.step(step, loss.item(), psnr(rendering.image.detach(), target), len(scene), spectrum)
+            log.step(step, loss.item(), rendering.psnr, len(scene), spectrum)
             if interrupted.is_set():
                 break
         seconds = log.seconds
@@ -190,15 +194,22 @@ def initial_points(
 class Pictures:
     """Training views in random order without replacement, epoch after epoch. A context manager.
 
-    generator: where the order, and random backgrounds, are drawn from.
+    generator: where the order, and random backgrounds, are drawn from. cache_gb: bound on what is kept in memory, and
+    on what is kept on the device.
     """
 
     def __init__(
-        self, views: tuple[View, ...], background: Background, cache_gb: float, generator: torch.Generator
+        self,
+        views: tuple[View, ...],
+        background: Background,
+        cache_gb: float,
+        generator: torch.Generator,
+        device: Device,
     ) -> None:
         self._colour = None if background == "random" else torch.full((3,), COLOURS[background])
         self._views = views if self._colour is None else tuple(_on_background(v, self._colour.numpy()) for v in views)
         self._cache = ImageCache(int(cache_gb * 1e9))
+        self._truths = TruthCache(device, int(cache_gb * 1e9))
         self._generator = generator
         self._order: list[View] = []
 
@@ -208,15 +219,14 @@ class Pictures:
     def __exit__(self, *_: object) -> None:
         self._cache.close()
 
-    def draw(self) -> tuple[View, Tensor, Tensor]:
-        """The next view, its picture (H, W, 3) in [0, 1] and the background (3,) that it lies on."""
+    def draw(self) -> tuple[View, Buffer, Tensor]:
+        """The next view, its picture on the device (for `render_loss`) and the background (3,) that it lies on."""
         if not self._order:
             self._order = [self._views[i] for i in torch.randperm(len(self._views), generator=self._generator).tolist()]
         view = self._order.pop(0)
-        self._cache.prefetch(self._order[:AHEAD])
+        self._cache.prefetch(view for view in self._order[:AHEAD] if view not in self._truths)
         colour = torch.rand(3, generator=self._generator) if self._colour is None else self._colour
-        pixels = composite(self._cache.get(view), colour.numpy())
-        return view, torch.from_numpy(pixels.astype(np.float32) / 255), colour
+        return view, self._truths.get(view, partial(self._cache.get, view)), colour
 
 
 def _on_background(view: View, colour: NDArray[np.float32]) -> View:

@@ -1,8 +1,13 @@
-"""Image losses and measures: L1, SSIM, PSNR. Images are (H, W, 3) in [0, 1]; all sums are in a fixed order."""
+"""Image losses and measures: L1, SSIM, Laplacian pyramid, NCC, PSNR. Images are (H, W, 3) in [0, 1].
+
+In plain torch, differentiable, of any float dtype, all sums in a fixed order: what the kernels of train/image_loss are
+held to.
+"""
 
 from __future__ import annotations
 
 import functools
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,15 +17,37 @@ SSIM_WINDOW = 11
 SSIM_SIGMA = 1.5  # pixels
 SSIM_C1 = 0.01**2
 SSIM_C2 = 0.03**2
+PYRAMID_BANDS = 3  # band-pass levels; below them lies the residual
+PYRAMID_TAPS = (1.0, 4.0, 6.0, 4.0, 1.0)  # sum 16
+NCC_WINDOW = 11
+NCC_E = 1e-4  # a covariance; what varies less counts as flat
+NCC_TINY = 1e-14  # keeps the square root differentiable; its own root lies far below NCC_E
+LUMINANCE = (0.299, 0.587, 0.114)  # Rec. 601, which is meant for gamma-encoded pictures such as ours
 LEAST_ERROR = 1e-10  # mean squared error that PSNR takes equal images to have: 100 dB
 
 
-def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
-    """(1 - w) L1 + w (1 - SSIM), a scalar; with w = 0.2 the loss of 3DGS (Kerbl et al. 2023)."""
-    difference = l1(image, target)
-    if ssim_weight == 0:
-        return difference
-    return (1 - ssim_weight) * difference + ssim_weight * (1 - ssim(image, target))
+class LossWeights(NamedTuple):
+    """Of each term in the loss of an image; a term of weight 0 is not computed.
+
+    l1, ssim (of 1 - SSIM), pyramid and ncc multiply the terms as they are.
+    """
+
+    l1: float
+    ssim: float
+    pyramid: float = 0.0
+    ncc: float = 0.0
+
+
+def total(image: Tensor, target: Tensor, weights: LossWeights) -> Tensor:
+    """The weighted sum of all image losses, a scalar; with l1 0.8 and ssim 0.2 that of 3DGS (Kerbl et al. 2023)."""
+    loss = weights.l1 * l1(image, target)
+    if weights.ssim:
+        loss = loss + weights.ssim * (1 - ssim(image, target))
+    if weights.pyramid:
+        loss = loss + weights.pyramid * pyramid_loss(image, target)
+    if weights.ncc:
+        loss = loss + weights.ncc * ncc_loss(image, target)
+    return loss
 
 
 def l1(image: Tensor, target: Tensor) -> Tensor:
@@ -40,6 +67,63 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
     variances = (aa - mean_a * mean_a) + (bb - mean_b * mean_b)
     luminance = (2 * mean_a * mean_b + SSIM_C1) / (mean_a * mean_a + mean_b * mean_b + SSIM_C1)
     return (luminance * (2 * covariance + SSIM_C2) / (variances + SSIM_C2)).mean()
+
+
+def pyramid_sizes(height: int, width: int) -> list[tuple[int, int]]:
+    """(height, width) of each level, the finest first, the residual last: halves, rounded up.
+
+    A level is only divided further where both sides are at least 3 pixels, which reflection needs: small images have
+    fewer band-pass levels, and the smallest are nothing but a residual.
+    """
+    sizes = [(height, width)]
+    while len(sizes) <= PYRAMID_BANDS and min(sizes[-1]) >= 3:
+        sizes.append(((sizes[-1][0] + 1) // 2, (sizes[-1][1] + 1) // 2))
+    return sizes
+
+
+def pyramid_weights(levels: int) -> list[float]:
+    """Of each level, the finest first: 2^-(l - 1), divided by their sum."""
+    weights = [2.0**-level for level in range(levels)]
+    return [weight / sum(weights) for weight in weights]
+
+
+def pyramid_loss(image: Tensor, target: Tensor) -> Tensor:
+    """Weighted mean absolute difference of the levels of two Laplacian pyramids (Burt and Adelson 1983), a scalar.
+
+    3 band-pass levels and the low-pass residual, 5x5 binomial kernel, borders reflected (without repeating the border
+    pixel); `pyramid_sizes` says what becomes of small images, `pyramid_weights` what each level counts. Since pyramids
+    are linear, it is that of the difference.
+    """
+    level = (image - target).permute(2, 0, 1)
+    sizes = pyramid_sizes(*level.shape[1:])
+    loss = level.new_zeros(())
+    for weight, coarse in zip(pyramid_weights(len(sizes)), [*sizes[1:], None], strict=True):
+        if coarse is None:
+            return loss + weight * level.abs().mean()
+        below = _binomial(level)[:, ::2, ::2]
+        loss = loss + weight * (level - _enlarge(below, level.shape[1], level.shape[2])).abs().mean()
+        level = below
+    raise AssertionError("the last level is the residual")
+
+
+def ncc_loss(image: Tensor, target: Tensor) -> Tensor:
+    """1 - mean local normalised cross-correlation of the luminances, a scalar.
+
+    (covariance + e) / (sqrt(variance variance + tiny) + e) over every 11x11 window that lies inside the image. Hence a
+    flat window agrees with every other (what it lacks, the other losses see), and brightness and contrast do not count,
+    as long as the variances are well above e. An image with a side below 11 pixels has no window: its loss is 0.
+    """
+    if min(image.shape[:2]) < NCC_WINDOW:
+        return 0.0 * image.sum()
+    weights = image.new_tensor(LUMINANCE)
+    a, b = image @ weights, target @ weights
+    mean_a, mean_b, aa, bb, ab = functional.avg_pool2d(torch.stack([a, b, a * a, b * b, a * b]), NCC_WINDOW, stride=1)
+    covariance = ab - mean_a * mean_b
+    variances = (
+        (aa - mean_a * mean_a).clamp(min=0),
+        (bb - mean_b * mean_b).clamp(min=0),
+    )
+    return 1 - ((covariance + NCC_E) / ((variances[0] * variances[1] + NCC_TINY).sqrt() + NCC_E)).mean()
 
 
 def psnr(image: Tensor, target: Tensor) -> float:
@@ -64,3 +148,18 @@ def _window(dtype: torch.dtype, device: torch.device) -> Tensor:
     x = torch.arange(SSIM_WINDOW, dtype=torch.float64) - SSIM_WINDOW // 2
     weights = torch.exp(-x * x / (2 * SSIM_SIGMA**2))
     return (weights / weights.sum()).to(dtype=dtype, device=device)
+
+
+def _binomial(planes: Tensor) -> Tensor:
+    """(P, H, W) planes under the 5x5 binomial kernel, borders reflected; H and W are at least 3."""
+    taps = planes.new_tensor(PYRAMID_TAPS) / 16
+    padded = functional.pad(planes[None], (2, 2, 2, 2), mode="reflect")
+    kernel = (taps[:, None] * taps).expand(len(planes), 1, 5, 5)
+    return functional.conv2d(padded, kernel, groups=len(planes))[0]
+
+
+def _enlarge(planes: Tensor, height: int, width: int) -> Tensor:
+    """(P, height, width): planes with zeros between their pixels, under four times the kernel. A constant stays one."""
+    spread = planes.new_zeros(len(planes), height, width)
+    spread[:, ::2, ::2] = planes
+    return 4 * _binomial(spread)

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import torch
 from encoder import EncoderReport, bench_encoder
+from losses import LossReport, bench_losses
 from measure import Timing, Traffic
 from raster import RasterReport, bench_raster
 from scene import make_scene, save_scene
@@ -49,12 +50,15 @@ def main() -> None:
     print_raster(raster)
     encoder = bench_encoder(device, load_config("dnerf").field, arrays["means"], options.repeat)
     print_encoder(encoder)
+    losses = bench_losses(device, options.size, options.repeat)
+    print_losses(losses)
     step = bench_step(device, options.repeat)
     print_step(step)
     if options.json:
         reports = {
             "raster": dataclasses.asdict(raster),
             "encoder": dataclasses.asdict(encoder),
+            "losses": dataclasses.asdict(losses),
             "step": dataclasses.asdict(step),
         }
         options.json.write_text(json.dumps({"machine": machine, **reports}, indent=1) + "\n")
@@ -125,6 +129,14 @@ def print_encoder(report: EncoderReport) -> None:
     print_row("torch twin: both", report.twin_forward_backward)
     ratio = report.twin_forward_backward.median / report.forward_backward.median
     print(f"  {ratio:.1f} times as fast as the twin; gradients differ by {report.largest_difference:.1e} at most")
+
+
+def print_losses(report: LossReport) -> None:
+    print_header(f"image losses, forward + backward: L1, SSIM, pyramid and NCC, {report.size}x{report.size}")
+    print_row("kernels", report.kernels)
+    print_row("torch twins", report.twins)
+    ratio = report.twins.median / report.kernels.median
+    print(f"  {ratio:.1f} times as fast as the twins; gradients differ by {report.difference:.1e}")
 
 
 def print_step(report: StepReport) -> None:

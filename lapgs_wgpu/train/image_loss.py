@@ -1,0 +1,270 @@
+"""The image losses and their gradient on the device: what train/losses computes in torch, as passes over buffers.
+
+The order of the passes is that of `ImageLoss.record`; docs/architecture.md lists them. Nothing here waits for the
+device.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..gpu.buffer import Buffer, BufferPool
+from ..gpu.device import Device
+from ..gpu.kernel import Commands, Kernel
+from .losses import NCC_WINDOW, LossWeights, pyramid_sizes, pyramid_weights
+
+TERMS = 5  # in the buffer that `record` leaves
+_WHOLE = 1 << 14  # longer than any side of an image: a lane takes a whole row or column
+
+
+class LossBuffers(NamedTuple):
+    """terms (5,) float32: L1, mean squared error, 1 - SSIM, pyramid, NCC; the last three 0 where their weight is 0.
+    d_image (4, H, W) float32: the weighted loss's gradient by red, green, blue, and zeros; None where none was asked.
+    """
+
+    terms: Buffer
+    d_image: Buffer | None
+
+
+class ImageLoss:
+    """Records the passes that compare images with their ground truth. Keeps its buffers from image to image.
+
+    An image may have as many pixels as fit into one binding at 48 bytes each (2.8 million at WebGPU's default limit,
+    128 MiB) where SSIM is used, else at 16 bytes.
+    """
+
+    def __init__(self, device: Device) -> None:
+        self.device = device
+        self.pool = BufferPool(device)
+        # On CPUs a workgroup is one vector that walks a whole row or column; GPUs need more lanes than that makes.
+        self._lanes, self._run = (8, _WHOLE) if device.is_cpu else (64, 64)
+
+    def record(
+        self,
+        commands: Commands,
+        image: Buffer,
+        truth: Buffer,
+        size: tuple[int, int],
+        background: tuple[float, float, float],
+        weights: LossWeights,
+        *,
+        gradient: bool,
+    ) -> LossBuffers:
+        """Compare an image with its ground truth.
+
+        image: planes (4, H, W) of float32, the first three red, green, blue. truth: (H, W) u32, straight RGBA of 8
+        bits, red lowest. size: (height, width). background: in [0, 1], under the ground truth, which is rounded to 8
+        bits, as data/views.composite does. weights: of the terms. gradient: whether to leave it, too.
+        """
+        height, width = size
+        frame = _Frame(self, commands, height, width, background, weights)
+        pixels = frame.pixels(image, truth)
+        extra = {}
+        if weights.ssim:
+            extra["ssim"] = frame.ssim(pixels)
+        correlated = frame.ncc_forward(pixels) if frame.ncc_windows else None
+        levels = frame.pyramid_forward(pixels)
+        terms = frame.sum_up()
+        if not gradient:
+            return LossBuffers(terms, None)
+        if correlated:
+            extra["ncc"] = frame.ncc_backward(pixels, *correlated)
+        if levels:
+            extra["pyramid"] = frame.pyramid_backward(levels)
+        d_image = self.pool.get("d_image", 16 * width * height)
+        kernel = self.kernel("loss_gradient", **{name.upper(): 1 for name in extra})
+        grid = frame.grid(width, height, channels=3)
+        commands.dispatch_grid(kernel, grid, picture=frame.picture, pixels=pixels, d_image=d_image, **extra)
+        return LossBuffers(terms, d_image)
+
+    def kernel(self, name: str, **defines: int) -> Kernel:
+        return Kernel.get(self.device, name, LANES=self._lanes, **defines)
+
+
+class _Level(NamedTuple):
+    """Two neighbouring levels of the pyramid: their uniform, the coarse one's values, the fine band's signs."""
+
+    uniform: Buffer
+    coarse: Buffer
+    signs: Buffer
+    fine_size: tuple[int, int]
+
+
+class _Frame:
+    """One image's passes while they are recorded."""
+
+    def __init__(
+        self,
+        owner: ImageLoss,
+        commands: Commands,
+        height: int,
+        width: int,
+        background: tuple[float, float, float],
+        weights: LossWeights,
+    ) -> None:
+        self.owner, self.commands, self.weights = owner, commands, weights
+        self.height, self.width = height, width
+        fits = min(height, width) >= NCC_WINDOW
+        margin = NCC_WINDOW - 1
+        self.ncc_windows = (height - margin) * (width - margin) if weights.ncc and fits else 0
+        # One level is all residual: the pyramid's loss is then L1.
+        sizes = pyramid_sizes(height, width) if weights.pyramid else []
+        self.sizes = sizes if len(sizes) > 1 else []
+        self.flat_pyramid = weights.pyramid if len(sizes) == 1 else 0.0
+        self.level_weights = pyramid_weights(len(sizes))
+
+        # How many lanes leave partial sums, a term after the other.
+        columns, rows = self.runs(height) * width, self.runs(width) * height
+        counts = [columns, columns, 3 * rows if weights.ssim else 0]
+        self.pyramid_counts = [self.runs(h) * w for h, w in self.sizes[1:]]
+        counts += [sum(self.pyramid_counts), self.runs(width) * (height - margin) if self.ncc_windows else 0]
+        self.ends = np.cumsum(counts).tolist()
+        self.sums = owner.pool.get("sums", 4 * self.ends[-1])
+
+        pixel = 1.0 / (3 * height * width)
+        window = 1.0 / max(1, self.ncc_windows)
+        per_pixel = window / NCC_WINDOW**2
+        self.picture = owner.pool.constant(
+            "picture",
+            owner.kernel("loss_pixels").uniform(
+                "Picture",
+                size=(width, height),
+                run=owner._run,
+                ssim_first=self.ends[1],
+                background=background,
+                ncc_first=self.ends[3],
+                value=(pixel, pixel, window, 0.0),
+                slope=((weights.l1 + self.flat_pyramid) * pixel, weights.ssim * pixel, weights.ncc * per_pixel, 0.0),
+            ),
+        )
+
+    def runs(self, length: int) -> int:
+        return -(-length // self.owner._run)
+
+    def grid(self, lanes: int, length: int, channels: int = 1) -> tuple[int, int]:
+        """Workgroups for so many lanes, each of which takes a run of the length."""
+        return -(-lanes // self.owner._lanes), channels * self.runs(length)
+
+    def pixels(self, image: Buffer, truth: Buffer) -> Buffer:
+        pool, count = self.owner.pool, self.height * self.width
+        # A copy, so that all pictures of a training go through one buffer (and one texture, and one bind group).
+        held = pool.get("truth", 4 * count)
+        self.commands.copy(truth, held, 4 * count)
+        pixels = pool.get("pixels", 16 * count)
+        self.commands.dispatch_grid(
+            self.owner.kernel("loss_pixels"),
+            self.grid(self.width, self.height),
+            picture=self.picture,
+            image=(image, 0, 16 * count),
+            rgba=(held, 0, max(16, 4 * count)),
+            pixels=pixels,
+            sums=self.sums,
+        )
+        return pixels
+
+    def ssim(self, pixels: Buffer) -> Buffer:
+        """The derivatives, blurred along the rows."""
+        nbytes = 48 * self.height * self.width
+        moments, slopes = (self.owner.pool.get(f"ssim {name}", nbytes) for name in ("moments", "slopes"))
+        down, across = self.owner.kernel("loss_ssim_down"), self.owner.kernel("loss_ssim_across")
+        grid = self.grid(self.width, self.height, channels=3)
+        self.commands.dispatch_grid(down, grid, picture=self.picture, pixels=pixels, moments=moments)
+        grid = self.grid(self.height, self.width, channels=3)
+        buffers = {"moments": moments, "slopes": slopes, "sums": self.sums}
+        self.commands.dispatch_grid(across, grid, picture=self.picture, **buffers)
+        return slopes
+
+    def ncc_forward(self, pixels: Buffer) -> tuple[Buffer, Buffer]:
+        """Moments of pixels below each other, and the derivatives, summed over the windows along the rows."""
+        pool, count = self.owner.pool, self.height * self.width
+        moments, slopes = (pool.get(f"ncc {name}", 16 * count) for name in ("moments", "slopes"))
+        halves = {"moments": moments, "truth_variances": pool.get("ncc truth variances", 4 * count)}
+        down, across = self.owner.kernel("loss_ncc_down"), self.owner.kernel("loss_ncc_across")
+        rows = self.height - NCC_WINDOW + 1
+        self.commands.dispatch_grid(
+            down, self.grid(self.width, rows), picture=self.picture, pixels=pixels, **halves
+        )  # fmt: skip
+        grid = self.grid(rows, self.width)
+        self.commands.dispatch_grid(across, grid, picture=self.picture, slopes=slopes, sums=self.sums, **halves)
+        return moments, slopes
+
+    def ncc_backward(self, pixels: Buffer, moments: Buffer, slopes: Buffer) -> Buffer:
+        """The gradient by the luminance."""
+        d_luminance = self.owner.pool.get("d_luminance", 4 * self.height * self.width)
+        up, grid = self.owner.kernel("loss_ncc_up"), self.grid(self.width, self.height)
+        buffers = {"pixels": pixels, "moments": moments, "slopes": slopes, "d_luminance": d_luminance}
+        self.commands.dispatch_grid(up, grid, picture=self.picture, **buffers)
+        return d_luminance
+
+    def pyramid_forward(self, pixels: Buffer) -> list[_Level]:
+        """The levels, from the finest on; none where the pyramid is not used, or nothing but a residual."""
+        owner, levels = self.owner, list[_Level]()
+        shares = [w / (3 * h * w_) for w, (h, w_) in zip(self.level_weights, self.sizes, strict=False)]
+        first, fine = self.ends[2], pixels
+        bands = len(self.sizes) - 1
+        for k in range(bands):
+            (fine_height, fine_width), (height, width) = self.sizes[k : k + 2]
+            finest = {"FINEST": 1} if k == 0 else {}
+            residual = {"RESIDUAL": 1} if k == bands - 1 else {}
+            reduce, band = owner.kernel("loss_pyramid_reduce", **finest), owner.kernel(
+                "loss_pyramid_band", **finest, **residual
+            )  # fmt: skip
+            uniform = owner.pool.constant(
+                f"level {k}",
+                band.uniform(
+                    "Level",
+                    fine=(fine_width, fine_height),
+                    coarse=(width, height),
+                    run=owner._run,
+                    first=first,
+                    value=shares[k],
+                    slope=shares[k] * self.weights.pyramid,
+                    coarse_value=shares[k + 1],
+                    coarse_slope=shares[k + 1] * self.weights.pyramid,
+                ),
+            )
+            coarse = owner.pool.get(f"level {k + 1}", 16 * height * width)
+            signs = owner.pool.get(f"signs {k}", 4 * fine_height * fine_width)
+            columns = -(-width // owner._lanes)
+            self.commands.dispatch_grid(reduce, (columns, height), level=uniform, fine=fine, coarse=coarse)
+            grid = self.grid(width, height)
+            buffers: dict[str, Any] = {"fine": fine, "coarse": coarse, "signs": signs, "sums": self.sums}
+            self.commands.dispatch_grid(band, grid, level=uniform, **buffers)
+            levels.append(_Level(uniform, coarse, signs, (fine_height, fine_width)))
+            first += self.pyramid_counts[k]
+            fine = coarse
+        return levels
+
+    def pyramid_backward(self, levels: list[_Level]) -> Buffer:
+        """The gradient by the difference, from the residual up."""
+        owner = self.owner
+        d_level = levels[-1].coarse  # until there is a gradient
+        for k in range(len(levels), -1, -1):
+            defines, buffers = {}, dict[str, Any]()
+            if k == 0:
+                defines["FINEST"] = 1
+            else:
+                buffers |= {"above": levels[k - 1].uniform, "fine_signs": levels[k - 1].signs}
+            if k == len(levels):
+                defines["RESIDUAL"] = 1
+                buffers["difference"] = levels[-1].coarse
+            else:
+                buffers |= {"below": levels[k].uniform, "signs": levels[k].signs, "d_coarse": d_level}
+            height, width = self.sizes[k]
+            d_level = owner.pool.get(f"d_level {k}", 16 * height * width)
+            kernel = owner.kernel("loss_pyramid_bwd", **defines)
+            self.commands.dispatch_grid(kernel, (-(-width // owner._lanes), height), d_level=d_level, **buffers)
+        return d_level
+
+    def sum_up(self) -> Buffer:
+        terms = self.owner.pool.get("terms", 4 * TERMS)
+        kernel = self.owner.kernel("loss_sums")
+        names = ("l1", "squared", "ssim", "pyramid", "ncc")
+        parts = dict(zip(names, zip([0, *self.ends], self.ends, strict=False), strict=True))
+        if self.flat_pyramid:
+            parts["pyramid"] = parts["l1"]
+        uniform = self.owner.pool.constant("parts", kernel.uniform("Parts", **parts))
+        self.commands.dispatch_grid(kernel, (TERMS, 1), parts=uniform, sums=self.sums, terms=terms)
+        return terms

@@ -1,0 +1,32 @@
+// What the passes of the image losses share: an image that was drawn, its ground truth, and how lanes walk over them.
+struct Picture {
+    size: vec2<u32>,         // width, height
+    run: u32,                // pixels that a lane takes one after another, down a column or along a row
+    ssim_first: u32,         // where the partial sums of these terms begin
+    background: vec3<f32>,   // under the ground truth
+    ncc_first: u32,
+    value: vec4<f32>,        // a pixel's share in each term: L1 and squared error, SSIM, a window's in NCC, -
+    slope: vec4<f32>,        // the same, times the term's weight in the loss
+}
+
+// pixels: red, green, blue of the image, as bits; ground truth, 8 bits a channel.
+fn seen(pixel: vec4<u32>) -> vec3<f32> {
+    return bitcast<vec3<f32>>(pixel.xyz);
+}
+
+fn truth(pixel: vec4<u32>) -> vec3<f32> {
+    return vec3<f32>((vec3(pixel.w) >> vec3(0u, 8u, 16u)) & vec3(255u)) / 255.0;
+}
+
+// Both in one channel.
+fn channel_of(pixel: vec4<u32>, channel: u32) -> vec2<f32> {
+    let bits = select(select(pixel.z, pixel.y, channel == 1u), pixel.x, channel == 0u);
+    return vec2(bitcast<f32>(bits), f32((pixel.w >> (8u * channel)) & 255u) / 255.0);
+}
+
+const LUMINANCE = vec3<f32>(0.299, 0.587, 0.114);   // Rec. 601
+
+// The first and one past the last pixel of a lane's run.
+fn run_of(number: u32, length: u32, picture: Picture) -> vec2<i32> {
+    return vec2<i32>(vec2(number * picture.run, min((number + 1u) * picture.run, length)));
+}

@@ -1,0 +1,6 @@
+// The window of the structural similarity: a Gaussian of sigma 1.5 pixels along one axis; its sum is 1.
+const WINDOW = array<f32, 11>(
+    0.0010283801, 0.0075987582, 0.036000773, 0.10936069, 0.21300553, 0.26601172,
+    0.21300553, 0.10936069, 0.036000773, 0.0075987582, 0.0010283801);
+const SSIM_C1: f32 = 1e-4;   // 0.01^2
+const SSIM_C2: f32 = 9e-4;   // 0.03^2

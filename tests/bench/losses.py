@@ -1,0 +1,62 @@
+"""All image losses and their gradient, against their plain-torch twins in the same run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from measure import Timing, timed
+from numpy.typing import NDArray
+
+from lapgs_wgpu.gpu.buffer import Buffer
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.kernel import Commands
+from lapgs_wgpu.train.image_loss import TERMS, ImageLoss
+from lapgs_wgpu.train.losses import LossWeights, total
+from lapgs_wgpu.train.render_loss import upload_rgba
+
+WEIGHTS = LossWeights(0.8, 0.2, pyramid=0.2, ncc=0.05)  # the paper's
+
+
+@dataclass(frozen=True)
+class LossReport:
+    """Forward and backward together. kernels: from an image on the device to its gradient there, and the terms' values
+    on the host. twins: torch, in float32, on the processor."""
+
+    size: int
+    kernels: Timing
+    twins: Timing
+    difference: float  # of the gradients, |kernels - twins| / |twins|
+
+
+def bench_losses(device: Device, size: int, repeat: int) -> LossReport:
+    """With a picture of noise: the time does not depend on what is in it."""
+    rng = np.random.default_rng(0)
+    picture, truth = rng.random((3, size, size), np.float32), rng.integers(0, 256, (size, size, 3), np.uint8)
+    planes = Buffer(device, 16 * size * size, "image")
+    planes.write(picture)
+    held, losses = upload_rgba(device, truth), ImageLoss(device)
+
+    def kernels() -> Buffer:
+        planes.version += 1  # as if it were newly drawn
+        with Commands(device) as commands:
+            done = losses.record(commands, planes, held, (size, size), (0.0, 0.0, 0.0), WEIGHTS, gradient=True)
+        done.terms.read("float32", (TERMS,))
+        assert done.d_image is not None
+        return done.d_image
+
+    image = torch.from_numpy(np.ascontiguousarray(picture.transpose(1, 2, 0))).requires_grad_()
+    target = torch.from_numpy(truth.astype(np.float32) / 255)
+
+    def twins() -> NDArray[np.float32]:
+        (gradient,) = torch.autograd.grad(total(image, target, WEIGHTS), image)
+        return gradient.permute(2, 0, 1).numpy()
+
+    ours, theirs = kernels().read("float32", (3, size, size)), twins()
+    return LossReport(
+        size=size,
+        kernels=timed(kernels, repeat),
+        twins=timed(twins, repeat),
+        difference=float(np.linalg.norm(ours - theirs) / np.linalg.norm(theirs)),
+    )

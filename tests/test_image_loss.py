@@ -1,0 +1,335 @@
+"""The kernels of the image losses against their twins in float64, and a step in which nothing but losses comes back."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from scenes import oblique_camera, random_scene, relative
+
+from lapgs_wgpu.data.views import composite
+from lapgs_wgpu.gpu.buffer import Buffer
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.kernel import Commands, Kernel
+from lapgs_wgpu.splat.gaussians import Gaussians
+from lapgs_wgpu.splat.rasterize import rasterize
+from lapgs_wgpu.splat.rasterizer import Rasterizer
+from lapgs_wgpu.train import losses
+from lapgs_wgpu.train import render_loss as render_loss_module
+from lapgs_wgpu.train.image_loss import TERMS, ImageLoss
+from lapgs_wgpu.train.losses import LossWeights, total
+from lapgs_wgpu.train.render_loss import RenderLoss, TruthCache, render_loss, upload_rgba
+
+pytestmark = pytest.mark.kernels
+
+WEIGHTS = {
+    "l1": LossWeights(1.0, 0.0),
+    "ssim": LossWeights(0.0, 1.0),
+    "pyramid": LossWeights(0.0, 0.0, pyramid=1.0),
+    "ncc": LossWeights(0.0, 0.0, ncc=1.0),
+    "all": LossWeights(0.8, 0.2, pyramid=0.2, ncc=0.05),
+}
+SIZES = [(1, 1), (1, 9), (2, 5), (3, 3), (3, 4), (5, 70), (10, 13), (11, 11), (12, 30), (37, 61), (64, 64), (131, 90)]
+BLACK = (0.0, 0.0, 0.0)
+Picture = NDArray[np.float32]
+
+
+class Pair(NamedTuple):
+    """An image (H, W, 3) and its ground truth in 8 bits."""
+
+    image: Picture
+    truth: NDArray[np.uint8]
+
+
+def random_pair(height: int, width: int) -> Pair:
+    rng = np.random.default_rng(1000 * height + width)
+    return Pair(rng.random((height, width, 3), np.float32), rng.integers(0, 256, (height, width, 3), np.uint8))
+
+
+def structured_pair(height: int, width: int, flat: bool = True) -> Pair:
+    """Waves, an edge, a white channel, a corner that is white in both; one that is flat in the image alone."""
+    y, x = np.mgrid[:height, :width] / max(height, width)
+    truth = np.stack([0.5 + 0.4 * np.sin(9 * x + 5 * y), 0.8 * (x > 0.4) + 0.1 * y, np.ones_like(x)], -1)
+    truth[: height // 3, width // 2 :] = 0
+    # Its noise keeps differences away from 0, where rounding decides on their sign.
+    noise = 2e-3 * np.random.default_rng(0).standard_normal((height, width, 3))
+    image = 0.9 * truth + 0.05 * np.sin(20 * x * y)[..., None] + noise
+    image[height // 2 :, : width // 3] = truth[height // 2 :, : width // 3] = 1
+    if flat:
+        image[: height // 4, : width // 4] = 0.7
+    return Pair(image.clip(0, 1).astype(np.float32), np.round(255 * truth).astype(np.uint8))
+
+
+def record(
+    losses: ImageLoss, pair: Pair, weights: LossWeights, background: tuple[float, float, float] = BLACK
+) -> tuple[NDArray[np.float32], Picture]:
+    """Terms (5,) and gradient (H, W, 3)."""
+    height, width = pair.image.shape[:2]
+    image = Buffer(losses.device, 16 * height * width, "image")
+    image.write(np.concatenate([pair.image.transpose(2, 0, 1), np.full((1, height, width), np.nan, np.float32)]))
+    truth = upload_rgba(losses.device, pair.truth)
+    with Commands(losses.device) as commands:
+        done = losses.record(commands, image, truth, (height, width), background, weights, gradient=True)
+    assert done.d_image is not None
+    planes = done.d_image.read("float32", (4, height, width))
+    assert (planes[3] == 0).all()
+    return done.terms.read("float32", (TERMS,)), planes[:3].transpose(1, 2, 0)
+
+
+def smooth_pair(height: int, width: int) -> Pair:
+    """Without a region of constant difference, on whose bands, which are 0, rounding decides on the sign."""
+    return structured_pair(height, width, flat=False)
+
+
+def loss_of(terms: NDArray[np.float32], weights: LossWeights) -> float:
+    return float(np.dot(terms.astype(float), [weights.l1, 0, weights.ssim, weights.pyramid, weights.ncc]))
+
+
+def twin(pair: Pair, weights: LossWeights) -> tuple[float, torch.Tensor]:
+    image = torch.from_numpy(pair.image).double().requires_grad_()
+    loss = total(image, torch.from_numpy(pair.truth.astype(np.float32) / np.float32(255)).double(), weights)
+    loss.backward()
+    assert image.grad is not None
+    return loss.item(), image.grad
+
+
+def check(losses: ImageLoss, pair: Pair, weights: LossWeights) -> None:
+    terms, gradient = record(losses, pair, weights)
+    expected, expected_gradient = twin(pair, weights)
+    assert loss_of(terms, weights) == pytest.approx(expected, rel=1e-5, abs=1e-6)
+    assert relative(torch.from_numpy(gradient.copy()), expected_gradient) < 1e-4
+
+
+@pytest.fixture(scope="module")
+def image_loss(device: Device) -> ImageLoss:
+    return ImageLoss(device)
+
+
+# Against the twins
+
+
+@pytest.mark.parametrize("name", WEIGHTS)
+def test_value_and_gradient(image_loss: ImageLoss, name: str) -> None:
+    structured = structured_pair if WEIGHTS[name].pyramid == 0 else smooth_pair
+    for size in SIZES:
+        check(image_loss, random_pair(*size), WEIGHTS[name])
+        check(image_loss, structured(*size), WEIGHTS[name])
+
+
+@pytest.mark.parametrize("run", [1, 7, 64, 1 << 14])
+def test_runs_of_any_length(device: Device, run: int) -> None:
+    """How a lane's work is cut does not show."""
+    losses = ImageLoss(device)
+    losses._run = run
+    for size in ((37, 61), (12, 30)):
+        check(losses, smooth_pair(*size), WEIGHTS["all"])
+
+
+def test_equal_images(image_loss: ImageLoss) -> None:
+    truth = structured_pair(40, 30).truth
+    terms, gradient = record(image_loss, Pair(truth.astype(np.float32) / np.float32(255), truth), WEIGHTS["all"])
+    np.testing.assert_allclose(terms, [0, 0, 0, 0, 0], atol=2e-3)  # NCC of flat windows: sqrt(tiny) / e
+    np.testing.assert_allclose(terms[:4], 0, atol=1e-7)
+    assert np.abs(gradient).max() < 1e-5
+
+
+def test_mean_squared_error(image_loss: ImageLoss) -> None:
+    pair = random_pair(33, 47)
+    terms, _ = record(image_loss, pair, WEIGHTS["l1"])
+    assert terms[1] == pytest.approx(np.square(pair.image - pair.truth.astype(float) / 255).mean(), rel=1e-5)
+
+
+def test_constants_are_those_of_the_twins(device: Device) -> None:
+    source = Kernel.get(device, "loss_ssim_across", LANES=8).source
+    numbers = source.split("array<f32, 11>(")[1].split(")")[0].split(",")
+    torch.testing.assert_close(
+        torch.tensor([float(n) for n in numbers]), losses._window(torch.float32, torch.device("cpu"))
+    )
+    for constant in (losses.SSIM_C1, losses.SSIM_C2):
+        assert f"{constant:.0e}".replace("e-0", "e-") in source
+    source = Kernel.get(device, "loss_ncc_across", LANES=8).source
+    assert f"E: f32 = {losses.NCC_E:.0e}".replace("e-0", "e-") in source
+    assert f"TINY: f32 = {losses.NCC_TINY:.0e}" in source
+    assert str(losses.LUMINANCE) in source
+
+
+@pytest.mark.parametrize("background", [(0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (0.31, 0.77, 0.123)])
+def test_transparent_pictures_are_laid_on_the_background(
+    image_loss: ImageLoss, background: tuple[float, float, float]
+) -> None:
+    rng = np.random.default_rng(5)
+    rgba = rng.integers(0, 256, (64, 80, 4), np.uint8)
+    rgba[:8, :, 3], rgba[8:16, :, 3] = 0, 255
+    pair = Pair(np.zeros((64, 80, 3), np.float32), rgba)
+    terms, _ = record(image_loss, pair, WEIGHTS["l1"], background)
+    assert terms[0] == pytest.approx(composite(rgba, background).mean(dtype=float) / 255, rel=1e-6)
+    pixels = image_loss.pool.get("pixels", 0).read("uint8", (64, 80, 16))
+    assert (pixels[..., 12:15] == composite(rgba, background)).all()
+
+
+def test_the_same_bits_twice(image_loss: ImageLoss) -> None:
+    pair = structured_pair(131, 90)
+    runs = []
+    for other in (random_pair(150, 150), random_pair(20, 20)):
+        record(image_loss, other, WEIGHTS["all"])  # leaves its own in the buffers
+        runs.append([array.tobytes() for array in record(image_loss, pair, WEIGHTS["all"])])
+    assert runs[0] == runs[1]
+
+
+def test_a_term_of_weight_0_runs_no_passes(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    losses, names = ImageLoss(device), list[str]()
+    dispatch = Commands.dispatch_grid
+    monkeypatch.setattr(Commands, "dispatch_grid", lambda *a, **k: names.append(a[1].name) or dispatch(*a, **k))
+    record(losses, random_pair(20, 20), WEIGHTS["l1"])
+    assert names == ["loss_pixels", "loss_sums", "loss_gradient"]
+
+
+# With the rasteriser
+
+CAMERA = oblique_camera(61, 47)
+TRUTH = random_pair(CAMERA.height, CAMERA.width).truth
+BACKGROUND = torch.tensor([0.2, 0.5, 0.9])
+
+
+def gaussians(count: int = 200, **changes: torch.Tensor) -> Gaussians:
+    scene = random_scene(count, 1, sh=4)
+    tensors = {"sh" if name == "colors" else name: value for name, value in scene.items()} | changes
+    return Gaussians(**{name: value.clone().requires_grad_() for name, value in tensors.items()})
+
+
+def step(device: Device, scene: Gaussians, weights: LossWeights = WEIGHTS["all"]) -> RenderLoss:
+    return render_loss(scene, CAMERA, upload_rgba(device, TRUTH), BACKGROUND, weights, device)
+
+
+def gradients(scene: Gaussians, done: RenderLoss) -> dict[str, torch.Tensor]:
+    tensors = {field.name: getattr(scene, field.name) for field in dataclasses.fields(scene)}
+    return {name: t.grad for name, t in (tensors | {"means2d": done.means2d}).items()}
+
+
+def test_a_step_is_that_of_the_rasteriser_and_the_twins(device: Device) -> None:
+    scene, other = gaussians(), gaussians()
+    done = step(device, scene)
+    done.loss.backward()
+    drawn = rasterize(
+        other.means, other.quats, other.scales, other.opacities, other.sh, CAMERA,
+        sh_degree=1, background=BACKGROUND, depth=False, device=device,
+    )  # fmt: skip
+    truth = torch.from_numpy(TRUTH.astype(np.float32) / 255)
+    loss = total(drawn.image.double(), truth.double(), WEIGHTS["all"])
+    loss.backward()
+    assert done.loss.item() == pytest.approx(loss.item(), rel=1e-5)
+    image = drawn.image.detach().double()
+    assert done.terms == pytest.approx(
+        {
+            "l1": losses.l1(image, truth).item(),
+            "mse": (image - truth).square().mean().item(),
+            "ssim": losses.ssim(image, truth.double()).item(),
+            "pyramid": losses.pyramid_loss(image, truth).item(),
+            "ncc": losses.ncc_loss(image, truth.double()).item(),
+        },
+        rel=1e-5,
+    )
+    assert done.psnr == pytest.approx(losses.psnr(image, truth), rel=1e-5)
+    assert torch.equal(done.radii, drawn.radii)
+    assert torch.equal(done.means2d, drawn.means2d)
+    expected = gradients(other, RenderLoss(loss, {}, drawn.radii, drawn.means2d))
+    for name, gradient in gradients(scene, done).items():
+        assert relative(gradient, expected[name]) < 1e-4, name
+
+
+def test_the_upstream_gradient_scales(device: Device) -> None:
+    scene, other = gaussians(), gaussians()
+    done, again = step(device, scene), step(device, other)
+    (3 * done.loss).backward()
+    again.loss.backward()
+    expected = gradients(other, again)
+    for name, gradient in gradients(scene, done).items():
+        torch.testing.assert_close(gradient, 3 * expected[name], msg=name)
+
+
+def test_without_a_gradient_no_backward_pass_runs(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    value = step(device, gaussians()).loss.item()
+    monkeypatch.setattr(Rasterizer, "backward", None)
+    with torch.no_grad():
+        assert step(device, gaussians()).loss.item() == value
+
+
+def test_overflow_and_bands_do_not_show(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Buffers that are too small at first; then so small a device that the image is drawn in bands."""
+    results = []
+    for capacity, most in ((1 << 16, 1 << 20), (16, 1 << 20), (400, 400)):
+        rasterizer = Rasterizer(device, capacity=capacity)
+        rasterizer.max_capacity = most
+        monkeypatch.setattr(render_loss_module, "rasterizer_of", lambda device, one=rasterizer: one)
+        scene = gaussians(400)
+        done = step(device, scene)
+        done.loss.backward()
+        results.append((rasterizer.bands, done.loss.item(), gradients(scene, done)))
+    bands, values, found = zip(*results, strict=True)
+    assert bands[:2] == (1, 1)
+    assert bands[2] > 1
+    assert len(set(values)) == 1
+    for name in found[0]:
+        assert torch.equal(found[0][name], found[1][name]), name
+        assert relative(found[2][name], found[0][name]) < 1e-5, name
+
+
+def test_no_gaussians(device: Device) -> None:
+    scene = gaussians(0)
+    done = step(device, scene)
+    done.loss.backward()
+    image = BACKGROUND.double().expand(CAMERA.height, CAMERA.width, 3)
+    truth = torch.from_numpy(TRUTH / 255)
+    assert done.loss.item() == pytest.approx(total(image, truth, WEIGHTS["all"]).item(), rel=1e-5)
+    assert scene.means.grad is not None
+    assert scene.means.grad.shape == (0, 3)
+
+
+def test_drawing_in_between_does_no_harm(device: Device) -> None:
+    """`rasterize` and `render_loss` share their buffers."""
+
+    def draw(scene: Gaussians) -> torch.Tensor:
+        more = {"sh_degree": 1, "device": device}
+        drawn = rasterize(scene.means, scene.quats, scene.scales, scene.opacities, scene.sh, CAMERA, **more)
+        return drawn.image.square().mean()
+
+    one, other = gaussians(), gaussians()
+    loss = draw(one)
+    step(device, gaussians(300)).loss.backward()
+    loss.backward()
+    draw(other).backward()
+    assert one.means.grad is not None
+    assert torch.equal(one.means.grad, other.means.grad)
+
+
+# Pictures on the device
+
+
+def test_pictures_are_uploaded_once(device: Device) -> None:
+    cache, loads = TruthCache(device, 10_000), list[str]()
+
+    def get(name: str, side: int = 20) -> Buffer:
+        def load() -> NDArray[np.uint8]:
+            loads.append(name)
+            return np.full((side, side, 3), len(name), np.uint8)
+
+        return cache.get(name, load)
+
+    assert get("a") is get("a")
+    assert (get("a").read("uint8", (20, 20, 4)) == [1, 1, 1, 255]).all()
+    for name in "bcdef":  # 1600 bytes each: six fit
+        get(name)
+    assert loads == list("abcdef")
+    get("a")
+    get("g")  # b was used least recently
+    assert "b" not in cache
+    assert "a" in cache
+    assert cache.used_bytes == 9600
+    get("huge", side=60)  # more than the bound
+    get("huge", side=60)
+    assert loads == [*"abcdefg", "huge", "huge"]
+    assert cache.used_bytes == 9600
