@@ -113,6 +113,27 @@ def test_the_checkpoint_is_the_last_model(run: Path, dataset: Dataset, device: D
     assert scene.metadata["background"] == "black"
 
 
+def test_the_training_never_sees_the_test_views(
+    run: Path, dataset: Dataset, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not one is opened before the model is saved, and without them it is the same to the last byte."""
+
+    def refuse() -> np.ndarray:
+        raise AssertionError("a test view was opened")
+
+    class Saved(Exception):
+        pass
+
+    def stop(*_: object) -> None:
+        raise Saved
+
+    blind = tuple(dataclasses.replace(view, pixels=refuse, time=0.5) for view in dataset.test[:1])
+    monkeypatch.setattr(loop, "evaluate_run", stop)
+    with pytest.raises(Saved):
+        train(configure(), dataclasses.replace(dataset, test=blind), tmp_path / "run", device=device)
+    assert (tmp_path / "run" / "checkpoint.ply").read_bytes() == (run / "checkpoint.ply").read_bytes()
+
+
 def test_a_training_repeats_to_the_last_byte(run: Path, dataset: Dataset, device: Device, tmp_path: Path) -> None:
     train(configure(), dataset, tmp_path / "second", device=device)
     assert (tmp_path / "second" / "checkpoint.ply").read_bytes() == (run / "checkpoint.ply").read_bytes()
