@@ -121,15 +121,15 @@ def test_the_training_never_sees_the_test_views(
     def refuse() -> np.ndarray:
         raise AssertionError("a test view was opened")
 
-    class Saved(Exception):
+    class SavedError(Exception):
         pass
 
     def stop(*_: object) -> None:
-        raise Saved
+        raise SavedError
 
     blind = tuple(dataclasses.replace(view, pixels=refuse, time=0.5) for view in dataset.test[:1])
     monkeypatch.setattr(loop, "evaluate_run", stop)
-    with pytest.raises(Saved):
+    with pytest.raises(SavedError):
         train(configure(), dataclasses.replace(dataset, test=blind), tmp_path / "run", device=device)
     assert (tmp_path / "run" / "checkpoint.ply").read_bytes() == (run / "checkpoint.ply").read_bytes()
 
