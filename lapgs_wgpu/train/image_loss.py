@@ -89,7 +89,6 @@ class _Level(NamedTuple):
     uniform: Buffer
     coarse: Buffer
     signs: Buffer
-    fine_size: tuple[int, int]
 
 
 class _Frame:
@@ -185,9 +184,8 @@ class _Frame:
         halves = {"moments": moments, "truth_variances": pool.get("ncc truth variances", 4 * count)}
         down, across = self.owner.kernel("loss_ncc_down"), self.owner.kernel("loss_ncc_across")
         rows = self.height - NCC_WINDOW + 1
-        self.commands.dispatch_grid(
-            down, self.grid(self.width, rows), picture=self.picture, pixels=pixels, **halves
-        )  # fmt: skip
+        grid = self.grid(self.width, rows)
+        self.commands.dispatch_grid(down, grid, picture=self.picture, pixels=pixels, **halves)
         grid = self.grid(rows, self.width)
         self.commands.dispatch_grid(across, grid, picture=self.picture, slopes=slopes, sums=self.sums, **halves)
         return moments, slopes
@@ -203,16 +201,18 @@ class _Frame:
     def pyramid_forward(self, pixels: Buffer) -> list[_Level]:
         """The levels, from the finest on; none where the pyramid is not used, or nothing but a residual."""
         owner, levels = self.owner, list[_Level]()
-        shares = [w / (3 * h * w_) for w, (h, w_) in zip(self.level_weights, self.sizes, strict=False)]
+        shares = [
+            weight / (3 * height * width)
+            for weight, (height, width) in zip(self.level_weights, self.sizes, strict=False)
+        ]
         first, fine = self.ends[2], pixels
         bands = len(self.sizes) - 1
         for k in range(bands):
             (fine_height, fine_width), (height, width) = self.sizes[k : k + 2]
             finest = {"FINEST": 1} if k == 0 else {}
             residual = {"RESIDUAL": 1} if k == bands - 1 else {}
-            reduce, band = owner.kernel("loss_pyramid_reduce", **finest), owner.kernel(
-                "loss_pyramid_band", **finest, **residual
-            )  # fmt: skip
+            reduce = owner.kernel("loss_pyramid_reduce", **finest)
+            band = owner.kernel("loss_pyramid_band", **finest, **residual)
             uniform = owner.pool.constant(
                 f"level {k}",
                 band.uniform(
@@ -234,7 +234,7 @@ class _Frame:
             grid = self.grid(width, height)
             buffers: dict[str, Any] = {"fine": fine, "coarse": coarse, "signs": signs, "sums": self.sums}
             self.commands.dispatch_grid(band, grid, level=uniform, **buffers)
-            levels.append(_Level(uniform, coarse, signs, (fine_height, fine_width)))
+            levels.append(_Level(uniform, coarse, signs))
             first += self.pyramid_counts[k]
             fine = coarse
         return levels
