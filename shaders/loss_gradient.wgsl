@@ -34,6 +34,7 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) g
     let width = picture.size.x;
     let height = i32(picture.size.y);
     let count = width * picture.size.y;
+    let top = place(id.x, 0u, picture);
 #ifdef SSIM
     var similar: array<vec3<f32>, 12>;      // the last stays zero
 #endif
@@ -43,14 +44,14 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) g
     for (var ahead = run.x - REACH; ahead < run.y + REACH; ahead++) {
         let row = ahead - REACH;
 #ifdef SSIM
-        let blurred = ssim_at(channel * count + u32(clamp(ahead, 0, height - 1)) * width + id.x).xyz;
+        let blurred = ssim_at(channel * places(picture) + top + 8u * u32(clamp(ahead, 0, height - 1))).xyz;
         let inside = select(vec3(0.0), blurred, ahead >= 0 && ahead < height);
 #unroll k 11
         similar[$k] = fma(vec3(WINDOW[$k]), inside, similar[$k + 1]);
 #end
 #endif
         if (row >= run.x) {
-            let i = u32(row) * width + id.x;
+            let i = top + 8u * u32(row);
             let pixel = pixels_at(i);
             let both = channel_of(pixel, channel);
             var d = picture.slope.x * sign(both.x - both.y);
@@ -64,9 +65,10 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) g
             let band = pyramid_at(i);
             d += select(select(band.z, band.y, channel == 1u), band.x, channel == 0u);
 #endif
-            d_image[channel * count + i] = d;
+            let at = u32(row) * width + id.x;
+            d_image[channel * count + at] = d;
             if (channel == 0u) {
-                d_image[3u * count + i] = 0.0;
+                d_image[3u * count + at] = 0.0;
             }
         }
     }

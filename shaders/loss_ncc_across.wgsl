@@ -20,13 +20,12 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>) {
     }
     let run = run_of(id.y, picture.size.x, picture);
     let width = i32(picture.size.x);
-    let first = id.x * picture.size.x;
     var row: array<vec2<f32>, 11>;          // means of pixel columns
     var moments_within: array<vec3<f32>, 12>;   // windows under way; the last stays zero, here and below
     var back: array<vec3<f32>, 12>;
     var sum = 0.0;
     for (var column = run.x - 10; column < run.y + 10; column++) {
-        let i = first + u32(clamp(column, 0, width - 1));
+        let i = place(u32(clamp(column, 0, width - 1)), id.x, picture);
         let here = moments_at(i);
 #unroll k 10
         row[$k] = row[$k + 1];
@@ -63,7 +62,7 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>) {
         back[$k] = back[$k + 1] + vec3(d, dot(d, mean.yx - row[$k].yx));
 #end
         if (begin >= run.x) {
-            slopes[first + u32(begin)] = vec4(back[0], 0.0);
+            slopes[place(u32(begin), id.x, picture)] = vec4(back[0], 0.0);
         }
     }
     sums[picture.ncc_first + id.y * (picture.size.y - 10u) + id.x] = picture.value.z * sum;

@@ -14,10 +14,10 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>) {
         return;
     }
     let run = run_of(id.y, picture.size.y - 10u, picture);
+    let top = place(id.x, 0u, picture);
     var column: array<vec2<f32>, 11>;
     for (var row = run.x; row < run.y + 10; row++) {
-        let i = u32(row) * picture.size.x + id.x;
-        let pixel = pixels_at(i);
+        let pixel = pixels_at(top + 8u * u32(row));
 #unroll k 10
         column[$k] = column[$k + 1];
 #end
@@ -37,7 +37,7 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>) {
                 covariance = fma(d.x, d.y, covariance);
             }
 #end
-            let at = i - 10u * picture.size.x;
+            let at = top + 8u * u32(row - 10);
             moments[at] = vec4(mean, variances.x / 11.0, covariance / 11.0);
             truth_variances[at] = variances.y / 11.0;
         }

@@ -15,15 +15,16 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>) {
     }
     let run = run_of(id.y, picture.size.y, picture);
     let last = i32(picture.size.y) - 1;
+    let top = place(id.x, 0u, picture);
     var column: array<vec2<f32>, 11>;   // luminances from the window's first row on
     var back: array<f32, 12>;           // and their gradients; the last stays zero
     for (var begin = run.x - 10; begin < run.y; begin++) {
-        let pixel = pixels_at(u32(min(begin + 10, last)) * picture.size.x + id.x);
+        let pixel = pixels_at(top + 8u * u32(min(begin + 10, last)));
 #unroll k 10
         column[$k] = column[$k + 1];
 #end
         column[10] = vec2(dot(LUMINANCE, seen(pixel)), dot(LUMINANCE, truth(pixel)));
-        let i = u32(clamp(begin, 0, last)) * picture.size.x + id.x;
+        let i = top + 8u * u32(clamp(begin, 0, last));
         let valid = begin >= 0 && begin + 10 <= last;
         let slope = select(vec3(0.0), slopes_at(i).xyz, valid);
         let mean = select(vec2(0.0), moments_at(i).xy, valid);

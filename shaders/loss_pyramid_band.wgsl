@@ -58,15 +58,14 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>) {
         {
             let at = vec2(2 * x + $q % 2, 2 * y + $q / 2);
             if (all(at < size)) {
-                let i = u32(at.y * size.x + at.x);
-                let texel = fine_at(i);
+                let texel = fine_at(fine_place(u32(at.x), u32(at.y), level));
 #ifdef FINEST
                 let left = seen(texel) - truth(texel) - enlarged[$q];
 #else
                 let left = texel.xyz - enlarged[$q];
 #endif
                 band += dot(abs(left), vec3(1.0));
-                signs[i] = pack_signs(left);
+                signs[u32(at.y * size.x + at.x)] = pack_signs(left);
             }
         }
 #end

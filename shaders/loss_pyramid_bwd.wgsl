@@ -1,11 +1,9 @@
-// The gradient by a level of the difference's pyramid: of its own absolute values, less what the finer band took from it
-// (unless FINEST), plus what reaches it through the coarser level (unless RESIDUAL).
+// The gradient by a level of the difference's pyramid, but the finest: of its own absolute values, less what the finer
+// band took from it, plus what reaches it through the coarser level (unless RESIDUAL).
 #import common/pyramid
 
-#ifndef FINEST
 @group(0) @binding(0) var<uniform> above: Level;    // this level as the coarse one of two
 #table 1 fine_signs: u32
-#endif
 #ifdef RESIDUAL
 #table 2 difference: vec4<f32>
 #else
@@ -17,11 +15,7 @@
 
 @compute @workgroup_size($LANES)
 fn main(@builtin(global_invocation_id) id: vec3<u32>) {
-#ifdef RESIDUAL
     let size = vec2<i32>(above.coarse);
-#else
-    let size = vec2<i32>(below.fine);
-#endif
     if (id.x >= u32(size.x)) {
         return;
     }
@@ -45,7 +39,6 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>) {
 #end
     }
 #endif
-#ifndef FINEST
     let fine = vec2<i32>(above.fine);
     for (var row = 2 * y - 2; row <= 2 * y + 2; row++) {
         let down = -above.slope * enlarge_weight(y, row, fine.y);
@@ -58,6 +51,5 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>) {
         }
 #end
     }
-#endif
     d_level[i] = vec4(d, 0.0);
 }

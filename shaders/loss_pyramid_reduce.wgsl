@@ -25,11 +25,11 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>) {
 #end
     for (var dy = -2; dy <= 2; dy++) {
         let y = 2 * center.y + dy;
-        let row = clamp(y, 0, last.y) * size.x;
+        let row = u32(clamp(y, 0, last.y));
         var along = vec3(0.0);
 #unroll k 5
         {
-            let texel = fine_at(u32(row + clamp(2 * center.x + $k - 2, 0, last.x)));
+            let texel = fine_at(fine_place(u32(clamp(2 * center.x + $k - 2, 0, last.x)), row, level));
 #ifdef FINEST
             along = fma(vec3(across[$k]), seen(texel) - truth(texel), along);
 #else

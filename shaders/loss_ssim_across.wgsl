@@ -18,14 +18,15 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) g
     let channel = id.y / runs;
     let run = run_of(id.y % runs, picture.size.x, picture);
     let width = i32(picture.size.x);
-    let first = (channel * picture.size.y + id.x) * picture.size.x;
+    let start = channel * places_across(picture) + place_across(0u, id.x, picture);
+    let first = channel * places(picture);
     var row: array<vec2<f32>, 11>;        // means of pixel columns
     var within: array<vec2<f32>, 12>;     // windows under way; the last stays zero, here and below
     var back: array<vec3<f32>, 12>;
     var sum = 0.0;
     for (var column = run.x - 10; column < run.y + 10; column++) {
         let inside = column >= 0 && column < width;
-        let here = select(vec4(0.0), moments_at(first + u32(clamp(column, 0, width - 1))), inside);
+        let here = select(vec4(0.0), moments_at(start + 8u * u32(clamp(column, 0, width - 1))), inside);
 #unroll k 10
         row[$k] = row[$k + 1];
 #end
@@ -65,7 +66,7 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) g
         back[$k] = fma(vec3(WINDOW[$k]), d_center, back[$k + 1]);
 #end
         if (column - 10 >= run.x) {
-            slopes[first + u32(column - 10)] = vec4(back[0], 0.0);
+            slopes[first + place(u32(column - 10), id.x, picture)] = vec4(back[0], 0.0);
         }
     }
     sums[picture.ssim_first + id.y * picture.size.y + id.x] = picture.value.y * sum;

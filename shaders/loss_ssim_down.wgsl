@@ -18,11 +18,12 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) g
     let channel = id.y / runs;
     let run = run_of(id.y % runs, picture.size.y, picture);
     let height = i32(picture.size.y);
-    let first = channel * picture.size.x * picture.size.y;
+    let top = place(id.x, 0u, picture);
+    let first = channel * places_across(picture);
     var column: array<vec2<f32>, 11>;
     for (var row = run.x - 5; row < run.y + 5; row++) {
         let inside = row >= 0 && row < height;   // beyond the border lies zero
-        let both = channel_of(pixels_at(u32(clamp(row, 0, height - 1)) * picture.size.x + id.x), channel);
+        let both = channel_of(pixels_at(top + 8u * u32(clamp(row, 0, height - 1))), channel);
 #unroll k 10
         column[$k] = column[$k + 1];
 #end
@@ -42,7 +43,7 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) g
                 covariance = fma(weighted.x, d.y, covariance);
             }
 #end
-            moments[first + u32(row - 5) * picture.size.x + id.x] = vec4(mean, variances, covariance);
+            moments[first + place_across(id.x, u32(row - 5), picture)] = vec4(mean, variances, covariance);
         }
     }
 }

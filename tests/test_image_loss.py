@@ -167,8 +167,9 @@ def test_transparent_pictures_are_laid_on_the_background(
     pair = Pair(np.zeros((64, 80, 3), np.float32), rgba)
     terms, _ = record(image_loss, pair, WEIGHTS["l1"], background)
     assert terms[0] == pytest.approx(composite(rgba, background).mean(dtype=float) / 255, rel=1e-6)
-    pixels = image_loss.pool.get("pixels", 0).read("uint8", (64, 80, 16))
-    assert (pixels[..., 12:15] == composite(rgba, background)).all()
+    pixels = image_loss.pool.get("pixels", 0).read("uint8", (10, 64, 8, 16))  # in strips of 8 columns
+    laid = pixels[..., 12:15].transpose(1, 0, 2, 3).reshape(64, 80, 3)
+    assert (laid == composite(rgba, background)).all()
 
 
 def test_the_same_bits_twice(image_loss: ImageLoss) -> None:

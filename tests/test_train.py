@@ -23,7 +23,9 @@ from lapgs_wgpu.train import loop
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.loop import Pictures, train
+from lapgs_wgpu.train.losses import LossWeights
 from lapgs_wgpu.train.presets import load_config
+from lapgs_wgpu.train.render_loss import RenderLoss, render_loss
 
 STEPS = 36
 SMALL: dict[str, str | list[str]] = {
@@ -163,6 +165,28 @@ def test_nothing_moves_during_the_warm_up(dataset: Dataset, device: Device, tmp_
         torch.equal(ours, initial)
         for ours, initial in zip(moved.field.parameters(), fresh.field.parameters(), strict=True)
     )
+
+
+def test_cross_correlation_counts_once_the_warm_up_is_over(
+    dataset: Dataset, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With all losses and random backgrounds."""
+    seen: list[tuple[LossWeights, RenderLoss]] = []
+
+    def spy(*arguments: Any) -> RenderLoss:
+        seen.append((arguments[4], render_loss(*arguments)))
+        return seen[-1][1]
+
+    monkeypatch.setattr(loop, "render_loss", spy)
+    options = {"loss__pyramid": "0.2", "loss__ncc": "0.05", "data__background": "random"}
+    config = configure(schedule__steps="4", schedule__warm_up="2", **options)
+    train(config, dataset, tmp_path / "run", device=device)
+    assert [weights.ncc for weights, _ in seen] == [0, 0, 0.05, 0.05]
+    for weights, done in seen:
+        assert weights[:3] == pytest.approx((0.8, 0.2, 0.2))
+        terms = {"ncc": 0.0} | done.terms
+        loss = 0.8 * terms["l1"] + 0.2 * (1 - terms["ssim"]) + 0.2 * terms["pyramid"] + weights.ncc * terms["ncc"]
+        assert done.loss.item() == pytest.approx(loss, rel=1e-5)
 
 
 def test_test_views_are_not_decoded_before_the_training_is_over(

@@ -89,7 +89,6 @@ class _Level(NamedTuple):
     uniform: Buffer
     coarse: Buffer
     signs: Buffer
-    fine_size: tuple[int, int]
 
 
 class _Frame:
@@ -106,6 +105,8 @@ class _Frame:
     ) -> None:
         self.owner, self.commands, self.weights = owner, commands, weights
         self.height, self.width = height, width
+        # With what fills up strips of 8 columns, or of 8 rows: common/picture.wgsl.
+        self.places, self.places_across = (width + 7) // 8 * 8 * height, (height + 7) // 8 * 8 * width
         fits = min(height, width) >= NCC_WINDOW
         margin = NCC_WINDOW - 1
         self.ncc_windows = (height - margin) * (width - margin) if weights.ncc and fits else 0
@@ -116,8 +117,8 @@ class _Frame:
         self.level_weights = pyramid_weights(len(sizes))
 
         # How many lanes leave partial sums, a term after the other.
-        columns, rows = self.runs(height) * width, self.runs(width) * height
-        counts = [columns, columns, 3 * rows if weights.ssim else 0]
+        rows = self.runs(width) * height
+        counts = [height * owner._lanes, height * owner._lanes, 3 * rows if weights.ssim else 0]
         self.pyramid_counts = [self.runs(h) * w for h, w in self.sizes[1:]]
         counts += [sum(self.pyramid_counts), self.runs(width) * (height - margin) if self.ncc_windows else 0]
         self.ends = np.cumsum(counts).tolist()
@@ -152,10 +153,10 @@ class _Frame:
         # A copy, so that all pictures of a training go through one buffer (and one texture, and one bind group).
         held = pool.get("truth", 4 * count)
         self.commands.copy(truth, held, 4 * count)
-        pixels = pool.get("pixels", 16 * count)
+        pixels = pool.get("pixels", 16 * self.places)
         self.commands.dispatch_grid(
             self.owner.kernel("loss_pixels"),
-            self.grid(self.width, self.height),
+            (1, self.height),
             picture=self.picture,
             image=(image, 0, 16 * count),
             rgba=(held, 0, max(16, 4 * count)),
@@ -166,8 +167,8 @@ class _Frame:
 
     def ssim(self, pixels: Buffer) -> Buffer:
         """The derivatives, blurred along the rows."""
-        nbytes = 48 * self.height * self.width
-        moments, slopes = (self.owner.pool.get(f"ssim {name}", nbytes) for name in ("moments", "slopes"))
+        moments = self.owner.pool.get("ssim moments", 48 * self.places_across)
+        slopes = self.owner.pool.get("ssim slopes", 48 * self.places)
         down, across = self.owner.kernel("loss_ssim_down"), self.owner.kernel("loss_ssim_across")
         grid = self.grid(self.width, self.height, channels=3)
         self.commands.dispatch_grid(down, grid, picture=self.picture, pixels=pixels, moments=moments)
@@ -178,21 +179,20 @@ class _Frame:
 
     def ncc_forward(self, pixels: Buffer) -> tuple[Buffer, Buffer]:
         """Moments of pixels below each other, and the derivatives, summed over the windows along the rows."""
-        pool, count = self.owner.pool, self.height * self.width
+        pool, count = self.owner.pool, self.places
         moments, slopes = (pool.get(f"ncc {name}", 16 * count) for name in ("moments", "slopes"))
         halves = {"moments": moments, "truth_variances": pool.get("ncc truth variances", 4 * count)}
         down, across = self.owner.kernel("loss_ncc_down"), self.owner.kernel("loss_ncc_across")
         rows = self.height - NCC_WINDOW + 1
-        self.commands.dispatch_grid(
-            down, self.grid(self.width, rows), picture=self.picture, pixels=pixels, **halves
-        )  # fmt: skip
+        grid = self.grid(self.width, rows)
+        self.commands.dispatch_grid(down, grid, picture=self.picture, pixels=pixels, **halves)
         grid = self.grid(rows, self.width)
         self.commands.dispatch_grid(across, grid, picture=self.picture, slopes=slopes, sums=self.sums, **halves)
         return moments, slopes
 
     def ncc_backward(self, pixels: Buffer, moments: Buffer, slopes: Buffer) -> Buffer:
         """The gradient by the luminance."""
-        d_luminance = self.owner.pool.get("d_luminance", 4 * self.height * self.width)
+        d_luminance = self.owner.pool.get("d_luminance", 4 * self.places)
         up, grid = self.owner.kernel("loss_ncc_up"), self.grid(self.width, self.height)
         buffers = {"pixels": pixels, "moments": moments, "slopes": slopes, "d_luminance": d_luminance}
         self.commands.dispatch_grid(up, grid, picture=self.picture, **buffers)
@@ -201,16 +201,18 @@ class _Frame:
     def pyramid_forward(self, pixels: Buffer) -> list[_Level]:
         """The levels, from the finest on; none where the pyramid is not used, or nothing but a residual."""
         owner, levels = self.owner, list[_Level]()
-        shares = [w / (3 * h * w_) for w, (h, w_) in zip(self.level_weights, self.sizes, strict=False)]
+        shares = [
+            weight / (3 * height * width)
+            for weight, (height, width) in zip(self.level_weights, self.sizes, strict=False)
+        ]
         first, fine = self.ends[2], pixels
         bands = len(self.sizes) - 1
         for k in range(bands):
             (fine_height, fine_width), (height, width) = self.sizes[k : k + 2]
             finest = {"FINEST": 1} if k == 0 else {}
             residual = {"RESIDUAL": 1} if k == bands - 1 else {}
-            reduce, band = owner.kernel("loss_pyramid_reduce", **finest), owner.kernel(
-                "loss_pyramid_band", **finest, **residual
-            )  # fmt: skip
+            reduce = owner.kernel("loss_pyramid_reduce", **finest)
+            band = owner.kernel("loss_pyramid_band", **finest, **residual)
             uniform = owner.pool.constant(
                 f"level {k}",
                 band.uniform(
@@ -232,7 +234,7 @@ class _Frame:
             grid = self.grid(width, height)
             buffers: dict[str, Any] = {"fine": fine, "coarse": coarse, "signs": signs, "sums": self.sums}
             self.commands.dispatch_grid(band, grid, level=uniform, **buffers)
-            levels.append(_Level(uniform, coarse, signs, (fine_height, fine_width)))
+            levels.append(_Level(uniform, coarse, signs))
             first += self.pyramid_counts[k]
             fine = coarse
         return levels
@@ -241,12 +243,9 @@ class _Frame:
         """The gradient by the difference, from the residual up."""
         owner = self.owner
         d_level = levels[-1].coarse  # until there is a gradient
-        for k in range(len(levels), -1, -1):
-            defines, buffers = {}, dict[str, Any]()
-            if k == 0:
-                defines["FINEST"] = 1
-            else:
-                buffers |= {"above": levels[k - 1].uniform, "fine_signs": levels[k - 1].signs}
+        for k in range(len(levels), 0, -1):
+            defines = dict[str, int]()
+            buffers: dict[str, Any] = {"above": levels[k - 1].uniform, "fine_signs": levels[k - 1].signs}
             if k == len(levels):
                 defines["RESIDUAL"] = 1
                 buffers["difference"] = levels[-1].coarse
@@ -256,7 +255,17 @@ class _Frame:
             d_level = owner.pool.get(f"d_level {k}", 16 * height * width)
             kernel = owner.kernel("loss_pyramid_bwd", **defines)
             self.commands.dispatch_grid(kernel, (-(-width // owner._lanes), height), d_level=d_level, **buffers)
-        return d_level
+        difference = owner.pool.get("d_difference", 16 * self.places)
+        (height, width), level = self.sizes[1], levels[0]
+        self.commands.dispatch_grid(
+            owner.kernel("loss_pyramid_finest", FINEST=1),
+            (-(-width // owner._lanes), height),
+            level=level.uniform,
+            signs=level.signs,
+            d_coarse=d_level,
+            d_difference=difference,
+        )
+        return difference
 
     def sum_up(self) -> Buffer:
         terms = self.owner.pool.get("terms", 4 * TERMS)

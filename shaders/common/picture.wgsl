@@ -9,6 +9,26 @@ struct Picture {
     slope: vec4<f32>,        // the same, times the term's weight in the loss
 }
 
+// Where a pixel lies in the buffers of these passes. What is read by lanes that walk down lies in strips of 8 columns, so
+// that the next row is nearby (in an image row by row, each step down would be a new page of memory) ...
+fn place(x: u32, y: u32, picture: Picture) -> u32 {
+    return ((x >> 3u) * picture.size.y + y) * 8u + (x & 7u);
+}
+
+// ... and what is read by lanes that walk along the rows, in strips of 8 rows.
+fn place_across(x: u32, y: u32, picture: Picture) -> u32 {
+    return ((y >> 3u) * picture.size.x + x) * 8u + (y & 7u);
+}
+
+// The pixels of a channel, with those that fill up the last strip, in either.
+fn places(picture: Picture) -> u32 {
+    return ((picture.size.x + 7u) & ~7u) * picture.size.y;
+}
+
+fn places_across(picture: Picture) -> u32 {
+    return ((picture.size.y + 7u) & ~7u) * picture.size.x;
+}
+
 // pixels: red, green, blue of the image, as bits; ground truth, 8 bits a channel.
 fn seen(pixel: vec4<u32>) -> vec3<f32> {
     return bitcast<vec3<f32>>(pixel.xyz);

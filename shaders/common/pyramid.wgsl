@@ -11,6 +11,15 @@ struct Level {
     coarse_slope: f32,
 }
 
+// Where a pixel of the fine level lies: the finest in strips, as common/picture has it, the others row by row.
+fn fine_place(x: u32, y: u32, level: Level) -> u32 {
+#ifdef FINEST
+    return ((x >> 3u) * level.fine.y + y) * 8u + (x & 7u);
+#else
+    return y * level.fine.x + x;
+#endif
+}
+
 fn tap(distance: i32) -> f32 {   // the binomial kernel, times 16
     let d = abs(distance);
     return select(select(select(0.0, 1.0, d == 2), 4.0, d == 1), 6.0, d == 0);
