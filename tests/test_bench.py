@@ -71,6 +71,13 @@ def test_a_training_step_waits_three_times(results: dict) -> None:
     assert step["read_backs_before_sort"] == 1
 
 
+def test_the_parts_of_a_step_add_up(results: dict) -> None:
+    shares = dict(results["shares"])
+    step = shares.pop("step")
+    assert all(share > 0 for share in shares.values()), shares
+    assert sum(shares.values()) == pytest.approx(step, rel=0.01)
+
+
 def test_the_scene_can_be_saved_for_other_rasterisers(tmp_path: Path) -> None:
     bench("--save-scene", tmp_path / "scene.npz")
     scene = np.load(tmp_path / "scene.npz")

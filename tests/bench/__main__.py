@@ -20,6 +20,7 @@ from losses import LossReport, bench_losses
 from measure import Timing, Traffic
 from raster import RasterReport, bench_raster
 from scene import make_scene, save_scene
+from shares import bench_shares
 from step import StepReport, bench_step
 
 from lapgs_wgpu.gpu.device import Device, open_device
@@ -54,12 +55,15 @@ def main() -> None:
     print_losses(losses)
     step = bench_step(device, options.repeat)
     print_step(step)
+    shares = bench_shares(device, max(1, options.repeat // 2), options.gaussians, options.size)
+    print_shares(shares, options.gaussians, options.size)
     if options.json:
         reports = {
             "raster": dataclasses.asdict(raster),
             "encoder": dataclasses.asdict(encoder),
             "losses": dataclasses.asdict(losses),
             "step": dataclasses.asdict(step),
+            "shares": shares,
         }
         options.json.write_text(json.dumps({"machine": machine, **reports}, indent=1) + "\n")
 
@@ -137,6 +141,13 @@ def print_losses(report: LossReport) -> None:
     print_row("torch twins", report.twins)
     ratio = report.twins.median / report.kernels.median
     print(f"  {ratio:.1f} times as fast as the twins; gradients differ by {report.difference:.1e}")
+
+
+def print_shares(shares: dict[str, float], gaussians: int, size: int) -> None:
+    print(f"\ntraining step, preset dnerf: {gaussians:,} Gaussians, {size}x{size}, everything moving")
+    print(f"  {'':46s}{'median':>8s}  milliseconds")
+    for name, milliseconds in shares.items():
+        print(f"  {name:46s}{milliseconds:8.2f}  {milliseconds / shares['step']:4.0%}")
 
 
 def print_step(report: StepReport) -> None:

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.motion.field import FieldConfig, GridField
+from lapgs_wgpu.motion.field import FieldConfig
+from lapgs_wgpu.motion.grid_field import GridField
 from lapgs_wgpu.motion.hashgrid import HashEncoder, encode_reference
 
 TIME = 0.37

@@ -20,7 +20,7 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands
 from lapgs_wgpu.gpu.profile import Profile
 from lapgs_wgpu.motion import hashgrid
-from lapgs_wgpu.splat import rasterize
+from lapgs_wgpu.splat import objective
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.loop import train
 from lapgs_wgpu.train.optimise import FrequencyOptimiser, Optimiser
@@ -112,7 +112,7 @@ class _Clock:
             mock.patch.object(Buffer, "write", self._timed(TRANSFERS, Buffer.write)),
             mock.patch.object(Optimiser, "step", self._timed(OPTIMISER, Optimiser.step)),
             mock.patch.object(FrequencyOptimiser, "step", self._timed(OPTIMISER, FrequencyOptimiser.step)),
-            *(mock.patch.object(module, "read_all", read_when_done) for module in (buffer_module, hashgrid, rasterize)),
+            *(mock.patch.object(module, "read_all", read_when_done) for module in (buffer_module, hashgrid, objective)),
         ]
         for patch in patches:
             patch.start()
