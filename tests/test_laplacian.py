@@ -135,6 +135,8 @@ def test_faint_components_move_further() -> None:
     ratio = float(m.variances()[0] / m.variances()[3])
     assert ratio > 3
     assert float(moved[2] / moved[0]) == pytest.approx(ratio)
+    gradient = 1 / (2 * math.pi * m.variances())
+    torch.testing.assert_close(moved, (1e-3 * gradient / gradient.square().mean().sqrt())[1:])
     assert m.frequencies.grad is None
 
 

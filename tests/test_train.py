@@ -136,6 +136,21 @@ def test_the_training_never_sees_the_test_views(
     assert (tmp_path / "run" / "checkpoint.ply").read_bytes() == (run / "checkpoint.ply").read_bytes()
 
 
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("smoothness__static", "5"), ("smoothness__temporal", "5"), ("loss__dynamics", "1"), ("loss__pyramid", "1"),
+        ("loss__ncc", "1"), ("loss__ssim", "0.5"), ("rates__frequencies__start", "2e-3"), ("density__split", "plain"),
+    ],
+)  # fmt: skip
+def test_each_part_of_the_method_reaches_the_model(
+    key: str, value: str, run: Path, dataset: Dataset, device: Device, tmp_path: Path
+) -> None:
+    """None of these changes how many random numbers are drawn before the first step that differs."""
+    train(configure(**{key: value}), dataset, tmp_path / "run", device=device)
+    assert (tmp_path / "run" / "checkpoint.ply").read_bytes() != (run / "checkpoint.ply").read_bytes()
+
+
 def test_a_training_repeats_to_the_last_byte(run: Path, dataset: Dataset, device: Device, tmp_path: Path) -> None:
     train(configure(), dataset, tmp_path / "second", device=device)
     assert (tmp_path / "second" / "checkpoint.ply").read_bytes() == (run / "checkpoint.ply").read_bytes()
