@@ -26,12 +26,15 @@ def motion(frequencies: list[float] | None = None, seed: int = 0) -> LaplacianMo
 STATIC = torch.rand(7, INPUTS, generator=torch.Generator().manual_seed(9), dtype=torch.float64)
 
 
-def test_frequencies_start_at_whole_cycles() -> None:
+def test_the_spectrum_at_the_start() -> None:
+    """Whole cycles, faint in all, and falling like 1 / f whatever the number of components is."""
     assert motion().frequencies.tolist() == [0, 1, 2, 3, 4]
-    # alpha, beta ~ N(0, 1/K): the series has unit variance whatever K is.
-    wide = LaplacianMotion(2, 4000, 25, torch.Generator().manual_seed(0))
-    assert float(wide.alpha.detach().std()) == pytest.approx(0.2, rel=0.02)
-    assert float(wide.series(0.3).detach().std()) == pytest.approx(1.0, rel=0.05)
+    wide = LaplacianMotion(2, 4000, 25, torch.Generator().manual_seed(0), frequency_step=0.5)
+    assert wide.frequencies.tolist() == [0.5 * k for k in range(25)]
+    assert float(wide.series(0.3).detach().std()) == pytest.approx(0.1, rel=0.05)
+    amplitudes = wide.amplitudes()
+    for k in (2, 5, 24):
+        assert float(amplitudes[1] / amplitudes[k]) == pytest.approx(k, rel=0.05)
 
 
 @pytest.mark.parametrize("t", [0.0, 0.17, 1.0])

@@ -12,6 +12,9 @@ from .laplacian import LaplacianMotion, TimeMotion
 from .layers import linear, zero_head
 
 GEOMETRY = (4, 3, 4, 3)  # outputs of the geometry heads: turn, shift, quaternion, scale
+# Times the appearance head's outputs: it then learns about as fast as the colours themselves; at full speed it explains
+# what is motion by changes of colour.
+APPEARANCE_SCALE = 0.1
 TEMPORAL_AXES = ((0, 1, TIME), (1, 2, TIME), (0, 2, TIME))
 
 
@@ -74,7 +77,7 @@ class GridField(nn.Module):
         gated = torch.relu(self.temporal(torch.cat(temporal, dim=1))) * gate
         turn, shift, d_quats, d_scales = self._geometry(gated, static, t).split(GEOMETRY, dim=1)
         rotation = nn.functional.normalize(turn + turn.new_tensor([1.0, 0.0, 0.0, 0.0]), dim=1)
-        look = self.appearance(gated) if self.appearance is not None else None
+        look = APPEARANCE_SCALE * self.appearance(gated) if self.appearance is not None else None
         return Deformation(
             rotation,
             shift,

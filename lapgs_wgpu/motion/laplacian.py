@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from .layers import linear
 
+START = 0.1  # standard deviation of a channel of L(t) before the training
 VARIANCE_FLOOR = 1e-4
 VARIANCE_SPREAD = (
     10.0  # a component's variance counts as at most this times the geometric mean of all, and at least 1/this
@@ -45,9 +46,12 @@ class LaplacianMotion(nn.Module):
         self, inputs: int, width: int, components: int, generator: torch.Generator, *, frequency_step: float = 1.0
     ) -> None:
         super().__init__()
-        # Neither factor starts at zero: the product would have no gradient.
-        self.alpha = nn.Parameter(torch.randn(components, width, generator=generator) * components**-0.5)
-        self.beta = nn.Parameter(torch.randn(components, width, generator=generator) * components**-0.5)
+        # Faint, and fainter at higher frequencies, as smooth motions are: so that the heads do not learn to explain
+        # single pictures by a flicker. Not zero: with both factors at zero the product would have no gradient.
+        fall = 1.0 / torch.arange(components).clamp(min=1)[:, None]
+        size = START * fall / fall.square().sum().sqrt()
+        self.alpha = nn.Parameter(torch.randn(components, width, generator=generator) * size)
+        self.beta = nn.Parameter(torch.randn(components, width, generator=generator) * size)
         self.frequencies = nn.Parameter(frequency_step * torch.arange(components, dtype=torch.float32))
         self.first = linear(inputs, width, generator)
         self.second = linear(width, width, generator)
