@@ -34,7 +34,7 @@ def test_dnerf_is_the_papers_schedule() -> None:
     assert (density.neighbours, density.divergence_weight, density.split_quantile) == (10, 0.5, 0.3)
     assert (config.points.count, config.points.box, config.points.opacity) == (100_000, 1.3, 0.1)
     assert (config.data.background, config.seed, config.loss.ssim) == ("black", 0, 0.2)
-    assert (config.loss.pyramid, config.loss.ncc) == (0, 0)
+    assert (config.loss.pyramid, config.loss.ncc) == (0.2, 0.05)
     assert config.field == FieldConfig()
 
 
