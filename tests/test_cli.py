@@ -111,6 +111,7 @@ MISTAKES = {
     "too few values": (["tiny", "--field.static.base", "1", "2"], "expected 3 arguments"),
     "not a number": (["tiny", "--data", "SCENE", "--out", "OUT", "--steps", "x"], "must be a whole number, got 'x'"),
     "no steps": (["tiny", "--data", "SCENE", "--out", "OUT", "--steps", "0"], "at least 1, got 0"),
+    "unknown part": (["tiny", "--data", "SCENE", "--out", "OUT", "--ablate", "lap,nc"], "not 'nc'; did you mean ncc?"),
     "unknown field": (["tiny", "--data", "SCENE", "--out", "OUT", "--field", "grid5d"], "did you mean grid4d?"),
     "unknown device": (["tiny", "--data", "SCENE", "--out", "OUT", "--device", "GTX 9999"], "'GTX 9999'"),
     "missing folder": (["tiny", "--data", "nowhere", "--out", "OUT"], "nowhere does not exist"),
