@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ..gpu.buffer import Buffer, BufferPool, read_all
+from ..gpu.buffer import Buffer, BufferPool, Request, read_all
 from ..gpu.device import Device
 from ..gpu.kernel import Commands, Kernel
 
@@ -164,7 +164,10 @@ class HashEncoder:
 
     # One call on the device -----------------------------------------------------------------------------------------
 
-    def _uniform(self, part: _Part, points: int, time: float, fixed_scale: float = 1.0, first: int = 0) -> Buffer:
+    def _uniform(
+        self, part: _Part, number: int, points: int, time: float, fixed_scale: float = 1.0, first: int = 0
+    ) -> Buffer:
+        """What the kernels are told of the place of this number; all places of a call are submitted at once."""
         axes = self.grids[part.grid].axes
         content = Kernel.get(self.device, "hashgrid_slice", SLICED=1, CORNERS=4).uniform(
             "Grid",
@@ -178,7 +181,7 @@ class HashEncoder:
             bound=self.bound,
             fixed_scale=fixed_scale,
         )
-        return self.pool.constant(f"grid {part.grid} {part.sliced} {first}", content)
+        return self.pool.constant(f"grid {part.grid} {part.sliced} place {number} from {first}", content)
 
     @staticmethod
     def _defines(part: _Part) -> dict[str, int]:
@@ -186,25 +189,34 @@ class HashEncoder:
 
     def encode(self, places: Sequence[Place], tables: Sequence[Tensor]) -> list[Tensor]:
         """The forward pass without autograd: the encodings of the first place, grid by grid, then of the second, ..."""
+        # Everything is written before anything is submitted: a buffer can only be mapped while the device rests.
         table_buffers = [self._upload(f"table {i}", table) for i, table in enumerate(tables)]
-        requests: list[tuple[Buffer, str, tuple[int, ...], int]] = []
-        for number, (points, time) in enumerate(places):
-            n = len(points)
-            outputs = [
-                self.pool.get(f"encoding {number} {i}", 4 * n * grid.features) for i, grid in enumerate(self.grids)
-            ]
-            requests += [(b, "float32", (n, g.features), 0) for b, g in zip(outputs, self.grids, strict=True)]
-            if n:
-                with Commands(self.device) as commands:
-                    self._encode_place(commands, self._points(number, points), n, time, table_buffers, outputs)
+        point_buffers = [self._points(number, points) for number, (points, _) in enumerate(places)]
+        requests: list[Request] = []
+        with Commands(self.device) as commands:
+            for number, (points, time) in enumerate(places):
+                n = len(points)
+                outputs = [
+                    self.pool.get(f"encoding {number} {i}", 4 * n * grid.features) for i, grid in enumerate(self.grids)
+                ]
+                requests += [(b, "float32", (n, g.features), 0) for b, g in zip(outputs, self.grids, strict=True)]
+                if n:
+                    self._encode_place(commands, number, point_buffers[number], n, time, table_buffers, outputs)
         device = places[0][0].device
         return [torch.from_numpy(array).to(device) for array in read_all(requests)]
 
     def _encode_place(
-        self, commands: Commands, points: Buffer, n: int, time: float, tables: list[Buffer], outputs: list[Buffer]
+        self,
+        commands: Commands,
+        number: int,
+        points: Buffer,
+        n: int,
+        time: float,
+        tables: list[Buffer],
+        outputs: list[Buffer],
     ) -> None:
         for part in self._parts:
-            uniform = self._uniform(part, n, time)
+            uniform = self._uniform(part, number, n, time)
             features = tables[part.grid]
             defines = self._defines(part)
             if part.sliced:
@@ -230,29 +242,26 @@ class HashEncoder:
 
     def backward(self, places: Sequence[Place], d_encodings: Sequence[Tensor]) -> list[Tensor]:
         """The gradients of the tables, from those of the encodings in the order of `encode`."""
+        count = len(self.grids)
         d_tables = [self.pool.get(f"d_table {i}", 8 * len(grid.table)) for i, grid in enumerate(self.grids)]
+        point_buffers = [self._points(number, points) for number, (points, _) in enumerate(places)]
+        d_buffers = [self._upload(f"d_encoding {i // count} {i % count}", d) for i, d in enumerate(d_encodings)]
         with Commands(self.device) as commands:
             for buffer in d_tables:
                 commands.clear(buffer)
-        count = len(self.grids)
-        for number, (points, time) in enumerate(places):
-            if len(points):
-                given = d_encodings[number * count : (number + 1) * count]
-                d_buffers = [self._upload(f"d_encoding {number} {i}", d) for i, d in enumerate(given)]
-                # The largest sum that can occur stays below 2^61 in fixed point.
-                largest = max(float(d.abs().max()) for d in given) if not self._lane_levels else 0.0
-                scale = (
-                    2.0 ** math.floor(61 - math.log2(max(largest, 1e-30) * len(points))) if largest < math.inf else 1.0
-                )
-                with Commands(self.device) as commands:
-                    buffer = self._points(number, points)
-                    self._add_place(commands, buffer, len(points), time, min(scale, 2.0**120), d_buffers, d_tables)
+            for number, (points, time) in enumerate(places):
+                if len(points):
+                    mine = slice(number * count, (number + 1) * count)
+                    scale = 1.0 if self._lane_levels else _fixed_scale(d_encodings[mine], len(points))
+                    buffer, n = point_buffers[number], len(points)
+                    self._add_place(commands, number, buffer, n, time, scale, d_buffers[mine], d_tables)
         arrays = read_all([(b, "float32", tuple(g.table.shape), 0) for b, g in zip(d_tables, self.grids, strict=True)])
         return [torch.from_numpy(array).to(places[0][0].device) for array in arrays]
 
     def _add_place(
         self,
         commands: Commands,
+        number: int,
         points: Buffer,
         n: int,
         time: float,
@@ -262,7 +271,7 @@ class HashEncoder:
     ) -> None:
         for part in self._parts:
             inputs = {
-                "grid": self._uniform(part, n, time, fixed_scale),
+                "grid": self._uniform(part, number, n, time, fixed_scale),
                 "levels": part.levels,
                 "points": points,
                 "d_encoding": d_encodings[part.grid],
@@ -272,7 +281,7 @@ class HashEncoder:
                 target = self.pool.get(f"d_slices {part.grid}", 8 * part.entries)
                 commands.clear(target)
             if self._lane_levels:
-                self._add_lanes(commands, part, n, time, inputs, target)
+                self._add_lanes(commands, part, number, n, time, inputs, target)
             else:
                 self._add_fixed(commands, part, n, inputs, target)
             if part.sliced:
@@ -286,11 +295,11 @@ class HashEncoder:
                 )
 
     def _add_lanes(
-        self, commands: Commands, part: _Part, n: int, time: float, inputs: dict[str, Buffer], out: Buffer
+        self, commands: Commands, part: _Part, number: int, n: int, time: float, inputs: dict[str, Buffer], out: Buffer
     ) -> None:
         kernel = Kernel.get(self.device, "hashgrid_bwd", LANE_LEVELS=1, **self._defines(part))
         for first in range(0, n, _DISPATCH_POINTS):
-            inputs["grid"] = self._uniform(part, n, time, first=first)
+            inputs["grid"] = self._uniform(part, number, n, time, first=first)
             commands.dispatch(kernel, -(-part.count // 8), **inputs, d_features=out)
 
     def _add_fixed(self, commands: Commands, part: _Part, n: int, inputs: dict[str, Buffer], out: Buffer) -> None:
@@ -309,6 +318,14 @@ class HashEncoder:
         buffer = self.pool.get(name, array.nbytes)
         buffer.write(array)
         return buffer
+
+
+def _fixed_scale(gradients: Sequence[Tensor], points: int) -> float:
+    """By which gradients are multiplied in fixed point: the largest sum that can occur stays below 2^61."""
+    largest = max(float(gradient.abs().max()) for gradient in gradients)
+    if largest == math.inf:
+        return 1.0
+    return 2.0 ** min(120, math.floor(61 - math.log2(max(largest, 1e-30) * points)))
 
 
 class _Encode(torch.autograd.Function):

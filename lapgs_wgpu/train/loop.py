@@ -31,6 +31,7 @@ from lapgs_wgpu.train.config import Background, Config, PointsConfig, Smoothness
 from lapgs_wgpu.train.densify import Statistics, densify, reset_opacities
 from lapgs_wgpu.train.evaluate import COLOURS, evaluate, write_metrics
 from lapgs_wgpu.train.log import Log, environment
+from lapgs_wgpu.train.memory import keep_freed_memory
 from lapgs_wgpu.train.optimise import FrequencyOptimiser, Optimiser
 from lapgs_wgpu.train.presets import write_toml
 from lapgs_wgpu.train.render_loss import TruthCache, render_loss
@@ -57,6 +58,7 @@ def train(
     """
     out = Path(out)
     check_run_folder(out, overwrite=overwrite)
+    keep_freed_memory()
     device = device or open_device()
     generator = torch.Generator().manual_seed(config.seed)
     scene = Scene4D.from_points(

@@ -35,7 +35,8 @@ ORDER = (RASTER, ENCODER, LOSSES, TRANSFERS, OPTIMISER, REST)
 def bench_shares(device: Device, repeat: int, gaussians: int = 50_000, size: int = 400) -> dict[str, float]:
     """Milliseconds a step, the median of each part, and under "step" of the whole.
 
-    Kernels by the device's timestamps. Transfers are the host's copies, timed when the device has finished.
+    Kernels by the device's timestamps. Transfers are the host's copies, timed when the device has finished, and the
+    device's own between buffers and textures.
     """
     steps = WARM_UP + repeat
     config = load_config(
@@ -74,14 +75,14 @@ class _Clock:
         self._now, self._start = defaultdict(float), time.perf_counter()
 
     def _collect(self) -> None:
-        """Take in the kernels that were submitted so far; the reading itself is not part of the step."""
+        """Wait for the device and take in its kernels; what it did besides are copies from buffers to textures."""
         start = time.perf_counter()
         kernels = self._profile.read()
         for name, milliseconds in kernels:
             part = ENCODER if name.startswith("hashgrid") else LOSSES if name.startswith("loss_") else RASTER
             self._now[part] += milliseconds
         waited = 1e3 * (time.perf_counter() - start) - sum(milliseconds for _, milliseconds in kernels)
-        self._start += 1e-3 * max(0.0, waited)
+        self._now[TRANSFERS] += max(0.0, waited)
 
     def _timed(self, part: str, function: Callable[..., Any]) -> Callable[..., Any]:
         def run(*arguments: Any, **options: Any) -> Any:
