@@ -16,7 +16,7 @@ from lapgs_wgpu.train.memory import keep_freed_memory
 if sys.argv[1] == "keep":
     keep_freed_memory()
 torch.set_num_threads(1)
-for _ in range(3):
+for _ in range(20):  # aligned blocks fit only once their neighbours are free, too
     torch.full((10_000_000,), 1.0)
 before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
 for _ in range(5):
@@ -26,7 +26,7 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 
 
 def page_faults(how: str) -> int:
-    """Of a process that fills 40 MB five times."""
+    """Of a process that fills 40 MB five times, after it has done so before."""
     command = [sys.executable, "-c", SCRIPT, how]
     return int(subprocess.run(command, check=True, capture_output=True, text=True, timeout=120).stdout)
 
