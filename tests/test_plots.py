@@ -43,7 +43,7 @@ def figures(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
 
 def make_scene(device: Device, kind: str, n: int = 60) -> Scene4D:
     grid = HashConfig(2, (4, 4, 4), (8, 8, 8), 10)
-    config = FieldConfig(kind=kind, static=grid, temporal=grid, width=8)  # type: ignore[arg-type]
+    config = FieldConfig(kind=kind, static=grid, temporal=grid, width=8, components=2)  # type: ignore[arg-type]
     points = np.random.default_rng(0).uniform(-1, 1, (n, 3))
     scene = Scene4D.from_points(points, np.full((n, 3), 0.5), np.full(n, 0.1), config, opacity=0.5, device=device)
     if scene.field is not None:
@@ -84,12 +84,14 @@ def test_a_moving_scene_has_trajectories(device: Device, tmp_path: Path) -> None
 def test_a_spectrum_and_dynamics_are_drawn_where_the_scene_has_them(
     device: Device, tmp_path: Path, figures: dict[str, Any]
 ) -> None:
-    scene = make_scene(device, "grid4d")
-    assert scene.field is not None
-    alpha, beta = torch.tensor([[3.0, 0.0], [0.0, 0.0]]), torch.tensor([[4.0, 5.0], [1.0, 1.0]])
-    motion = SimpleNamespace(frequencies=torch.tensor([1.0, 2.5]), alpha=alpha, beta=beta)
-    object.__setattr__(scene.field, "motion", motion)
-    scene.parameters["dynamics"] = torch.nn.Parameter(torch.ones(len(scene), 16))
+    scene = make_scene(device, "laplacian")
+    motion = scene.spectrum
+    assert motion is not None
+    with torch.no_grad():
+        motion.frequencies.copy_(torch.tensor([1.0, 2.5]))
+        for values, other in ((motion.alpha, (3.0, 0.0)), (motion.beta, (4.0, 1.0))):
+            values.copy_(torch.tensor(other)[:, None].expand(2, 8))
+        scene.parameters["dynamics"].fill_(1.0)
     path = [{**line, "frequencies": [1.0, 2.0 + 0.1 * i], "amplitudes": [i, 2 * i]} for i, line in enumerate(LINES)]
     drawn = plots.plot_run(make_run(tmp_path, path), scene)
     assert {file.name for file in drawn} == {
@@ -99,7 +101,7 @@ def test_a_spectrum_and_dynamics_are_drawn_where_the_scene_has_them(
 
     (stems,) = figures["spectrum.png"].axes[0].containers
     assert list(stems.markerline.get_xdata()) == [1.0, 2.5]
-    assert list(stems.markerline.get_ydata()) == pytest.approx([5.0, 1.0])  # roots of (25 + 25) / 2 and (1 + 1) / 2
+    assert list(stems.markerline.get_ydata()) == pytest.approx([5.0, 1.0])  # roots of 9 + 16 and of 1
     frequencies, amplitudes = figures["spectrum-path.png"].axes
     assert lines_of(frequencies) == [pytest.approx([1.0] * 4), pytest.approx([2.0, 2.1, 2.2, 2.3])]
     assert lines_of(amplitudes) == [[0, 1, 2, 3], [0, 2, 4, 6]]
@@ -186,5 +188,6 @@ def test_evaluation_plots_and_does_without_matplotlib(
     assert not (run / "eval" / "plots").exists()
 
     assert cli.train_command(["--eval", str(run)]) == 0
-    assert {file.name for file in (run / "eval" / "plots").iterdir()} == {"training.png", "trajectories.png"}
+    drawn = {file.name for file in (run / "eval" / "plots").iterdir()}
+    assert drawn == {"training.png", "trajectories.png", "spectrum.png", "dynamics.png"}
     assert capsys.readouterr().err == ""

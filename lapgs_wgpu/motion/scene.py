@@ -25,6 +25,7 @@ from .field import FieldConfig, Nearby, PlaneConfig
 from .grid_field import TEMPORAL_AXES, GridField
 from .hashgrid import HashConfig, make_levels
 from .hexplane_field import HexPlaneField, plane_shapes
+from .laplacian import LaplacianMotion
 from .mlp_field import MlpField
 
 SH_C0 = 0.28209479177387814
@@ -113,6 +114,12 @@ class Scene4D:
 
     def __len__(self) -> int:
         return len(self.parameters["means"])
+
+    @property
+    def spectrum(self) -> LaplacianMotion | None:
+        """The spectrum of the motion, where the field has one."""
+        motion = self.field.motion if isinstance(self.field, GridField) else None
+        return motion if isinstance(motion, LaplacianMotion) else None
 
     def _sh(self) -> Tensor:
         used = (self.sh_degree + 1) ** 2 - 1

@@ -25,7 +25,6 @@ from lapgs_wgpu.gpu.device import Device, open_device
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.motion.dynamics import dynamics_loss
 from lapgs_wgpu.motion.field import Nearby
-from lapgs_wgpu.motion.laplacian import LaplacianMotion
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.config import Background, Config, PointsConfig, SmoothnessConfig
 from lapgs_wgpu.train.densify import Statistics, densify, reset_opacities
@@ -71,7 +70,7 @@ def train(
     optimiser = Optimiser(
         scene.parameters, scene.field.parameter_groups() if scene.field else {}, config.rates.schedules()
     )
-    spectrum = spectrum_of(scene)
+    spectrum = scene.spectrum
     frequencies = FrequencyOptimiser(spectrum, config.rates.frequencies, len(dataset.times) / 2) if spectrum else None
     # Cameras that all stand at one place have no extent; the scene's own size must serve.
     extent = dataset.extent or config.points.box
@@ -133,12 +132,6 @@ def train(
         raise KeyboardInterrupt(f"stopped after step {step} of {schedule.steps}; {out / 'checkpoint.ply'} holds it.")
     evaluate_run(out, scene, dataset, config.data.background, {"steps": step, "seconds": round(seconds, 3)})
     return scene
-
-
-def spectrum_of(scene: Scene4D) -> LaplacianMotion | None:
-    """The scene's spectrum of motion, where its field has one."""
-    motion = getattr(scene.field, "motion", None)
-    return motion if isinstance(motion, LaplacianMotion) else None
 
 
 def draw_nearby(config: SmoothnessConfig, count: int, t: float, generator: torch.Generator) -> Nearby | None:

@@ -9,7 +9,6 @@ import importlib.util
 import json
 import typing
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +45,7 @@ def plot_run(run: Path, scene: Scene4D) -> list[Path]:
     """Draw what a run folder's log.jsonl and its scene have to show into eval/plots/; returns the pictures."""
     folder = run / "eval" / "plots"
     folder.mkdir(parents=True, exist_ok=True)
-    log, learnt = _read_log(run / "log.jsonl"), _learnt(scene)
+    log, motion = _read_log(run / "log.jsonl"), scene.spectrum
     drawn = []
 
     def draw(name: str, function: typing.Callable[..., None], *values: Any) -> None:
@@ -58,36 +57,13 @@ def plot_run(run: Path, scene: Scene4D) -> list[Path]:
     path = [line for line in log if {"frequencies", "amplitudes"} <= line.keys()]
     if len(path) > 1:
         draw("spectrum-path.png", spectrum_path, *_columns(path, "step", "frequencies", "amplitudes"))
-    if learnt.frequencies is not None and len(learnt.frequencies):
-        draw("spectrum.png", spectrum, learnt.frequencies, learnt.amplitudes)
-    if learnt.dynamics is not None and len(learnt.dynamics):
-        draw("dynamics.png", dynamics_histogram, learnt.dynamics)
+    if motion is not None:
+        draw("spectrum.png", spectrum, motion.frequencies.numpy(force=True), motion.amplitudes().numpy(force=True))
+    if "dynamics" in scene.parameters and len(scene):
+        draw("dynamics.png", dynamics_histogram, scene.parameters["dynamics"].numpy(force=True))
     if scene.field is not None and len(scene):
         draw("trajectories.png", trajectories, *sample_trajectories(scene))
     return drawn
-
-
-@dataclass(frozen=True)
-class Learnt:
-    """What a field has learnt beside its weights; None where it has no such thing.
-
-    frequencies, amplitudes: (K,). dynamics: (N, D), the vector d_i of each Gaussian.
-    """
-
-    frequencies: Floats | None
-    amplitudes: Floats | None
-    dynamics: Floats | None
-
-
-def _learnt(scene: Scene4D) -> Learnt:
-    """The one place that knows where fields keep these."""
-    frequencies = amplitudes = None
-    motion: Any = getattr(scene.field, "motion", None)
-    if all(isinstance(getattr(motion, name, None), torch.Tensor) for name in ("frequencies", "alpha", "beta")):
-        frequencies = motion.frequencies.numpy(force=True)
-        amplitudes = (motion.alpha.square() + motion.beta.square()).mean(1).sqrt().numpy(force=True)
-    dynamics = scene.parameters["dynamics"].numpy(force=True) if "dynamics" in scene.parameters else None
-    return Learnt(frequencies, amplitudes, dynamics)
 
 
 def _read_log(path: Path) -> list[dict[str, Any]]:
