@@ -19,7 +19,7 @@ from lapgs_wgpu.gpu.buffer import Buffer
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands
 from lapgs_wgpu.gpu.profile import Profile
-from lapgs_wgpu.motion import hashgrid
+from lapgs_wgpu.motion import hash_encoder
 from lapgs_wgpu.splat import objective
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.loop import train
@@ -113,7 +113,10 @@ class _Clock:
             mock.patch.object(Buffer, "write", self._timed(TRANSFERS, Buffer.write)),
             mock.patch.object(Optimiser, "step", self._timed(OPTIMISER, Optimiser.step)),
             mock.patch.object(FrequencyOptimiser, "step", self._timed(OPTIMISER, FrequencyOptimiser.step)),
-            *(mock.patch.object(module, "read_all", read_when_done) for module in (buffer_module, hashgrid, objective)),
+            *(
+                mock.patch.object(module, "read_all", read_when_done)
+                for module in (buffer_module, hash_encoder, objective)
+            ),
         ]
         for patch in patches:
             patch.start()
