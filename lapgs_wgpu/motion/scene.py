@@ -193,10 +193,8 @@ class Scene4D:
         write_checkpoint(path, arrays, tensors, {**self.metadata, **(metadata or {}), **header})
 
 
-def draw(
-    gaussians: Gaussians, camera: Camera, background: Tensor | None, device: Device, *, depth: bool = True
-) -> Rendering:
-    """Rasterise activated Gaussians; differentiable. depth: whether to draw it, too."""
+def draw(gaussians: Gaussians, camera: Camera, background: Tensor | None, device: Device) -> Rendering:
+    """Rasterise activated Gaussians; differentiable."""
     return rasterize(
         gaussians.means,
         gaussians.quats,
@@ -206,7 +204,6 @@ def draw(
         camera,
         sh_degree=gaussians.sh_degree,
         background=background,
-        depth=depth,
         device=device,
     )
 
