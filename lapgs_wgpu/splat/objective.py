@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -65,14 +66,18 @@ def judge_image(
     return Judged(loss, task.terms, radii, probe)
 
 
+@dataclass
 class _Task:
     """What `_Judge` needs besides tensors, and the terms that it leaves."""
 
-    def __init__(self, *arguments: Any) -> None:
-        (self.rasterizer, self.sh_degree, self.camera, self.background, self.judge, self.loss_of, self.wanted) = (
-            arguments
-        )
-        self.terms: NDArray[np.float32] = np.zeros(0, np.float32)
+    rasterizer: Rasterizer
+    sh_degree: int
+    camera: Camera
+    background: tuple[float, float, float]
+    judge: Judge
+    loss_of: Callable[[NDArray[np.float32]], float]
+    wanted: bool  # whether gradients are
+    terms: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
 
     def run(self, tensors: list[Tensor]) -> tuple[NDArray[np.float32], list[NDArray[np.float32]]]:
         """Projected splats (N, 12), and the gradients of the tensors and of means2d; none where none is wanted."""
