@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 from lapgs_wgpu.motion.dynamics import DynamicsMode
 from lapgs_wgpu.motion.field import FieldConfig
+from lapgs_wgpu.motion.hashgrid import option
 from lapgs_wgpu.train.losses import LossWeights
 
 Background = Literal["black", "white", "random"]
@@ -22,7 +23,7 @@ Split = Literal["plain", "adaptive"]
 
 def described(text: str, default: Any = dataclasses.MISSING) -> Any:
     """A key of the configuration with its help text; one without a default must stand in every preset."""
-    return dataclasses.field(default=default, metadata={"help": text})
+    return option(default, text)
 
 
 @dataclass(frozen=True)
