@@ -185,10 +185,7 @@ def reflect(source: str) -> dict[str, Binding]:
 
 def pack(source: str, struct_name: str, values: Mapping[str, object]) -> bytes:
     """The bytes of a WGSL struct, each member taken from `values` by name (matrices column by column)."""
-    body = re.search(rf"struct\s+{struct_name}\s*{{(.*?)}}", source, re.S)
-    if body is None:
-        raise ShaderError(f"no struct {struct_name} in the shader")
-    members = _MEMBER.findall(re.sub(r"//[^\n]*", "", body[1]))
+    members = _members(source, struct_name)
     if {name for name, _ in members} != set(values):
         difference = {name for name, _ in members} ^ set(values)
         raise ShaderError(f"struct {struct_name}: members that only one side has: {sorted(difference)}")
@@ -203,3 +200,12 @@ def pack(source: str, struct_name: str, values: Mapping[str, object]) -> bytes:
         out += struct.pack("<" + code, *numbers)
     out += bytes(-len(out) % max(16, largest))  # uniform buffers come in units of 16 bytes
     return bytes(out)
+
+
+@functools.cache
+def _members(source: str, struct_name: str) -> tuple[tuple[str, str], ...]:
+    """Name and type of each member of a struct; a training step asks for the same ones again and again."""
+    body = re.search(rf"struct\s+{struct_name}\s*{{(.*?)}}", source, re.S)
+    if body is None:
+        raise ShaderError(f"no struct {struct_name} in the shader")
+    return tuple(_MEMBER.findall(re.sub(r"//[^\n]*", "", body[1])))
