@@ -46,7 +46,12 @@ class GridField(nn.Module):
         self.motion: LaplacianMotion | TimeMotion | None = None
         if ours and config.motion == "laplacian":
             self.motion = LaplacianMotion(
-                static, width, config.components, generator, frequency_step=config.frequency_step
+                static,
+                width,
+                config.components,
+                generator,
+                frequency_step=config.frequency_step,
+                amplitude=config.amplitude,
             )
         elif ours:
             self.motion = TimeMotion(static, width, generator)

@@ -10,7 +10,6 @@ from torch import Tensor, nn
 
 from .layers import linear
 
-START = 0.1  # standard deviation of a channel of L(t) before the training
 VARIANCE_FLOOR = 1e-4
 VARIANCE_SPREAD = (
     10.0  # a component's variance counts as at most this times the geometric mean of all, and at least 1/this
@@ -38,18 +37,25 @@ class LaplacianMotion(nn.Module):
     """A_L(t) = L(t) * M(H_s), with L(t) = sum over k of alpha_k cos(2 pi f_k t) + beta_k sin(2 pi f_k t).
 
     alpha, beta: (K, W), shared by all Gaussians; frequencies: (K,), cycles over the clip, at first 0, 1, ... K - 1
-    times frequency_step.
+    times frequency_step. At first the standard deviation of a channel of L(t) is `amplitude`.
     M: two layers from the static features H_s, by which each Gaussian picks its part of the motion.
     """
 
     def __init__(
-        self, inputs: int, width: int, components: int, generator: torch.Generator, *, frequency_step: float = 1.0
+        self,
+        inputs: int,
+        width: int,
+        components: int,
+        generator: torch.Generator,
+        *,
+        frequency_step: float = 1.0,
+        amplitude: float = 0.1,
     ) -> None:
         super().__init__()
         # Faint, and fainter at higher frequencies, as smooth motions are: so that the heads do not learn to explain
         # single pictures by a flicker. Not zero: with both factors at zero the product would have no gradient.
         fall = 1.0 / torch.arange(components).clamp(min=1)[:, None]
-        size = START * fall / fall.square().sum().sqrt()
+        size = amplitude * fall / fall.square().sum().sqrt()
         self.alpha = nn.Parameter(torch.randn(components, width, generator=generator) * size)
         self.beta = nn.Parameter(torch.randn(components, width, generator=generator) * size)
         self.frequencies = nn.Parameter(frequency_step * torch.arange(components, dtype=torch.float32))
