@@ -66,7 +66,7 @@ class FieldConfig:
     frequency_step: float = option(
         1.0, "from one frequency to the next at the start, which is at 0; cycles over the clip"
     )
-    amplitude: float = option(0.1, "standard deviation of the spectrum's sum at the start; 0.03 to 1 are reasonable")
+    amplitude: float = option(0.3, "standard deviation of the spectrum's sum at the start; 0.03 to 1 are reasonable")
     dynamics: int = option(16, "length of each Gaussian's dynamics attribute with the field laplacian; 0 for none")
     appearance: Appearance = option(
         "color", "what the field laplacian changes besides the geometry: none, color, or color+opacity"

@@ -49,7 +49,7 @@ class LaplacianMotion(nn.Module):
         generator: torch.Generator,
         *,
         frequency_step: float = 1.0,
-        amplitude: float = 0.1,
+        amplitude: float = 0.3,
     ) -> None:
         super().__init__()
         # Faint, and fainter at higher frequencies, as smooth motions are: so that the heads do not learn to explain
