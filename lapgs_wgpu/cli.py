@@ -39,15 +39,16 @@ and eval/ with pictures: ground truth | rendering | 4 x error."""
 
 def train_command(arguments: Sequence[str] | None = None) -> int:
     """lapgs-train: returns the exit code."""
-    return _guarded("lapgs-train", _train, list(sys.argv[1:] if arguments is None else arguments))
+    return guarded("lapgs-train", _train, list(sys.argv[1:] if arguments is None else arguments))
 
 
 def table_command(arguments: Sequence[str] | None = None) -> int:
     """lapgs-table: returns the exit code, 1 where runs failed."""
-    return _guarded("lapgs-table", _table, list(sys.argv[1:] if arguments is None else arguments))
+    return guarded("lapgs-table", _table, list(sys.argv[1:] if arguments is None else arguments))
 
 
-def _guarded(name: str, command: Callable[[list[str]], int | None], arguments: list[str]) -> int:
+def guarded(name: str, command: Callable[[list[str]], int | None], arguments: list[str]) -> int:
+    """Run a command; what its user should know goes to stderr in one sentence. Returns the exit code."""
     try:
         code = command(arguments)
     except NoAdapterError as error:
@@ -65,10 +66,15 @@ def _guarded(name: str, command: Callable[[list[str]], int | None], arguments: l
     return code or 0
 
 
+def print_devices() -> None:
+    """The adapters, the default one first."""
+    for info in list_devices():
+        print(f"{info.name}  ({info.kind}, {info.backend}, {info.driver})")
+
+
 def _train(arguments: list[str]) -> None:
     if "--list-devices" in arguments:
-        for info in list_devices():
-            print(f"{info.name}  ({info.kind}, {info.backend}, {info.driver})")
+        print_devices()
         return
     from lapgs_wgpu.gpu.device import open_device  # what follows needs torch, which takes seconds to import
     from lapgs_wgpu.train.loop import check_run_folder, train

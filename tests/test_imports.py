@@ -20,8 +20,9 @@ ALLOWED = {
     "splat": {"errors", "gpu"},
     "motion": {"errors", "gpu", "splat", "io"},
     "data": {"errors", "splat.camera"},
-    "io": {"errors"},
+    "io": {"errors", "splat.camera"},
     "train": {"errors", "gpu", "splat", "motion", "data", "io"},
+    "viewer": {"errors", "gpu", "splat", "motion", "data", "io", "viewer"},
     "cli": {"errors", "gpu", "splat", "motion", "data", "io", "train"},
 }
 FILES = sorted(file.relative_to(PACKAGE) for file in PACKAGE.rglob("*.py"))

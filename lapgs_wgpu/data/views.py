@@ -62,6 +62,25 @@ class Dataset:
         return 1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
 
     @cached_property
+    def up(self) -> NDArray[np.float64]:
+        """(3,) of unit length: what is up in the pictures, on average over the training cameras."""
+        mean = -np.mean([view.camera.T_cam_world[1, :3] for view in self.train], axis=0)
+        length = np.linalg.norm(mean)
+        return mean / length if length > 1e-3 else -self.train[0].camera.T_cam_world[1, :3]
+
+    @cached_property
+    def focus(self) -> NDArray[np.float64]:
+        """(3,) the point nearest to the lines of sight of all training cameras; where these are parallel, and say
+        little, one extent in front of the cameras."""
+        centres = np.stack([view.camera.position for view in self.train])
+        ahead = np.stack([view.camera.T_cam_world[2, :3] for view in self.train])
+        across = np.eye(3) - ahead[:, :, None] * ahead[:, None, :]
+        faint = 1e-3 * len(centres) * np.eye(3)
+        guess = centres.mean(axis=0) + (self.extent or 1.0) * ahead.mean(axis=0)
+        right_side = np.einsum("nij,nj->i", across, centres) + faint @ guess
+        return np.linalg.solve(across.sum(axis=0) + faint, right_side)
+
+    @cached_property
     def times(self) -> NDArray[np.float64]:
         """(T,) the distinct training times, ascending."""
         return np.unique([view.time for view in self.train])

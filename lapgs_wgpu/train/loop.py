@@ -23,6 +23,7 @@ from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.buffer import Buffer
 from lapgs_wgpu.gpu.device import Device, open_device
 from lapgs_wgpu.io.atomic import atomic_write
+from lapgs_wgpu.io.first_look import FirstLook
 from lapgs_wgpu.motion.dynamics import dynamics_loss
 from lapgs_wgpu.motion.field import Nearby
 from lapgs_wgpu.motion.scene import Scene4D
@@ -127,7 +128,14 @@ def train(
                 break
         seconds = log.seconds
 
-    scene.save(out / "checkpoint.ply", {"scene": dataset.name, "background": config.data.background, "step": str(step)})
+    first = (dataset.test or dataset.train)[0].camera
+    metadata = {
+        "scene": dataset.name,
+        "background": config.data.background,
+        "step": str(step),
+        "view": FirstLook(first, dataset.focus, dataset.up, len(dataset.times)).to_json(),
+    }
+    scene.save(out / "checkpoint.ply", metadata)
     if interrupted.is_set():
         raise KeyboardInterrupt(f"stopped after step {step} of {schedule.steps}; {out / 'checkpoint.ply'} holds it.")
     evaluate_run(out, scene, dataset, config.data.background, {"steps": step, "seconds": round(seconds, 3)})

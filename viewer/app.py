@@ -1,0 +1,364 @@
+"""The interactive viewer: a canvas, what is shown on it, and what mouse and keys do. Draws only when something changed."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import deque
+from pathlib import Path
+from typing import Any, Literal
+
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.splat.camera import Camera
+
+from .capture import Capture, open_capture
+from .clock import LOOPS, SPEEDS
+from .frame import Frame, Mode, Painter, Request
+from .keys import FLY, KEYS
+from .opened import BACKGROUNDS, Opened, open_scene
+from .present import Placed, Presenter
+
+Compare = Literal["off", "side", "split", "error"]
+COMPARES: tuple[Compare, ...] = ("off", "side", "split", "error")
+MARGIN = (0.11, 0.11, 0.12)  # what surrounds a picture that does not fill the window
+_ACTIONS = {key.key: key.action for key in KEYS}
+_TARGET_SECONDS = 1 / 12  # a frame may take while something moves; beyond it the resolution falls
+_SETTLED = 0.2  # seconds without a change after which the full resolution is drawn
+_SMALLEST = 0.25  # share of the window's width and height
+_ERROR_GAIN = 4.0
+_ORBIT = 0.008  # radians a pixel of dragging
+_FLY = 0.6  # of the distance to the focus a second
+_GUI_DRAWS = 3  # after an event, until the panels have found their sizes and colours
+_GRIP = 8  # pixels from the split at which it can be dragged
+
+
+class App:
+    """What the window shows. The panels (viewer/panels) read and set its attributes, keys call its methods.
+
+    scale: of the frame on show against the window, 1 at full resolution. message: for the user, None or one sentence.
+    """
+
+    def __init__(self, canvas: Any, loop: Any, opened: Opened, *, transport: bool | None = None) -> None:
+        self.canvas, self.loop = canvas, loop
+        self.device: Device = opened.playback.device
+        context = canvas.get_wgpu_context()
+        wanted = context.get_preferred_format(self.device.wgpu_device.adapter)
+        self.format = wanted.removesuffix("-srgb")  # colours are stored as they are seen
+        context.configure(device=self.device.wgpu_device, format=self.format)
+        self._context = context
+        self._presenter = Presenter(self.device, self.format)
+        self._gui: Any = None  # made after the first picture: its import takes a third of a second
+        self._gui_draws = _GUI_DRAWS
+
+        self.mode: Mode = "rgb"
+        self.compare: Compare = "off"
+        self.split = 0.5
+        self.show_panels = self.show_overlay = True
+        self.show_help = False
+        self.flying = False
+        self.profiling = False
+        self.message: str | None = None
+        self.frame: Frame | None = None
+        self.scale = 1.0
+        self._moving_scale = 1.0
+        self._drawn_key: Any = None
+        self._changed_at = self._drawn_at = time.perf_counter()
+        self._times: deque[float] = deque(maxlen=30)
+        self._pointer = (0.0, 0.0)
+        self._dragging: str | None = None
+        self._held: set[str] = set()
+        self._transport = transport
+        self._show(opened)
+
+        canvas.add_event_handler(self._on_pointer_down, "pointer_down")
+        canvas.add_event_handler(self._on_pointer_move, "pointer_move")
+        canvas.add_event_handler(self._on_pointer_up, "pointer_up")
+        canvas.add_event_handler(self._on_double_click, "double_click")
+        canvas.add_event_handler(self._on_wheel, "wheel")
+        canvas.add_event_handler(self._on_key_down, "key_down")
+        canvas.add_event_handler(self._on_key_up, "key_up")
+        # Panels react to everything, so everything asks for a draw; what has not changed is only presented again.
+        everything = ("pointer_down", "pointer_move", "pointer_up", "wheel", "key_down", "key_up", "char", "resize")
+        canvas.add_event_handler(self._on_any_event, *everything, order=-100)
+        canvas.request_draw(self._draw)
+
+    def open(self, path: Path) -> None:
+        """Show another file; where it cannot be read, say why and keep the present one."""
+        try:
+            self._show(open_scene(path, self.device))
+        except InputError as error:
+            self.message = str(error)
+        self.canvas.request_draw()
+
+    def _show(self, opened: Opened) -> None:
+        self.opened = opened
+        self.painter = Painter(opened.playback)
+        self.camera, self.clock = opened.camera(), opened.clock()
+        self.background = opened.background
+        self.show_transport = opened.playback.moves if self._transport is None else self._transport
+        self.capture: Capture | None = open_capture(opened.path) if opened.path else None
+        self.view: int | None = None
+        if self.mode not in self.painter.modes():
+            self.mode = "rgb"
+        self.message = None if opened.playback.moves else "no motion data in this file"
+        self._drawn_key = None
+
+    # Drawing ---------------------------------------------------------------------------------------------------------
+
+    def _draw(self) -> None:
+        now = time.perf_counter()
+        passed = min(now - self._drawn_at, 0.5)
+        self._drawn_at = now
+        self.clock.advance(passed)
+        self._fly(passed)
+        self._paint(now)
+        self._present()
+        if self._gui is None:
+            from .panels import Panels
+
+            self._gui = Panels(self)
+        else:
+            self._gui.render()
+            self._gui_draws -= 1
+        if self.clock.playing or self._held or self._gui_draws > 0:
+            self.canvas.request_draw()
+        elif self.scale < 1:
+            self.loop.call_later(_SETTLED, self.canvas.request_draw)
+
+    def _paint(self, now: float) -> None:
+        """Draw the scene where something changed: at a lower resolution while it changes, in full once it rests."""
+        width, height = self._picture_size()
+        whole = self.camera.camera(width, height)
+        key = (_key(whole), self.clock.time, self.mode, self.background, self.profiling, id(self.painter))
+        changed = key != self._drawn_key
+        if changed:
+            self._changed_at = now
+        elif self.scale == 1 or now - self._changed_at < _SETTLED:
+            return
+        first = self._drawn_key is None
+        self.scale = self._moving_scale if changed and not first else 1.0
+        camera = whole
+        if self.scale < 1:
+            camera = whole.resized(max(1, round(self.scale * whole.width)), max(1, round(self.scale * whole.height)))
+        request = Request(camera, self.clock.time, self.mode, self.background)
+        self.frame = self.painter.draw(request, profile=self.profiling)
+        self._drawn_key = key
+        self._times.append(time.perf_counter())
+        if not first:
+            ideal = self.scale * math.sqrt(_TARGET_SECONDS / max(self.frame.seconds, 1e-4))
+            ideal = 0.5 * (self._moving_scale + ideal)
+            self._moving_scale = min(max(math.floor(16 * ideal) / 16, _SMALLEST), 1.0)
+
+    def _picture_size(self) -> tuple[int, int]:
+        width, height = self.canvas.get_physical_size()
+        return (max(1, width // 2) if self._comparing() == "side" else max(1, width)), max(1, height)
+
+    def _present(self) -> None:
+        assert self.frame is not None
+        target = self._context.get_current_texture()
+        width, height = target.size[:2]
+        self._presenter(target.create_view(), self._placed(width, height), MARGIN)
+
+    def _placed(self, width: int, height: int) -> list[Placed]:
+        """The frame on a window of this size, with the ground truth where the two are compared."""
+        assert self.frame is not None
+        compare = self._comparing()
+        picture = self.frame.placed
+        columns = width // 2 if compare == "side" else width
+        if compare != "off" and self.capture is not None and self.view is not None:
+            picture = picture._replace(**self.capture.truth(self.view, self.background, self.device))
+        if compare == "side":
+            right = _fit(picture._replace(truth_until=0.0), columns, height, columns)
+            return [_fit(picture._replace(truth_until=1.0), columns, height, 0), right]
+        changes = {"split": {"truth_until": self.split}, "error": {"error_gain": _ERROR_GAIN}}.get(compare, {})
+        return [_fit(picture._replace(**changes), columns, height, 0)]
+
+    def _comparing(self) -> Compare:
+        """How the capture's picture is shown beside ours: not at all where there is none of this camera and time."""
+        if self.capture is None or self.view is None or self.camera.exact is None or self.mode != "rgb":
+            return "off"
+        return self.compare if abs(self.clock.time - self.capture.views[self.view].time) < 1e-6 else "off"
+
+    @property
+    def fps(self) -> float:
+        """Frames of the scene drawn in the last second."""
+        recent = [moment for moment in self._times if moment > time.perf_counter() - 1.0]
+        return len(recent) - 1.0 if len(recent) > 1 else 0.0
+
+    # What the keys do (viewer/keys) ----------------------------------------------------------------------------------
+
+    def toggle_playing(self) -> None:
+        if self.opened.playback.moves:
+            self.clock.toggle()
+
+    def previous_frame(self) -> None:
+        self.clock.step(-1)
+
+    def next_frame(self) -> None:
+        self.clock.step(1)
+
+    def first_frame(self) -> None:
+        self.clock.seek(0.0)
+
+    def last_frame(self) -> None:
+        self.clock.seek(1.0)
+
+    def slower(self) -> None:
+        self.clock.speed = max((s for s in SPEEDS if s < self.clock.speed), default=SPEEDS[0])
+
+    def faster(self) -> None:
+        self.clock.speed = min((s for s in SPEEDS if s > self.clock.speed), default=SPEEDS[-1])
+
+    def next_loop(self) -> None:
+        self.clock.loop = _next(LOOPS, self.clock.loop)
+
+    def next_mode(self) -> None:
+        self.mode = _next(self.painter.modes(), self.mode)
+
+    def next_background(self) -> None:
+        self.background = _next(list(BACKGROUNDS.values()), self.background)
+
+    def reset_camera(self) -> None:
+        self.camera.reset()
+
+    def toggle_flying(self) -> None:
+        self.flying = not self.flying
+        self._held.clear()
+
+    def next_view(self) -> None:
+        if self.capture is not None:
+            self.stand_at((self.view + 1 if self.view is not None else 0) % len(self.capture.views))
+
+    def next_compare(self) -> None:
+        if self.capture is None:
+            self.message = "nothing to compare with: the run folder beside this file names no capture that is here"
+            return
+        if self.view is None or self.camera.exact is None:
+            self.stand_at(self.view or 0)
+        self.compare = _next(COMPARES, self.compare)
+
+    def toggle_overlay(self) -> None:
+        self.show_overlay = not self.show_overlay
+
+    def toggle_transport(self) -> None:
+        self.show_transport = not self.show_transport
+
+    def toggle_panels(self) -> None:
+        self.show_panels = not self.show_panels
+
+    def toggle_help(self) -> None:
+        self.show_help = not self.show_help
+
+    def stand_at(self, view: int) -> None:
+        """Go to a camera of the capture, and to its time."""
+        assert self.capture is not None
+        self.view = view
+        self.camera.snap(self.capture.views[view].camera)
+        self.clock.playing = False
+        self.clock.seek(self.capture.views[view].time)
+
+    def focus(self) -> None:
+        """Turn about what lies under the pointer."""
+        if self.frame is None:
+            return
+        width, height = self.canvas.get_physical_size()
+        placed = self._placed(width, height)[-1]
+        ratio = self.canvas.get_pixel_ratio()
+        share = [(p * ratio - o) / s for p, o, s in zip(self._pointer, placed.origin, placed.size, strict=True)]
+        if not all(0 <= s < 1 for s in share):
+            return
+        camera = self.frame.request.camera
+        column, row = int(share[0] * camera.width), int(share[1] * camera.height)
+        depth = self.painter.depth_at(self.frame, column, row)
+        self._drawn_key = None  # the frame's buffers hold the depth now
+        if depth is not None:
+            K, T = camera.K, camera.T_cam_world
+            ray = [(column + 0.5 - K[0, 2]) / K[0, 0], (row + 0.5 - K[1, 2]) / K[1, 1], 1.0]
+            self.camera.focus_on(camera.position + depth * (T[:3, :3].T @ ray))
+
+    # Mouse and keys --------------------------------------------------------------------------------------------------
+
+    def _on_any_event(self, event: dict[str, Any]) -> None:
+        self._gui_draws = _GUI_DRAWS
+        self.canvas.request_draw()
+
+    def _on_key_down(self, event: dict[str, Any]) -> None:
+        key = event["key"]
+        if self.flying and key.lower() in FLY:
+            self._held.add(key.lower())
+        elif key in ("Shift", "Alt") and self.flying:
+            self._held.add(key)
+        elif "Control" not in event["modifiers"]:
+            action = _ACTIONS.get(key) or _ACTIONS.get(key.lower())
+            if action:
+                getattr(self, action)()
+
+    def _on_key_up(self, event: dict[str, Any]) -> None:
+        key = event["key"]
+        self._held.discard(key if key in ("Shift", "Alt") else key.lower())
+
+    def _fly(self, seconds: float) -> None:
+        moves = [FLY[key] for key in self._held if key in FLY]
+        if moves:
+            fast = 4.0 if "Shift" in self._held else 0.25 if "Alt" in self._held else 1.0
+            reach = seconds * _FLY * fast * self.camera.distance
+            right, down, forward = (reach * sum(axis) for axis in zip(*moves, strict=True))
+            self.camera.fly(right, down, forward)
+
+    def _on_pointer_down(self, event: dict[str, Any]) -> None:
+        self._pointer = (event["x"], event["y"])
+        sideways = event["button"] != 1 or "Shift" in event["modifiers"]
+        self._dragging = "pan" if sideways else "look" if self.flying else "orbit"
+        if self._comparing() == "split" and self.frame is not None:
+            placed = self._placed(*self.canvas.get_physical_size())[0]
+            divider = placed.origin[0] + self.split * placed.size[0]
+            if abs(event["x"] * self.canvas.get_pixel_ratio() - divider) < _GRIP:
+                self._dragging = "split"
+
+    def _on_pointer_move(self, event: dict[str, Any]) -> None:
+        x, y = event["x"], event["y"]
+        right, down = x - self._pointer[0], y - self._pointer[1]
+        self._pointer = (x, y)
+        if self._dragging == "orbit":
+            self.camera.orbit(_ORBIT * right, _ORBIT * down)
+        elif self._dragging == "look":
+            self.camera.look(0.4 * _ORBIT * right, 0.4 * _ORBIT * down)
+        elif self._dragging == "pan":
+            height = self.canvas.get_logical_size()[1]
+            self.camera.pan(right / height, down / height)
+        elif self._dragging == "split":
+            placed = self._placed(*self.canvas.get_physical_size())[0]
+            share = (x * self.canvas.get_pixel_ratio() - placed.origin[0]) / placed.size[0]
+            self.split = min(max(share, 0.0), 1.0)
+
+    def _on_pointer_up(self, event: dict[str, Any]) -> None:
+        self._dragging = None
+
+    def _on_double_click(self, event: dict[str, Any]) -> None:
+        self._pointer = (event["x"], event["y"])
+        self.focus()
+        self.canvas.request_draw()
+
+    def _on_wheel(self, event: dict[str, Any]) -> None:
+        self.camera.zoom(math.exp(0.0015 * event["dy"]))
+
+
+def _next(choices: Any, present: Any) -> Any:
+    return choices[(choices.index(present) + 1) % len(choices)] if present in choices else choices[0]
+
+
+def _key(camera: Camera) -> tuple[bytes, bytes, int, int]:
+    return camera.K.tobytes(), camera.T_cam_world.tobytes(), camera.width, camera.height
+
+
+def _fit(picture: Placed, width: int, height: int, left: int) -> Placed:
+    """The picture as large as fits between columns left and left + width, in the middle."""
+    columns, rows = picture.picture
+    scale = min(width / columns, height / rows)
+    # A picture drawn for this window at a lower resolution fills it again, whatever rounding did to its size.
+    size = tuple(
+        most if abs(scale * n - most) <= max(1.0, scale) else max(1, round(scale * n))
+        for n, most in ((columns, width), (rows, height))
+    )
+    return picture._replace(origin=(left + (width - size[0]) // 2, (height - size[1]) // 2), size=size)

@@ -1,0 +1,132 @@
+"""The camera that the mouse and the keys move, and how it becomes the rasteriser's."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lapgs_wgpu.splat.camera import Camera
+
+Vector = NDArray[np.float64]
+_STEEPEST = math.radians(89)  # of the line of sight, up or down: beyond it the picture would turn over
+
+
+class ViewCamera:
+    """A camera that turns about a focus. World frame and units are the scene's; camera axes are OpenCV's.
+
+    position (3,), focus (3,), up (3,) of unit length; fov_y: vertical field of view in radians.
+    exact: the camera of a data set at which this one stands, with its own centre and aspect, until it is moved.
+    """
+
+    def __init__(self, position: ArrayLike, focus: ArrayLike, up: ArrayLike, fov_y: float) -> None:
+        self.position: Vector = np.asarray(position, np.float64)
+        self.focus: Vector = np.asarray(focus, np.float64)
+        self.up: Vector = _unit(np.asarray(up, np.float64))
+        self.fov_y = fov_y
+        self.rotation = self._level(self.focus - self.position)
+        self.exact: Camera | None = None
+        self._start = (self.position, self.focus, self.rotation, self.fov_y, self.exact)
+
+    @staticmethod
+    def of(camera: Camera, focus: ArrayLike, up: ArrayLike) -> ViewCamera:
+        """A camera that starts where another one stands; the focus is moved onto its line of sight."""
+        made = ViewCamera(camera.position, focus, up, 2 * math.atan(0.5 * camera.height / camera.K[1, 1]))
+        made.snap(camera)
+        made.exact = None  # so that the picture fills the window, whatever its aspect
+        made._start = (made.position, made.focus, made.rotation, made.fov_y, made.exact)
+        return made
+
+    @property
+    def distance(self) -> float:
+        """From the position to the focus, world units."""
+        return float(np.linalg.norm(self.focus - self.position))
+
+    def snap(self, camera: Camera) -> None:
+        """Stand exactly where `camera` stands."""
+        distance = max(float((self.focus - camera.position) @ camera.T_cam_world[2, :3]), 1e-3 * self.distance, 1e-6)
+        self.rotation = camera.T_cam_world[:3, :3].copy()
+        self.position = camera.position
+        self.focus = self.position + distance * self.rotation[2]
+        self.fov_y = 2 * math.atan(0.5 * camera.height / camera.K[1, 1])
+        self.exact = camera
+
+    def reset(self) -> None:
+        """Back to where it started."""
+        self.position, self.focus, self.rotation, self.fov_y, self.exact = self._start
+
+    def orbit(self, right: float, down: float) -> None:
+        """Turn about the focus, as if the scene were dragged; radians."""
+        distance = self.distance
+        self._turn(right, down)
+        self.position = self.focus - distance * self.rotation[2]
+
+    def look(self, right: float, down: float) -> None:
+        """Turn about the camera itself; radians."""
+        distance = self.distance
+        self._turn(-right, -down)
+        self.focus = self.position + distance * self.rotation[2]
+
+    def pan(self, right: float, down: float) -> None:
+        """Drag the scene, by these parts of the picture's height at the focus."""
+        reach = 2 * self.distance * math.tan(0.5 * self.fov_y)
+        self._shift(-reach * (right * self.rotation[0] + down * self.rotation[1]))
+
+    def zoom(self, factor: float) -> None:
+        """Multiply the distance to the focus."""
+        self.position = self.focus + factor * (self.position - self.focus)
+        self.exact = None
+
+    def fly(self, right: float, down: float, forward: float) -> None:
+        """Move by these lengths, world units, along the camera's axes."""
+        self._shift(np.array([right, down, forward]) @ self.rotation)
+
+    def focus_on(self, point: ArrayLike) -> None:
+        """Turn about another point from now on, which moves to the middle of the picture."""
+        self.focus = np.asarray(point, np.float64)
+        self.rotation = self._level(self.focus - self.position)
+        self.exact = None
+
+    def camera(self, width: int, height: int) -> Camera:
+        """The rasteriser's camera for a picture of this size; at an exact camera it keeps that one's aspect, and is
+        as large as fits."""
+        if self.exact is not None:
+            scale = min(width / self.exact.width, height / self.exact.height)
+            return self.exact.resized(max(1, round(scale * self.exact.width)), max(1, round(scale * self.exact.height)))
+        f = 0.5 * height / math.tan(0.5 * self.fov_y)
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = self.rotation, -self.rotation @ self.position
+        return Camera(np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]]), T, width, height)
+
+    def _shift(self, by: Vector) -> None:
+        self.position, self.focus, self.exact = self.position + by, self.focus + by, None
+
+    def _turn(self, right: float, down: float) -> None:
+        """Turn the line of sight: about `up` so that the scene goes to the right, and about the horizontal axis."""
+        forward = _about(self.up, -right) @ self.rotation[2]
+        pitch = math.asin(float(np.clip(forward @ self.up, -1, 1)))
+        new = float(np.clip(pitch - down, -_STEEPEST, _STEEPEST))
+        level = self._level(forward)
+        self.rotation = level @ _about(level[0], pitch - new)
+        self.exact = None
+
+    def _level(self, forward: Vector) -> NDArray[np.float64]:
+        """(3, 3) rotation from world to camera of a line of sight, the horizon level."""
+        forward = _unit(forward) if np.linalg.norm(forward) > 0 else np.array([0.0, 0.0, 1.0])
+        right = np.cross(forward, self.up)
+        if np.linalg.norm(right) < 1e-6:  # straight up or down: any direction is to the right
+            right = np.cross(forward, np.roll(self.up, 1))
+        right = _unit(right)
+        return np.stack([right, np.cross(forward, right), forward])
+
+
+def _unit(v: Vector) -> Vector:
+    return v / np.linalg.norm(v)
+
+
+def _about(axis: Vector, angle: float) -> NDArray[np.float64]:
+    """(3, 3) rotation by an angle about a unit axis, right-handed (Rodrigues)."""
+    x, y, z = axis
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross

@@ -1,0 +1,51 @@
+"""The capture that a run was trained on: its cameras to stand at, and its pictures to compare with."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lapgs_wgpu.data import View, composite, load_dataset
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.gpu.buffer import BufferPool
+from lapgs_wgpu.gpu.device import Device
+
+SYNTHETIC = "synthetic"
+
+
+class Capture:
+    """views: those held out first, then the training's."""
+
+    def __init__(self, views: tuple[View, ...]) -> None:
+        self.views = views
+        self._pool: BufferPool | None = None
+        self._held: Any = None
+
+    def truth(self, view: int, background: tuple[float, float, float], device: Device) -> dict[str, Any]:
+        """What `Placed` has to know of the picture of a view, laid on a background."""
+        key = (view, background)
+        if self._held is None or self._held[0] != key:
+            pixels = composite(self.views[view].load(), np.asarray(background, np.float32))
+            packed = np.zeros((*pixels.shape[:2], 4), np.uint8)
+            packed[..., :3] = pixels
+            self._pool = self._pool or BufferPool(device)
+            buffer = self._pool.get("ground truth", packed.nbytes)
+            buffer.write(packed)
+            self._held = (key, {"truth": buffer, "truth_size": (pixels.shape[1], pixels.shape[0])})
+        return self._held[1]  # type: ignore[no-any-return]
+
+
+def open_capture(checkpoint: Path) -> Capture | None:
+    """The capture that the config.toml beside a checkpoint names; None where there is none, or it is not here."""
+    try:
+        data = tomllib.loads((checkpoint.parent / "config.toml").read_text(encoding="utf-8"))["data"]
+        path, size = Path(data["path"]), int(data["size"])
+        if str(path) == SYNTHETIC:
+            path = checkpoint.parent.parent / SYNTHETIC
+        dataset = load_dataset(path, image_size=size or None)
+    except (OSError, ValueError, KeyError, TypeError, InputError):
+        return None
+    return Capture((*dataset.test, *dataset.train))

@@ -1,0 +1,143 @@
+"""Drawing a frame: the scene at a time, seen by a camera, as its colours or as one of its values."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lapgs_wgpu.gpu.buffer import Buffer, BufferPool, read_all
+from lapgs_wgpu.gpu.profile import Profile
+from lapgs_wgpu.motion.playback import Playback
+from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.splat.rasterizer import Rasterizer
+
+from .present import Placed
+
+Mode = Literal["rgb", "depth", "alpha", "motion", "dynamics", "scale"]
+MODES: dict[Mode, str] = {
+    "rgb": "colours",
+    "depth": "depth, world units",
+    "alpha": "how much is covered",
+    "motion": "how far each Gaussian moves over the clip, world units",
+    "dynamics": "length of each Gaussian's dynamics attribute",
+    "scale": "largest standard deviation of each Gaussian, world units",
+}
+_MOMENTS = 9  # times at which the Gaussians' places are compared
+
+
+class Request(NamedTuple):
+    """What to draw: equal requests give equal frames."""
+
+    camera: Camera
+    time: float
+    mode: Mode
+    background: tuple[float, float, float]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Frame:
+    """A drawn frame. placed: for the presenter, at the origin in its own size. seconds: it took, all passes waited for.
+    splats: how many touched the picture. passes: milliseconds of each pass, where they were asked for."""
+
+    request: Request
+    placed: Placed
+    seconds: float
+    splats: int
+    passes: dict[str, float]
+
+
+class Painter:
+    """Draws frames of one scene with buffers of its own; a frame is valid until the next one is drawn."""
+
+    def __init__(self, playback: Playback) -> None:
+        self.playback = playback
+        self._rasterizer = Rasterizer(playback.device)
+        self._pool = BufferPool(playback.device)
+        self._profile: Profile | None = None
+        self._values: dict[tuple[Mode, float], tuple[Buffer, float, float]] = {}
+
+    def modes(self) -> list[Mode]:
+        """Those that this scene has something to show in."""
+        missing = set() if self.playback.moves else {"motion"}
+        if not self.playback.field_config.dynamics_size:
+            missing.add("dynamics")
+        return [mode for mode in MODES if mode not in missing]
+
+    def draw(self, request: Request, *, profile: bool = False) -> Frame:
+        """Draw, and wait until it is done. profile: take the time of each pass, where the device can."""
+        start = time.perf_counter()
+        camera, mode = request.camera, request.mode
+        gaussians = self.playback.at(request.time)
+        low, high, background = 0.0, 1.0, request.background
+        if mode in ("motion", "dynamics", "scale"):
+            colours, low, high = self._value(mode, request.time)
+            gaussians = dataclasses.replace(gaussians, colors=colours, sh_degree=None, sh_stored=1)
+            background = (0.0, 0.0, 0.0)
+        taken = self._profiler() if profile else None
+        while True:
+            planes = self._rasterizer.draw(gaussians, camera, background, depth=mode == "depth", profile=taken)
+            visible, *needed = read_all(
+                [(self._rasterizer.pool.get("visible", 4), "uint32", (1,), 0), *self._rasterizer.needed_requests()]
+            )
+            passes: dict[str, float] = {}
+            for name, milliseconds in taken.read() if taken else []:
+                passes[name] = passes.get(name, 0.0) + milliseconds
+            if not self._rasterizer.fit([int(count[0]) for count in needed]):
+                break
+        if mode == "depth":
+            low, high = self._depth_range(planes, camera)
+        shows = {"rgb": "color", "alpha": "alpha", "depth": "depth"}.get(mode, "value")
+        size = (camera.width, camera.height)
+        placed = Placed(planes, size, (0, 0), size, request.background, shows, low, high)
+        return Frame(request, placed, time.perf_counter() - start, int(visible[0]), passes)
+
+    def depth_at(self, frame: Frame, column: int, row: int) -> float | None:
+        """Depth along the camera's axis of what a pixel shows, world units; None where it shows next to nothing."""
+        drawn = self.draw(frame.request._replace(mode="depth"))
+        width, height = drawn.placed.picture
+        planes = drawn.placed.planes.read("float32", (5, height, width))
+        alpha = 1.0 - float(planes[3, row, column])
+        return float(planes[4, row, column]) / alpha if alpha > 0.1 else None
+
+    def _profiler(self) -> Profile | None:
+        if self._profile is None and "timestamp-query" in self.playback.device.features:
+            self._profile = Profile(self.playback.device)
+        return self._profile
+
+    def _depth_range(self, planes: Buffer, camera: Camera) -> tuple[float, float]:
+        rest, depth = planes.read("float32", (5, camera.height, camera.width))[3:]
+        seen = rest < 0.5
+        if not seen.any():
+            return 0.0, 1.0
+        low, high = np.percentile(depth[seen] / (1.0 - rest[seen]), [1, 99])
+        return float(low), float(high)
+
+    def _value(self, mode: Mode, t: float) -> tuple[Buffer, float, float]:
+        """A value of each Gaussian as its colour (N, 3), and the values at the ends of the scale."""
+        key = (mode, t if mode == "scale" else 0.0)
+        held = self._values.get(key)
+        if held is None:
+            value = self._measure(mode, t)
+            buffer = self._pool.get(mode, 12 * len(value))
+            buffer.write(np.repeat(value[:, None], 3, axis=1))
+            low = float(np.percentile(value, 2)) if mode == "scale" and len(value) else 0.0
+            high = float(np.percentile(value, 98)) if len(value) else 1.0
+            self._values = {other: entry for other, entry in self._values.items() if other[0] != mode}
+            held = self._values[key] = (buffer, low, max(high, 1e-9))
+        return held
+
+    def _measure(self, mode: Mode, t: float) -> NDArray[np.float32]:
+        if mode == "dynamics":
+            attributes = self.playback.dynamics()
+            assert attributes is not None
+            return np.linalg.norm(attributes, axis=1).astype(np.float32)
+        if mode == "scale":
+            count = self.playback.count
+            scales = self.playback.at(t).scales.read("float32", (count, 3))
+            return scales.max(axis=1, initial=0.0)
+        places = np.stack([self.playback.means(moment) for moment in np.linspace(0, 1, _MOMENTS)])
+        return np.linalg.norm(places - places.mean(axis=0), axis=2).max(axis=0).astype(np.float32)

@@ -1,0 +1,60 @@
+"""An opened file: its scene, ready to be shown, and where a viewer begins."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.io.first_look import FirstLook
+from lapgs_wgpu.motion.playback import Playback, open_playback
+from lapgs_wgpu.splat.camera import Camera
+
+from .camera import ViewCamera
+from .clock import Clock
+
+BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "grey": (0.5, 0.5, 0.5)}
+_FRAMES = 150  # of a clip whose file does not say how many it has
+
+
+class Opened(NamedTuple):
+    """path: where it came from, None for a training under way. look: camera, focus, up and frames to begin with."""
+
+    path: Path | None
+    playback: Playback
+    look: FirstLook
+
+    def camera(self) -> ViewCamera:
+        """A camera where the viewer begins."""
+        return ViewCamera.of(self.look.camera, self.look.focus, self.look.up)
+
+    def clock(self) -> Clock:
+        """The clip from its start."""
+        return Clock(self.look.frames if self.playback.moves else 1)
+
+    @property
+    def background(self) -> tuple[float, float, float]:
+        """The one it was trained on, black where that is not known."""
+        return BACKGROUNDS.get(self.playback.metadata.get("background", ""), BACKGROUNDS["black"])
+
+
+def open_scene(path: Path, device: Device) -> Opened:
+    """Open a checkpoint, or any 3DGS .ply. Raises InputError."""
+    playback = open_playback(path, device)
+    look = FirstLook.from_json(playback.metadata.get("view", ""))
+    return Opened(path, playback, look or guess_look(playback))
+
+
+def guess_look(playback: Playback) -> FirstLook:
+    """For files that say nothing of cameras: the middle of the Gaussians from a distance that shows most of them.
+    Up is -y, as in scenes whose poses come from COLMAP."""
+    means = playback.means(0.0).astype(np.float64)
+    middle = np.median(means, axis=0) if len(means) else np.zeros(3)
+    radius = float(np.quantile(np.linalg.norm(means - middle, axis=1), 0.9)) if len(means) else 1.0
+    radius = max(radius, 1e-3)
+    camera = Camera.looking_at(
+        middle - [0, 0.5 * radius, 2.5 * radius], middle, up=[0, -1, 0], fov_x=0.9, width=4, height=3
+    )
+    return FirstLook(camera.resized(640, 480), middle, np.array([0.0, -1.0, 0.0]), _FRAMES)

@@ -1,0 +1,136 @@
+"""`present`: a drawn picture on a window's texture, or on one of our own, without a way through the host."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import wgpu
+from numpy.typing import NDArray
+
+from lapgs_wgpu.gpu.buffer import Buffer, BufferPool
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.shader import compose, pack
+
+# The scale of colours for values, from low to high.
+HEAT = (
+    (0.05, 0.03, 0.20),
+    (0.33, 0.06, 0.43),
+    (0.73, 0.21, 0.33),
+    (0.95, 0.45, 0.15),
+    (0.98, 0.75, 0.25),
+    (0.99, 0.99, 0.80),
+)
+VALUES = ("color", "alpha", "depth", "value")  # what a pixel shows; the order is the shader's
+OFFSCREEN_FORMAT = "rgba8unorm"
+
+
+class Placed(NamedTuple):
+    """A picture and where it stands on the target.
+
+    planes: as the rasteriser draws them, (4 or 5, height, width). origin, size: in pixels of the target.
+    shows: one of VALUES; low, high: the values at the ends of the scale, for depth and value.
+    truth: (height, width) uint32 on the device, red in the lowest byte, of truth_size; shown left of `truth_until`
+    (a share of the width), or, with error_gain, its absolute difference times this.
+    """
+
+    planes: Buffer
+    picture: tuple[int, int]
+    origin: tuple[int, int]
+    size: tuple[int, int]
+    background: tuple[float, float, float]
+    shows: str = "color"
+    low: float = 0.0
+    high: float = 1.0
+    truth: Buffer | None = None
+    truth_size: tuple[int, int] = (0, 0)
+    truth_until: float = 0.0
+    error_gain: float = 0.0
+
+
+class Presenter:
+    """Draws pictures onto textures of one format of one device."""
+
+    def __init__(self, device: Device, target_format: str) -> None:
+        self.device = device
+        self._pool = BufferPool(device)
+        self._source = compose("present", {})
+        native = device.wgpu_device
+        module = native.create_shader_module(label="present", code=self._source)
+        kinds = ("uniform", "read-only-storage", "read-only-storage")
+        self._layout = native.create_bind_group_layout(
+            entries=[
+                {"binding": i, "visibility": wgpu.ShaderStage.FRAGMENT, "buffer": {"type": kind}}
+                for i, kind in enumerate(kinds)
+            ]
+        )
+        self._pipeline = native.create_render_pipeline(
+            label="present",
+            layout=native.create_pipeline_layout(bind_group_layouts=[self._layout]),
+            vertex={"module": module, "entry_point": "vertex"},
+            fragment={"module": module, "entry_point": "fragment", "targets": [{"format": target_format}]},
+            primitive={"topology": "triangle-list"},
+        )
+
+    def __call__(self, target: Any, pictures: list[Placed], margin: tuple[float, float, float]) -> None:
+        """Submit: `target`, a texture view, filled with the margin's colour and then with the pictures."""
+        uniforms = [self._uniform(i, placed) for i, placed in enumerate(pictures)]
+        native = self.device.wgpu_device
+        encoder = native.create_command_encoder()
+        attachment = {"view": target, "load_op": "clear", "store_op": "store", "clear_value": (*margin, 1)}
+        render = encoder.begin_render_pass(color_attachments=[attachment])
+        render.set_pipeline(self._pipeline)
+        for uniform, placed in zip(uniforms, pictures, strict=True):
+            bound = (uniform, placed.planes, placed.truth or self._pool.get("no truth", 16))
+            entries = [
+                {"binding": i, "resource": {"buffer": buffer.wgpu_buffer, "offset": 0, "size": buffer.nbytes}}
+                for i, buffer in enumerate(bound)
+            ]
+            render.set_bind_group(0, native.create_bind_group(layout=self._layout, entries=entries))
+            render.set_viewport(*placed.origin, *placed.size, 0, 1)
+            render.set_scissor_rect(*placed.origin, *placed.size)
+            render.draw(3)
+        render.end()
+        self.device.queue.submit([encoder.finish()])
+
+    def _uniform(self, number: int, placed: Placed) -> Buffer:
+        values: dict[str, object] = {f"heat{i}": (*colour, 1.0) for i, colour in enumerate(HEAT)}
+        values |= {
+            "background": (*placed.background, 1.0),
+            "origin": placed.origin,
+            "size": placed.size,
+            "picture": placed.picture,
+            "truth": placed.truth_size,
+            "value": VALUES.index(placed.shows),
+            "low": placed.low,
+            "high": placed.high,
+            "truth_until": placed.truth_until,
+            "error_gain": placed.error_gain,
+        }
+        return self._pool.constant(f"picture {number}", pack(self._source, "Present", values))
+
+
+class Offscreen:
+    """A texture of our own to present on, and the way back to the host."""
+
+    def __init__(self, device: Device) -> None:
+        self._presenter = Presenter(device, OFFSCREEN_FORMAT)
+        self._texture: Any = None
+        self._device = device
+
+    def __call__(
+        self, size: tuple[int, int], pictures: list[Placed], margin: tuple[float, float, float]
+    ) -> NDArray[np.uint8]:
+        """(height, width, 3) uint8 of the pictures on a target of (width, height)."""
+        native = self._device.wgpu_device
+        if self._texture is None or self._texture.size[:2] != size:
+            usage = wgpu.TextureUsage.RENDER_ATTACHMENT | wgpu.TextureUsage.COPY_SRC
+            self._texture = native.create_texture(size=(*size, 1), format=OFFSCREEN_FORMAT, usage=usage)
+        self._presenter(self._texture.create_view(), pictures, margin)
+        width, height = size
+        pitch = (4 * width + 255) // 256 * 256
+        data = self._device.queue.read_texture(
+            {"texture": self._texture}, {"bytes_per_row": pitch, "rows_per_image": height}, (*size, 1)
+        )
+        rows = np.frombuffer(data, np.uint8).reshape(height, pitch)
+        return rows[:, : 4 * width].reshape(height, width, 4)[..., :3].copy()
