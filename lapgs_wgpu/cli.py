@@ -93,7 +93,10 @@ def _train(arguments: list[str]) -> None:
     check_run_folder(out, overwrite=given["overwrite"])
     device = open_device(given["device"])
     config, dataset = _open_data(config, out.parent / SYNTHETIC)
-    train(config, dataset, out, device=device, overwrite=given["overwrite"])
+    watch = None
+    if given["view"]:
+        from lapgs_wgpu.viewer.live import watch
+    train(config, dataset, out, device=device, overwrite=given["overwrite"], watch=watch)
     _report(out)
 
 
@@ -247,6 +250,9 @@ def _parse(arguments: list[str]) -> dict[str, typing.Any]:
     )
     parser.add_argument("--out", metavar="RUN", help="run folder, new or empty [runs/SCENE-PRESET]")
     parser.add_argument("--overwrite", action="store_true", help="replace the run that lies in the run folder")
+    parser.add_argument(
+        "--view", action="store_true", help="watch the training in a window, where it can be paused and single-stepped"
+    )
     parser.add_argument("--device", metavar="NAME", help="part of an adapter's name, or cpu, integrated, discrete")
     parser.add_argument("--list-devices", action="store_true", help="list the adapters, the default one first")
     parser.add_argument("--eval", metavar="RUN", help="measure a finished run again, on the data it was trained on")

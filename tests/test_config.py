@@ -31,7 +31,7 @@ def test_dnerf_is_the_papers_schedule() -> None:
     assert (density.start, density.stop, density.interval, density.gradient) == (500, 15_000, 100, 2e-4)
     assert (density.min_opacity, density.max_screen_radius, density.max_world_size) == (0.005, 20, 0.1)
     assert (density.reset_interval, density.reset_opacity) == (3000, 0.01)
-    assert (density.neighbours, density.divergence_weight, density.split_quantile) == (10, 0.5, 0.3)
+    assert (density.neighbours, density.divergence_weight, density.split_quantile) == (10, 0.5, 0.4)
     assert (config.points.count, config.points.box, config.points.opacity) == (100_000, 1.3, 0.1)
     assert (config.data.background, config.seed, config.loss.ssim) == ("black", 0, 0.2)
     assert (config.loss.pyramid, config.loss.ncc) == (0.2, 0.05)

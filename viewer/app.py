@@ -1,4 +1,4 @@
-"""The interactive viewer: a canvas, what is shown on it, and what mouse and keys do. Draws only when something changed."""
+"""The interactive viewer: a canvas, what is shown on it, and what mouse and keys do. It draws only what has changed."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 import time
 from collections import deque
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
@@ -18,6 +18,9 @@ from .frame import Frame, Mode, Painter, Request
 from .keys import FLY, KEYS
 from .opened import BACKGROUNDS, Opened, open_scene
 from .present import Placed, Presenter
+
+if TYPE_CHECKING:
+    from .live import Training
 
 Compare = Literal["off", "side", "split", "error"]
 COMPARES: tuple[Compare, ...] = ("off", "side", "split", "error")
@@ -37,6 +40,8 @@ class App:
     """What the window shows. The panels (viewer/panels) read and set its attributes, keys call its methods.
 
     scale: of the frame on show against the window, 1 at full resolution. message: for the user, None or one sentence.
+    moved_at: when what is shown was last changed, but for `refresh`. seconds: that the last draw took, GUI included.
+    training: the training under way, None where a file is shown.
     """
 
     def __init__(self, canvas: Any, loop: Any, opened: Opened, *, transport: bool | None = None) -> None:
@@ -63,7 +68,10 @@ class App:
         self.scale = 1.0
         self._moving_scale = 1.0
         self._drawn_key: Any = None
-        self._changed_at = self._drawn_at = time.perf_counter()
+        self._stale = False
+        self.moved_at = self._drawn_at = time.perf_counter()
+        self.seconds = 0.0
+        self.training: Training | None = None
         self._times: deque[float] = deque(maxlen=30)
         self._pointer = (0.0, 0.0)
         self._dragging: str | None = None
@@ -89,6 +97,12 @@ class App:
             self._show(open_scene(path, self.device))
         except InputError as error:
             self.message = str(error)
+        self.canvas.request_draw()
+
+    def refresh(self) -> None:
+        """The scene itself has changed: draw it again."""
+        self._stale = True
+        self.painter.forget()
         self.canvas.request_draw()
 
     def _show(self, opened: Opened) -> None:
@@ -125,6 +139,7 @@ class App:
             self.canvas.request_draw()
         elif self.scale < 1:
             self.loop.call_later(_SETTLED, self.canvas.request_draw)
+        self.seconds = time.perf_counter() - now
 
     def _paint(self, now: float) -> None:
         """Draw the scene where something changed: at a lower resolution while it changes, in full once it rests."""
@@ -133,8 +148,8 @@ class App:
         key = (_key(whole), self.clock.time, self.mode, self.background, self.profiling, id(self.painter))
         changed = key != self._drawn_key
         if changed:
-            self._changed_at = now
-        elif self.scale == 1 or now - self._changed_at < _SETTLED:
+            self.moved_at = now
+        elif not self._stale and (self.scale == 1 or now - self.moved_at < _SETTLED):
             return
         first = self._drawn_key is None
         self.scale = self._moving_scale if changed and not first else 1.0
@@ -143,7 +158,7 @@ class App:
             camera = whole.resized(max(1, round(self.scale * whole.width)), max(1, round(self.scale * whole.height)))
         request = Request(camera, self.clock.time, self.mode, self.background)
         self.frame = self.painter.draw(request, profile=self.profiling)
-        self._drawn_key = key
+        self._drawn_key, self._stale = key, False
         self._times.append(time.perf_counter())
         if not first:
             ideal = self.scale * math.sqrt(_TARGET_SECONDS / max(self.frame.seconds, 1e-4))

@@ -60,6 +60,10 @@ class Painter:
         self._profile: Profile | None = None
         self._values: dict[tuple[Mode, float], tuple[Buffer, float, float]] = {}
 
+    def forget(self) -> None:
+        """The scene has changed: what was measured of it is out of date."""
+        self._values.clear()
+
     def modes(self) -> list[Mode]:
         """Those that this scene has something to show in."""
         missing = set() if self.playback.moves else {"motion"}

@@ -16,6 +16,7 @@ from .present import HEAT
 
 if TYPE_CHECKING:
     from .app import App
+    from .live import Training
 
 _FIXED = imgui.WindowFlags_.no_move | imgui.WindowFlags_.no_resize | imgui.WindowFlags_.no_saved_settings
 _BAR = _FIXED | imgui.WindowFlags_.no_title_bar | imgui.WindowFlags_.no_scrollbar
@@ -140,11 +141,27 @@ class Panels:
         imgui.new_line()
         if app.flying:
             imgui.text_colored(_ACCENT, "flying: W A S D Q E, V ends")
+        if app.training is not None:
+            self._training(app.training)
         if app.capture is not None:
             self._capture()
         if self._browsing:
             self._files()
         imgui.end()
+
+    def _training(self, training: Training) -> None:
+        imgui.separator_text("Training")
+        last = training.last
+        if last is not None:
+            imgui.progress_bar(last.step / last.steps, (-1, 0), f"step {last.step} of {last.steps}")
+            imgui.text(f"{last.psnr:.2f} dB   {self.app.opened.playback.count:,} Gaussians")
+        if imgui.button("Go on" if training.paused else "Pause", (66, 0)):
+            training.paused = not training.paused
+        imgui.same_line()
+        if imgui.button("Step", (66, 0)):
+            training.paused = True
+            training.single += 1
+        _tip("one step of the optimiser, then pause")
 
     def _capture(self) -> None:
         app = self.app

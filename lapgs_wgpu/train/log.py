@@ -31,6 +31,7 @@ class Log:
 
     def __init__(self, path: Path, steps: int, terminal: TextIO | None = None) -> None:
         self._steps = steps
+        self.done = 0  # the last step
         self._terminal = terminal or sys.stderr
         self._file = path.open("w", encoding="utf-8")
         self._recent: deque[tuple[float, float]] = deque(maxlen=INTERVAL)
@@ -57,6 +58,7 @@ class Log:
     ) -> None:
         """Take in a step that is done (counted from 1)."""
         now = time.perf_counter()
+        self.done = step
         self._recent.append((loss, psnr))
         self._times.append(now)
         rate = (len(self._times) - 1) / max(now - self._times[0], 1e-9)

@@ -6,11 +6,12 @@ import dataclasses
 import shutil
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from types import FrameType
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -41,6 +42,20 @@ AHEAD = 4  # pictures that are decoded before they are needed
 RUN_FILES = ("config.toml", "log.jsonl", "metrics.json", "checkpoint.ply", "eval")
 
 
+class Progress(NamedTuple):
+    """A step that is done, of how many in all; loss, and PSNR in dB, of the view that it saw."""
+
+    step: int
+    steps: int
+    loss: float
+    psnr: float
+
+
+# Takes over a training's steps, such as a viewer does: called with the scene, where to look at it from, and the steps,
+# of which it takes as many as it likes, each one a step of the training. The rest follows when it returns.
+Watch = Callable[[Scene4D, FirstLook, Iterator[Progress]], None]
+
+
 def train(
     config: Config,
     dataset: Dataset,
@@ -48,19 +63,19 @@ def train(
     *,
     device: Device | None = None,
     overwrite: bool = False,
+    watch: Watch | None = None,
 ) -> Scene4D:
     """Train on a dataset, evaluate on its test views, and leave config.toml, log.jsonl, metrics.json, checkpoint.ply
     and eval/ in the folder `out`, which must be new or empty, or hold an earlier run when `overwrite` is set.
 
     device: the default adapter where None. The same configuration, pictures, adapter and driver give the same
-    checkpoint to the last byte. Raises InputError before anything is written where the input is not usable, and
-    KeyboardInterrupt after Ctrl-C, when the checkpoint of the last whole step has been written.
+    checkpoint to the last byte, watched or not. Raises InputError before anything is written where the input is not
+    usable, and KeyboardInterrupt after Ctrl-C, when the checkpoint of the last whole step has been written.
     """
     out = Path(out)
     check_run_folder(out, overwrite=overwrite)
     keep_freed_memory()
     device = device or open_device()
-    generator = torch.Generator().manual_seed(config.seed)
     scene = Scene4D.from_points(
         *initial_points(config.points, config.seed),
         config.field,
@@ -68,6 +83,32 @@ def train(
         device=device,
         seed=config.seed,
     )
+    look = FirstLook((dataset.test or dataset.train)[0].camera, dataset.focus, dataset.up, len(dataset.times))
+    start_run_folder(out, config, device)
+    with Log(out / "log.jsonl", config.schedule.steps) as log, _interruptible() as interrupted:
+        steps = training_steps(config, dataset, scene, log, interrupted)
+        if watch is not None:
+            watch(scene, look, steps)
+        for _ in steps:
+            pass
+        done, seconds = log.done, log.seconds
+
+    metadata = {"scene": dataset.name, "background": config.data.background, "step": str(done), "view": look.to_json()}
+    scene.save(out / "checkpoint.ply", metadata)
+    if interrupted.is_set():
+        raise KeyboardInterrupt(
+            f"stopped after step {done} of {config.schedule.steps}; {out / 'checkpoint.ply'} holds it."
+        )
+    evaluate_run(out, scene, dataset, config.data.background, {"steps": done, "seconds": round(seconds, 3)})
+    return scene
+
+
+def training_steps(
+    config: Config, dataset: Dataset, scene: Scene4D, log: Log, interrupted: threading.Event
+) -> Iterator[Progress]:
+    """The training itself: each turn of the iterator is one step of the optimiser, until `interrupted` is set."""
+    generator = torch.Generator().manual_seed(config.seed)
+    device = scene.device
     optimiser = Optimiser(
         scene.parameters, scene.field.parameter_groups() if scene.field else {}, config.rates.schedules()
     )
@@ -76,11 +117,8 @@ def train(
     # Cameras that all stand at one place have no extent; the scene's own size must serve.
     extent = dataset.extent or config.points.box
     statistics = Statistics(len(scene), scene.parameters["means"].device)
-    pictures = Pictures(dataset.train, config.data.background, config.data.cache_gb, generator, device)
     schedule, density = config.schedule, config.density
-
-    start_run_folder(out, config, device)
-    with Log(out / "log.jsonl", schedule.steps) as log, pictures, _interruptible() as interrupted:
+    with Pictures(dataset.train, config.data.background, config.data.cache_gb, generator, device) as pictures:
         for step in range(1, schedule.steps + 1):
             view, truth, background = pictures.draw()
             moving = step > schedule.warm_up
@@ -123,23 +161,11 @@ def train(
             if step % schedule.sh_interval == 0:
                 scene.sh_degree = min(scene.sh_degree + 1, MAX_SH_DEGREE)
 
-            log.step(step, loss.item(), rendering.psnr, len(scene), spectrum)
+            value = loss.item()
+            log.step(step, value, rendering.psnr, len(scene), spectrum)
+            yield Progress(step, schedule.steps, value, rendering.psnr)
             if interrupted.is_set():
                 break
-        seconds = log.seconds
-
-    first = (dataset.test or dataset.train)[0].camera
-    metadata = {
-        "scene": dataset.name,
-        "background": config.data.background,
-        "step": str(step),
-        "view": FirstLook(first, dataset.focus, dataset.up, len(dataset.times)).to_json(),
-    }
-    scene.save(out / "checkpoint.ply", metadata)
-    if interrupted.is_set():
-        raise KeyboardInterrupt(f"stopped after step {step} of {schedule.steps}; {out / 'checkpoint.ply'} holds it.")
-    evaluate_run(out, scene, dataset, config.data.background, {"steps": step, "seconds": round(seconds, 3)})
-    return scene
 
 
 def draw_nearby(config: SmoothnessConfig, count: int, t: float, generator: torch.Generator) -> Nearby | None:

@@ -1,0 +1,73 @@
+"""Watching a training while it runs: `lapgs-train --view`.
+
+Training and window share one thread: the window's loop takes a step of the training at a time and looks after mouse
+and keys in between. A picture of the new state is drawn seldom enough to cost the training little, unless the camera
+or the time moves, when the pictures come first.
+"""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+from rendercanvas.utils.asyncs import sleep
+
+from lapgs_wgpu.io.first_look import FirstLook
+from lapgs_wgpu.motion.playback import ScenePlayback
+from lapgs_wgpu.motion.scene import Scene4D
+
+from .app import App
+from .opened import Opened
+
+if TYPE_CHECKING:
+    from lapgs_wgpu.train.loop import Progress
+
+SHARE = 0.03  # of the time may go into pictures while nobody moves anything
+_ATTENTION = 0.5  # seconds after a move in which the pictures come first
+_PATIENCE = 0.02  # seconds between looks at mouse and keys while the training rests
+
+
+class Training:
+    """What the viewer's panel shows of a training, and where it pauses it.
+
+    last: the last step that was done. single: steps still to be done although it is paused.
+    """
+
+    def __init__(self) -> None:
+        self.last: Progress | None = None
+        self.paused = False
+        self.single = 0
+
+
+def watch(scene: Scene4D, look: FirstLook, steps: Iterator[Progress]) -> None:
+    """Show the scene in a window and take the training's steps, until the window is closed."""
+    from .window import make_canvas
+
+    canvas, loop = make_canvas("training - lapgs-train", (1280, 720))
+    app = App(canvas, loop, Opened(None, ScenePlayback(scene), look), transport=True)
+    app.training = training = Training()
+    handler = signal.getsignal(signal.SIGINT)
+
+    async def drive() -> None:
+        signal.signal(signal.SIGINT, handler)  # the window's loop has one of its own, which would end the training
+        pictured = time.perf_counter()
+        while True:
+            moving = not app.clock.playing and time.perf_counter() - app.moved_at < _ATTENTION
+            if moving or (training.paused and not training.single):
+                await sleep(_PATIENCE)
+                continue
+            progress = next(steps, None)
+            if progress is None:  # done, or interrupted: what follows must not wait for somebody to close the window
+                canvas.close()
+                return
+            training.last = progress
+            training.single = max(0, training.single - 1)
+            if training.paused or time.perf_counter() - pictured > app.seconds / SHARE:
+                app.refresh()
+                pictured = time.perf_counter()
+            await sleep(0.0)
+
+    loop.add_task(drive)
+    loop.run()
