@@ -95,7 +95,9 @@ def _train(arguments: list[str]) -> None:
     config, dataset = _open_data(config, out.parent / SYNTHETIC)
     watch = None
     if given["view"]:
-        from lapgs_wgpu.viewer.live import watch
+        from lapgs_wgpu.viewer import live
+
+        watch = live.watch
     train(config, dataset, out, device=device, overwrite=given["overwrite"], watch=watch)
     _report(out)
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 Compare = Literal["off", "side", "split", "error"]
 COMPARES: tuple[Compare, ...] = ("off", "side", "split", "error")
 MARGIN = (0.11, 0.11, 0.12)  # what surrounds a picture that does not fill the window
-_ACTIONS = {key.key: key.action for key in KEYS}
+_ACTIONS = {key.key: key.action for key in KEYS} | {"/": "toggle_help"}  # where "?" is told as "/" with Shift
 _TARGET_SECONDS = 1 / 12  # a frame may take while something moves; beyond it the resolution falls
 _SETTLED = 0.2  # seconds without a change after which the full resolution is drawn
 _SMALLEST = 0.25  # share of the window's width and height
@@ -252,6 +252,15 @@ class App:
         if self.view is None or self.camera.exact is None:
             self.stand_at(self.view or 0)
         self.compare = _next(COMPARES, self.compare)
+
+    def toggle_pause(self) -> None:
+        if self.training is not None:
+            self.training.paused = not self.training.paused
+
+    def step_training(self) -> None:
+        if self.training is not None:
+            self.training.paused = True
+            self.training.single += 1
 
     def toggle_overlay(self) -> None:
         self.show_overlay = not self.show_overlay

@@ -60,3 +60,7 @@ def _size(text: str) -> tuple[int, int]:
     if found is None or not (0 < int(found[1]) <= 16384 and 0 < int(found[2]) <= 16384):
         raise argparse.ArgumentTypeError(f"expected WIDTHxHEIGHT in pixels, such as 1280x720, got {text!r}")
     return int(found[1]), int(found[2])
+
+
+if __name__ == "__main__":
+    sys.exit(view_command())

@@ -31,6 +31,8 @@ KEYS = (
     Key("n", "N", "next_view", "stand at the capture's next camera, at its time"),
     Key("c", "C", "next_compare", "compare with the capture: side by side, split, error"),
     Key("k", "K", "add_key_frame", "add a key-frame to the camera path"),
+    Key("p", "P", "toggle_pause", "pause a training that is watched, or let it go on"),
+    Key("s", "S", "step_training", "one step of a training, then pause"),
     Key("o", "O", "toggle_overlay", "frames a second, milliseconds, splats, adapter"),
     Key("t", "T", "toggle_transport", "the time slider"),
     Key("h", "H", "toggle_panels", "all panels"),

@@ -10,6 +10,7 @@ from __future__ import annotations
 import signal
 import time
 from collections.abc import Iterator
+from types import FrameType
 from typing import TYPE_CHECKING
 
 from rendercanvas.utils.asyncs import sleep
@@ -48,10 +49,15 @@ def watch(scene: Scene4D, look: FirstLook, steps: Iterator[Progress]) -> None:
     canvas, loop = make_canvas("training - lapgs-train", (1280, 720))
     app = App(canvas, loop, Opened(None, ScenePlayback(scene), look), transport=True)
     app.training = training = Training()
-    handler = signal.getsignal(signal.SIGINT)
+    interrupt = signal.getsignal(signal.SIGINT)
+
+    def on_interrupt(signum: int, frame: FrameType | None) -> None:
+        training.paused = False  # the training notices after its next step
+        if callable(interrupt):
+            interrupt(signum, frame)
 
     async def drive() -> None:
-        signal.signal(signal.SIGINT, handler)  # the window's loop has one of its own, which would end the training
+        signal.signal(signal.SIGINT, on_interrupt)  # in place of the one of the window's loop
         pictured = time.perf_counter()
         while True:
             moving = not app.clock.playing and time.perf_counter() - app.moved_at < _ATTENTION

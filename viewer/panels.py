@@ -156,11 +156,10 @@ class Panels:
             imgui.progress_bar(last.step / last.steps, (-1, 0), f"step {last.step} of {last.steps}")
             imgui.text(f"{last.psnr:.2f} dB   {self.app.opened.playback.count:,} Gaussians")
         if imgui.button("Go on" if training.paused else "Pause", (66, 0)):
-            training.paused = not training.paused
+            self.app.toggle_pause()
         imgui.same_line()
         if imgui.button("Step", (66, 0)):
-            training.paused = True
-            training.single += 1
+            self.app.step_training()
         _tip("one step of the optimiser, then pause")
 
     def _capture(self) -> None:

@@ -1,9 +1,12 @@
 """Scenes ready to be shown."""
 
 from __future__ import annotations
-from typing import Protocol, Any
+
+from typing import Any, Protocol
+
 import numpy as np
 from numpy.typing import NDArray
+
 from ..gpu.buffer import BufferPool
 from ..gpu.device import Device
 from ..splat.rasterizer import GaussianBuffers

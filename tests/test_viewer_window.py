@@ -1,0 +1,151 @@
+"""The desktop window, on a virtual screen, driven by real mouse and key events."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import json
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from desktop import PATIENCE, Desktop
+from numpy.typing import NDArray
+from test_scene import CONFIG
+
+from lapgs_wgpu.data import Dataset, load_dataset
+from lapgs_wgpu.data.synthetic import write_synthetic
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.io.first_look import FirstLook
+from lapgs_wgpu.motion.scene import Scene4D, load
+from lapgs_wgpu.train.evaluate import to_8_bit
+from lapgs_wgpu.train.presets import load_config, write_toml
+
+SIZE = 320
+Picture = NDArray[np.int32]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory, device: Device) -> Path:
+    """A run folder: a moving scene of a few soft Gaussians, and the capture that its config.toml names."""
+    folder = tmp_path_factory.mktemp("run")
+    data = write_synthetic(folder / "data", size=SIZE, train_views=4, test_views=2)
+    dataset = load_dataset(data)
+    generator = torch.Generator().manual_seed(0)
+    points = 0.5 * torch.randn(400, 3, generator=generator)
+    colours = torch.rand(400, 3, generator=generator)
+    scales = np.full(400, 0.06)
+    scene = Scene4D.from_points(points.numpy(), colours.numpy(), scales, CONFIG, opacity=0.7, device=device)
+    assert scene.field is not None
+    with torch.no_grad():
+        for parameter in scene.field.parameters():
+            parameter.copy_(0.4 * torch.randn(*parameter.shape, generator=generator))
+    scene.save(folder / "checkpoint.ply", {"view": look(dataset).to_json(), "background": "black"})
+    config = load_config("demo", {"data.path": str(data), "data.size": "0"})
+    (folder / "config.toml").write_text(write_toml(dataclasses.asdict(config)))
+    return folder
+
+
+def look(dataset: Dataset) -> FirstLook:
+    return FirstLook(dataset.test[0].camera, dataset.focus, dataset.up, 31)
+
+
+@pytest.fixture
+def desktop() -> Iterator[Desktop]:
+    with Desktop() as made:
+        yield made
+
+
+def view(desktop: Desktop, file: Path, size: str) -> None:
+    desktop.start(sys.executable, "-m", "lapgs_wgpu.viewer.cli", str(file), "--time-slider", "--size", size)
+
+
+def scene_part(screen: Picture) -> Picture:
+    """Where the panels do not reach in a window of 800x600."""
+    return screen[120:480, 260:620]
+
+
+def test_scrub_play_orbit_and_modes(desktop: Desktop, run: Path) -> None:
+    view(desktop, run / "checkpoint.ply", "800x600")
+    first = desktop.wait_for(lambda s: scene_part(s).max() > 60 and s[525:590, 20:780].max() > 200, "scene and slider")
+
+    def changed(screen: Picture, before: Picture) -> bool:
+        return np.abs(scene_part(screen) - scene_part(before)).mean() > 1
+
+    desktop.drag((25, 536), (400, 536))
+    scrubbed = desktop.wait_for(lambda s: changed(s, first), "another time")
+    desktop.events("mousemove", 400, 300, "key", "Home")
+    back = desktop.wait_for(lambda s: not changed(s, first), "the start again")
+    assert np.abs(scene_part(back) - scene_part(first)).max() <= 1
+
+    desktop.drag((400, 300), (470, 320))
+    turned = desktop.wait_for(lambda s: changed(s, first), "the scene from elsewhere")
+    desktop.events("key", "r")
+    desktop.wait_for(lambda s: not changed(s, first), "the first camera again")
+
+    seen = [first, scrubbed, turned]
+    for mode in ("depth", "alpha", "motion", "dynamics", "scale"):
+        desktop.events("key", "m")
+        seen.append(desktop.wait_for(lambda s: all(changed(s, other) for other in seen), f"the mode {mode}"))
+    desktop.events("key", "m")
+    desktop.wait_for(lambda s: not changed(s, first), "colours again")
+
+    desktop.events("key", "question")
+    desktop.wait_for(lambda s: changed(s, first), "the help")
+    desktop.events("key", "question")
+    desktop.wait_for(lambda s: not changed(s, first), "no help")
+
+    desktop.events("key", "space")
+    pictures = []
+    for _ in range(20):
+        pictures.append(scene_part(desktop.picture()))
+        time.sleep(0.3)
+    assert sum(not np.array_equal(a, b) for a, b in itertools.pairwise(pictures)) >= 3, "it does not play"
+
+
+def test_the_picture_is_the_evaluators(desktop: Desktop, run: Path, device: Device) -> None:
+    """At a camera and time of the capture, to 1/255 in every pixel; and beside it the capture's own picture."""
+    view(desktop, run / "checkpoint.ply", f"{SIZE}x{SIZE}")
+    desktop.wait_for(lambda s: s[:SIZE, :SIZE].max() > 60, "the scene")
+    desktop.events("mousemove", 160, 160, "key", "h", "n", "n")
+    shot = load_dataset(run / "data").test[1]
+    expected = to_8_bit(load(run / "checkpoint.ply", device).render(shot.camera, shot.time).image).astype(np.int32)
+    screen = desktop.wait_for(lambda s: np.abs(s[:SIZE, :SIZE] - expected).mean() < 1, "the second test view")
+    # The pointer, which the server draws into its frame buffer, hides a few pixels.
+    away = np.ones((SIZE, SIZE), bool)
+    away[145:175, 145:175] = False
+    assert np.abs(screen[:SIZE, :SIZE] - expected)[away].max() <= 1
+    desktop.events("key", "c", "c")
+    truth = shot.load()[..., :3].astype(np.int32) * (shot.load()[..., 3:] / 255)
+    left = (slice(0, SIZE), slice(0, SIZE // 2 - 20))
+    desktop.wait_for(lambda s: np.abs(s[:SIZE, :SIZE][left] - truth[left]).max() <= 2, "the ground truth at the left")
+
+
+def test_a_training_is_watched_paused_and_stepped(desktop: Desktop, run: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    training = desktop.start(
+        sys.executable, "-m", "lapgs_wgpu.cli", "demo", "--data", str(run / "data"), "--data.size", "64",
+        "--points.count", "300", "--steps", "100000", "--view", "--out", str(out),
+    )  # fmt: skip
+    first = desktop.wait_for_change(lambda s: s[150:500, 300:700].max() > 20, "the scene")
+    desktop.wait_for_change(lambda s: np.abs(s - first)[150:500, 300:700].max() > 3, "the scene after more steps")
+    desktop.events("mousemove", 500, 600, "key", "p")
+    paused = desktop.wait_for(lambda s: True, "a training at rest")
+    log = (out / "log.jsonl").read_text()
+    time.sleep(3)
+    assert (out / "log.jsonl").read_text() == log
+    desktop.events("key", "s")
+    desktop.wait_for(lambda s: not np.array_equal(s, paused), "one more step")
+    training.send_signal(signal.SIGINT)
+    _, errors = training.communicate(timeout=PATIENCE)
+    assert training.returncode == 130
+    assert "Traceback" not in errors
+    done = int(errors.split("stopped after step ")[1].split()[0])
+    logged = json.loads(log.splitlines()[-1])["step"] if log else 0
+    assert logged <= done <= logged + 52
+    assert int(load(out / "checkpoint.ply").metadata["step"]) == done
