@@ -1,4 +1,4 @@
-"""The commands. Users' mistakes end in one sentence on stderr and exit code 2; 3 means that there is no adapter."""
+"""The commands lapgs-train and lapgs-table."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ import functools
 import json
 import sys
 import typing
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn
 
-from lapgs_wgpu.errors import InputError, NoAdapterError
-from lapgs_wgpu.gpu.device import list_devices
+from lapgs_wgpu.command import guarded, print_devices
+from lapgs_wgpu.errors import InputError
 
 if typing.TYPE_CHECKING:
     from lapgs_wgpu.data import Dataset
@@ -21,7 +21,6 @@ if typing.TYPE_CHECKING:
 # Short names for the keys that are given most often.
 SHORTCUTS = {"data.path": "--data", "schedule.steps": "--steps"}
 SYNTHETIC = "synthetic"
-INTERRUPTED = 130  # the shell's code for a process that Ctrl-C ended
 
 USAGE = "lapgs-train PRESET --data DIR [--out RUN] [--KEY VALUE ...]"
 DESCRIPTION = """\
@@ -45,31 +44,6 @@ def train_command(arguments: Sequence[str] | None = None) -> int:
 def table_command(arguments: Sequence[str] | None = None) -> int:
     """lapgs-table: returns the exit code, 1 where runs failed."""
     return guarded("lapgs-table", _table, list(sys.argv[1:] if arguments is None else arguments))
-
-
-def guarded(name: str, command: Callable[[list[str]], int | None], arguments: list[str]) -> int:
-    """Run a command; what its user should know goes to stderr in one sentence. Returns the exit code."""
-    try:
-        code = command(arguments)
-    except NoAdapterError as error:
-        print(f"{name}: {error}", file=sys.stderr)
-        return 2 if list_devices() else 3  # an adapter that is not there, or none at all
-    except InputError as error:
-        print(f"{name}: {error}", file=sys.stderr)
-        return 2
-    except OSError as error:  # a full disk, a folder that may not be written to
-        print(f"{name}: {error}.", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt as error:
-        print(f"{name}: {str(error) or 'interrupted.'}", file=sys.stderr)
-        return INTERRUPTED
-    return code or 0
-
-
-def print_devices() -> None:
-    """The adapters, the default one first."""
-    for info in list_devices():
-        print(f"{info.name}  ({info.kind}, {info.backend}, {info.driver})")
 
 
 def _train(arguments: list[str]) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from lapgs_wgpu import cli
+from lapgs_wgpu import cli, command
 from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.errors import NoAdapterError
 from lapgs_wgpu.gpu import device as device_module
@@ -162,7 +162,7 @@ def test_without_any_adapter_the_exit_code_is_3(
         raise NoAdapterError("no adapter was found on this machine")
 
     monkeypatch.setattr(device_module, "open_device", none)
-    monkeypatch.setattr(cli, "list_devices", list)
+    monkeypatch.setattr(command, "list_devices", list)
     assert cli.train_command(["tiny", "--data", str(scene), "--out", str(tmp_path / "out"), *FAST]) == 3
     assert capsys.readouterr().err == "lapgs-train: no adapter was found on this machine\n"
     assert not (tmp_path / "out").exists()

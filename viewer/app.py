@@ -167,7 +167,7 @@ class App:
 
     def _picture_size(self) -> tuple[int, int]:
         width, height = self.canvas.get_physical_size()
-        return (max(1, width // 2) if self._comparing() == "side" else max(1, width)), max(1, height)
+        return (max(1, width // 2) if self.comparing() == "side" else max(1, width)), max(1, height)
 
     def _present(self) -> None:
         assert self.frame is not None
@@ -178,7 +178,7 @@ class App:
     def _placed(self, width: int, height: int) -> list[Placed]:
         """The frame on a window of this size, with the ground truth where the two are compared."""
         assert self.frame is not None
-        compare = self._comparing()
+        compare = self.comparing()
         picture = self.frame.placed
         columns = width // 2 if compare == "side" else width
         if compare != "off" and self.capture is not None and self.view is not None:
@@ -186,10 +186,13 @@ class App:
         if compare == "side":
             right = _fit(picture._replace(truth_until=0.0), columns, height, columns)
             return [_fit(picture._replace(truth_until=1.0), columns, height, 0), right]
-        changes = {"split": {"truth_until": self.split}, "error": {"error_gain": _ERROR_GAIN}}.get(compare, {})
-        return [_fit(picture._replace(**changes), columns, height, 0)]
+        if compare == "split":
+            picture = picture._replace(truth_until=self.split)
+        elif compare == "error":
+            picture = picture._replace(error_gain=_ERROR_GAIN)
+        return [_fit(picture, columns, height, 0)]
 
-    def _comparing(self) -> Compare:
+    def comparing(self) -> Compare:
         """How the capture's picture is shown beside ours: not at all where there is none of this camera and time."""
         if self.capture is None or self.view is None or self.camera.exact is None or self.mode != "rgb":
             return "off"
@@ -334,7 +337,7 @@ class App:
         self._pointer = (event["x"], event["y"])
         sideways = event["button"] != 1 or "Shift" in event["modifiers"]
         self._dragging = "pan" if sideways else "look" if self.flying else "orbit"
-        if self._comparing() == "split" and self.frame is not None:
+        if self.comparing() == "split" and self.frame is not None:
             placed = self._placed(*self.canvas.get_physical_size())[0]
             divider = placed.origin[0] + self.split * placed.size[0]
             if abs(event["x"] * self.canvas.get_pixel_ratio() - divider) < _GRIP:
@@ -381,8 +384,8 @@ def _fit(picture: Placed, width: int, height: int, left: int) -> Placed:
     columns, rows = picture.picture
     scale = min(width / columns, height / rows)
     # A picture drawn for this window at a lower resolution fills it again, whatever rounding did to its size.
-    size = tuple(
+    across, down = (
         most if abs(scale * n - most) <= max(1.0, scale) else max(1, round(scale * n))
         for n, most in ((columns, width), (rows, height))
     )
-    return picture._replace(origin=(left + (width - size[0]) // 2, (height - size[1]) // 2), size=size)
+    return picture._replace(origin=(left + (width - across) // 2, (height - down) // 2), size=(across, down))

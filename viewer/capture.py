@@ -35,7 +35,7 @@ class Capture:
             buffer = self._pool.get("ground truth", packed.nbytes)
             buffer.write(packed)
             self._held = (key, {"truth": buffer, "truth_size": (pixels.shape[1], pixels.shape[0])})
-        return self._held[1]  # type: ignore[no-any-return]
+        return self._held[1]
 
 
 def open_capture(checkpoint: Path) -> Capture | None:

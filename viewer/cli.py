@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from lapgs_wgpu.cli import guarded, print_devices
+from lapgs_wgpu.command import guarded, print_devices
 from lapgs_wgpu.errors import InputError
 
 DESCRIPTION = """\

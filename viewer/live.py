@@ -11,7 +11,7 @@ import signal
 import time
 from collections.abc import Iterator
 from types import FrameType
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 from rendercanvas.utils.asyncs import sleep
 
@@ -22,12 +22,20 @@ from lapgs_wgpu.motion.scene import Scene4D
 from .app import App
 from .opened import Opened
 
-if TYPE_CHECKING:
-    from lapgs_wgpu.train.loop import Progress
-
 SHARE = 0.03  # of the time may go into pictures while nobody moves anything
 _ATTENTION = 0.5  # seconds after a move in which the pictures come first
 _PATIENCE = 0.02  # seconds between looks at mouse and keys while the training rests
+
+
+class Progress(Protocol):
+    """What the viewer needs to know of a step that is done: which of how many, and the PSNR in dB of its view."""
+
+    @property
+    def step(self) -> int: ...
+    @property
+    def steps(self) -> int: ...
+    @property
+    def psnr(self) -> float: ...
 
 
 class Training:

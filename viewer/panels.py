@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from imgui_bundle import imgui
 from wgpu.utils.imgui import ImguiRenderer
 
+from .app import COMPARES, App
 from .clock import LOOPS, SPEEDS
 from .frame import MODES
 from .keys import KEYS, MOUSE
@@ -15,7 +16,6 @@ from .opened import BACKGROUNDS
 from .present import HEAT
 
 if TYPE_CHECKING:
-    from .app import App
     from .live import Training
 
 _FIXED = imgui.WindowFlags_.no_move | imgui.WindowFlags_.no_resize | imgui.WindowFlags_.no_saved_settings
@@ -172,13 +172,12 @@ class Panels:
         if changed:
             app.stand_at(chosen)
         imgui.set_next_item_width(-1)
-        order = ("off", "side", "split", "error")
-        changed, chosen = imgui.combo("##compare", order.index(app.compare), list(_COMPARE_NAMES))
+        changed, chosen = imgui.combo("##compare", COMPARES.index(app.compare), list(_COMPARE_NAMES))
         if changed:
-            app.compare = order[chosen]
+            app.compare = COMPARES[chosen]
             if app.view is None:
                 app.stand_at(0)
-        if app.compare != "off" and app._comparing() == "off":
+        if app.compare != "off" and app.comparing() == "off":
             imgui.text_wrapped("The capture has no picture of this camera and time; N goes to the next that it has.")
 
     # Files -----------------------------------------------------------------------------------------------------------

@@ -1,0 +1,36 @@
+"""What all commands share. Users' mistakes end in one sentence on stderr and exit code 2; 3 means no adapter."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+
+from lapgs_wgpu.errors import InputError, NoAdapterError
+from lapgs_wgpu.gpu.device import list_devices
+
+INTERRUPTED = 130  # the shell's code for a process that Ctrl-C ended
+
+
+def guarded(name: str, command: Callable[[list[str]], int | None], arguments: list[str]) -> int:
+    """Run a command; what its user should know goes to stderr in one sentence. Returns the exit code."""
+    try:
+        code = command(arguments)
+    except NoAdapterError as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        return 2 if list_devices() else 3  # an adapter that is not there, or none at all
+    except InputError as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        return 2
+    except OSError as error:  # a full disk, a folder that may not be written to
+        print(f"{name}: {error}.", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt as error:
+        print(f"{name}: {str(error) or 'interrupted.'}", file=sys.stderr)
+        return INTERRUPTED
+    return code or 0
+
+
+def print_devices() -> None:
+    """The adapters, the default one first."""
+    for info in list_devices():
+        print(f"{info.name}  ({info.kind}, {info.backend}, {info.driver})")
