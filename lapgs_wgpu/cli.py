@@ -122,16 +122,13 @@ def _open_data(config: Config, synthetic: Path) -> tuple[Config, Dataset]:
     from lapgs_wgpu.data import load_dataset
     from lapgs_wgpu.data.synthetic import write_synthetic
 
-    path, size = config.data.path, config.data.size
+    path = config.data.path
     if not path.isprintable():
         raise InputError(f"{path!r} holds characters that config.toml cannot record; rename the folder.")
     if not path:
         raise InputError(f"name the folder of the scene with --data DIR, or take --data {SYNTHETIC}.")
     folder = write_synthetic(synthetic) if path == SYNTHETIC else Path(path)
-    dataset = load_dataset(folder)
-    camera = dataset.train[0].camera
-    if 0 < size < max(camera.width, camera.height):
-        dataset = load_dataset(folder, image_size=size)
+    dataset = load_dataset(folder, image_size=config.data.size or None)
     data = dataclasses.replace(config.data, path=str(folder.resolve()))
     return dataclasses.replace(config, data=data), dataset
 

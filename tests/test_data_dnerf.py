@@ -279,10 +279,9 @@ def test_bad_scene_is_refused_in_one_sentence(tmp_path: Path, name: str) -> None
         assert word in message
 
 
-@pytest.mark.parametrize("image_size", [0, -3, 13])
-def test_image_size_out_of_range(tmp_path: Path, image_size: int) -> None:
-    with pytest.raises(InputError, match=rf"image size {image_size} .* 1 and 12"):
-        load_dataset(make_scene(tmp_path / "toy"), image_size=image_size)
+def test_smaller_pictures_are_not_enlarged(tmp_path: Path) -> None:
+    camera = load_dataset(make_scene(tmp_path / "toy"), image_size=13).train[0].camera
+    assert (camera.width, camera.height) == (12, 8)
 
 
 def test_folder_missing_a_file_or_of_another_kind(tmp_path: Path) -> None:

@@ -53,7 +53,7 @@ class App:
         context.configure(device=self.device.wgpu_device, format=self.format)
         self._context = context
         self._presenter = Presenter(self.device, self.format)
-        self._gui: Any = None  # made after the first picture: its import takes a third of a second
+        self._gui: Any = None  # made after the first picture, for which nobody should have to wait
         self._gui_draws = _GUI_DRAWS
 
         self.mode: Mode = "rgb"
@@ -95,9 +95,13 @@ class App:
         """Show another file; where it cannot be read, say why and keep the present one."""
         try:
             self._show(open_scene(path, self.device))
+            self._open_capture()
         except InputError as error:
             self.message = str(error)
         self.canvas.request_draw()
+
+    def _open_capture(self) -> None:
+        self.capture = open_capture(self.opened.path) if self.opened.path else None
 
     def refresh(self) -> None:
         """The scene itself has changed: draw it again."""
@@ -111,7 +115,7 @@ class App:
         self.camera, self.clock = opened.camera(), opened.clock()
         self.background = opened.background
         self.show_transport = opened.playback.moves if self._transport is None else self._transport
-        self.capture: Capture | None = open_capture(opened.path) if opened.path else None
+        self.capture: Capture | None = None
         self.view: int | None = None
         if self.mode not in self.painter.modes():
             self.mode = "rgb"
@@ -132,6 +136,7 @@ class App:
             from .panels import Panels
 
             self._gui = Panels(self)
+            self._open_capture()
         else:
             self._gui.render()
             self._gui_draws -= 1

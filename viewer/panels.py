@@ -63,7 +63,7 @@ class Panels:
     def _transport(self) -> None:
         app, clock = self.app, self.app.clock
         width, height = app.canvas.get_logical_size()
-        bar = 74.0
+        bar = 62.0
         imgui.set_next_window_pos((_GAP, height - bar - _GAP))
         imgui.set_next_window_size((width - 2 * _GAP, bar))
         imgui.begin("transport", None, _BAR)

@@ -14,7 +14,8 @@ __all__ = ["Dataset", "ImageCache", "View", "composite", "load_dataset"]
 def load_dataset(folder: str | Path, *, image_size: int | None = None) -> Dataset:
     """Open a capture, its format told by the files it holds (for now: D-NeRF).
 
-    image_size: longer side in pixels to which pictures are shrunk; None keeps them as they are. Raises InputError.
+    image_size: longer side in pixels, 1 or more, to which larger pictures are shrunk; None keeps all as they are.
+    Raises InputError.
     """
     folder = Path(folder)
     if not folder.is_dir() or is_dnerf(folder):

@@ -66,7 +66,7 @@ def load_dnerf(folder: str | Path, *, image_size: int | None = None) -> Dataset:
             raise InputError(
                 f"{path} is {_text(size)} pixels and {first} is {_text(stored)}; all pictures must have one size."
             )
-    size = _shrunk(stored, image_size, first)
+    size = _shrunk(stored, image_size)
 
     def views(split: str, fov_x: float, frames: list[_Frame]) -> tuple[View, ...]:
         # camera_angle_x is the horizontal field of view, and pixels are square: one focal length serves both axes.
@@ -201,16 +201,11 @@ def _check_picture(path: Path) -> tuple[int, int]:
     return size
 
 
-def _shrunk(stored: tuple[int, int], image_size: int | None, example: Path) -> tuple[int, int]:
-    """(width, height) whose longer side is image_size, in the proportions of `stored`."""
+def _shrunk(stored: tuple[int, int], image_size: int | None) -> tuple[int, int]:
+    """(width, height) whose longer side is at most image_size, in the proportions of `stored`."""
     longer = max(stored)
-    if image_size is None:
+    if image_size is None or image_size >= longer:
         return stored
-    if not 1 <= image_size <= longer:
-        raise InputError(
-            f"image size {image_size} must lie between 1 and {longer}, the longer side of the pictures in pixels "
-            f"({example} is {_text(stored)}): they can be shrunk, not enlarged."
-        )
     width, height = (max(1, math.floor(side * image_size / longer + 0.5)) for side in stored)
     return width, height
 
