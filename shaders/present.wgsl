@@ -64,8 +64,8 @@ fn fragment(@builtin(position) position: vec4<f32>) -> @location(0) vec4<f32> {
     var color = vec3(0.0);
     var reference = vec3(0.0);
     if (!compared || share.x >= present.truth_until || present.error_gain > 0.0) {
-        if (all(present.size == vec2<f32>(present.picture))) {
-            color = drawn(vec2<i32>(position.xy - present.origin));
+        if (all(present.size == vec2<f32>(present.picture)) || all(present.truth == present.picture)) {
+            color = drawn(vec2<i32>(share * vec2<f32>(present.picture)));
         } else {
             let p = share * vec2<f32>(present.picture) - 0.5;
             let low = vec2<i32>(floor(p));

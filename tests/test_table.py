@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from lapgs_wgpu import cli
+from lapgs_wgpu import cli, command
 from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.train import table
@@ -328,7 +328,7 @@ def test_the_table_is_written_after_every_run(
         return original(run, data, out, device)
 
     monkeypatch.setattr(table, "_train_in_process", look)
-    assert make(spec_file, data) == cli.INTERRUPTED
+    assert make(spec_file, data) == command.INTERRUPTED
     assert capsys.readouterr().err.endswith("lapgs-table: stopped in run 4 of 5; the same command goes on.\n")
     assert seen == [0, 1, 2, 3]
     assert "| toys | grid4d | 1 | 25.00 | - |" in (spec_file.parent / "out" / "table.md").read_text()

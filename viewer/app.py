@@ -148,8 +148,7 @@ class App:
 
     def _paint(self, now: float) -> None:
         """Draw the scene where something changed: at a lower resolution while it changes, in full once it rests."""
-        width, height = self._picture_size()
-        whole = self.camera.camera(width, height)
+        whole = self._whole()
         key = (_key(whole), self.clock.time, self.mode, self.background, self.profiling, id(self.painter))
         changed = key != self._drawn_key
         if changed:
@@ -170,9 +169,13 @@ class App:
             ideal = 0.5 * (self._moving_scale + ideal)
             self._moving_scale = min(max(math.floor(16 * ideal) / 16, _SMALLEST), 1.0)
 
-    def _picture_size(self) -> tuple[int, int]:
+    def _whole(self) -> Camera:
+        """The camera at full resolution: the window's, or that of the picture from which ours is subtracted."""
+        comparing = self.comparing()
+        if comparing == "error" and self.camera.exact is not None:
+            return self.camera.exact
         width, height = self.canvas.get_physical_size()
-        return (max(1, width // 2) if self.comparing() == "side" else max(1, width)), max(1, height)
+        return self.camera.camera(max(1, width // 2 if comparing == "side" else width), max(1, height))
 
     def _present(self) -> None:
         assert self.frame is not None
