@@ -17,6 +17,7 @@ from lapgs_wgpu.errors import InputError
 if typing.TYPE_CHECKING:
     from lapgs_wgpu.data import Dataset
     from lapgs_wgpu.train.config import Config
+    from lapgs_wgpu.train.loop import Watch
 
 # Short names for the keys that are given most often.
 SHORTCUTS = {"data.path": "--data", "schedule.steps": "--steps"}
@@ -30,6 +31,7 @@ Train a moving scene on the pictures of a folder, on any Vulkan, Metal or D3D12 
   lapgs-train tiny --data DIR                   a D-NeRF scene at 200x200, sized for a CPU
   lapgs-train dnerf --data DIR --out RUN        the same with the paper's pictures and schedule
   lapgs-train RUN/config.toml --out RUN2        the same training once more
+  lapgs-train --resume RUN                      go on with a training that was interrupted, or killed
   lapgs-train --eval RUN                        measure RUN/checkpoint.ply on the test views again
 
 The run folder then holds config.toml, log.jsonl, metrics.json, checkpoint.ply (which any 3DGS viewer opens as a still)
@@ -51,13 +53,22 @@ def _train(arguments: list[str]) -> None:
         print_devices()
         return
     from lapgs_wgpu.gpu.device import open_device  # what follows needs torch, which takes seconds to import
-    from lapgs_wgpu.train.loop import check_run_folder, train
+    from lapgs_wgpu.train.loop import train
     from lapgs_wgpu.train.presets import config_keys, load_config
+    from lapgs_wgpu.train.run_folder import check_run_folder
 
     given = _parse(arguments)
     overrides = {key.name: given[key.name] for key in config_keys() if key.name in given}
     if given["eval"]:
         _evaluate(Path(given["eval"]), given["device"], overrides)
+        return
+    watch = None
+    if given["view"]:
+        from lapgs_wgpu.viewer import live
+
+        watch = live.watch
+    if given["resume"]:
+        _resume(Path(given["resume"]), given, overrides, watch)
         return
     if given["preset"] is None:
         raise InputError("name a preset, such as tiny, and the data to train on; lapgs-train --help says more.")
@@ -67,13 +78,30 @@ def _train(arguments: list[str]) -> None:
     check_run_folder(out, overwrite=given["overwrite"])
     device = open_device(given["device"])
     config, dataset = _open_data(config, out.parent / SYNTHETIC)
-    watch = None
-    if given["view"]:
-        from lapgs_wgpu.viewer import live
-
-        watch = live.watch
     train(config, dataset, out, device=device, overwrite=given["overwrite"], watch=watch)
     _report(out)
+
+
+def _resume(run: Path, given: dict[str, typing.Any], overrides: dict[str, typing.Any], watch: Watch | None) -> None:
+    from lapgs_wgpu.gpu.device import open_device
+    from lapgs_wgpu.train.loop import resume
+    from lapgs_wgpu.train.presets import load_config
+    from lapgs_wgpu.train.run_folder import changes_since
+
+    others = [f"--{name}" for name in ("preset", "field", "ablate", "out", "overwrite") if given[name]]
+    if others or overrides:
+        raise InputError(
+            f"--resume goes on as the run began, so {(others + [f'--{key}' for key in overrides])[0]} cannot be given."
+        )
+    if not (run / "config.toml").is_file():
+        raise InputError(f"{run / 'config.toml'} does not exist; --resume needs the folder of a run.")
+    config = load_config(str(run / "config.toml"))
+    device = open_device(given["device"])
+    config, dataset = _open_data(config, run.parent / SYNTHETIC)
+    for what, before, now in changes_since(run, device, dataset):
+        print(f"lapgs-train: {what} was {before} when {run} began and is {now}: bits may differ.", file=sys.stderr)
+    resume(config, dataset, run, device=device, watch=watch)
+    _report(run)
 
 
 def _evaluate(run: Path, device_name: str | None, overrides: dict[str, str | list[str]]) -> None:
@@ -222,6 +250,7 @@ def _parse(arguments: list[str]) -> dict[str, typing.Any]:
         "--ablate", metavar="PART[,PART]", help=f"parts of the paper's method to leave out: {', '.join(ABLATIONS)}"
     )
     parser.add_argument("--out", metavar="RUN", help="run folder, new or empty [runs/SCENE-PRESET]")
+    parser.add_argument("--resume", metavar="RUN", help="go on with an interrupted training from its last saved state")
     parser.add_argument("--overwrite", action="store_true", help="replace the run that lies in the run folder")
     parser.add_argument(
         "--view", action="store_true", help="watch the training in a window, where it can be paused and single-stepped"

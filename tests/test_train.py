@@ -6,6 +6,7 @@ import dataclasses
 import io
 import json
 import signal
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +20,12 @@ from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.scene import Scene4D, load
-from lapgs_wgpu.train import loop
+from lapgs_wgpu.train import loop, training
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.log import Log
-from lapgs_wgpu.train.loop import Pictures, train
+from lapgs_wgpu.train.loop import train
 from lapgs_wgpu.train.losses import LossWeights
+from lapgs_wgpu.train.pictures import Pictures
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.render_loss import RenderLoss, render_loss
 
@@ -169,7 +171,7 @@ def test_another_seed_gives_another_model(run: Path, dataset: Dataset, device: D
 def test_nothing_moves_during_the_warm_up(dataset: Dataset, device: Device, tmp_path: Path) -> None:
     config = configure(schedule__steps="4")
     scene = train(config, dataset, tmp_path / "run", device=device)
-    fresh = Scene4D.from_points(*loop.initial_points(config.points, 0), config.field, device=device)
+    fresh = Scene4D.from_points(*training.initial_points(config.points, 0), config.field, device=device)
     assert scene.field is not None
     assert fresh.field is not None
     for ours, initial in zip(scene.field.parameters(), fresh.field.parameters(), strict=True):
@@ -192,7 +194,7 @@ def test_cross_correlation_counts_once_the_warm_up_is_over(
         seen.append((arguments[4], render_loss(*arguments)))
         return seen[-1][1]
 
-    monkeypatch.setattr(loop, "render_loss", spy)
+    monkeypatch.setattr(training, "render_loss", spy)
     options = {"loss__pyramid": "0.2", "loss__ncc": "0.05", "data__background": "random"}
     config = configure(schedule__steps="4", schedule__warm_up="2", **options)
     train(config, dataset, tmp_path / "run", device=device)
@@ -256,7 +258,7 @@ def test_overwriting_replaces_a_run_and_nothing_else(dataset: Dataset, device: D
 
 
 def test_every_picture_is_drawn_once_an_epoch(dataset: Dataset, device: Device) -> None:
-    with Pictures(dataset.train, "black", 1.0, torch.Generator().manual_seed(3), device) as pictures:
+    with closing(Pictures(dataset.train, "black", 1.0, torch.Generator().manual_seed(3), device)) as pictures:
         epochs = [[pictures.draw()[0].name for _ in dataset.train] for _ in range(3)]
     assert all(sorted(epoch) == sorted(view.name for view in dataset.train) for epoch in epochs)
     assert epochs[0] != epochs[1]
@@ -266,7 +268,7 @@ def test_every_picture_is_drawn_once_an_epoch(dataset: Dataset, device: Device) 
 def test_pictures_lie_on_their_background(background: str, dataset: Dataset, device: Device) -> None:
     """On a fixed background they lie before they are uploaded, on a random one in the loss's first pass."""
     generator = torch.Generator().manual_seed(3)
-    with Pictures(dataset.train, background, 1.0, generator, device) as pictures:  # type: ignore[arg-type]
+    with closing(Pictures(dataset.train, background, 1.0, generator, device)) as pictures:  # type: ignore[arg-type]
         drawn = [pictures.draw() for _ in range(4)]
     for view, truth, colour in drawn:
         picture = truth.read("uint8", (32, 32, 4))
@@ -286,7 +288,7 @@ def test_log_lines_and_the_progress_line(tmp_path: Path) -> None:
             return True
 
     for stream in (io.StringIO(), Terminal()):
-        with Log(tmp_path / "log.jsonl", 120, stream) as log:
+        with Log(tmp_path / "log.jsonl", 120, terminal=stream) as log:
             for step in range(1, 121):
                 log.step(step, 0.5 + step, 20.0, 1000)
         text = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]

@@ -72,6 +72,7 @@ class App:
         self.moved_at = self._drawn_at = time.perf_counter()
         self.seconds = 0.0
         self.training: Training | None = None
+        self.capture: Capture | None = None
         self._times: deque[float] = deque(maxlen=30)
         self._pointer = (0.0, 0.0)
         self._dragging: str | None = None
@@ -115,7 +116,7 @@ class App:
         self.camera, self.clock = opened.camera(), opened.clock()
         self.background = opened.background
         self.show_transport = opened.playback.moves if self._transport is None else self._transport
-        self.capture: Capture | None = None
+        self.capture = None
         self.view: int | None = None
         if self.mode not in self.painter.modes():
             self.mode = "rgb"

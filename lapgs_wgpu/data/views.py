@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from threading import Lock
 
 import numpy as np
@@ -60,6 +62,17 @@ class Dataset:
         """1.1 times the largest distance of a training camera from their mean, world units; 0 where all coincide."""
         centres = np.stack([view.camera.position for view in self.train])
         return 1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """16 hexadecimal digits that change with the cameras, the times and the sizes of the files."""
+        digest = hashlib.sha256()
+        for view in (*self.train, *self.test):
+            camera, file = view.camera, Path(view.source)
+            size = file.stat().st_size if file.is_file() else 0
+            digest.update(f"{view.name} {view.time!r} {camera.width} {camera.height} {size}".encode())
+            digest.update(camera.K.tobytes() + camera.T_cam_world.tobytes())
+        return digest.hexdigest()[:16]
 
     @cached_property
     def up(self) -> NDArray[np.float64]:

@@ -61,6 +61,7 @@ class ScheduleConfig:
     steps: int = described("length of the training, one picture a step")
     warm_up: int = described("steps at the start during which nothing moves")
     sh_interval: int = described("steps after which the degree of the spherical harmonics grows by one, up to 3")
+    save_interval: int = described("steps from one saved state, from which --resume goes on, to the next; 0 for none")
 
     def __post_init__(self) -> None:
         if self.steps < 1 or self.sh_interval < 1:

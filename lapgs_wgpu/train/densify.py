@@ -48,6 +48,14 @@ class Statistics:
         self.views += visible
         self.radii = torch.maximum(self.radii, rendering.radii.to(self.radii.dtype))
 
+    def state(self) -> dict[str, Tensor]:
+        """All that was noted."""
+        return {"gradients": self.gradients, "views": self.views, "radii": self.radii}
+
+    def restore(self, state: Mapping[str, Tensor]) -> None:
+        """Go on from what `state` gave."""
+        self.gradients, self.views, self.radii = state["gradients"], state["views"], state["radii"]
+
     @property
     def mean_gradients(self) -> Tensor:
         """(N,) mean over the views in which a Gaussian was visible; 0 for those never seen."""

@@ -8,12 +8,14 @@ import subprocess
 import sys
 import time
 from collections import deque
+from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
 from types import TracebackType
 from typing import TextIO
 
 from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.motion.laplacian import LaplacianMotion
 
 INTERVAL = 50  # steps from one line of log.jsonl to the next, over which loss and PSNR are averaged
@@ -24,19 +26,20 @@ FILE_SECONDS = 15.0  # the same where stderr is no terminal, and each is a line 
 class Log:
     """Progress of a training, step by step. A context manager.
 
-    path: log.jsonl, written anew. Each line holds step, loss, psnr (dB, training views) and gaussians, and the
-    frequencies and amplitudes of the motion's spectrum where there is one, all of which repeat from run to run; and
-    under "timing" seconds and steps_per_second, which do not.
+    path: log.jsonl, written anew, or continued after the step `done`. Each line holds step, loss, psnr (dB, training
+    views) and gaussians, and the frequencies and amplitudes of the motion's spectrum where there is one, all of which
+    repeat from run to run, but for the first line after a resumption, which averages what came since; and under
+    "timing" seconds and steps_per_second, which do not.
     """
 
-    def __init__(self, path: Path, steps: int, terminal: TextIO | None = None) -> None:
+    def __init__(self, path: Path, steps: int, *, done: int = 0, terminal: TextIO | None = None) -> None:
         self._steps = steps
-        self.done = 0  # the last step
         self._terminal = terminal or sys.stderr
-        self._file = path.open("w", encoding="utf-8")
+        self._file, before = _continued(path, done)
         self._recent: deque[tuple[float, float]] = deque(maxlen=INTERVAL)
-        self._start = self._shown = time.perf_counter()
-        self._times: deque[float] = deque([self._start], maxlen=INTERVAL + 1)
+        self._shown = time.perf_counter()
+        self._start = self._shown - before
+        self._times: deque[float] = deque([self._shown], maxlen=INTERVAL + 1)
 
     def __enter__(self) -> Log:
         return self
@@ -58,7 +61,6 @@ class Log:
     ) -> None:
         """Take in a step that is done (counted from 1)."""
         now = time.perf_counter()
-        self.done = step
         self._recent.append((loss, psnr))
         self._times.append(now)
         rate = (len(self._times) - 1) / max(now - self._times[0], 1e-9)
@@ -86,6 +88,21 @@ class Log:
             )
             self._terminal.write(f"\r\x1b[2K{text}" if on_terminal else f"{text}\n")
             self._terminal.flush()
+
+
+def _continued(path: Path, done: int) -> tuple[TextIO, float]:
+    """The log of the first `done` steps, open at its end, and the seconds that they took."""
+    kept, seconds = [], 0.0
+    if done:
+        with suppress(OSError, ValueError, KeyError, TypeError):  # a damaged log is no reason to stop
+            for text in path.read_text(encoding="utf-8").splitlines():
+                line = json.loads(text)
+                if line["step"] <= done:
+                    kept.append(text + "\n")
+                    seconds = float(line["timing"]["seconds"])
+    with atomic_write(path) as file:
+        file.write("".join(kept).encode())
+    return path.open("a", encoding="utf-8"), seconds
 
 
 def _spectrum(motion: LaplacianMotion) -> dict[str, list[float]]:

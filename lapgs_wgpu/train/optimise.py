@@ -62,6 +62,24 @@ class Optimiser:
         state = self._adam.state.get(self.gaussians[name], {})
         return {key: state[key] for key in ("exp_avg", "exp_avg_sq") if key in state}
 
+    def state(self) -> dict[str, Tensor]:
+        """Everything that the next step depends on, besides the parameters and their gradients."""
+        return {
+            f"{group['name']}.{i}.{key}": value
+            for group in self._adam.param_groups
+            for i, parameter in enumerate(group["params"])
+            for key, value in self._adam.state.get(parameter, {}).items()
+        }
+
+    def restore(self, state: Mapping[str, Tensor]) -> None:
+        """Go on from what `state` gave, with parameters of the same shapes."""
+        for group in self._adam.param_groups:
+            for i, parameter in enumerate(group["params"]):
+                prefix = f"{group['name']}.{i}."
+                mine = {key.removeprefix(prefix): value for key, value in state.items() if key.startswith(prefix)}
+                if mine:
+                    self._adam.state[parameter] = mine
+
     def _replace(self, name: str, values: Tensor, moments: Mapping[str, Tensor]) -> None:
         state = self._adam.state.pop(self.gaussians[name], {})
         parameter = self.gaussians[name] = nn.Parameter(values)
@@ -98,3 +116,15 @@ class FrequencyOptimiser:
         move = self._rate.at(step) * mean / (size + ADAM_EPS)
         frequencies.sub_(move.clamp(-LARGEST_FREQUENCY_STEP, LARGEST_FREQUENCY_STEP)).clamp_(0.0, self._limit)
         frequencies.grad = None
+
+    def state(self) -> dict[str, Tensor]:
+        """Everything that the next step depends on, besides the frequencies and their gradient."""
+        return {
+            "mean": self._mean,
+            "square": torch.tensor(self._square, dtype=torch.float64),
+            "steps": torch.tensor(self._steps),
+        }
+
+    def restore(self, state: Mapping[str, Tensor]) -> None:
+        """Go on from what `state` gave."""
+        self._mean, self._square, self._steps = state["mean"], float(state["square"]), int(state["steps"])

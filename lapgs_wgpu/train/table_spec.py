@@ -114,9 +114,9 @@ def read_spec(path: Path) -> Spec:
 
 
 def fingerprint(config: Config) -> str:
-    """Of all that a training depends on, but not of where its pictures lie on this machine."""
+    """Of all that the result of a training depends on: not of where its pictures lie, or how often it is saved."""
     values = dataclasses.asdict(config)
-    del values["data"]["path"]
+    del values["data"]["path"], values["schedule"]["save_interval"]
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:16]
 
 

@@ -1,0 +1,66 @@
+"""Training views in the order in which they are trained on, with their pictures on the device."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import partial
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lapgs_wgpu.data.views import ImageCache, View, composite
+from lapgs_wgpu.gpu.buffer import Buffer
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.train.config import Background
+from lapgs_wgpu.train.evaluate import COLOURS
+from lapgs_wgpu.train.render_loss import TruthCache
+
+AHEAD = 4  # pictures that are decoded before they are needed
+
+
+class Pictures:
+    """Training views in random order without replacement, epoch after epoch.
+
+    generator: where the order, and random backgrounds, are drawn from. cache_gb: bound on what is kept in memory, and
+    on what is kept on the device.
+    """
+
+    def __init__(
+        self,
+        views: tuple[View, ...],
+        background: Background,
+        cache_gb: float,
+        generator: torch.Generator,
+        device: Device,
+    ) -> None:
+        self._colour = None if background == "random" else torch.full((3,), COLOURS[background])
+        self._views = views if self._colour is None else tuple(_on_background(v, self._colour.numpy()) for v in views)
+        self._cache = ImageCache(int(cache_gb * 1e9))
+        self._truths = TruthCache(device, int(cache_gb * 1e9))
+        self._generator = generator
+        self.order: list[int] = []  # the views that are still to come in this epoch, by number
+
+    def close(self) -> None:
+        """End the decoding."""
+        self._cache.close()
+
+    def draw(self) -> tuple[View, Buffer, Tensor]:
+        """The next view, its picture on the device (for `render_loss`) and the background (3,) that it lies on."""
+        if not self.order:
+            self.order = torch.randperm(len(self._views), generator=self._generator).tolist()
+        view = self._views[self.order.pop(0)]
+        coming = (self._views[i] for i in self.order[:AHEAD])
+        self._cache.prefetch(each for each in coming if each not in self._truths)
+        colour = torch.rand(3, generator=self._generator) if self._colour is None else self._colour
+        return view, self._truths.get(view, partial(self._cache.get, view)), colour
+
+
+def _on_background(view: View, colour: NDArray[np.float32]) -> View:
+    """The view without transparency, so that it is laid on its background once and not at every step."""
+    return dataclasses.replace(view, pixels=partial(_flat, view, colour))
+
+
+def _flat(view: View, colour: NDArray[np.float32]) -> NDArray[np.uint8]:
+    return composite(view.load(), colour)

@@ -1,0 +1,184 @@
+"""The training, step by step, and everything that its next step depends on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lapgs_wgpu.data.init import initial_scales, random_points
+from lapgs_wgpu.data.views import Dataset
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.motion.dynamics import dynamics_loss
+from lapgs_wgpu.motion.field import Nearby
+from lapgs_wgpu.motion.scene import Scene4D
+from lapgs_wgpu.train.config import Config, PointsConfig, SmoothnessConfig
+from lapgs_wgpu.train.densify import Statistics, densify, reset_opacities
+from lapgs_wgpu.train.optimise import FrequencyOptimiser, Optimiser
+from lapgs_wgpu.train.pictures import Pictures
+from lapgs_wgpu.train.render_loss import render_loss
+
+MAX_SH_DEGREE = 3
+
+
+class Progress(NamedTuple):
+    """A step that is done, of how many in all; loss, and PSNR in dB, of the view that it saw."""
+
+    step: int
+    steps: int
+    loss: float
+    psnr: float
+
+
+class Training:
+    """A training between two of its steps. done: the steps so far."""
+
+    def __init__(self, config: Config, dataset: Dataset, device: Device) -> None:
+        self.config = config
+        self.done = 0
+        self._generator = torch.Generator().manual_seed(config.seed)
+        self.scene = Scene4D.from_points(
+            *initial_points(config.points, config.seed),
+            config.field,
+            opacity=config.points.opacity,
+            device=device,
+            seed=config.seed,
+        )
+        self._start(dataset)
+
+    def _start(self, dataset: Dataset) -> None:
+        config, scene = self.config, self.scene
+        groups = scene.field.parameter_groups() if scene.field else {}
+        self._optimiser = Optimiser(scene.parameters, groups, config.rates.schedules())
+        self._frequencies = None
+        if scene.spectrum is not None:
+            limit = len(dataset.times) / 2
+            self._frequencies = FrequencyOptimiser(scene.spectrum, config.rates.frequencies, limit)
+        # Cameras that all stand at one place have no extent; the scene's own size must serve.
+        self._extent = dataset.extent or config.points.box
+        self._statistics = Statistics(len(scene), scene.parameters["means"].device)
+        data = config.data
+        self._pictures = Pictures(dataset.train, data.background, data.cache_gb, self._generator, scene.device)
+
+    def close(self) -> None:
+        """End what goes on beside the steps."""
+        self._pictures.close()
+
+    def step(self) -> Progress:
+        """One step of the optimiser, on one picture."""
+        config, scene, optimiser = self.config, self.scene, self._optimiser
+        step = self.done + 1
+        view, truth, background = self._pictures.draw()
+        moving = step > config.schedule.warm_up
+        if moving:
+            nearby = draw_nearby(config.smoothness, len(scene), view.time, self._generator)
+            gaussians, smoothness = scene.deformed(view.time, nearby)
+        else:
+            gaussians, smoothness = scene.canonical(), None
+        weights = config.loss.weights(warm=moving)
+        rendering = render_loss(gaussians, view.camera, truth, background, weights, scene.device)
+        loss = rendering.loss
+        if smoothness is not None:
+            loss = loss + smoothness
+        if moving and "dynamics" in scene.parameters:
+            spread = dynamics_loss(scene.parameters["dynamics"], config.loss.dynamics_mode)
+            loss = loss + config.loss.dynamics * spread
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step(step)
+        if self._frequencies is not None:
+            self._frequencies.step(step)
+
+        # After the optimiser's step, so that no gradient is lost with the rows that change.
+        if step < config.density.stop:
+            self._statistics.add(rendering, view.camera)
+        self._change_density(step)
+        if step % config.schedule.sh_interval == 0:
+            scene.sh_degree = min(scene.sh_degree + 1, MAX_SH_DEGREE)
+        self.done = step
+        return Progress(step, config.schedule.steps, loss.item(), rendering.psnr)
+
+    def _change_density(self, step: int) -> None:
+        density, scene = self.config.density, self.scene
+        if density.changes_at(step):
+            change = densify(
+                scene.parameters,
+                self._statistics,
+                density,
+                self._extent,
+                self._generator,
+                bound_sizes=step > density.reset_interval,
+            )
+            self._optimiser.edit_rows(change.keep, change.added)
+            self._statistics = Statistics(len(scene), scene.parameters["means"].device)
+        if density.resets_at(step):
+            logits = reset_opacities(scene.parameters["opacity_logits"], density.reset_opacity)
+            self._optimiser.reset("opacity_logits", logits)
+
+    # The state between two steps -------------------------------------------------------------------------------------
+
+    def state(self) -> dict[str, NDArray[np.generic]]:
+        """Everything that the next step depends on, by name."""
+        scene = self.scene
+        parts: dict[str, Mapping[str, Tensor]] = {
+            "gaussians": scene.parameters,
+            "field": scene.field.state_dict() if scene.field else {},
+            "adam": self._optimiser.state(),
+            "frequencies": self._frequencies.state() if self._frequencies else {},
+            "statistics": self._statistics.state(),
+            "training": {
+                "done": torch.tensor(self.done),
+                "sh_degree": torch.tensor(scene.sh_degree),
+                "random": self._generator.get_state(),
+                "order": torch.tensor(self._pictures.order, dtype=torch.int64),
+            },
+        }
+        return {f"{part}.{name}": t.numpy(force=True) for part, tensors in parts.items() for name, t in tensors.items()}
+
+    def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
+        """Go on from what `state` gave. Raises KeyError, RuntimeError or ValueError where it belongs to a training of
+        another configuration."""
+        parts: dict[str, dict[str, Tensor]] = {}
+        for name, array in state.items():
+            part, _, rest = name.partition(".")
+            parts.setdefault(part, {})[rest] = torch.from_numpy(array)
+        scene = self.scene
+        if parts["gaussians"].keys() != scene.parameters.keys():
+            raise ValueError(f"it has Gaussians with {sorted(parts['gaussians'])}, not {sorted(scene.parameters)}")
+        for name, value in parts["gaussians"].items():
+            if value.shape[1:] != scene.parameters[name].shape[1:]:
+                raise ValueError(f"its {name} have the shape {tuple(value.shape)}")
+            self._optimiser.reset(name, value)
+        if scene.field is not None:
+            scene.field.load_state_dict(parts["field"])
+        self._optimiser.restore(parts.get("adam", {}))
+        if self._frequencies is not None:
+            self._frequencies.restore(parts["frequencies"])
+        self._statistics.restore(parts["statistics"])
+        own = parts["training"]
+        self.done, scene.sh_degree = int(own["done"]), int(own["sh_degree"])
+        self._generator.set_state(own["random"])
+        self._pictures.order = own["order"].tolist()
+
+
+def initial_points(
+    config: PointsConfig, seed: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """Random Gaussians in the box: points (N, 3), colours (N, 3) and scales (N,)."""
+    points, colours = random_points(config.count, -config.box, config.box, seed)
+    return points, colours, initial_scales(points)
+
+
+def draw_nearby(config: SmoothnessConfig, count: int, t: float, generator: torch.Generator) -> Nearby | None:
+    """Where the field of `count` Gaussians is compared with itself in a step at time t; None where it is not."""
+    chosen = round(config.share * count)
+    if chosen == 0 or config.static == config.temporal == 0:
+        return None
+    rows = torch.randint(count, (chosen,), generator=generator)
+    offsets = config.reach * (2 * torch.rand(chosen, 3, generator=generator) - 1)
+    other = t + config.time_reach * (2 * float(torch.rand((), generator=generator)) - 1)
+    return Nearby(rows, offsets, min(max(other, 0.0), 1.0), config.static, config.temporal)

@@ -1,0 +1,246 @@
+"""Interrupted and killed trainings go on to the same bytes; what was saved survives; two writers are kept apart."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from test_train import STEPS, configure
+
+from lapgs_wgpu import cli
+from lapgs_wgpu.data import Dataset, load_dataset
+from lapgs_wgpu.data.synthetic import write_synthetic
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.io import atomic
+from lapgs_wgpu.train import run_folder
+from lapgs_wgpu.train.config import Config
+from lapgs_wgpu.train.log import Log
+from lapgs_wgpu.train.loop import resume, train
+from lapgs_wgpu.train.presets import write_toml
+from lapgs_wgpu.train.run_folder import STATE, STATE_BEFORE, load_state, locked_run_folder, save_state
+from lapgs_wgpu.train.training import Training
+
+KILLS = int(os.environ.get("LAPGS_SOAK_KILLS", "3"))
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_synthetic(tmp_path_factory.mktemp("data") / "scene", size=32, train_views=8, test_views=2)
+
+
+@pytest.fixture(scope="module")
+def dataset(data: Path) -> Dataset:
+    return load_dataset(data)
+
+
+@pytest.fixture(scope="module")
+def whole(dataset: Dataset, device: Device, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run that nothing interrupted."""
+    out = tmp_path_factory.mktemp("runs") / "whole"
+    train(configure(), dataset, out, device=device)
+    return out
+
+
+def interrupt_at(at: int, monkeypatch: pytest.MonkeyPatch, number: signal.Signals = signal.SIGINT) -> None:
+    original = Log.step
+
+    def interrupt(self: Log, step: int, *rest: Any) -> None:
+        original(self, step, *rest)
+        if step == at:
+            signal.raise_signal(number)
+
+    monkeypatch.setattr(Log, "step", interrupt)
+
+
+# In the warm-up, after it, at a change of density, at a reset, with an epoch just over, at the last step but one.
+@pytest.mark.parametrize("at", [4, 11, 20, 25, 16, STEPS - 1])
+def test_an_interrupted_run_goes_on_to_the_same_bytes(
+    at: int, whole: Path, dataset: Dataset, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patched:
+        interrupt_at(at, patched, signal.SIGTERM if at == 11 else signal.SIGINT)
+        with pytest.raises(KeyboardInterrupt, match=f"after step {at} of {STEPS}"):
+            train(configure(), dataset, tmp_path / "run", device=device)
+    assert not (tmp_path / "run" / "metrics.json").exists()
+    resume(configure(), dataset, tmp_path / "run", device=device)
+    assert (tmp_path / "run" / "checkpoint.ply").read_bytes() == (whole / "checkpoint.ply").read_bytes()
+    assert {file.name for file in (tmp_path / "run").iterdir()} == {file.name for file in whole.iterdir()}
+
+
+@pytest.mark.parametrize("method", ["static", "mlp", "hexplane", "grid4d"])
+def test_every_field_goes_on_to_the_same_bytes(
+    method: str, dataset: Dataset, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    train(configure(method), dataset, tmp_path / "whole", device=device)
+    with monkeypatch.context() as patched:
+        interrupt_at(22, patched)
+        with pytest.raises(KeyboardInterrupt):
+            train(configure(method), dataset, tmp_path / "run", device=device)
+    resume(configure(method), dataset, tmp_path / "run", device=device)
+    assert (tmp_path / "run" / "checkpoint.ply").read_bytes() == (tmp_path / "whole" / "checkpoint.ply").read_bytes()
+
+
+def test_states_are_saved_at_intervals_and_the_last_two_are_kept(
+    dataset: Dataset, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    saved: list[int] = []
+    original = run_folder.save_state
+
+    def note(out: Path, state: run_folder.State) -> None:
+        original(out, state)
+        saved.append(int(state["training.done"]))
+
+    monkeypatch.setattr("lapgs_wgpu.train.loop.save_state", note)
+    interrupt_at(28, monkeypatch)
+    out = tmp_path / "run"
+    with pytest.raises(KeyboardInterrupt):
+        train(configure(schedule__save_interval="10"), dataset, out, device=device)
+    assert saved == [10, 20, 28]
+    assert int(load_state(out)["training.done"]) == 28  # type: ignore[index]
+    (out / STATE).unlink()
+    assert int(load_state(out)["training.done"]) == 20  # type: ignore[index]
+
+
+def test_a_damaged_state_gives_way_to_the_one_before(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for done in (1, 2):
+        save_state(tmp_path, {"training.done": np.array(done)})
+    content = (tmp_path / STATE).read_bytes()
+    (tmp_path / STATE).write_bytes(content[: len(content) // 2])
+    assert int(load_state(tmp_path)["training.done"]) == 1  # type: ignore[index]
+    error = capsys.readouterr().err
+    assert STATE in error
+    assert f"going on from {STATE_BEFORE}, which is older" in error
+    (tmp_path / STATE_BEFORE).write_bytes(b"")
+    with pytest.raises(InputError, match=STATE):
+        load_state(tmp_path)
+    (tmp_path / STATE).unlink()
+    (tmp_path / STATE_BEFORE).unlink()
+    assert load_state(tmp_path) is None
+
+
+@pytest.mark.parametrize("failing", ["write", "replace"])
+def test_a_full_disk_leaves_the_older_state(failing: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    save_state(tmp_path, {"training.done": np.array(1)})
+    full = OSError(28, "No space left on device")
+
+    def fail(*_: Any) -> None:
+        raise full
+
+    if failing == "write":
+        monkeypatch.setattr(atomic.os, "fsync", fail)
+    else:
+        monkeypatch.setattr(atomic.os, "replace", fail)
+    with pytest.raises(InputError, match=r"state.safetensors: not written \(No space left on device\)"):
+        save_state(tmp_path, {"training.done": np.array(2)})
+    monkeypatch.undo()
+    assert int(load_state(tmp_path)["training.done"]) == 1  # type: ignore[index]
+
+
+def test_a_state_of_another_configuration_is_refused(dataset: Dataset, device: Device, tmp_path: Path) -> None:
+    save_state(tmp_path, Training(configure(), dataset, device).state())
+    others = [configure(field__width="8"), configure(field__dynamics="4"), configure("mlp")]
+    for config in others:
+        with pytest.raises(InputError, match=r"its state and its config.toml do not belong together"):
+            resume(config, dataset, tmp_path, device=device)
+
+
+def test_a_finished_run_is_not_resumed(
+    whole: Path, dataset: Dataset, device: Device, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(InputError, match="is finished: there is nothing to resume"):
+        resume(configure(), dataset, whole, device=device)
+    assert cli.train_command(["--resume", str(whole), "--steps", "3"]) == 2
+    assert "so --schedule.steps cannot be given" in capsys.readouterr().err
+    assert cli.train_command(["--resume", str(whole.parent / "nowhere")]) == 2
+    assert "config.toml does not exist; --resume needs the folder of a run" in capsys.readouterr().err
+
+
+def test_two_writers_are_kept_apart(tmp_path: Path) -> None:
+    with locked_run_folder(tmp_path / "run"):
+        program = (
+            "import sys; from pathlib import Path\n"
+            "from lapgs_wgpu.train.run_folder import locked_run_folder\n"
+            "from lapgs_wgpu.errors import InputError\n"
+            "try:\n    with locked_run_folder(Path(sys.argv[1])): print('both')\n"
+            "except InputError as error: print(error)"
+        )
+        command = [sys.executable, "-c", program, str(tmp_path / "run")]
+        told = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True).stdout
+        assert told.startswith(f"{tmp_path / 'run'} is being written by another lapgs-train (process {os.getpid()})")
+    assert list((tmp_path / "run").iterdir()) == []
+    with locked_run_folder(tmp_path / "run"):
+        pass
+
+
+def test_what_has_changed_since_the_run_began_is_told(
+    dataset: Dataset, data: Path, device: Device, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    config = configure(data__path=str(data), schedule__steps="3", schedule__save_interval="0")
+    run_folder.start_run_folder(tmp_path, config, device, dataset)
+    text = (tmp_path / "config.toml").read_text()
+    (tmp_path / "config.toml").write_text(text.replace(f'driver = "{device.info.driver}"', 'driver = "another"'))
+    assert cli.train_command(["--resume", str(tmp_path)]) == 0
+    error = capfd.readouterr().err
+    assert f"driver was another when {tmp_path} began and is {device.info.driver}: bits may differ." in error
+    assert error.count("bits may differ") == 1
+
+
+@pytest.fixture
+def command(data: Path, tmp_path: Path) -> list[str]:
+    """lapgs-train on a configuration that saves often."""
+    config: Config = configure(data__path=str(data), schedule__save_interval="3")
+    (tmp_path / "small.toml").write_text(write_toml(dataclasses.asdict(config)))
+    return [sys.executable, "-m", "lapgs_wgpu.cli", str(tmp_path / "small.toml")]
+
+
+def finished(program: list[str]) -> None:
+    subprocess.run(program, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, timeout=300)
+
+
+def moments(seed: int, longest: float) -> Iterator[float]:
+    draw = random.Random(seed)
+    while True:
+        yield draw.uniform(0.0, longest)
+
+
+def test_killed_at_random_moments_and_resumed(command: list[str], tmp_path: Path) -> None:
+    """With SIGKILL, anywhere: at the start, between and during the writing of states, while it evaluates."""
+    start = time.monotonic()
+    finished([*command, "--out", str(tmp_path / "whole")])
+    longest = time.monotonic() - start
+    expected = (tmp_path / "whole" / "checkpoint.ply").read_bytes()
+    out = tmp_path / "run"
+    going_on = [sys.executable, "-m", "lapgs_wgpu.cli", "--resume", str(out)]
+    killed = 0
+    for moment in moments(KILLS, longest):
+        program = going_on if (out / "config.toml").exists() else [*command, "--out", str(out), "--overwrite"]
+        process = subprocess.Popen(program, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        try:
+            code = process.wait(moment)
+            assert code == 0
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+            killed += 1
+        if (out / "metrics.json").exists():  # whole: the next round begins anew
+            assert (out / "checkpoint.ply").read_bytes() == expected
+            shutil.rmtree(out)
+        if killed == KILLS:
+            break
+    if not (out / "config.toml").exists():
+        going_on = [*command, "--out", str(out), "--overwrite"]
+    finished(going_on)
+    assert (out / "checkpoint.ply").read_bytes() == expected
+    assert not [file for file in out.iterdir() if file.suffix == ".tmp" or "state" in file.name]
