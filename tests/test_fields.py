@@ -11,7 +11,8 @@ from torch import Tensor, nn
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.field import Deformation, FieldConfig, FieldKind, Nearby, PlaneConfig
 from lapgs_wgpu.motion.grid_field import GridField
-from lapgs_wgpu.motion.hashgrid import HashConfig, encode_reference
+from lapgs_wgpu.motion.hash_encoder import encode_reference
+from lapgs_wgpu.motion.hashgrid import HashConfig
 from lapgs_wgpu.motion.hexplane_field import PLANES, HexPlaneField
 from lapgs_wgpu.motion.laplacian import LaplacianMotion, TimeMotion
 from lapgs_wgpu.motion.mlp_field import MlpField, octaves

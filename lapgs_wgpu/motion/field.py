@@ -9,11 +9,12 @@ and "mlp".
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal, NamedTuple
-
-from torch import Tensor
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from .hashgrid import HashConfig, option
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 FieldKind = Literal["static", "mlp", "hexplane", "grid4d", "laplacian"]
 Motion = Literal["laplacian", "mlp"]

@@ -7,8 +7,8 @@ from torch import Tensor, nn
 
 from ..gpu.device import Device
 from .field import Deformation, FieldConfig, Nearby
-from .hash_encoder import HashEncoder
-from .hashgrid import TIME, HashGrid
+from .hash_encoder import HashEncoder, HashGrid
+from .hashgrid import TIME
 from .laplacian import LaplacianMotion, TimeMotion
 from .layers import linear, zero_head
 

@@ -1,14 +1,10 @@
-"""Multi-resolution hash grids (Instant-NGP's, with the resolutions of Grid4D; paper eq. 1): their levels and tables,
-which belong to torch, and the plain-torch twin of the kernels of motion/hash_encoder."""
+"""Shapes of multi-resolution hash grids (Instant-NGP's, with the resolutions of Grid4D; paper eq. 1), without torch."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
 from typing import Any
-
-import torch
-from torch import Tensor, nn
 
 _SLICE_CELLS = 1 << 14  # a level with more cells a plane than this is looked up directly, not cut
 TIME = 3  # the axis number of time
@@ -64,15 +60,17 @@ def make_levels(config: HashConfig) -> list[Level]:
     return levels
 
 
-class HashGrid(nn.Module):
-    """One grid over three of the axes x, y, z (0 to 2) and t (3, only as the last). table: (entries, 2) float32."""
+class GridShape:
+    """A grid without its table: over three of the axes x, y, z (0 to 2) and t (3, only as the last)."""
 
-    def __init__(self, config: HashConfig, axes: tuple[int, int, int], generator: torch.Generator) -> None:
-        super().__init__()
+    def __init__(self, config: HashConfig, axes: tuple[int, int, int]) -> None:
         self.axes = axes
         self.levels = make_levels(config)
-        entries = self.levels[-1].first + self.levels[-1].entries
-        self.table = nn.Parameter(torch.empty(entries, 2).uniform_(-1e-4, 1e-4, generator=generator))
+
+    @property
+    def entries(self) -> int:
+        """Rows of the table, of two features each."""
+        return self.levels[-1].first + self.levels[-1].entries
 
     @property
     def features(self) -> int:
@@ -86,35 +84,3 @@ class HashGrid(nn.Module):
             return []
         cells = [level.resolution[0] * level.resolution[1] for level in self.levels]
         return [i for i, level in enumerate(self.levels) if level.dense and cells[i] <= _SLICE_CELLS]
-
-
-def encode_reference(grid: HashGrid, table: Tensor, points: Tensor, time: float, bound: float) -> Tensor:
-    """The plain-torch twin: (N, 2 x levels) in the table's precision; cells are found in float32 as on the device."""
-    columns = [(points[:, axis] + bound) / (2 * bound) if axis != TIME else None for axis in grid.axes]
-    unit = torch.stack([torch.full_like(points[:, 0], time) if c is None else c for c in columns], dim=1)
-    inside = ((unit >= 0) & (unit <= 1)).all(dim=1)
-    primes = (1, 2654435761, 805459861)
-    encodings = []
-    for level, rows in zip(grid.levels, table.split([level.entries for level in grid.levels]), strict=True):
-        p = torch.where(inside[:, None], unit * torch.tensor(level.scale, dtype=unit.dtype), 0.0)
-        low = p.floor()
-        fraction = (p - low).to(table.dtype)
-        up = fraction * fraction * (3 - 2 * fraction)
-        base = low.long()
-        total = table.new_zeros((len(points), 2))
-        for corner in range(8):
-            weight = inside.to(table.dtype)
-            at = []
-            for axis in range(3):
-                high = (corner >> axis) & 1
-                weight = weight * (up[:, axis] if high else 1 - up[:, axis])
-                at.append((base[:, axis] + high).clamp(max=level.resolution[axis] - 1))
-            x, y, z = at
-            if level.dense:
-                index = x + level.resolution[0] * (y + level.resolution[1] * z)
-            else:
-                hashed = [((a * prime) & 0xFFFFFFFF) for a, prime in zip(at, primes, strict=True)]
-                index = (hashed[0] ^ hashed[1] ^ hashed[2]) % level.entries
-            total = total + weight[:, None] * rows[index]
-        encodings.append(total)
-    return torch.cat(encodings, dim=1)

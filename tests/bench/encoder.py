@@ -14,8 +14,7 @@ from torch import Tensor
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.field import FieldConfig
 from lapgs_wgpu.motion.grid_field import GridField
-from lapgs_wgpu.motion.hash_encoder import HashEncoder
-from lapgs_wgpu.motion.hashgrid import encode_reference
+from lapgs_wgpu.motion.hash_encoder import HashEncoder, encode_reference
 
 TIME = 0.37
 

@@ -1,0 +1,197 @@
+"""The passes of the hash encoder, without torch: points through several hash grids, and the gradient of their tables.
+
+All points share one time, so a grid with a time axis is first cut at that time wherever that is cheaper than looking up
+the planes around it for each point.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..gpu.buffer import Buffer, BufferPool
+from ..gpu.device import Device
+from ..gpu.kernel import Commands, Kernel
+from .hashgrid import GridShape
+
+_DISPATCH_POINTS = 1 << 15  # with lane_levels: Mesa's software driver ends a shader's loops after 65,535 rounds
+_LEVEL_WORDS = 12  # common/hashgrid.wgsl: struct Level
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Some levels of a grid that are handled alike."""
+
+    grid: int
+    sliced: bool
+    count: int
+    levels: Buffer
+    cells: int  # of the largest plane
+    entries: int  # of all slices together
+
+
+class DeviceEncoder:
+    """Records the passes that encode points with several grids at once. Axes and levels are fixed; tables (entries, 2),
+    points (N, 4) and encodings (N, 2 x levels) are float32 buffers that come with each call.
+
+    lane_levels: the shape of the backward pass for CPU devices; otherwise fixed-point atomics.
+    row, column: all encodings are parts of the rows of one buffer (N, row), one grid's behind the other's from `column`
+    on; both even. None: a buffer for each grid.
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        grids: Sequence[GridShape],
+        bound: float,
+        *,
+        lane_levels: bool | None = None,
+        row: int | None = None,
+        column: int = 0,
+    ) -> None:
+        self.device, self.grids, self.bound = device, list(grids), bound
+        self.pool = BufferPool(device)
+        self.lane_levels = device.is_cpu if lane_levels is None else lane_levels
+        self._rows = [grid.features if row is None else row for grid in grids]
+        self._parts: list[_Part] = []
+        for number, grid in enumerate(grids):
+            sliced = grid.sliced
+            direct = [i for i in range(len(grid.levels)) if i not in sliced]
+            for chosen, cut in ((sliced, True), (direct, False)):
+                if chosen:
+                    self._parts.append(self._part(number, chosen, cut, column // 2))
+            if row is not None:
+                column += grid.features
+
+    def _part(self, number: int, chosen: list[int], sliced: bool, first_pair: int) -> _Part:
+        levels = self.grids[number].levels
+        words = np.zeros((len(chosen), _LEVEL_WORDS), np.uint32)
+        slices = largest = 0
+        for row, i in zip(words, chosen, strict=True):
+            level = levels[i]
+            row[:3] = np.asarray(level.scale, np.float32).view(np.uint32)
+            row[4:8] = (*level.resolution, level.entries)
+            row[8:12] = (level.first, slices, first_pair + i, level.dense)
+            cells = level.resolution[0] * level.resolution[1]
+            largest = max(largest, cells)
+            slices += cells
+        buffer = Buffer(self.device, words.nbytes, f"levels {number} {'sliced' if sliced else 'direct'}")
+        buffer.write(words)
+        return _Part(number, sliced, len(chosen), buffer, largest, slices if sliced else 0)
+
+    def _uniform(
+        self, part: _Part, number: int, points: int, time: float, fixed_scale: float = 1.0, first: int = 0
+    ) -> Buffer:
+        """What the kernels are told of the place of this number; all places of a call are submitted at once."""
+        axes = self.grids[part.grid].axes
+        content = Kernel.get(self.device, "hashgrid_slice", SLICED=1, CORNERS=4).uniform(
+            "Grid",
+            points=points,
+            levels=part.count,
+            all_levels=self._rows[part.grid] // 2,
+            first_point=first,
+            last_point=min(points, first + _DISPATCH_POINTS),
+            axes=(*axes, 0),
+            time=time,
+            bound=self.bound,
+            fixed_scale=fixed_scale,
+        )
+        return self.pool.constant(f"grid {part.grid} {part.sliced} place {number} from {first}", content)
+
+    @staticmethod
+    def _defines(part: _Part) -> dict[str, int]:
+        return {"SLICED": 1, "CORNERS": 4} if part.sliced else {"CORNERS": 8}
+
+    def encode(
+        self,
+        commands: Commands,
+        number: int,
+        points: Buffer,
+        n: int,
+        time: float,
+        tables: list[Buffer],
+        outputs: list[Buffer],
+    ) -> None:
+        """Encode n points at a time in [0, 1]; outside the box [-bound, bound]^3 features are zero.
+
+        number: tells apart the calls that are submitted together.
+        """
+        for part in self._parts:
+            uniform = self._uniform(part, number, n, time)
+            features = tables[part.grid]
+            defines = self._defines(part)
+            if part.sliced:
+                slices = self.pool.get(f"slices {part.grid}", 8 * part.entries)
+                commands.dispatch_grid(
+                    Kernel.get(self.device, "hashgrid_slice", **defines),
+                    (-(-part.cells // 64), part.count),
+                    grid=uniform,
+                    levels=part.levels,
+                    features=features,
+                    slices=slices,
+                )
+                features = slices
+            commands.dispatch(
+                Kernel.get(self.device, "hashgrid", **defines),
+                -(-n // 512) * part.count,
+                grid=uniform,
+                levels=part.levels,
+                points=points,
+                features=features,
+                encoding=outputs[part.grid],
+            )
+
+    def add_gradient(
+        self,
+        commands: Commands,
+        number: int,
+        points: Buffer,
+        n: int,
+        time: float,
+        fixed_scale: float,
+        d_encodings: list[Buffer],
+        d_tables: list[Buffer],
+    ) -> None:
+        """Add the gradient of the tables, from that of the encodings. fixed_scale: see `HashEncoder`."""
+        for part in self._parts:
+            inputs = {
+                "grid": self._uniform(part, number, n, time, fixed_scale),
+                "levels": part.levels,
+                "points": points,
+                "d_encoding": d_encodings[part.grid],
+            }
+            target = d_tables[part.grid]
+            if part.sliced:
+                target = self.pool.get(f"d_slices {part.grid}", 8 * part.entries)
+                commands.clear(target)
+            if self.lane_levels:
+                self._add_lanes(commands, part, number, n, time, inputs, target)
+            else:
+                self._add_fixed(commands, part, n, inputs, target)
+            if part.sliced:
+                commands.dispatch_grid(
+                    Kernel.get(self.device, "hashgrid_slice_bwd", **self._defines(part)),
+                    (-(-part.cells // 64), part.count),
+                    grid=inputs["grid"],
+                    levels=part.levels,
+                    d_slices=target,
+                    d_features=d_tables[part.grid],
+                )
+
+    def _add_lanes(
+        self, commands: Commands, part: _Part, number: int, n: int, time: float, inputs: dict[str, Buffer], out: Buffer
+    ) -> None:
+        kernel = Kernel.get(self.device, "hashgrid_bwd", LANE_LEVELS=1, **self._defines(part))
+        for first in range(0, n, _DISPATCH_POINTS):
+            inputs["grid"] = self._uniform(part, number, n, time, first=first)
+            commands.dispatch(kernel, -(-part.count // 8), **inputs, d_features=out)
+
+    def _add_fixed(self, commands: Commands, part: _Part, n: int, inputs: dict[str, Buffer], out: Buffer) -> None:
+        fixed = self.pool.get(f"d_fixed {part.grid} {part.sliced}", 2 * out.nbytes)
+        commands.clear(fixed)
+        kernel = Kernel.get(self.device, "hashgrid_bwd", **self._defines(part))
+        commands.dispatch(kernel, -(-n // 64) * part.count, **inputs, d_fixed=fixed)
+        unfix = Kernel.get(self.device, "hashgrid_unfix", **self._defines(part))
+        commands.dispatch(unfix, -(-out.nbytes // 256), grid=inputs["grid"], d_fixed=fixed, d_features=out)
