@@ -88,7 +88,7 @@ def test_the_decoder_written_out(device: Device, depth: int, t: float) -> None:
 
 def test_time_fills_a_share_of_its_axis(device: Device) -> None:
     field = GridField(SMALL, device, seed=0)
-    assert [field.grid_time(t) for t in (0.0, 0.5, 1.0)] == pytest.approx([0.05, 0.5, 0.95])
+    assert [field.config.grid_time(t) for t in (0.0, 0.5, 1.0)] == pytest.approx([0.05, 0.5, 0.95])
 
 
 def test_motion_depends_on_time_and_place(device: Device) -> None:

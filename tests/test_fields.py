@@ -9,11 +9,11 @@ import torch
 from torch import Tensor, nn
 
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.motion.field import Deformation, FieldConfig, FieldKind, Nearby, PlaneConfig
+from lapgs_wgpu.motion.field import PLANES, Deformation, FieldConfig, FieldKind, Nearby, PlaneConfig
 from lapgs_wgpu.motion.grid_field import GridField
 from lapgs_wgpu.motion.hash_encoder import encode_reference
 from lapgs_wgpu.motion.hashgrid import HashConfig
-from lapgs_wgpu.motion.hexplane_field import PLANES, HexPlaneField
+from lapgs_wgpu.motion.hexplane_field import HexPlaneField
 from lapgs_wgpu.motion.laplacian import LaplacianMotion, TimeMotion
 from lapgs_wgpu.motion.mlp_field import MlpField, octaves
 from lapgs_wgpu.motion.scene import Field, make_field
@@ -150,7 +150,7 @@ def test_the_decoder_written_out(device: Device, depth: int) -> None:
     """Equations 6, 8 and 9, from the tables to the heads."""
     field, t = grid_field(device, replace(OURS, depth=depth, appearance="color+opacity")), 0.3
     weights = dict(field.named_parameters())
-    time = field.grid_time(t)
+    time = field.config.grid_time(t)
     static, *temporal = (
         encode_reference(grid, grid.table.double(), POINTS, time, OURS.bound).float() for grid in field.grids
     )
@@ -210,8 +210,8 @@ def test_smoothness_of_grids_written_out(device: Device) -> None:
     near = POINTS[ROWS] + NEARBY.offsets
     squares = []
     for grid in field.grids:
-        here = encode_reference(grid, grid.table.double(), POINTS[ROWS], field.grid_time(0.3), OURS.bound)
-        there = encode_reference(grid, grid.table.double(), near, field.grid_time(0.32), OURS.bound)
+        here = encode_reference(grid, grid.table.double(), POINTS[ROWS], field.config.grid_time(0.3), OURS.bound)
+        there = encode_reference(grid, grid.table.double(), near, field.config.grid_time(0.32), OURS.bound)
         squares.append(float((there - here).square().sum(dim=1).mean().detach()))
     assert found is not None
     assert found.item() == pytest.approx(0.7 * squares[0] + 0.2 * sum(squares[1:]), rel=1e-4)
@@ -224,8 +224,8 @@ def test_smoothness_of_grids_written_out(device: Device) -> None:
     tables = [grid.table.detach().clone().requires_grad_() for grid in field.grids]
     total = torch.zeros(())
     for number, (grid, table) in enumerate(zip(field.grids, tables, strict=True)):
-        here = encode_reference(grid, table, POINTS[ROWS], field.grid_time(0.3), OURS.bound)
-        there = encode_reference(grid, table, near, field.grid_time(0.32), OURS.bound)
+        here = encode_reference(grid, table, POINTS[ROWS], field.config.grid_time(0.3), OURS.bound)
+        there = encode_reference(grid, table, near, field.config.grid_time(0.32), OURS.bound)
         total = total + (0.7 if number == 0 else 0.2) * (there - here).square().sum(dim=1).mean()
     total.backward()
     for ours, table in zip(gradients, tables, strict=True):

@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
-from .hashgrid import HashConfig, option
+from .hashgrid import TIME, GridShape, HashConfig, option
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -19,6 +19,13 @@ if TYPE_CHECKING:
 FieldKind = Literal["static", "mlp", "hexplane", "grid4d", "laplacian"]
 Motion = Literal["laplacian", "mlp"]
 Appearance = Literal["none", "color", "color+opacity"]
+MIN_SCALE = 1e-7  # of a Gaussian, after its deformation; world units
+PLANES = ((0, 1), (0, 2), (1, 2), (0, TIME), (1, TIME), (2, TIME))  # of the field hexplane: pairs of x, y, z, t
+TEMPORAL_AXES = ((0, 1, TIME), (1, 2, TIME), (0, 2, TIME))  # of the temporal hash grids
+GEOMETRY = (4, 3, 4, 3)  # outputs of the grid fields' geometry heads: turn, shift, quaternion, scale
+# Times the appearance head's outputs: it then learns about as fast as the colours themselves; at full speed it explains
+# what is motion by changes of colour.
+APPEARANCE_SCALE = 0.1
 MAX_WIDTH, MAX_DEPTH, MAX_COMPONENTS, MAX_DYNAMICS = 4096, 16, 256, 256
 
 
@@ -96,6 +103,34 @@ class FieldConfig:
     def dynamics_size(self) -> int:
         """Length of a Gaussian's dynamics attribute; 0 where the field has no use for it."""
         return self.dynamics if self.kind == "laplacian" else 0
+
+    @property
+    def appearance_size(self) -> int:
+        """Outputs of the appearance head of a grid field; 0 where it has none."""
+        return {"none": 0, "color": 3, "color+opacity": 4}[self.appearance] if self.kind == "laplacian" else 0
+
+    def grid_time(self, t: float) -> float:
+        """A time in [0, 1] as the place on the temporal grids' time axis."""
+        return 0.5 * ((2.0 * t - 1.0) * self.time_scale + 1.0)
+
+
+def static_grid(config: FieldConfig) -> GridShape:
+    """The hash grid of the grid fields over space."""
+    return GridShape(config.static, (0, 1, 2))
+
+
+def temporal_grids(config: FieldConfig) -> list[GridShape]:
+    """Those over time, too."""
+    return [GridShape(config.temporal, axes) for axes in (TEMPORAL_AXES if config.temporal_hash else ())]
+
+
+def plane_shapes(config: PlaneConfig) -> list[tuple[int, int, int, int]]:
+    """(1, features, second axis, first axis) of each plane of the field hexplane, six for each resolution."""
+    shapes = []
+    for level in range(config.levels):
+        sizes = [config.space << level] * 3 + [config.time]
+        shapes += [(1, config.features, sizes[b], sizes[a]) for a, b in PLANES]
+    return shapes
 
 
 class Nearby(NamedTuple):

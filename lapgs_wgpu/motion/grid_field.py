@@ -6,17 +6,10 @@ import torch
 from torch import Tensor, nn
 
 from ..gpu.device import Device
-from .field import Deformation, FieldConfig, Nearby
+from .field import APPEARANCE_SCALE, GEOMETRY, TEMPORAL_AXES, Deformation, FieldConfig, Nearby
 from .hash_encoder import HashEncoder, HashGrid
-from .hashgrid import TIME
 from .laplacian import LaplacianMotion, TimeMotion
 from .layers import linear, zero_head
-
-GEOMETRY = (4, 3, 4, 3)  # outputs of the geometry heads: turn, shift, quaternion, scale
-# Times the appearance head's outputs: it then learns about as fast as the colours themselves; at full speed it explains
-# what is motion by changes of colour.
-APPEARANCE_SCALE = 0.1
-TEMPORAL_AXES = ((0, 1, TIME), (1, 2, TIME), (0, 2, TIME))
 
 
 class GridField(nn.Module):
@@ -55,7 +48,7 @@ class GridField(nn.Module):
             )
         elif ours:
             self.motion = TimeMotion(static, width, generator)
-        changes = {"none": 0, "color": 3, "color+opacity": 4}[config.appearance] if ours else 0
+        changes = config.appearance_size
         self.appearance = zero_head(width, changes) if changes else None
 
     @property
@@ -63,17 +56,13 @@ class GridField(nn.Module):
         """The static one first."""
         return [self.static_grid, *(grid for grid in self.temporal_grids if isinstance(grid, HashGrid))]
 
-    def grid_time(self, t: float) -> float:
-        """A time in [0, 1] as the place on the temporal grids' time axis."""
-        return 0.5 * ((2.0 * t - 1.0) * self.config.time_scale + 1.0)
-
     def forward(
         self, means: Tensor, t: float, dynamics: Tensor | None = None, nearby: Nearby | None = None
     ) -> Deformation:
         """See motion/field.py."""
-        places = [(means, self.grid_time(t))]
+        places = [(means, self.config.grid_time(t))]
         if nearby is not None:
-            places.append((means[nearby.rows] + nearby.offsets, self.grid_time(nearby.time)))
+            places.append((means[nearby.rows] + nearby.offsets, self.config.grid_time(nearby.time)))
         encoded = self._encoder.encode_all(places)
         static, *temporal = encoded[0]
         if self.config.dynamics_size and dynamics is not None:

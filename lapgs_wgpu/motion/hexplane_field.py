@@ -5,22 +5,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from .field import Deformation, FieldConfig, Nearby, PlaneConfig
+from .field import PLANES, Deformation, FieldConfig, Nearby, plane_shapes
+from .hashgrid import TIME
 from .layers import linear, zero_head
 
-PLANES = ((0, 1), (0, 2), (1, 2), (0, 3), (1, 3), (2, 3))  # pairs of x, y, z, t
-TIME = 3
 # Weights of the smoothness loss that 4D-GS trains with on D-NeRF scenes.
 SPACE_SMOOTHNESS, TIME_SMOOTHNESS, TIME_SPARSITY = 1e-4, 1e-2, 1e-4
-
-
-def plane_shapes(config: PlaneConfig) -> list[tuple[int, int, int, int]]:
-    """(1, features, second axis, first axis) of each plane, six for each resolution."""
-    shapes = []
-    for level in range(config.levels):
-        sizes = [config.space << level] * 3 + [config.time]
-        shapes += [(1, config.features, sizes[b], sizes[a]) for a, b in PLANES]
-    return shapes
 
 
 class HexPlaneField(nn.Module):

@@ -5,41 +5,28 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-import typing
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from ..errors import InputError
 from ..gpu.device import Device, open_device
-from ..io.checkpoint import read_checkpoint, write_checkpoint
+from ..io.checkpoint import write_checkpoint
 from ..io.ply import StillGaussians
 from ..splat.camera import Camera
 from ..splat.gaussians import Gaussians
 from ..splat.rasterize import Rendering, rasterize
-from .field import FieldConfig, Nearby, PlaneConfig
-from .grid_field import TEMPORAL_AXES, GridField
-from .hashgrid import HashConfig, make_levels
-from .hexplane_field import HexPlaneField, plane_shapes
+from .field import MIN_SCALE, FieldConfig, Nearby
+from .grid_field import GridField
+from .hexplane_field import HexPlaneField
 from .laplacian import LaplacianMotion
 from .mlp_field import MlpField
+from .scene_file import SceneFile, read_scene, row_shapes
 
 SH_C0 = 0.28209479177387814
-_MIN_SCALE = 1e-7
-_MAX_DEGREE = 3
-_SHAPES = {
-    "means": (3,),
-    "log_scales": (3,),
-    "quats": (4,),
-    "opacity_logits": (),
-    "sh_dc": (1, 3),
-    "sh_rest": (15, 3),
-}
-
 
 Field = GridField | MlpField | HexPlaneField
 
@@ -53,12 +40,6 @@ def make_field(config: FieldConfig, device: Device, seed: int = 0) -> Field | No
     if config.kind == "hexplane":
         return HexPlaneField(config, seed)
     return GridField(config, device, seed)
-
-
-def row_shapes(config: FieldConfig) -> dict[str, tuple[int, ...]]:
-    """What each Gaussian carries with this field: name -> shape of a row."""
-    size = config.dynamics_size
-    return _SHAPES | ({"dynamics": (size,)} if size else {})
 
 
 class Scene4D:
@@ -131,7 +112,7 @@ class Scene4D:
         return Gaussians(
             p["means"],
             nn.functional.normalize(p["quats"], dim=1),
-            p["log_scales"].exp().clamp(min=_MIN_SCALE),
+            p["log_scales"].exp().clamp(min=MIN_SCALE),
             p["opacity_logits"].sigmoid(),
             self._sh(),
         )
@@ -157,7 +138,7 @@ class Scene4D:
         moved = Gaussians(
             means + move.translation,
             nn.functional.normalize(still.quats + move.d_quats, dim=1),
-            (still.scales + move.d_scales).clamp(min=_MIN_SCALE),
+            (still.scales + move.d_scales).clamp(min=MIN_SCALE),
             opacities,
             sh,
         )
@@ -168,24 +149,28 @@ class Scene4D:
         with torch.no_grad():
             return draw(self.at(t), camera, background, self.device)
 
-    def save(self, path: str | os.PathLike[str], metadata: Mapping[str, str] | None = None) -> None:
-        """Write the scene to one file, which 3DGS viewers open as a still at time 0 (docs/format.md). Atomic.
-
-        Raises InputError where the disk or the values do not allow it; an older file then stays as it was.
-        """
+    def still(self, t: float) -> StillGaussians:
+        """The Gaussians at time t in [0, 1] before their activations, as 3DGS viewers read them."""
         with torch.no_grad():
-            still = self.at(0.0)
+            still = self.at(t)
             sh = torch.cat([still.sh[:, :1], self.parameters["sh_rest"]], dim=1)
             logits = self.parameters["opacity_logits"].detach()
             if not torch.equal(still.opacities, logits.sigmoid()):
                 logits = still.opacities.logit(eps=1e-7)
-        arrays = StillGaussians(
+        return StillGaussians(
             means=still.means.numpy(force=True),
             sh=sh.numpy(force=True),
             opacity_logits=logits.numpy(force=True),
             log_scales=still.scales.log().numpy(force=True),
             quats=still.quats.numpy(force=True),
         )
+
+    def save(self, path: str | os.PathLike[str], metadata: Mapping[str, str] | None = None) -> None:
+        """Write the scene to one file, which 3DGS viewers open as a still at time 0 (docs/format.md). Atomic.
+
+        Raises InputError where the disk or the values do not allow it; an older file then stays as it was.
+        """
+        arrays = self.still(0.0)
         tensors = {f"gaussians.{name}": value.numpy(force=True) for name, value in self.parameters.items()}
         if self.field is not None:
             tensors |= {f"field.{name}": value.numpy(force=True) for name, value in self.field.state_dict().items()}
@@ -210,93 +195,19 @@ def draw(gaussians: Gaussians, camera: Camera, background: Tensor | None, device
 
 def load(path: str | os.PathLike[str], device: Device | None = None) -> Scene4D:
     """Read a checkpoint, or any 3DGS .ply, which becomes a static scene. Raises InputError."""
-    still, tensors, metadata = read_checkpoint(path)
-    if not tensors:
-        sh = np.zeros((len(still.means), 16, 3), np.float32)
-        sh[:, : still.sh.shape[1]] = still.sh
-        tensors = {
-            "gaussians.means": still.means,
-            "gaussians.log_scales": still.log_scales,
-            "gaussians.quats": still.quats,
-            "gaussians.opacity_logits": still.opacity_logits,
-            "gaussians.sh_dc": sh[:, :1],
-            "gaussians.sh_rest": sh[:, 1:],
-        }
-        config, degree = FieldConfig(kind="static"), still.sh_degree
-    else:
-        config, degree = _read_header(metadata, path)
-    count = len(still.means)
-    parameters = {}
-    for name, shape in row_shapes(config).items():
-        parameters[name] = _tensor(tensors, f"gaussians.{name}", (count, *shape), path)
-    _check_sizes(config, tensors, path)
-    scene = Scene4D(parameters, config, device or open_device(), sh_degree=degree)
+    return scene_of(read_scene(path), device)
+
+
+def scene_of(file: SceneFile, device: Device | None = None) -> Scene4D:
+    """The scene in a file that was read. Raises InputError where the field's parameters are damaged."""
+    parameters = {name: torch.from_numpy(array.copy()) for name, array in file.gaussians.items()}
+    scene = Scene4D(parameters, file.field_config, device or open_device(), sh_degree=file.sh_degree)
     if scene.field is not None:
-        state = scene.field.state_dict()
-        read = {name: _tensor(tensors, f"field.{name}", tuple(value.shape), path) for name, value in state.items()}
-        scene.field.load_state_dict(read)
-    scene.metadata = {key: value for key, value in metadata.items() if key not in ("field", "sh_degree")}
+        shapes = {name: tuple(value.shape) for name, value in scene.field.state_dict().items()}
+        # Copied into the module by load_state_dict, so that they may be views of the file's bytes.
+        scene.field.load_state_dict({name: torch.from_numpy(array) for name, array in file.field(shapes).items()})
+    scene.metadata = file.metadata
     return scene
-
-
-def _read_header(metadata: Mapping[str, str], path: str | os.PathLike[str]) -> tuple[FieldConfig, int]:
-    try:
-        values: dict[str, Any] = json.loads(metadata["field"])
-        for name in ("static", "temporal"):
-            grid: dict[str, Any] = values[name]
-            values[name] = HashConfig(grid["levels"], tuple(grid["base"]), tuple(grid["finest"]), grid["table_log2"])
-        values["planes"] = PlaneConfig(**values["planes"])
-        config, degree = FieldConfig(**values), int(metadata["sh_degree"])
-        _check_types(config, FieldConfig())
-        if not 0 <= degree <= _MAX_DEGREE:
-            raise ValueError(f"sh_degree {degree} is outside 0 to {_MAX_DEGREE}")
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(
-            f"{path}: the checkpoint's description of its field cannot be read ({type(error).__name__}: {error}): "
-            "it was damaged, or written by another version of lapgs_wgpu"
-        ) from error
-    return config, degree
-
-
-def _check_types(found: Any, like: Any) -> None:
-    """That a description has the types of another one: JSON may hold anything."""
-    if dataclasses.is_dataclass(like):
-        kinds = typing.get_type_hints(type(like))
-        for field in dataclasses.fields(like):
-            value, choices = getattr(found, field.name), typing.get_args(kinds[field.name])
-            if typing.get_origin(kinds[field.name]) is Literal and value not in choices:
-                raise ValueError(f"{field.name} is {value!r}")
-            _check_types(value, getattr(like, field.name))
-    elif isinstance(like, tuple):
-        for value, entry in zip(found, like, strict=True):
-            _check_types(value, entry)
-    elif type(found) is not type(like) and not (type(like) is float and type(found) is int):
-        raise TypeError(f"{found!r} has the wrong type")
-
-
-def _check_sizes(config: FieldConfig, tensors: Mapping[str, NDArray[Any]], path: str | os.PathLike[str]) -> None:
-    """That the large tensors in the file have the sizes that the description asks for, before memory is taken."""
-    if config.kind in ("grid4d", "laplacian"):
-        temporal = [f"temporal_grids.{i}" for i in range(len(TEMPORAL_AXES) if config.temporal_hash else 0)]
-        for name in ("static_grid", *temporal):
-            last = make_levels(config.static if name == "static_grid" else config.temporal)[-1]
-            _tensor(tensors, f"field.{name}.table", (last.first + last.entries, 2), path)
-    elif config.kind == "hexplane":
-        for i, shape in enumerate(plane_shapes(config.planes)):
-            _tensor(tensors, f"field.planes.{i}", shape, path)
-
-
-def _tensor(
-    tensors: Mapping[str, NDArray[Any]], name: str, shape: tuple[int, ...], path: str | os.PathLike[str]
-) -> Tensor:
-    if name not in tensors:
-        raise InputError(f"{path}: the checkpoint has no tensor {name!r}: it was damaged or written by another version")
-    array = tensors[name]
-    if array.shape != shape:
-        raise InputError(f"{path}: tensor {name!r} has shape {array.shape}, but the scene needs {shape}")
-    if not np.isfinite(array).all():
-        raise InputError(f"{path}: tensor {name!r} holds {int((~np.isfinite(array)).sum())} values that are not finite")
-    return torch.from_numpy(np.array(array, np.float32))
 
 
 def rotate(q: Tensor, v: Tensor) -> Tensor:

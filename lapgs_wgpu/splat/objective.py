@@ -82,7 +82,7 @@ class _Task:
     def run(self, tensors: list[Tensor]) -> tuple[NDArray[np.float32], list[NDArray[np.float32]]]:
         """Projected splats (N, 12), and the gradients of the tensors and of means2d; none where none is wanted."""
         rasterizer, n = self.rasterizer, len(tensors[0])
-        gaussians = upload_gaussians(rasterizer, tensors, self.sh_degree)
+        gaussians = upload_gaussians(rasterizer.pool, tensors, self.sh_degree)
         while True:
             image = rasterizer.draw(gaussians, self.camera, self.background)
             with Commands(rasterizer.device) as commands:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..gpu.buffer import Buffer, Request, read_all
+from ..gpu.buffer import Buffer, BufferPool, Request, read_all
 from ..gpu.device import Device, open_device
 from .camera import Camera
 from .rasterizer import SPLAT_FLOATS, GaussianBuffers, GradientBuffers, Rasterizer
@@ -136,7 +136,7 @@ class _Rasterize(torch.autograd.Function):
             _draw(rasterizer, tensors, ctx.camera, ctx.sh_degree, ctx.depth)
             ctx.drawing = rasterizer._drawn
         planes = torch.cat([d_image.permute(2, 0, 1), d_alpha[None], *([d_depth[None]] if ctx.depth else [])])
-        d_planes = _upload(rasterizer, "d_image", planes)
+        d_planes = _upload(rasterizer.pool, "d_image", planes)
         gradients = rasterizer.backward(d_planes)
         n = len(tensors[0])
         requests = read_requests(gradients, n, tuple(tensors[4].shape))
@@ -155,7 +155,7 @@ def _draw(
     """Upload, draw until the buffers are large enough, read back: planes (4 or 5, H, W) and splats (N, 12)."""
     *shapes, background = tensors
     n = len(shapes[0])
-    gaussians = upload_gaussians(rasterizer, shapes, sh_degree)
+    gaussians = upload_gaussians(rasterizer.pool, shapes, sh_degree)
     red, green, blue = background.tolist()
     while True:
         image = rasterizer.draw(gaussians, camera, (red, green, blue), depth=depth)
@@ -171,10 +171,10 @@ def _draw(
             return planes, projected
 
 
-def upload_gaussians(rasterizer: Rasterizer, tensors: list[Tensor], sh_degree: int | None) -> GaussianBuffers:
-    """The tensors means, quats, scales, opacities and colors, on the device."""
+def upload_gaussians(pool: BufferPool, tensors: list[Tensor], sh_degree: int | None) -> GaussianBuffers:
+    """The tensors means, quats, scales, opacities and colors, in buffers of a pool."""
     names = ("means", "quats", "scales", "opacities", "colors")
-    buffers = {name: _upload(rasterizer, name, tensor) for name, tensor in zip(names, tensors, strict=True)}
+    buffers = {name: _upload(pool, name, tensor) for name, tensor in zip(names, tensors, strict=True)}
     stored = 1 if sh_degree is None else tensors[4].shape[1]
     return GaussianBuffers(count=len(tensors[0]), sh_degree=sh_degree, sh_stored=stored, **buffers)
 
@@ -193,8 +193,8 @@ def read_requests(gradients: GradientBuffers, n: int, colors: tuple[int, ...]) -
     return requests
 
 
-def _upload(rasterizer: Rasterizer, name: str, tensor: Tensor) -> Buffer:
+def _upload(pool: BufferPool, name: str, tensor: Tensor) -> Buffer:
     array = tensor.detach().to("cpu", torch.float32).contiguous().numpy()
-    buffer = rasterizer.pool.get(f"input {name}", array.nbytes)
+    buffer = pool.get(f"input {name}", array.nbytes)
     buffer.write(array)
     return buffer

@@ -1,0 +1,253 @@
+"""Grid fields on the device, without torch: the Gaussians of a grid4d or laplacian scene at a time, for playback.
+
+What needs no time is computed once. Then a time costs the temporal encoding and one pass, `deform`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..gpu.buffer import Buffer, BufferPool
+from ..gpu.device import Device
+from ..gpu.kernel import Commands, Kernel
+from ..splat.rasterizer import GaussianBuffers
+from .device_encoder import DeviceEncoder
+from .field import APPEARANCE_SCALE, GEOMETRY, FieldConfig, static_grid, temporal_grids
+
+Floats = NDArray[np.float32]
+
+_LANES = 64  # deform.wgsl
+_CANONICAL = 16  # deform.wgsl: floats of a Gaussian before its still features
+_MAX_ROUNDS = 65_535  # after which Mesa's software driver ends a shader's loops
+_BLOCK_BYTES = 128 << 20  # of the features that one dispatch sees: WebGPU's default limit of a binding
+
+
+def runs_on_device(config: FieldConfig) -> bool:
+    """Whether `DeviceField` can show this field."""
+    shown = config.kind == "grid4d" or (config.kind == "laplacian" and config.motion == "laplacian")
+    if not shown or config.depth:
+        return False
+    sizes = _Sizes(config)
+    # Of 8 channels (on CPU devices), with the loops over channels and the round itself.
+    return (sizes.width // 8 + 1) * (sizes.still_quads + sizes.moving_quads + 11) < _MAX_ROUNDS
+
+
+class _Sizes:
+    """Lengths of the rows that the pass reads, in floats and in quads of them."""
+
+    def __init__(self, config: FieldConfig) -> None:
+        self.width = config.width
+        self.static = static_grid(config).features
+        self.dynamics = config.dynamics_size
+        self.temporal = sum(grid.features for grid in temporal_grids(config))
+        self.first_temporal = self.dynamics + self.dynamics % 2  # features come in pairs
+        self.still_quads = -(-self.static // 4)
+        self.moving_quads = -(-(self.first_temporal + self.temporal) // 4)
+
+
+def parameter_shapes(config: FieldConfig) -> dict[str, tuple[int, ...]]:
+    """The parameters of the field's module that playback needs, all of them where there are no hidden layers."""
+    sizes = _Sizes(config)
+    width, static = sizes.width, sizes.static
+    layers = {"spatial": (width, static), "temporal": (width, max(1, sizes.dynamics + sizes.temporal))}
+    layers["heads"] = (sum(GEOMETRY), width)
+    shapes: dict[str, tuple[int, ...]] = {"static_grid.table": (static_grid(config).entries, 2)}
+    shapes |= {f"temporal_grids.{i}.table": (grid.entries, 2) for i, grid in enumerate(temporal_grids(config))}
+    if config.kind == "laplacian":
+        layers |= {"motion.first": (width, static), "motion.second": (width, width)}
+        shapes |= {"motion.alpha": (config.components, width), "motion.beta": (config.components, width)}
+        shapes["motion.frequencies"] = (config.components,)
+    if config.appearance_size:
+        layers["appearance"] = (config.appearance_size, width)
+    for name, shape in layers.items():
+        shapes |= {f"{name}.weight": shape, f"{name}.bias": shape[:1]}
+    return shapes
+
+
+@dataclass(frozen=True)
+class _Block:
+    """Gaussians that one dispatch takes: a range of all, with what is read of them."""
+
+    first: int
+    count: int
+    points: Buffer  # (count, 4)
+    still: Buffer  # (count, 16 + still features)
+    moving: Buffer  # (count, dynamics and temporal features)
+
+
+class DeviceField:
+    """Moves activated Gaussians (`still`, means (N, 3), quats (N, 4) of unit length, ..., with opacity_logits in place
+    of opacities) by a field whose parameters have the names and shapes of `parameter_shapes`.
+
+    block: how many Gaussians a dispatch takes, a multiple of 64; by default what fits into 128 MiB.
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        config: FieldConfig,
+        parameters: Mapping[str, Floats],
+        gaussians: Mapping[str, Floats],
+        *,
+        block: int | None = None,
+    ) -> None:
+        self._device, self._config, self._parameters = device, config, parameters
+        self._pool = BufferPool(device)
+        self._sizes = sizes = _Sizes(config)
+        self._defines = {"POINTS": 4, "QUADS": 2} if device.is_cpu else {"POINTS": 2, "QUADS": 1}
+        self._defines["HEADS"] = 5 if config.appearance_size else 4
+        if config.kind == "laplacian":
+            self._defines["MOTION"] = 1
+        if config.appearance_size:
+            self._defines["COLOR"] = 1
+        self._channels = 4 * self._defines["QUADS"]  # a round
+        self._rounds = -(-config.width // self._channels)
+        row = max(_CANONICAL + 4 * sizes.still_quads, 4 * sizes.moving_quads)
+        size = block or _BLOCK_BYTES // (4 * row) // _LANES * _LANES
+        count = len(gaussians["means"])
+        self._blocks = [self._block(gaussians, first, min(size, count - first)) for first in range(0, count, size)]
+        self._temporal = DeviceEncoder(
+            device, temporal_grids(config), config.bound, row=4 * sizes.moving_quads, column=sizes.first_temporal
+        )
+        self._tables = [
+            self._filled(f"table {i}", parameters[f"temporal_grids.{i}.table"])
+            for i in range(len(self._temporal.grids))
+        ]
+        self._encode_static()
+        heads, stream = self._heads(0.0), self._stream()
+        self._stream_at = len(heads)
+        self._weights = self._filled("weights", np.concatenate([heads, stream]))
+
+    def _filled(self, name: str, array: Floats) -> Buffer:
+        buffer = self._pool.get(name, array.nbytes)
+        buffer.write(array)
+        return buffer
+
+    def _block(self, gaussians: Mapping[str, Floats], first: int, count: int) -> _Block:
+        g = {name: array[first : first + count] for name, array in gaussians.items()}
+        points = np.zeros((count, 4), np.float32)
+        points[:, :3] = g["means"]
+        still = np.zeros((count, _CANONICAL + 4 * self._sizes.still_quads), np.float32)
+        still[:, :3], still[:, 3], still[:, 4:8] = g["means"], g["opacity_logits"], g["quats"]
+        still[:, 8:11], still[:, 12:15] = g["scales"], g["colors"][:, 0]
+        moving = np.zeros((count, max(4, 4 * self._sizes.moving_quads)), np.float32)
+        if self._sizes.dynamics:
+            moving[:, : self._sizes.dynamics] = g["dynamics"]
+        named = {"points": points, "still": still, "moving": moving}
+        return _Block(first, count, **{name: self._filled(f"{name} from {first}", a) for name, a in named.items()})
+
+    def _encode_static(self) -> None:
+        """H_s, into the rows of what does not change."""
+        row = _CANONICAL + 4 * self._sizes.still_quads
+        encoder = DeviceEncoder(
+            self._device, [static_grid(self._config)], self._config.bound, row=row, column=_CANONICAL
+        )
+        table = Buffer(self._device, self._parameters["static_grid.table"].nbytes, "static table")
+        table.write(self._parameters["static_grid.table"])
+        with Commands(self._device) as commands:
+            for number, block in enumerate(self._blocks):
+                encoder.encode(commands, number, block.points, block.count, 0.0, [table], [block.still])
+
+    # Weights ---------------------------------------------------------------------------------------------------------
+
+    def _columns(self, weight: Floats, quads: int) -> Floats:
+        """(rounds, input quads, output quads of a round, 4 inputs, 4 outputs) of a layer's weight (width, inputs)."""
+        padded = np.zeros((self._rounds * self._channels, 4 * quads), np.float32)
+        padded[: weight.shape[0], : weight.shape[1]] = weight
+        return padded.reshape(self._rounds, self._channels // 4, 4, quads, 4).transpose(0, 3, 1, 4, 2)
+
+    def _stream(self) -> Floats:
+        """(vectors, 4): biases and layers of the decoder, in the order in which the pass reads them."""
+        p, sizes, rounds = self._parameters, self._sizes, self._rounds
+        moving = np.zeros((sizes.width, sizes.first_temporal + sizes.temporal), np.float32)
+        moving[:, : sizes.dynamics] = p["temporal.weight"][:, : sizes.dynamics]
+        moving[:, sizes.first_temporal :] = p["temporal.weight"][:, sizes.dynamics : sizes.dynamics + sizes.temporal]
+        still, biases = ["spatial"], ["spatial", "temporal"]
+        if self._config.kind == "laplacian":
+            still, biases = [*still, "motion.first"], [*biases, "motion.first"]
+        starts = np.concatenate([self._columns(p[f"{name}.bias"][:, None], 1)[:, 0, :, :1] for name in biases], axis=2)
+        layers = [self._columns(p[f"{name}.weight"], sizes.still_quads) for name in still]
+        parts = [starts, np.stack(layers, axis=4), self._columns(moving, sizes.moving_quads)]
+        return np.concatenate([part.reshape(rounds, -1, 4) for part in parts], axis=1).reshape(-1, 4)
+
+    def _heads(self, t: float) -> Floats:
+        """(vectors, 4): biases and, by channel, weights of the heads; with the Laplacian motion at a time folded in."""
+        p, width = self._parameters, self._sizes.width
+        weight = p["heads.weight"]
+        heads, channels = self._defines["HEADS"], self._rounds * self._channels
+        columns = np.zeros((channels, heads + 4 if "MOTION" in self._defines else heads, 4), np.float32)
+        start = np.zeros((heads, 4), np.float32)
+        _fill_geometry(columns[:width], weight.T)
+        _fill_geometry(start[None], p["heads.bias"][None])
+        if self._config.kind == "laplacian":
+            phase = 2 * math.pi * t * p["motion.frequencies"].astype(np.float64)
+            series = np.cos(phase) @ p["motion.alpha"] + np.sin(phase) @ p["motion.beta"]
+            # Factors.through: A_L goes into nothing but these heads.
+            _fill_geometry(columns[:width, heads:], (weight @ (series[:, None] * p["motion.second.weight"])).T)
+            bias = p["heads.bias"] + weight @ (series * p["motion.second.bias"])
+            _fill_geometry(start[None], bias[None])
+        if self._config.appearance_size:
+            look = APPEARANCE_SCALE * p["appearance.weight"], APPEARANCE_SCALE * p["appearance.bias"]
+            columns[:width, 4, :3], start[4, :3] = look[0][:3].T, look[1][:3]
+            if self._config.appearance_size == 4:
+                columns[:width, 2, 3], start[2, 3] = look[0][3], look[1][3]
+        return np.concatenate([start, columns.reshape(-1, 4)])
+
+    # A time ----------------------------------------------------------------------------------------------------------
+
+    def move(self, t: float, out: GaussianBuffers) -> None:
+        """Submit the passes that write the Gaussians at a time in [0, 1]: all of `out` but the colours above their
+        constant part, which stay, and the constant part, too, where the field changes no colours."""
+        kernel = Kernel.get(self._device, "deform", **self._defines)
+        self._weights.write(self._heads(t))
+        points, stored = self._defines["POINTS"], out.sh_stored
+        with Commands(self._device) as commands:
+            for number, block in enumerate(self._blocks):
+                self._temporal.encode(
+                    commands,
+                    number,
+                    block.points,
+                    block.count,
+                    self._config.grid_time(t),
+                    self._tables,
+                    [block.moving] * len(self._tables),
+                )
+                uniform = self._pool.constant(
+                    f"deform {number}",
+                    kernel.uniform(
+                        "Deform",
+                        gaussians=block.count,
+                        rounds=self._rounds,
+                        still_quads=self._sizes.still_quads,
+                        moving_quads=self._sizes.moving_quads,
+                        stream=self._stream_at,
+                        sh_stored=stored,
+                    ),
+                )
+                rows = {"means": 12, "quats": 16, "scales": 12, "opacities": 4, "colors": 12 * stored}
+                if "COLOR" not in self._defines:
+                    del rows["colors"]
+                outputs = {
+                    name: (getattr(out, name), block.first * size, max(16, block.count * size))
+                    for name, size in rows.items()
+                }
+                commands.dispatch(
+                    kernel,
+                    -(-block.count // (_LANES * points)),
+                    deform=uniform,
+                    still=block.still,
+                    moving=block.moving,
+                    weights=self._weights,
+                    **outputs,
+                )
+
+
+def _fill_geometry(quads: NDArray[np.float32], outputs: NDArray[np.floating]) -> None:
+    """Lay the geometry heads' 14 outputs (rows, 14) out as deform.wgsl has them, in quads (rows, 4 or more, 4)."""
+    turn, shift, quaternion, scale = np.split(outputs, np.cumsum(GEOMETRY)[:-1], axis=1)
+    quads[:, 0], quads[:, 1], quads[:, 2, :3], quads[:, 3, :3] = turn, quaternion, shift, scale

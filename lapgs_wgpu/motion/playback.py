@@ -1,0 +1,143 @@
+"""Showing a trained scene at any time: what a viewer needs of it, and opening a file for that.
+
+Where a scene stands still or the device evaluates its field (motion/deform), torch is not imported, which alone would
+take longer than all the rest.
+"""
+
+from __future__ import annotations
+
+import os
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..gpu.buffer import BufferPool, read_all
+from ..gpu.device import Device
+from ..io.ply import StillGaussians
+from ..splat.rasterizer import GaussianBuffers
+from .deform import DeviceField, parameter_shapes, runs_on_device
+from .field import MIN_SCALE, FieldConfig
+from .scene_file import SceneFile, read_scene
+
+Floats = NDArray[np.float32]
+
+
+class Playback(Protocol):
+    """A scene that can be shown: `count` Gaussians of `sh_degree`, which stand still unless it `moves`.
+
+    metadata: what the checkpoint says of itself. Times are in [0, 1].
+    """
+
+    device: Device
+    field_config: FieldConfig
+    metadata: dict[str, str]
+
+    @property
+    def count(self) -> int: ...
+    @property
+    def sh_degree(self) -> int: ...
+    @property
+    def moves(self) -> bool: ...
+
+    def at(self, t: float) -> GaussianBuffers:
+        """The activated Gaussians at a time, on the device: submitted, not waited for. Valid until the next call."""
+
+    def means(self, t: float) -> Floats:
+        """(count, 3), world units, at a time."""
+
+    def dynamics(self) -> Floats | None:
+        """(count, D) the dynamics attributes; None where the field has none."""
+
+    def still(self, t: float) -> StillGaussians:
+        """All Gaussians at a time, as 3DGS viewers read them; what `Scene4D.save` writes for time 0."""
+
+
+def open_playback(path: str | os.PathLike[str], device: Device) -> Playback:
+    """Open a checkpoint, or any 3DGS .ply, which becomes a static scene.
+
+    torch is imported for the fields mlp and hexplane, for hidden layers, and for the ablated motion alone.
+    Raises InputError, and MemoryError where a buffer of all Gaussians is beyond the device's limits: colours are the
+    largest, 1.4 million Gaussians of degree 3 at WebGPU's default limits.
+    """
+    file = read_scene(path)
+    if file.field_config.kind == "static" or runs_on_device(file.field_config):
+        return DevicePlayback(file, device)
+    from .scene import scene_of
+    from .scene_playback import ScenePlayback
+
+    return ScenePlayback(scene_of(file, device))
+
+
+class DevicePlayback:
+    """A file whose scene stands still, or moves by a field that the device evaluates. See Playback.
+
+    block: how many Gaussians a dispatch takes, see DeviceField.
+    """
+
+    def __init__(self, file: SceneFile, device: Device, *, block: int | None = None) -> None:
+        self.device, self.field_config, self.metadata = device, file.field_config, file.metadata
+        self.count, self.sh_degree = len(file.gaussians["means"]), file.sh_degree
+        self.moves = file.field_config.kind != "static"
+        self._stored = file.gaussians
+        activated = activate(file.gaussians, file.sh_degree)
+        pool = BufferPool(device)
+        buffers = {}
+        for name in ("means", "quats", "scales", "opacities", "colors"):
+            buffers[name] = pool.get(name, activated[name].nbytes)
+            buffers[name].write(activated[name])
+        self._buffers = GaussianBuffers(
+            count=self.count, sh_degree=self.sh_degree, sh_stored=(self.sh_degree + 1) ** 2, **buffers
+        )
+        self._field: DeviceField | None = None
+        self._time: float | None = None
+        if self.moves:
+            parameters = file.field(parameter_shapes(file.field_config))
+            self._field = DeviceField(device, file.field_config, parameters, activated, block=block)
+
+    def at(self, t: float) -> GaussianBuffers:
+        """See Playback."""
+        if self._field is not None and self._time != t:
+            self._field.move(t, self._buffers)
+            self._time = t
+        return self._buffers
+
+    def means(self, t: float) -> Floats:
+        """See Playback."""
+        return self.at(t).means.read("float32", (self.count, 3)) if self.moves else self._stored["means"]
+
+    def dynamics(self) -> Floats | None:
+        """See Playback."""
+        return self._stored.get("dynamics")
+
+    def still(self, t: float) -> StillGaussians:
+        """See Playback."""
+        now, n = self.at(t), self.count
+        means, quats, scales, opacities, colors = read_all(
+            [
+                (now.means, "float32", (n, 3), 0),
+                (now.quats, "float32", (n, 4), 0),
+                (now.scales, "float32", (n, 3), 0),
+                (now.opacities, "float32", (n,), 0),
+                (now.colors, "float32", (n, now.sh_stored, 3), 0),
+            ]
+        )
+        logits = self._stored["opacity_logits"]
+        if self.field_config.appearance_size == 4:
+            inside = np.clip(opacities.astype(np.float64), 1e-7, 1 - 1e-7)
+            logits = np.log(inside / (1 - inside)).astype(np.float32)
+        sh = np.concatenate([colors[:, :1], self._stored["sh_rest"]], axis=1)
+        return StillGaussians(means, sh, logits, np.log(scales), quats)
+
+
+def activate(stored: dict[str, Floats], sh_degree: int) -> dict[str, Floats]:
+    """What is stored, and beside it the Gaussians after their activations, as Scene4D.canonical has them."""
+    quats, used = stored["quats"], (sh_degree + 1) ** 2 - 1
+    with np.errstate(over="ignore"):
+        scales = np.maximum(np.exp(stored["log_scales"]), np.float32(MIN_SCALE))
+    return stored | {
+        "quats": quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-12),
+        "scales": scales,
+        "opacities": 0.5 + 0.5 * np.tanh(0.5 * stored["opacity_logits"]),
+        "colors": np.concatenate([stored["sh_dc"], stored["sh_rest"][:, :used]], axis=1),
+    }

@@ -1,0 +1,138 @@
+"""What a file says of a scene, checked, as arrays: read without torch, for training's Scene4D and for playback."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import typing
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..io.checkpoint import read_checkpoint
+from .field import FieldConfig, PlaneConfig, plane_shapes, static_grid, temporal_grids
+from .hashgrid import HashConfig
+
+_MAX_DEGREE = 3
+_SHAPES = {
+    "means": (3,),
+    "log_scales": (3,),
+    "quats": (4,),
+    "opacity_logits": (),
+    "sh_dc": (1, 3),
+    "sh_rest": (15, 3),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class SceneFile:
+    """gaussians: the canonical ones by name, float32, in the shapes of `row_shapes`. metadata: the file's own texts."""
+
+    path: str | os.PathLike[str]
+    field_config: FieldConfig
+    sh_degree: int
+    gaussians: dict[str, NDArray[np.float32]]
+    metadata: dict[str, str]
+    tensors: Mapping[str, NDArray[Any]]
+
+    def field(self, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, NDArray[np.float32]]:
+        """The field's parameters of these names and shapes. Raises InputError where the file has others."""
+        return {name: _tensor(self.tensors, f"field.{name}", shape, self.path) for name, shape in shapes.items()}
+
+
+def read_scene(path: str | os.PathLike[str]) -> SceneFile:
+    """Read a checkpoint, or any 3DGS .ply, which becomes a static scene. Raises InputError."""
+    still, tensors, metadata = read_checkpoint(path)
+    if not tensors:
+        sh = np.zeros((len(still.means), 16, 3), np.float32)
+        sh[:, : still.sh.shape[1]] = still.sh
+        tensors = {
+            "gaussians.means": still.means,
+            "gaussians.log_scales": still.log_scales,
+            "gaussians.quats": still.quats,
+            "gaussians.opacity_logits": still.opacity_logits,
+            "gaussians.sh_dc": sh[:, :1],
+            "gaussians.sh_rest": sh[:, 1:],
+        }
+        config, degree = FieldConfig(kind="static"), still.sh_degree
+    else:
+        config, degree = _read_header(metadata, path)
+    count = len(still.means)
+    gaussians = {
+        name: _tensor(tensors, f"gaussians.{name}", (count, *shape), path) for name, shape in row_shapes(config).items()
+    }
+    _check_sizes(config, tensors, path)
+    texts = {key: value for key, value in metadata.items() if key not in ("field", "sh_degree")}
+    return SceneFile(path, config, degree, gaussians, texts, tensors)
+
+
+def row_shapes(config: FieldConfig) -> dict[str, tuple[int, ...]]:
+    """What each Gaussian carries with this field: name -> shape of a row."""
+    size = config.dynamics_size
+    return _SHAPES | ({"dynamics": (size,)} if size else {})
+
+
+def _read_header(metadata: Mapping[str, str], path: str | os.PathLike[str]) -> tuple[FieldConfig, int]:
+    try:
+        values: dict[str, Any] = json.loads(metadata["field"])
+        for name in ("static", "temporal"):
+            grid: dict[str, Any] = values[name]
+            values[name] = HashConfig(grid["levels"], tuple(grid["base"]), tuple(grid["finest"]), grid["table_log2"])
+        values["planes"] = PlaneConfig(**values["planes"])
+        config, degree = FieldConfig(**values), int(metadata["sh_degree"])
+        _check_types(config, FieldConfig())
+        if not 0 <= degree <= _MAX_DEGREE:
+            raise ValueError(f"sh_degree {degree} is outside 0 to {_MAX_DEGREE}")
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(
+            f"{path}: the checkpoint's description of its field cannot be read ({type(error).__name__}: {error}): "
+            "it was damaged, or written by another version of lapgs_wgpu"
+        ) from error
+    return config, degree
+
+
+def _check_types(found: Any, like: Any) -> None:
+    """That a description has the types of another one: JSON may hold anything."""
+    if dataclasses.is_dataclass(like):
+        kinds = typing.get_type_hints(type(like))
+        for field in dataclasses.fields(like):
+            value, choices = getattr(found, field.name), typing.get_args(kinds[field.name])
+            if typing.get_origin(kinds[field.name]) is Literal and value not in choices:
+                raise ValueError(f"{field.name} is {value!r}")
+            _check_types(value, getattr(like, field.name))
+    elif isinstance(like, tuple):
+        for value, entry in zip(found, like, strict=True):
+            _check_types(value, entry)
+    elif type(found) is not type(like) and not (type(like) is float and type(found) is int):
+        raise TypeError(f"{found!r} has the wrong type")
+
+
+def _check_sizes(config: FieldConfig, tensors: Mapping[str, NDArray[Any]], path: str | os.PathLike[str]) -> None:
+    """That the large tensors in the file have the sizes that the description asks for, before memory is taken."""
+    shapes: dict[str, tuple[int, ...]] = {}
+    if config.kind in ("grid4d", "laplacian"):
+        shapes["static_grid.table"] = (static_grid(config).entries, 2)
+        shapes |= {f"temporal_grids.{i}.table": (grid.entries, 2) for i, grid in enumerate(temporal_grids(config))}
+    elif config.kind == "hexplane":
+        shapes |= {f"planes.{i}": shape for i, shape in enumerate(plane_shapes(config.planes))}
+    for name, shape in shapes.items():
+        _tensor(tensors, f"field.{name}", shape, path)
+
+
+def _tensor(
+    tensors: Mapping[str, NDArray[Any]], name: str, shape: tuple[int, ...], path: str | os.PathLike[str]
+) -> NDArray[np.float32]:
+    if name not in tensors:
+        raise InputError(f"{path}: the checkpoint has no tensor {name!r}: it was damaged or written by another version")
+    array = tensors[name]
+    if array.shape != shape:
+        raise InputError(f"{path}: tensor {name!r} has shape {array.shape}, but the scene needs {shape}")
+    values = array.astype(np.float32, copy=False)
+    if values is not array and not np.isfinite(values).all():  # as read, all values are finite
+        raise InputError(f"{path}: tensor {name!r} holds values beyond float32: it was written by another program")
+    return values

@@ -1,0 +1,205 @@
+"""Grid fields on the device against the formula of Scene4D in float64 torch."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from lapgs_wgpu.gpu.buffer import BufferPool
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.motion.deform import DeviceField, parameter_shapes, runs_on_device
+from lapgs_wgpu.motion.field import FieldConfig
+from lapgs_wgpu.motion.grid_field import GridField
+from lapgs_wgpu.motion.hash_encoder import encode_reference
+from lapgs_wgpu.motion.hashgrid import HashConfig
+from lapgs_wgpu.motion.playback import activate
+from lapgs_wgpu.motion.scene import Scene4D, rotate
+from lapgs_wgpu.splat.rasterizer import GaussianBuffers
+
+pytestmark = pytest.mark.kernels
+
+GRID4D = FieldConfig(
+    kind="grid4d",
+    bound=1.5,
+    static=HashConfig(3, (4, 4, 4), (16, 16, 16), table_log2=9),
+    temporal=HashConfig(4, (4, 4, 4), (12, 12, 8)),
+    width=16,
+    components=4,
+    dynamics=5,
+)
+OURS = replace(GRID4D, kind="laplacian", appearance="color+opacity")
+# Each with a way of its own through the pass.
+CONFIGS: dict[str, FieldConfig] = {
+    "grid4d": GRID4D,
+    "grid4d without time": replace(GRID4D, temporal_hash=False),
+    "laplacian": OURS,
+    "color": replace(OURS, appearance="color"),
+    "no appearance": replace(OURS, appearance="none"),
+    "no dynamics": replace(OURS, dynamics=0),
+    "dynamics alone": replace(OURS, temporal_hash=False),
+    "neither": replace(OURS, temporal_hash=False, dynamics=0),
+    "one channel": replace(OURS, width=1),
+    "odd width": replace(OURS, width=43, dynamics=1),
+    "odd levels": replace(OURS, static=HashConfig(1, (4, 4, 4)), temporal=HashConfig(1, (4, 4, 4))),
+    "sizes of dnerf": replace(
+        OURS,
+        width=256,
+        dynamics=16,
+        static=HashConfig(16, (4, 4, 4), (64, 64, 64), table_log2=12),
+        temporal=HashConfig(32, (4, 4, 4), (32, 32, 16)),
+    ),
+}
+
+
+def trained(device: Device, config: FieldConfig, count: int, seed: int = 0) -> Scene4D:
+    """As training might leave it; some Gaussians outside the field's box, one far away and one tiny."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator)
+
+    parameters = {
+        "means": 0.8 * normal(count, 3),
+        "log_scales": normal(count, 3) * 0.5 - 1.5,
+        "quats": 2 * normal(count, 4),
+        "opacity_logits": 3 * normal(count),
+        "sh_dc": normal(count, 1, 3),
+        "sh_rest": 0.2 * normal(count, 15, 3),
+        "dynamics": normal(count, config.dynamics_size),
+    }
+    parameters["means"][3:4] = 50.0
+    parameters["log_scales"][5:6] = -30.0
+    scene = Scene4D(parameters, config, device, sh_degree=2)
+    if scene.field is not None:
+        with torch.no_grad():
+            for name, parameter in scene.field.named_parameters():
+                if name.endswith("table"):
+                    parameter.copy_(normal(*parameter.shape))
+                elif not name.endswith("frequencies"):
+                    parameter.copy_(normal(*parameter.shape) / math.sqrt(max(2, parameter.shape[-1])))
+    return scene
+
+
+def expected(scene: Scene4D, t: float) -> dict[str, Tensor]:
+    """The formulas of docs/method.md, in float64."""
+    field, config = scene.field, scene.field_config
+    assert isinstance(field, GridField)
+    p = {name: value.detach().double() for name, value in scene.parameters.items()}
+    w = {name: value.detach().double() for name, value in field.named_parameters()}
+    time = 0.5 * ((2 * t - 1) * config.time_scale + 1)
+    means = scene.parameters["means"].detach()
+    static, *temporal = (encode_reference(g, g.table.detach().double(), means, time, config.bound) for g in field.grids)
+
+    def layer(name: str, x: Tensor) -> Tensor:
+        return x @ w[f"{name}.weight"].T + w[f"{name}.bias"]
+
+    inputs = [p["dynamics"], *temporal] if config.dynamics_size else temporal
+    fused = torch.cat(inputs, dim=1) if inputs else means.new_zeros(len(means), 1).double()
+    hidden = torch.relu(layer("temporal", fused)) * (2 * torch.sigmoid(layer("spatial", static)) - 1)
+    look = 0.1 * layer("appearance", hidden) if config.appearance_size else None
+    if config.kind == "laplacian":
+        phase = 2 * math.pi * t * w["motion.frequencies"]
+        series = phase.cos() @ w["motion.alpha"] + phase.sin() @ w["motion.beta"]
+        hidden = hidden + series * layer("motion.second", torch.relu(layer("motion.first", static)))
+    turn, shift, d_quats, d_scales = layer("heads", hidden).split((4, 3, 4, 3), dim=1)
+    unit = nn.functional.normalize
+    turn = unit(turn + turn.new_tensor([1.0, 0, 0, 0]), dim=1)
+    dc, logits = p["sh_dc"], p["opacity_logits"]
+    if look is not None:
+        dc = dc + look[:, None, :3]
+        logits = logits + look[:, 3] if look.shape[1] == 4 else logits
+    return {
+        "means": rotate(turn, p["means"]) + shift,
+        "quats": unit(unit(p["quats"], dim=1) + d_quats, dim=1),
+        "scales": (p["log_scales"].exp().clamp(min=1e-7) + d_scales).clamp(min=1e-7),
+        "opacities": logits.sigmoid(),
+        "colors": torch.cat([dc, p["sh_rest"][:, :8]], dim=1),
+    }
+
+
+def device_field(scene: Scene4D, block: int | None = None) -> tuple[DeviceField, GaussianBuffers]:
+    """The scene's field without torch, and buffers for what it moves: colours as they are, rubbish elsewhere."""
+    assert scene.field is not None
+    parameters = {name: value.numpy(force=True) for name, value in scene.field.state_dict().items()}
+    stored = {name: value.numpy(force=True) for name, value in scene.parameters.items()}
+    gaussians = activate(stored, scene.sh_degree)
+    pool, count = BufferPool(scene.device), len(scene)
+    buffers = {
+        name: pool.get(name, gaussians[name].nbytes) for name in ("means", "quats", "scales", "opacities", "colors")
+    }
+    for name, buffer in buffers.items():
+        buffer.write(gaussians["colors"] if name == "colors" else np.full(buffer.nbytes // 4, np.nan, np.float32))
+    out = GaussianBuffers(count=count, sh_degree=scene.sh_degree, sh_stored=9, **buffers)
+    return DeviceField(scene.device, scene.field_config, parameters, gaussians, block=block), out
+
+
+def check(scene: Scene4D, times: tuple[float, ...] = (0.37,), block: int | None = None) -> None:
+    field, out = device_field(scene, block)
+    for t in times:
+        field.move(t, out)
+        for name, exact in expected(scene, t).items():
+            found = torch.from_numpy(getattr(out, name).read("float32", tuple(exact.shape))).double()
+            size = exact.abs().amax(dim=tuple(range(1, exact.ndim)), keepdim=True).clamp(min=1)
+            assert float(((found - exact).abs() / size).max()) < 1e-4, (name, t)
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_every_kind_of_field(device: Device, name: str) -> None:
+    check(trained(device, CONFIGS[name], 100), (0.0, 0.37, 1.0))
+
+
+@pytest.mark.parametrize("count", [1, 7, 64, 255, 257, 1000])
+def test_any_number_of_gaussians(device: Device, count: int) -> None:
+    check(trained(device, OURS, count, seed=count))
+
+
+def test_several_blocks(device: Device) -> None:
+    """As many Gaussians as do not fit into one binding: each dispatch has its own range of the buffers."""
+    check(trained(device, OURS, 1000), (0.2, 0.9, 0.2), block=192)
+
+
+def test_no_gaussians(device: Device) -> None:
+    field, out = device_field(trained(device, OURS, 0))
+    field.move(0.5, out)
+
+
+def test_only_what_changes_is_written(device: Device) -> None:
+    """The colours above their constant part stand in the buffer that is drawn, and stay."""
+    scene = trained(device, replace(OURS, appearance="none"), 50)
+    field, out = device_field(scene)
+    before = out.colors.read("float32", (50, 27))
+    field.move(0.4, out)
+    np.testing.assert_array_equal(out.colors.read("float32", (50, 27)), before)
+
+
+def test_the_same_bits_again(device: Device) -> None:
+    scene = trained(device, OURS, 500)
+    field, out = device_field(scene)
+    found = []
+    for t in (0.3, 0.8, 0.3):
+        field.move(t, out)
+        found.append(out.means.read("float32", (500, 3)).tobytes())
+    assert found[0] == found[2] != found[1]
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_the_parameters_are_those_of_the_module(device: Device, name: str) -> None:
+    field = GridField(CONFIGS[name], device, seed=0)
+    shapes = {key: tuple(value.shape) for key, value in field.state_dict().items()}
+    assert parameter_shapes(CONFIGS[name]) == shapes
+
+
+def test_what_the_device_does_not_evaluate() -> None:
+    assert runs_on_device(OURS)
+    assert runs_on_device(GRID4D)
+    assert runs_on_device(FieldConfig())
+    assert runs_on_device(replace(GRID4D, motion="mlp"))  # which belongs to the field laplacian alone
+    assert not runs_on_device(replace(OURS, motion="mlp"))
+    for changes in ({"kind": "static"}, {"kind": "mlp"}, {"kind": "hexplane"}, {"depth": 1}):
+        assert not runs_on_device(replace(OURS, **changes))
+    assert not runs_on_device(replace(FieldConfig(), width=4096, dynamics=256))  # too long a loop for lavapipe

@@ -1,0 +1,201 @@
+"""Opening a scene to show it: the pictures are those of Scene4D, and torch stays outside where it can."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from test_deform import CONFIGS, GRID4D, OURS, trained
+from test_ply import columns_of, ply_bytes, random_still
+from test_scene import DAMAGE, moving_scene, rewrite
+
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.gpu.buffer import read_all
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.io.ply import StillGaussians, write_ply
+from lapgs_wgpu.motion.field import FieldConfig
+from lapgs_wgpu.motion.playback import DevicePlayback, Playback, open_playback
+from lapgs_wgpu.motion.scene import Scene4D, load
+from lapgs_wgpu.motion.scene_file import read_scene
+from lapgs_wgpu.motion.scene_playback import ScenePlayback
+from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.splat.rasterizer import Rasterizer
+
+TIMES = (0.0, 0.37, 1.0)
+CAMERA = Camera.looking_at([1.0, -4, 0.7], [0, 0, 0], up=[0, 0, 1], fov_x=0.8, width=64, height=48)
+KINDS = {
+    "static": FieldConfig(kind="static"),
+    "mlp": replace(OURS, kind="mlp"),
+    "hexplane": replace(OURS, kind="hexplane"),
+    "hidden layers": replace(OURS, depth=1),
+    "ablated motion": replace(OURS, motion="mlp"),
+} | CONFIGS
+ON_DEVICE = {"static", *CONFIGS}
+
+
+def picture(playback: Playback, t: float) -> np.ndarray:
+    """(height, width, 3), drawn from the buffers as a viewer does."""
+    rasterizer = Rasterizer(playback.device)
+    while True:
+        planes = rasterizer.draw(playback.at(t), CAMERA, (0.1, 0.2, 0.3))
+        if not rasterizer.grow():
+            return planes.read("float32", (4, CAMERA.height, CAMERA.width))[:3].transpose(1, 2, 0)
+
+
+def saved(device: Device, folder: Path, config: FieldConfig, count: int = 300) -> tuple[Scene4D, Path]:
+    scene = trained(device, config, count)
+    scene.save(folder / "scene.ply", {"scene": "test"})
+    return scene, folder / "scene.ply"
+
+
+@pytest.mark.kernels
+@pytest.mark.parametrize("name", KINDS)
+def test_it_shows_the_scene(device: Device, tmp_path: Path, name: str) -> None:
+    scene, path = saved(device, tmp_path, KINDS[name])
+    playback = open_playback(path, device)
+    assert isinstance(playback, DevicePlayback if name in ON_DEVICE else ScenePlayback)
+    assert (playback.count, playback.sh_degree, playback.moves) == (300, 2, name != "static")
+    assert playback.field_config == KINDS[name]
+    assert playback.metadata == {"scene": "test"}
+    for t in TIMES:
+        shown = picture(playback, t)
+        drawn = scene.render(CAMERA, t, torch.tensor([0.1, 0.2, 0.3])).image.numpy()
+        assert np.ptp(drawn) > 0.3
+        # Rounding may add or drop the faint rim of a splat, which is 1/255 of its colour.
+        assert np.quantile(np.abs(shown - drawn), 0.99) < 2e-4
+        assert np.abs(shown - drawn).max() < 1 / 255
+        means = scene.at(t).means.detach().numpy()
+        np.testing.assert_allclose(playback.means(t), means, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.kernels
+@pytest.mark.parametrize("name", ["static", "mlp", "grid4d", "laplacian", "color"])
+def test_the_still_is_that_of_the_scene(device: Device, tmp_path: Path, name: str) -> None:
+    scene, path = saved(device, tmp_path, KINDS[name])
+    for t in (0.0, 0.6):
+        found, exact = open_playback(path, device).still(t), scene.still(t)
+        write_ply(tmp_path / "still.ply", found)
+        for part in ("means", "sh", "quats", "log_scales", "opacity_logits"):
+            # Logits near their ends magnify float32's rounding of opacities.
+            tolerance = 2e-2 if part == "opacity_logits" else 1e-3
+            a, b = getattr(found, part), getattr(exact, part)
+            if part == "log_scales":  # of scales that are clamped, or nearly
+                a, b = np.maximum(a, -6), np.maximum(b, -6)
+            np.testing.assert_allclose(a, b, rtol=tolerance, atol=tolerance, err_msg=part)
+
+
+@pytest.mark.parametrize("name", ["static", "mlp", "grid4d", "laplacian"])
+def test_dynamics(device: Device, tmp_path: Path, name: str) -> None:
+    scene, path = saved(device, tmp_path, KINDS[name])
+    found = open_playback(path, device).dynamics()
+    if name == "laplacian":
+        assert found is not None
+        np.testing.assert_array_equal(found, scene.parameters["dynamics"].detach().numpy())
+    else:
+        assert found is None
+
+
+def test_a_time_that_is_shown_is_not_computed_again(
+    device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While the camera moves and the clock stands."""
+    _, path = saved(device, tmp_path, GRID4D)
+    playback = open_playback(path, device)
+    assert isinstance(playback, DevicePlayback)
+    assert playback._field is not None
+    times: list[float] = []
+    monkeypatch.setattr(playback._field, "move", lambda t, out: times.append(t))
+    for t in (0.1, 0.1, 0.2, 0.1):
+        playback.at(t)
+    assert times == [0.1, 0.2, 0.1]
+
+
+@pytest.mark.kernels
+def test_a_training_can_be_watched(device: Device) -> None:
+    """Parameters, their number and the degree change between calls, and training's own buffers stay as they are."""
+    scene = trained(device, OURS, 50)
+    playback = ScenePlayback(scene)
+    before = picture(playback, 0.4)
+    assert np.abs(before - scene.render(CAMERA, 0.4, torch.tensor([0.1, 0.2, 0.3])).image.numpy()).max() < 1e-6
+    with torch.no_grad():
+        scene.parameters["sh_dc"] += 0.5
+    assert np.abs(picture(playback, 0.4) - before).max() > 0.05
+    for name, parameter in scene.parameters.items():
+        scene.parameters[name] = torch.nn.Parameter(parameter.detach()[:20].clone())
+    scene.sh_degree = 3
+    now = playback.at(0.4)
+    assert (playback.count, now.count, playback.sh_degree, now.sh_degree, now.sh_stored) == (20, 20, 3, 3, 16)
+
+
+@pytest.mark.kernels
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_a_foreign_ply_stands_still(device: Device, tmp_path: Path, degree: int) -> None:
+    still = random_still(40, degree)
+    (tmp_path / "foreign.ply").write_bytes(ply_bytes(columns_of(still)))
+    playback = open_playback(tmp_path / "foreign.ply", device)
+    assert isinstance(playback, DevicePlayback)
+    assert (playback.moves, playback.count, playback.sh_degree, playback.metadata) == (False, 40, degree, {})
+    drawn = load(tmp_path / "foreign.ply", device).render(CAMERA, 0.0, torch.tensor([0.1, 0.2, 0.3])).image.numpy()
+    assert np.abs(picture(playback, 0.7) - drawn).max() < 1e-4
+    found: StillGaussians = playback.still(0.3)
+    np.testing.assert_array_equal(found.means, still.means)
+    np.testing.assert_array_equal(found.sh[:, : still.sh.shape[1]], still.sh)
+    np.testing.assert_array_equal(found.opacity_logits, still.opacity_logits)
+
+
+@pytest.mark.parametrize("name", DAMAGE)
+def test_damage_is_refused_in_one_sentence(device: Device, tmp_path: Path, name: str) -> None:
+    path = tmp_path / "scene.ply"
+    moving_scene(device).save(path)
+    rewrite(path, DAMAGE[name][0])
+    with pytest.raises(InputError, match=DAMAGE[name][1]) as caught:
+        open_playback(path, device)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.kernels
+def test_blocks_make_no_difference(device: Device, tmp_path: Path) -> None:
+    _, path = saved(device, tmp_path, OURS)
+    whole, parts = (DevicePlayback(read_scene(path), device, block=block) for block in (None, 128))
+    for t in TIMES:
+        a, b = (
+            read_all([(p.at(t).colors, "uint32", (300, 27), 0), (p.at(t).quats, "uint32", (300, 4), 0)])
+            for p in (whole, parts)
+        )
+        for x, y in zip(a, b, strict=True):
+            np.testing.assert_array_equal(x, y)
+
+
+SHOW = """
+import sys
+from lapgs_wgpu.gpu.device import open_device
+from lapgs_wgpu.motion.playback import open_playback
+from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.splat.rasterizer import Rasterizer
+
+device = open_device()
+playback = open_playback(sys.argv[1], device)
+rasterizer = Rasterizer(device)
+camera = Camera.looking_at([0, -4, 0], [0, 0, 0], up=[0, 0, 1], fov_x=0.8, width=32, height=32)
+while True:
+    image = rasterizer.draw(playback.at(0.3), camera)
+    if not rasterizer.grow():
+        break
+assert image.read("float32", (4, 32, 32))[3].min() < 0.99
+playback.means(0.5), playback.dynamics(), playback.still(0.2)
+print("torch" in sys.modules)
+"""
+
+
+@pytest.mark.parametrize("name", ["static", "grid4d", "laplacian", "mlp"])
+def test_torch_is_imported_only_where_it_is_needed(device: Device, tmp_path: Path, name: str) -> None:
+    _, path = saved(device, tmp_path, KINDS[name])
+    done = subprocess.run([sys.executable, "-c", SHOW, str(path)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == [str(name == "mlp")]
