@@ -146,6 +146,7 @@ def check(scene: Scene4D, times: tuple[float, ...] = (0.37,), block: int | None 
             found = torch.from_numpy(getattr(out, name).read("float32", tuple(exact.shape))).double()
             size = exact.abs().amax(dim=tuple(range(1, exact.ndim)), keepdim=True).clamp(min=1)
             assert float(((found - exact).abs() / size).max()) < 1e-4, (name, t)
+        assert out.scales.read("float32", (len(scene), 3)).min() >= np.float32(1e-7)
 
 
 @pytest.mark.parametrize("name", CONFIGS)

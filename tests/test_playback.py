@@ -24,6 +24,7 @@ from lapgs_wgpu.motion.scene import Scene4D, load
 from lapgs_wgpu.motion.scene_file import read_scene
 from lapgs_wgpu.motion.scene_playback import ScenePlayback
 from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.splat.rasterize import rasterizer_of
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 
 TIMES = (0.0, 0.37, 1.0)
@@ -122,6 +123,7 @@ def test_a_training_can_be_watched(device: Device) -> None:
     playback = ScenePlayback(scene)
     before = picture(playback, 0.4)
     assert np.abs(before - scene.render(CAMERA, 0.4, torch.tensor([0.1, 0.2, 0.3])).image.numpy()).max() < 1e-6
+    assert playback.at(0.4).means is not rasterizer_of(device).pool.get("input means", 0)
     with torch.no_grad():
         scene.parameters["sh_dc"] += 0.5
     assert np.abs(picture(playback, 0.4) - before).max() > 0.05

@@ -96,7 +96,8 @@ class DeviceField:
         *,
         block: int | None = None,
     ) -> None:
-        self._device, self._config, self._parameters = device, config, parameters
+        self._device, self._config = device, config
+        self._parameters = {name: array for name, array in parameters.items() if not name.endswith(".table")}
         self._pool = BufferPool(device)
         self._sizes = sizes = _Sizes(config)
         self._defines = {"POINTS": 4, "QUADS": 2} if device.is_cpu else {"POINTS": 2, "QUADS": 1}
@@ -118,7 +119,7 @@ class DeviceField:
             self._filled(f"table {i}", parameters[f"temporal_grids.{i}.table"])
             for i in range(len(self._temporal.grids))
         ]
-        self._encode_static()
+        self._encode_static(parameters["static_grid.table"])
         heads, stream = self._heads(0.0), self._stream()
         self._stream_at = len(heads)
         self._weights = self._filled("weights", np.concatenate([heads, stream]))
@@ -141,14 +142,14 @@ class DeviceField:
         named = {"points": points, "still": still, "moving": moving}
         return _Block(first, count, **{name: self._filled(f"{name} from {first}", a) for name, a in named.items()})
 
-    def _encode_static(self) -> None:
+    def _encode_static(self, entries: Floats) -> None:
         """H_s, into the rows of what does not change."""
         row = _CANONICAL + 4 * self._sizes.still_quads
         encoder = DeviceEncoder(
             self._device, [static_grid(self._config)], self._config.bound, row=row, column=_CANONICAL
         )
-        table = Buffer(self._device, self._parameters["static_grid.table"].nbytes, "static table")
-        table.write(self._parameters["static_grid.table"])
+        table = Buffer(self._device, entries.nbytes, "static table")  # not in the pool: it is needed once
+        table.write(entries)
         with Commands(self._device) as commands:
             for number, block in enumerate(self._blocks):
                 encoder.encode(commands, number, block.points, block.count, 0.0, [table], [block.still])
