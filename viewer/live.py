@@ -16,7 +16,7 @@ from typing import Protocol
 from rendercanvas.utils.asyncs import sleep
 
 from lapgs_wgpu.io.first_look import FirstLook
-from lapgs_wgpu.motion.playback import ScenePlayback
+from lapgs_wgpu.motion.scene_playback import ScenePlayback
 from lapgs_wgpu.motion.scene import Scene4D
 
 from .app import App
