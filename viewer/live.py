@@ -52,9 +52,9 @@ class Training:
 
 def watch(scene: Scene4D, look: FirstLook, steps: Iterator[Progress]) -> None:
     """Show the scene in a window and take the training's steps, until the window is closed."""
-    from .window import make_canvas
+    from .window import choose_backend, make_canvas
 
-    canvas, loop = make_canvas("training - lapgs-train", (1280, 720))
+    canvas, loop = make_canvas(choose_backend("auto"), "training - lapgs-train", (1280, 720))
     app = App(canvas, loop, Opened(None, ScenePlayback(scene), look), transport=True)
     app.training = training = Training()
     interrupt = signal.getsignal(signal.SIGINT)

@@ -2,26 +2,109 @@
 
 from __future__ import annotations
 
+import importlib.util
+import os
+import sys
+import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+from lapgs_wgpu.errors import InputError
 
 from .app import App
 from .opened import Opened
 
+_OTHERWISE = "take --backend http to look in a browser (also from another machine), or --screenshot FILE.png"
 
-def run_window(opened: Opened, *, size: tuple[int, int], transport: bool | None) -> None:
-    """Show it until the window is closed. size: of the picture, logical pixels. transport: whether the time slider is
-    shown; where the scene moves, by default."""
-    canvas, loop = make_canvas(f"{opened.path} - lapgs-view", size)
+
+def choose_backend(wanted: str) -> str:
+    """glfw or qt: the wanted one, or for `auto` the first that works here. Raises InputError where it does not."""
+    if importlib.util.find_spec("imgui_bundle") is None:
+        raise InputError("the viewer needs imgui-bundle: pip install 'lapgs-wgpu[viewer]'.")
+    if wanted != "auto":
+        reason = _CHECKS[wanted]()
+        if reason:
+            raise InputError(f"--backend {wanted}: {reason}.")
+        return wanted
+    reasons = {}
+    for name, check in _CHECKS.items():
+        reason = check()
+        if reason is None:
+            return name
+        reasons[name] = reason
+    raise InputError(f"no window can be opened here ({reasons['glfw']}): {_OTHERWISE}.")
+
+
+def run_window(opened: Opened, *, backend: str, size: tuple[int, int], transport: bool | None) -> None:
+    """Show it until the window is closed. backend: what choose_backend returned. size: of the picture, logical pixels.
+    transport: whether the time slider is shown; where the scene moves, by default."""
+
+    def drop(path: Path) -> None:
+        app.open(path)
+
+    canvas, loop = make_canvas(backend, f"{opened.path} - lapgs-view", size, drop)
     app = App(canvas, loop, opened, transport=transport)
-    from rendercanvas.glfw import glfw
-
-    glfw.set_drop_callback(canvas._window, lambda window, paths: app.open(Path(paths[0])))
     loop.run()
 
 
-def make_canvas(title: str, size: tuple[int, int]) -> tuple[Any, Any]:
-    """A window that draws when it is asked to, and its event loop."""
-    from rendercanvas.glfw import RenderCanvas, loop
+def make_canvas(
+    backend: str, title: str, size: tuple[int, int], drop: Callable[[Path], None] | None = None
+) -> tuple[Any, Any]:
+    """A window that draws when it is asked to, and its event loop. drop: is told of a file dropped on it."""
+    options = {"title": title, "size": size, "update_mode": "ondemand", "max_fps": 60}
+    return (_qt_canvas if backend == "qt" else _glfw_canvas)(options, drop)
 
-    return RenderCanvas(title=title, size=size, update_mode="ondemand", max_fps=60), loop
+
+def _glfw_canvas(options: dict[str, Any], drop: Callable[[Path], None] | None) -> tuple[Any, Any]:
+    from rendercanvas.glfw import RenderCanvas, glfw, loop
+
+    canvas = RenderCanvas(**options)
+    if drop is not None:
+        glfw.set_drop_callback(canvas._window, lambda window, paths: drop(Path(paths[0])))
+    return canvas, loop
+
+
+def _qt_canvas(options: dict[str, Any], drop: Callable[[Path], None] | None) -> tuple[Any, Any]:
+    import PySide6.QtWidgets  # noqa: F401  (rendercanvas takes the Qt that is imported)
+    from rendercanvas.qt import RenderCanvas, loop
+
+    class Window(RenderCanvas):
+        def dragEnterEvent(self, event: Any) -> None:  # noqa: N802
+            if event.mimeData().hasUrls():
+                event.acceptProposedAction()
+
+        def dropEvent(self, event: Any) -> None:  # noqa: N802
+            if drop is not None:
+                drop(Path(event.mimeData().urls()[0].toLocalFile()))
+
+    canvas = Window(**options)
+    canvas.setAcceptDrops(drop is not None)
+    return canvas, loop
+
+
+def _glfw_lacks() -> str | None:
+    """Why glfw opens no window here, or None."""
+    try:
+        import glfw
+    except ImportError:
+        return "glfw is not installed: pip install 'lapgs-wgpu[viewer]'"
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # it warns, and a window without this check would abort the process
+        if glfw.init():
+            return None
+    return "there is no display" if _no_display() else "glfw finds no display that it can use"
+
+
+def _qt_lacks() -> str | None:
+    if importlib.util.find_spec("PySide6") is None:
+        return "PySide6 is not installed: pip install PySide6"
+    # Qt aborts the process where there is none.
+    return f"there is no display: {_OTHERWISE}" if _no_display() and not os.environ.get("QT_QPA_PLATFORM") else None
+
+
+def _no_display() -> bool:
+    return sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+_CHECKS = {"glfw": _glfw_lacks, "qt": _qt_lacks}
