@@ -106,6 +106,9 @@ image.style.width = image.style.height = '100%' // renderview sets its own where
 image.decoding = 'sync'
 image.ondragstart = () => false
 const view = new View(image, null)
+// renderview would hold a move back for some milliseconds, past the release of the button that it came before. Browsers
+// give no more moves than they repaint, and the server takes those together that it could not draw in between.
+view.setThrottle(0)
 
 // Keys count from the start, without a click, and none stays down when its release goes to another window.
 const focus = () => view._focusElement.focus({ preventScroll: true })

@@ -1,0 +1,134 @@
+"""Headless Chromium, driven over its DevTools protocol: real mouse and key events, and what is on the screen."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import json
+import shutil
+import subprocess
+import time
+import urllib.request
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import imageio.v3 as iio
+import numpy as np
+from numpy.typing import NDArray
+
+CHROMIUM = next((path for path in map(shutil.which, ("chromium", "chromium-browser", "google-chrome")) if path), None)
+_FLAGS = (
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--force-color-profile=srgb",
+    "--remote-debugging-port=0",
+)
+
+
+class Browser:
+    """One window of a fresh profile, of `size` pixels. Leave the `with` block to end it."""
+
+    def __init__(self, profile: Path, size: tuple[int, int]) -> None:
+        from websockets.sync.client import connect
+
+        assert CHROMIUM is not None
+        self._open = contextlib.ExitStack()
+        self._process = subprocess.Popen(
+            [CHROMIUM, *_FLAGS, f"--user-data-dir={profile}", "about:blank"],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        try:
+            active = profile / "DevToolsActivePort"
+            port = int(wait_for(lambda: active.is_file() and active.read_text().split(), 60, "Chromium's port")[0])
+            page = wait_for(lambda: _page(port), 60, "Chromium's page")
+            self._socket = self._open.enter_context(connect(page, max_size=None, open_timeout=30))
+            self._calls = 0
+            self.call("Page.enable")
+            self.resize(size)
+            self.call("Emulation.setFocusEmulationEnabled", enabled=True)
+        except BaseException:
+            self._end()
+            raise
+
+    def __enter__(self) -> Browser:
+        return self
+
+    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._end()
+
+    def call(self, method: str, **parameters: Any) -> dict[str, Any]:
+        """A command of the protocol, and its result."""
+        self._calls += 1
+        self._socket.send(json.dumps({"id": self._calls, "method": method, "params": parameters}))
+        while True:
+            message = json.loads(self._socket.recv(timeout=60))
+            if message.get("id") == self._calls:
+                assert "error" not in message, message
+                return message["result"]
+
+    def open(self, url: str) -> None:
+        self.call("Page.navigate", url=url)
+
+    def resize(self, size: tuple[int, int]) -> None:
+        width, height = size
+        self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
+
+    def value(self, script: str) -> Any:
+        """What a JavaScript expression gives on the page."""
+        return self.call("Runtime.evaluate", expression=script, returnByValue=True)["result"].get("value")
+
+    def note(self) -> str:
+        """What the page says, empty while it shows pictures."""
+        return self.value("document.getElementById('note')?.textContent ?? 'no page'")
+
+    def picture(self) -> NDArray[np.int16]:
+        """(height, width, 3): what is on the screen."""
+        data = self.call("Page.captureScreenshot", format="png")["data"]
+        return iio.imread(base64.b64decode(data), extension=".png")[..., :3].astype(np.int16)
+
+    def mouse(self, kind: str, x: float, y: float, *, down: bool = False) -> None:
+        """kind: mouseMoved, mousePressed or mouseReleased, of the left button."""
+        pressed = {"button": "left", "clickCount": 1} if kind != "mouseMoved" or down else {}
+        self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, buttons=int(down), **pressed)
+
+    def key(self, key: str) -> None:
+        """Press and release."""
+        self.call("Input.dispatchKeyEvent", type="keyDown", key=key, text=key if len(key) == 1 else "")
+        self.call("Input.dispatchKeyEvent", type="keyUp", key=key)
+
+    def _end(self) -> None:
+        self._open.close()
+        self._process.terminate()
+        try:
+            self._process.wait(10)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait(10)
+
+
+def wait_for(look: Any, seconds: float, what: str) -> Any:
+    """The first true value that `look` returns; fails after that many seconds."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        found = look()
+        if found:
+            return found
+        time.sleep(0.1)
+    raise AssertionError(f"{what}: not within {seconds} seconds")
+
+
+def _page(port: int) -> str | None:
+    try:
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list", timeout=10) as answer:
+            pages = [target for target in json.load(answer) if target["type"] == "page"]
+    except OSError:
+        return None
+    return pages[0]["webSocketDebuggerUrl"] if pages else None
