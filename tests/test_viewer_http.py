@@ -244,6 +244,76 @@ def test_without_a_display_it_says_what_works(
     assert "there is no display): take --backend http" in capsys.readouterr().err
 
 
+# The canvas
+
+
+@pytest.fixture
+def sent(device: Device, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Any, list[tuple[int, str, int]]]]:
+    """A canvas that its first browser has just connected to, and who was sent what: browser, kind, number."""
+    http = pytest.importorskip("rendercanvas.http")
+    from lapgs_wgpu.viewer.remote_canvas import RemoteCanvas
+
+    log: list[tuple[int, str, int]] = []
+
+    def note(message: dict[str, Any], buffers: list[bytes], id: int) -> None:
+        if message["type"] == "framebufferdata":
+            log.append((id, message["mimetype"], message["index"]))
+
+    monkeypatch.setattr(http.asgi, "send_to", note)
+    canvas = RemoteCanvas(device)
+    canvas._on_event({"type": "_clients_change", "ids": (1,)}, 0)
+    yield canvas, log
+    canvas.close()
+
+
+def test_the_lossless_picture_comes_also_after_a_slow_network(sent: Any) -> None:
+    canvas, log = sent
+    canvas._on_event({"type": "resize", "pwidth": 8, "pheight": 8, "ratio": 1}, 1)
+    canvas._draw_requested = False
+
+    async def slow() -> None:
+        for _ in range(2):
+            canvas._encode_frame(np.zeros((8, 8, 4), np.uint8))
+        canvas._lossless_draw()  # while both are on their way
+        assert [kind for _, kind, _ in log] == ["image/jpeg"] * 2
+        canvas._on_event({"type": "_framefeedback", "index": 2, "timestamp": 0.0}, 1)
+        canvas._maybe_draw()
+
+    asyncio.run(slow())
+    assert log[2:] == [(1, "image/png", 3)]
+
+
+def test_nothing_is_drawn_before_the_browser_has_a_size(sent: Any) -> None:
+    canvas, _ = sent
+    canvas._draw_requested = True
+    canvas._maybe_draw()
+    assert canvas._draw_requested
+    huge = 1 << 30
+    canvas._on_event({"type": "resize", "pwidth": huge, "pheight": 0, "ratio": 1}, 1)
+    width, height = canvas.get_physical_size()
+    assert 2048 <= width < huge
+    assert height == 1
+
+
+def test_what_a_leaving_browser_held_is_let_go(sent: Any) -> None:
+    canvas, _ = sent
+    ends: list[tuple[str, Any]] = []
+    canvas.add_event_handler(lambda event: ends.append((event["event_type"], event.get("button"))), "pointer_up")
+    canvas.add_event_handler(lambda event: ends.append((event["event_type"], event["key"])), "key_up")
+    canvas._on_event({"type": "_clients_change", "ids": (1, 2)}, 0)
+    place = {"x": 1, "y": 1, "timestamp": 0.0, "modifiers": []}
+    for button in (1, 2):
+        canvas._on_event({"type": "pointer_down", "button": button, "buttons": [button], **place}, 1)
+    canvas._on_event({"type": "pointer_up", "button": 2, "buttons": [1], **place}, 1)
+    canvas._on_event({"type": "key_down", "key": "w", "modifiers": [], "timestamp": 0.0}, 1)
+    canvas._on_event({"type": "key_down", "key": "x", "modifiers": [], "timestamp": 0.0}, 2)  # only watches
+    canvas._on_event({"type": "close"}, 1)
+    assert not canvas.get_closed()
+    canvas._on_event({"type": "_clients_change", "ids": (2,)}, 0)
+    canvas._events.flush()
+    assert ends == [("pointer_up", 2), ("pointer_up", 1), ("key_up", "w")]
+
+
 # In a browser
 
 
