@@ -9,9 +9,8 @@ import sys
 import typing
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NoReturn
 
-from lapgs_wgpu.command import guarded, print_devices
+from lapgs_wgpu.command import HelpFormatter, Parser, guarded, print_devices
 from lapgs_wgpu.errors import InputError
 
 if typing.TYPE_CHECKING:
@@ -173,7 +172,7 @@ counts as finished when its folder, OUT/results.json or a --from file holds it i
 
 
 def _table(arguments: list[str]) -> int:
-    parser = _Parser("lapgs-table", description=TABLE_DESCRIPTION, formatter_class=_HelpFormatter, allow_abbrev=False)
+    parser = Parser("lapgs-table", description=TABLE_DESCRIPTION, formatter_class=HelpFormatter, allow_abbrev=False)
     parser.add_argument("spec", nargs="?", metavar="SPEC.toml", help="the table, as docs/tables/demo.toml explains")
     parser.add_argument("--data", metavar="DIR", default=".", help="where the scenes' folders lie [.]")
     parser.add_argument("--out", metavar="OUT", help="folder of the runs and the table")
@@ -213,28 +212,16 @@ def _table(arguments: list[str]) -> int:
 _METAVARS = {int: "INT", float: "FLOAT", str: "TEXT", bool: "true|false"}
 
 
-class _HelpFormatter(argparse.RawDescriptionHelpFormatter):
-    def __init__(self, prog: str) -> None:
-        super().__init__(prog, max_help_position=32, width=120)
-
-
-class _Parser(argparse.ArgumentParser):
-    """argparse, with its mistakes told in our way."""
-
-    def error(self, message: str) -> NoReturn:
-        raise InputError(f"{message}; {self.prog} --help lists the options.")
-
-
 def _parse(arguments: list[str]) -> dict[str, typing.Any]:
     from lapgs_wgpu.train.presets import ABLATIONS, config_keys, did_you_mean, load_config, preset_names
 
     shown = next((word for word in arguments if word in preset_names()), "dnerf")
     preset = load_config(shown)
-    parser = _Parser(
+    parser = Parser(
         "lapgs-train",
         usage=USAGE,
         description=DESCRIPTION,
-        formatter_class=_HelpFormatter,
+        formatter_class=HelpFormatter,
         allow_abbrev=False,
     )
     parser.add_argument(

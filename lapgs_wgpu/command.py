@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import argparse
 import sys
 from collections.abc import Callable
+from typing import NoReturn
 
 from lapgs_wgpu.errors import InputError, NoAdapterError
 from lapgs_wgpu.gpu.device import list_devices
@@ -34,3 +36,15 @@ def print_devices() -> None:
     """The adapters, the default one first."""
     for info in list_devices():
         print(f"{info.name}  ({info.kind}, {info.backend}, {info.driver})")
+
+
+class HelpFormatter(argparse.RawDescriptionHelpFormatter):
+    def __init__(self, prog: str) -> None:
+        super().__init__(prog, max_help_position=32, width=120)
+
+
+class Parser(argparse.ArgumentParser):
+    """argparse, with its mistakes told in our way."""
+
+    def error(self, message: str) -> NoReturn:
+        raise InputError(f"{message}; {self.prog} --help lists the options.")

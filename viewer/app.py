@@ -17,6 +17,8 @@ from .clock import LOOPS, SPEEDS
 from .frame import Frame, Mode, Painter, Request
 from .keys import FLY, KEYS
 from .opened import BACKGROUNDS, Opened, open_scene
+from .path import Pose
+from .path_editor import PathEditor
 from .present import Placed, Presenter
 
 if TYPE_CHECKING:
@@ -72,7 +74,8 @@ class App:
         self.moved_at = self._drawn_at = time.perf_counter()
         self.seconds = 0.0
         self.training: Training | None = None
-        self.capture: Capture | None = None
+        self._capture: Capture | None = None
+        self._capture_sought = False
         self._times: deque[float] = deque(maxlen=30)
         self._pointer = (0.0, 0.0)
         self._dragging: str | None = None
@@ -96,13 +99,18 @@ class App:
         """Show another file; where it cannot be read, say why and keep the present one."""
         try:
             self._show(open_scene(path, self.device))
-            self._open_capture()
         except InputError as error:
             self.message = str(error)
         self.canvas.request_draw()
 
-    def _open_capture(self) -> None:
-        self.capture = open_capture(self.opened.path) if self.opened.path else None
+    @property
+    def capture(self) -> Capture | None:
+        """What the scene was trained on, where that is here. Looked for when it is first needed, not before the first
+        picture."""
+        if not self._capture_sought:
+            self._capture = open_capture(self.opened.path) if self.opened.path else None
+            self._capture_sought = True
+        return self._capture
 
     def refresh(self) -> None:
         """The scene itself has changed: draw it again."""
@@ -114,9 +122,10 @@ class App:
         self.opened = opened
         self.painter = Painter(opened.playback)
         self.camera, self.clock = opened.camera(), opened.clock()
+        self.path = PathEditor()
         self.background = opened.background
         self.show_transport = opened.playback.moves if self._transport is None else self._transport
-        self.capture = None
+        self._capture_sought = False
         self.view: int | None = None
         if self.mode not in self.painter.modes():
             self.mode = "rgb"
@@ -131,17 +140,19 @@ class App:
         self._drawn_at = now
         self.clock.advance(passed)
         self._fly(passed)
+        previewed = self.path.preview(now)  # of this very moment, however long the last frame took
+        if previewed is not None:
+            self.stand_on(*previewed)
         self._paint(now)
         self._present()
         if self._gui is None:
             from .panels import Panels
 
             self._gui = Panels(self)
-            self._open_capture()
         else:
             self._gui.render()
             self._gui_draws -= 1
-        if self.clock.playing or self._held or self._gui_draws > 0:
+        if self.clock.playing or self._held or self._gui_draws > 0 or previewed is not None:
             self.canvas.request_draw()
         elif self.scale < 1:
             self.loop.call_later(_SETTLED, self.canvas.request_draw)
@@ -203,7 +214,7 @@ class App:
 
     def comparing(self) -> Compare:
         """How the capture's picture is shown beside ours: not at all where there is none of this camera and time."""
-        if self.capture is None or self.view is None or self.camera.exact is None or self.mode != "rgb":
+        if self.view is None or self.camera.exact is None or self.mode != "rgb" or self.capture is None:
             return "off"
         return self.compare if abs(self.clock.time - self.capture.views[self.view].time) < 1e-6 else "off"
 
@@ -274,6 +285,9 @@ class App:
             self.training.paused = True
             self.training.single += 1
 
+    def add_key_frame(self) -> None:
+        self.path.add(self.camera, self.clock.time)
+
     def toggle_overlay(self) -> None:
         self.show_overlay = not self.show_overlay
 
@@ -293,6 +307,12 @@ class App:
         self.camera.snap(self.capture.views[view].camera)
         self.clock.playing = False
         self.clock.seek(self.capture.views[view].time)
+
+    def stand_on(self, pose: Pose, time: float) -> None:
+        """Go to a pose of a camera path, and to a time."""
+        self.camera.stand(pose.position, pose.rotation, pose.fov_y)
+        self.clock.playing = False
+        self.clock.seek(time)
 
     def focus(self) -> None:
         """Turn about what lies under the pointer."""
@@ -344,6 +364,7 @@ class App:
 
     def _on_pointer_down(self, event: dict[str, Any]) -> None:
         self._pointer = (event["x"], event["y"])
+        self.path.started = None  # whoever takes the camera has it
         sideways = event["button"] != 1 or "Shift" in event["modifiers"]
         self._dragging = "pan" if sideways else "look" if self.flying else "orbit"
         if self.comparing() == "split" and self.frame is not None:

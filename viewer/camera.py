@@ -52,6 +52,13 @@ class ViewCamera:
         self.fov_y = 2 * math.atan(0.5 * camera.height / camera.K[1, 1])
         self.exact = camera
 
+    def stand(self, position: ArrayLike, rotation: ArrayLike, fov_y: float) -> None:
+        """Stand at a position (3,), turned by a rotation (3, 3) from world to camera; the focus stays as far ahead."""
+        distance = self.distance
+        self.position, self.rotation = np.array(position, np.float64), np.array(rotation, np.float64)
+        self.focus = self.position + distance * self.rotation[2]
+        self.fov_y, self.exact = fov_y, None
+
     def reset(self) -> None:
         """Back to where it started."""
         self.position, self.focus, self.rotation, self.fov_y, self.exact = self._start

@@ -22,7 +22,7 @@ Scope = MutableMapping[str, Any]
 Message = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[Message]]
 Send = Callable[[Message], Awaitable[None]]
-App = Callable[[Scope, Receive, Send], Awaitable[None]]
+Application = Callable[[Scope, Receive, Send], Awaitable[None]]
 
 LOCAL = ("localhost", "127.0.0.1", "::1")
 _TOKEN = re.compile(r"[A-Za-z0-9_-]{16,256}")  # stands in an address and in a cookie as it is
@@ -56,7 +56,7 @@ class Guard:
     """
 
     def __init__(
-        self, app: App, *, names: Iterable[str] = (), any_address: bool = False, token: str | None = None
+        self, app: Application, *, names: Iterable[str] = (), any_address: bool = False, token: str | None = None
     ) -> None:
         self._app = app
         self._names = {name.lower() for name in (*LOCAL, *names)}

@@ -16,8 +16,8 @@ from typing import Protocol
 from rendercanvas.utils.asyncs import sleep
 
 from lapgs_wgpu.io.first_look import FirstLook
-from lapgs_wgpu.motion.scene_playback import ScenePlayback
 from lapgs_wgpu.motion.scene import Scene4D
+from lapgs_wgpu.motion.scene_playback import ScenePlayback
 
 from .app import App
 from .opened import Opened

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,6 +17,8 @@ from .camera import ViewCamera
 from .clock import Clock
 
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "grey": (0.5, 0.5, 0.5)}
+_ELEVATION = math.radians(35)  # of the guessed camera above the middle
+_FLAT = 0.5  # of the extents along x and y: what is lower lies on the ground
 _FRAMES = 150  # of a clip whose file does not say how many it has
 
 
@@ -49,12 +52,23 @@ def open_scene(path: Path, device: Device) -> Opened:
 
 def guess_look(playback: Playback) -> FirstLook:
     """For files that say nothing of cameras: the middle of the Gaussians from a distance that shows most of them.
-    Up is -y, as in scenes whose poses come from COLMAP."""
+
+    Up is -y, as in scenes whose poses come from COLMAP; z where the Gaussians lie flat in x and y, or the file is a
+    checkpoint of D-NeRF's scenes.
+    """
     means = playback.means(0.0).astype(np.float64)
-    middle = np.median(means, axis=0) if len(means) else np.zeros(3)
-    radius = float(np.quantile(np.linalg.norm(means - middle, axis=1), 0.9)) if len(means) else 1.0
-    radius = max(radius, 1e-3)
-    camera = Camera.looking_at(
-        middle - [0, 0.5 * radius, 2.5 * radius], middle, up=[0, -1, 0], fov_x=0.9, width=4, height=3
-    )
-    return FirstLook(camera.resized(640, 480), middle, np.array([0.0, -1.0, 0.0]), _FRAMES)
+    if not len(means):
+        means = np.zeros((1, 3))
+    middle = np.median(means, axis=0)
+    radius = max(float(np.quantile(np.linalg.norm(means - middle, axis=1), 0.9)), 1e-3)
+    extent = np.subtract(*np.quantile(means, [0.9, 0.1], axis=0))
+    flat = extent[2] < _FLAT * min(extent[0], extent[1])
+    if playback.metadata:
+        up, ahead = np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0])
+    elif flat:
+        up, ahead = np.array([0.0, 0.0, 1.0]), np.array([0.0, -1.0, 0.0])  # y points down in pictures
+    else:
+        up, ahead = np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, 1.0])
+    away = math.sin(_ELEVATION) * up - math.cos(_ELEVATION) * ahead
+    camera = Camera.looking_at(middle + 3.6 * radius * away, middle, up=up.tolist(), fov_x=0.9, width=640, height=480)
+    return FirstLook(camera, middle, up, _FRAMES)

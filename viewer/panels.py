@@ -13,6 +13,7 @@ from .clock import LOOPS, SPEEDS
 from .frame import MODES
 from .keys import KEYS, MOUSE
 from .opened import BACKGROUNDS
+from .path_panel import draw_path
 from .present import HEAT
 
 if TYPE_CHECKING:
@@ -145,6 +146,7 @@ class Panels:
             self._training(app.training)
         if app.capture is not None:
             self._capture()
+        draw_path(app)
         if self._browsing:
             self._files()
         imgui.end()

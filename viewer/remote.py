@@ -13,7 +13,8 @@ from typing import Any, NamedTuple
 
 from lapgs_wgpu.errors import InputError
 
-from .guard import LOCAL, App, Guard, Receive, Scope, Send, answer, check_entry
+from .guard import LOCAL, Application, Guard, Receive, Scope, Send, answer, check_entry
+from .start import Start
 
 DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 8080
 _EVERYWHERE = ("0.0.0.0", "::")
@@ -73,19 +74,20 @@ def open_entry(host: str, port: int, token: str | None) -> Entry:
         raise InputError(f"--host {host} --port {port} cannot be listened on: {error.strerror}.") from None
 
 
-def run_remote(opened: Any, entry: Entry, *, transport: bool | None) -> None:
-    """Show it to browsers until Ctrl-C, which raises KeyboardInterrupt. transport: as for run_window."""
+def run_remote(opened: Any, entry: Entry, *, transport: bool | None, start: Start) -> None:
+    """Show it to browsers until Ctrl-C, which raises KeyboardInterrupt. transport, start: as for run_window."""
     import uvicorn
     from rendercanvas.http import asgi, loop
 
-    from .app import App as Viewer
+    from .app import App
     from .remote_canvas import RemoteCanvas
 
     # rendercanvas takes Ctrl-C from uvicorn when its loop starts, closes the canvas and leaves the server running.
     loop._BaseLoop__setup_interrupt_hooks = dict
     name = opened.path.name if opened.path else "lapgs-view"
     canvas = RemoteCanvas(opened.playback.device, title=name, update_mode="ondemand", max_fps=60)
-    viewer = Viewer(canvas, loop, opened, transport=transport)
+    viewer = App(canvas, loop, opened, transport=transport)
+    start.apply(viewer)
     everywhere = entry.host in _EVERYWHERE
     names = [entry.host, entry.listening.getsockname()[0], *([socket.gethostname()] if everywhere else [])]
     guard = Guard(pages(name, asgi), names=names, any_address=everywhere, token=entry.token)
@@ -107,7 +109,7 @@ def run_remote(opened: Any, entry: Entry, *, transport: bool | None) -> None:
     del viewer
 
 
-def pages(title: str, sockets: App) -> App:
+def pages(title: str, sockets: Application) -> Application:
     """ASGI: the page and its parts, with everything that is no http left to `sockets`."""
     folder = resources.files(__package__) / "page"
     files = {name: (kind, (folder / name).read_bytes()) for name, kind in _TYPES.items()}

@@ -1,0 +1,169 @@
+"""The viewer's camera: what mouse moves leave as it was, and exact snapping to a capture's camera."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from lapgs_wgpu.viewer.camera import ViewCamera
+
+from lapgs_wgpu.splat.camera import Camera
+
+UP = np.array([0.0, 0.6, 0.8])
+
+
+@pytest.fixture
+def view() -> ViewCamera:
+    return ViewCamera([3.0, -1.0, 0.5], [0.2, 0.1, -0.3], UP, 0.7)
+
+
+def level(view: ViewCamera) -> bool:
+    return abs(view.rotation[0] @ UP) < 1e-9 and view.rotation[1] @ UP < 0
+
+
+def proper(view: ViewCamera) -> bool:
+    rotation = view.rotation
+    return np.allclose(rotation @ rotation.T, np.eye(3)) and np.linalg.det(rotation) > 0
+
+
+def ahead(view: ViewCamera) -> bool:
+    """Whether the focus is in the middle of the picture."""
+    seen = view.rotation @ (view.focus - view.position)
+    return bool(np.allclose(seen, [0, 0, view.distance]))
+
+
+def project(camera: Camera, point: np.ndarray) -> np.ndarray:
+    seen = camera.K @ (camera.T_cam_world[:3, :3] @ point + camera.T_cam_world[:3, 3])
+    return seen[:2] / seen[2]
+
+
+def test_orbit_keeps_focus_distance_and_horizon(view: ViewCamera) -> None:
+    focus, distance = view.focus.copy(), view.distance
+    for right, down in ((0.3, 0.2), (-2.0, 0.5), (1.0, -3.0), (0.1, 9.0), (4.0, -0.2)):
+        view.orbit(right, down)
+        assert np.allclose(view.focus, focus)
+        assert view.distance == pytest.approx(distance)
+        assert level(view)
+        assert proper(view)
+        assert ahead(view)
+
+
+def test_orbit_drags_the_scene(view: ViewCamera) -> None:
+    """What is nearer than the focus goes with the mouse."""
+    near = view.focus + 0.3 * (view.position - view.focus)
+    before = project(view.camera(400, 300), near)
+    view.orbit(0.05, 0.03)
+    after = project(view.camera(400, 300), near)
+    assert after[0] > before[0]
+    assert after[1] > before[1]
+
+
+def test_a_whole_turn_ends_where_it_began(view: ViewCamera) -> None:
+    position, rotation = view.position.copy(), view.rotation.copy()
+    for _ in range(100):
+        view.orbit(2 * math.pi / 100, 0.0)
+    assert np.allclose(view.position, position)
+    assert np.allclose(view.rotation, rotation)
+
+
+def test_looking_around_keeps_the_position(view: ViewCamera) -> None:
+    position, distance = view.position.copy(), view.distance
+    view.look(0.4, -0.3)
+    assert np.allclose(view.position, position)
+    assert view.distance == pytest.approx(distance)
+    assert level(view)
+    assert ahead(view)
+
+
+def test_pan_moves_the_focus_with_the_mouse(view: ViewCamera) -> None:
+    focus, rotation = view.focus.copy(), view.rotation.copy()
+    view.pan(0.25, -0.1)
+    assert np.allclose(project(view.camera(400, 200), focus), [200 + 50, 100 - 20])
+    assert np.array_equal(view.rotation, rotation)
+
+
+def test_zoom_keeps_the_focus(view: ViewCamera) -> None:
+    focus, distance = view.focus.copy(), view.distance
+    view.zoom(0.5)
+    assert view.distance == pytest.approx(0.5 * distance)
+    assert np.array_equal(view.focus, focus)
+    assert ahead(view)
+
+
+def test_flying_goes_along_the_cameras_axes(view: ViewCamera) -> None:
+    position, distance = view.position.copy(), view.distance
+    view.fly(0.1, 0.2, 0.3)
+    assert np.allclose(view.rotation @ (view.position - position), [0.1, 0.2, 0.3])
+    assert view.distance == pytest.approx(distance)
+
+
+def test_a_new_focus_comes_to_the_middle(view: ViewCamera) -> None:
+    position, point = view.position.copy(), np.array([-1.0, 2.0, 0.4])
+    view.focus_on(point)
+    assert np.array_equal(view.position, position)
+    assert np.allclose(project(view.camera(400, 300), point), [200, 150])
+    assert level(view)
+
+
+def test_looking_straight_down_is_no_accident() -> None:
+    view = ViewCamera(3 * UP, [0, 0, 0], UP, 0.7)
+    assert proper(view)
+    view.orbit(0.3, -0.4)
+    assert proper(view)
+    assert np.isfinite(view.camera(8, 8).T_cam_world).all()
+
+
+def captured() -> Camera:
+    """A rolled camera with a principal point off the centre and unequal focal lengths."""
+    camera = Camera.looking_at([1, -3, 0.7], [0.1, 0, 0], up=[0.3, 0.2, 1], fov_x=0.8, width=60, height=40)
+    return Camera(camera.K * np.array([[1.0, 1, 1.1], [1, 1.15, 0.93], [1, 1, 1]]), camera.T_cam_world, 60, 40)
+
+
+def test_snapping_is_exact(view: ViewCamera) -> None:
+    wanted = captured()
+    view.snap(wanted)
+    got = view.camera(60, 40)
+    assert np.array_equal(got.K, wanted.K)
+    assert np.array_equal(got.T_cam_world, wanted.T_cam_world)
+    assert ahead(view)
+    larger = view.camera(300, 120)  # the capture's aspect, as large as fits
+    assert (larger.width, larger.height) == (180, 120)
+    assert np.allclose(larger.K, wanted.resized(180, 120).K)
+
+
+@pytest.mark.parametrize("move", ["orbit", "look", "pan", "zoom", "fly", "focus_on", "stand", "reset"])
+def test_any_move_leaves_the_exact_camera(view: ViewCamera, move: str) -> None:
+    arguments = {"zoom": (0.9,), "fly": (0, 0, 1), "focus_on": ([0, 0, 0],), "reset": ()}
+    arguments["stand"] = (view.position, view.rotation, 0.5)
+    view.snap(captured())
+    getattr(view, move)(*arguments.get(move, (0.1, 0.1)))
+    assert view.exact is None
+    assert (view.camera(300, 120).width, view.camera(300, 120).height) == (300, 120)
+
+
+def test_standing_on_a_pose(view: ViewCamera) -> None:
+    distance = view.distance
+    wanted = captured()
+    view.stand(wanted.position, wanted.T_cam_world[:3, :3], 0.5)
+    assert np.allclose(view.camera(60, 40).T_cam_world, wanted.T_cam_world)
+    assert view.fov_y == 0.5
+    assert view.distance == pytest.approx(distance)
+    assert ahead(view)
+
+
+def test_reset_returns_to_the_start(view: ViewCamera) -> None:
+    before = view.camera(64, 48)
+    view.orbit(0.3, 0.2)
+    view.pan(0.1, 0.1)
+    view.snap(captured())
+    view.reset()
+    after = view.camera(64, 48)
+    assert np.array_equal(after.K, before.K)
+    assert np.array_equal(after.T_cam_world, before.T_cam_world)
+
+
+def test_starting_where_a_camera_stands() -> None:
+    view = ViewCamera.of(captured(), [0, 0, 0], [0, 0, 1])
+    assert np.allclose(view.camera(200, 100).T_cam_world, captured().T_cam_world)
+    assert (view.camera(200, 100).width, view.camera(200, 100).height) == (200, 100)

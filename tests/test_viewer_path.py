@@ -1,0 +1,430 @@
+"""Camera paths: through their key-frames, smoothly; nerfstudio's files; files that lie; the editor."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from lapgs_wgpu.viewer.camera import ViewCamera
+from lapgs_wgpu.viewer.path import CameraPath, KeyFrame, Pose
+from lapgs_wgpu.viewer.path_editor import PathEditor, beside
+from lapgs_wgpu.viewer.path_file import PathFile, read_path, write_path
+from scipy.spatial.transform import Rotation
+
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.motion.field import FieldConfig
+from lapgs_wgpu.motion.hashgrid import HashConfig
+from lapgs_wgpu.motion.scene import Scene4D
+
+
+def keys(seed: int = 0) -> list[KeyFrame]:
+    rng = np.random.default_rng(seed)
+    turns = Rotation.random(4, random_state=seed).as_matrix()
+    moments, times = [0.0, 1.0, 1.5, 4.0], [0.0, 0.2, 0.8, 1.0]
+    return [
+        KeyFrame(second, time, Pose(rng.normal(size=3), turn, float(rng.uniform(0.4, 1.2))))
+        for second, time, turn in zip(moments, times, turns, strict=True)
+    ]
+
+
+def assert_near(a: Pose, b: Pose, atol: float = 1e-9) -> None:
+    np.testing.assert_allclose(a.position, b.position, atol=atol)
+    np.testing.assert_allclose(a.rotation, b.rotation, atol=atol)
+    assert a.fov_y == pytest.approx(b.fov_y, abs=atol)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_it_passes_through_its_keys_without_a_jump_of_speed(seed: int) -> None:
+    path = CameraPath(keys(seed))
+    e = 1e-5
+    for key in path.keys:
+        pose, time = path.at(key.second)
+        assert_near(pose, key.pose)
+        assert time == pytest.approx(key.time)
+    for key in path.keys[1:-1]:
+        before, at, after = (path.at(key.second + step)[0] for step in (-e, 0, e))
+        for name in ("position", "rotation", "fov_y"):
+            a, b, c = (getattr(pose, name) for pose in (before, at, after))
+            np.testing.assert_allclose((c - b) / e, (b - a) / e, atol=2e-3, err_msg=name)
+
+
+def test_rotations_stay_rotations_and_go_the_short_way() -> None:
+    def turned(degrees: float) -> np.ndarray:
+        return Rotation.from_euler("y", degrees, degrees=True).as_matrix()
+
+    pose = Pose(np.zeros(3), turned(170), 0.7)
+    path = CameraPath([KeyFrame(0, 0, pose), KeyFrame(2, 1, pose._replace(rotation=turned(-170)))])
+    np.testing.assert_allclose(path.at(1.0)[0].rotation, turned(180), atol=1e-9)
+    path = CameraPath(keys(3))
+    for second in np.linspace(0, 4, 40):
+        rotation = path.at(float(second))[0].rotation
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
+
+
+def test_two_keys_give_a_straight_line_at_one_speed() -> None:
+    first, last = keys()[0], keys()[-1]
+    path = CameraPath([first, last])
+    expected = 0.75 * first.pose.position + 0.25 * last.pose.position
+    np.testing.assert_allclose(path.at(1.0)[0].position, expected)
+
+
+def test_velocity_at_a_key_is_that_of_the_parabola_through_its_neighbours() -> None:
+    def key(second: float) -> KeyFrame:
+        return KeyFrame(second, 0, Pose(np.array([second**2, second, 0.0]), np.eye(3), 0.7))
+
+    path, e = CameraPath([key(0), key(1), key(3)]), 1e-5
+    velocity = (path.at(1 + e)[0].position - path.at(1 - e)[0].position) / (2 * e)
+    np.testing.assert_allclose(velocity, [2, 1, 0], atol=1e-3)
+
+
+def test_times_are_linear_between_keys() -> None:
+    path = CameraPath(keys())
+    assert path.at(1.25)[1] == pytest.approx(0.5)
+    times = [path.at(second)[1] for second in np.linspace(0, 4, 200)]
+    assert (np.diff(times) > 0).all()
+
+
+def test_between_equal_keys_it_rests() -> None:
+    some = keys()
+    some[2] = some[1]._replace(second=1.5)
+    path = CameraPath(some)
+    for second in np.linspace(1.0, 1.5, 7):
+        assert_near(path.at(float(second))[0], some[1].pose)
+
+
+def test_fields_of_view_stay_within_those_of_the_keys() -> None:
+    some = [key._replace(pose=key.pose._replace(fov_y=f)) for key, f in zip(keys(), [0.3, 1.5, 1.4, 0.3], strict=True)]
+    path = CameraPath(some)
+    found = [path.at(second)[0].fov_y for second in np.linspace(0, 4, 400)]
+    assert min(found) >= 0.3 - 1e-12
+    assert max(found) <= 1.5 + 1e-12
+
+
+def test_its_ends_stand() -> None:
+    path = CameraPath(keys())
+    assert_near(path.at(-1.0)[0], path.keys[0].pose)
+    assert_near(path.at(99.0)[0], path.keys[-1].pose)
+    single = CameraPath(keys()[:1])
+    assert single.seconds == 0
+    assert_near(single.at(0.5)[0], single.keys[0].pose)
+
+
+def test_the_first_key_is_at_second_zero() -> None:
+    path = CameraPath([key._replace(second=key.second + 7) for key in reversed(keys())])
+    assert [key.second for key in path.keys] == [0.0, 1.0, 1.5, 4.0]
+
+
+def test_a_pose_is_a_camera() -> None:
+    pose = keys()[0].pose
+    camera = pose.camera(64, 48)
+    np.testing.assert_allclose(camera.position, pose.position)
+    assert 2 * math.atan(24 / camera.K[1, 1]) == pytest.approx(pose.fov_y)
+    assert camera.K[0, 0] == camera.K[1, 1]
+
+
+# Files
+
+
+def test_round_trip(tmp_path: Path) -> None:
+    held = PathFile(CameraPath(keys()), (640, 360), 24.0)
+    write_path(tmp_path / "a.json", held)
+    back = read_path(tmp_path / "a.json")
+    assert (back.size, back.fps, back.moves) == ((640, 360), 24.0, True)
+    for a, b in zip(back.path.keys, held.path.keys, strict=True):
+        assert (a.second, a.time) == (pytest.approx(b.second), pytest.approx(b.time))
+        assert_near(a.pose, b.pose)
+
+
+def test_what_is_written_is_nerfstudios(tmp_path: Path) -> None:
+    """Every key that nerfstudio's render command and viewer read, in its axes and units."""
+    camera = ViewCamera([0, 0, 5], [0, 0, 0], [0, 1, 0], math.radians(50))  # looks along -z, as OpenGL's cameras do
+    pose = Pose(camera.position, camera.rotation, camera.fov_y)
+    path = CameraPath([KeyFrame(0, 0.25, pose), KeyFrame(2, 0.75, pose._replace(position=np.array([1.0, 0, 5])))])
+    write_path(tmp_path / "a.json", PathFile(path, (640, 360), 10.0))
+    values = json.loads((tmp_path / "a.json").read_text())
+    assert values["camera_type"] == "perspective"
+    assert (values["render_width"], values["render_height"]) == (640, 360)
+    assert (values["fps"], values["seconds"], values["is_cycle"]) == (10.0, 2.0, False)
+    assert len(values["camera_path"]) == 20
+    frame = values["camera_path"][10]
+    np.testing.assert_allclose(frame["camera_to_world"], [1, 0, 0, 0.5, 0, 1, 0, 0, 0, 0, 1, 5, 0, 0, 0, 1], atol=1e-12)
+    assert frame["fov"] == pytest.approx(50)
+    assert frame["aspect"] == pytest.approx(640 / 360)
+    assert frame["render_time"] == pytest.approx(0.5)
+    key = values["keyframes"][1]
+    np.testing.assert_allclose(key["matrix"], [1, 0, 0, 1, 0, 1, 0, 0, 0, 0, 1, 5, 0, 0, 0, 1], atol=1e-12)
+    assert (key["override_transition_enabled"], key["override_transition_sec"]) == (True, 2.0)
+    assert (key["override_time_enabled"], key["render_time"]) == (True, 0.75)
+
+
+IDENTITY = np.eye(4).ravel().tolist()
+SHIFTED = [1, 0, 0, 3, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
+
+
+def nerfstudio(**changes: Any) -> dict[str, Any]:
+    """A path as nerfstudio's viewer saves it, without times."""
+    values: dict[str, Any] = {
+        "default_fov": 75.0,
+        "default_transition_sec": 2.0,
+        "keyframes": [
+            {
+                "matrix": matrix,
+                "fov": 60.0,
+                "aspect": 1.78,
+                "override_transition_enabled": i == 2,
+                "override_transition_sec": 0.5 if i == 2 else None,
+            }
+            for i, matrix in enumerate([IDENTITY, SHIFTED, IDENTITY])
+        ],
+        "camera_type": "perspective",
+        "render_height": 1080,
+        "render_width": 1920,
+        "fps": 30.0,
+        "seconds": 2.5,
+        "is_cycle": False,
+        "smoothness_value": 0.0,
+        "camera_path": [{"camera_to_world": m, "fov": 60.0, "aspect": 1.78} for m in (IDENTITY, SHIFTED)],
+    }
+    return values | changes
+
+
+def read(tmp_path: Path, values: Any) -> PathFile:
+    (tmp_path / "a.json").write_text(json.dumps(values))
+    return read_path(tmp_path / "a.json")
+
+
+def test_nerfstudios_key_frames(tmp_path: Path) -> None:
+    held = read(tmp_path, nerfstudio())
+    assert [key.second for key in held.path.keys] == [0.0, 2.0, 2.5]
+    assert not held.moves
+    assert [key.time for key in held.path.keys] == pytest.approx([0.0, 0.8, 1.0])  # the clip once along the path
+    first = held.path.keys[0].pose
+    np.testing.assert_allclose(first.rotation, np.diag([1, -1, -1]), atol=1e-12)
+    assert first.fov_y == pytest.approx(math.radians(60))
+    np.testing.assert_allclose(held.path.keys[1].pose.position, [3, 0, 0])
+
+
+def test_a_closed_path_comes_back(tmp_path: Path) -> None:
+    held = read(tmp_path, nerfstudio(is_cycle=True))
+    assert [key.second for key in held.path.keys] == [0.0, 2.0, 2.5, 4.5]
+    assert_near(held.path.keys[-1].pose, held.path.keys[0].pose)
+
+
+def test_frames_serve_where_there_are_no_key_frames(tmp_path: Path) -> None:
+    """Files of other programs have none; those of nerfstudio's first viewer hold them as texts."""
+    for given in ([], [{"matrix": json.dumps(IDENTITY), "fov": 50, "properties": "[]"}]):
+        held = read(tmp_path, nerfstudio(keyframes=given))
+        assert [key.second for key in held.path.keys] == pytest.approx([0.0, 1 / 30])
+    rows = [{"camera_to_world": np.eye(4).tolist(), "fov": 50, "time": t} for t in (0.5, 0.75, 0.25)]
+    held = read(tmp_path, {"camera_path": rows, "render_width": 64, "render_height": 48})
+    assert [key.time for key in held.path.keys] == [0.5, 0.75, 0.25]
+    assert held.moves
+
+
+def test_times_are_read_from_the_key_frames(tmp_path: Path) -> None:
+    values = nerfstudio()
+    for key, time in zip(values["keyframes"], (0.5, 0.25, 1.0), strict=True):
+        key["render_time"] = time
+    assert [key.time for key in read(tmp_path, values).path.keys] == [0.5, 0.25, 1.0]
+
+
+def test_older_files_spread_their_keys_over_their_seconds(tmp_path: Path) -> None:
+    values = nerfstudio()
+    del values["default_transition_sec"]
+    for key in values["keyframes"]:
+        del key["override_transition_sec"], key["override_transition_enabled"]
+    assert [key.second for key in read(tmp_path, values).path.keys] == [0.0, 1.25, 2.5]
+
+
+def changed(key: str, value: Any) -> dict[str, Any]:
+    values = nerfstudio()
+    values["keyframes"][1][key] = value
+    return values
+
+
+BAD: dict[str, tuple[Any, str]] = {
+    "a list": ([], "list"),
+    "fisheye": (nerfstudio(camera_type="fisheye"), "camera_type"),
+    "no width": (nerfstudio(render_width=None), "render_width is missing"),
+    "zero height": (nerfstudio(render_height=0), "render_height"),
+    "text for fps": (nerfstudio(fps="30"), "fps"),
+    "endless": (nerfstudio(fps=float("inf")), "fps"),
+    "a huge number": (nerfstudio(fps=10**400), "fps"),
+    "nothing": (nerfstudio(keyframes=[], camera_path=[]), "camera_path is missing or empty"),
+    "keys of no list": (nerfstudio(keyframes=5), "keyframes is not a list"),
+    "a frame of no object": (nerfstudio(keyframes=[], camera_path=[1]), r"camera_path\[0\]"),
+    "12 numbers": (changed("matrix", IDENTITY[:12]), r"keyframes\[1\].matrix"),
+    "no numbers": (changed("matrix", ["a"] * 16), r"keyframes\[1\].matrix"),
+    "NaN": (changed("matrix", [float("nan")] * 16), r"keyframes\[1\].matrix"),
+    "sheared": (changed("matrix", [1, 1, *IDENTITY[2:]]), r"keyframes\[1\].matrix is not a rotation"),
+    "mirrored": (changed("matrix", [-1, *IDENTITY[1:]]), r"keyframes\[1\].matrix is not a rotation"),
+    "all zeros": (changed("matrix", [0] * 16), r"keyframes\[1\].matrix"),
+    "fov of 180": (changed("fov", 180), r"keyframes\[1\].fov"),
+    "fov true": (changed("fov", True), r"keyframes\[1\].fov"),
+    "no fov": (changed("fov", None), r"keyframes\[1\].fov is missing"),
+    "time of 2": (changed("render_time", 2), r"keyframes\[1\].render_time"),
+    "a step back": (
+        nerfstudio(
+            keyframes=[
+                {"matrix": IDENTITY, "fov": 50, "override_transition_enabled": True, "override_transition_sec": wait}
+                for wait in (0, -1)
+            ]
+        ),
+        r"keyframes\[1\].override_transition_sec",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_files_are_refused_in_one_sentence(name: str, tmp_path: Path) -> None:
+    values, message = BAD[name]
+    with pytest.raises(InputError, match=message) as caught:
+        read(tmp_path, values)
+    assert str(caught.value).startswith(f"{tmp_path / 'a.json'}: ")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe", b"[" * 100_000])
+def test_what_is_no_json(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_bytes(content)
+    with pytest.raises(InputError, match=r"a\.json: is not JSON"):
+        read_path(tmp_path / "a.json")
+
+
+def test_a_missing_file(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="cannot be read"):
+        read_path(tmp_path / "none.json")
+
+
+# The editor
+
+
+def camera(x: float) -> ViewCamera:
+    return ViewCamera([x, 0, 5], [0, 0, 0], [0, 1, 0], 0.7)
+
+
+def edited() -> PathEditor:
+    editor = PathEditor()
+    for number in range(3):
+        editor.add(camera(number), 0.1 * number)
+    return editor
+
+
+def seconds(editor: PathEditor) -> list[float]:
+    return [round(key.second, 6) for key in editor.keys]
+
+
+def test_key_frames_are_added_at_the_end() -> None:
+    editor = edited()
+    assert seconds(editor) == [0.0, 2.0, 4.0]
+    assert editor.chosen == 2
+    assert editor.keys[1].pose.position.tolist() == [1, 0, 5]
+    assert editor.keys[1].time == 0.1
+
+
+def test_moving_a_key_frame() -> None:
+    editor = edited()
+    editor.move(1.0)
+    assert seconds(editor) == [0.0, 1.0, 2.0]
+    assert editor.chosen == 1
+    assert editor.keys[1].time == 0.2
+    editor.move(2.0)  # where another one is: a little beyond
+    assert seconds(editor) == [0.0, 2.0, 2.05]
+    assert editor.chosen == 2
+    editor.move(-1.0)  # becomes the first, at second 0
+    assert seconds(editor) == [0.0, 1.0, 3.0]
+    assert editor.chosen == 0
+
+
+def test_replacing_and_deleting() -> None:
+    editor = edited()
+    editor.chosen = 1
+    editor.replace(camera(9), 0.9)
+    assert (editor.keys[1].second, editor.keys[1].time, editor.keys[1].pose.position[0]) == (2.0, 0.9, 9)
+    editor.chosen = 0
+    editor.delete()
+    assert seconds(editor) == [0.0, 2.0]
+    editor.delete()
+    editor.delete()
+    assert editor.keys == []
+    assert editor.chosen is None
+    assert editor.path is None
+
+
+def test_the_preview_shows_the_path_at_that_moment() -> None:
+    editor = edited()
+    assert editor.preview(100.0) is None
+    editor.play(100.0)
+    for now in (100.0, 100.7, 103.9):  # however many frames were drawn in between
+        shown, path = editor.preview(now), editor.path
+        assert shown is not None
+        assert path is not None
+        assert_near(shown[0], path.at(now - 100.0)[0])
+    shown = editor.preview(105.0)
+    assert shown is not None
+    assert_near(shown[0], editor.keys[-1].pose)
+    assert editor.preview(105.1) is None
+
+
+def test_saving_and_loading(tmp_path: Path) -> None:
+    file = beside(tmp_path / "checkpoint.ply")
+    assert file == tmp_path / "checkpoint.camera_path.json"
+    editor, other = edited(), PathEditor()
+    editor.save(file, (640, 360), 25.0)
+    other.load(file)
+    assert seconds(other) == seconds(editor)
+    assert_near(other.keys[2].pose, editor.keys[2].pose)
+    file.write_text("{}")
+    with pytest.raises(InputError):
+        other.load(file)
+    assert seconds(other) == seconds(editor)
+    with pytest.raises(InputError, match="no key-frame"):
+        PathEditor().save(file, (640, 360), 25.0)
+
+
+@pytest.mark.kernels
+def test_the_window_shows_the_path_at_that_moment(
+    device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    offscreen = pytest.importorskip("rendercanvas.offscreen")
+    pytest.importorskip("imgui_bundle")
+    from lapgs_wgpu.viewer import app as app_module
+    from lapgs_wgpu.viewer.opened import open_scene
+    from lapgs_wgpu.viewer.start import Start
+
+    grid = HashConfig(2, (4, 4, 4), (8, 8, 8), 10)
+    config = FieldConfig(static=grid, temporal=grid, width=8)
+    scene = Scene4D.from_points(np.eye(3), np.eye(3), np.full(3, 0.2), config, device=device)
+    scene.save(tmp_path / "a.ply")
+    now = [50.0]
+    monkeypatch.setattr(app_module, "time", SimpleNamespace(perf_counter=lambda: now[0]))
+    canvas = offscreen.RenderCanvas(size=(64, 48), pixel_ratio=1)
+    app = app_module.App(canvas, offscreen.loop, open_scene(tmp_path / "a.ply", device))
+    Start(time=0.2, speed=0.5, loop="bounce", mode="depth", fps=12.0, background=(1.0, 1.0, 1.0)).apply(app)
+    assert (app.clock.time, app.clock.speed, app.clock.loop, app.clock.fps) == (0.2, 0.5, "bounce", 12.0)
+    assert (app.mode, app.background, app.clock.playing) == ("depth", (1.0, 1.0, 1.0), False)
+    for turn, time in ((0.0, 0.2), (0.7, 0.8)):
+        app.camera.orbit(turn, 0.1)
+        app.clock.seek(time)
+        app._on_key_down({"key": "k", "modifiers": ()})
+    path = app.path.path
+    assert path is not None
+    app.path.play(now[0])
+    for now[0] in (50.0, 50.4, 51.9, 52.3):  # frames were dropped in between
+        canvas.draw()
+        pose, time = path.at(now[0] - 50.0)
+        assert app.frame is not None
+        request = app.frame.request
+        assert request.time == pytest.approx(time)
+        np.testing.assert_allclose(request.camera.position, pose.position, atol=1e-9)
+        np.testing.assert_allclose(request.camera.T_cam_world[:3, :3], pose.rotation, atol=1e-9)
+    assert app.path.started is None
+    app.path.play(now[0])
+    app._on_pointer_down({"x": 5, "y": 5, "button": 1, "modifiers": ()})
+    assert app.path.started is None
