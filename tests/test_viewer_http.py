@@ -443,8 +443,8 @@ def test_in_a_browser(server: Server, scene: Path, device: Device, tmp_path: Pat
         wait_for(lambda: changes(first), 30, "the panels")
 
         # The slider, dragged to the middle with the mouse; from there to the next whole frame.
-        scene_rows, bar_rows = slice(115, 235), slice(240, 270)
-        middle, row = SIZE[0] / 2, SIZE[1] - 64
+        scene_rows, bar_rows = slice(115, 235), slice(252, 282)
+        middle, row = SIZE[0] / 2, SIZE[1] - 52
         before = browser.picture()
         browser.mouse("mouseMoved", 25, row)
         wait_for(lambda: apart(browser.picture()[bar_rows], before[bar_rows]) > 20, 30, "the slider under the mouse")

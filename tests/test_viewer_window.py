@@ -72,12 +72,12 @@ def scene_part(screen: Picture) -> Picture:
 
 def test_scrub_play_orbit_and_modes(desktop: Desktop, run: Path) -> None:
     view(desktop, run / "checkpoint.ply", "800x600")
-    first = desktop.wait_for(lambda s: scene_part(s).max() > 60 and s[525:590, 20:780].max() > 200, "scene and slider")
+    first = desktop.wait_for(lambda s: scene_part(s).max() > 60 and s[535:590, 20:780].max() > 200, "scene and slider")
 
     def changed(screen: Picture, before: Picture) -> bool:
         return np.abs(scene_part(screen) - scene_part(before)).mean() > 1
 
-    desktop.drag((25, 536), (400, 536))
+    desktop.drag((25, 548), (400, 548))
     scrubbed = desktop.wait_for(lambda s: changed(s, first), "another time")
     desktop.events("mousemove", 400, 300, "key", "Home")
     back = desktop.wait_for(lambda s: not changed(s, first), "the start again")

@@ -70,7 +70,7 @@ class App:
         self.scale = 1.0
         self._moving_scale = 1.0
         self._drawn_key: Any = None
-        self._stale = False
+        self._stale = self._running = False
         self.moved_at = self._drawn_at = time.perf_counter()
         self.seconds = 0.0
         self.training: Training | None = None
@@ -90,6 +90,7 @@ class App:
         canvas.add_event_handler(self._on_wheel, "wheel")
         canvas.add_event_handler(self._on_key_down, "key_down")
         canvas.add_event_handler(self._on_key_up, "key_up")
+        canvas.add_event_handler(lambda event: self._held.clear(), "pointer_leave")
         # Panels react to everything, so everything asks for a draw; what has not changed is only presented again.
         everything = ("pointer_down", "pointer_move", "pointer_up", "wheel", "key_down", "key_up", "char", "resize")
         canvas.add_event_handler(self._on_any_event, *everything, order=-100)
@@ -136,8 +137,9 @@ class App:
 
     def _draw(self) -> None:
         now = time.perf_counter()
-        passed = min(now - self._drawn_at, 0.5)
-        self._drawn_at = now
+        # Time passes between two frames of something that runs, not while the window rested before it.
+        passed = now - self._drawn_at if self._running else 0.0
+        self._drawn_at, self._running = now, self.clock.playing or bool(self._held)
         self.clock.advance(passed)
         self._fly(passed)
         previewed = self.path.preview(now)  # of this very moment, however long the last frame took
@@ -364,6 +366,8 @@ class App:
 
     def _on_pointer_down(self, event: dict[str, Any]) -> None:
         self._pointer = (event["x"], event["y"])
+        if self._covered():
+            return
         self.path.started = None  # whoever takes the camera has it
         sideways = event["button"] != 1 or "Shift" in event["modifiers"]
         self._dragging = "pan" if sideways else "look" if self.flying else "orbit"
@@ -372,6 +376,10 @@ class App:
             divider = placed.origin[0] + self.split * placed.size[0]
             if abs(event["x"] * self.canvas.get_pixel_ratio() - divider) < _GRIP:
                 self._dragging = "split"
+
+    def _covered(self) -> bool:
+        """Whether the pointer is on a panel."""
+        return self._gui is not None and self._gui.covers(*self._pointer)
 
     def _on_pointer_move(self, event: dict[str, Any]) -> None:
         x, y = event["x"], event["y"]
@@ -394,10 +402,15 @@ class App:
 
     def _on_double_click(self, event: dict[str, Any]) -> None:
         self._pointer = (event["x"], event["y"])
+        if self._covered():
+            return
         self.focus()
         self.canvas.request_draw()
 
     def _on_wheel(self, event: dict[str, Any]) -> None:
+        self._pointer = (event["x"], event["y"])
+        if self._covered():
+            return
         self.camera.zoom(math.exp(0.0015 * event["dy"]))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from imgui_bundle import imgui
 from wgpu.utils.imgui import ImguiRenderer
@@ -28,12 +28,24 @@ _ACCENT = (0.95, 0.60, 0.25, 1.0)
 _COMPARE_NAMES = ("no comparison", "side by side", "split", "error, 4 times")
 
 
+class _Renderer(ImguiRenderer):
+    """wgpu's, but keys are kept from the viewer only while text is typed: after a click on a panel, imgui would
+    otherwise hold on to them."""
+
+    def _on_key(self, event: dict[str, Any]) -> None:
+        passed_on = dict(event)
+        super()._on_key(passed_on)
+        if self.backend.io.want_text_input:
+            event["stop_propagation"] = True
+
+
 class Panels:
     """Draws the GUI of an App onto its canvas."""
 
     def __init__(self, app: App) -> None:
         self.app = app
-        self._renderer = ImguiRenderer(app.device.wgpu_device, app.canvas, app.format)
+        self._covered: list[tuple[float, float, float, float]] = []
+        self._renderer = _Renderer(app.device.wgpu_device, app.canvas, app.format)
         self._renderer.set_gui(self._draw)
         self._folder = app.opened.path.resolve().parent if app.opened.path else Path.cwd()
         self._browsing = False
@@ -45,8 +57,20 @@ class Panels:
         """Draw over what the canvas shows."""
         self._renderer.render()
 
+    def covers(self, x: float, y: float) -> bool:
+        """Whether a place on the canvas, logical pixels, lies under a panel. imgui itself knows this only from the
+        next frame on."""
+        return any(left <= x < right and top <= y < bottom for left, top, right, bottom in self._covered)
+
+    def _end(self) -> None:
+        """The panel that was begun last is whole."""
+        (x, y), (width, height) = imgui.get_window_pos(), imgui.get_window_size()
+        self._covered.append((x, y, x + width, y + height))
+        imgui.end()
+
     def _draw(self) -> None:
         app = self.app
+        self._covered.clear()
         if app.show_help:
             self._help()
         if not app.show_panels:
@@ -105,7 +129,7 @@ class Panels:
         if changed:
             clock.loop = LOOPS[chosen]
         imgui.end_disabled()
-        imgui.end()
+        self._end()
 
     # The panel at the left -------------------------------------------------------------------------------------------
 
@@ -149,7 +173,7 @@ class Panels:
         draw_path(app)
         if self._browsing:
             self._files()
-        imgui.end()
+        self._end()
 
     def _training(self, training: Training) -> None:
         imgui.separator_text("Training")
@@ -228,7 +252,7 @@ class Panels:
         _, app.profiling = imgui.checkbox("passes", app.profiling)
         for name, milliseconds in sorted(frame.passes.items(), key=lambda entry: -entry[1]):
             imgui.text(f"{milliseconds:7.2f} ms {name}")
-        imgui.end()
+        self._end()
 
     def _message(self, message: str) -> None:
         app = self.app
@@ -239,7 +263,7 @@ class Panels:
         imgui.text_wrapped(message)
         if imgui.button("OK"):
             app.message = None
-        imgui.end()
+        self._end()
 
     def _help(self) -> None:
         width, height = self.app.canvas.get_logical_size()
@@ -253,7 +277,7 @@ class Panels:
                 imgui.table_next_column()
                 imgui.text(text)
             imgui.end_table()
-        imgui.end()
+        self._end()
         self.app.show_help = bool(stays)
 
 

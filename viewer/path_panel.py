@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from imgui_bundle import imgui
@@ -27,7 +28,7 @@ def draw_path(app: App) -> None:
     if imgui.button("Play" if editor.started is None else "Stop", (66, 0)):
         editor.play(time.perf_counter())
     imgui.end_disabled()
-    file = beside(app.opened.path)
+    file = beside(app.opened.path or Path("training.ply"))
     for text, action, possible in (
         ("Save", lambda: editor.save(file, app.canvas.get_physical_size(), app.clock.fps), bool(editor.keys)),
         ("Load", lambda: editor.load(file), file.is_file()),
