@@ -386,7 +386,7 @@ def expected(scene: Path, device: Device, size: tuple[int, int], time: float) ->
     from lapgs_wgpu.viewer.opened import open_scene
     from lapgs_wgpu.viewer.present import Offscreen
 
-    opened = open_scene(scene, device)
+    opened = open_scene(scene, lambda: device)
     frame = Painter(opened.playback).draw(Request(opened.camera().camera(*size), time, "rgb", opened.background))
     return Offscreen(device)(size, [frame.placed], MARGIN).astype(np.int16)
 

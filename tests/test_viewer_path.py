@@ -405,7 +405,7 @@ def test_the_window_shows_the_path_at_that_moment(
     now = [50.0]
     monkeypatch.setattr(app_module, "time", SimpleNamespace(perf_counter=lambda: now[0]))
     canvas = offscreen.RenderCanvas(size=(64, 48), pixel_ratio=1)
-    app = app_module.App(canvas, offscreen.loop, open_scene(tmp_path / "a.ply", device))
+    app = app_module.App(canvas, offscreen.loop, open_scene(tmp_path / "a.ply", lambda: device))
     Start(time=0.2, speed=0.5, loop="bounce", mode="depth", fps=12.0, background=(1.0, 1.0, 1.0)).apply(app)
     assert (app.clock.time, app.clock.speed, app.clock.loop, app.clock.fps) == (0.2, 0.5, "bounce", 12.0)
     assert (app.mode, app.background, app.clock.playing) == ("depth", (1.0, 1.0, 1.0), False)

@@ -99,7 +99,7 @@ class App:
     def open(self, path: Path) -> None:
         """Show another file; where it cannot be read, say why and keep the present one."""
         try:
-            self._show(open_scene(path, self.device))
+            self._show(open_scene(path, lambda: self.device))
         except InputError as error:
             self.message = str(error)
         self.canvas.request_draw()

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import tomllib
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lapgs_wgpu.data import View, composite, load_dataset
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.buffer import BufferPool
 from lapgs_wgpu.gpu.device import Device
+
+if TYPE_CHECKING:
+    from lapgs_wgpu.data import View
 
 SYNTHETIC = "synthetic"
 
@@ -28,6 +30,8 @@ class Capture:
         """What `Placed` has to know of the picture of a view, laid on a background."""
         key = (view, background)
         if self._held is None or self._held[0] != key:
+            from lapgs_wgpu.data import composite
+
             pixels = composite(self.views[view].load(), np.asarray(background, np.float32))
             packed = np.zeros((*pixels.shape[:2], 4), np.uint8)
             packed[..., :3] = pixels
@@ -40,6 +44,8 @@ class Capture:
 
 def open_capture(checkpoint: Path) -> Capture | None:
     """The capture that the config.toml beside a checkpoint names; None where there is none, or it is not here."""
+    from lapgs_wgpu.data import load_dataset  # not before the first picture
+
     try:
         data = tomllib.loads((checkpoint.parent / "config.toml").read_text(encoding="utf-8"))["data"]
         path, size = Path(data["path"]), int(data["size"])

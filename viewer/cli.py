@@ -6,6 +6,7 @@ import argparse
 import re
 import sys
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,8 @@ from lapgs_wgpu.command import HelpFormatter, Parser, guarded, print_devices
 from lapgs_wgpu.errors import InputError
 
 if TYPE_CHECKING:
+    from lapgs_wgpu.gpu.device import Device
+
     from .opened import Opened
 
 DESCRIPTION = """\
@@ -59,13 +62,14 @@ def _view(arguments: list[str]) -> None:
         return
     if given.file is None:
         raise InputError("name a .ply file; lapgs-view --help says more.")
-    # Before the scene is read, which may take a while: whether there is a place to show it.
-    place = _place(given) if job == "window" else None
-    from lapgs_wgpu.gpu.device import open_device
+    with ThreadPoolExecutor(1) as other:
+        # Beside all that follows: the driver and its compiler take longer than the rest together.
+        device = other.submit(_warm_device, given.device)
+        # Before the scene is read, which may take a while: whether there is a place to show it.
+        place = _place(given) if job == "window" else None
+        from .opened import open_scene
 
-    from .opened import open_scene
-
-    opened = open_scene(Path(given.file), open_device(given.device))
+        opened = open_scene(Path(given.file), device.result)
     if not opened.playback.moves:
         for name in ("time", "play", "frames"):
             if getattr(given, name) is not None:
@@ -74,6 +78,16 @@ def _view(arguments: list[str]) -> None:
         _window(given, opened, place)
     else:
         {"screenshot": _screenshot, "video": _video, "export": _export}[job](given, opened)
+
+
+def _warm_device(name: str | None) -> Device:
+    from lapgs_wgpu.gpu.device import open_device
+
+    from .frame import warm_up
+
+    device = open_device(name)
+    warm_up(device)
+    return device
 
 
 def _place(given: Any) -> Any:

@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.gpu.buffer import Buffer, BufferPool, read_all
+from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.profile import Profile
 from lapgs_wgpu.motion.playback import Playback
 from lapgs_wgpu.splat.camera import Camera
-from lapgs_wgpu.splat.rasterizer import Rasterizer
+from lapgs_wgpu.splat.rasterizer import GaussianBuffers, Rasterizer
 
 from .present import Placed
 
@@ -48,6 +49,19 @@ class Frame:
     seconds: float
     splats: int
     passes: dict[str, float]
+
+
+def warm_up(device: Device) -> None:
+    """Have the driver compile the passes of a picture, with harmonics of degree 3, by drawing one Gaussian."""
+    pool = BufferPool(device)
+    names = ("means", "quats", "scales", "opacities", "colors")
+    buffers = {name: pool.get(name, 4 * 3 * 16) for name in names}
+    for buffer in buffers.values():
+        buffer.write(np.ones(buffer.nbytes // 4, np.float32))
+    camera = Camera.looking_at([1, 1, -3], [1, 1, 1], up=[0, -1, 0], fov_x=0.7, width=16, height=16)
+    rasterizer = Rasterizer(device)
+    rasterizer.draw(GaussianBuffers(count=1, sh_degree=3, sh_stored=16, **buffers), camera)
+    rasterizer.grow()
 
 
 class Painter:

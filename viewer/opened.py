@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,7 +11,8 @@ import numpy as np
 
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.first_look import FirstLook
-from lapgs_wgpu.motion.playback import Playback, open_playback
+from lapgs_wgpu.motion.playback import Playback, playback_of
+from lapgs_wgpu.motion.scene_file import read_scene
 from lapgs_wgpu.splat.camera import Camera
 
 from .camera import ViewCamera
@@ -43,9 +45,9 @@ class Opened(NamedTuple):
         return BACKGROUNDS.get(self.playback.metadata.get("background", ""), BACKGROUNDS["black"])
 
 
-def open_scene(path: Path, device: Device) -> Opened:
-    """Open a checkpoint, or any 3DGS .ply. Raises InputError."""
-    playback = open_playback(path, device)
+def open_scene(path: Path, device: Callable[[], Device]) -> Opened:
+    """Open a checkpoint, or any 3DGS .ply. device: is asked for when the file has been read. Raises InputError."""
+    playback = playback_of(read_scene(path), device())
     look = FirstLook.from_json(playback.metadata.get("view", ""))
     return Opened(path, playback, look or guess_look(playback))
 

@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from lapgs_wgpu.splat.camera import Camera
 
@@ -49,6 +48,8 @@ class CameraPath:
     """
 
     def __init__(self, keys: Iterable[KeyFrame]) -> None:
+        from scipy.spatial.transform import Rotation  # not at the start of the viewer: it takes a fifth of a second
+
         ordered = sorted(keys, key=lambda key: key.second)
         start = ordered[0].second
         self.keys = tuple(key._replace(second=key.second - start) for key in ordered)
@@ -87,6 +88,8 @@ class CameraPath:
 
     def _rotation(self, i: int, gap: float, u: float) -> Array:
         """De Casteljau's algorithm on rotations: a cubic curve with the angular velocities at its two ends."""
+        from scipy.spatial.transform import Rotation
+
         first, last = self._turns[i], self._turns[i + 1]
         points = [
             first,

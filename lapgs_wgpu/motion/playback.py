@@ -54,13 +54,17 @@ class Playback(Protocol):
 
 
 def open_playback(path: str | os.PathLike[str], device: Device) -> Playback:
-    """Open a checkpoint, or any 3DGS .ply, which becomes a static scene.
+    """Open a checkpoint, or any 3DGS .ply, which becomes a static scene. Raises as `read_scene` and `playback_of`."""
+    return playback_of(read_scene(path), device)
+
+
+def playback_of(file: SceneFile, device: Device) -> Playback:
+    """Show a file that was read.
 
     torch is imported for the fields mlp and hexplane, for hidden layers, and for the ablated motion alone.
-    Raises InputError, and MemoryError where a buffer of all Gaussians is beyond the device's limits: colours are the
-    largest, 1.4 million Gaussians of degree 3 at WebGPU's default limits.
+    Raises MemoryError where a buffer of all Gaussians is beyond the device's limits: colours are the largest,
+    1.4 million Gaussians of degree 3 at WebGPU's default limits.
     """
-    file = read_scene(path)
     if file.field_config.kind == "static" or runs_on_device(file.field_config):
         return DevicePlayback(file, device)
     from .scene import scene_of
