@@ -245,7 +245,8 @@ class Panels:
         # Not without inputs: its one check box must be reached.
         imgui.begin("overlay", None, _BAR | imgui.WindowFlags_.always_auto_resize | imgui.WindowFlags_.no_nav)
         frame, camera = app.frame, app.frame.request.camera
-        imgui.text(f"{app.fps:.0f} fps   {1000 * frame.seconds:.1f} ms")
+        rate = f"{app.fps:.0f} fps" if app.fps else "at rest"
+        imgui.text(f"{rate}   {1000 * frame.seconds:.1f} ms a frame")
         imgui.text(f"{frame.splats:,} of {app.opened.playback.count:,} splats")
         imgui.text(f"{camera.width}x{camera.height}" + (f" ({100 * app.scale:.0f} %)" if app.scale < 1 else ""))
         imgui.text(app.device.info.name[:34])

@@ -22,6 +22,7 @@ from raster import RasterReport, bench_raster
 from scene import make_scene, save_scene
 from shares import bench_shares
 from step import StepReport, bench_step
+from viewer import bench_viewer, print_viewer
 
 from lapgs_wgpu.gpu.device import Device, open_device
 from lapgs_wgpu.train.presets import load_config
@@ -57,6 +58,9 @@ def main() -> None:
     print_step(step)
     shares = bench_shares(device, max(1, options.repeat // 2), options.gaussians, options.size)
     print_shares(shares, options.gaussians, options.size)
+    viewer = bench_viewer(device, options.repeat)
+    for one in viewer:
+        print_viewer(one)
     if options.json:
         reports = {
             "raster": dataclasses.asdict(raster),
@@ -64,6 +68,7 @@ def main() -> None:
             "losses": dataclasses.asdict(losses),
             "step": dataclasses.asdict(step),
             "shares": shares,
+            "viewer": [dataclasses.asdict(one) for one in viewer],
         }
         options.json.write_text(json.dumps({"machine": machine, **reports}, indent=1) + "\n")
 
