@@ -167,3 +167,20 @@ def test_starting_where_a_camera_stands() -> None:
     view = ViewCamera.of(captured(), [0, 0, 0], [0, 0, 1])
     assert np.allclose(view.camera(200, 100).T_cam_world, captured().T_cam_world)
     assert (view.camera(200, 100).width, view.camera(200, 100).height) == (200, 100)
+
+
+def test_a_rolled_camera_turns_without_a_jump() -> None:
+    """The first drag after snapping moves as little as a drag does, and keeps the roll."""
+    roll = 0.3
+    turn = np.array([[math.cos(roll), -math.sin(roll), 0], [math.sin(roll), math.cos(roll), 0], [0, 0, 1]])
+    camera = Camera.looking_at([0, -4, 1], [0, 0, 0], up=[0, 0, 1], fov_x=0.7, width=64, height=48)
+    T = np.eye(4)
+    T[:3, :3] = turn @ camera.T_cam_world[:3, :3]
+    T[:3, 3] = -T[:3, :3] @ camera.position
+    view = ViewCamera.of(Camera(camera.K, T, 64, 48), [0, 0, 0], [0, 0, 1])
+    before = view.rotation
+    view.orbit(1e-3, 1e-3)
+    assert np.abs(view.rotation - before).max() < 3e-3
+    np.testing.assert_allclose(view.rotation @ view.rotation.T, np.eye(3), atol=1e-12)
+    view.orbit(0.5, 0.1)
+    assert abs(view.rotation[0] @ view.up) == pytest.approx(abs(before[0] @ view.up), abs=0.05)

@@ -412,7 +412,7 @@ def test_the_window_shows_the_path_at_that_moment(
     for turn, time in ((0.0, 0.2), (0.7, 0.8)):
         app.camera.orbit(turn, 0.1)
         app.clock.seek(time)
-        app._on_key_down({"key": "k", "modifiers": ()})
+        app.add_key_frame()
     path = app.path.path
     assert path is not None
     app.path.play(now[0])
@@ -426,5 +426,5 @@ def test_the_window_shows_the_path_at_that_moment(
         np.testing.assert_allclose(request.camera.T_cam_world[:3, :3], pose.rotation, atol=1e-9)
     assert app.path.started is None
     app.path.play(now[0])
-    app._on_pointer_down({"x": 5, "y": 5, "button": 1, "modifiers": ()})
+    app.controls._on_pointer_down({"x": 5, "y": 5, "button": 1, "modifiers": ()})
     assert app.path.started is None

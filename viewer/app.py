@@ -14,8 +14,8 @@ from lapgs_wgpu.splat.camera import Camera
 
 from .capture import Capture, open_capture
 from .clock import LOOPS, SPEEDS
+from .controls import Controls
 from .frame import Frame, Mode, Painter, Request
-from .keys import FLY, KEYS
 from .opened import BACKGROUNDS, Opened, open_scene
 from .path import Pose
 from .path_editor import PathEditor
@@ -27,15 +27,11 @@ if TYPE_CHECKING:
 Compare = Literal["off", "side", "split", "error"]
 COMPARES: tuple[Compare, ...] = ("off", "side", "split", "error")
 MARGIN = (0.11, 0.11, 0.12)  # what surrounds a picture that does not fill the window
-_ACTIONS = {key.key: key.action for key in KEYS} | {"/": "toggle_help"}  # where "?" is told as "/" with Shift
 _TARGET_SECONDS = 1 / 12  # a frame may take while something moves; beyond it the resolution falls
 _SETTLED = 0.2  # seconds without a change after which the full resolution is drawn
 _SMALLEST = 0.25  # share of the window's width and height
 _ERROR_GAIN = 4.0
-_ORBIT = 0.008  # radians a pixel of dragging
-_FLY = 0.6  # of the distance to the focus a second
 _GUI_DRAWS = 3  # after an event, until the panels have found their sizes and colours
-_GRIP = 8  # pixels from the split at which it can be dragged
 
 
 class App:
@@ -77,23 +73,10 @@ class App:
         self._capture: Capture | None = None
         self._capture_sought = False
         self._times: deque[float] = deque(maxlen=30)
-        self._pointer = (0.0, 0.0)
-        self._dragging: str | None = None
-        self._held: set[str] = set()
         self._transport = transport
         self._show(opened)
 
-        canvas.add_event_handler(self._on_pointer_down, "pointer_down")
-        canvas.add_event_handler(self._on_pointer_move, "pointer_move")
-        canvas.add_event_handler(self._on_pointer_up, "pointer_up")
-        canvas.add_event_handler(self._on_double_click, "double_click")
-        canvas.add_event_handler(self._on_wheel, "wheel")
-        canvas.add_event_handler(self._on_key_down, "key_down")
-        canvas.add_event_handler(self._on_key_up, "key_up")
-        canvas.add_event_handler(lambda event: self._held.clear(), "pointer_leave")
-        # Panels react to everything, so everything asks for a draw; what has not changed is only presented again.
-        everything = ("pointer_down", "pointer_move", "pointer_up", "wheel", "key_down", "key_up", "char", "resize")
-        canvas.add_event_handler(self._on_any_event, *everything, order=-100)
+        self.controls = Controls(self)
         canvas.request_draw(self._draw)
 
     def open(self, path: Path) -> None:
@@ -139,9 +122,9 @@ class App:
         now = time.perf_counter()
         # Time passes between two frames of something that runs, not while the window rested before it.
         passed = now - self._drawn_at if self._running else 0.0
-        self._drawn_at, self._running = now, self.clock.playing or bool(self._held)
+        self._drawn_at, self._running = now, self.clock.playing or self.controls.flying
         self.clock.advance(passed)
-        self._fly(passed)
+        self.controls.fly(passed)
         previewed = self.path.preview(now)  # of this very moment, however long the last frame took
         if previewed is not None:
             self.stand_on(*previewed)
@@ -154,7 +137,7 @@ class App:
         else:
             self._gui.render()
             self._gui_draws -= 1
-        if self.clock.playing or self._held or self._gui_draws > 0 or previewed is not None:
+        if self.clock.playing or self.controls.flying or self._gui_draws > 0 or previewed is not None:
             self.canvas.request_draw()
         elif self.scale < 1:
             self.loop.call_later(_SETTLED, self.canvas.request_draw)
@@ -264,7 +247,7 @@ class App:
 
     def toggle_flying(self) -> None:
         self.flying = not self.flying
-        self._held.clear()
+        self.controls.release()
 
     def next_view(self) -> None:
         if self.capture is not None:
@@ -318,16 +301,11 @@ class App:
 
     def focus(self) -> None:
         """Turn about what lies under the pointer."""
-        if self.frame is None:
-            return
-        width, height = self.canvas.get_physical_size()
-        placed = self._placed(width, height)[-1]
-        ratio = self.canvas.get_pixel_ratio()
-        share = [(p * ratio - o) / s for p, o, s in zip(self._pointer, placed.origin, placed.size, strict=True)]
-        if not all(0 <= s < 1 for s in share):
+        place = self.on_picture(*self.controls.pointer)
+        if place is None or self.frame is None:
             return
         camera = self.frame.request.camera
-        column, row = int(share[0] * camera.width), int(share[1] * camera.height)
+        column, row = int(place[0] * camera.width), int(place[1] * camera.height)
         depth = self.painter.depth_at(self.frame, column, row)
         self._drawn_key = None  # the frame's buffers hold the depth now
         if depth is not None:
@@ -335,83 +313,28 @@ class App:
             ray = [(column + 0.5 - K[0, 2]) / K[0, 0], (row + 0.5 - K[1, 2]) / K[1, 1], 1.0]
             self.camera.focus_on(camera.position + depth * (T[:3, :3].T @ ray))
 
-    # Mouse and keys --------------------------------------------------------------------------------------------------
+    # For the controls ------------------------------------------------------------------------------------------------
 
-    def _on_any_event(self, event: dict[str, Any]) -> None:
+    def wake(self) -> None:
+        """Something happened that may change the picture or a panel."""
         self._gui_draws = _GUI_DRAWS
         self.canvas.request_draw()
 
-    def _on_key_down(self, event: dict[str, Any]) -> None:
-        key = event["key"]
-        if self.flying and key.lower() in FLY:
-            self._held.add(key.lower())
-        elif key in ("Shift", "Alt") and self.flying:
-            self._held.add(key)
-        elif "Control" not in event["modifiers"]:
-            action = _ACTIONS.get(key) or _ACTIONS.get(key.lower())
-            if action:
-                getattr(self, action)()
+    def covered(self, x: float, y: float) -> bool:
+        """Whether a place on the canvas, logical pixels, lies under a panel."""
+        return self._gui is not None and self._gui.covers(x, y)
 
-    def _on_key_up(self, event: dict[str, Any]) -> None:
-        key = event["key"]
-        self._held.discard(key if key in ("Shift", "Alt") else key.lower())
-
-    def _fly(self, seconds: float) -> None:
-        moves = [FLY[key] for key in self._held if key in FLY]
-        if moves:
-            fast = 4.0 if "Shift" in self._held else 0.25 if "Alt" in self._held else 1.0
-            reach = seconds * _FLY * fast * self.camera.distance
-            right, down, forward = (reach * sum(axis) for axis in zip(*moves, strict=True))
-            self.camera.fly(right, down, forward)
-
-    def _on_pointer_down(self, event: dict[str, Any]) -> None:
-        self._pointer = (event["x"], event["y"])
-        if self._covered():
-            return
-        self.path.started = None  # whoever takes the camera has it
-        sideways = event["button"] != 1 or "Shift" in event["modifiers"]
-        self._dragging = "pan" if sideways else "look" if self.flying else "orbit"
-        if self.comparing() == "split" and self.frame is not None:
-            placed = self._placed(*self.canvas.get_physical_size())[0]
-            divider = placed.origin[0] + self.split * placed.size[0]
-            if abs(event["x"] * self.canvas.get_pixel_ratio() - divider) < _GRIP:
-                self._dragging = "split"
-
-    def _covered(self) -> bool:
-        """Whether the pointer is on a panel."""
-        return self._gui is not None and self._gui.covers(*self._pointer)
-
-    def _on_pointer_move(self, event: dict[str, Any]) -> None:
-        x, y = event["x"], event["y"]
-        right, down = x - self._pointer[0], y - self._pointer[1]
-        self._pointer = (x, y)
-        if self._dragging == "orbit":
-            self.camera.orbit(_ORBIT * right, _ORBIT * down)
-        elif self._dragging == "look":
-            self.camera.look(0.4 * _ORBIT * right, 0.4 * _ORBIT * down)
-        elif self._dragging == "pan":
-            height = self.canvas.get_logical_size()[1]
-            self.camera.pan(right / height, down / height)
-        elif self._dragging == "split":
-            placed = self._placed(*self.canvas.get_physical_size())[0]
-            share = (x * self.canvas.get_pixel_ratio() - placed.origin[0]) / placed.size[0]
-            self.split = min(max(share, 0.0), 1.0)
-
-    def _on_pointer_up(self, event: dict[str, Any]) -> None:
-        self._dragging = None
-
-    def _on_double_click(self, event: dict[str, Any]) -> None:
-        self._pointer = (event["x"], event["y"])
-        if self._covered():
-            return
-        self.focus()
-        self.canvas.request_draw()
-
-    def _on_wheel(self, event: dict[str, Any]) -> None:
-        self._pointer = (event["x"], event["y"])
-        if self._covered():
-            return
-        self.camera.zoom(math.exp(0.0015 * event["dy"]))
+    def on_picture(self, x: float, y: float) -> tuple[float, float] | None:
+        """A place on the canvas, logical pixels, as shares of the picture's width and height; None beside it. Of two
+        pictures the right one counts."""
+        if self.frame is None:
+            return None
+        placed = self._placed(*self.canvas.get_physical_size())[-1]
+        ratio = self.canvas.get_pixel_ratio()
+        across, down = (
+            (at * ratio - start) / length for at, start, length in zip((x, y), placed.origin, placed.size, strict=True)
+        )
+        return (across, down) if 0 <= across < 1 and 0 <= down < 1 else None
 
 
 def _next(choices: Any, present: Any) -> Any:

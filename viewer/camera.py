@@ -110,12 +110,14 @@ class ViewCamera:
         self.position, self.focus, self.exact = self.position + by, self.focus + by, None
 
     def _turn(self, right: float, down: float) -> None:
-        """Turn the line of sight: about `up` so that the scene goes to the right, and about the horizontal axis."""
-        forward = _about(self.up, -right) @ self.rotation[2]
-        pitch = math.asin(float(np.clip(forward @ self.up, -1, 1)))
+        """Turn the line of sight: about `up` so that the scene goes to the right, and about the horizontal axis. The
+        horizon stays as level, or as rolled, as it was."""
+        turned = self.rotation @ _about(self.up, right)
+        across = np.cross(turned[2], self.up)
+        across = _unit(across) if np.linalg.norm(across) > 1e-6 else turned[0]
+        pitch = math.asin(float(np.clip(turned[2] @ self.up, -1, 1)))
         new = float(np.clip(pitch - down, -_STEEPEST, _STEEPEST))
-        level = self._level(forward)
-        self.rotation = level @ _about(level[0], pitch - new)
+        self.rotation = turned @ _about(across, pitch - new)
         self.exact = None
 
     def _level(self, forward: Vector) -> NDArray[np.float64]:

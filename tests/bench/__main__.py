@@ -22,10 +22,10 @@ from raster import RasterReport, bench_raster
 from scene import make_scene, save_scene
 from shares import bench_shares
 from step import StepReport, bench_step
-from viewer import bench_viewer, print_viewer
 
 from lapgs_wgpu.gpu.device import Device, open_device
 from lapgs_wgpu.train.presets import load_config
+from viewer import bench_viewer, print_viewer
 
 
 def main() -> None:
