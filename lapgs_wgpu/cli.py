@@ -19,7 +19,7 @@ if typing.TYPE_CHECKING:
     from lapgs_wgpu.train.loop import Watch
 
 # Short names for the keys that are given most often.
-SHORTCUTS = {"data.path": "--data", "schedule.steps": "--steps"}
+SHORTCUTS = {"data.path": "--data", "schedule.steps": "--steps", "data.cache_gb": "--cache-gb"}
 SYNTHETIC = "synthetic"
 
 USAGE = "lapgs-train PRESET --data DIR [--out RUN] [--KEY VALUE ...]"
@@ -29,6 +29,8 @@ Train a moving scene on the pictures of a folder, on any Vulkan, Metal or D3D12 
   lapgs-train demo --data synthetic             the built-in scene, in minutes on a CPU
   lapgs-train tiny --data DIR                   a D-NeRF scene at 200x200, sized for a CPU
   lapgs-train dnerf --data DIR --out RUN        the same with the paper's pictures and schedule
+  lapgs-train hypernerf --data DIR              a capture of nerfies or HyperNeRF; for a CPU: hypernerf-tiny
+  lapgs-train neu3d --data DIR                  several cameras that stand still; for a CPU: neu3d-tiny
   lapgs-train RUN/config.toml --out RUN2        the same training once more
   lapgs-train --resume RUN                      go on with a training that was interrupted, or killed
   lapgs-train --eval RUN                        measure RUN/checkpoint.ply on the test views again

@@ -93,7 +93,16 @@ def test_help_lists_every_key_with_the_presets_value(capsys: pytest.CaptureFixtu
         cli.train_command(["tiny", "--help"])
     assert left.value.code == 0
     text = capsys.readouterr().out
-    for option in ("--data", "--steps", "--field", "--device", "--eval", "--rates.means.start", "--density.gradient"):
+    for option in (
+        "--data",
+        "--steps",
+        "--cache-gb",
+        "--field",
+        "--device",
+        "--eval",
+        "--rates.means.start",
+        "--density.gradient",
+    ):
         assert option in text
     assert "half side of the cube around the origin in which they lie at random, world units" in " ".join(text.split())
 

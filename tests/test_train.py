@@ -171,7 +171,7 @@ def test_another_seed_gives_another_model(run: Path, dataset: Dataset, device: D
 def test_nothing_moves_during_the_warm_up(dataset: Dataset, device: Device, tmp_path: Path) -> None:
     config = configure(schedule__steps="4")
     scene = train(config, dataset, tmp_path / "run", device=device)
-    fresh = Scene4D.from_points(*training.initial_points(config.points, 0), config.field, device=device)
+    fresh = Scene4D.from_points(*training.initial_points(config.points, dataset, 0), config.field, device=device)
     assert scene.field is not None
     assert fresh.field is not None
     for ours, initial in zip(scene.field.parameters(), fresh.field.parameters(), strict=True):
@@ -262,6 +262,22 @@ def test_every_picture_is_drawn_once_an_epoch(dataset: Dataset, device: Device) 
         epochs = [[pictures.draw()[0].name for _ in dataset.train] for _ in range(3)]
     assert all(sorted(epoch) == sorted(view.name for view in dataset.train) for epoch in epochs)
     assert epochs[0] != epochs[1]
+
+
+def test_memory_and_device_share_one_bound_where_they_are_one(dataset: Dataset, device: Device) -> None:
+    """Whatever it is; and what is decoded ahead finds room."""
+    picture = 32 * 32 * 4
+    for pictures_held, decoded_again in ((1, True), (4, True), (100, False)):
+        bound = pictures_held * picture / 1e9
+        with closing(Pictures(dataset.train, "random", bound, torch.Generator().manual_seed(3), device)) as pictures:
+            for _ in range(3 * len(dataset.train)):
+                _, truth, _ = pictures.draw()
+                held = pictures._truths.used_bytes
+                if device.info.kind in ("cpu", "integrated"):
+                    assert pictures._cache.max_bytes + pictures._truths.max_bytes <= 1e9 * bound
+                assert held <= 1e9 * bound
+                assert truth.nbytes == picture
+            assert (held < len(dataset.train) * picture) == decoded_again
 
 
 @pytest.mark.parametrize("background", ["black", "white", "random"])

@@ -5,22 +5,38 @@ from __future__ import annotations
 from pathlib import Path
 
 from lapgs_wgpu.data.dnerf import is_dnerf, load_dnerf
+from lapgs_wgpu.data.hypernerf import is_hypernerf, load_hypernerf
+from lapgs_wgpu.data.neu3d import is_neu3d, load_neu3d
 from lapgs_wgpu.data.views import Dataset, ImageCache, View, composite
 from lapgs_wgpu.errors import InputError
 
 __all__ = ["Dataset", "ImageCache", "View", "composite", "load_dataset"]
 
+FORMATS = (
+    ("D-NeRF", "transforms_train.json and transforms_test.json", is_dnerf, load_dnerf),
+    ("HyperNeRF", "dataset.json beside camera/ and rgb/", is_hypernerf, load_hypernerf),
+    ("Neu3D", "poses_bounds.npy beside cam00.mp4, ... or cam00/images/, ...", is_neu3d, load_neu3d),
+)
+
 
 def load_dataset(folder: str | Path, *, image_size: int | None = None) -> Dataset:
-    """Open a capture, its format told by the files it holds (for now: D-NeRF).
+    """Open a capture, its format (docs/data.md) told by the files it holds.
 
     image_size: longer side in pixels, 1 or more, to which larger pictures are shrunk; None keeps all as they are.
     Raises InputError.
     """
     folder = Path(folder)
-    if not folder.is_dir() or is_dnerf(folder):
-        return load_dnerf(folder, image_size=image_size)
-    scenes = sorted(child.name for child in folder.iterdir() if child.is_dir() and is_dnerf(child))
+    if not folder.is_dir():
+        problem = "is not a folder" if folder.exists() else "does not exist"
+        raise InputError(f"{folder} {problem}; give the folder of a scene.")
+    fitting = [entry for entry in FORMATS if entry[2](folder)]
+    if len(fitting) == 1:
+        return fitting[0][3](folder, image_size=image_size)
+    if fitting:
+        both = " and of ".join(f"{name} ({files})" for name, files, _, _ in fitting)
+        raise InputError(f"{folder} holds the files of {both}; keep one format's in it.")
+    children = sorted(child for child in folder.iterdir() if child.is_dir())
+    scenes = [child.name for child in children if any(is_format(child) for _, _, is_format, _ in FORMATS)]
     inside = f"; it holds the scenes {', '.join(scenes[:8])}: name one of them" if scenes else ""
-    expected = "transforms_train.json and transforms_test.json (D-NeRF)"
+    expected = ", or ".join(f"{files} ({name})" for name, files, _, _ in FORMATS)
     raise InputError(f"{folder} is no scene in a known format: expected {expected}{inside}.")

@@ -1,4 +1,4 @@
-"""Where Gaussians start when a capture brings no points: random means, and scales from the distances between them."""
+"""Where Gaussians start: the capture's own points, or random ones; and scales from the distances between them."""
 
 from __future__ import annotations
 
@@ -6,8 +6,27 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from lapgs_wgpu.data.cloud import points_in_view
+from lapgs_wgpu.data.views import Dataset
+
 NEIGHBOURS = 3
 MIN_SCALE = float(np.sqrt(1e-7))  # 3DGS's bound on the squared distance: keeps the log-scale of duplicate points finite
+
+
+def first_points(
+    dataset: Dataset, count: int, box: float, seed: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Means (n, 3) in world units and colours (n, 3) RGB in [0, 1] of the first Gaussians of a training.
+
+    The capture's cloud, at most `count` of its points; without one `count` random points, mid-grey: where the cameras'
+    views overlap if the capture says how deep they see, else in [-box, box]^3.
+    """
+    if dataset.cloud is not None:
+        return dataset.cloud.at_most(count, seed)
+    if dataset.depths is None:
+        return random_points(count, -box, box, seed)
+    means = points_in_view(dataset.cameras, *dataset.depths, count, seed).astype(np.float32)
+    return means, np.full_like(means, 0.5)
 
 
 def random_points(n: int, low: float, high: float, seed: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

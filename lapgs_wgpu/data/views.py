@@ -14,6 +14,8 @@ from threading import Lock
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lapgs_wgpu.data.cloud import Cloud
+from lapgs_wgpu.data.poses import Placement
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
 
@@ -51,11 +53,23 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Dataset:
-    """A capture: the views to train on and the views held out for testing, all of which share one time axis."""
+    """A capture: the views to train on and the views held out for testing, all of which share one time axis.
+
+    cloud: points that it brings, where Gaussians start. depths: nearest and furthest of what the cameras see, world
+    units, where the capture says so. placement: how it was moved, None where its coordinates are those of its files.
+    """
 
     name: str
     train: tuple[View, ...]
     test: tuple[View, ...]
+    cloud: Cloud | None = None
+    depths: tuple[float, float] | None = None
+    placement: Placement | None = None
+
+    @cached_property
+    def cameras(self) -> tuple[Camera, ...]:
+        """The training cameras, those that stay where they are once."""
+        return tuple({id(view.camera): view.camera for view in self.train}.values())
 
     @cached_property
     def extent(self) -> float:

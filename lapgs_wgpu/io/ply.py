@@ -118,7 +118,7 @@ def read_vertices(file: BinaryIO, elements: dict[str, Element], path: PathLike) 
     vertex = elements["vertex"]
     rest = _rest_count(vertex, path)
     names = _names(rest)
-    values = _read_columns(file, vertex, names, path)
+    values = read_columns(file, vertex, names, path)
     _check_values(values, names, f"{path}:")
     end = 6 + rest  # of the colours
     sh = np.empty((len(values), 1 + rest // 3, 3), np.float32)
@@ -159,7 +159,7 @@ def _rest_count(vertex: Element, path: PathLike) -> int:
     return rest
 
 
-def _read_columns(file: BinaryIO, vertex: Element, names: list[str], path: PathLike) -> Floats:
+def read_columns(file: BinaryIO, vertex: Element, names: list[str], path: PathLike) -> Floats:
     """(N, len(names)) float32: the named properties of every row."""
     offsets, offset = {}, 0
     for name, dtype in vertex.properties.items():

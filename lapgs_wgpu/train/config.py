@@ -34,7 +34,10 @@ class DataConfig:
     background: Background = described(
         "what transparent pictures are laid on; random is another colour at each step, and black when measuring"
     )
-    cache_gb: float = described("bound on decoded pictures kept in memory, and on those on the device, in gigabytes")
+    cache_gb: float = described(
+        "bound on decoded pictures kept in memory, and on those on the device, in gigabytes; on both together where "
+        "the device shares the memory"
+    )
     path: str = described('folder of the scene, or "synthetic", the built-in scene, written beside the run', "")
 
 
@@ -42,8 +45,11 @@ class DataConfig:
 class PointsConfig:
     """The Gaussians at the start."""
 
-    count: int = described("how many")
-    box: float = described("half side of the cube around the origin in which they lie at random, world units")
+    count: int = described("how many; of a cloud that the capture brings, at most")
+    box: float = described(
+        "half side of the cube around the origin in which they lie at random, world units, where the capture brings "
+        "neither a cloud nor the depths that its cameras see"
+    )
     opacity: float = described("of each, between 0 and 1")
 
     def __post_init__(self) -> None:

@@ -95,6 +95,8 @@ def _run(training: Training, dataset: Dataset, out: Path, watch: Watch | None) -
     if done < all_steps or config.schedule.save_interval:
         save_state(out, training.state())
     metadata = {"scene": dataset.name, "background": config.data.background, "step": str(done), "view": look.to_json()}
+    if dataset.placement is not None:
+        metadata["placement"] = dataset.placement.to_json()
     scene.save(out / "checkpoint.ply", metadata)
     if done < all_steps:
         raise KeyboardInterrupt(

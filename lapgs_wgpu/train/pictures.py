@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from functools import partial
 
 import numpy as np
@@ -17,14 +18,15 @@ from lapgs_wgpu.train.config import Background
 from lapgs_wgpu.train.evaluate import COLOURS
 from lapgs_wgpu.train.render_loss import TruthCache
 
-AHEAD = 4  # pictures that are decoded before they are needed
+AHEAD = 8  # pictures that are decoded before they are needed
+DECODERS = min(4, os.cpu_count() or 1)  # threads that decode them
 
 
 class Pictures:
     """Training views in random order without replacement, epoch after epoch.
 
-    generator: where the order, and random backgrounds, are drawn from. cache_gb: bound on what is kept in memory, and
-    on what is kept on the device.
+    generator: where the order, and random backgrounds, are drawn from. cache_gb: bound on what is kept on the device
+    and on what is kept in memory; together where the device's memory is the host's.
     """
 
     def __init__(
@@ -37,8 +39,15 @@ class Pictures:
     ) -> None:
         self._colour = None if background == "random" else torch.full((3,), COLOURS[background])
         self._views = views if self._colour is None else tuple(_on_background(v, self._colour.numpy()) for v in views)
-        self._cache = ImageCache(int(cache_gb * 1e9))
-        self._truths = TruthCache(device, int(cache_gb * 1e9))
+        bound = int(cache_gb * 1e9)
+        in_memory = bound
+        if device.info.kind in ("cpu", "integrated"):
+            # A picture on the device is in the same memory a second time: the host keeps only what is under way.
+            largest = max(4 * view.camera.width * view.camera.height for view in views)
+            in_memory = min((AHEAD + 1) * largest, bound // 2)
+            bound -= in_memory
+        self._cache = ImageCache(in_memory, workers=DECODERS)
+        self._truths = TruthCache(device, bound)
         self._generator = generator
         self.order: list[int] = []  # the views that are still to come in this epoch, by number
 

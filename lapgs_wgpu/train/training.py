@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lapgs_wgpu.data.init import initial_scales, random_points
+from lapgs_wgpu.data.init import first_points, initial_scales
 from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.dynamics import dynamics_loss
@@ -42,7 +42,7 @@ class Training:
         self.done = 0
         self._generator = torch.Generator().manual_seed(config.seed)
         self.scene = Scene4D.from_points(
-            *initial_points(config.points, config.seed),
+            *initial_points(config.points, dataset, config.seed),
             config.field,
             opacity=config.points.opacity,
             device=device,
@@ -166,10 +166,10 @@ class Training:
 
 
 def initial_points(
-    config: PointsConfig, seed: int
+    config: PointsConfig, dataset: Dataset, seed: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """Random Gaussians in the box: points (N, 3), colours (N, 3) and scales (N,)."""
-    points, colours = random_points(config.count, -config.box, config.box, seed)
+    """The first Gaussians (data/init.first_points): points (N, 3), colours (N, 3) and scales (N,)."""
+    points, colours = first_points(dataset, config.count, config.box, seed)
     return points, colours, initial_scales(points)
 
 

@@ -1,0 +1,69 @@
+"""Fields of JSON files that strangers wrote: each error names the file, the field, and what was found in it."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lapgs_wgpu.errors import InputError
+
+
+def read_json(path: Path, needs: str) -> dict[str, Any]:
+    """The JSON object that a file holds. needs: what it must consist of, for errors. Raises InputError."""
+    try:
+        data = json.loads(path.read_text(encoding="utf-8-sig"))
+    except json.JSONDecodeError as error:
+        place = f"line {error.lineno}, column {error.colno}"
+        raise InputError(f"{path} is not valid JSON at {place}: {error.msg}.") from None
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"{path} cannot be read as JSON text: {error}.") from None
+    if not isinstance(data, dict):
+        raise InputError(f"{path} must hold a JSON object with {needs}, got {kind(data)}.")
+    return data
+
+
+def required(data: dict[str, Any], name: str, where: str | Path, hint: str) -> Any:
+    """A field that must be there; hint: why, for the error, after a comma."""
+    if name not in data:
+        raise InputError(f"{where} has no field {name}, {hint}.")
+    return data[name]
+
+
+def number(value: Any, name: str, where: str | Path) -> float:
+    """A JSON number as a float, infinite where it is beyond one; may be NaN."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise InputError(f"{where}: {name} must be made of numbers, got {kind(value)}.")
+    try:
+        return float(value)
+    except OverflowError:  # an integer of more than 308 digits
+        return math.inf
+
+
+def finite(value: Any, name: str, where: str | Path) -> float:
+    """A finite number."""
+    got = number(value, name, where)
+    if not math.isfinite(got):
+        raise InputError(f"{where}: {name} must be a finite number, got {got:g}.")
+    return got
+
+
+def vector(value: Any, length: int, name: str, where: str | Path) -> NDArray[np.float64]:
+    """(length,) finite numbers."""
+    if not isinstance(value, list) or len(value) != length:
+        raise InputError(f"{where}: {name} must be a list of {length} numbers, got {kind(value)}.")
+    return np.array([finite(entry, name, where) for entry in value])
+
+
+def kind(value: Any) -> str:
+    """What a JSON value is, in JSON's words and short enough for an error."""
+    if isinstance(value, list):
+        return f"a list of {len(value)}"
+    if isinstance(value, dict):
+        return "an object"
+    text = json.dumps(value)
+    return text if len(text) <= 40 else text[:37] + "..."

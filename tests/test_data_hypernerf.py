@@ -1,0 +1,295 @@
+"""The reader of nerfies' layout: what its cameras see is what the pictures show; one sentence for what is wrong."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from captures import HEIGHT, WIDTH, Blobs, Change, agreement, write_nerfies, write_points
+from PIL import Image
+
+from lapgs_wgpu.data import load_dataset
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.gpu.device import Device
+
+SHARED = Path(__file__).parents[2] / "shared" / "data"
+ID = "left_000001"
+
+LENSES: dict[str, dict[str, Any]] = {
+    "principal point": {"principal_point": [WIDTH / 2 + 7, HEIGHT / 2 - 5]},
+    "skew": {"skew": 6.0},
+    "pixel aspect ratio": {"pixel_aspect_ratio": 1.2},
+    "radial": {"radial_distortion": [0.3, -0.2, 0.1]},
+    "barrel": {"radial_distortion": [-0.3, 0.05, 0.0]},
+    "tangential": {"tangential_distortion": [0.05, -0.03]},
+    "all": {
+        "principal_point": [WIDTH / 2 + 3, HEIGHT / 2 + 2],
+        "skew": -2.0,
+        "radial_distortion": [0.2, -0.1, 0.02],
+        "tangential_distortion": [-0.02, 0.03],
+    },
+}
+
+
+@pytest.fixture(scope="module")
+def template(device: Device, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A good capture; tests copy it."""
+    return write_nerfies(tmp_path_factory.mktemp("template") / "toy", device)
+
+
+@pytest.fixture
+def toy(template: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(template, tmp_path / "toy"))
+
+
+def edit(path: Path, **fields: Any) -> None:
+    """Other values in a JSON file; None removes a field."""
+    data = json.loads(path.read_text()) | fields
+    path.write_text(json.dumps({name: value for name, value in data.items() if value is not None}))
+
+
+def test_cameras_see_what_the_pictures_show(toy: Path, device: Device) -> None:
+    """Axes, scale, centre: the only difference left is the rounding of both sides."""
+    assert agreement(load_dataset(toy), Blobs.random(), device) > 50
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_lenses_are_honoured(name: str, device: Device, tmp_path: Path) -> None:
+    data = load_dataset(write_nerfies(tmp_path / "toy", device, count=3, lens=LENSES[name]))
+    assert agreement(data, Blobs.random(), device, [0, 2]) > 33
+    assert all(view.camera.K[0, 1] == 0 for view in data.train)
+
+
+def test_a_bent_picture_keeps_its_size_and_loses_as_little_as_can_be(device: Device, tmp_path: Path) -> None:
+    focal = {}
+    for name in ("radial", "barrel"):
+        data = load_dataset(write_nerfies(tmp_path / name, device, count=3, lens=LENSES[name]))
+        camera = data.train[0].camera
+        assert data.train[0].load().shape == (HEIGHT, WIDTH, 3)
+        focal[name] = camera.K[0, 0] * math.tan(0.45) / (WIDTH / 2)
+    assert focal["barrel"] == pytest.approx(1)  # the picture shows more than its frame: nothing is missing
+    assert 1 < focal["radial"] < 1.2
+
+
+def test_a_straight_picture_is_not_touched(toy: Path) -> None:
+    view = load_dataset(toy).train[1]
+    np.testing.assert_array_equal(view.load(), np.asarray(Image.open(toy / f"rgb/1x/{ID}.png")))
+
+
+def test_splits_of_a_validation_rig(toy: Path) -> None:
+    data = load_dataset(toy)
+    assert [Path(view.source).stem for view in data.train] == [f"left_{i:06d}" for i in range(4)]
+    assert [Path(view.source).stem for view in data.test] == ["left_000004"]
+    assert [view.name for view in (*data.train[:1], *data.test)] == ["train_000", "test_000"]
+
+
+@pytest.mark.parametrize("empty", [None, []])
+def test_splits_of_interpolation(empty: Any, device: Device, tmp_path: Path) -> None:
+    """Without val_ids every fourth frame is trained on, and those halfway between are tested."""
+    toy = write_nerfies(tmp_path / "toy", device, count=9)
+    edit(toy / "dataset.json", val_ids=empty)
+    data = load_dataset(toy)
+    assert [int(Path(view.source).stem[-3:]) for view in data.train] == [0, 4, 8]
+    assert [int(Path(view.source).stem[-3:]) for view in data.test] == [2, 6]
+    assert [view.time for view in data.test] == [2 / 8, 6 / 8]
+
+
+def test_times_are_those_of_time_id_then_warp_id(toy: Path) -> None:
+    assert [view.time for view in load_dataset(toy).train] == [0, 0.25, 0.5, 0.75]
+    path = toy / "metadata.json"
+    entries = json.loads(path.read_text())
+    for i, entry in enumerate(entries.values()):
+        entry["time_id"] = [3, 3, 5, 7, 11][i]  # a rig: two pictures at a time
+    path.write_text(json.dumps(entries))
+    data = load_dataset(toy)
+    assert [view.time for view in (*data.train, *data.test)] == [0, 0, 0.25, 0.5, 1]
+
+
+@pytest.mark.parametrize(
+    ("wanted", "folder", "width"),
+    [(None, "1x", 64), (200, "1x", 64), (64, "1x", 64), (63, "1x", 63), (33, "1x", 33), (32, "2x", 32), (16, "2x", 16)],
+)  # fmt: skip
+def test_the_folder_suits_the_wanted_size(
+    wanted: int | None, folder: str, width: int, toy: Path, device: Device
+) -> None:
+    data = load_dataset(toy, image_size=wanted)
+    view = data.train[0]
+    assert Path(view.source).parent.name == folder
+    assert (view.camera.width, view.load().shape[1]) == (width, width)
+    assert agreement(data, Blobs.random(), device) > 20  # small pictures are averaged, and drawn with a dilation
+
+
+def test_cloud_and_cameras_are_moved_alike(toy: Path) -> None:
+    data = load_dataset(toy)
+    assert data.cloud is not None
+    assert data.placement is not None
+    means = Blobs.random().means.double().numpy()
+    np.testing.assert_allclose(data.cloud.points, data.placement.points(means), atol=1e-5)
+    assert (data.cloud.colours == 0.5).all()
+    raw = json.loads((toy / f"camera/{ID}.json").read_text())["position"]
+    np.testing.assert_allclose(data.train[1].camera.position, data.placement.points(np.array(raw)), atol=1e-9)
+    assert np.abs(data.cloud.points).max() == pytest.approx(1.3, rel=0.1)
+
+
+def test_without_a_cloud_the_views_fill_the_box(toy: Path, device: Device) -> None:
+    (toy / "points.npy").unlink()
+    data = load_dataset(toy)
+    assert data.cloud is None
+    assert data.depths is not None
+    assert data.placement is not None
+    np.testing.assert_allclose(np.array(data.depths) / data.placement.scale, [2, 8])
+    assert np.linalg.norm(data.focus) < 1.3
+    assert agreement(data, Blobs.random(), device) > 50
+
+
+def test_a_ply_cloud_is_in_the_coordinates_of_the_camera_files(toy: Path) -> None:
+    with_npy = load_dataset(toy).cloud
+    (toy / "points.npy").unlink()
+    write_points(toy / "points3D_downsample2.ply", Blobs.random().means.numpy(), np.full((40, 3), 51))
+    cloud = load_dataset(toy).cloud
+    assert cloud is not None
+    assert with_npy is not None
+    np.testing.assert_allclose(cloud.points, with_npy.points, atol=1e-5)
+    np.testing.assert_allclose(cloud.colours, 0.2)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda p: (p - [0.5, -1.0, 0.25]) * 0.2 + [40, 0, 0], ["see 0 %", "50 %", "radius", "away from it"]),
+        (lambda p: p * 1e3, ["% of its points", "other coordinates"]),
+        (lambda p: p * 1e-4 + [0.3, -0.2, 0.5], ["speck", "radius of", "stand"]),
+    ],
+)
+def test_a_cloud_in_other_coordinates_is_refused(change: Any, words: list[str], toy: Path) -> None:
+    np.save(toy / "points.npy", change(Blobs.random().means.double().numpy()))
+    with pytest.raises(InputError) as caught:
+        load_dataset(toy)
+    for word in ["points.npy", *words]:
+        assert word in str(caught.value)
+
+
+def json_file(name: str, **fields: Any) -> Change:
+    return lambda folder, _: edit(folder / f"{name}.json", **fields)
+
+
+def text(name: str, content: str) -> Change:
+    return lambda folder, _: (folder / name).write_text(content)
+
+
+def gone(name: str) -> Change:
+    def change(folder: Path, _: Any) -> None:
+        path = folder / name
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+    return change
+
+
+def entry(**fields: Any) -> Change:
+    """Another metadata entry of the second id."""
+
+    def change(folder: Path, _: Any) -> None:
+        path = folder / "metadata.json"
+        data = json.loads(path.read_text())
+        data[ID] = {key: value for key, value in (data[ID] | fields).items() if value is not None}
+        path.write_text(json.dumps(data))
+
+    return change
+
+
+def picture(size: tuple[int, int], mode: str = "RGB") -> Change:
+    return lambda folder, _: Image.new(mode, size).save(folder / f"rgb/1x/{ID}.png")
+
+
+def array(name: str, value: Any) -> Change:
+    return lambda folder, _: np.save(folder / name, value)
+
+
+CAMERA = f"camera/{ID}"
+BAD: dict[str, tuple[Change, list[str]]] = {
+    "no scene": (gone("scene.json"), ["scene.json", "does not exist"]),
+    "no metadata": (gone("metadata.json"), ["metadata.json", "does not exist"]),
+    "no camera": (gone(f"{CAMERA}.json"), [f"{CAMERA}.json", "does not exist"]),
+    "no pictures": (gone("rgb"), ["rgb", "1x, 2x"]),
+    "picture absent": (gone(f"rgb/1x/{ID}.png"), [f"rgb/1x/{ID}.png", "does not exist", "dataset.json"]),
+    "not JSON": (text("dataset.json", "{"), ["dataset.json", "line 1"]),
+    "a list": (text("dataset.json", "[1]"), ["dataset.json", "a list of 1"]),
+    "no ids": (json_file("dataset", ids=None), ["dataset.json", "no field ids"]),
+    "ids of numbers": (json_file("dataset", ids=[1, 2]), ["dataset.json", "ids", "holds 1"]),
+    "an id as a path": (json_file("dataset", ids=["../../x"]), ["dataset.json", "ids", "../../x"]),
+    "an id twice": (json_file("dataset", ids=["a", "a"]), ["dataset.json", "2 ids of which 1"]),
+    "unknown id": (json_file("dataset", train_ids=["x"]), ["train_ids names x", "5 ids"]),
+    "trained on the test": (json_file("dataset", val_ids=[ID]), ["1 of 1 val_ids", "train_ids", ID]),
+    "no training ids": (json_file("dataset", train_ids=[]), ["0 train_ids", "1 test"]),
+    "no scale": (json_file("scene", scale=None), ["scene.json", "no field scale"]),
+    "scale 0": (json_file("scene", scale=0), ["scene.json", "scale", "above 0", "got 0"]),
+    "scale NaN": (json_file("scene", scale=math.nan), ["scene.json", "scale", "nan"]),
+    "center of 2": (json_file("scene", center=[0, 0]), ["scene.json", "center", "3 numbers", "a list of 2"]),
+    "near beyond far": (json_file("scene", near=9, far=2), ["scene.json", "near", "far", "9 and 2"]),
+    "entry missing": (json_file("metadata", **{ID: None}), ["metadata.json", f"no field {ID}", "dataset.json"]),
+    "no warp_id": (entry(warp_id=None), ["metadata.json", ID, "no field warp_id", "4 of 5"]),
+    "one time_id": (entry(time_id=4), ["metadata.json", "no field time_id", "1 of 5"]),
+    "warp_id of text": (entry(warp_id="4"), ["metadata.json", ID, "warp_id", '"4"']),
+    "warp_id below 0": (entry(warp_id=-4), ["metadata.json", ID, "warp_id", "-4"]),
+    "no orientation": (json_file(CAMERA, orientation=None), [f"{CAMERA}.json", "no field orientation"]),
+    "orientation of 2 rows": (json_file(CAMERA, orientation=[[1, 0, 0]] * 2), ["orientation", "a list of 2"]),
+    "orientation scaled": (json_file(CAMERA, orientation=(2 * np.eye(3)).tolist()), ["orientation", "lengths 2 2 2"]),
+    "orientation mirrored": (json_file(CAMERA, orientation=np.diag([1, 1, -1]).tolist()), ["left-handed"]),
+    "position of text": (json_file(CAMERA, position=[0, 0, "1"]), ["position", '"1"']),
+    "position far": (json_file(CAMERA, position=[0, 0, 1e12]), ["position", "1e+12", "1e+09"]),
+    "focal length 0": (json_file(CAMERA, focal_length=0), ["focal_length", "got 0"]),
+    "aspect 0": (json_file(CAMERA, pixel_aspect_ratio=0), ["pixel_aspect_ratio", "got 0"]),
+    "principal point NaN": (json_file(CAMERA, principal_point=[math.nan, 0]), ["principal_point", "nan"]),
+    "2 radial": (json_file(CAMERA, radial_distortion=[0, 0]), ["radial_distortion", "3 numbers", "a list of 2"]),
+    "wild lens": (json_file(CAMERA, radial_distortion=[900, 0, 0]), [f"{CAMERA}.json", "radial_distortion", "4 times"]),
+    "lens that folds": (json_file(CAMERA, radial_distortion=[-90, 0, 0]), ["radial_distortion", "4 times"]),
+    "image size": (json_file(CAMERA, image_size=[0, 48]), ["image_size", "0x48"]),
+    "other proportions": (json_file(CAMERA, image_size=[64, 64]), ["rgb/1x", "64x48", "64x64", f"{CAMERA}.json"]),
+    "sizes mixed": (picture((32, 24)), [f"{ID}.png", "32x24", "64x48"]),
+    "16 bit": (picture((64, 48), "I;16"), [f"{ID}.png", "8 bits"]),
+    "picture of text": (text(f"rgb/1x/{ID}.png", "hello"), [f"{ID}.png", "not a readable picture"]),
+    "points of text": (text("points.npy", "hello"), ["points.npy", "NumPy array"]),
+    "points of objects": (array("points.npy", np.array([{}])), ["points.npy", "NumPy array"]),
+    "points of 2": (array("points.npy", np.zeros((5, 2))), ["points.npy", "(N, 3)", "(5, 2)"]),
+    "no points": (array("points.npy", np.zeros((0, 3))), ["points.npy", "(0, 3)"]),
+    "points NaN": (array("points.npy", np.full((5, 3), np.nan)), ["points.npy", "5 of 5 points", "point 0"]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_capture_is_refused_in_one_sentence(name: str, toy: Path) -> None:
+    change, words = BAD[name]
+    change(toy, {})
+    with pytest.raises(InputError) as caught:
+        load_dataset(toy)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert message.endswith(".")
+    assert len(message) < 500
+    for word in [str(toy), *words]:
+        assert word in message
+
+
+def test_a_picture_exchanged_after_opening_is_named(toy: Path) -> None:
+    view = load_dataset(toy).train[1]
+    picture((32, 24))(toy, {})
+    with pytest.raises(InputError, match=rf"{ID}\.png.*32x24.*64x48"):
+        view.load()
+
+
+def test_a_real_capture() -> None:
+    folder = SHARED / "hypernerf/hand"
+    if not folder.is_dir():
+        pytest.skip("scenes not at hand")
+    data = load_dataset(folder, image_size=256)
+    assert (len(data.train), len(data.test)) == (75, 11)
+    assert Path(data.test[0].source).parent.name == "2x"
+    assert data.cloud is not None
+    assert np.linalg.norm(data.focus) < 1.3
+    assert np.abs(np.percentile(data.cloud.points, [1, 99], axis=0)).max() == pytest.approx(1.3, abs=1e-3)
+    assert data.test[0].load().shape == (192, 256, 3)
