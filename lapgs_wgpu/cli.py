@@ -61,8 +61,10 @@ def _train(arguments: list[str]) -> None:
     given = _parse(arguments)
     overrides = {key.name: given[key.name] for key in config_keys() if key.name in given}
     if given["eval"]:
-        _evaluate(Path(given["eval"]), given["device"], overrides)
+        _evaluate(Path(given["eval"]), given["device"], overrides, given["lpips_weights"])
         return
+    if given["lpips_weights"]:
+        raise InputError("--lpips-weights goes with --eval RUN, after the training.")
     watch = None
     if given["view"]:
         from lapgs_wgpu.viewer import live
@@ -105,13 +107,17 @@ def _resume(run: Path, given: dict[str, typing.Any], overrides: dict[str, typing
     _report(run)
 
 
-def _evaluate(run: Path, device_name: str | None, overrides: dict[str, str | list[str]]) -> None:
+def _evaluate(
+    run: Path, device_name: str | None, overrides: dict[str, str | list[str]], lpips_weights: str | None
+) -> None:
     from lapgs_wgpu.gpu.device import open_device
     from lapgs_wgpu.motion.scene import load
     from lapgs_wgpu.train import plots
     from lapgs_wgpu.train.loop import evaluate_run
+    from lapgs_wgpu.train.lpips import Lpips
     from lapgs_wgpu.train.presets import load_config
 
+    lpips = Lpips(Path(lpips_weights)) if lpips_weights else None
     for name in ("config.toml", "checkpoint.ply"):
         if not (run / name).is_file():
             raise InputError(f"{run / name} does not exist; --eval needs the folder of a finished run.")
@@ -123,7 +129,7 @@ def _evaluate(run: Path, device_name: str | None, overrides: dict[str, str | lis
         training = json.loads((run / "metrics.json").read_text())["training"]
     except (OSError, ValueError, KeyError, TypeError):
         training = {"steps": int(scene.metadata.get("step", 0))}
-    evaluate_run(run, scene, dataset, config.data.background, training)
+    evaluate_run(run, scene, dataset, config.data.background, training, lpips)
     if plots.available():
         plots.plot_run(run, scene)
     else:
@@ -247,6 +253,11 @@ def _parse(arguments: list[str]) -> dict[str, typing.Any]:
     parser.add_argument("--device", metavar="NAME", help="part of an adapter's name, or cpu, integrated, discrete")
     parser.add_argument("--list-devices", action="store_true", help="list the adapters, the default one first")
     parser.add_argument("--eval", metavar="RUN", help="measure a finished run again, on the data it was trained on")
+    parser.add_argument(
+        "--lpips-weights",
+        metavar="FILE",
+        help="with --eval: measure LPIPS (VGG), too (docs/metrics.md)",
+    )
     groups: dict[str, argparse._ArgumentGroup] = {}
     for name, kind, about in config_keys():
         section = name.split(".")[0] if "." in name else "general"

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import csv
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
+from scipy.signal import convolve2d
 
 from lapgs_wgpu.data.views import View
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.io.tensors import pack_tensors
 from lapgs_wgpu.motion.field import FieldConfig
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.camera import Camera
-from lapgs_wgpu.train.evaluate import evaluate, side_by_side, to_8_bit
+from lapgs_wgpu.train.evaluate import evaluate, side_by_side, to_8_bit, write_metrics
+from lapgs_wgpu.train.losses import MS_SSIM_SMALLEST, ms_ssim
+from lapgs_wgpu.train.lpips import BLOCKS, Lpips
 
 CAMERA = Camera.looking_at([0, -4, 0], [0, 0, 0], up=[0, 0, 1], fov_x=0.7, width=24, height=16)
 
@@ -61,7 +67,7 @@ def test_metrics_are_means_over_views_of_8_bit_pictures(scene: Scene4D, tmp_path
     assert metrics["views"][0]["ssim"] == pytest.approx(1, abs=1e-6)
     assert metrics["gaussians"] == 40
     assert metrics["size"] == [24, 16]
-    assert metrics["lpips"] == "not available"
+    assert metrics["lpips"] == metrics["ms_ssim"] == metrics["views"][0]["lpips_unscaled"] == "not available"
     assert metrics["environment"]["adapter"] == scene.device.info.name
     panel = np.asarray(Image.open(tmp_path / "off.png"))
     assert np.array_equal(panel, side_by_side(off, drawn))
@@ -82,3 +88,120 @@ def test_an_unreadable_picture_is_named(scene: Scene4D) -> None:
 
     with pytest.raises(InputError, match="r_000"):
         evaluate(scene, [View("a", CAMERA, 0.0, "a", fail)], "black")
+
+
+def test_a_line_for_each_view(scene: Scene4D, tmp_path: Path) -> None:
+    drawn = to_8_bit(scene.render(CAMERA, 0.5).image)
+    metrics = evaluate(scene, [view("a", drawn), view("b", 255 - drawn)], "black")
+    write_metrics(tmp_path, metrics)
+    with (tmp_path / "metrics.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["view"] for row in rows] == ["a", "b"]
+    assert [float(row["psnr"]) for row in rows] == [one["psnr"] for one in metrics["views"]]
+    assert rows[0]["ms_ssim"] == "not available"
+    assert json.loads((tmp_path / "metrics.json").read_text())["ssim"] == metrics["ssim"]
+
+
+def pictures(height: int, width: int) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    a = torch.rand(height, width, 3, generator=generator, dtype=torch.float64)
+    smooth = torch.nn.functional.avg_pool2d(a.permute(2, 0, 1), 5, stride=1, padding=2).permute(1, 2, 0)
+    return smooth, (smooth + 0.05 * torch.randn(smooth.shape, generator=generator, dtype=torch.float64)).clamp(0, 1)
+
+
+@pytest.mark.parametrize("size", [(161, 161), (180, 203)])
+def test_ms_ssim_written_out(size: tuple[int, int]) -> None:
+    """Scale by scale with scipy's filters, which are not ours."""
+    a, b = pictures(*size)
+    x = np.arange(11) - 5
+    window = np.exp(-(x**2) / (2 * 1.5**2))
+    window = np.outer(window, window) / window.sum() ** 2
+    values = []
+    for channel in range(3):
+        p, q = a[..., channel].numpy(), b[..., channel].numpy()
+        product = 1.0
+        for level, weight in enumerate((0.0448, 0.2856, 0.3001, 0.2363, 0.1333)):
+            means = [convolve2d(image, window, "valid") for image in (p, q, p * p, q * q, p * q)]
+            vp, vq, cov = means[2] - means[0] ** 2, means[3] - means[1] ** 2, means[4] - means[0] * means[1]
+            value = (2 * cov + 0.03**2) / (vp + vq + 0.03**2)
+            if level == 4:
+                value *= (2 * means[0] * means[1] + 0.01**2) / (means[0] ** 2 + means[1] ** 2 + 0.01**2)
+            product *= value.mean() ** weight
+            p, q = (
+                torch.nn.functional.avg_pool2d(
+                    torch.from_numpy(each)[None, None], 2, padding=(p.shape[0] % 2, p.shape[1] % 2)
+                )[0, 0].numpy()
+                for each in (p, q)
+            )
+        values.append(product)
+    assert float(ms_ssim(a, b)) == pytest.approx(np.mean(values), abs=1e-9)
+    assert float(ms_ssim(a, a)) == pytest.approx(1.0, abs=1e-9)
+    assert MS_SSIM_SMALLEST == 161
+
+
+@pytest.fixture(scope="module")
+def network(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, torch.nn.Sequential, list[torch.Tensor]]:
+    """VGG16 in torchvision's layers, with random weights, and heads; and the file that holds them."""
+    torch.manual_seed(0)
+    layers: list[torch.nn.Module] = []
+    for k, channels in enumerate(((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))):
+        if k:
+            layers.append(torch.nn.MaxPool2d(2))
+        for out in channels:
+            previous = next((m.out_channels for m in reversed(layers) if isinstance(m, torch.nn.Conv2d)), 3)
+            layers += [torch.nn.Conv2d(previous, out, 3, padding=1), torch.nn.ReLU()]
+    vgg = torch.nn.Sequential(*layers)
+    heads = [torch.rand(1, block[-1][2], 1, 1) for block in BLOCKS]
+    tensors = {f"features.{name}": value.numpy() for name, value in vgg.state_dict().items()}
+    tensors |= {f"lin{k}.model.1.weight": head.numpy() for k, head in enumerate(heads)}
+    file = tmp_path_factory.mktemp("weights") / "vgg.safetensors"
+    file.write_bytes(b"".join(bytes(part) for part in pack_tensors(tensors, {})))
+    return file, vgg, heads
+
+
+def test_lpips_is_the_distance_of_vggs_features(
+    network: tuple[Path, torch.nn.Sequential, list[torch.Tensor]],
+) -> None:
+    file, vgg, heads = network
+    a, b = (image[:48, :40].float() for image in pictures(60, 60))
+    lpips = Lpips(file)
+    assert lpips(a, a) == 0
+    for unscaled in (False, True):
+        features = []
+        for image in (a, b):
+            x = (image if unscaled else 2 * image - 1).permute(2, 0, 1)
+            x = (x - torch.tensor([-0.030, -0.088, -0.188])[:, None, None]) / torch.tensor([0.458, 0.448, 0.450])[
+                :, None, None
+            ]
+            taps = []
+            for i, layer in enumerate(vgg.requires_grad_(False)):
+                x = layer(x)
+                if i in (3, 8, 15, 22, 29):
+                    taps.append(x / (x.norm(dim=0, keepdim=True) + 1e-10))
+            features.append(taps)
+        expected = sum(
+            float(((p - q).square() * head[0]).sum(dim=0).mean()) for p, q, head in zip(*features, heads, strict=True)
+        )
+        assert lpips(a, b, unscaled=unscaled) == pytest.approx(expected, rel=1e-4)
+
+
+def test_lpips_refuses_other_files(
+    network: tuple[Path, torch.nn.Sequential, list[torch.Tensor]], tmp_path: Path
+) -> None:
+    with pytest.raises(InputError, match="cannot be read"):
+        Lpips(tmp_path / "nowhere")
+    (tmp_path / "part").write_bytes(
+        b"".join(map(bytes, pack_tensors({"features.0.bias": np.zeros(64, np.float32)}, {})))
+    )
+    with pytest.raises(InputError, match=r"features.0.weight must have the shape \(64, 3, 3, 3\), .* holds nothing"):
+        Lpips(tmp_path / "part")
+
+
+def test_lpips_is_measured_where_there_are_weights(
+    scene: Scene4D, network: tuple[Path, torch.nn.Sequential, list[torch.Tensor]]
+) -> None:
+    large = CAMERA.resized(48, 32)
+    drawn = to_8_bit(scene.render(large, 0.5).image)
+    shown = View("a", large, 0.5, "a", lambda: 255 - drawn)
+    metrics = evaluate(scene, [shown], "black", lpips=Lpips(network[0]))
+    assert 0 < metrics["lpips"] != metrics["lpips_unscaled"] > 0

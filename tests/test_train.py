@@ -89,7 +89,7 @@ def test_pictures_improve(kind: str, dataset: Dataset, device: Device, tmp_path:
 
 def test_a_run_is_whole(run: Path, dataset: Dataset) -> None:
     assert {file.name for file in run.iterdir()} == {
-        "config.toml", "log.jsonl", "metrics.json", "checkpoint.ply", "eval",
+        "config.toml", "log.jsonl", "metrics.json", "metrics.csv", "checkpoint.ply", "eval",
     }  # fmt: skip
     assert load_config(str(run / "config.toml")) == configure()
     record = (run / "config.toml").read_text().split("[record]")[1]

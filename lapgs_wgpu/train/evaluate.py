@@ -5,6 +5,8 @@ Both sides are compared as 8-bit pictures: the model of the last step, clamped a
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import time
 from collections.abc import Sequence
@@ -21,19 +23,27 @@ from lapgs_wgpu.data.views import View, composite
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.log import environment
-from lapgs_wgpu.train.losses import psnr, ssim
+from lapgs_wgpu.train.losses import MS_SSIM_SMALLEST, ms_ssim, psnr, ssim
+from lapgs_wgpu.train.lpips import SMALLEST, Lpips
 
 ERROR_GAIN = 4  # of the error pictures
+MEASURES = ("psnr", "ssim", "ms_ssim", "lpips", "lpips_unscaled")
+NOT_AVAILABLE = "not available"
 COLOURS = {"black": 0.0, "white": 1.0, "random": 0.0}  # of the background under test views
 
 
-def evaluate(scene: Scene4D, views: Sequence[View], background: str, folder: Path | None = None) -> dict[str, Any]:
+def evaluate(
+    scene: Scene4D, views: Sequence[View], background: str, folder: Path | None = None, *, lpips: Lpips | None = None
+) -> dict[str, Any]:
     """Render every view and compare: the content of metrics.json.
 
     background: black, white, or random, which is black here. folder: where a picture of each view is written, the
-    ground truth beside the rendering and their error, 4 times enlarged; an existing folder.
-    psnr is per image over all channels, then the mean of the dB; ssim is that of the loss. Raises InputError where a
-    picture cannot be read.
+    ground truth beside the rendering and their error, 4 times enlarged; an existing folder. lpips: None where there
+    are no weights for it.
+    Each measure is one of an image, then the mean over the images (of PSNR of the dB): psnr over all channels; ssim,
+    that of the loss; ms_ssim; lpips on inputs in [-1, 1], and lpips_unscaled on inputs in [0, 1], as 3DGS's code
+    reports it. "not available" stands for what cannot be measured: pictures too small, or no weights. Raises
+    InputError where a picture cannot be read.
     """
     start = time.perf_counter()
     colour = torch.full((3,), COLOURS[background])
@@ -41,14 +51,11 @@ def evaluate(scene: Scene4D, views: Sequence[View], background: str, folder: Pat
     for view in views:
         truth = composite(view.load(), colour.numpy())
         image = to_8_bit(scene.render(view.camera, view.time, colour).image)
-        a, b = _unit(image), _unit(truth)
-        rows.append({"view": view.name, "time": view.time, "psnr": psnr(a, b), "ssim": float(ssim(a, b))})
+        rows.append({"view": view.name, "time": view.time, **_measures(_unit(image), _unit(truth), lpips)})
         if folder is not None:
             Image.fromarray(side_by_side(truth, image)).save(folder / f"{view.name}.png")
     return {
-        "psnr": float(np.mean([row["psnr"] for row in rows])),
-        "ssim": float(np.mean([row["ssim"] for row in rows])),
-        "lpips": "not available",  # it needs weights, which do not come with the package
+        **{name: _mean([row[name] for row in rows]) for name in MEASURES},
         "gaussians": len(scene),
         "field": scene.field_config.kind,
         "size": [views[0].camera.width, views[0].camera.height],
@@ -59,10 +66,32 @@ def evaluate(scene: Scene4D, views: Sequence[View], background: str, folder: Pat
     }
 
 
-def write_metrics(path: Path, metrics: dict[str, Any]) -> None:
-    """Write metrics.json. Atomic; InputError where it cannot be written."""
-    with atomic_write(path) as file:
-        file.write((json.dumps(metrics, indent=1) + "\n").encode())
+def _measures(image: Tensor, truth: Tensor, lpips: Lpips | None) -> dict[str, float | str]:
+    side = min(image.shape[:2])
+    perceptual = lpips if side >= SMALLEST else None
+    return {
+        "psnr": psnr(image, truth),
+        "ssim": float(ssim(image, truth)),
+        "ms_ssim": float(ms_ssim(image, truth)) if side >= MS_SSIM_SMALLEST else NOT_AVAILABLE,
+        "lpips": perceptual(image, truth) if perceptual else NOT_AVAILABLE,
+        "lpips_unscaled": perceptual(image, truth, unscaled=True) if perceptual else NOT_AVAILABLE,
+    }
+
+
+def _mean(values: list[Any]) -> float | str:
+    return NOT_AVAILABLE if NOT_AVAILABLE in values else float(np.mean(values))
+
+
+def write_metrics(folder: Path, metrics: dict[str, Any]) -> None:
+    """Write metrics.json, and metrics.csv with a line a view. Atomic; InputError where they cannot be written."""
+    columns = ("view", "time", *MEASURES)
+    text = io.StringIO()
+    table = csv.DictWriter(text, columns, lineterminator="\n")
+    table.writeheader()
+    table.writerows(metrics["views"])
+    for name, content in (("metrics.csv", text.getvalue()), ("metrics.json", json.dumps(metrics, indent=1) + "\n")):
+        with atomic_write(folder / name) as file:
+            file.write(content.encode())
 
 
 def to_8_bit(image: Tensor) -> NDArray[np.uint8]:

@@ -17,6 +17,7 @@ from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.config import Background, Config
 from lapgs_wgpu.train.evaluate import evaluate, write_metrics
 from lapgs_wgpu.train.log import Log
+from lapgs_wgpu.train.lpips import Lpips
 from lapgs_wgpu.train.memory import keep_freed_memory
 from lapgs_wgpu.train.run_folder import (
     check_run_folder,
@@ -123,12 +124,17 @@ def _steps(training: Training, log: Log, out: Path, interrupted: threading.Event
 
 
 def evaluate_run(
-    out: Path, scene: Scene4D, dataset: Dataset, background: Background, training: dict[str, float]
+    out: Path,
+    scene: Scene4D,
+    dataset: Dataset,
+    background: Background,
+    training: dict[str, float],
+    lpips: Lpips | None = None,
 ) -> dict[str, object]:
-    """Evaluate on the test views, and write metrics.json and eval/ of a run folder; returns the metrics."""
+    """Evaluate on the test views; write metrics.json, metrics.csv and eval/ of a run folder; returns the metrics."""
     (out / "eval").mkdir(exist_ok=True)
-    metrics = {**evaluate(scene, dataset.test, background, out / "eval"), "training": training}
-    write_metrics(out / "metrics.json", metrics)
+    metrics = {**evaluate(scene, dataset.test, background, out / "eval", lpips=lpips), "training": training}
+    write_metrics(out, metrics)
     return metrics
 
 

@@ -17,6 +17,8 @@ SSIM_WINDOW = 11
 SSIM_SIGMA = 1.5  # pixels
 SSIM_C1 = 0.01**2
 SSIM_C2 = 0.03**2
+MS_SSIM_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)  # of the scales, the finest first
+MS_SSIM_SMALLEST = (SSIM_WINDOW - 1) * 2 ** (len(MS_SSIM_WEIGHTS) - 1) + 1  # 161: the coarsest has one window
 PYRAMID_BANDS = 3  # band-pass levels; below them lies the residual
 PYRAMID_TAPS = (1.0, 4.0, 6.0, 4.0, 1.0)  # sum 16
 NCC_WINDOW = 11
@@ -67,6 +69,30 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
     variances = (aa - mean_a * mean_a) + (bb - mean_b * mean_b)
     luminance = (2 * mean_a * mean_b + SSIM_C1) / (mean_a * mean_a + mean_b * mean_b + SSIM_C1)
     return (luminance * (2 * covariance + SSIM_C2) / (variances + SSIM_C2)).mean()
+
+
+def ms_ssim(image: Tensor, target: Tensor) -> Tensor:
+    """Mean structural similarity over five scales (Wang et al. 2003) of two (H, W, C) images of at least
+    MS_SSIM_SMALLEST pixels a side.
+
+    Windows lie wholly inside; a scale has half the pixels of the one before, means of 2x2 (an odd border counts as
+    half zeros); a channel's product over the scales, then the mean over the channels.
+    """
+    a, b = image.permute(2, 0, 1), target.permute(2, 0, 1)
+    product: Tensor | None = None
+    for level, weight in enumerate(MS_SSIM_WEIGHTS):
+        inside = _blur(torch.cat([a, b, a * a, b * b, a * b]))[:, 5:-5, 5:-5]
+        mean_a, mean_b, aa, bb, ab = inside.chunk(5)
+        variances = (aa - mean_a * mean_a) + (bb - mean_b * mean_b)
+        similar = (2 * (ab - mean_a * mean_b) + SSIM_C2) / (variances + SSIM_C2)
+        if level == len(MS_SSIM_WEIGHTS) - 1:
+            similar = similar * (2 * mean_a * mean_b + SSIM_C1) / (mean_a * mean_a + mean_b * mean_b + SSIM_C1)
+        term = similar.mean(dim=(1, 2)).clamp(min=0) ** weight
+        product = term if product is None else product * term
+        odd = [side % 2 for side in a.shape[1:]]
+        a, b = (functional.avg_pool2d(each[None], 2, padding=(odd[0], odd[1]))[0] for each in (a, b))
+    assert product is not None
+    return product.mean()
 
 
 def pyramid_sizes(height: int, width: int) -> list[tuple[int, int]]:
