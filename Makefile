@@ -1,5 +1,6 @@
 # Everything lives in .venv; `make` or `make setup` makes it, and the other goals call that first.
 #   make demo   trains the built-in scene         make test   all tests        make lint   ruff and mypy
+#   make soak   the tests that take long: scale
 #   make bench  times the kernels; options go into ARGS, for example: make bench ARGS="--json bench.json"
 
 BIN := .venv/bin
@@ -7,7 +8,7 @@ READY := .venv/.ready
 PYTEST = $(BIN)/pytest
 export XDG_RUNTIME_DIR ?= /tmp
 
-.PHONY: setup demo test bench lint
+.PHONY: setup demo test soak bench lint
 setup: $(READY)
 
 # torch first: where there is no CUDA device, by exact version, so that an index with CPU builds can offer its own
@@ -63,3 +64,7 @@ test: $(READY)
 	  LAPGS_TEST_DEVICE=$$name $(PYTEST) -m kernels || exit 1; done
 	@echo "== all tests"
 	@$(PYTEST)
+
+# What takes minutes, or gigabytes: docs/reliability.md.
+soak: $(READY)
+	LAPGS_SOAK=1 $(PYTEST) -s tests/test_scale.py

@@ -1,4 +1,7 @@
-"""What all commands share. Users' mistakes end in one sentence on stderr and exit code 2; 3 means no adapter."""
+"""What all commands share. Users' mistakes end in one sentence on stderr and exit code 2.
+
+3 means no adapter, 4 that device or memory gave out, 5 values that are not finite in a training.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +10,10 @@ import sys
 from collections.abc import Callable
 from typing import NoReturn
 
-from lapgs_wgpu.errors import InputError, NoAdapterError
+from lapgs_wgpu.errors import DeviceError, InputError, NoAdapterError, NumericalError
 from lapgs_wgpu.gpu.device import list_devices
 
+OUT_OF_DEVICE, NOT_FINITE = 4, 5
 INTERRUPTED = 130  # the shell's code for a process that Ctrl-C ended
 
 
@@ -23,6 +27,17 @@ def guarded(name: str, command: Callable[[list[str]], int | None], arguments: li
     except InputError as error:
         print(f"{name}: {error}", file=sys.stderr)
         return 2
+    except (DeviceError, MemoryError) as error:
+        print(f"{name}: {str(error) or 'out of memory.'}", file=sys.stderr)
+        return OUT_OF_DEVICE
+    except RuntimeError as error:  # how torch says that memory gave out
+        if "allocate" not in str(error):
+            raise
+        print(f"{name}: out of memory ({str(error).splitlines()[0]})", file=sys.stderr)
+        return OUT_OF_DEVICE
+    except NumericalError as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        return NOT_FINITE
     except OSError as error:  # a full disk, a folder that may not be written to
         print(f"{name}: {error}.", file=sys.stderr)
         return 2

@@ -5,6 +5,11 @@
 #table 3 slot_ids: u32
 #table 4 splats: vec4<f32>
 @group(0) @binding(5) var<storage, read_write> image: array<f32>;   // planes red, green, blue, transmittance (, depth)
+#ifdef ROUND_SPLATS
+// [2]: whether a list of this image asks for more rounds. A round ends after ROUND_SPLATS splats; what a tile has by then
+// lies in the image, the background not yet under it, and the sign of the transmittance says whether a pixel has stopped.
+@group(0) @binding(6) var<storage, read_write> needed: array<u32>;
+#endif
 #import common/index
 #import common/raster
 
@@ -41,8 +46,35 @@ fn main(
 #end
 
     let range = ranges[tile];
+#ifdef ROUND_SPLATS
+#ifdef CONTINUED
+    if (range.w == 0u) {
+        return;
+    }
+    let all = frame.size.x * frame.size.y;
+#unroll r $ROWS
+    if (corner.x + my.column < frame.size.x && corner.y + my.row + $(r)u < frame.size.y) {
+        let pixel = (corner.y + my.row + $(r)u) * frame.size.x + corner.x + my.column;
+        red[$r] = image[pixel];
+        green[$r] = image[all + pixel];
+        blue[$r] = image[2u * all + pixel];
+        T[$r] = image[3u * all + pixel];
+#ifdef DEPTH
+        depth[$r] = image[4u * all + pixel];
+#endif
+    }
+#end
+    var first = range.z;
+#else
     var first = range.x;
-    while (first < range.y) {
+#endif
+    let end = min(range.y, first + u32($ROUND_SPLATS));
+    var closed = false;
+#else
+    var first = range.x;
+    let end = range.y;
+#endif
+    while (first < end) {
         var mine = empty();
         if (first + lane < range.y) {
             mine = load(slot_ids_at(slots_at(first + lane)), origin);
@@ -89,6 +121,9 @@ fn main(
 #end
 #ifdef SUBGROUPS
         if (!subgroupAny(open)) {
+#ifdef ROUND_SPLATS
+            closed = true;
+#endif
             break;
         }
 #else
@@ -100,10 +135,29 @@ fn main(
         }
         workgroupBarrier();
         if (any_open == 0u) {
+#ifdef ROUND_SPLATS
+            closed = true;
+#endif
             break;
         }
 #endif
     }
+#ifdef ROUND_SPLATS
+    let unfinished = !closed && first < range.y;
+    if (lane == 0u) {
+        ranges[tile].w = select(0u, 1u, unfinished);
+#ifdef LAST_ROUND
+        if (unfinished) {
+            needed[2] = 1u;
+        }
+#ifndef CONTINUED
+        if (range.y - range.x > u32($LONG_LIST)) {
+            needed[2] = 1u;
+        }
+#endif
+#endif
+    }
+#endif
     if (lane == 0u) {
         ranges[tile].z = first;   // the backward pass stops here, too
     }
@@ -112,11 +166,19 @@ fn main(
 #unroll r $ROWS
     if (corner.x + my.column < frame.size.x && corner.y + my.row + $(r)u < frame.size.y) {
         let pixel = (corner.y + my.row + $(r)u) * frame.size.x + corner.x + my.column;
+#ifdef ROUND_SPLATS
+        let t = select(abs(T[$r]), 0.0, unfinished);
+#else
         let t = abs(T[$r]);
+#endif
         image[pixel] = red[$r] + t * frame.background.x;
         image[pixels + pixel] = green[$r] + t * frame.background.y;
         image[2u * pixels + pixel] = blue[$r] + t * frame.background.z;
+#ifdef ROUND_SPLATS
+        image[3u * pixels + pixel] = select(t, T[$r], unfinished);
+#else
         image[3u * pixels + pixel] = t;
+#endif
 #ifdef DEPTH
         image[4u * pixels + pixel] = depth[$r];
 #endif

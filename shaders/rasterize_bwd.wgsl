@@ -15,6 +15,12 @@
 #table 6 d_image: f32
 @group(0) @binding(7) var<storage, read_write> records: array<f32>;        // 8 a slot: the moments, red, green
 @group(0) @binding(8) var<storage, read_write> record_tails: array<f32>;   // blue of each slot (, then depth of each)
+#ifdef ROUNDS
+// Of a list that is drawn in rounds, each round takes ROUND_SPLATS splats, and leaves transmittance and rest of its pixels
+// behind the tails of all slots. Records are zero before.
+struct Piece { number: u32, state: u32 }   // the place of the state among the tails
+@group(0) @binding(9) var<uniform> piece: Piece;
+#endif
 #import common/index
 #import common/raster
 
@@ -90,7 +96,26 @@ fn main(
 #end
 
     let range = ranges[tile];
-    for (var first = range.x; first < range.z; first += u32(LANES)) {
+#ifdef ROUNDS
+    let begin = range.x + piece.number * u32($ROUND_SPLATS);
+    let end = min(range.z, begin + u32($ROUND_SPLATS));
+    if (begin >= end) {
+        return;
+    }
+    if (piece.number > 0u) {
+#unroll r $ROWS
+        if (corner.x + my.column < frame.size.x && corner.y + my.row + $(r)u < frame.size.y) {
+            let at = piece.state + 2u * ((corner.y + my.row + $(r)u) * frame.size.x + corner.x + my.column);
+            T[$r] = record_tails[at];
+            rest[$r] = record_tails[at + 1u];
+        }
+#end
+    }
+#else
+    let begin = range.x;
+    let end = range.z;
+#endif
+    for (var first = begin; first < end; first += u32(LANES)) {
         var mine = empty();
         var slot = 0u;
         var my_blue = 0.0;
@@ -214,6 +239,15 @@ fn main(
         }
 #endif
     }
+#ifdef ROUNDS
+#unroll r $ROWS
+    if (corner.x + my.column < frame.size.x && corner.y + my.row + $(r)u < frame.size.y) {
+        let at = piece.state + 2u * ((corner.y + my.row + $(r)u) * frame.size.x + corner.x + my.column);
+        record_tails[at] = T[$r];
+        record_tails[at + 1u] = rest[$r];
+    }
+#end
+#else
     // What no pixel of the tile sees has no gradient.
     for (var i = range.z + lane; i < range.y; i += u32(LANES)) {
         let slot = slots_at(i);
@@ -225,4 +259,5 @@ fn main(
         record_tails[frame.capacity + slot] = 0.0;
 #endif
     }
+#endif
 }

@@ -18,9 +18,9 @@ fn main(@builtin(local_invocation_index) lane: u32) {
         }
         let prefix = workgroup_scan(lane, sum);
         if (i < blocks.count) {
-            block_sums[i] = before + prefix;
+            block_sums[i] = plus(before, prefix);
         }
-        before += lane_sums[BLOCK_LANES - 1u];
+        before = plus(before, lane_sums[BLOCK_LANES - 1u]);
         workgroupBarrier();
     }
     if (lane == 0u) {

@@ -34,6 +34,7 @@ def scan(
     length: int,
     indices: Words | None = None,
     capacity: int | None = None,
+    saturating: bool = False,
 ) -> tuple[Words, int]:
     """The first `length` sums and the total. Fails where anything else was written."""
     capacity = length if capacity is None else capacity
@@ -42,7 +43,7 @@ def scan(
     total = buffer_of(device, np.full(4, UNTOUCHED, np.uint32), "total")
     picked = {} if indices is None else {"indices": buffer_of(device, indices, "indices")}
     with Commands(device) as commands:
-        Scan(device, pool, "test", source)(
+        Scan(device, pool, "test", source, saturating=saturating)(
             commands,
             length=buffer_of(device, np.array([length], np.uint32), "length"),
             capacity=capacity,
@@ -103,6 +104,15 @@ def test_no_room_and_no_elements(device: Device) -> None:
 
 def test_sums_wrap_as_unsigned_words_do(device: Device) -> None:
     check(device, np.full(5000, 0xFFFFFFFF, np.uint32), source="values", length=5000)
+
+
+@pytest.mark.parametrize("length", [6000, 40_000, 300_000])
+def test_saturating_sums_end_at_the_largest_word(device: Device, length: int) -> None:
+    values = np.full(length, (1 << 21) - 1, np.uint32)
+    assert scan(device, values, source="values", length=length, saturating=True)[1] == 0xFFFFFFFF
+    sums, total = scan(device, values[:2000], source="values", length=2000, saturating=True)
+    np.testing.assert_array_equal(sums, np.arange(2000) * ((1 << 21) - 1))
+    assert total == 2000 * ((1 << 21) - 1)
 
 
 @settings(max_examples=25, deadline=None, derandomize=True)

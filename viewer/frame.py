@@ -104,7 +104,7 @@ class Painter:
             passes: dict[str, float] = {}
             for name, milliseconds in taken.read() if taken else []:
                 passes[name] = passes.get(name, 0.0) + milliseconds
-            if not self._rasterizer.fit([int(count[0]) for count in needed]):
+            if not self._rasterizer.fit(needed):
                 break
         if mode == "depth":
             low, high = self._depth_range(planes, camera)

@@ -9,7 +9,9 @@ import numpy as np
 import wgpu
 from numpy.typing import NDArray
 
+from ..errors import DeviceMemoryError
 from .shader import TABLE_TYPES, TABLE_WIDTH
+from .trouble import Guard
 
 if TYPE_CHECKING:
     from .device import Device
@@ -40,13 +42,18 @@ class Buffer:
         self.nbytes = max(16, (nbytes + 15) & ~15)
         if self.nbytes > device.limits["max-buffer-size"]:
             limit = device.limits["max-buffer-size"]
-            raise MemoryError(f"buffer {label!r} needs {self.nbytes} bytes, but a buffer of this device holds {limit}")
-        usage = _STORAGE | (_MAPPABLE if device.mappable else 0)
-        self.wgpu_buffer = device.wgpu_device.create_buffer(label=label, size=self.nbytes, usage=usage)
+            raise DeviceMemoryError(
+                f"buffer {label!r} needs {self.nbytes} bytes, but a buffer of this device holds {limit}"
+            )
+        self.wgpu_buffer = self._create(_STORAGE | (_MAPPABLE if device.mappable else 0))
         self.version = 0  # counts the writes, so that a texture made from the buffer is known to be out of date
         self._textures: dict[str, _Texture] = {}
         self._upload: Any = None
         self._download: Any = None
+
+    def _create(self, usage: int) -> Any:
+        with Guard(self.device, f"buffer {self.label!r}", self.nbytes):
+            return self.device.wgpu_device.create_buffer(label=self.label, size=self.nbytes, usage=usage)
 
     def write(self, array: NDArray[Any], offset: int = 0) -> None:
         """Copy an array into the buffer, `offset` bytes (a multiple of 8) from its start."""
@@ -56,19 +63,19 @@ class Buffer:
         if data.nbytes == 0:
             return
         self.version += 1
-        if self.device.mappable:
-            self._fill(self.wgpu_buffer, data, offset)
-        elif data.nbytes <= _SMALL:
-            self.device.queue.write_buffer(self.wgpu_buffer, offset, data)
-        else:
-            if self._upload is None:
-                usage = wgpu.BufferUsage.MAP_WRITE | wgpu.BufferUsage.COPY_SRC
-                self._upload = self.device.wgpu_device.create_buffer(size=self.nbytes, usage=usage)
-            self._fill(self._upload, data, offset)
-            encoder = self.device.wgpu_device.create_command_encoder()
-            size = (data.nbytes + 3) & ~3
-            encoder.copy_buffer_to_buffer(self._upload, offset, self.wgpu_buffer, offset, size)
-            self.device.queue.submit([encoder.finish()])
+        with Guard(self.device, f"what is written to buffer {self.label!r}", data.nbytes):
+            if self.device.mappable:
+                self._fill(self.wgpu_buffer, data, offset)
+            elif data.nbytes <= _SMALL:
+                self.device.queue.write_buffer(self.wgpu_buffer, offset, data)
+            else:
+                if self._upload is None:
+                    self._upload = self._create(wgpu.BufferUsage.MAP_WRITE | wgpu.BufferUsage.COPY_SRC)
+                self._fill(self._upload, data, offset)
+                encoder = self.device.wgpu_device.create_command_encoder()
+                size = (data.nbytes + 3) & ~3
+                encoder.copy_buffer_to_buffer(self._upload, offset, self.wgpu_buffer, offset, size)
+                self.device.queue.submit([encoder.finish()])
 
     @staticmethod
     def _fill(target: Any, data: NDArray[np.uint8], offset: int) -> None:
@@ -86,12 +93,13 @@ class Buffer:
         rows = -(-count // TABLE_WIDTH)
         held = self._textures.get(texel_format)
         if held is None or held.rows < rows:
-            texture = self.device.wgpu_device.create_texture(
-                label=self.label,
-                size=(TABLE_WIDTH, rows, 1),
-                format=texel_format,
-                usage=wgpu.TextureUsage.STORAGE_BINDING | wgpu.TextureUsage.COPY_DST,
-            )
+            with Guard(self.device, f"the texture of buffer {self.label!r}", rows * TABLE_WIDTH * texel):
+                texture = self.device.wgpu_device.create_texture(
+                    label=self.label,
+                    size=(TABLE_WIDTH, rows, 1),
+                    format=texel_format,
+                    usage=wgpu.TextureUsage.STORAGE_BINDING | wgpu.TextureUsage.COPY_DST,
+                )
             held = self._textures[texel_format] = _Texture(texture, texture.create_view(), rows)
         if held.state != (self.version, offset, size):
             held.state = (self.version, offset, size)
@@ -132,16 +140,18 @@ def read_all(requests: list[Request]) -> list[NDArray[Any]]:
             sources.append((buffer.wgpu_buffer, offset, size, nbytes))
             continue
         if buffer._download is None:
-            usage = wgpu.BufferUsage.MAP_READ | wgpu.BufferUsage.COPY_DST
-            buffer._download = buffer.device.wgpu_device.create_buffer(size=buffer.nbytes, usage=usage)
+            buffer._download = buffer._create(wgpu.BufferUsage.MAP_READ | wgpu.BufferUsage.COPY_DST)
         encoder = encoder or buffer.device.wgpu_device.create_command_encoder()
         encoder.copy_buffer_to_buffer(buffer.wgpu_buffer, offset, buffer._download, offset, size)
         sources.append((buffer._download, offset, size, nbytes))
     if encoder is not None:
-        requests[0][0].device.queue.submit([encoder.finish()])
+        device = requests[0][0].device
+        with Guard(device, "what is read back"):
+            device.queue.submit([encoder.finish()])
     out = []
-    for (source, offset, size, nbytes), (_, dtype, shape, _) in zip(sources, requests, strict=True):
-        source.map_sync("READ_NOSYNC", offset, size)
+    for (source, offset, size, nbytes), (buffer, dtype, shape, _) in zip(sources, requests, strict=True):
+        with Guard(buffer.device, f"what is read from buffer {buffer.label!r}", nbytes):
+            source.map_sync("READ_NOSYNC", offset, size)
         view = np.frombuffer(source.read_mapped(offset, size, copy=False), dtype=np.uint8)
         array = view[:nbytes].copy().view(dtype).reshape(shape)
         del view

@@ -89,7 +89,11 @@ class Device:
                     f"the adapter {info.name!r} offers {name} = {adapter.limits[name]}, but {needed} is needed: "
                     "choose another with --device"
                 )
-        self.wgpu_device = adapter.request_device_sync(required_features=sorted(features), required_limits=limits)
+        try:
+            self.wgpu_device = adapter.request_device_sync(required_features=sorted(features), required_limits=limits)
+        except RuntimeError as error:  # wgpu-py's only type for it
+            reason = str(error).splitlines()[0]
+            raise NoAdapterError(f"the adapter {info.name!r} cannot be opened ({reason}): choose another") from error
         self.queue = self.wgpu_device.queue
         self.limits = limits
         self.features = features

@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import wgpu
 
+from ..errors import DeviceMemoryError
 from .buffer import Buffer
 from .shader import Defines, ShaderError, compose, pack, reflect
+from .trouble import Guard, is_lost
 
 if TYPE_CHECKING:
     from .device import Device
@@ -32,6 +34,9 @@ class Kernel:
         try:
             module = native.create_shader_module(label=name, code=self.source)
         except wgpu.GPUError as error:
+            if is_lost(native):
+                with Guard(device, "a shader"):
+                    raise
             raise ShaderError(f"shaders/{name}.wgsl does not compile:\n{error}") from error
         entries: list[Any] = [
             {"binding": b.number, "visibility": wgpu.ShaderStage.COMPUTE}
@@ -78,7 +83,7 @@ class Kernel:
             if not isinstance(part[0], Buffer):
                 raise ShaderError(f"shaders/{self.name}.wgsl: {name} must be a Buffer, got {type(part[0]).__name__}")
             if part[2] > self.device.max_binding:
-                raise MemoryError(
+                raise DeviceMemoryError(
                     f"{name} of the pass {self.name} needs {part[2]} bytes in one binding, "
                     f"but {self.device.info.name} allows {self.device.max_binding}"
                 )
@@ -176,7 +181,9 @@ class Commands:
         if kind is None:
             if self._profile is not None:
                 self._profile.resolve(self._encoder)
-            self.device.queue.submit([self._encoder.finish()])
+            with Guard(self.device, "commands"):
+                self.device.queue.submit([self._encoder.finish()])
         else:
             for buffer in self._copied:  # the copies are never made
                 buffer.version += 1
+            Guard(self.device, "commands").__exit__(kind, error, at)

@@ -16,13 +16,17 @@ class Scan:
     """Exclusive prefix sums of u32.
 
     source: "values"; "flags" adds 1 for each value that is not zero; "gather" adds values[indices[i]].
+    saturating: sums end at 2^32 - 1 instead of beginning anew, provided that no element reaches 2^21.
     """
 
-    def __init__(self, device: Device, pool: BufferPool, name: str, source: str = "values") -> None:
+    def __init__(
+        self, device: Device, pool: BufferPool, name: str, source: str = "values", *, saturating: bool = False
+    ) -> None:
         self._pool, self._name = pool, name
         defines = {"SCAN_LANES": 8 if device.is_cpu else 256} | ({} if source == "values" else {source.upper(): 1})
         self._reduce = Kernel.get(device, "scan_reduce", **defines)
-        self._blocks = Kernel.get(device, "scan_blocks", SCAN_LANES=defines["SCAN_LANES"])
+        blocks = {"SCAN_LANES": defines["SCAN_LANES"]} | ({"SATURATING": 1} if saturating else {})
+        self._blocks = Kernel.get(device, "scan_blocks", **blocks)
         self._apply = Kernel.get(device, "scan_apply", **defines)
 
     def __call__(

@@ -97,7 +97,7 @@ class _Task:
             needed = rasterizer.needed_requests()
             arrays = read_all(requests + gradients + needed)
             # Where the intersections did not fit, none of this is right, and all of it is done again.
-            if not rasterizer.fit([int(count[0]) for count in arrays[-len(needed) :]]):
+            if not rasterizer.fit(arrays[-len(needed) :]):
                 self.terms = arrays[0]
                 return arrays[1], arrays[2 : -len(needed)]
 

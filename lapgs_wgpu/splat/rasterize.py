@@ -167,7 +167,7 @@ def _draw(
                 *rasterizer.needed_requests(),
             ]
         )
-        if not rasterizer.fit([int(count[0]) for count in needed]):
+        if not rasterizer.fit(needed):
             return planes, projected
 
 

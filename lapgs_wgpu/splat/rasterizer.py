@@ -8,12 +8,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import DeviceMemoryError
 from ..gpu.buffer import Buffer, BufferPool, Request, read_all
 from ..gpu.device import Device
 from ..gpu.kernel import Commands, Kernel
 from ..gpu.primitives import RadixSort, Scan
 from .camera import Camera
-from .shape import RasterShape, raster_shape
+from .shape import MOST_TILES, RasterShape, raster_shape
 
 SPLAT_FLOATS = 12  # common/splat.wgsl
 _RECORD_BYTES = 32  # rasterize_bwd.wgsl
@@ -65,9 +69,11 @@ class Rasterizer:
         self.pool = BufferPool(device)
         self.capacity = capacity
         self.bands = 1
+        self.rounds = 1  # in which the lists of tiles are drawn, where the shape limits a round
         self.max_capacity = device.max_binding // _RECORD_BYTES
         self._flags_scan = Scan(device, self.pool, "visible", "flags")
-        self._offset_scan = Scan(device, self.pool, "offsets", "gather")
+        # A number of intersections that no buffer holds must not come back as a small one.
+        self._offset_scan = Scan(device, self.pool, "offsets", "gather", saturating=True)
         self._depth_sort = RadixSort(device, self.pool, "depth sort", lane_runs=self.shape.lane_runs)
         self._tile_sort = RadixSort(device, self.pool, "tile sort", lane_runs=self.shape.lane_runs)
         self._drawn: _Drawn | None = None
@@ -88,34 +94,43 @@ class Rasterizer:
 
         The picture is valid once `grow` has returned False.
         """
-        self._drawn = _Drawn(gaussians, camera, background, depth)
+        self._drawn = drawn = _Drawn(gaussians, camera, background, depth)
+        if self.shape.round_splats:
+            rows, columns = -(-camera.height // self.shape.tile_height), -(-camera.width // self.shape.tile_width)
+            self.bands = max(self.bands, -(-rows // max(1, MOST_TILES // columns)))
         planes = 5 if depth else 4
         image = self.pool.get("image", 4 * planes * camera.width * camera.height)
         self.pool.get("needed", 256 * self.bands)
         for band in range(self.bands):
             with Commands(self.device, profile) as commands:
-                self._draw_band(commands, self._drawn, band)
+                self._draw_band(commands, drawn, band)
         return image
 
     def grow(self) -> bool:
         """Wait for the last draw and see whether its intersections fitted. Where they did not, the buffers are made
-        larger, or the image is cut into more bands of tile rows, and True says that it has to be drawn again."""
-        return self.fit([int(n[0]) for n in read_all(self.needed_requests())])
+        larger, or the image is cut into more bands of tile rows, or its tiles are drawn in more rounds, and True says
+        that it has to be drawn again."""
+        return self.fit(read_all(self.needed_requests()))
 
     def needed_requests(self) -> list[Request]:
-        """What to read to know the last draw's number of intersections, a band at a time (for `read_all`)."""
-        return [(self._needed(band), "uint32", (1,), 0) for band in range(self.bands)]
+        """What to read to know the last draw's number of intersections, which comes first, and whether it asks for more
+        rounds, a band at a time (for `read_all`)."""
+        return [(self._needed(band), "uint32", (3,), 0) for band in range(self.bands)]
 
-    def fit(self, needed: list[int]) -> bool:
+    def fit(self, counts: list[NDArray[np.uint32]]) -> bool:
         """`grow`, from numbers that were already read."""
         assert self._drawn is not None
+        needed = [int(count[0]) for count in counts]
         most = max(needed)
         if most <= self.capacity:
-            return False
+            if not any(count[2] for count in counts):
+                return False
+            self.rounds *= 2
+            return True
         if most > self.max_capacity:
             rows = -(-self._drawn.camera.height // self.shape.tile_height)
             if self.bands >= rows:
-                raise MemoryError(
+                raise DeviceMemoryError(
                     f"one row of tiles holds {most} intersections, but the device's bindings hold {self.max_capacity}"
                 )
             self.bands = min(rows, max(self.bands + 1, -(-5 * sum(needed) // (4 * self.max_capacity))))
@@ -123,7 +138,7 @@ class Rasterizer:
         return True
 
     def _needed(self, band: int) -> Buffer:
-        return self.pool.get(f"needed {band}", 4)
+        return self.pool.get(f"needed {band}", 16)
 
     def _draw_band(self, commands: Commands, drawn: _Drawn, band: int) -> None:
         device, pool, shape = self.device, self.pool, self.shape
@@ -134,6 +149,8 @@ class Rasterizer:
         tile_counts = pool.get("tile counts", 4 * n)
         ranges = pool.get("ranges", 16 * max(1, tiles))
         visible, needed = pool.get("visible", 4), self._needed(band)
+        if shape.round_splats:
+            commands.clear(needed)
         length = pool.constant("gaussians", n.to_bytes(4, "little"))
         ids, keys, prefix = (pool.get(name, 4 * n) for name in ("ids", "depth keys", "prefix"))
 
@@ -197,16 +214,24 @@ class Rasterizer:
             tile_keys_singly=sorted_keys,
             ranges=ranges,
         )
-        commands.dispatch(
-            Kernel.get(device, "rasterize", **shape.raster_defines(depth=drawn.depth)),
-            tiles,
-            frame=frame,
-            ranges=ranges,
-            slots=slots,
-            slot_ids=slot_ids,
-            splats=splats,
-            image=pool.get("image", 0),
-        )
+        for number in range(self.rounds):
+            rounds = {"CONTINUED": number > 0, "LAST_ROUND": number == self.rounds - 1} if shape.round_splats else {}
+            commands.dispatch(
+                Kernel.get(
+                    device,
+                    "rasterize",
+                    **shape.raster_defines(depth=drawn.depth),
+                    **{name: 1 for name, on in rounds.items() if on},
+                ),
+                tiles,
+                frame=frame,
+                ranges=ranges,
+                slots=slots,
+                slot_ids=slot_ids,
+                splats=splats,
+                image=pool.get("image", 0),
+                **({"needed": needed} if shape.round_splats else {}),
+            )
         drawn.sorted_ids, drawn.slots = sorted_ids, slots
 
     def _color(self, commands: Commands, drawn: _Drawn, frame: Buffer, splats: Buffer, tile_counts: Buffer) -> None:
@@ -294,25 +319,42 @@ class Rasterizer:
     def _backward_band(self, commands: Commands, drawn: _Drawn, band: int, d_image: Buffer, d_splats: Buffer) -> None:
         device, pool, n = self.device, self.pool, drawn.gaussians.count
         records = pool.get("records", _RECORD_BYTES * self.capacity)
-        record_tails = pool.get("record tails", (8 if drawn.depth else 4) * self.capacity)
+        tails_size = (2 if drawn.depth else 1) * self.capacity
+        pixels = drawn.camera.width * drawn.camera.height if self.rounds > 1 else 0
+        record_tails = pool.get("record tails", 4 * tails_size + 8 * pixels)
         gather = Kernel.get(device, "gather_gradients", **({"DEPTH": 1} if drawn.depth else {}))
         tails = {}
         if drawn.depth:
             tails["tails"] = pool.constant("tails", gather.uniform("Tails", depth=self.capacity))
         splats = pool.get("splats", 0)
-        commands.dispatch(
-            Kernel.get(device, "rasterize_bwd", **self.shape.raster_defines(depth=drawn.depth)),
-            self._band_tiles(drawn, band),
-            frame=self._frame(drawn, band),
-            ranges=pool.get("ranges", 0),
-            slots=drawn.slots,
-            slot_ids=pool.get("slot ids", 0),
-            splats=splats,
-            image=pool.get("image", 0),
-            d_image=d_image,
-            records=records,
-            record_tails=record_tails,
+        kernel = Kernel.get(
+            device,
+            "rasterize_bwd",
+            **self.shape.raster_defines(depth=drawn.depth),
+            **({"ROUNDS": 1} if self.rounds > 1 else {}),
         )
+        if self.rounds > 1:
+            commands.clear(records)
+            commands.clear(record_tails)
+        for number in range(self.rounds):
+            piece = {}
+            if self.rounds > 1:
+                uniform = kernel.uniform("Piece", number=number, state=tails_size)
+                piece["piece"] = pool.constant(f"piece {number}", uniform)
+            commands.dispatch(
+                kernel,
+                self._band_tiles(drawn, band),
+                frame=self._frame(drawn, band),
+                ranges=pool.get("ranges", 0),
+                slots=drawn.slots,
+                slot_ids=pool.get("slot ids", 0),
+                splats=splats,
+                image=pool.get("image", 0),
+                d_image=d_image,
+                records=records,
+                record_tails=record_tails,
+                **piece,
+            )
         commands.dispatch(
             gather,
             _groups(n),

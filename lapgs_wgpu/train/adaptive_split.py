@@ -28,17 +28,26 @@ def adaptive_split(rows: Mapping[str, Tensor], candidates: Tensor, config: Densi
     """(N,) bool: the candidates whose score tau reaches a quantile of all candidates' scores, and the outliers in d.
 
     rows: means (N, 3), log_scales (N, 3), quats (N, 4) wxyz, dynamics (N, 16); without dynamics (an ablation) there are
-    no outliers. candidates: (N,) bool.
+    no outliers. candidates: (N,) bool. A Gaussian with values that are not finite is never split.
     """
     of = candidates.nonzero()[:, 0]
     if len(of) == 0:
         return candidates
+    sound = torch.stack([row.isfinite().flatten(1).all(dim=1) for row in _looked_at(rows).values()]).all(dim=0)
+    if not bool(sound.all()):  # which neither have neighbours nor are any
+        split = torch.zeros_like(candidates)
+        split[sound] = adaptive_split({name: row[sound] for name, row in rows.items()}, candidates[sound], config)
+        return split
     scores = split_scores(rows, of, config.neighbours, config.divergence_weight)
     split = torch.zeros_like(candidates)
     split[of] = scores >= torch.quantile(scores, config.split_quantile)
     if "dynamics" in rows:
         split |= candidates & outliers(rows["dynamics"])
     return split
+
+
+def _looked_at(rows: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    return {name: rows[name] for name in ("means", "log_scales", "quats", "dynamics") if name in rows}
 
 
 def split_scores(rows: Mapping[str, Tensor], of: Tensor, count: int, divergence_weight: float) -> Tensor:

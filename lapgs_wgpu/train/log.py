@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import platform
 import subprocess
 import sys
@@ -59,10 +60,13 @@ class Log:
     def step(
         self, step: int, loss: float, psnr: float, gaussians: int, spectrum: LaplacianMotion | None = None
     ) -> None:
-        """Take in a step that is done (counted from 1)."""
+        """Take in a step that is done (counted from 1); the loss of one that was skipped does not count."""
         now = time.perf_counter()
-        self._recent.append((loss, psnr))
+        if math.isfinite(loss) and math.isfinite(psnr):
+            self._recent.append((loss, psnr))
         self._times.append(now)
+        if not self._recent:
+            return
         rate = (len(self._times) - 1) / max(now - self._times[0], 1e-9)
         last = step == self._steps
         if step % INTERVAL == 0 or last:
@@ -88,6 +92,11 @@ class Log:
             )
             self._terminal.write(f"\r\x1b[2K{text}" if on_terminal else f"{text}\n")
             self._terminal.flush()
+
+    def tell(self, text: str) -> None:
+        """A line of its own on the terminal."""
+        self._terminal.write(f"\r\x1b[2K{text}\n" if self._terminal.isatty() else f"{text}\n")
+        self._terminal.flush()
 
 
 def _continued(path: Path, done: int) -> tuple[TextIO, float]:

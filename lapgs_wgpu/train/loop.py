@@ -10,7 +10,7 @@ from pathlib import Path
 from types import FrameType
 
 from lapgs_wgpu.data.views import Dataset
-from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.errors import DeviceError, InputError, NumericalError
 from lapgs_wgpu.gpu.device import Device, open_device
 from lapgs_wgpu.io.first_look import FirstLook
 from lapgs_wgpu.motion.scene import Scene4D
@@ -20,6 +20,7 @@ from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.lpips import Lpips
 from lapgs_wgpu.train.memory import keep_freed_memory
 from lapgs_wgpu.train.run_folder import (
+    STATE,
     check_run_folder,
     drop_states,
     load_state,
@@ -49,7 +50,8 @@ def train(
     device: the default adapter where None. The same configuration, pictures, adapter and driver give the same
     checkpoint to the last byte, watched or not, interrupted and resumed or not. Raises InputError before anything is
     written where the input is not usable, and KeyboardInterrupt after Ctrl-C or SIGTERM, when checkpoint and state of
-    the last whole step have been written.
+    the last whole step have been written. DeviceError, NumericalError and whatever else ends a step go on to the caller
+    when that state has been written.
     """
     out = Path(out)
     check_run_folder(out, overwrite=overwrite)
@@ -115,12 +117,32 @@ def _steps(training: Training, log: Log, out: Path, interrupted: threading.Event
     try:
         while training.done < schedule.steps and not interrupted.is_set():
             progress = training.step()
+            if progress.skipped is not None:
+                log.tell(str(progress.skipped))
             log.step(progress.step, progress.loss, progress.psnr, len(training.scene), training.scene.spectrum)
             yield progress
             if schedule.save_interval and training.done % schedule.save_interval == 0 < schedule.steps - training.done:
                 save_state(out, training.state())
+    except (DeviceError, NumericalError, MemoryError) as error:
+        raise type(error)(f"{error}{_saved(training, out)}") from error
+    except Exception:
+        _saved(training, out)
+        raise
     finally:
         training.close()
+
+
+def _saved(training: Training, out: Path) -> str:
+    """Save the state of a training that cannot go on, if it has one worth saving; what a user should know of it."""
+    if training.whole and training.done:
+        try:
+            save_state(out, training.state())
+        except InputError as error:  # no second trouble instead of the first
+            return f" (and {error})"
+        return f"; stopped after step {training.done}, from which lapgs-train --resume {out} goes on."
+    if (out / STATE).exists():
+        return f"; lapgs-train --resume {out} goes on from the state that was saved last."
+    return "; nothing was saved yet."
 
 
 def evaluate_run(

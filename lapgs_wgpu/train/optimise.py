@@ -39,6 +39,14 @@ class Optimiser:
         """Forget the gradients."""
         self._adam.zero_grad(set_to_none=True)
 
+    def parameters(self) -> dict[str, list[Tensor]]:
+        """All that it moves, by group."""
+        return {group["name"]: list(group["params"]) for group in self._adam.param_groups}
+
+    def gradients(self) -> dict[str, list[Tensor]]:
+        """Of those parameters that have one, by group."""
+        return {name: [p.grad for p in group if p.grad is not None] for name, group in self.parameters().items()}
+
     def step(self, step: int) -> None:
         """Move every parameter that has a gradient, at the rates of this step (counted from 1)."""
         for group in self._adam.param_groups:
@@ -100,6 +108,19 @@ class FrequencyOptimiser:
         self._mean = torch.zeros_like(motion.frequencies)
         self._square = 0.0
         self._steps = 0
+
+    def parameters(self) -> dict[str, list[Tensor]]:
+        """The frequencies."""
+        return {"frequencies": [self._motion.frequencies]}
+
+    def gradients(self) -> dict[str, list[Tensor]]:
+        """The frequencies' gradient, if they have one."""
+        gradient = self._motion.frequencies.grad
+        return {} if gradient is None else {"frequencies": [gradient]}
+
+    def zero_grad(self) -> None:
+        """Forget it."""
+        self._motion.frequencies.grad = None
 
     @torch.no_grad()
     def step(self, step: int) -> None:

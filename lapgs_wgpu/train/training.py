@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -12,30 +13,35 @@ from torch import Tensor
 
 from lapgs_wgpu.data.init import first_points, initial_scales
 from lapgs_wgpu.data.views import Dataset
+from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.dynamics import dynamics_loss
 from lapgs_wgpu.motion.field import Nearby
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.config import Config, PointsConfig, SmoothnessConfig
 from lapgs_wgpu.train.densify import Statistics, densify, reset_opacities
+from lapgs_wgpu.train.health import Health, Skipped, check_parameters, describe, finite
 from lapgs_wgpu.train.optimise import FrequencyOptimiser, Optimiser
 from lapgs_wgpu.train.pictures import Pictures
-from lapgs_wgpu.train.render_loss import render_loss
+from lapgs_wgpu.train.render_loss import RenderLoss, render_loss
 
 MAX_SH_DEGREE = 3
 
 
 class Progress(NamedTuple):
-    """A step that is done, of how many in all; loss, and PSNR in dB, of the view that it saw."""
+    """A step that is done, of how many in all; loss, and PSNR in dB, of the view that it saw. skipped: where its values
+    were not finite, so that it moved nothing."""
 
     step: int
     steps: int
     loss: float
     psnr: float
+    skipped: Skipped | None = None
 
 
 class Training:
-    """A training between two of its steps. done: the steps so far."""
+    """A training between two of its steps. done: the steps so far. whole: whether `state` is that of a whole step,
+    which it also is where `step` raised an error before anything that lasts had changed."""
 
     def __init__(self, config: Config, dataset: Dataset, device: Device) -> None:
         self.config = config
@@ -49,6 +55,7 @@ class Training:
             seed=config.seed,
         )
         self._start(dataset)
+        self.whole = True
 
     def _start(self, dataset: Dataset) -> None:
         config, scene = self.config, self.scene
@@ -61,6 +68,7 @@ class Training:
         # Cameras that all stand at one place have no extent; the scene's own size must serve.
         self._extent = dataset.extent or config.points.box
         self._statistics = Statistics(len(scene), scene.parameters["means"].device)
+        self._health = Health()
         data = config.data
         self._pictures = Pictures(dataset.train, data.background, data.cache_gb, self._generator, scene.device)
 
@@ -69,10 +77,26 @@ class Training:
         self._pictures.close()
 
     def step(self) -> Progress:
-        """One step of the optimiser, on one picture."""
+        """One step of the optimiser, on one picture.
+
+        A step whose loss or gradients are not finite moves nothing: parameters, the optimisers' and the density
+        control's state stay as they were; what the schedule plans for this step is done. Raises NumericalError where
+        too many are skipped, or where a parameter is not finite, and DeviceError.
+        """
+        random, order = self._generator.get_state(), list(self._pictures.order)
+        try:
+            return self._step()
+        except Exception:
+            if self.whole:  # the device gave out: as if the step had not begun
+                self._generator.set_state(random)
+                self._pictures.order = order
+            raise
+
+    def _step(self) -> Progress:
         config, scene, optimiser = self.config, self.scene, self._optimiser
         step = self.done + 1
         view, truth, background = self._pictures.draw()
+        drawn = self._generator.get_state()
         moving = step > config.schedule.warm_up
         if moving:
             nearby = draw_nearby(config.smoothness, len(scene), view.time, self._generator)
@@ -89,18 +113,47 @@ class Training:
             loss = loss + config.loss.dynamics * spread
         optimiser.zero_grad()
         loss.backward()
-        optimiser.step(step)
-        if self._frequencies is not None:
-            self._frequencies.step(step)
-
-        # After the optimiser's step, so that no gradient is lost with the rows that change.
-        if step < config.density.stop:
-            self._statistics.add(rendering, view.camera)
+        value = loss.item()
+        skipped = self._examine(rendering, value, step, view.name)
+        self.whole = False
+        if skipped is None:
+            optimiser.step(step)
+            if self._frequencies is not None:
+                self._frequencies.step(step)
+            # After the optimiser's step, so that no gradient is lost with the rows that change.
+            if step < config.density.stop:
+                self._statistics.add(rendering, view.camera)
+        else:
+            self._generator.set_state(drawn)
+            optimiser.zero_grad()
+            if self._frequencies is not None:
+                self._frequencies.zero_grad()
         self._change_density(step)
         if step % config.schedule.sh_interval == 0:
             scene.sh_degree = min(scene.sh_degree + 1, MAX_SH_DEGREE)
         self.done = step
-        return Progress(step, config.schedule.steps, loss.item(), rendering.psnr)
+        self.whole = True
+        self._health.note(skipped)
+        return Progress(step, config.schedule.steps, value, rendering.psnr, skipped)
+
+    def _examine(self, rendering: RenderLoss, loss: float, step: int, view: str) -> Skipped | None:
+        """Whether the step of these gradients is to be skipped, and why. Raises NumericalError for a parameter, whose
+        values a step cannot mend."""
+        parameters, gradients = self._optimiser.parameters(), self._optimiser.gradients()
+        if self._frequencies is not None:
+            parameters |= self._frequencies.parameters()
+            gradients |= self._frequencies.gradients()
+        if rendering.means2d.grad is not None:
+            gradients["the places in the image"] = [rendering.means2d.grad]
+        if math.isfinite(loss) and finite(parameters, gradients):
+            return None
+        self.whole = False
+        check_parameters(parameters)
+        self.whole = True
+        terms = [f"the loss term {name} is {value}" for name, value in rendering.terms.items() if value - value != 0]
+        terms = terms or ([] if math.isfinite(loss) else [f"the loss is {loss}"])
+        what = [*terms, *describe("gradient", gradients)] or ["the gradients together are too large"]
+        return Skipped(step, view, "; ".join(what))
 
     def _change_density(self, step: int) -> None:
         density, scene = self.config.density, self.scene
@@ -113,6 +166,10 @@ class Training:
                 self._generator,
                 bound_sizes=step > density.reset_interval,
             )
+            if not change.keep.any() and len(change.added["means"]) == 0:
+                raise InputError(
+                    f"density control leaves no Gaussian at step {step}; lower density.min_opacity or density.gradient."
+                )
             self._optimiser.edit_rows(change.keep, change.added)
             self._statistics = Statistics(len(scene), scene.parameters["means"].device)
         if density.resets_at(step):

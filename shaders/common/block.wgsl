@@ -5,6 +5,14 @@ const LANE_ITEMS = BLOCK_ITEMS / BLOCK_LANES;
 
 var<workgroup> lane_sums: array<u32, BLOCK_LANES>;
 
+fn plus(a: u32, b: u32) -> u32 {
+#ifdef SATURATING
+    return select(a + b, 0xffffffffu, a + b < a);
+#else
+    return a + b;
+#endif
+}
+
 // Exclusive prefix sum of one value a lane; the total of the workgroup goes to lane_sums[BLOCK_LANES - 1].
 fn workgroup_scan(lane: u32, value: u32) -> u32 {
     lane_sums[lane] = value;
@@ -12,7 +20,7 @@ fn workgroup_scan(lane: u32, value: u32) -> u32 {
     for (var step = 1u; step < BLOCK_LANES; step *= 2u) {
         var sum = lane_sums[lane];
         if (lane >= step) {
-            sum += lane_sums[lane - step];
+            sum = plus(sum, lane_sums[lane - step]);
         }
         workgroupBarrier();
         lane_sums[lane] = sum;

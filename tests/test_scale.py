@@ -1,0 +1,213 @@
+"""Much of everything: splats in one tile, tiles, intersections, workgroups, Gaussians; and none, or one.
+
+Mesa's software driver ends a shader without a word when all loops of an invocation together have turned 65,535 times.
+What is large runs with LAPGS_SOAK=1 alone (`make soak`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import resource
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scenes import front_camera, random_scene
+from test_train import configure
+from torch import Tensor
+
+from lapgs_wgpu.data import Dataset, load_dataset
+from lapgs_wgpu.data.synthetic import write_synthetic
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.motion.playback import open_playback
+from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.splat.rasterize import rasterize, upload_gaussians
+from lapgs_wgpu.splat.rasterizer import Rasterizer
+from lapgs_wgpu.splat.shape import raster_shape
+from lapgs_wgpu.train.loop import train
+
+soak = pytest.mark.skipif(os.environ.get("LAPGS_SOAK") != "1", reason="large: LAPGS_SOAK=1 runs it")
+Use = Callable[[Rasterizer], Rasterizer]
+TILE = Camera(np.array([[40.0, 0, 4], [0, 40, 4], [0, 0, 1]]), np.eye(4), 8, 8)
+ALPHA = 0.0042
+
+
+def pile(count: int) -> dict[str, Tensor]:
+    """Faint Gaussians of less than a pixel behind each other in one tile, at its 64 pixels in turn."""
+    i = torch.arange(count)
+    z = 2 + i.float() / count
+    places = torch.stack([i % 8 - 3.5, i // 8 % 8 - 3.5], dim=1) / 40 * z[:, None]
+    return {
+        "means": torch.cat([places, z[:, None]], dim=1),
+        "quats": torch.tensor([1.0, 0, 0, 0]).repeat(count, 1),
+        "scales": torch.full((count, 3), 1e-4),
+        "opacities": torch.full((count,), ALPHA),
+        "colors": torch.ones(count, 3) * (i[:, None] % 3 == torch.arange(3)),
+    }
+
+
+def drawn(scene: dict[str, Tensor], camera: Camera, device: Device, *, depth: bool = True) -> dict[str, Tensor]:
+    """Outputs, and gradients of a weighted sum of the picture."""
+    leaves = {name: value.clone().requires_grad_() for name, value in scene.items()}
+    out = rasterize(**leaves, camera=camera, depth=depth, device=device)
+    weights = torch.linspace(-1, 1, out.image.numel()).view_as(out.image)
+    ((out.image * weights).sum() + out.alpha.sum()).backward()
+    gradients = {f"d {name}": leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
+    return {"image": out.image.detach(), "alpha": out.alpha.detach(), **gradients}
+
+
+def check_pile(count: int, device: Device) -> None:
+    """Against what follows from the formulas: no pixel stops, and its splats differ in nothing but colour."""
+    found = drawn(pile(count), TILE, device)
+    each = -(-count // 64)
+    order = torch.arange(count) // 64
+    weights = ALPHA * (1 - ALPHA) ** order.double()
+    stop = weights * (1 - ALPHA) / ALPHA <= 1e-4
+    weights = torch.where(stop, 0.0, weights)
+    picture = torch.zeros(64, 3, dtype=torch.float64)
+    picture.index_add_(0, torch.arange(count) % 64, weights[:, None] * pile(count)["colors"].double())
+    assert each * 64 >= count
+    assert (found["image"].reshape(64, 3) - picture).abs().max() < 2e-3 * picture.max()
+    # The gradient by colour is the splat's weight times the pixel's.
+    d_image = torch.linspace(-1, 1, 192).view(64, 3).double()
+    expected = weights[:, None] * d_image[torch.arange(count) % 64]
+    assert (found["d colors"] - expected).abs().max() < 2e-3 * ALPHA
+    assert torch.equal(found["d colors"] != 0, expected != 0)
+
+
+@pytest.mark.kernels
+def test_lists_beyond_a_round_are_drawn_in_more(device: Device, use: Use) -> None:
+    shape = raster_shape(device)
+    if not shape.round_splats:
+        pytest.skip("this device has no rounds")
+    rasterizer = use(Rasterizer(device))
+    check_pile(5000 if shape.round_splats < 5000 else 40_000, device)
+    assert rasterizer.rounds > 1
+
+
+@pytest.mark.kernels
+@pytest.mark.parametrize("depth", [False, True])
+def test_rounds_change_no_bit(depth: bool, device: Device, use: Use, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Many short rounds, with other tiles that are done long before, in bands and at once."""
+    if not raster_shape(device).round_splats:
+        pytest.skip("this device has no rounds")
+    scene, camera = random_scene(400, 3, size=0.3), front_camera(45, 37)
+    scene["means"][:, 2] += 4
+    scene["opacities"] *= 0.3
+    use(Rasterizer(device))
+    expected = drawn(scene, camera, device, depth=depth)
+    short = dataclasses.replace(raster_shape(device), round_splats=16)
+    for bands in (1, 2):
+        rasterizer = use(Rasterizer(device, shape=short))
+        rasterizer.bands = bands
+        found = drawn(scene, camera, device, depth=depth)
+        assert rasterizer.rounds >= 8
+        for name in ("image", "alpha"):
+            assert torch.equal(found[name], expected[name]), name
+        for name, value in expected.items():
+            assert torch.allclose(found[name], value, rtol=1e-4, atol=1e-5 * float(value.abs().max())), name
+        if bands == 1:
+            assert all(torch.equal(found[name], value) for name, value in expected.items())
+
+
+@pytest.mark.kernels
+def test_large_images_are_cut_so_that_a_splat_has_few_enough_tiles(
+    device: Device, use: Use, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not raster_shape(device).round_splats:
+        pytest.skip("this device has no limit")
+    scene, camera = random_scene(50, 3), front_camera(64, 64)
+    expected = drawn(scene, camera, device)
+    monkeypatch.setattr("lapgs_wgpu.splat.rasterizer.MOST_TILES", 20)
+    rasterizer = use(Rasterizer(device))
+    found = drawn(scene, camera, device)
+    assert rasterizer.bands == 4
+    assert max(rasterizer._band_tiles(rasterizer._drawn, band) for band in range(4)) <= 20  # type: ignore[arg-type]
+    assert torch.equal(found["image"], expected["image"])
+
+
+@pytest.mark.kernels
+@pytest.mark.parametrize("count", [0, 1])
+def test_none_or_one_through_losses_and_gradients(count: int, device: Device) -> None:
+    scene = random_scene(count, 3, size=1.0)
+    scene["means"][:] = torch.tensor([0.0, 0.0, 3.0])
+    found = drawn(scene, front_camera(20, 12), device)
+    assert all(value.isfinite().all() for value in found.values())
+    assert found["d means"].shape == (count, 3)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    return load_dataset(write_synthetic(tmp_path_factory.mktemp("data") / "s", size=16, train_views=4, test_views=1))
+
+
+def test_a_training_from_one_gaussian(dataset: Dataset, device: Device, tmp_path: Path) -> None:
+    few = {"points__count": "1", "schedule__steps": "12", "density__start": "100"}
+    assert len(train(configure(**few), dataset, tmp_path / "run", device=device)) == 1
+    assert open_playback(tmp_path / "run" / "checkpoint.ply", device).count == 1
+
+
+def test_a_training_that_loses_all_gaussians_says_so(dataset: Dataset, device: Device, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"density control leaves no Gaussian at step \d+; lower density\.min_opacity"):
+        train(configure(density__min_opacity="0.999"), dataset, tmp_path / "run", device=device)
+
+
+@pytest.mark.kernels
+def test_a_number_of_intersections_beyond_32_bits_is_not_taken_for_a_small_one(device: Device) -> None:
+    count, rasterizer = 140_000, Rasterizer(device)
+    filling = [torch.zeros(count, 3), torch.ones(count, 4), torch.full((count, 3), 50.0), torch.ones(count)]
+    filling[0][:, 2] = 2.0
+    gaussians = upload_gaussians(rasterizer.pool, [*filling, torch.ones(count, 3)], None)
+    rasterizer.draw(gaussians, front_camera(2048, 2048, focal=2000.0))
+    assert all(buffer.read(*rest)[0] == 0xFFFFFFFF for buffer, *rest in rasterizer.needed_requests())
+
+
+# What takes long
+
+
+def peak_gb() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+
+
+@soak
+def test_a_hundred_thousand_splats_in_one_tile(device: Device, use: Use) -> None:
+    rasterizer = use(Rasterizer(device))
+    check_pile(100_000, device)
+    print(f"rounds {rasterizer.rounds}")
+
+
+@soak
+def test_a_thousand_gaussians_over_the_whole_screen(device: Device, use: Use) -> None:
+    """10 million intersections: in bands."""
+    rasterizer = use(Rasterizer(device))
+    start = time.perf_counter()
+    scene = {
+        "means": torch.cat([torch.zeros(1000, 2), torch.linspace(2, 3, 1000)[:, None]], dim=1),
+        "quats": torch.tensor([1.0, 0, 0, 0]).repeat(1000, 1),
+        "scales": torch.full((1000, 3), 50.0),
+        "opacities": torch.full((1000,), 0.01),
+        "colors": torch.ones(1000, 3),
+    }
+    found = drawn(scene, front_camera(800, 800, focal=800.0), device, depth=False)
+    transmittance = max((1 - 0.01) ** 1000, 0.0)
+    assert rasterizer.bands > 1
+    assert (found["alpha"] - (1 - transmittance)).abs().max() < 1e-3
+    print(f"{time.perf_counter() - start:.1f} s, bands {rasterizer.bands}, {peak_gb():.2f} GB")
+
+
+@soak
+@pytest.mark.parametrize("size", [(3840, 2160)])
+def test_two_million_gaussians_on_a_4k_picture(size: tuple[int, int], device: Device, use: Use) -> None:
+    rasterizer = use(Rasterizer(device))
+    start = time.perf_counter()
+    scene = random_scene(2_000_000, 5, size=0.002)
+    scene["means"][:, 2] += 5
+    found = drawn(scene, front_camera(*size, focal=3000.0), device, depth=False)
+    assert all(value.isfinite().all() for value in found.values())
+    assert float(found["alpha"].mean()) > 0.1
+    print(f"{time.perf_counter() - start:.1f} s, bands {rasterizer.bands}, {peak_gb():.2f} GB")
