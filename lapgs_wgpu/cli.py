@@ -17,9 +17,15 @@ if typing.TYPE_CHECKING:
     from lapgs_wgpu.data import Dataset
     from lapgs_wgpu.train.config import Config
     from lapgs_wgpu.train.loop import Watch
+    from lapgs_wgpu.train.ranks import Ranks
 
 # Short names for the keys that are given most often.
-SHORTCUTS = {"data.path": "--data", "schedule.steps": "--steps", "data.cache_gb": "--cache-gb"}
+SHORTCUTS = {
+    "data.path": "--data",
+    "schedule.steps": "--steps",
+    "schedule.batch": "--batch",
+    "data.cache_gb": "--cache-gb",
+}
 SYNTHETIC = "synthetic"
 
 USAGE = "lapgs-train PRESET --data DIR [--out RUN] [--KEY VALUE ...]"
@@ -56,6 +62,7 @@ def _train(arguments: list[str]) -> None:
     from lapgs_wgpu.gpu.device import open_device  # what follows needs torch, which takes seconds to import
     from lapgs_wgpu.train.loop import train
     from lapgs_wgpu.train.presets import config_keys, load_config
+    from lapgs_wgpu.train.ranks import join_ranks
     from lapgs_wgpu.train.run_folder import check_run_folder
 
     given = _parse(arguments)
@@ -70,22 +77,27 @@ def _train(arguments: list[str]) -> None:
         from lapgs_wgpu.viewer import live
 
         watch = live.watch
+    ranks = join_ranks()
     if given["resume"]:
-        _resume(Path(given["resume"]), given, overrides, watch)
+        _resume(Path(given["resume"]), given, overrides, watch, ranks)
         return
     if given["preset"] is None:
         raise InputError("name a preset, such as tiny, and the data to train on; lapgs-train --help says more.")
     ablate = [part.strip() for part in (given["ablate"] or "").split(",") if part.strip()]
     config = load_config(given["preset"], overrides, method=given["field"], ablate=ablate)
     out = Path(given["out"] or f"runs/{_scene_name(config)}-{Path(given['preset']).stem}")
-    check_run_folder(out, overwrite=given["overwrite"])
-    device = open_device(given["device"])
-    config, dataset = _open_data(config, out.parent / SYNTHETIC)
-    train(config, dataset, out, device=device, overwrite=given["overwrite"], watch=watch)
-    _report(out)
+    if ranks.first:
+        check_run_folder(out, overwrite=given["overwrite"])
+    device = open_device(given["device"], number=ranks.on_machine)
+    config, dataset = _open_data(config, out.parent / SYNTHETIC, ranks)
+    train(config, dataset, out, device=device, overwrite=given["overwrite"], watch=watch, ranks=ranks)
+    if ranks.first:
+        _report(out)
 
 
-def _resume(run: Path, given: dict[str, typing.Any], overrides: dict[str, typing.Any], watch: Watch | None) -> None:
+def _resume(
+    run: Path, given: dict[str, typing.Any], overrides: dict[str, typing.Any], watch: Watch | None, ranks: Ranks
+) -> None:
     from lapgs_wgpu.gpu.device import open_device
     from lapgs_wgpu.train.loop import resume
     from lapgs_wgpu.train.presets import load_config
@@ -99,12 +111,13 @@ def _resume(run: Path, given: dict[str, typing.Any], overrides: dict[str, typing
     if not (run / "config.toml").is_file():
         raise InputError(f"{run / 'config.toml'} does not exist; --resume needs the folder of a run.")
     config = load_config(str(run / "config.toml"))
-    device = open_device(given["device"])
-    config, dataset = _open_data(config, run.parent / SYNTHETIC)
-    for what, before, now in changes_since(run, device, dataset):
+    device = open_device(given["device"], number=ranks.on_machine)
+    config, dataset = _open_data(config, run.parent / SYNTHETIC, ranks)
+    for what, before, now in changes_since(run, device, dataset) if ranks.first else ():
         print(f"lapgs-train: {what} was {before} when {run} began and is {now}: bits may differ.", file=sys.stderr)
-    resume(config, dataset, run, device=device, watch=watch)
-    _report(run)
+    resume(config, dataset, run, device=device, watch=watch, ranks=ranks)
+    if ranks.first:
+        _report(run)
 
 
 def _evaluate(
@@ -150,8 +163,9 @@ def _scene_name(config: Config) -> str:
     return Path(config.data.path).resolve().name or "scene"
 
 
-def _open_data(config: Config, synthetic: Path) -> tuple[Config, Dataset]:
-    """The dataset, and the configuration with the folder in which it lies. synthetic: where the built-in scene goes."""
+def _open_data(config: Config, synthetic: Path, ranks: Ranks | None = None) -> tuple[Config, Dataset]:
+    """The dataset, and the configuration with the folder in which it lies. synthetic: where the built-in scene goes,
+    which the first of several processes writes."""
     import dataclasses
 
     from lapgs_wgpu.data import load_dataset
@@ -162,7 +176,11 @@ def _open_data(config: Config, synthetic: Path) -> tuple[Config, Dataset]:
         raise InputError(f"{path!r} holds characters that config.toml cannot record; rename the folder.")
     if not path:
         raise InputError(f"name the folder of the scene with --data DIR, or take --data {SYNTHETIC}.")
+    if ranks is not None and not ranks.first:
+        ranks.any(False)  # waits until the first has done so
     folder = write_synthetic(synthetic) if path == SYNTHETIC else Path(path)
+    if ranks is not None and ranks.first:
+        ranks.any(False)
     dataset = load_dataset(folder, image_size=config.data.size or None)
     data = dataclasses.replace(config.data, path=str(folder.resolve()))
     return dataclasses.replace(config, data=data), dataset

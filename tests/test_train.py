@@ -259,7 +259,7 @@ def test_overwriting_replaces_a_run_and_nothing_else(dataset: Dataset, device: D
 
 def test_every_picture_is_drawn_once_an_epoch(dataset: Dataset, device: Device) -> None:
     with closing(Pictures(dataset.train, "black", 1.0, torch.Generator().manual_seed(3), device)) as pictures:
-        epochs = [[pictures.draw()[0].name for _ in dataset.train] for _ in range(3)]
+        epochs = [[pictures.choose()[0].name for _ in dataset.train] for _ in range(3)]
     assert all(sorted(epoch) == sorted(view.name for view in dataset.train) for epoch in epochs)
     assert epochs[0] != epochs[1]
 
@@ -271,7 +271,7 @@ def test_memory_and_device_share_one_bound_where_they_are_one(dataset: Dataset, 
         bound = pictures_held * picture / 1e9
         with closing(Pictures(dataset.train, "random", bound, torch.Generator().manual_seed(3), device)) as pictures:
             for _ in range(3 * len(dataset.train)):
-                _, truth, _ = pictures.draw()
+                truth = pictures.on_device(pictures.choose()[0])
                 held = pictures._truths.used_bytes
                 if device.info.kind in ("cpu", "integrated"):
                     assert pictures._cache.max_bytes + pictures._truths.max_bytes <= 1e9 * bound
@@ -285,7 +285,7 @@ def test_pictures_lie_on_their_background(background: str, dataset: Dataset, dev
     """On a fixed background they lie before they are uploaded, on a random one in the loss's first pass."""
     generator = torch.Generator().manual_seed(3)
     with closing(Pictures(dataset.train, background, 1.0, generator, device)) as pictures:  # type: ignore[arg-type]
-        drawn = [pictures.draw() for _ in range(4)]
+        drawn = [(view, pictures.on_device(view), colour) for view, colour in (pictures.choose() for _ in range(4))]
     for view, truth, colour in drawn:
         picture = truth.read("uint8", (32, 32, 4))
         if background == "random":

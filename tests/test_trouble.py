@@ -136,13 +136,13 @@ def test_a_step_that_broke_off_halfway_is_not_saved(
 def test_nothing_is_saved_before_the_first_step(
     dataset: Dataset, doomed: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    original = Pictures.draw
+    original = Pictures.choose
 
-    def draw(self: Pictures) -> Any:
+    def choose(self: Pictures) -> Any:
         doomed.wgpu_device.destroy()
         return original(self)
 
-    monkeypatch.setattr(Pictures, "draw", draw)
+    monkeypatch.setattr(Pictures, "choose", choose)
     with pytest.raises(DeviceLostError, match=r"was lost, .*; nothing was saved yet\."):
         train(configure(), dataset, tmp_path, device=doomed)
     assert not (tmp_path / STATE).exists()

@@ -127,14 +127,18 @@ def _matches(info: DeviceInfo, wanted: str) -> bool:
     return wanted.lower() in (info.kind, info.backend.lower()) or wanted.lower() in info.name.lower()
 
 
-@functools.cache
-def open_device(name: str | None = None) -> Device:
+def open_device(name: str | None = None, *, number: int = 0) -> Device:
     """Open an adapter: by a part of its name, by kind (cpu, integrated, discrete), or the best one.
 
-    name: also taken from the environment variable LAPGS_DEVICE where it is None. One Device a name and process.
+    name: also taken from the environment variable LAPGS_DEVICE where it is None. number: which of several adapters of
+    the best one's kind, counted around where there are fewer. One Device a name and number and process.
     Raises NoAdapterError.
     """
-    name = name or os.environ.get("LAPGS_DEVICE") or None
+    return _open_device(name or os.environ.get("LAPGS_DEVICE") or None, number)
+
+
+@functools.cache
+def _open_device(name: str | None, number: int) -> Device:
     adapters = _adapters()
     if not adapters:
         raise NoAdapterError(f"no Vulkan, Metal or D3D12 adapter was found on this machine: {INSTALL_HINT}")
@@ -142,5 +146,6 @@ def open_device(name: str | None = None) -> Device:
     if not chosen:
         there = ", ".join(f"{info.name!r} ({info.kind})" for info, _ in adapters)
         raise NoAdapterError(f"no adapter matches --device {name!r}; this machine has: {there}")
-    info, adapter = chosen[0]
+    alike = [pair for pair in chosen if pair[0].kind == chosen[0][0].kind]
+    info, adapter = alike[number % len(alike)]
     return Device(adapter, info)

@@ -64,14 +64,16 @@ class PointsConfig:
 class ScheduleConfig:
     """When things happen."""
 
-    steps: int = described("length of the training, one picture a step")
+    steps: int = described("length of the training")
+    batch: int = described("pictures a step, whose gradients are averaged")
     warm_up: int = described("steps at the start during which nothing moves")
     sh_interval: int = described("steps after which the degree of the spherical harmonics grows by one, up to 3")
     save_interval: int = described("steps from one saved state, from which --resume goes on, to the next; 0 for none")
 
     def __post_init__(self) -> None:
-        if self.steps < 1 or self.sh_interval < 1:
-            raise ValueError(f"steps and sh_interval must be at least 1, got {self.steps} and {self.sh_interval}")
+        if min(self.steps, self.batch, self.sh_interval) < 1:
+            given = f"{self.steps}, {self.batch} and {self.sh_interval}"
+            raise ValueError(f"steps, batch and sh_interval must be at least 1, got {given}")
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ are looked at, and dynamics by the adaptive split; whatever else a Gaussian carr
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 import torch
@@ -37,16 +37,23 @@ class Statistics:
         self.views = torch.zeros(count, device=device)
         self.radii = torch.zeros(count, device=device)
 
-    def add(self, rendering: Seen, camera: Camera) -> None:
-        """Take in a rendering after its backward pass."""
+    def add(self, rendering: Seen, camera: Camera, *, scale: float = 1.0) -> None:
+        """Take in a rendering after its backward pass. scale: of its gradients, where its loss had a share in a sum."""
         pixels = rendering.means2d.grad
         if pixels is None:
             raise ValueError("Statistics.add needs a rendering whose means2d have a gradient: call backward() first")
         to_ndc = pixels.new_tensor([camera.width / 2, camera.height / 2])
         visible = rendering.radii > 0
-        self.gradients += torch.where(visible, (pixels * to_ndc).norm(dim=1), 0.0)
+        self.gradients += torch.where(visible, (pixels * (scale * to_ndc)).norm(dim=1), 0.0)
         self.views += visible
         self.radii = torch.maximum(self.radii, rendering.radii.to(self.radii.dtype))
+
+    def merge(self, others: Iterable[Statistics]) -> None:
+        """Take in what others have seen of the same Gaussians, in this order."""
+        for other in others:
+            self.gradients += other.gradients
+            self.views += other.views
+            self.radii = torch.maximum(self.radii, other.radii)
 
     def state(self) -> dict[str, Tensor]:
         """All that was noted."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from types import FrameType
 
@@ -19,6 +19,7 @@ from lapgs_wgpu.train.evaluate import evaluate, write_metrics
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.lpips import Lpips
 from lapgs_wgpu.train.memory import keep_freed_memory
+from lapgs_wgpu.train.ranks import ALONE, Ranks
 from lapgs_wgpu.train.run_folder import (
     STATE,
     check_run_folder,
@@ -43,27 +44,38 @@ def train(
     device: Device | None = None,
     overwrite: bool = False,
     watch: Watch | None = None,
+    ranks: Ranks = ALONE,
 ) -> Scene4D:
     """Train on a dataset, evaluate on its test views, and leave config.toml, log.jsonl, metrics.json, checkpoint.ply
     and eval/ in the folder `out`, which must be new or empty, or hold an earlier run when `overwrite` is set.
 
-    device: the default adapter where None. The same configuration, pictures, adapter and driver give the same
+    device: the default adapter where None. ranks: this process among those that train together; only the first one
+    writes. The same configuration, pictures, adapter and driver give the same
     checkpoint to the last byte, watched or not, interrupted and resumed or not. Raises InputError before anything is
     written where the input is not usable, and KeyboardInterrupt after Ctrl-C or SIGTERM, when checkpoint and state of
     the last whole step have been written. DeviceError, NumericalError and whatever else ends a step go on to the caller
     when that state has been written.
     """
     out = Path(out)
-    check_run_folder(out, overwrite=overwrite)
+    if ranks.first:
+        check_run_folder(out, overwrite=overwrite)
     keep_freed_memory()
-    training = Training(config, dataset, device or open_device())
+    training = Training(config, dataset, device or open_device(), ranks)
+    if not ranks.first:
+        return _assist(training)
     with locked_run_folder(out):
         start_run_folder(out, config, training.scene.device, dataset)
         return _run(training, dataset, out, watch)
 
 
 def resume(
-    config: Config, dataset: Dataset, out: str | Path, *, device: Device | None = None, watch: Watch | None = None
+    config: Config,
+    dataset: Dataset,
+    out: str | Path,
+    *,
+    device: Device | None = None,
+    watch: Watch | None = None,
+    ranks: Ranks = ALONE,
 ) -> Scene4D:
     """Go on with an interrupted training of this configuration and dataset in its run folder, from its last saved
     state, or from the start where it has none. Otherwise as `train`."""
@@ -71,8 +83,8 @@ def resume(
     if (out / "metrics.json").exists():
         raise InputError(f"{out} is finished: there is nothing to resume.")
     keep_freed_memory()
-    training = Training(config, dataset, device or open_device())
-    with locked_run_folder(out):
+    training = Training(config, dataset, device or open_device(), ranks)
+    with locked_run_folder(out) if ranks.first else nullcontext():
         state = load_state(out)
         if state is not None:
             try:
@@ -80,7 +92,25 @@ def resume(
             except (KeyError, RuntimeError, ValueError) as error:
                 reason = f"{type(error).__name__}: {error}".splitlines()[0]
                 raise InputError(f"{out}: its state and its config.toml do not belong together ({reason}).") from error
-        return _run(training, dataset, out, watch)
+        return _run(training, dataset, out, watch) if ranks.first else _assist(training)
+
+
+def _assist(training: Training) -> Scene4D:
+    """Take the steps of a process that is not the first: nothing is written."""
+    with _interruptible() as interrupted:
+        try:
+            while _goes_on(training, interrupted):
+                training.step()
+        finally:
+            training.close()
+    if training.done < training.config.schedule.steps:
+        raise KeyboardInterrupt(f"stopped after step {training.done}.")
+    return training.scene
+
+
+def _goes_on(training: Training, interrupted: threading.Event) -> bool:
+    """Whether a step is left, and no process was interrupted."""
+    return training.done < training.config.schedule.steps and not training.ranks.any(interrupted.is_set())
 
 
 def _run(training: Training, dataset: Dataset, out: Path, watch: Watch | None) -> Scene4D:
@@ -115,7 +145,7 @@ def _steps(training: Training, log: Log, out: Path, interrupted: threading.Event
     """The steps that are left, each logged, and the state saved now and then, until `interrupted` is set."""
     schedule = training.config.schedule
     try:
-        while training.done < schedule.steps and not interrupted.is_set():
+        while _goes_on(training, interrupted):
             progress = training.step()
             if progress.skipped is not None:
                 log.tell(str(progress.skipped))

@@ -55,15 +55,18 @@ class Pictures:
         """End the decoding."""
         self._cache.close()
 
-    def draw(self) -> tuple[View, Buffer, Tensor]:
-        """The next view, its picture on the device (for `render_loss`) and the background (3,) that it lies on."""
+    def choose(self) -> tuple[View, Tensor]:
+        """The next view, and the background (3,) that its picture lies on."""
         if not self.order:
             self.order = torch.randperm(len(self._views), generator=self._generator).tolist()
         view = self._views[self.order.pop(0)]
         coming = (self._views[i] for i in self.order[:AHEAD])
         self._cache.prefetch(each for each in coming if each not in self._truths)
-        colour = torch.rand(3, generator=self._generator) if self._colour is None else self._colour
-        return view, self._truths.get(view, partial(self._cache.get, view)), colour
+        return view, torch.rand(3, generator=self._generator) if self._colour is None else self._colour
+
+    def on_device(self, view: View) -> Buffer:
+        """The picture of a view that `choose` gave, for `render_loss`."""
+        return self._truths.get(view, partial(self._cache.get, view))
 
 
 def _on_background(view: View, colour: NDArray[np.float32]) -> View:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lapgs_wgpu.data.init import first_points, initial_scales
-from lapgs_wgpu.data.views import Dataset
+from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.dynamics import dynamics_loss
@@ -23,13 +23,14 @@ from lapgs_wgpu.train.densify import Statistics, densify, reset_opacities
 from lapgs_wgpu.train.health import Health, Skipped, check_parameters, describe, finite
 from lapgs_wgpu.train.optimise import FrequencyOptimiser, Optimiser
 from lapgs_wgpu.train.pictures import Pictures
+from lapgs_wgpu.train.ranks import ALONE, Ranks
 from lapgs_wgpu.train.render_loss import RenderLoss, render_loss
 
 MAX_SH_DEGREE = 3
 
 
 class Progress(NamedTuple):
-    """A step that is done, of how many in all; loss, and PSNR in dB, of the view that it saw. skipped: where its values
+    """A step that is done, of how many in all; loss, and PSNR in dB, means over its views. skipped: where its values
     were not finite, so that it moved nothing."""
 
     step: int
@@ -39,12 +40,25 @@ class Progress(NamedTuple):
     skipped: Skipped | None = None
 
 
+class _Look(NamedTuple):
+    """A view of a step: on what it lies, and where the field is asked once more."""
+
+    view: View
+    background: Tensor
+    nearby: Nearby | None
+
+
 class Training:
     """A training between two of its steps. done: the steps so far. whole: whether `state` is that of a whole step,
     which it also is where `step` raised an error before anything that lasts had changed."""
 
-    def __init__(self, config: Config, dataset: Dataset, device: Device) -> None:
-        self.config = config
+    def __init__(self, config: Config, dataset: Dataset, device: Device, ranks: Ranks = ALONE) -> None:
+        if config.schedule.batch % ranks.count:
+            raise InputError(
+                f"{ranks.count} processes cannot share {config.schedule.batch} views a step evenly; give --batch "
+                f"{ranks.count}, or a multiple of it."
+            )
+        self.config, self.ranks = config, ranks
         self.done = 0
         self._generator = torch.Generator().manual_seed(config.seed)
         self.scene = Scene4D.from_points(
@@ -77,7 +91,7 @@ class Training:
         self._pictures.close()
 
     def step(self) -> Progress:
-        """One step of the optimiser, on one picture.
+        """One step of the optimiser, on `schedule.batch` pictures, whose losses count as their mean.
 
         A step whose loss or gradients are not finite moves nothing: parameters, the optimisers' and the density
         control's state stay as they were; what the schedule plans for this step is done. Raises NumericalError where
@@ -93,39 +107,41 @@ class Training:
             raise
 
     def _step(self) -> Progress:
-        config, scene, optimiser = self.config, self.scene, self._optimiser
+        config, scene, ranks = self.config, self.scene, self.ranks
         step = self.done + 1
-        view, truth, background = self._pictures.draw()
-        drawn = self._generator.get_state()
         moving = step > config.schedule.warm_up
-        if moving:
-            nearby = draw_nearby(config.smoothness, len(scene), view.time, self._generator)
-            gaussians, smoothness = scene.deformed(view.time, nearby)
-        else:
-            gaussians, smoothness = scene.canonical(), None
-        weights = config.loss.weights(warm=moving)
-        rendering = render_loss(gaussians, view.camera, truth, background, weights, scene.device)
-        loss = rendering.loss
-        if smoothness is not None:
-            loss = loss + smoothness
-        if moving and "dynamics" in scene.parameters:
-            spread = dynamics_loss(scene.parameters["dynamics"], config.loss.dynamics_mode)
-            loss = loss + config.loss.dynamics * spread
-        optimiser.zero_grad()
-        loss.backward()
-        value = loss.item()
-        skipped = self._examine(rendering, value, step, view.name)
+        # Every rank draws the numbers of all views, so that their random streams stay the same.
+        chosen = [self._pictures.choose() for _ in range(config.schedule.batch)]
+        drawn = self._generator.get_state()
+        looks = [_Look(*each, self._nearby(each[0]) if moving else None) for each in chosen]
+
+        self._optimiser.zero_grad()
+        seen = Statistics(len(scene), scene.parameters["means"].device)
+        renderings, totals = [], torch.zeros(2, dtype=torch.float64)
+        for look in looks[ranks.rank :: ranks.count]:
+            loss, rendering = self._loss(look, moving)
+            (loss / len(looks)).backward()
+            seen.add(rendering, look.view.camera, scale=len(looks))
+            renderings.append(rendering)
+            totals += torch.tensor([loss.item(), rendering.psnr], dtype=torch.float64)
+        if ranks.count > 1:
+            self._put_together()
+        loss_sum, psnr_sum = ranks.sums([totals])[0].tolist()
+        value, psnr = loss_sum / len(looks), psnr_sum / len(looks)
+
+        names = ", ".join(look.view.name for look in looks)
+        skipped = self._examine(renderings, value, step, names)
         self.whole = False
         if skipped is None:
-            optimiser.step(step)
+            self._optimiser.step(step)
             if self._frequencies is not None:
                 self._frequencies.step(step)
             # After the optimiser's step, so that no gradient is lost with the rows that change.
             if step < config.density.stop:
-                self._statistics.add(rendering, view.camera)
+                self._statistics.merge(self._seen_by_all(seen))
         else:
             self._generator.set_state(drawn)
-            optimiser.zero_grad()
+            self._optimiser.zero_grad()
             if self._frequencies is not None:
                 self._frequencies.zero_grad()
         self._change_density(step)
@@ -134,26 +150,72 @@ class Training:
         self.done = step
         self.whole = True
         self._health.note(skipped)
-        return Progress(step, config.schedule.steps, value, rendering.psnr, skipped)
+        return Progress(step, config.schedule.steps, value, psnr, skipped)
 
-    def _examine(self, rendering: RenderLoss, loss: float, step: int, view: str) -> Skipped | None:
+    def _nearby(self, view: View) -> Nearby | None:
+        return draw_nearby(self.config.smoothness, len(self.scene), view.time, self._generator)
+
+    def _loss(self, look: _Look, moving: bool) -> tuple[Tensor, RenderLoss]:
+        """The loss of a view, all terms together, and its rendering."""
+        config, scene, view = self.config, self.scene, look.view
+        if moving:
+            gaussians, smoothness = scene.deformed(view.time, look.nearby)
+        else:
+            gaussians, smoothness = scene.canonical(), None
+        weights = config.loss.weights(warm=moving)
+        truth = self._pictures.on_device(view)
+        rendering = render_loss(gaussians, view.camera, truth, look.background, weights, scene.device)
+        loss = rendering.loss
+        if smoothness is not None:
+            loss = loss + smoothness
+        if moving and "dynamics" in scene.parameters:
+            spread = dynamics_loss(scene.parameters["dynamics"], config.loss.dynamics_mode)
+            loss = loss + config.loss.dynamics * spread
+        return loss, rendering
+
+    def _gradients(self) -> dict[str, list[Tensor]]:
+        """By group, of all parameters that have one."""
+        gradients = self._optimiser.gradients()
+        return gradients | (self._frequencies.gradients() if self._frequencies is not None else {})
+
+    def _put_together(self) -> None:
+        """Every rank's gradients become the sums over the ranks."""
+        mine = [gradient for group in self._gradients().values() for gradient in group]
+        for gradient, total in zip(mine, self.ranks.sums(mine), strict=True):
+            gradient.copy_(total)
+
+    def _seen_by_all(self, seen: Statistics) -> list[Statistics]:
+        names = list(seen.state())
+        parts = self.ranks.gather(list(seen.state().values()))
+        found = []
+        for values in zip(*parts, strict=True):
+            one = Statistics(0, values[0].device)
+            one.restore(dict(zip(names, values, strict=True)))
+            found.append(one)
+        return found
+
+    def _examine(self, renderings: list[RenderLoss], loss: float, step: int, views: str) -> Skipped | None:
         """Whether the step of these gradients is to be skipped, and why. Raises NumericalError for a parameter, whose
         values a step cannot mend."""
-        parameters, gradients = self._optimiser.parameters(), self._optimiser.gradients()
+        parameters, gradients = self._optimiser.parameters(), self._gradients()
         if self._frequencies is not None:
             parameters |= self._frequencies.parameters()
-            gradients |= self._frequencies.gradients()
-        if rendering.means2d.grad is not None:
-            gradients["the places in the image"] = [rendering.means2d.grad]
-        if math.isfinite(loss) and finite(parameters, gradients):
+        places = [each.means2d.grad for each in renderings if each.means2d.grad is not None]
+        gradients |= {"the places in the image": places} if places else {}
+        if not self.ranks.any(not (math.isfinite(loss) and finite(parameters, gradients))):
             return None
         self.whole = False
         check_parameters(parameters)
         self.whole = True
-        terms = [f"the loss term {name} is {value}" for name, value in rendering.terms.items() if value - value != 0]
+        terms = [
+            f"the loss term {name} is {value}"
+            for each in renderings
+            for name, value in each.terms.items()
+            if value - value != 0
+        ]
         terms = terms or ([] if math.isfinite(loss) else [f"the loss is {loss}"])
         what = [*terms, *describe("gradient", gradients)] or ["the gradients together are too large"]
-        return Skipped(step, view, "; ".join(what))
+        return Skipped(step, views, "; ".join(what))
 
     def _change_density(self, step: int) -> None:
         density, scene = self.config.density, self.scene
