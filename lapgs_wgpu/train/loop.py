@@ -154,7 +154,8 @@ def _steps(training: Training, log: Log, out: Path, interrupted: threading.Event
             if schedule.save_interval and training.done % schedule.save_interval == 0 < schedule.steps - training.done:
                 save_state(out, training.state())
     except (DeviceError, NumericalError, MemoryError) as error:
-        raise type(error)(f"{error}{_saved(training, out)}") from error
+        kind = MemoryError if not isinstance(error, DeviceError | NumericalError) else type(error)  # numpy has its own
+        raise kind(f"{error}{_saved(training, out)}") from error
     except Exception:
         _saved(training, out)
         raise
