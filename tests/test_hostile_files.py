@@ -1,7 +1,7 @@
 """Files of every format that is read, damaged at random: each is read or refused in one sentence, and nothing else.
 
 A few hundred inputs a format, always the same; LAPGS_FUZZ=10000 takes as many new ones (make soak). What was found so
-far stands at the end as plain tests.
+far stands in test_hostile_found.py as plain tests.
 """
 
 from __future__ import annotations
@@ -106,7 +106,8 @@ def with_table(checkpoint: bytes, change: Callable[[dict[str, Any]], bytes]) -> 
 # PLY -----------------------------------------------------------------------------------------------------------------
 
 WORDS = [
-    b"element vertex 4\n", b"element vertex 999999999999999999\n", b"property double x\n", b"property list uchar int x\n",
+    b"element vertex 4\n", b"element vertex 999999999999999999\n", b"property double x\n",
+    b"property list uchar int x\n",
     b"end_header\n", b"comment lapgs4d v1 safetensors 4\n", b"format ascii 1.0\n", b"obj_info\n", b"f_rest_", b"double",
     b"uchar", b"element empty 999999999999999999\n", b"\r\n", b"lapgs4d", b"{\"a\":", b"\"shape\":[0,9007199254740991]",
     b"safetensors 18446744073709551615", b"packed_position",
@@ -168,12 +169,17 @@ def shown_at_all_times(file: Path, device: Device) -> None:
 # The state of a training ---------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def config() -> Config:
+def short_config() -> Config:
+    """Of a training of five steps."""
     few = {"points.count": "20", "field.width": "4", "field.static.levels": "1", "field.temporal.levels": "1"}
     few |= {"schedule.warm_up": "0", "schedule.steps": "5"}
     grids = {f"field.{name}.{end}": ["4", "4", "4"] for name in ("static", "temporal") for end in ("base", "finest")}
     return load_config("tiny", {**few, **grids})
+
+
+@pytest.fixture(scope="module")
+def config() -> Config:
+    return short_config()
 
 
 @pytest.fixture(scope="module")
@@ -278,7 +284,7 @@ def test_results_of_tables(folder: Path, changes: TreeEdits, edits: ByteEdits) -
     (folder / "results.json").write_bytes(damaged_json(tree, changes, edits))
     results = refused_or(lambda: read_results(folder / "results.json"))
     if results is not None:
-        assert markdown(results).isascii() or True
+        assert markdown(results).startswith("## ")
         write_results(folder, results)
 
 
@@ -289,7 +295,8 @@ def test_finished_runs(
 ) -> None:
     """metrics.json and config.toml of a run folder, where lapgs-table finds them."""
     metrics = {
-        "psnr": 20.0, "ssim": 0.5, "gaussians": 9, "size": [24, 24], "views": [{}], "training": {"steps": 5, "seconds": 1.0}
+        "psnr": 20.0, "ssim": 0.5, "gaussians": 9, "size": [24, 24], "views": [{}],
+        "training": {"steps": 5, "seconds": 1.0}
     }  # fmt: skip
     table: dict[str, Any] = {**dataclasses.asdict(config), "record": {"torch": "2"}}
     (folder / "metrics.json").write_bytes(damaged_json(metrics, changes, edits) if which else json_text(metrics))

@@ -66,7 +66,7 @@ def _read_text(path: PathLike, most: int, language: str) -> str:
         if found.st_size > most:
             raise InputError(f"{path}: cannot be read as {language}: it has {found.st_size} bytes, over {most}.")
         with open(path, "rb") as file:
-            return file.read(most + 1)[:most].decode("utf-8-sig" if language == "JSON" else "utf-8")
+            return file.read(found.st_size).decode("utf-8-sig" if language == "JSON" else "utf-8")
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the path.") from None
     except UnicodeDecodeError as error:
