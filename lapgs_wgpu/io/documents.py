@@ -1,6 +1,6 @@
 """JSON and TOML files from strangers: read, or refused in one sentence, within bounds on memory and time.
 
-JSON takes at most 40 times the file's size in memory. TOML's parser is slow, but our files of it are small.
+JSON takes at most 64 times the file's size in memory. TOML's parser is slow, but our files of it are small.
 """
 
 from __future__ import annotations
