@@ -124,6 +124,7 @@ def _evaluate(
     run: Path, device_name: str | None, overrides: dict[str, str | list[str]], lpips_weights: str | None
 ) -> None:
     from lapgs_wgpu.gpu.device import open_device
+    from lapgs_wgpu.io.documents import read_json
     from lapgs_wgpu.motion.scene import load
     from lapgs_wgpu.train import plots
     from lapgs_wgpu.train.loop import evaluate_run
@@ -139,9 +140,10 @@ def _evaluate(
     config, dataset = _open_data(config, run.parent / SYNTHETIC)
     scene = load(run / "checkpoint.ply", device)
     try:
-        training = json.loads((run / "metrics.json").read_text())["training"]
-    except (OSError, ValueError, KeyError, TypeError):
-        training = {"steps": int(scene.metadata.get("step", 0))}
+        training = read_json(run / "metrics.json")["training"]
+    except (InputError, KeyError, TypeError):
+        step = scene.metadata.get("step", "")
+        training = {"steps": int(step[:15]) if step.isascii() and step.isdigit() else 0}
     evaluate_run(run, scene, dataset, config.data.background, training, lpips)
     if plots.available():
         plots.plot_run(run, scene)

@@ -39,7 +39,9 @@ def guarded(name: str, command: Callable[[list[str]], int | None], arguments: li
         print(f"{name}: {error}", file=sys.stderr)
         return NOT_FINITE
     except OSError as error:  # a full disk, a folder that may not be written to
-        print(f"{name}: {error}.", file=sys.stderr)
+        where = f"{error.filename}: " if error.filename is not None else ""
+        reason = InputError(f"{where}{error.strerror or error}; check the disk's free space, the path and your rights")
+        print(f"{name}: {reason}.", file=sys.stderr)
         return 2
     except KeyboardInterrupt as error:
         print(f"{name}: {str(error) or 'interrupted.'}", file=sys.stderr)

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.buffer import BufferPool
 from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.io.documents import read_toml
 
 if TYPE_CHECKING:
     from lapgs_wgpu.data import View
@@ -47,11 +46,11 @@ def open_capture(checkpoint: Path) -> Capture | None:
     from lapgs_wgpu.data import load_dataset  # not before the first picture
 
     try:
-        data = tomllib.loads((checkpoint.parent / "config.toml").read_text(encoding="utf-8"))["data"]
+        data = read_toml(checkpoint.parent / "config.toml")["data"]
         path, size = Path(data["path"]), int(data["size"])
         if str(path) == SYNTHETIC:
             path = checkpoint.parent.parent / SYNTHETIC
         dataset = load_dataset(path, image_size=size or None)
-    except (OSError, ValueError, KeyError, TypeError, InputError):
+    except (OSError, ValueError, KeyError, TypeError, OverflowError):  # InputError is a ValueError
         return None
     return Capture((*dataset.test, *dataset.train))

@@ -10,13 +10,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.errors import InputError, shown
 from lapgs_wgpu.io.atomic import atomic_write
+from lapgs_wgpu.io.documents import read_json
 
 from .path import CameraPath, KeyFrame, Pose
 
 _OPENGL = np.diag([1.0, -1.0, -1.0])  # camera axes there: x right, y up, z backwards
-_MOST_BYTES = 64 << 20
 _MOST_KEYS = 100_000
 _MOST_SECONDS = 24 * 3600.0
 
@@ -80,18 +80,7 @@ def read_path(file: Path) -> PathFile:
 
     Files without times play the clip once along the path. Raises InputError, which names the file and the field.
     """
-    try:
-        if file.stat().st_size > _MOST_BYTES:
-            raise InputError(f"{file}: is over {_MOST_BYTES >> 20} MiB large, which is no camera path.")
-        text = file.read_text(encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{file}: cannot be read ({error.strerror or error}).") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{file}: is not JSON (byte {error.start} is not UTF-8).") from error
-    try:
-        values = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{file}: is not JSON ({error}).") from error
+    values = read_json(file)
     if not isinstance(values, dict):
         raise InputError(f"{file}: holds {type(values).__name__}, not the object of a camera path.")
     return _Reader(file, values).read()
@@ -105,7 +94,7 @@ class _Reader:
         values = self.values
         kind = values.get("camera_type", "perspective")
         if kind != "perspective":
-            raise self.wrong("camera_type", f"is {kind!r}; only perspective cameras can be drawn")
+            raise self.wrong("camera_type", f"is {shown(kind)}; only perspective cameras can be drawn")
         size = tuple(int(self.number(values, f"render_{side}", 1, 16384)) for side in ("width", "height"))
         fps = self.number(values, "fps", 0.1, 1000.0, 30.0)
         keys = values.get("keyframes", [])
@@ -203,9 +192,9 @@ class _Reader:
         if value is None:
             raise self.wrong(field, "is missing")
         if isinstance(value, bool) or not isinstance(value, int | float):
-            raise self.wrong(field, f"is {str(value)[:40]!r}, not a number")
+            raise self.wrong(field, f"is {shown(value)}, not a number")
         if not low <= value <= high:
-            raise self.wrong(field, f"is {str(value)[:40]}, outside {low:g} to {high:g}")
+            raise self.wrong(field, f"is {shown(value)}, outside {low:g} to {high:g}")
         return float(value)
 
     def wrong(self, field: str, what: str) -> InputError:

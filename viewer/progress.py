@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from contextlib import suppress
 from types import TracebackType
 from typing import TextIO
 
@@ -26,7 +27,7 @@ class Progress:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         if self._terminal.isatty():
-            self._terminal.write("\n")
+            self._tell("\n")
 
     def step(self) -> None:
         """One more is done."""
@@ -38,5 +39,9 @@ class Progress:
             self._shown = now
             minutes, seconds = divmod(round((now - self._start) / self._done * (self._total - self._done)), 60)
             text = f"{self._done}/{self._total} {self._what}  {minutes}:{seconds:02d} left"
-            self._terminal.write(f"\r\x1b[2K{text}" if on_terminal else f"{text}\n")
+            self._tell(f"\r\x1b[2K{text}" if on_terminal else f"{text}\n")
+
+    def _tell(self, text: str) -> None:
+        with suppress(OSError):  # nobody reads it any more, or it goes into a file on a full disk: no reason to stop
+            self._terminal.write(text)
             self._terminal.flush()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,7 +70,21 @@ def write_video(
     Raises InputError where PyAV is missing or the file cannot be written.
     """
     opened = _video_writer()
-    with atomic_write(file) as target, Progress(frames, "frames") as progress, opened(target) as video:
+    with atomic_write(file) as target:
+        sink = _Sink(target)
+        _encode(opened(sink), sink, shots, frames, fps, shoot)
+        sink.check()
+
+
+def _encode(
+    writer: Any,
+    sink: _Sink,
+    shots: Iterator[Shot],
+    frames: int,
+    fps: float,
+    shoot: Callable[[Camera, float], NDArray[np.uint8]],
+) -> None:
+    with Progress(frames, "frames") as progress, writer as video:
         video.init_video_stream("libx264", fps=fps, pixel_format="yuv420p")
         context = video._video_stream.codec_context
         context.options = {"crf": _QUALITY, "preset": "medium"}
@@ -79,7 +93,39 @@ def write_video(
         context.colorspace, context.color_primaries, context.color_trc, context.color_range = 6, 1, 13, 1
         for camera, time in shots:
             video.write_frame(shoot(camera, time))
+            sink.check()
             progress.step()
+
+
+class _Sink:
+    """The file, for PyAV, which must not learn of a full disk: it would encode on in a destructor, and print errors."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self._error: OSError | None = None
+
+    def check(self) -> None:
+        """Raises what has kept the file from being written."""
+        if self._error is not None:
+            raise self._error
+
+    def write(self, data: bytes) -> int:
+        try:
+            if self._error is None:
+                self._file.write(data)
+        except OSError as error:
+            self._error = error
+        return len(data)
+
+    def seek(self, *place: int) -> int:
+        try:
+            return self._file.seek(*place)  # which writes what is still waiting
+        except OSError as error:
+            self._error = self._error or error
+            return 0
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._file, name)
 
 
 def _video_writer() -> Callable[[Any], Any]:

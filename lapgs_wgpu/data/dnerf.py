@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.data.fields import kind, number, read_json, required
+from lapgs_wgpu.data.fields import kind, leads_out, number, read_json, required
 from lapgs_wgpu.data.pictures import PICTURE_SUFFIXES, check_pictures, read_picture, shrunk
 from lapgs_wgpu.data.poses import LARGEST_ENTRY, ROTATION_TOLERANCE, check_rotation, world_to_camera
 from lapgs_wgpu.data.views import Dataset, View
@@ -95,6 +95,11 @@ def _read_split(folder: Path, split: str) -> tuple[float, list[_Frame]]:
         if not isinstance(file_path, str) or not file_path:
             raise InputError(f"{where}: file_path must be the path of a picture, got {kind(file_path)}.")
         suffix = "" if file_path.lower().endswith(PICTURE_SUFFIXES) else ".png"
+        if leads_out(file_path):
+            raise InputError(
+                f"{where}: file_path {kind(file_path)} leads out of the scene's folder; put the pictures, or a link to "
+                "them, into it."
+            )
         picture = folder / (file_path + suffix)
         if not os.path.isfile(picture):  # Path.is_file raises where a name is too long
             raise InputError(f"{picture} does not exist, but {where} names it as its file_path.")

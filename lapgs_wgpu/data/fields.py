@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from pathlib import Path
+import os
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
 import numpy as np
@@ -57,6 +58,15 @@ def vector(value: Any, length: int, name: str, where: str | Path) -> NDArray[np.
     if not isinstance(value, list) or len(value) != length:
         raise InputError(f"{where}: {name} must be a list of {length} numbers, got {kind(value)}.")
     return np.array([finite(entry, name, where) for entry in value])
+
+
+def leads_out(name: str) -> bool:
+    """Whether a file's relative path, on any system, leaves the folder that it is relative to. Links are not followed:
+    whoever made the folder put them there."""
+    return any(
+        bool(system(name).anchor) or ".." in system(os.path.normpath(name)).parts
+        for system in (PurePosixPath, PureWindowsPath)
+    )
 
 
 def kind(value: Any) -> str:

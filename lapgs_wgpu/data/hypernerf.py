@@ -153,8 +153,8 @@ def _times(path: Path, ids: Sequence[str]) -> dict[str, float]:
             raise InputError(f"{path}: {name} must be a JSON object, got {kind(entry)}.")
     field = "time_id" if any("time_id" in entry for entry in entries.values()) else "warp_id"
     values = {}
+    with_it = sum(field in entry for entry in entries.values())
     for name, entry in entries.items():
-        with_it = sum(field in other for other in entries.values())
         hint = f"though {with_it} of {len(entries)} entries have it" if with_it else NEEDED
         value = required(entry, field, f"{path}: {name}", hint)
         if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= LARGEST_ENTRY:

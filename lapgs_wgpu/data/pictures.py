@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +15,10 @@ from lapgs_wgpu.errors import InputError
 
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg")
 PICTURE_FORMATS = ("PNG", "JPEG")  # no other of Pillow's decoders is handed a file
-PICTURE_ERRORS = (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError)  # what Pillow raises
+PICTURE_ERRORS = (  # what Pillow raises; the last five where it takes damage for what the format says
+    OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError,
+    IndexError, KeyError, TypeError, struct.error, zlib.error,
+)  # fmt: skip
 EIGHT_BIT_MODES = {"1", "L", "LA", "P", "PA", "RGB", "RGBA"}
 
 

@@ -51,6 +51,6 @@ class FirstLook(NamedTuple):
                 and np.allclose(camera.T_cam_world[:3, :3] @ camera.T_cam_world[:3, :3].T, np.eye(3), atol=1e-3)
             )
             frames = int(values["frames"])
-        except (KeyError, TypeError, ValueError, AttributeError, OverflowError):
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError):
             return None
         return FirstLook(camera, focus, up / np.linalg.norm(up), max(1, min(frames, 1_000_000))) if usable else None

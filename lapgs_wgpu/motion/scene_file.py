@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import os
 import typing
 from collections.abc import Mapping
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..io.checkpoint import read_checkpoint
+from ..io.documents import parse_json
 from .field import FieldConfig, PlaneConfig, plane_shapes, static_grid, temporal_grids
 from .hashgrid import HashConfig
 
@@ -79,7 +79,7 @@ def row_shapes(config: FieldConfig) -> dict[str, tuple[int, ...]]:
 
 def _read_header(metadata: Mapping[str, str], path: str | os.PathLike[str]) -> tuple[FieldConfig, int]:
     try:
-        values: dict[str, Any] = json.loads(metadata["field"])
+        values: dict[str, Any] = parse_json(metadata["field"], "its text")
         for name in ("static", "temporal"):
             grid: dict[str, Any] = values[name]
             values[name] = HashConfig(grid["levels"], tuple(grid["base"]), tuple(grid["finest"]), grid["table_log2"])
@@ -88,9 +88,10 @@ def _read_header(metadata: Mapping[str, str], path: str | os.PathLike[str]) -> t
         _check_types(config, FieldConfig())
         if not 0 <= degree <= _MAX_DEGREE:
             raise ValueError(f"sh_degree {degree} is outside 0 to {_MAX_DEGREE}")
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        reason = f"{type(error).__name__}: {error}"[:200]
         raise InputError(
-            f"{path}: the checkpoint's description of its field cannot be read ({type(error).__name__}: {error}): "
+            f"{path}: the checkpoint's description of its field cannot be read ({reason}): "
             "it was damaged, or written by another version of lapgs_wgpu"
         ) from error
     return config, degree
@@ -115,11 +116,18 @@ def _check_types(found: Any, like: Any) -> None:
 def _check_sizes(config: FieldConfig, tensors: Mapping[str, NDArray[Any]], path: str | os.PathLike[str]) -> None:
     """That the large tensors in the file have the sizes that the description asks for, before memory is taken."""
     shapes: dict[str, tuple[int, ...]] = {}
+    square = (config.width, config.width)
     if config.kind in ("grid4d", "laplacian"):
         shapes["static_grid.table"] = (static_grid(config).entries, 2)
         shapes |= {f"temporal_grids.{i}.table": (grid.entries, 2) for i, grid in enumerate(temporal_grids(config))}
+        shapes |= {f"hidden.{2 * i}.weight": square for i in range(config.depth)}
     elif config.kind == "hexplane":
         shapes |= {f"planes.{i}": shape for i, shape in enumerate(plane_shapes(config.planes))}
+        shapes |= {f"trunk.{2 * i}.weight": square for i in range(1, config.depth + 1)} | {"heads.0.1.weight": square}
+    elif config.kind == "mlp":
+        shapes["layers.1.weight"] = square  # there are a few more of this size
+    if config.kind == "laplacian":
+        shapes["motion.second.weight"] = square
     for name, shape in shapes.items():
         _tensor(tensors, f"field.{name}", shape, path)
 

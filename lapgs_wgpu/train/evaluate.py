@@ -53,7 +53,8 @@ def evaluate(
         image = to_8_bit(scene.render(view.camera, view.time, colour).image)
         rows.append({"view": view.name, "time": view.time, **_measures(_unit(image), _unit(truth), lpips)})
         if folder is not None:
-            Image.fromarray(side_by_side(truth, image)).save(folder / f"{view.name}.png")
+            with atomic_write(folder / f"{view.name}.png") as file:
+                Image.fromarray(side_by_side(truth, image)).save(file, "PNG")
     return {
         **{name: _mean([row[name] for row in rows]) for name in MEASURES},
         "gaussians": len(scene),

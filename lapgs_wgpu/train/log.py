@@ -13,14 +13,16 @@ from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
 from types import TracebackType
-from typing import TextIO
+from typing import BinaryIO, TextIO
 
+from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.motion.laplacian import LaplacianMotion
 
 INTERVAL = 50  # steps from one line of log.jsonl to the next, over which loss and PSNR are averaged
 TERMINAL_SECONDS = 0.25  # from one redraw of the progress line to the next
+_MOST_SECONDS = 1e9  # that a training takes
 FILE_SECONDS = 15.0  # the same where stderr is no terminal, and each is a line of its own
 
 
@@ -36,6 +38,7 @@ class Log:
     def __init__(self, path: Path, steps: int, *, done: int = 0, terminal: TextIO | None = None) -> None:
         self._steps = steps
         self._terminal = terminal or sys.stderr
+        self._path = path
         self._file, before = _continued(path, done)
         self._recent: deque[tuple[float, float]] = deque(maxlen=INTERVAL)
         self._shown = time.perf_counter()
@@ -49,7 +52,7 @@ class Log:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         if self._terminal.isatty():
-            self._terminal.write("\n")
+            self._tell("\n")
         self._file.close()
 
     @property
@@ -79,8 +82,7 @@ class Log:
                 **(_spectrum(spectrum) if spectrum else {}),
                 "timing": {"seconds": round(now - self._start, 3), "steps_per_second": round(rate, 3)},
             }
-            self._file.write(json.dumps(line) + "\n")
-            self._file.flush()
+            self._write(json.dumps(line) + "\n")
         on_terminal = self._terminal.isatty()
         if last or now - self._shown >= (TERMINAL_SECONDS if on_terminal else FILE_SECONDS):
             self._shown = now
@@ -90,7 +92,20 @@ class Log:
                 f"step {step}/{self._steps}  {smooth:5.2f} dB  {gaussians} Gaussians  "
                 f"{rate:.1f} steps/s  {_clock(left)} left"
             )
-            self._terminal.write(f"\r\x1b[2K{text}" if on_terminal else f"{text}\n")
+            self._tell(f"\r\x1b[2K{text}" if on_terminal else f"{text}\n")
+
+    def _write(self, line: str) -> None:
+        try:
+            self._file.write(line.encode())
+        except OSError as error:
+            raise InputError(
+                f"{self._path}: not written ({error.strerror or error}); free some space or check the disk, then "
+                f"lapgs-train --resume {self._path.parent} goes on from the last saved state"
+            ) from error
+
+    def _tell(self, text: str) -> None:
+        with suppress(OSError):  # nobody reads it any more, or it goes into a file on a full disk: no reason to stop
+            self._terminal.write(text)
             self._terminal.flush()
 
     def tell(self, text: str) -> None:
@@ -99,19 +114,21 @@ class Log:
         self._terminal.flush()
 
 
-def _continued(path: Path, done: int) -> tuple[TextIO, float]:
+def _continued(path: Path, done: int) -> tuple[BinaryIO, float]:
     """The log of the first `done` steps, open at its end, and the seconds that they took."""
     kept, seconds = [], 0.0
     if done:
-        with suppress(OSError, ValueError, KeyError, TypeError):  # a damaged log is no reason to stop
+        with suppress(
+            OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError
+        ):  # a damaged log is no reason to stop
             for text in path.read_text(encoding="utf-8").splitlines():
                 line = json.loads(text)
                 if line["step"] <= done:
                     kept.append(text + "\n")
-                    seconds = float(line["timing"]["seconds"])
+                    seconds = min(max(float(line["timing"]["seconds"]), 0.0), _MOST_SECONDS)
     with atomic_write(path) as file:
         file.write("".join(kept).encode())
-    return path.open("a", encoding="utf-8"), seconds
+    return path.open("ab", buffering=0), seconds  # a line is one write, and none waits for a later one to fail
 
 
 def _spectrum(motion: LaplacianMotion) -> dict[str, list[float]]:

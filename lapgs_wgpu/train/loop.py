@@ -23,6 +23,7 @@ from lapgs_wgpu.train.ranks import ALONE, Ranks
 from lapgs_wgpu.train.run_folder import (
     STATE,
     check_run_folder,
+    check_state,
     drop_states,
     load_state,
     locked_run_folder,
@@ -88,8 +89,9 @@ def resume(
         state = load_state(out)
         if state is not None:
             try:
+                check_state(state, views=len(dataset.train), steps=config.schedule.steps)
                 training.restore(state)
-            except (KeyError, RuntimeError, ValueError) as error:
+            except (IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
                 reason = f"{type(error).__name__}: {error}".splitlines()[0]
                 raise InputError(f"{out}: its state and its config.toml do not belong together ({reason}).") from error
         return _run(training, dataset, out, watch) if ranks.first else _assist(training)
@@ -185,6 +187,9 @@ def evaluate_run(
     lpips: Lpips | None = None,
 ) -> dict[str, object]:
     """Evaluate on the test views; write metrics.json, metrics.csv and eval/ of a run folder; returns the metrics."""
+    for folder in (out / "eval", out / "eval" / "plots"):
+        if folder.is_symlink():
+            raise InputError(f"{folder} is a link, and pictures are written into the run's own folder only; remove it.")
     (out / "eval").mkdir(exist_ok=True)
     metrics = {**evaluate(scene, dataset.test, background, out / "eval", lpips=lpips), "training": training}
     write_metrics(out, metrics)

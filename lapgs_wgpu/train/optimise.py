@@ -80,11 +80,17 @@ class Optimiser:
         }
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
-        """Go on from what `state` gave, with parameters of the same shapes."""
+        """Go on from what `state` gave, with parameters of the same shapes. Raises ValueError where they are others."""
         for group in self._adam.param_groups:
             for i, parameter in enumerate(group["params"]):
                 prefix = f"{group['name']}.{i}."
                 mine = {key.removeprefix(prefix): value for key, value in state.items() if key.startswith(prefix)}
+                for key, value in mine.items():
+                    shape = torch.Size() if key == "step" else parameter.shape
+                    if value.shape != shape or value.dtype != torch.float32:
+                        raise ValueError(f"its {prefix}{key} is {value.dtype} of shape {tuple(value.shape)}")
+                if mine and mine.keys() != {"step", "exp_avg", "exp_avg_sq"}:
+                    raise ValueError(f"its {prefix[:-1]} holds {sorted(mine)}")
                 if mine:
                     self._adam.state[parameter] = mine
 
@@ -147,5 +153,9 @@ class FrequencyOptimiser:
         }
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
-        """Go on from what `state` gave."""
+        """Go on from what `state` gave. Raises ValueError where it is of another spectrum."""
+        if state["mean"].shape != self._mean.shape or state["mean"].dtype != self._mean.dtype:
+            raise ValueError(f"its spectrum has {tuple(state['mean'].shape)} frequencies")
+        if not (float(state["square"]) >= 0 and int(state["steps"]) >= 0):
+            raise ValueError("its spectrum's moments are negative")
         self._mean, self._square, self._steps = state["mean"], float(state["square"]), int(state["steps"])

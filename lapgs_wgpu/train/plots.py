@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import math
 import typing
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -16,6 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
+from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.motion.scene import Scene4D
 
 if typing.TYPE_CHECKING:
@@ -55,7 +57,8 @@ def plot_run(run: Path, scene: Scene4D) -> list[Path]:
     if log:
         draw("training.png", training_curves, *_columns(log, "step", "loss", "psnr", "gaussians"))
     path = [line for line in log if {"frequencies", "amplitudes"} <= line.keys()]
-    if len(path) > 1:
+    sizes = {len(line[name]) for line in path for name in ("frequencies", "amplitudes")}
+    if len(path) > 1 and len(sizes) == 1:
         draw("spectrum-path.png", spectrum_path, *_columns(path, "step", "frequencies", "amplitudes"))
     if motion is not None:
         draw("spectrum.png", spectrum, motion.frequencies.numpy(force=True), motion.amplitudes().numpy(force=True))
@@ -76,9 +79,12 @@ def _read_log(path: Path) -> list[dict[str, Any]]:
     for line in lines:
         try:
             entry = json.loads(line)
-        except ValueError:
+            sound = all(math.isfinite(entry[name]) for name in ("step", "loss", "psnr", "gaussians"))
+            for name in {"frequencies", "amplitudes"} & entry.keys():
+                sound = sound and len(entry[name]) > 0 and all(math.isfinite(value) for value in entry[name])
+        except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError):
             continue
-        if isinstance(entry, dict) and {"step", "loss", "psnr", "gaussians"} <= entry.keys():
+        if sound:
             read.append(entry)
     return read
 
@@ -214,4 +220,5 @@ def _save(figure: Figure, path: Path, title: str, panels: Sequence[Axes]) -> Non
         axes.spines[["top", "right"]].set_visible(False)
     figure.align_ylabels(panels)
     figure.suptitle(title)
-    figure.savefig(path, format="png")
+    with atomic_write(path) as file:
+        figure.savefig(file, format="png")

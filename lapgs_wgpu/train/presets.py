@@ -9,13 +9,13 @@ import dataclasses
 import difflib
 import importlib.resources
 import json
-import tomllib
 import typing
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.errors import InputError, shown
+from lapgs_wgpu.io.documents import read_toml
 from lapgs_wgpu.motion.field import FieldKind
 from lapgs_wgpu.train.config import Config
 
@@ -90,7 +90,8 @@ def _shorthands(method: str | None, ablate: Iterable[str]) -> dict[str, Any]:
         values |= PAPER_ONLY if method != "laplacian" else {}
     for part in ablate:
         if part not in ABLATIONS:
-            raise InputError(f"--ablate knows {', '.join(ABLATIONS)}, not {part!r}{did_you_mean(part, ABLATIONS)}.")
+            hint = did_you_mean(part, ABLATIONS)
+            raise InputError(f"--ablate knows {', '.join(ABLATIONS)}, not {shown(part)}{hint}.")
         values |= ABLATIONS[part]
     return values
 
@@ -139,16 +140,13 @@ def _read(preset: str, seen: tuple[str, ...] = ()) -> Table:
         names = preset_names()
         hint = did_you_mean(preset, names) or f"; there are {', '.join(names)}, or give a .toml file."
         raise InputError(f"there is no preset {preset!r}{hint}")
-    try:
-        table = tomllib.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{file} cannot be read as TOML: {error}.") from None
+    table = read_toml(file)
     table.pop("record", None)  # what a run noted about itself
     base = table.pop("base", None)
     if base is None:
         return table
     if not isinstance(base, str):
-        raise InputError(f"{file}: base must be the name of a preset, got {base!r}.")
+        raise InputError(f"{file}: base must be the name of a preset, got {shown(base)}.")
     return merge(_read(base, (*seen, preset)), table)
 
 
@@ -177,7 +175,7 @@ def _types(cls: type) -> dict[str, Any]:
 def _build(cls: type, table: Any, source: str, prefix: str) -> Any:
     """A dataclass from a table; every key must be known, every value of its type."""
     if not isinstance(table, dict):
-        raise InputError(f"{source}: {prefix.rstrip('.')} must be a table, got {table!r}.")
+        raise InputError(f"{source}: {prefix.rstrip('.')} must be a table, got {shown(table)}.")
     types = _types(cls)
     for key in table:
         if key not in types:
@@ -206,18 +204,17 @@ def _checked(kind: Any, value: Any, where: str) -> Any:
     if typing.get_origin(kind) is Literal:
         if value in parts:
             return value
-        raise InputError(f"{where} must be {' or '.join(parts)}, got {value!r}{did_you_mean(str(value), parts)}.")
+        hint = did_you_mean(value, parts) if isinstance(value, str) else ""
+        raise InputError(f"{where} must be {' or '.join(parts)}, got {shown(value)}{hint}.")
     if typing.get_origin(kind) is tuple:
         if not isinstance(value, list | tuple) or len(value) != len(parts):
-            raise InputError(f"{where} must be {len(parts)} numbers, got {value!r}.")
+            raise InputError(f"{where} must be {len(parts)} numbers, got {shown(value)}.")
         return tuple(_checked(part, entry, where) for part, entry in zip(parts, value, strict=True))
-    if kind is float and type(value) is int:
-        value = float(value)
-    if type(value) is not kind:
-        raise InputError(f"{where} must be {_KINDS[kind]}, got {value!r}.")
+    if type(value) is not kind and not (kind is float and type(value) is int):
+        raise InputError(f"{where} must be {_KINDS[kind]}, got {shown(value)}.")
     if kind in (int, float) and not 0 <= value <= LARGEST_NUMBER:
-        raise InputError(f"{where} must lie between 0 and {LARGEST_NUMBER}, got {value!r}.")
-    return value
+        raise InputError(f"{where} must lie between 0 and {LARGEST_NUMBER}, got {shown(value)}.")
+    return float(value) if kind is float else value
 
 
 _KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "a text"}

@@ -6,18 +6,19 @@ import dataclasses
 import os
 import shutil
 import sys
-import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.atomic import atomic_write
+from lapgs_wgpu.io.documents import read_toml
 from lapgs_wgpu.io.tensors import pack_tensors, unpack_tensors
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.log import environment
@@ -49,30 +50,37 @@ def locked_run_folder(out: Path) -> Iterator[None]:
         yield
         return
     lock = out / LOCK
-    with open(lock, "a+") as file:
+    with open(lock, "a+", opener=_not_through_a_link) as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if not lock.exists() or not os.path.samestat(os.fstat(file.fileno()), lock.stat()):
                 raise BlockingIOError  # whoever had it has just removed it, and a third one may have another
         except OSError:
             file.seek(0)
-            who = file.read(20).strip() or "unknown"
+            who = file.read(20).strip()
+            who = who if who.isdecimal() else "unknown"
             raise InputError(
                 f"{out} is being written by another lapgs-train (process {who}); wait for it, or name another folder."
             ) from None
-        file.truncate(0)
-        file.write(str(os.getpid()))
-        file.flush()
+        with suppress(OSError):  # on a full disk nobody learns who has it
+            os.truncate(file.fileno(), 0)
+            os.write(file.fileno(), str(os.getpid()).encode())
         try:
             yield
         finally:
-            lock.unlink(missing_ok=True)
+            with suppress(OSError):  # a lock that nobody holds stops nobody
+                lock.unlink(missing_ok=True)
+
+
+def _not_through_a_link(path: str, flags: int) -> int:
+    """What is about to be overwritten must not lie elsewhere."""
+    return os.open(path, flags | os.O_NOFOLLOW, 0o666)
 
 
 def start_run_folder(out: Path, config: Config, device: Device, dataset: Dataset) -> None:
     """Free the folder of an earlier run's files, and write config.toml."""
     for name in RUN_FILES:
-        if (out / name).is_dir():
+        if (out / name).is_dir() and not (out / name).is_symlink():
             shutil.rmtree(out / name)
         else:
             (out / name).unlink(missing_ok=True)
@@ -84,11 +92,14 @@ def start_run_folder(out: Path, config: Config, device: Device, dataset: Dataset
 def changes_since(out: Path, device: Device, dataset: Dataset) -> list[tuple[str, str, str]]:
     """What is not as it was when the run in this folder began, though its bits may depend on it: name, then, now."""
     try:
-        record = tomllib.loads((out / "config.toml").read_text(encoding="utf-8")).get("record", {})
-    except (OSError, ValueError):
+        record = read_toml(out / "config.toml").get("record")
+    except InputError:
+        return []
+    if not isinstance(record, dict):
         return []
     now = _record(device, dataset)
-    return [(name, str(record[name]), now[name]) for name in now if record.get(name, now[name]) != now[name]]
+    then = {name: text for name, text in record.items() if isinstance(text, str) and text.isprintable()}
+    return [(name, then[name][:200], now[name]) for name in now if then.get(name, now[name]) != now[name]]
 
 
 def _record(device: Device, dataset: Dataset) -> dict[str, str]:
@@ -114,10 +125,15 @@ def load_state(out: Path) -> dict[str, NDArray[Any]] | None:
         if not path.exists():
             continue
         try:
+            if not path.is_file():  # a pipe would block
+                raise InputError(f"{path}: is not a regular file")
             with path.open("rb") as file:
                 state = unpack_tensors(file, path.stat().st_size, str(path))[0]
         except InputError as error:
             damaged = damaged or error
+            continue
+        except OSError as error:
+            damaged = damaged or InputError(f"{path}: cannot be read ({error.strerror or error})")
             continue
         if damaged is not None:
             print(f"{damaged}; going on from {name}, which is older.", file=sys.stderr)
@@ -125,6 +141,23 @@ def load_state(out: Path) -> dict[str, NDArray[Any]] | None:
     if damaged is not None:
         raise damaged
     return None
+
+
+def check_state(state: State, *, views: int, steps: int) -> None:
+    """That a training of so many views and steps can go on from it, as far as the shapes of its parameters do not tell.
+    Raises KeyError or ValueError."""
+    done, degree, order = (state[f"training.{name}"] for name in ("done", "sh_degree", "order"))
+    for name, value, most in (("done", done, steps), ("sh_degree", degree, 3)):
+        if value.shape != () or value.dtype.kind != "i" or not 0 <= value <= most:
+            raise ValueError(f"its {name} is not a whole number from 0 to {most}")
+    if order.ndim != 1 or order.dtype.kind != "i" or not ((order >= 0) & (order < views)).all():
+        raise ValueError(f"its order is not made of numbers from 0 to {views - 1}")
+    count = state["gaussians.means"].shape[:1]
+    for name, array in state.items():
+        part = name.partition(".")[0]
+        rows = array.shape == count if part == "statistics" else array.shape[:1] == count
+        if part in ("gaussians", "statistics") and (array.dtype != np.float32 or not rows or count == (0,)):
+            raise ValueError(f"its {name} is {array.dtype} of shape {array.shape}")
 
 
 def drop_states(out: Path) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import tomllib
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,10 +13,12 @@ from typing import Any
 
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.atomic import atomic_write
+from lapgs_wgpu.io.documents import read_json, read_toml
 from lapgs_wgpu.train.presets import Table, load_config
 from lapgs_wgpu.train.table_spec import Run, RunKey, fingerprint
 
 FORMAT = "lapgs-table 1"
+LARGEST = 1e15  # of a figure
 
 
 @dataclass(frozen=True)
@@ -59,38 +60,36 @@ class Results:
 def read_run(folder: Path, run: Run) -> Result | None:
     """What a run folder holds; None where the run is not finished, or has another configuration."""
     try:
-        metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
-        record = tomllib.loads((folder / "config.toml").read_text(encoding="utf-8"))["record"]
+        metrics = read_json(folder / "metrics.json")
+        record = read_toml(folder / "config.toml")["record"]
         made = fingerprint(load_config(str(folder / "config.toml")))
         # An interrupted run that lapgs-train --eval measured has metrics, too.
         steps, seconds = metrics["training"]["steps"], metrics["training"]["seconds"]
         if made != run.fingerprint or steps != run.config.schedule.steps:
             return None
-        return Result(
-            *run.key,
-            fingerprint=made,
-            psnr=metrics["psnr"],
-            ssim=metrics["ssim"],
-            gaussians=metrics["gaussians"],
-            steps=steps,
-            seconds=seconds,
-            size=metrics["size"],
-            views=len(metrics["views"]),
-            overrides=run.overrides,
-            environment=record,
-        )
+        entry = {
+            **run.key._asdict(),
+            "fingerprint": made,
+            "psnr": metrics["psnr"],
+            "ssim": metrics["ssim"],
+            "gaussians": metrics["gaussians"],
+            "steps": steps,
+            "seconds": seconds,
+            "size": metrics["size"],
+            "views": len(metrics["views"]),
+            "overrides": run.overrides,
+            "environment": record,
+        }
+        return _read_result(entry, str(folder))
     except (OSError, ValueError, KeyError, TypeError):  # missing or damaged: it is trained again
         return None
 
 
 def read_results(path: Path) -> Results:
     """Read a results.json. Raises InputError."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{path} does not exist; give a results.json that lapgs-table wrote.") from None
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path} cannot be read as JSON: {error}.") from None
+    if not path.exists():
+        raise InputError(f"{path} does not exist; give a results.json that lapgs-table wrote.")
+    content = read_json(path)
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise InputError(f"{path} is no results.json of this version of lapgs-table (format {FORMAT!r}).")
     runs = _checked(content, "runs", list, f"{path}")
@@ -112,9 +111,19 @@ def _read_result(entry: Any, where: str) -> Result:
 
 
 def _checked(table: Any, name: str, kind: Any, where: str) -> Any:
-    if not isinstance(table, dict) or not isinstance(table.get(name), kind):
-        raise InputError(f"{where}: {name} is missing or has the wrong type; the file was damaged.")
-    return table[name]
+    value: Any = table.get(name) if isinstance(table, dict) else None
+    sound = isinstance(value, kind) and not isinstance(value, bool)
+    if isinstance(value, int | float):
+        sound = sound and abs(value) < LARGEST  # and no NaN
+    if isinstance(value, str) and kind is str:
+        sound = sound and value.isprintable()
+    if name == "size":
+        sound = sound and len(value) == 2 and all(type(side) is int and 0 < side < LARGEST for side in value)
+    if name == "environment":
+        sound = sound and all(isinstance(text, str) and text.isprintable() for text in value.values())
+    if not sound:
+        raise InputError(f"{where}: {name} is missing or has the wrong type or value; the file was damaged.")
+    return value
 
 
 def merge_results(parts: Sequence[Results]) -> Results:

@@ -21,16 +21,17 @@ import dataclasses
 import hashlib
 import json
 import re
-import tomllib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.errors import InputError, shown
+from lapgs_wgpu.io.documents import read_toml
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.presets import Table, build_config, did_you_mean, merge
 
+MOST_RUNS = 10_000
 _NAME = re.compile(r"\w[\w .+=-]*", re.ASCII)  # becomes the name of a folder, and a cell of a Markdown table
 
 
@@ -70,34 +71,33 @@ class Spec:
 
 def read_spec(path: Path) -> Spec:
     """Read and check a whole table: every name, key and value of each run. Raises InputError."""
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{path} does not exist; give the .toml file that describes the table.") from None
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path} cannot be read as TOML: {error}.") from None
+    if not path.exists():
+        raise InputError(f"{path} does not exist; give the .toml file that describes the table.")
+    table = read_toml(path)
     known = ("preset", "seeds", "common", "scenes", "rows")
     for key in table:
         if key not in known:
             raise InputError(f"{path}: there is no key {key}{did_you_mean(key, known) or f'; known: {_list(known)}'}.")
     preset = table.get("preset")
     if not isinstance(preset, str):
-        raise InputError(f"{path}: preset must be the name of a preset, got {preset!r}.")
+        raise InputError(f"{path}: preset must be the name of a preset, got {shown(preset)}.")
     seeds = _seeds(table.get("seeds"), f"{path}: seeds")
     common = _overrides(table.get("common", {}), f"{path}: common")
     scenes = _scenes(table.get("scenes"), path)
 
     runs: list[Run] = []
     rows = _named_tables(table.get("rows"), f"{path}: rows")
+    if len(scenes) * len(rows) * len(seeds) > MOST_RUNS:
+        raise InputError(f"{path}: names more than {MOST_RUNS} runs; make several tables of it.")
     for row, entry in rows.items():
         where = f"{path}: rows.{row}"
         if not isinstance(entry, dict):
-            raise InputError(f"{where} must be a table of keys of the configuration, got {entry!r}.")
+            raise InputError(f"{where} must be a table of keys of the configuration, got {shown(entry)}.")
         row_scenes = _subset(entry.pop("scenes", list(scenes)), list(scenes), f"{where}.scenes")
         row_seeds = _subset(_seeds(entry.pop("seeds", seeds), f"{where}.seeds"), seeds, f"{where}.seeds")
         method, ablate = entry.pop("method", None), entry.pop("ablate", [])
-        if not isinstance(ablate, list):
-            raise InputError(f"{where}.ablate must be a list of parts, got {ablate!r}.")
+        if not isinstance(ablate, list) or not all(isinstance(part, str) for part in ablate):
+            raise InputError(f"{where}.ablate must be a list of parts, got {shown(ablate)}.")
         entry = _overrides(entry, where)
         for scene in row_scenes:
             folder, own = scenes[scene]
@@ -106,8 +106,8 @@ def read_spec(path: Path) -> Spec:
                 where = f"{path}: {scene}, {row}"
                 values = merge(overrides, {"seed": seed})
                 config = build_config(preset, values, where, method=method, ablate=ablate)
-                shown = overrides | ({"method": method} if method else {}) | ({"ablate": ablate} if ablate else {})
-                runs.append(Run(RunKey(scene, row, seed), folder, config, shown))
+                said = overrides | ({"method": method} if method else {}) | ({"ablate": ablate} if ablate else {})
+                runs.append(Run(RunKey(scene, row, seed), folder, config, said))
     # Scene by scene, so that a table of which half is made compares all rows on half of the scenes.
     order = list(scenes)
     return Spec(path.stem, preset, tuple(sorted(runs, key=lambda run: order.index(run.key.scene))))
@@ -126,7 +126,9 @@ def _scenes(value: Any, path: Path) -> dict[str, tuple[str, Table]]:
     for name, entry in _named_tables(value, f"{path}: scenes").items():
         entry = {"folder": entry} if isinstance(entry, str) else entry
         if not isinstance(entry, dict) or not isinstance(entry.get("folder"), str):
-            raise InputError(f"{path}: scenes.{name} must be a folder, or a table with the key folder, got {entry!r}.")
+            raise InputError(
+                f"{path}: scenes.{name} must be a folder, or a table with the key folder, got {shown(entry)}."
+            )
         folder = entry.pop("folder")
         scenes[name] = (folder, _overrides(entry, f"{path}: scenes.{name}"))
     return scenes
@@ -134,7 +136,7 @@ def _scenes(value: Any, path: Path) -> dict[str, tuple[str, Table]]:
 
 def _named_tables(value: Any, where: str) -> Table:
     if not isinstance(value, dict) or not value:
-        raise InputError(f"{where} must be a table with at least one entry, got {value!r}.")
+        raise InputError(f"{where} must be a table with at least one entry, got {shown(value)}.")
     for name in value:
         if not _NAME.fullmatch(name):
             raise InputError(f"{where}: {name!r} must be a name of letters, digits, spaces and . + = _ - only.")
@@ -143,7 +145,7 @@ def _named_tables(value: Any, where: str) -> Table:
 
 def _overrides(value: Any, where: str) -> Table:
     if not isinstance(value, dict):
-        raise InputError(f"{where} must be a table of keys of the configuration, got {value!r}.")
+        raise InputError(f"{where} must be a table of keys of the configuration, got {shown(value)}.")
     data = value.get("data")
     if "seed" in value or (isinstance(data, dict) and "path" in data):
         raise InputError(f"{where} must set neither seed nor data.path: the keys seeds and scenes do.")
@@ -153,16 +155,16 @@ def _overrides(value: Any, where: str) -> Table:
 def _seeds(value: Any, where: str) -> list[int]:
     whole = isinstance(value, list) and all(type(seed) is int and seed >= 0 for seed in value)
     if not whole or not value or len(set(value)) < len(value):
-        raise InputError(f"{where} must be a list of different whole numbers from 0 up, got {value!r}.")
+        raise InputError(f"{where} must be a list of different whole numbers from 0 up, got {shown(value)}.")
     return value
 
 
 def _subset(value: Any, known: list[Any], where: str) -> list[Any]:
     if not isinstance(value, list) or not value:
-        raise InputError(f"{where} must be a list of {_list(known)}, got {value!r}.")
+        raise InputError(f"{where} must be a list of {_list(known)}, got {shown(value)}.")
     for entry in value:
         if entry not in known:
-            raise InputError(f"{where}: {entry!r} is none of {_list(known)}.")
+            raise InputError(f"{where}: {shown(entry)} is none of {_list(known)}.")
     return [entry for entry in known if entry in value]
 
 

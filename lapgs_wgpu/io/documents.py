@@ -1,0 +1,90 @@
+"""JSON and TOML files from strangers: read, or refused in one sentence, within bounds on memory and time.
+
+JSON takes at most 64 times the file's size in memory. TOML's parser is slow, but our files of it are small.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import stat
+import tomllib
+from typing import Any
+
+from lapgs_wgpu.errors import InputError
+
+PathLike = str | os.PathLike[str]
+
+MAX_JSON_BYTES = 64 << 20
+MAX_TOML_BYTES = 256 << 10
+MAX_DEPTH = 32  # of lists and tables in each other
+# tomllib takes time by the square of a dotted key's parts; all our keys have three at most.
+_LONG_KEY = re.compile(r"""(?<![\w-])(?:(?:[\w-]+|"(?:[^"\\\n]|\\.)*"|'[^'\n]*')[ \t]*\.[ \t]*){16}""")
+
+
+def read_json(path: PathLike) -> Any:
+    """What a JSON file holds; of a name that stands twice in an object, the last one. Raises InputError."""
+    return parse_json(_read_text(path, MAX_JSON_BYTES, "JSON"), str(path))
+
+
+def parse_json(text: str, where: str) -> Any:
+    """The same of a text. The InputError begins with `where`."""
+    try:
+        value = json.loads(text)
+    except json.JSONDecodeError as error:
+        place = f"line {error.lineno}, column {error.colno}"
+        raise InputError(f"{where}: cannot be read as JSON: {error.msg} at {place}.") from None
+    except ValueError as error:  # a number of more than 4300 digits
+        raise InputError(f"{where}: cannot be read as JSON: {str(error)[:120]}.") from None
+    except RecursionError:
+        raise InputError(f"{where}: cannot be read as JSON: it is nested too deeply.") from None
+    _check_depth(value, where, "JSON")
+    return value
+
+
+def read_toml(path: PathLike) -> dict[str, Any]:
+    """What a TOML file holds. Raises InputError."""
+    text = _read_text(path, MAX_TOML_BYTES, "TOML")
+    if _LONG_KEY.search(text):
+        raise InputError(f"{path}: cannot be read as TOML: it holds a dotted key of more than 16 parts.")
+    try:
+        table = tomllib.loads(text)
+    except ValueError as error:
+        raise InputError(f"{path}: cannot be read as TOML: {str(error)[:200]}.") from None
+    except RecursionError:
+        raise InputError(f"{path}: cannot be read as TOML: it is nested too deeply.") from None
+    _check_depth(table, str(path), "TOML")
+    return table
+
+
+def _read_text(path: PathLike, most: int, language: str) -> str:
+    try:
+        found = os.stat(path)  # before opening: a pipe would block, a device never end
+        if not stat.S_ISREG(found.st_mode):
+            raise InputError(f"{path}: cannot be read as {language}: it is not a regular file.")
+        if found.st_size > most:
+            raise InputError(f"{path}: cannot be read as {language}: it has {found.st_size} bytes, over {most}.")
+        with open(path, "rb") as file:
+            return file.read(found.st_size).decode("utf-8-sig" if language == "JSON" else "utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the path.") from None
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: cannot be read as {language}: byte {error.start} is not UTF-8.") from None
+    except ValueError as error:  # a name that no file can have
+        raise InputError(f"{path!r}: cannot be read ({error}); check the path.") from None
+
+
+def _check_depth(value: Any, where: str, language: str) -> None:
+    """What follows goes down into it by recursion: so that this ends."""
+    level = [value] if isinstance(value, list | dict) else []
+    for _ in range(MAX_DEPTH):
+        level = [
+            inner
+            for outer in level
+            for inner in (outer.values() if isinstance(outer, dict) else outer)
+            if isinstance(inner, list | dict)
+        ]
+        if not level:
+            return
+    raise InputError(f"{where}: cannot be read as {language}: it is nested more than {MAX_DEPTH} deep.")

@@ -1,0 +1,435 @@
+"""Files of every format that is read, damaged at random: each is read or refused in one sentence, and nothing else.
+
+A few hundred inputs a format, always the same; LAPGS_FUZZ=10000 takes as many new ones (make soak). What was found so
+far stands in test_hostile_found.py as plain tests.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hostile import (
+    ByteEdits,
+    TreeEdits,
+    byte_edits,
+    edit_bytes,
+    edit_tree,
+    fuzzed,
+    json_text,
+    refused_or,
+    toml_text,
+    tree_edits,
+)
+from hypothesis import given
+from hypothesis import strategies as st
+from lapgs_wgpu.viewer.capture import open_capture
+from lapgs_wgpu.viewer.path_file import read_path
+from PIL import Image
+from test_data_dnerf import make_scene
+from test_ply import columns_of, ply_bytes, random_still
+from test_viewer_path import nerfstudio
+
+from lapgs_wgpu.data import Dataset, load_dataset
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.io.first_look import FirstLook
+from lapgs_wgpu.motion.field import FieldConfig, PlaneConfig
+from lapgs_wgpu.motion.hashgrid import HashConfig
+from lapgs_wgpu.motion.playback import open_playback
+from lapgs_wgpu.motion.scene import Scene4D
+from lapgs_wgpu.motion.scene_file import read_scene
+from lapgs_wgpu.train.config import Config
+from lapgs_wgpu.train.log import Log
+from lapgs_wgpu.train.plots import _columns, _read_log
+from lapgs_wgpu.train.presets import load_config, write_toml
+from lapgs_wgpu.train.run_folder import STATE, changes_since, check_state, load_state, save_state
+from lapgs_wgpu.train.table_results import Result, Results, markdown, read_results, read_run, write_results
+from lapgs_wgpu.train.table_spec import read_spec
+from lapgs_wgpu.train.training import Training
+
+GRID = HashConfig(1, (2, 2, 2), (2, 2, 2), 4)
+PLANES = PlaneConfig(features=1, space=2, time=2, levels=1)
+KINDS: dict[str, dict[str, Any]] = {
+    "static": {},
+    "mlp": {},
+    "hexplane": {},
+    "grid4d": {},
+    "laplacian": {},
+    "laplacian with hidden layers": {"kind": "laplacian", "depth": 1},
+}
+
+
+def small_scene(kind: str, device: Device) -> Scene4D:
+    config = FieldConfig(**{"kind": kind, "static": GRID, "temporal": GRID, "planes": PLANES, "width": 4} | KINDS[kind])
+    points = np.random.default_rng(0).uniform(-1, 1, (3, 3))
+    return Scene4D.from_points(points, np.full((3, 3), 0.5), np.full(3, 0.1), config, device=device)
+
+
+@pytest.fixture(scope="module")
+def checkpoints(device: Device, tmp_path_factory: pytest.TempPathFactory) -> list[bytes]:
+    """One of each field."""
+    file = tmp_path_factory.mktemp("checkpoints") / "a.ply"
+    found = []
+    for kind in KINDS:
+        small_scene(kind, device).save(file, {"step": "7", "background": "white"})
+        found.append(file.read_bytes())
+    return found
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One for all inputs of a test, which write the same names again."""
+    return tmp_path_factory.mktemp("hostile")
+
+
+def with_table(checkpoint: bytes, change: Callable[[dict[str, Any]], bytes]) -> bytes:
+    """A checkpoint whose safetensors table `change` made anew, with sizes that agree."""
+    head, _, body = checkpoint.partition(b"end_header\n")
+    size = int(head.rpartition(b"safetensors ")[2].split(b"\n")[0])
+    words = -(-size // 4)
+    rows, payload = body[: -4 * words], body[-4 * words :][:size]
+    length = int.from_bytes(payload[:8], "little")
+    text = change(json.loads(payload[8 : 8 + length]))
+    new = len(text).to_bytes(8, "little") + text + payload[8 + length :]
+    head = head.replace(b"lapgs4d %d\n" % words, b"lapgs4d %d\n" % -(-len(new) // 4))
+    head = head.replace(b"safetensors %d\n" % size, b"safetensors %d\n" % len(new))
+    return head + b"end_header\n" + rows + new + bytes(-len(new) % 4)
+
+
+# PLY -----------------------------------------------------------------------------------------------------------------
+
+WORDS = [
+    b"element vertex 4\n", b"element vertex 999999999999999999\n", b"property double x\n",
+    b"property list uchar int x\n",
+    b"end_header\n", b"comment lapgs4d v1 safetensors 4\n", b"format ascii 1.0\n", b"obj_info\n", b"f_rest_", b"double",
+    b"uchar", b"element empty 999999999999999999\n", b"\r\n", b"lapgs4d", b"{\"a\":", b"\"shape\":[0,9007199254740991]",
+    b"safetensors 18446744073709551615", b"packed_position",
+]  # fmt: skip
+FOREIGN = [ply_bytes(columns_of(random_still(4, degree))) for degree in (0, 3)] + [
+    ply_bytes({name: ("double", values) for name, (_, values) in columns_of(random_still(3, 1)).items()})
+]
+COMPRESSED = (
+    b"ply\nformat binary_little_endian 1.0\nelement chunk 1\nproperty float min_x\nelement vertex 2\n"
+    b"property uint packed_position\nproperty uint packed_rotation\nproperty uint packed_scale\n"
+    b"property uint packed_color\nend_header\n" + bytes(4 + 2 * 16)
+)
+
+
+@fuzzed()
+@given(st.sampled_from([*FOREIGN, COMPRESSED]), byte_edits(WORDS))
+def test_foreign_splats(folder: Path, data: bytes, edits: ByteEdits) -> None:
+    (folder / "a.ply").write_bytes(edit_bytes(data, edits, head=data.index(b"end_header") + 20))
+    scene = refused_or(lambda: read_scene(folder / "a.ply"))
+    if scene is not None:
+        assert all(np.isfinite(values).all() for values in scene.gaussians.values())
+
+
+@fuzzed()
+@given(st.integers(0, len(KINDS) - 1), byte_edits(WORDS))
+def test_checkpoints_with_other_bytes(
+    checkpoints: list[bytes], device: Device, folder: Path, kind: int, edits: ByteEdits
+) -> None:
+    (folder / "a.ply").write_bytes(edit_bytes(checkpoints[kind], edits, head=4000))
+    refused_or(lambda: shown_at_all_times(folder / "a.ply", device))
+
+
+@fuzzed()
+@given(st.integers(0, len(KINDS) - 1), tree_edits, st.booleans())
+def test_checkpoints_with_another_description(
+    checkpoints: list[bytes], device: Device, folder: Path, kind: int, edits: TreeEdits, inner: bool
+) -> None:
+    """Mutations of the table of tensors, or of the field's configuration in its metadata."""
+
+    def change(table: dict[str, Any]) -> bytes:
+        if not inner:
+            return json_text(edit_tree(table, edits))
+        values = edit_tree(json.loads(table["__metadata__"]["field"]), edits)
+        table["__metadata__"]["field"] = json_text(values).decode("utf-8", "replace")
+        return json_text(table)
+
+    (folder / "a.ply").write_bytes(with_table(checkpoints[kind], change))
+    refused_or(lambda: shown_at_all_times(folder / "a.ply", device))
+
+
+@np.errstate(all="ignore")
+def shown_at_all_times(file: Path, device: Device) -> None:
+    playback = open_playback(file, device)
+    FirstLook.from_json(playback.metadata.get("view", ""))
+    assert playback.means(0.5).shape == (playback.count, 3)
+    assert len(playback.still(1.0)) == playback.count
+
+
+# The state of a training ---------------------------------------------------------------------------------------------
+
+
+def short_config() -> Config:
+    """Of a training of five steps."""
+    few = {"points.count": "20", "field.width": "4", "field.static.levels": "1", "field.temporal.levels": "1"}
+    few |= {"schedule.warm_up": "0", "schedule.steps": "5"}
+    grids = {f"field.{name}.{end}": ["4", "4", "4"] for name in ("static", "temporal") for end in ("base", "finest")}
+    return load_config("tiny", {**few, **grids})
+
+
+@pytest.fixture(scope="module")
+def config() -> Config:
+    return short_config()
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    return load_dataset(make_scene(tmp_path_factory.mktemp("scene") / "toy"))
+
+
+@pytest.fixture(scope="module")
+def training(config: Config, dataset: Dataset, device: Device) -> Training:
+    training = Training(config, dataset, device)
+    training.step()
+    return training
+
+
+@fuzzed()
+@given(byte_edits([b'"shape":[0', b'"dtype":"F64"', b'"I64"', b'"U8"'], least=0), tree_edits, st.booleans())
+def test_states(
+    training: Training, dataset: Dataset, folder: Path, edits: ByteEdits, changes: TreeEdits, whole: bool
+) -> None:
+    """A state that is accepted is one that a training can go on from."""
+    run = folder / "run"
+    run.mkdir(exist_ok=True)
+    save_state(run, SAVED.setdefault("state", training.state()))
+    data = (run / STATE).read_bytes()
+    length = int.from_bytes(data[:8], "little")
+    if whole:
+        text = json_text(edit_tree(json.loads(data[8 : 8 + length]), changes))
+        data = len(text).to_bytes(8, "little") + text + data[8 + length :]
+    (run / STATE).write_bytes(edit_bytes(data, edits, head=length))
+    for other in run.iterdir():
+        if other.name != STATE:
+            other.unlink()
+    state = refused_or(lambda: load_state(run))
+    if state is None:
+        return
+    try:
+        check_state(state, views=len(dataset.train), steps=5)
+        training.restore(state)
+    except (IndexError, KeyError, RuntimeError, TypeError, ValueError):
+        return  # what loop.resume tells as an InputError
+    assert 0 <= training.done <= 5
+    assert len({len(value) for value in training.scene.parameters.values()}) == 1
+
+
+SAVED: dict[str, Any] = {}  # the state before any damage
+
+
+# JSON ----------------------------------------------------------------------------------------------------------------
+
+
+def damaged_json(tree: Any, changes: TreeEdits, edits: ByteEdits) -> bytes:
+    return edit_bytes(json_text(edit_tree(tree, changes)), edits)
+
+
+JSON_EDITS = (tree_edits, byte_edits([b"[", b"{", b'"', b",", b":"], least=0).filter(lambda edits: len(edits) < 2))
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    scene = make_scene(tmp_path_factory.mktemp("capture") / "toy")
+    return scene, json.loads((scene / "transforms_train.json").read_text())
+
+
+@fuzzed()
+@given(*JSON_EDITS)
+def test_transforms(capture: tuple[Path, dict[str, Any]], changes: TreeEdits, edits: ByteEdits) -> None:
+    scene, tree = capture
+    (scene / "transforms_train.json").write_bytes(damaged_json(tree, changes, edits))
+    found = refused_or(lambda: load_dataset(scene))
+    for view in found.train if found else ():
+        assert view.load().dtype == np.uint8
+
+
+@fuzzed(300)
+@given(*JSON_EDITS, st.booleans(), st.booleans())
+def test_camera_paths(folder: Path, changes: TreeEdits, edits: ByteEdits, cycle: bool, old: bool) -> None:
+    tree = nerfstudio(is_cycle=cycle, **({"keyframes": []} if old else {}))
+    (folder / "a.json").write_bytes(damaged_json(tree, changes, edits))
+    held = refused_or(lambda: read_path(folder / "a.json"))
+    if held is not None:
+        for second in np.linspace(0, held.path.seconds, 5).tolist():
+            pose, time = held.path.at(second)
+            assert 0 <= time <= 1
+            assert np.isfinite(pose.camera(*held.size).T_cam_world).all()
+
+
+RESULTS = Results(
+    "a table",
+    "tiny",
+    tuple(
+        Result("a", row, 0, "f", 20.0, 0.5, 9, 3, 1.0, [24, 24], 2, {"field": {"kind": "static"}}, {"torch": "2"})
+        for row in "xy"
+    ),
+)
+
+
+@fuzzed(300)
+@given(*JSON_EDITS)
+def test_results_of_tables(folder: Path, changes: TreeEdits, edits: ByteEdits) -> None:
+    write_results(folder, RESULTS)
+    tree = json.loads((folder / "results.json").read_text())
+    (folder / "results.json").write_bytes(damaged_json(tree, changes, edits))
+    results = refused_or(lambda: read_results(folder / "results.json"))
+    if results is not None:
+        assert markdown(results).startswith("## ")
+        write_results(folder, results)
+
+
+@fuzzed(300)
+@given(*JSON_EDITS, tree_edits, st.booleans())
+def test_finished_runs(
+    folder: Path, config: Config, changes: TreeEdits, edits: ByteEdits, others: TreeEdits, which: bool
+) -> None:
+    """metrics.json and config.toml of a run folder, where lapgs-table finds them."""
+    metrics = {
+        "psnr": 20.0, "ssim": 0.5, "gaussians": 9, "size": [24, 24], "views": [{}],
+        "training": {"steps": 5, "seconds": 1.0}
+    }  # fmt: skip
+    table: dict[str, Any] = {**dataclasses.asdict(config), "record": {"torch": "2"}}
+    (folder / "metrics.json").write_bytes(damaged_json(metrics, changes, edits) if which else json_text(metrics))
+    toml = edit_bytes(toml_text(edit_tree(table, others)), edits)
+    (folder / "config.toml").write_bytes(toml_text(table) if which else toml)
+    run = next(iter(read_spec_text(folder, config).runs))
+    result = read_run(folder, run)
+    if result is not None:
+        write_results(folder, Results("a", "tiny", (result,)))
+        read_results(folder / "results.json")
+    refused_or(lambda: changes_since_without_device(folder))
+    open_capture(folder / "checkpoint.ply")
+
+
+def read_spec_text(folder: Path, config: Config) -> Any:
+    values = dataclasses.asdict(config)
+    del values["data"]["path"], values["seed"]
+    (folder / "base.toml").write_text(write_toml(dataclasses.asdict(config)))
+    (folder / "spec.toml").write_text(
+        f'preset = "{folder / "base.toml"}"\nseeds = [0]\n[scenes]\na = "a"\n[rows]\nx = {{}}\n'
+    )
+    return read_spec(folder / "spec.toml")
+
+
+def changes_since_without_device(folder: Path) -> Any:
+    """`changes_since` with fixed words for what this machine is."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("lapgs_wgpu.train.run_folder._record", lambda device, dataset: {"torch": "3"})
+        return changes_since(folder, None, None)  # type: ignore[arg-type]
+
+
+@fuzzed()
+@given(tree_edits, byte_edits([b"\n", b"[", b'"'], least=0), st.integers(0, 9))
+def test_logs(folder: Path, changes: TreeEdits, edits: ByteEdits, done: int) -> None:
+    lines: list[Any] = [
+        {"step": step, "loss": 0.1, "psnr": 20.0, "gaussians": 9, "frequencies": [0.0, 1.0], "amplitudes": [0.1, 0.2],
+         "timing": {"seconds": 1.0, "steps_per_second": 2.0}}
+        for step in (3, 6)
+    ]  # fmt: skip
+    damaged = edit_tree(lines, changes)
+    data = b"\n".join(json_text(line) for line in damaged)
+    (folder / "log.jsonl").write_bytes(edit_bytes(data, edits))
+    read = _read_log(folder / "log.jsonl")
+    _columns(read, "step", "loss", "psnr", "gaussians")
+    with Log(folder / "log.jsonl", 10, done=done, terminal=io.StringIO()) as log:
+        assert 0 <= log.seconds < 1e10
+
+
+# TOML ----------------------------------------------------------------------------------------------------------------
+
+
+@fuzzed(300)
+@given(tree_edits, byte_edits([b"[", b"]", b"a.b.", b'"""', b"= "], least=0))
+def test_configurations(folder: Path, config: Config, changes: TreeEdits, edits: ByteEdits) -> None:
+    tree = {**dataclasses.asdict(config), "base": "tiny", "record": {"torch": "2"}}
+    (folder / "config.toml").write_bytes(edit_bytes(toml_text(edit_tree(tree, changes)), edits))
+    refused_or(lambda: load_config(str(folder / "config.toml")))
+
+
+SPEC = """
+preset = "tiny"
+seeds = [0, 1]
+[common]
+schedule.steps = 3
+[scenes]
+toys = "toys"
+lego = { folder = "lego", points.box = 1.5 }
+[rows]
+grid4d = { method = "grid4d" }
+no_ncc = { ablate = ["ncc"], scenes = ["toys"], seeds = [0], loss.pyramid = 0.1 }
+"""
+
+
+@fuzzed()
+@given(tree_edits, byte_edits([b"[", b"]", b"a.b.", b'"""', b"= "], least=0))
+def test_specs_of_tables(folder: Path, changes: TreeEdits, edits: ByteEdits) -> None:
+    (folder / "spec.toml").write_bytes(edit_bytes(toml_text(edit_tree(tomllib.loads(SPEC), changes)), edits))
+    spec = refused_or(lambda: read_spec(folder / "spec.toml"))
+    for run in spec.runs if spec else ():
+        assert ".." not in Path(run.key.scene, run.key.row).parts  # they become folders
+
+
+# Pictures ------------------------------------------------------------------------------------------------------------
+
+
+def encoded(kind: str, mode: str) -> bytes:
+    pixels = np.random.default_rng(0).integers(0, 256, (8, 12, 4), dtype=np.uint8)
+    file = io.BytesIO()
+    picture = Image.fromarray(pixels).convert("RGB" if kind == "JPEG" else "RGBA").convert(mode)
+    picture.save(file, kind, **({"pnginfo": None, "transparency": 1} if mode == "P" else {}))
+    return file.getvalue()
+
+
+PICTURES = [encoded("PNG", "RGBA"), encoded("PNG", "RGB"), encoded("PNG", "P"), encoded("JPEG", "RGB")]
+CHUNKS = [
+    b"IHDR",
+    b"IDAT",
+    b"tRNS",
+    b"PLTE",
+    b"iCCP",
+    b"zTXt",
+    b"acTL",
+    b"fcTL",
+    b"eXIf",
+    b"IEND",
+    b"\xff\xd8",
+    b"\xff\xe1",
+]
+
+
+@fuzzed()
+@given(st.sampled_from(PICTURES), byte_edits(CHUNKS), st.booleans())
+def test_pictures(capture: tuple[Path, dict[str, Any]], data: bytes, edits: ByteEdits, summed: bool) -> None:
+    scene, tree = capture
+    (scene / "transforms_train.json").write_text(json.dumps(tree))
+    damaged = edit_bytes(data, edits, head=60)
+    for frame in tree["frames"]:
+        (scene / f"{frame['file_path']}.png").write_bytes(with_checksums(damaged) if summed else damaged)
+    found = refused_or(lambda: load_dataset(scene))
+    for view in found.train if found else ():
+        refused_or(view.load)
+
+
+def with_checksums(data: bytes) -> bytes:
+    """A PNG whose chunks have right checksums, so that the damage gets further in."""
+    import zlib
+
+    done, at = data[:8], 8
+    while at + 12 <= len(data):
+        length = int.from_bytes(data[at : at + 4], "big")
+        body = data[at + 4 : at + 8 + length]
+        if at + 12 + length > len(data):
+            break
+        done += data[at : at + 4] + body + zlib.crc32(body).to_bytes(4, "big")
+        at += 12 + length
+    return done + data[at:]

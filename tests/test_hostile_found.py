@@ -1,0 +1,307 @@
+"""Hostile files: the faults that fuzzing and reading found, links and pipes, and the bounds on memory and time."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import subprocess
+import sys
+import tracemalloc
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hostile import refused_or
+from lapgs_wgpu.viewer.capture import open_capture
+from lapgs_wgpu.viewer.path_file import read_path
+from test_data_dnerf import make_scene
+from test_hostile_files import (
+    FOREIGN,
+    RESULTS,
+    SPEC,
+    changes_since_without_device,
+    short_config,
+    small_scene,
+    with_checksums,
+    with_table,
+)
+from test_ply import columns_of, ply_bytes, random_still
+
+from lapgs_wgpu.data import load_dataset
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.io.checkpoint import read_checkpoint
+from lapgs_wgpu.io.documents import MAX_TOML_BYTES, read_json, read_toml
+from lapgs_wgpu.io.first_look import FirstLook
+from lapgs_wgpu.motion.scene_file import read_scene
+from lapgs_wgpu.train.log import Log
+from lapgs_wgpu.train.loop import evaluate_run, resume
+from lapgs_wgpu.train.presets import load_config
+from lapgs_wgpu.train.run_folder import STATE, load_state, locked_run_folder, save_state, start_run_folder
+from lapgs_wgpu.train.table_results import read_results, write_results
+from lapgs_wgpu.train.table_spec import read_spec
+from lapgs_wgpu.train.training import Training
+
+FOUND_TOML = {
+    "deep lists": ("seed = " + "[" * 5000 + "]" * 5000, "nested too deeply"),
+    "a key of many parts": ("[points]\n" + "count." * 20_000 + "a = 1", "dotted key of more than 16 parts"),
+    "a key of many quoted parts": ("a" + '."b".c' * 5000 + " = 1", "dotted key of more than 16 parts"),
+    "a number of 9000 digits in hexadecimal": ("seed = 0x" + "f" * 9000, "seed must lie between 0 and"),
+    "a rate of 400 digits": ("rates.quats = 1" + "0" * 400, "rates.quats must lie between 0 and"),
+    "a text of 100 kB": ('seed = "' + "x" * 100_000 + '"', "seed must be a whole number, got 'xxx"),
+    "an escape sequence": ('"\\u001b]0;title\\u0007" = 1', r"there is no key \\x1b\]0;title\\x07"),
+}
+
+
+@pytest.mark.parametrize("name", FOUND_TOML)
+def test_found_in_toml(name: str, tmp_path: Path) -> None:
+    text, message = FOUND_TOML[name]
+    (tmp_path / "a.toml").write_text(f'base = "tiny"\n{text}\n')
+    with pytest.raises(InputError, match=message) as error:
+        load_config(str(tmp_path / "a.toml"))
+    assert str(error.value).isprintable()
+    assert len(str(error.value)) < 2100
+
+
+def test_found_in_specs(tmp_path: Path) -> None:
+    file = tmp_path / "spec.toml"
+    file.write_text(SPEC.replace('["ncc"]', "[[1]]"))
+    with pytest.raises(InputError, match=r"ablate must be a list of parts, got \[\[1\]\]"):
+        read_spec(file)
+    file.write_text(SPEC.replace("[0, 1]", str(list(range(6000)))))
+    with pytest.raises(InputError, match="more than 10000 runs"):
+        read_spec(file)
+
+
+def test_found_in_results(tmp_path: Path) -> None:
+    write_results(tmp_path, RESULTS)
+    good = json.loads((tmp_path / "results.json").read_text())
+    for name, value in (("psnr", float("inf")), ("seconds", 10**400), ("gaussians", True), ("size", [1, "2"]),
+                        ("environment", {"torch": 2}), ("scene", "a\nb")):  # fmt: skip
+        damaged = json.loads(json.dumps(good))
+        damaged["runs"][1][name] = value
+        (tmp_path / "results.json").write_text(json.dumps(damaged))
+        with pytest.raises(InputError, match=f"run 2: {name} is missing or has the wrong type or value"):
+            read_results(tmp_path / "results.json")
+    (tmp_path / "results.json").write_text("[" * 100_000)
+    with pytest.raises(InputError, match="nested too deeply"):
+        read_results(tmp_path / "results.json")
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, "9" * 5000, "null", '{"size": 1}'])
+def test_found_in_metadata(text: str, device: Device, tmp_path: Path) -> None:
+    """A place to look from is left out where it is no good; the description of a field is needed."""
+    small_scene("grid4d", device).save(tmp_path / "a.ply", {"view": text})
+    assert FirstLook.from_json(read_checkpoint(tmp_path / "a.ply").metadata["view"]) is None
+
+    def change(table: dict[str, Any]) -> bytes:
+        table["__metadata__"]["field"] = text
+        return json.dumps(table).encode()
+
+    (tmp_path / "a.ply").write_bytes(with_table((tmp_path / "a.ply").read_bytes(), change))
+    with pytest.raises(InputError, match="description of its field cannot be read"):
+        read_scene(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("kind", ["mlp", "hexplane", "grid4d", "laplacian"])
+def test_a_wide_network_takes_no_memory_that_the_file_does_not_hold(kind: str, device: Device, tmp_path: Path) -> None:
+    """4096 channels and 16 hidden layers are a gigabyte, which a file of some kB must not make us take."""
+    small_scene(kind, device).save(tmp_path / "a.ply")
+
+    def change(table: dict[str, Any]) -> bytes:
+        values = json.loads(table["__metadata__"]["field"])
+        table["__metadata__"]["field"] = json.dumps(values | {"width": 4096, "depth": 16})
+        return json.dumps(table).encode()
+
+    (tmp_path / "a.ply").write_bytes(with_table((tmp_path / "a.ply").read_bytes(), change))
+    with pytest.raises(InputError, match=r"but the scene needs|has no tensor"):
+        read_scene(tmp_path / "a.ply")
+
+
+def test_found_in_states(device: Device, tmp_path: Path) -> None:
+    config, dataset = short_config(), load_dataset(make_scene(tmp_path / "toy"))
+    training = Training(config, dataset, device)
+    training.step()
+    state = training.state()
+    training.close()
+    wrong: dict[str, Any] = {
+        "training.done": np.array(-1),
+        "training.sh_degree": np.array(99),
+        "training.order": np.array([7]),
+        "gaussians.quats": state["gaussians.quats"][:-1],
+        "gaussians.means": state["gaussians.means"].astype(np.float64),
+        "statistics.views": state["statistics.views"][:-1],
+        "training.random": state["training.random"].astype(np.int32),
+        "adam.means.0.exp_avg": state["adam.means.0.exp_avg"][:-1],
+        "frequencies.mean": np.zeros(1, np.float32),
+    }
+    for name, value in wrong.items():
+        save_state(tmp_path, {**state, name: value})
+        with pytest.raises(InputError, match="do not belong together"):
+            resume(config, dataset, tmp_path, device=device)
+    save_state(tmp_path, state)
+    resume(config, dataset, tmp_path, device=device)
+
+
+def test_found_in_a_run_folder(tmp_path: Path) -> None:
+    (tmp_path / "config.toml").write_text('record = "x"\n')
+    assert changes_since_without_device(tmp_path) == []
+    (tmp_path / "config.toml").write_text(f'[data]\npath = "{tmp_path}"\nsize = inf\n')
+    assert open_capture(tmp_path / "checkpoint.ply") is None
+
+
+# Names that lead elsewhere -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["../other/r", "/etc/passwd", "train/../../other/r", "C:\\r", "\\\\host\\r", "..\\r"])
+def test_pictures_of_transforms_lie_in_the_scene(name: str, tmp_path: Path) -> None:
+    other = make_scene(tmp_path / "other") / "train" / "r_000.png"
+    (tmp_path / "other" / "r.png").write_bytes(other.read_bytes())
+
+    def change(folder: Path, scene: dict[str, Any]) -> None:
+        scene["train"]["frames"][1]["file_path"] = name
+
+    with pytest.raises(InputError, match="leads out of the scene's folder"):
+        load_dataset(make_scene(tmp_path / "toy", change))
+
+
+def test_a_link_in_a_scene_is_followed(tmp_path: Path) -> None:
+    make_scene(tmp_path / "other")
+
+    def change(folder: Path, scene: dict[str, Any]) -> None:
+        (folder / "elsewhere").symlink_to(tmp_path / "other" / "train")
+        scene["train"]["frames"][1]["file_path"] = "train/../elsewhere/./r_000"
+
+    assert len(load_dataset(make_scene(tmp_path / "toy", change)).train) == 3
+
+
+def test_a_picture_without_pixels(tmp_path: Path) -> None:
+    """Pillow ends in an IndexError where a PNG has no IDAT."""
+    folder = make_scene(tmp_path / "toy")
+    file = folder / "train" / "r_000.png"
+    file.write_bytes(with_checksums(file.read_bytes().replace(b"IDAT", b"IDAU")))
+    with pytest.raises(InputError, match="is not a readable picture"):
+        load_dataset(folder)
+
+
+def test_nothing_is_written_through_a_link(tmp_path: Path) -> None:
+    """A run folder from elsewhere, whose files are links to ours."""
+    run, mine = tmp_path / "run", tmp_path / "mine"
+    run.mkdir()
+    mine.mkdir()
+    (mine / "file").write_text("precious")
+    (run / ".lock").symlink_to(mine / "file")
+    with pytest.raises(OSError, match="symbolic link"), locked_run_folder(run):
+        pass
+    (run / ".lock").unlink()
+    (run / "eval").symlink_to(mine)
+    with pytest.raises(InputError, match="eval is a link"):
+        evaluate_run(run, None, None, "black", {})  # type: ignore[arg-type]
+    for name in ("config.toml", "log.jsonl", STATE):
+        (run / name).symlink_to(mine / "file")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("lapgs_wgpu.train.run_folder._record", lambda device, dataset: {})
+        start_run_folder(run, load_config("tiny"), None, None)  # type: ignore[arg-type]
+    save_state(run, {"training.done": np.array(1)})
+    with Log(run / "log.jsonl", 1, terminal=io.StringIO()) as log:
+        log.step(1, 0.5, 10.0, 3)
+    assert [file.name for file in mine.iterdir()] == ["file"]
+    assert (mine / "file").read_text() == "precious"
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
+def test_pipes_and_devices_do_not_hang(tmp_path: Path) -> None:
+    for name in ("a.json", "a.toml", STATE):
+        os.mkfifo(tmp_path / name)
+    (tmp_path / "zero.json").symlink_to("/dev/zero")
+    (tmp_path / "zero.toml").symlink_to("/dev/zero")
+    actions: list[Callable[[], Any]] = [
+        lambda: read_path(tmp_path / "a.json"),
+        lambda: read_path(tmp_path / "zero.json"),
+        lambda: read_spec(tmp_path / "a.toml"),
+        lambda: read_toml(tmp_path / "zero.toml"),
+        lambda: load_state(tmp_path),
+    ]
+    for action in actions:
+        with pytest.raises(InputError, match="not a regular file"):
+            action()
+
+
+# Bounds on memory (docs/reliability.md) ------------------------------------------------------------------------------
+
+
+def peak_of(action: Callable[[], Any]) -> int:
+    tracemalloc.start()
+    try:
+        refused_or(action)
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("part", ["{},", "[],", "[0],", '{"":0},', "1.5,", "[" * 30 + "0" + "]" * 30 + ","])
+def test_json_takes_at_most_64_times_its_size(part: str, tmp_path: Path) -> None:
+    size = 1 << 20
+    (tmp_path / "a.json").write_text("[" + part * (size // len(part)) + "0]")
+    assert peak_of(lambda: read_json(tmp_path / "a.json")) < 64 * size + (1 << 20)
+
+
+def test_toml_of_the_largest_size_is_quick(tmp_path: Path) -> None:
+    line = ".".join("abcdefghijklmno") + ".{} = 1\n"
+    text = "".join(line.format(f"k{i}") for i in range(MAX_TOML_BYTES // (len(line) + 4)))
+    (tmp_path / "a.toml").write_text(text)
+    command = [
+        sys.executable,
+        "-c",
+        "import sys; from lapgs_wgpu.io.documents import read_toml; read_toml(sys.argv[1])",
+    ]
+    subprocess.run([*command, str(tmp_path / "a.toml")], check=True, timeout=60)
+    (tmp_path / "a.toml").write_text("#" * (MAX_TOML_BYTES + 1))
+    with pytest.raises(InputError, match=f"has {MAX_TOML_BYTES + 1} bytes, over {MAX_TOML_BYTES}"):
+        read_toml(tmp_path / "a.toml")
+
+
+@pytest.mark.parametrize("kind", ["uchar", "float", "double"])
+def test_splats_take_at_most_24_times_the_file(kind: str, tmp_path: Path) -> None:
+    """The smallest rows, of 17 bytes, become 236 bytes each: harmonics are padded to degree 3."""
+    still = random_still(100_000, 0)
+    columns = {name: (kind, np.ones(100_000)) for name in columns_of(still)}
+    data = ply_bytes(
+        {name: (code, values.astype(int) if kind == "uchar" else values) for name, (code, values) in columns.items()}
+    )
+    (tmp_path / "a.ply").write_bytes(data)
+    assert peak_of(lambda: read_scene(tmp_path / "a.ply")) < 24 * len(data) + (16 << 20)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs RLIMIT_AS")
+def test_sizes_that_a_file_only_declares_take_no_memory(tmp_path: Path) -> None:
+    """In a process that may not take a gigabyte more than it has: reading in whole, header by header."""
+    names = []
+    for number, (count, tensors) in enumerate([(10**17, 8), (2, 2**63), (10**9, 10**15)]):
+        head = FOREIGN[0].replace(b"element vertex 4", b"element vertex %d" % count)
+        trailer = b"element lapgs4d %d\ncomment lapgs4d v1 safetensors %d\nproperty uint word\nend_header\n"
+        (tmp_path / f"{number}.ply").write_bytes(head.replace(b"end_header\n", trailer % (tensors // 4, tensors)))
+        names.append(str(tmp_path / f"{number}.ply"))
+    program = (
+        "import resource, sys; from lapgs_wgpu.motion.scene_file import read_scene; "
+        "from lapgs_wgpu.errors import InputError\n"
+        "used = int(open('/proc/self/statm').read().split()[0]) * resource.getpagesize()\n"
+        "resource.setrlimit(resource.RLIMIT_AS, (used + (1 << 28),) * 2)\n"
+        "for name in sys.argv[1:]:\n    try: read_scene(name)\n    except InputError: print('refused')"
+    )
+    told = subprocess.run([sys.executable, "-c", program, *names], capture_output=True, text=True, timeout=120)
+    assert told.stdout.split() == ["refused"] * 3, told.stderr
+
+
+def test_a_hostile_checkpoint_ends_the_command_in_one_sentence(device: Device, tmp_path: Path) -> None:
+    """The whole way: no traceback, exit code 2; a step that is no number does not matter."""
+    small_scene("grid4d", device).save(tmp_path / "checkpoint.ply", {"step": "x\x1b"})
+    (tmp_path / "config.toml").write_text("seed = " + "[" * 3000)
+    command = [sys.executable, "-m", "lapgs_wgpu.cli", "--eval", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert "nested too deeply" in done.stderr
