@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,6 +12,7 @@ import numpy as np
 import torch
 from PIL import Image
 from scipy.ndimage import map_coordinates
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from lapgs_wgpu.data import Dataset
@@ -217,3 +219,170 @@ def write_points(path: Path, points: np.ndarray, colours: np.ndarray | None = No
     properties = "".join(f"property {kinds[rows.dtype[name].str]} {name}\n" for name in rows.dtype.names or ())
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{properties}end_header\n"
     path.write_bytes(header.encode() + rows.tobytes())
+
+
+# A sparse model of COLMAP, and nerfstudio's transforms.json
+
+COLMAP_MODELS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 1, "SIMPLE_RADIAL": 2, "RADIAL": 3, "OPENCV": 4, "OPENCV_FISHEYE": 5}
+
+
+def quaternion(R: np.ndarray) -> np.ndarray:
+    """wxyz of a rotation."""
+    x, y, z, w = Rotation.from_matrix(R).as_quat()
+    return np.array([w, x, y, z])
+
+
+def write_model(
+    folder: Path,
+    model: str,
+    size: tuple[int, int],
+    parameters: Sequence[float],
+    poses: dict[str, Camera],
+    points: np.ndarray,
+    colours: np.ndarray,
+    *,
+    binary: bool,
+) -> None:
+    """A sparse model with one camera, each picture seeing two points, each point seen by two pictures."""
+    folder.mkdir(parents=True)
+    rows = [(name, [*quaternion(c.T_cam_world[:3, :3]), *c.T_cam_world[:3, 3]]) for name, c in poses.items()]
+    if binary:
+        number = COLMAP_MODELS[model]
+        camera = struct.pack(f"<QIiQQ{len(parameters)}d", 1, 7, number, *size, *parameters)
+        (folder / "cameras.bin").write_bytes(camera)
+        images = struct.pack("<Q", len(rows))
+        for i, (name, pose) in enumerate(rows):
+            images += struct.pack("<I7dI", i + 1, *pose, 7) + name.encode() + b"\0"
+            images += struct.pack("<Q", 2) + 2 * struct.pack("<ddq", 1.5, 2.5, -1)
+        (folder / "images.bin").write_bytes(images)
+        cloud = struct.pack("<Q", len(points))
+        for i, (point, colour) in enumerate(zip(points.tolist(), colours.tolist(), strict=True)):
+            cloud += struct.pack("<Q3d3BdQ", i + 1, *point, *colour, 0.5, 2) + struct.pack("<4I", 1, 0, 2, 1)
+        (folder / "points3D.bin").write_bytes(cloud)
+        return
+    text = " ".join(map(repr, map(float, parameters)))
+    (folder / "cameras.txt").write_text(f"# Cameras\n7 {model} {size[0]} {size[1]} {text}\n")
+    lines = ["# Images"]
+    for i, (name, pose) in enumerate(rows):
+        lines += [f"{i + 1} {' '.join(map(repr, map(float, pose)))} 7 {name}", "1.5 2.5 -1 1.5 2.5 -1" if i else ""]
+    (folder / "images.txt").write_text("\n".join(lines) + "\n")
+    lines = ["# Points"]
+    for i, (point, colour) in enumerate(zip(points.tolist(), colours.tolist(), strict=True)):
+        lines.append(f"{i + 1} {' '.join(map(repr, point))} {' '.join(map(str, colour))} 0.5 1 0 2 1")
+    (folder / "points3D.txt").write_text("\n".join(lines) + "\n")
+
+
+def film(
+    device: Device, count: int, lens: dict[str, Any] | None = None, principal: tuple[float, float] = (0, 0)
+) -> list[tuple[Camera, np.ndarray]]:
+    """What a camera on the arc sees, whose principal point is moved and whose lens has these coefficients (k1, k2, k3,
+    p1, p2)."""
+    found = []
+    for camera in cameras(count):
+        camera = shifted(camera, *principal)
+        k = [(lens or {}).get(name, 0.0) for name in ("k1", "k2", "k3", "p1", "p2")]
+        fields = {"radial_distortion": k[:3], "tangential_distortion": k[3:], "skew": 0.0}
+        blobs = Blobs.random()
+        found.append((camera, bent(blobs, camera, device, fields) if lens else blobs.drawn(camera, device)))
+    return found
+
+
+def write_colmap(
+    folder: Path,
+    device: Device,
+    *,
+    count: int = 6,
+    model: str = "PINHOLE",
+    lens: dict[str, Any] | None = None,
+    binary: bool = True,
+    principal: tuple[float, float] = (0, 0),
+    name: str = "frame_{:04d}.png",
+) -> Path:
+    """One camera that moves past the blobs; the cloud is their middles, in their colours."""
+    poses = {}
+    (folder / "images").mkdir(parents=True)
+    for i, (camera, picture) in enumerate(film(device, count, lens, principal)):
+        poses[name.format(i + 1)] = camera
+        path = folder / "images" / name.format(i + 1)
+        path.parent.mkdir(exist_ok=True)
+        Image.fromarray(picture).save(path)
+    K = camera.K
+    values = {"fx": K[0, 0], "fy": K[1, 1], "f": K[0, 0], "cx": K[0, 2], "cy": K[1, 2], **(lens or {})}
+    names = {
+        "SIMPLE_PINHOLE": "f cx cy", "PINHOLE": "fx fy cx cy", "SIMPLE_RADIAL": "f cx cy k1", "RADIAL": "f cx cy k1 k2",
+        "OPENCV": "fx fy cx cy k1 k2 p1 p2", "OPENCV_FISHEYE": "fx fy cx cy k1 k2 p1 p2",
+    }[model]  # fmt: skip
+    blobs = Blobs.random()
+    write_model(
+        folder / "sparse/0",
+        model,
+        (WIDTH, HEIGHT),
+        [values.get(each, 0.0) for each in names.split()],
+        poses,
+        blobs.means.double().numpy(),
+        (blobs.colors * 255).round().byte().numpy(),
+        binary=binary,
+    )
+    return folder
+
+
+def write_rig(folder: Path, device: Device, *, count: int = 4, frames: int = 3) -> Path:
+    """Still cameras: the blobs move; COLMAP has seen the first picture of each camera alone."""
+    poses = {}
+    for number, camera in enumerate(cameras(count)):
+        (folder / f"images/cam{number:02d}").mkdir(parents=True)
+        poses[f"cam{number:02d}/0000.png"] = camera
+        for frame in range(frames):
+            picture = Image.fromarray(moved(frame).drawn(camera, device))
+            picture.save(folder / f"images/cam{number:02d}/{frame:04d}.png")
+    blobs = Blobs.random()
+    parameters = [camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]]
+    colours = (blobs.colors * 255).round().byte().numpy()
+    means = blobs.means.double().numpy()
+    write_model(folder / "sparse/0", "PINHOLE", (WIDTH, HEIGHT), parameters, poses, means, colours, binary=True)
+    return folder
+
+
+def write_nerfstudio(
+    folder: Path,
+    device: Device,
+    *,
+    count: int = 6,
+    lens: dict[str, Any] | None = None,
+    principal: tuple[float, float] = (0, 0),
+    each: bool = False,
+    change: Change | None = None,
+) -> Path:
+    """The same camera in transforms.json, with a cloud as text. each: every frame has its own intrinsics.
+
+    change: spoils the file's object before it is written.
+    """
+    data: dict[str, Any] = {"camera_model": "OPENCV", "frames": [], "ply_file_path": "sparse_pc.ply"}
+    (folder / "images").mkdir(parents=True)
+    for i, (camera, picture) in enumerate(film(device, count, lens, principal)):
+        Image.fromarray(picture).save(folder / f"images/frame_{i + 1:05d}.png")
+        K = camera.K
+        intrinsics = {"w": WIDTH, "h": HEIGHT, "fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+        intrinsics |= lens or {}
+        pose = np.linalg.inv(camera.T_cam_world) @ np.diag([1.0, -1, -1, 1])
+        frame = {
+            "file_path": f"./images/frame_{i + 1:05d}.png",
+            "transform_matrix": pose.tolist(),
+            "time": 2.0 + i / 10,
+        }
+        data["frames"].append(frame | intrinsics if each else frame)
+        if not each:
+            data |= intrinsics
+    blobs = Blobs.random()
+    rows = np.concatenate([blobs.means.numpy(), (blobs.colors * 255).round().numpy()], axis=1).tolist()
+    properties = "".join(f"property {kind} {name}\n" for kind, name in CLOUD_PROPERTIES)
+    text = f"ply\nformat ascii 1.0\nelement vertex {len(rows)}\n{properties}end_header\n"
+    text += "".join(f"{x} {y} {z} {r:.0f} {g:.0f} {b:.0f}\n" for x, y, z, r, g, b in rows)
+    (folder / "sparse_pc.ply").write_text(text)
+    if change:
+        change(folder, data)
+    (folder / "transforms.json").write_text(json.dumps(data))
+    return folder
+
+
+CLOUD_PROPERTIES = [("float", "x"), ("float", "y"), ("float", "z")] + [("uint8", c) for c in ("red", "green", "blue")]

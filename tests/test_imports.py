@@ -25,6 +25,7 @@ ALLOWED = {
     "train": {"errors", "gpu", "splat", "motion", "data", "io"},
     "command": {"errors", "gpu"},
     "viewer": {"errors", "command", "gpu", "splat", "motion", "data", "io"},
+    "prepare": {"errors", "command", "data"},
     "cli": {"errors", "command", "gpu", "splat", "motion", "data", "io", "train", "viewer"},
 }
 FOLDERS = {"": PACKAGE, "viewer": Path(lapgs_wgpu.viewer.__file__).parent}  # where the parts lie on the disk
@@ -94,7 +95,17 @@ def test_import_is_light_and_silent() -> None:
 
 
 @pytest.mark.parametrize(
-    "module", ["errors", "io.checkpoint", "splat.camera", "data.dnerf", "data.hypernerf", "data.neu3d"]
+    "module",
+    [
+        "errors",
+        "io.checkpoint",
+        "splat.camera",
+        "data.dnerf",
+        "data.hypernerf",
+        "data.neu3d",
+        "data.nerfstudio",
+        "data.colmap",
+    ],
 )
 def test_readers_need_neither_torch_nor_a_device(module: str) -> None:
     loaded = run(f"import sys, lapgs_wgpu.{module}; print(*sys.modules)").split()

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from lapgs_wgpu.data.colmap import is_colmap, load_colmap
 from lapgs_wgpu.data.dnerf import is_dnerf, load_dnerf
 from lapgs_wgpu.data.hypernerf import is_hypernerf, load_hypernerf
+from lapgs_wgpu.data.nerfstudio import is_nerfstudio, load_nerfstudio
 from lapgs_wgpu.data.neu3d import is_neu3d, load_neu3d
 from lapgs_wgpu.data.views import Dataset, ImageCache, View, composite
 from lapgs_wgpu.errors import InputError
@@ -16,6 +18,8 @@ FORMATS = (
     ("D-NeRF", "transforms_train.json and transforms_test.json", is_dnerf, load_dnerf),
     ("HyperNeRF", "dataset.json beside camera/ and rgb/", is_hypernerf, load_hypernerf),
     ("Neu3D", "poses_bounds.npy beside cam00.mp4, ... or cam00/images/, ...", is_neu3d, load_neu3d),
+    ("nerfstudio", "transforms.json", is_nerfstudio, load_nerfstudio),
+    ("COLMAP", "sparse/0/cameras.bin or .txt beside images/", is_colmap, load_colmap),
 )
 
 

@@ -9,19 +9,18 @@ import math
 import os
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.data.fields import kind, leads_out, number, read_json, required
 from lapgs_wgpu.data.pictures import PICTURE_SUFFIXES, check_pictures, read_picture, shrunk
-from lapgs_wgpu.data.poses import LARGEST_ENTRY, ROTATION_TOLERANCE, check_rotation, world_to_camera
+from lapgs_wgpu.data.poses import opengl_pose
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
 
-OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # y up, z backward -> y down, z forward
 NEEDED = "which a D-NeRF scene needs"
 
 
@@ -103,7 +102,7 @@ def _read_split(folder: Path, split: str) -> tuple[float, list[_Frame]]:
         picture = folder / (file_path + suffix)
         if not os.path.isfile(picture):  # Path.is_file raises where a name is too long
             raise InputError(f"{picture} does not exist, but {where} names it as its file_path.")
-        T_cam_world = _world_to_camera(required(frame, "transform_matrix", where, NEEDED), where)
+        T_cam_world = opengl_pose(required(frame, "transform_matrix", where, NEEDED), where)
         if timed == 0:
             time = index / max(len(frames) - 1, 1)
         else:
@@ -113,24 +112,3 @@ def _read_split(folder: Path, split: str) -> tuple[float, list[_Frame]]:
                 raise InputError(f"{where}: time must lie in [0, 1], got {time:g}; divide by the clip's duration.")
         parsed.append(_Frame(picture, T_cam_world, time))
     return fov_x, parsed
-
-
-def _world_to_camera(value: Any, where: str) -> NDArray[np.float64]:
-    """(4, 4) T_cam_world in OpenCV axes from a camera-to-world matrix in OpenGL axes, checked to be a rigid motion."""
-    name = f"{where}: transform_matrix"
-    rows = value if isinstance(value, list) else []
-    if len(rows) != 4 or not all(isinstance(row, list) and len(row) == 4 for row in rows):
-        raise InputError(f"{name} must be 4 rows of 4 numbers, got {kind(value)}.")
-    T = np.array([[number(entry, "transform_matrix", where) for entry in row] for row in rows])
-    bad = np.argwhere(~(np.abs(T) <= LARGEST_ENTRY))  # so written, NaN is bad too
-    if len(bad):
-        row, column = bad[0]
-        raise InputError(
-            f"{name} holds {T[row, column]:g} in row {row}, column {column}; "
-            f"its entries must be finite and at most {LARGEST_ENTRY:g}."
-        )
-    if np.abs(T[3] - [0, 0, 0, 1]).max() > ROTATION_TOLERANCE:
-        raise InputError(f"{name} must end with the row 0 0 0 1, got {' '.join(f'{x:g}' for x in T[3])}.")
-    R, position = T[:3, :3], T[:3, 3]
-    check_rotation(R, name)
-    return world_to_camera(R @ OPENGL_TO_OPENCV[:3, :3], position)

@@ -12,13 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from PIL import Image
 
 from lapgs_wgpu.data.cloud import check_cloud, find_cloud, points_in_view, read_cloud
 from lapgs_wgpu.data.fields import finite, kind, read_json, required, vector
-from lapgs_wgpu.data.lens import LARGEST_ZOOM, Lens
-from lapgs_wgpu.data.pictures import check_pictures, check_proportions, decode, shrink, shrunk
+from lapgs_wgpu.data.lens import LARGEST_ZOOM, Lens, read_straight
+from lapgs_wgpu.data.pictures import check_pictures, check_proportions, shrunk
 from lapgs_wgpu.data.poses import LARGEST_ENTRY, Placement, check_rotation, fitting, world_to_camera
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.errors import InputError
@@ -91,7 +89,7 @@ def load_hypernerf(folder: str | Path, *, image_size: int | None = None) -> Data
                 camera=fit.camera(cameras[name]).resized(*size),
                 time=times[name],
                 source=str(rgb / f"{name}.png"),
-                pixels=partial(_read, rgb / f"{name}.png", lenses[name], cameras[name].K, stored, size),
+                pixels=partial(read_straight, rgb / f"{name}.png", lenses[name], cameras[name].K, stored, size),
             )
             for index, name in enumerate(names)
         )
@@ -104,18 +102,6 @@ def load_hypernerf(folder: str | Path, *, image_size: int | None = None) -> Data
         depths=(depths[0] * fit.scale, depths[1] * fit.scale),
         placement=placement.then(fit),
     )
-
-
-def _read(
-    path: Path, lens: Lens, K: NDArray[np.float64], stored: tuple[int, int], size: tuple[int, int]
-) -> NDArray[np.uint8]:
-    """Decode, straighten for the pinhole camera K, and shrink."""
-    picture = decode(path)
-    if picture.size != stored:
-        raise InputError(f"{path} is {picture.size[0]}x{picture.size[1]} pixels now and was {stored[0]}x{stored[1]}.")
-    if not lens.is_pinhole:
-        picture = Image.fromarray(lens.straighten(np.asarray(picture), K))
-    return shrink(picture, size)
 
 
 def _splits(path: Path) -> tuple[list[str], list[str], list[str]]:

@@ -6,10 +6,15 @@ The model is that of nerfies (and of Brown 1966): three radial and two tangentia
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 from scipy.ndimage import map_coordinates
+
+from lapgs_wgpu.data.pictures import decode, shrink
+from lapgs_wgpu.errors import InputError
 
 Array = NDArray[np.float64]
 
@@ -90,6 +95,19 @@ class Lens:
     def _zoomed(self, zoom: float) -> Array:
         fx, fy = zoom * self.K[0, 0], zoom * self.K[1, 1]
         return np.array([[fx, 0, self.K[0, 2]], [0, fy, self.K[1, 2]], [0, 0, 1]])
+
+
+def read_straight(
+    path: Path, lens: Lens, K: Array, stored: tuple[int, int], size: tuple[int, int]
+) -> NDArray[np.uint8]:
+    """A picture of (width, height) `stored`, straightened for the pinhole camera K of that size and shrunk to `size`:
+    (H, W, 3) RGB or (H, W, 4) RGBA. Raises InputError."""
+    picture = decode(path)
+    if picture.size != stored:
+        raise InputError(f"{path} is {picture.size[0]}x{picture.size[1]} pixels now and was {stored[0]}x{stored[1]}.")
+    if not lens.is_pinhole:
+        picture = Image.fromarray(lens.straighten(np.asarray(picture), K))
+    return shrink(picture, size)
 
 
 def _rays(K: Array, pixels: Array) -> Array:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lapgs_wgpu.data.fields import kind, number
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
 
@@ -16,6 +17,7 @@ Array = NDArray[np.float64]
 # Largest deviation of R^T R from the identity: files hold about seven digits, a scaled or sheared camera is far beyond.
 ROTATION_TOLERANCE = 1e-3
 LARGEST_ENTRY = 1e9  # of a pose: a camera further away is a mistake, and its matrix products lose all digits
+OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0])  # y up, z backward -> y down, z forward
 BOX = 1.3  # half side of the cube around the origin that a capture is brought to: that of D-NeRF's scenes
 TAIL = 1.0  # per cent of the points at either end of each axis that may lie outside: stray ones decide nothing
 
@@ -75,3 +77,26 @@ def world_to_camera(R_world_cam: Array, position: Array) -> Array:
     T_cam_world = np.eye(4)
     T_cam_world[:3, :3], T_cam_world[:3, 3] = R_world_cam.T, -R_world_cam.T @ position
     return T_cam_world
+
+
+def opengl_pose(value: Any, where: str) -> Array:
+    """(4, 4) T_cam_world in OpenCV axes from a camera-to-world matrix in OpenGL axes, checked to be a rigid motion.
+
+    value: the field transform_matrix of a transforms file. where: what errors call its frame."""
+    name = f"{where}: transform_matrix"
+    rows = value if isinstance(value, list) else []
+    if len(rows) != 4 or not all(isinstance(row, list) and len(row) == 4 for row in rows):
+        raise InputError(f"{name} must be 4 rows of 4 numbers, got {kind(value)}.")
+    T = np.array([[number(entry, "transform_matrix", where) for entry in row] for row in rows])
+    bad = np.argwhere(~(np.abs(T) <= LARGEST_ENTRY))  # so written, NaN is bad too
+    if len(bad):
+        row, column = bad[0]
+        raise InputError(
+            f"{name} holds {T[row, column]:g} in row {row}, column {column}; "
+            f"its entries must be finite and at most {LARGEST_ENTRY:g}."
+        )
+    if np.abs(T[3] - [0, 0, 0, 1]).max() > ROTATION_TOLERANCE:
+        raise InputError(f"{name} must end with the row 0 0 0 1, got {' '.join(f'{x:g}' for x in T[3])}.")
+    R, position = T[:3, :3], T[:3, 3]
+    check_rotation(R, name)
+    return world_to_camera(R @ OPENGL_TO_OPENCV, position)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import OrderedDict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
@@ -57,6 +57,7 @@ class Dataset:
 
     cloud: points that it brings, where Gaussians start. depths: nearest and furthest of what the cameras see, world
     units, where the capture says so. placement: how it was moved, None where its coordinates are those of its files.
+    warnings: what looks wrong but does not stop a training, a sentence each.
     """
 
     name: str
@@ -65,6 +66,7 @@ class Dataset:
     cloud: Cloud | None = None
     depths: tuple[float, float] | None = None
     placement: Placement | None = None
+    warnings: tuple[str, ...] = ()
 
     @cached_property
     def cameras(self) -> tuple[Camera, ...]:
@@ -97,20 +99,26 @@ class Dataset:
 
     @cached_property
     def focus(self) -> NDArray[np.float64]:
-        """(3,) the point nearest to the lines of sight of all training cameras; where these are parallel, and say
-        little, one extent in front of the cameras."""
-        centres = np.stack([view.camera.position for view in self.train])
-        ahead = np.stack([view.camera.T_cam_world[2, :3] for view in self.train])
-        across = np.eye(3) - ahead[:, :, None] * ahead[:, None, :]
-        faint = 1e-3 * len(centres) * np.eye(3)
-        guess = centres.mean(axis=0) + (self.extent or 1.0) * ahead.mean(axis=0)
-        right_side = np.einsum("nij,nj->i", across, centres) + faint @ guess
-        return np.linalg.solve(across.sum(axis=0) + faint, right_side)
+        """(3,) the point that the training cameras look at (`focus_of`)."""
+        return focus_of([view.camera for view in self.train])
 
     @cached_property
     def times(self) -> NDArray[np.float64]:
         """(T,) the distinct training times, ascending."""
         return np.unique([view.time for view in self.train])
+
+
+def focus_of(cameras: Sequence[Camera]) -> NDArray[np.float64]:
+    """(3,) the point nearest to the lines of sight of all cameras; where these are parallel, and say little, one extent
+    (1.1 times the largest distance of a camera from their mean) in front of them."""
+    centres = np.stack([camera.position for camera in cameras])
+    ahead = np.stack([camera.T_cam_world[2, :3] for camera in cameras])
+    across = np.eye(3) - ahead[:, :, None] * ahead[:, None, :]
+    faint = 1e-3 * len(centres) * np.eye(3)
+    extent = 1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
+    guess = centres.mean(axis=0) + (extent or 1.0) * ahead.mean(axis=0)
+    right_side = np.einsum("nij,nj->i", across, centres) + faint @ guess
+    return np.linalg.solve(across.sum(axis=0) + faint, right_side)
 
 
 def composite(image: NDArray[np.uint8], background: ArrayLike) -> NDArray[np.uint8]:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from types import FrameType
 
+from lapgs_wgpu.data.sanity import check_times
 from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.errors import DeviceError, InputError, NumericalError
 from lapgs_wgpu.gpu.device import Device, open_device
@@ -58,8 +60,11 @@ def train(
     when that state has been written.
     """
     out = Path(out)
+    check_times(dataset, moving=config.field.kind != "static")
     if ranks.first:
         check_run_folder(out, overwrite=overwrite)
+        for warning in dataset.warnings:
+            print(f"warning: {warning}", file=sys.stderr, flush=True)
     keep_freed_memory()
     training = Training(config, dataset, device or open_device(), ranks)
     if not ranks.first:

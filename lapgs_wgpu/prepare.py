@@ -1,0 +1,173 @@
+"""lapgs-prepare: films become a capture, by the programs ffmpeg and colmap (docs/own-data.md has their commands)."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from lapgs_wgpu.command import guarded
+from lapgs_wgpu.data.colmap import IMAGES, SPARSE
+from lapgs_wgpu.data.colmap_model import count_images, is_model
+from lapgs_wgpu.data.moments import write_times
+from lapgs_wgpu.errors import InputError
+
+DESCRIPTION = """\
+Make a capture that lapgs-train opens: pictures from films with ffmpeg, cameras from the pictures with colmap.
+
+  lapgs-prepare walk.mp4 --out DIR              one camera that moves: every picture gets its own pose
+  lapgs-prepare a.mp4 b.mp4 c.mp4 --out DIR     cameras on tripods that film together, all started at the same moment
+"""
+FRAMES_PER_SECOND = 10.0
+NEIGHBOURS = 20  # pictures before and after, with which each one of a moving camera is matched
+FEWEST = 0.5  # of the pictures must get a pose
+
+
+def prepare_command(arguments: Sequence[str] | None = None) -> int:
+    """lapgs-prepare: returns the exit code."""
+    return guarded("lapgs-prepare", _prepare, list(sys.argv[1:] if arguments is None else arguments))
+
+
+def _prepare(arguments: list[str]) -> None:
+    parser = argparse.ArgumentParser(
+        "lapgs-prepare",
+        description=DESCRIPTION,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    parser.add_argument("videos", nargs="+", metavar="VIDEO", help="films, one a camera, of one size")
+    parser.add_argument("--out", required=True, metavar="DIR", help="folder of the capture, new or empty")
+    parser.add_argument(
+        "--fps", type=float, default=FRAMES_PER_SECOND, help=f"pictures a second, at most [{FRAMES_PER_SECOND:g}]"
+    )
+    given = parser.parse_args(arguments)
+    prepare([Path(video) for video in given.videos], Path(given.out), given.fps)
+
+
+def prepare(videos: Sequence[Path], out: Path, fps: float) -> None:
+    """Write images/, times.json and sparse/0 of films. fps: pictures a second, at most. Raises InputError."""
+    if not 0 < fps <= 1000:
+        raise InputError(f"--fps must be above 0 and at most 1000, got {fps:g}.")
+    for video in videos:
+        if not video.is_file():
+            raise InputError(f"{video} does not exist; name the films of the capture.")
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"{out} is not an empty folder; name a new one with --out.")
+    programs = {name: _program(name) for name in ("ffmpeg", "colmap")}
+    out.mkdir(parents=True, exist_ok=True)
+    times: dict[str, float] = {}
+    for index, video in enumerate(videos):
+        folder = out / IMAGES / f"cam{index:02d}" if len(videos) > 1 else out / IMAGES
+        for picture in extract(programs["ffmpeg"], video, folder, fps):
+            times[picture.relative_to(out / IMAGES).as_posix()] = int(picture.stem) / 1000
+    write_times(out, times)
+    if len(videos) > 1:
+        first = [sorted((out / IMAGES / f"cam{i:02d}").iterdir())[0] for i in range(len(videos))]
+        registered = reconstruct(programs["colmap"], out, first)
+        wanted = len(videos)
+    else:
+        registered = reconstruct(programs["colmap"], out, None)
+        wanted = len(times)
+    print(f"{out}: {len(times)} pictures, {registered} of {wanted} cameras placed; lapgs-train tiny --data {out}")
+    if registered < max(2, FEWEST * wanted):
+        raise InputError(
+            f"colmap placed {registered} of {wanted} pictures (at least half are needed); film slower, with more "
+            f"texture and overlap, or raise --fps. What it said is in {out / 'colmap.log'}."
+        )
+
+
+def extract(ffmpeg: str, video: Path, folder: Path, fps: float) -> list[Path]:
+    """The pictures of a film, at most `fps` a second, in order; each one's name is its time in milliseconds."""
+    folder.mkdir(parents=True, exist_ok=True)
+    # Frames as the film has them, the rate of a phone's varies: those that come 1 / fps after the last one taken.
+    chosen = f"select=isnan(prev_selected_t)+gte(t-prev_selected_t\\,{1 / fps - 5e-4:.6f}),settb=1/1000"
+    timed = ["-fps_mode", "passthrough", "-enc_time_base", "1/1000", "-frame_pts", "1"]
+    command = [ffmpeg, "-nostdin", "-v", "error", "-i", str(video), "-vf", chosen, *timed, "-qscale:v", "2"]
+    _run([*command, str(folder / "%08d.jpg")], folder.parent / "ffmpeg.log", f"{video}: ffmpeg")
+    (folder.parent / "ffmpeg.log").unlink(missing_ok=True)
+    pictures = sorted(folder.glob("*.jpg"))
+    if len(pictures) < 2:
+        raise InputError(f"{video} gave {len(pictures)} pictures at {fps:g} a second; is it a film?")
+    return pictures
+
+
+def reconstruct(colmap: str, out: Path, pictures: Sequence[Path] | None) -> int:
+    """Run colmap on these pictures, all below images/ where None, and leave the largest model in sparse/0.
+
+    Returns how many pictures it holds. All share one lens. None: a moving camera's film, in the order of the names.
+    """
+    log, images, work = out / "colmap.log", out / IMAGES, out / "colmap"
+    work.mkdir()
+    database = ["--database_path", str(work / "database.db")]
+    listed: list[str] = []
+    if pictures is not None:
+        names = "\n".join(path.relative_to(images).as_posix() for path in pictures)
+        (work / "pictures.txt").write_text(names + "\n", encoding="utf-8")
+        listed = ["--image_list_path", str(work / "pictures.txt")]
+    model = "OPENCV" if pictures is None else "SIMPLE_RADIAL"  # few pictures do not tell more of a lens
+
+    def run(step: str, *options: str) -> None:
+        print(f"colmap {step} ...", file=sys.stderr, flush=True)
+        _run([colmap, step, *options], log, f"colmap {step}")
+
+    lens = ["--ImageReader.single_camera", "1", "--ImageReader.camera_model", model]
+    run(
+        "feature_extractor",
+        *database,
+        "--image_path",
+        str(images),
+        *listed,
+        *lens,
+        *_no_gpu(colmap, "feature_extractor"),
+    )
+    matcher = "exhaustive_matcher" if pictures is not None else "sequential_matcher"
+    overlap = [] if pictures is not None else ["--SequentialMatching.overlap", str(NEIGHBOURS)]
+    run(matcher, *database, *overlap, *_no_gpu(colmap, matcher))
+    (work / SPARSE).mkdir()
+    run("mapper", *database, "--image_path", str(images), "--output_path", str(work / SPARSE))
+    models = [path for path in sorted((work / SPARSE).iterdir()) if is_model(path)]
+    if not models:
+        raise InputError(
+            f"colmap found no cameras for the pictures in {images}: they share too little; film slower, with more "
+            f"texture and overlap. What it said is in {log}."
+        )
+    best = max(models, key=count_images)
+    (out / SPARSE).mkdir()
+    shutil.copytree(best, out / SPARSE / "0")
+    return count_images(best)
+
+
+def _no_gpu(colmap: str, step: str) -> list[str]:
+    """The option that keeps a step on the processor: its name has changed over the versions of colmap."""
+    done = subprocess.run([colmap, step, "-h"], capture_output=True, text=True, check=False, env=_environment())
+    option = re.search(r"--(\w+\.use_gpu)", done.stdout + done.stderr)
+    return [f"--{option[1]}", "0"] if option else []
+
+
+def _program(name: str) -> str:
+    path = shutil.which(name)
+    if path is None:
+        raise InputError(f"the program {name} is not installed; on Debian and Ubuntu: sudo apt-get install {name}.")
+    return path
+
+
+def _run(command: list[str], log: Path, name: str) -> None:
+    """Run a program, with what it says appended to a file. InputError with the last line of it where it fails."""
+    with log.open("ab") as file:
+        done = subprocess.run(
+            command, stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT, check=False, env=_environment()
+        )
+    if done.returncode != 0:
+        said = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+        last = said[-1].strip()[:200] if said else "nothing"
+        raise InputError(f"{name} failed with code {done.returncode}, its last words: {last}; {log} has the rest.")
+
+
+def _environment() -> dict[str, str]:
+    """colmap is linked with Qt, which wants a screen unless it is told that there is none."""
+    return {**os.environ, "QT_QPA_PLATFORM": "offscreen"}

@@ -1,0 +1,202 @@
+"""The reader of nerfstudio's transforms.json: its cameras see what pictures show; one sentence for what is wrong."""
+
+from __future__ import annotations
+
+import math
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from captures import HEIGHT, WIDTH, Blobs, agreement, write_nerfstudio, write_points
+from PIL import Image
+
+from lapgs_wgpu.data import load_dataset
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.gpu.device import Device
+
+LENS = {"k1": 0.2, "k2": -0.1, "k3": 0.02, "p1": -0.02, "p2": 0.03}
+
+
+@pytest.fixture(scope="module")
+def pictures(device: Device, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_nerfstudio(tmp_path_factory.mktemp("template") / "toy", device)
+
+
+@pytest.fixture
+def make(pictures: Path, tmp_path: Path) -> Callable[[Callable[[dict[str, Any]], Any] | None], Path]:
+    """A good capture whose transforms.json is changed."""
+    import json
+
+    def make(change: Callable[[dict[str, Any]], Any] | None = None) -> Path:
+        toy = Path(shutil.copytree(pictures, tmp_path / "toy"))
+        data = json.loads((toy / "transforms.json").read_text())
+        if change is not None:
+            change(data)
+        (toy / "transforms.json").write_text(json.dumps(data))
+        return toy
+
+    return make
+
+
+@pytest.mark.parametrize("each", [False, True])
+@pytest.mark.parametrize("lens", [None, LENS])
+def test_cameras_see_what_the_pictures_show(each: bool, lens: Any, device: Device, tmp_path: Path) -> None:
+    """OpenGL's axes, intrinsics of the file or of each frame, lenses."""
+    data = load_dataset(write_nerfstudio(tmp_path / "toy", device, count=5, lens=lens, principal=(3, -2), each=each))
+    assert agreement(data, Blobs.random(), device, [0, 4]) > (33 if lens else 50)
+
+
+def test_times_splits_and_cloud(make: Any) -> None:
+    data = load_dataset(make())
+    np.testing.assert_allclose([view.time for view in data.train], [0, 0.2, 0.4, 0.6, 1])
+    assert [Path(view.source).name for view in data.test] == ["frame_00005.png"]
+    blobs = Blobs.random()
+    assert data.cloud is not None
+    assert data.placement is not None
+    np.testing.assert_allclose(data.cloud.points[:40], data.placement.points(blobs.means.numpy()), atol=1e-5)
+    np.testing.assert_allclose(data.cloud.colours[:40], blobs.colors.numpy(), atol=0.5 / 255 + 1e-6)
+
+
+def test_applied_transform_was_applied_to_cameras_and_cloud(make: Any, device: Device) -> None:
+    """It tells what was done before, and nothing is left to do."""
+    turn = [[0.0, 1, 0, 5], [1, 0, 0, 0], [0, 0, -1, 0]]
+    assert agreement(load_dataset(make(lambda data: data.update(applied_transform=turn))), Blobs.random(), device) > 50
+
+
+def test_the_file_may_say_what_is_held_out(make: Any) -> None:
+    names = ["images/frame_00001.png", "./images/frame_00003.png"]
+    data = load_dataset(make(lambda data: data.update(test_filenames=names)))
+    assert [Path(view.source).name for view in data.test] == ["frame_00001.png", "frame_00003.png"]
+
+
+def test_without_times_the_names_tell(make: Any) -> None:
+    data = load_dataset(make(lambda data: [frame.pop("time") for frame in data["frames"]]))
+    np.testing.assert_allclose([view.time for view in data.train], [0, 0.2, 0.4, 0.6, 1])
+
+
+def test_a_binary_cloud(make: Any) -> None:
+    toy = make()
+    expected = load_dataset(toy).cloud
+    blobs = Blobs.random()
+    write_points(toy / "sparse_pc.ply", blobs.means.numpy(), (blobs.colors * 255).round().numpy())
+    cloud = load_dataset(toy).cloud
+    assert cloud is not None
+    assert expected is not None
+    np.testing.assert_allclose(cloud.points, expected.points, atol=1e-5)
+    np.testing.assert_allclose(cloud.colours, expected.colours, atol=1e-6)
+
+
+def test_without_a_cloud_the_views_fill_the_box(make: Any, device: Device) -> None:
+    data = load_dataset(make(lambda data: data.pop("ply_file_path")))
+    assert data.cloud is None
+    assert data.depths is not None
+    assert np.linalg.norm(data.focus) < 1.3
+    assert agreement(data, Blobs.random(), device) > 50
+
+
+def frame(**fields: Any) -> Callable[[dict[str, Any]], Any]:
+    """Other fields of frame 1; None removes one."""
+
+    def change(data: dict[str, Any]) -> None:
+        merged = data["frames"][1] | fields
+        data["frames"][1] = {name: value for name, value in merged.items() if value is not None}
+
+    return change
+
+
+def top(**fields: Any) -> Callable[[dict[str, Any]], Any]:
+    def change(data: dict[str, Any]) -> None:
+        merged = data | fields
+        data.clear()
+        data.update({name: value for name, value in merged.items() if value is not None})
+
+    return change
+
+
+def opencv(data: dict[str, Any]) -> None:
+    for each in data["frames"]:
+        each["transform_matrix"] = (np.array(each["transform_matrix"]) @ np.diag([1.0, -1, -1, 1])).tolist()
+
+
+def opencv_without_cloud(data: dict[str, Any]) -> None:
+    opencv(data)
+    del data["ply_file_path"]
+
+
+SCALED = (2 * np.eye(4)).tolist()
+BAD: dict[str, tuple[Callable[[dict[str, Any]], Any], list[str]]] = {
+    "no frames": (top(frames=None), ["no field frames"]),
+    "frames empty": (top(frames=[]), ["frames", "a list of 0"]),
+    "a frame of text": (lambda data: data["frames"].__setitem__(1, "x"), ["frame 1", "JSON object"]),
+    "no file_path": (frame(file_path=None), ["frame 1", "no field file_path"]),
+    "file_path absent": (frame(file_path="images/x.png"), ["images/x.png does not exist", "frame 1"]),
+    "file_path twice": (frame(file_path="images/frame_00001.png"), ["6 frames name 5 pictures", "frame_00001.png"]),
+    "no matrix": (frame(transform_matrix=None), ["frame 1", "no field transform_matrix"]),
+    "matrix scaled": (frame(transform_matrix=SCALED), ["frame 1", "transform_matrix", "0 0 0 1"]),
+    "no fl_x": (top(fl_x=None), ["frame 0", "no field fl_x"]),
+    "fl_x 0": (top(fl_x=0), ["fl_x is 0"]),
+    "fl_x of text": (top(fl_x="wide"), ["fl_x", '"wide"']),
+    "cx NaN": (frame(cx=math.nan), ["frame 1", "cx", "nan"]),
+    "w 0": (top(w=0), ["w is 0"]),
+    "w half": (top(w=32), ["64x48", "32x48", "frame 0"]),
+    "fisheye": (top(camera_model="OPENCV_FISHEYE"), ["camera_model", "OPENCV_FISHEYE", "PINHOLE"]),
+    "k4": (top(k4=0.1), ["k4 is 0.1"]),
+    "wild lens": (top(k1=-90), ["frame 0", "distortion (-90", "4 times"]),
+    "time absent": (frame(time=None), ["frame 1", "no field time", "5 of 6"]),
+    "time of text": (frame(time="1"), ["frame 1", "time", '"1"']),
+    "ply absent": (top(ply_file_path="x.ply"), ["x.ply does not exist", "ply_file_path"]),
+    "ply of a number": (top(ply_file_path=3), ["ply_file_path"]),
+    "test unknown": (top(test_filenames=["x.png"]), ["test_filenames names x.png", "6 frames"]),
+    "test all": (top(test_filenames=[f"images/frame_{i:05d}.png" for i in range(1, 7)]), ["all 6 pictures"]),
+    "test of numbers": (top(test_filenames=[3]), ["test_filenames", "a list of 1"]),
+    "OpenCV's axes": (opencv, ["6 of 6 see none", "100 % of them", "OpenGL"]),
+    "the same without a cloud": (opencv_without_cloud, ["look away", "OpenGL", "5 of 5"]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_capture_is_refused_in_one_sentence(name: str, make: Any, tmp_path: Path) -> None:
+    change, words = BAD[name]
+    refused(make(change), [str(tmp_path / "toy"), *words])
+
+
+def refused(folder: Path, words: list[str]) -> None:
+    with pytest.raises(InputError) as caught:
+        load_dataset(folder)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert message.endswith(".")
+    assert len(message) < 600
+    for word in words:
+        assert word in message, message
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("element vertex 40", "element vertex 41", ["declares 41", "40 lines"]),
+        ("element vertex 40", f"element vertex {10**15}", [f"declares {10**15}", "40 lines"]),
+        ("element vertex 40", "element vertex -1", ["count"]),
+        ("element vertex", "element face", ["no element vertex"]),
+        ("property float x", "property float a", ["properties x, y, z"]),
+        ("end_header\n", "end_header\nx ", ["line 11", "6 numbers"]),
+        ("end_header\n", "end_header\nnan nan nan 0 0 0\n", ["NaN", "1 of 40 points", "point 0"]),
+        ("end_header", "end", ["end_header"]),
+    ],
+)
+def test_a_bad_cloud_of_text(old: str, new: str, words: list[str], make: Any) -> None:
+    toy = make()
+    path = toy / "sparse_pc.ply"
+    content = path.read_text()
+    assert old in content
+    path.write_text(content.replace(old, new, 1))
+    refused(toy, ["sparse_pc.ply", *words])
+
+
+def test_sizes_mixed(make: Any) -> None:
+    toy = make()
+    Image.new("RGB", (WIDTH // 2, HEIGHT // 2)).save(toy / "images/frame_00002.png")
+    refused(toy, ["frame_00002.png", "32x24", "64x48"])
