@@ -42,7 +42,7 @@ ERRORS = list(FAILING)
 
 @pytest.fixture(autouse=True)
 def one_device(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(device_module, "open_device", lambda name=None: device)
+    monkeypatch.setattr(device_module, "open_device", lambda name=None, **_: device)
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +67,7 @@ def operations(
     """What a whole run does to the disk, and its checkpoint."""
     out = tmp_path_factory.mktemp("whole") / "run"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(device_module, "open_device", lambda name=None: device)
+        patch.setattr(device_module, "open_device", lambda name=None, **_: device)
         disk = Disk(out)
         disk.install(patch)
         assert cli.train_command([str(preset), "--out", str(out)]) == 0
