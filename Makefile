@@ -74,4 +74,3 @@ test: $(READY)
 	@echo "== all tests"
 	@$(PYTEST)
 
-# What takes minutes, or gigabytes: docs/reliability.md.

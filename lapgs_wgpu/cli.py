@@ -37,6 +37,7 @@ Train a moving scene on the pictures of a folder, on any Vulkan, Metal or D3D12 
   lapgs-train dnerf --data DIR --out RUN        the same with the paper's pictures and schedule
   lapgs-train hypernerf --data DIR              a capture of nerfies or HyperNeRF; for a CPU: hypernerf-tiny
   lapgs-train neu3d --data DIR                  several cameras that stand still; for a CPU: neu3d-tiny
+  lapgs-train tiny --data DIR                   your own films: lapgs-prepare --help makes DIR of them
   lapgs-train RUN/config.toml --out RUN2        the same training once more
   lapgs-train --resume RUN                      go on with a training that was interrupted, or killed
   lapgs-train --eval RUN                        measure RUN/checkpoint.ply on the test views again

@@ -26,6 +26,7 @@ Make a capture that lapgs-train opens: pictures from films with ffmpeg, cameras 
 FRAMES_PER_SECOND = 10.0
 NEIGHBOURS = 20  # pictures before and after, with which each one of a moving camera is matched
 FEWEST = 0.5  # of the pictures must get a pose
+ADVICE = "they may share too little, so film slower, with more texture and overlap"
 
 
 def prepare_command(arguments: Sequence[str] | None = None) -> int:
@@ -73,11 +74,12 @@ def prepare(videos: Sequence[Path], out: Path, fps: float) -> None:
     else:
         registered = reconstruct(programs["colmap"], out, None)
         wanted = len(times)
-    print(f"{out}: {len(times)} pictures, {registered} of {wanted} cameras placed; lapgs-train tiny --data {out}")
+    preset = "neu3d-tiny" if len(videos) > 1 else "hypernerf-tiny"
+    print(f"{out}: {len(times)} pictures, {registered} of {wanted} cameras placed; lapgs-train {preset} --data {out}")
     if registered < max(2, FEWEST * wanted):
         raise InputError(
-            f"colmap placed {registered} of {wanted} pictures (at least half are needed); film slower, with more "
-            f"texture and overlap, or raise --fps. What it said is in {out / 'colmap.log'}."
+            f"colmap placed {registered} of {wanted} pictures (at least half are needed): {ADVICE}; "
+            f"{out / 'colmap.log'} has what it said."
         )
 
 
@@ -129,13 +131,13 @@ def reconstruct(colmap: str, out: Path, pictures: Sequence[Path] | None) -> int:
     overlap = [] if pictures is not None else ["--SequentialMatching.overlap", str(NEIGHBOURS)]
     run(matcher, *database, *overlap, *_no_gpu(colmap, matcher))
     (work / SPARSE).mkdir()
-    run("mapper", *database, "--image_path", str(images), "--output_path", str(work / SPARSE))
+    try:
+        run("mapper", *database, "--image_path", str(images), "--output_path", str(work / SPARSE))
+    except InputError as error:  # some versions of colmap fail where they find nothing
+        raise InputError(f"{str(error).removesuffix('.')}: {ADVICE}.") from None
     models = [path for path in sorted((work / SPARSE).iterdir()) if is_model(path)]
     if not models:
-        raise InputError(
-            f"colmap found no cameras for the pictures in {images}: they share too little; film slower, with more "
-            f"texture and overlap. What it said is in {log}."
-        )
+        raise InputError(f"colmap found no cameras for the pictures in {images}: {ADVICE}; {log} has what it said.")
     best = max(models, key=count_images)
     (out / SPARSE).mkdir()
     shutil.copytree(best, out / SPARSE / "0")
