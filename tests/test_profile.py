@@ -32,7 +32,6 @@ def test_dispatches_are_timed_in_order_over_several_submissions(device: Device, 
     names, times = zip(*profile.read(), strict=True)
     assert names == ("scan_reduce",) * 3
     assert min(times) > 0.0
-    assert times[2] > 5 * times[1]  # by far more work
 
 
 @pytest.mark.kernels

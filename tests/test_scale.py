@@ -51,10 +51,17 @@ def pile(count: int) -> dict[str, Tensor]:
     }
 
 
-def drawn(scene: dict[str, Tensor], camera: Camera, device: Device, *, depth: bool = True) -> dict[str, Tensor]:
+def drawn(
+    scene: dict[str, Tensor],
+    camera: Camera,
+    device: Device,
+    *,
+    depth: bool = True,
+    background: tuple[float, ...] = (0.0, 0.0, 0.0),
+) -> dict[str, Tensor]:
     """Outputs, and gradients of a weighted sum of the picture."""
     leaves = {name: value.clone().requires_grad_() for name, value in scene.items()}
-    out = rasterize(**leaves, camera=camera, depth=depth, device=device)
+    out = rasterize(**leaves, camera=camera, depth=depth, background=torch.tensor(background), device=device)
     weights = torch.linspace(-1, 1, out.image.numel()).view_as(out.image)
     ((out.image * weights).sum() + out.alpha.sum()).backward()
     gradients = {f"d {name}": leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
@@ -100,12 +107,13 @@ def test_rounds_change_no_bit(depth: bool, device: Device, use: Use, monkeypatch
     scene["means"][:, 2] += 4
     scene["opacities"] *= 0.3
     use(Rasterizer(device))
-    expected = drawn(scene, camera, device, depth=depth)
+    background = (0.2, 0.7, 0.4)
+    expected = drawn(scene, camera, device, depth=depth, background=background)
     short = dataclasses.replace(raster_shape(device), round_splats=16)
     for bands in (1, 2):
         rasterizer = use(Rasterizer(device, shape=short))
         rasterizer.bands = bands
-        found = drawn(scene, camera, device, depth=depth)
+        found = drawn(scene, camera, device, depth=depth, background=background)
         assert rasterizer.rounds >= 8
         for name in ("image", "alpha"):
             assert torch.equal(found[name], expected[name]), name

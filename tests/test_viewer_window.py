@@ -100,6 +100,15 @@ def test_scrub_play_orbit_and_modes(desktop: Desktop, run: Path) -> None:
     desktop.events("key", "question")
     desktop.wait_for(lambda s: not changed(s, first), "no help")
 
+    def panel(screen: Picture) -> Picture:
+        return screen[140:460, 10:236]
+
+    desktop.events("key", "k")
+    one = desktop.wait_for(lambda s: np.abs(panel(s) - panel(first)).mean() > 2, "a key-frame in the panel")
+    desktop.drag((400, 300), (470, 320))
+    desktop.events("key", "k")
+    desktop.wait_for(lambda s: np.abs(panel(s) - panel(one)).mean() > 0.5, "another key-frame")
+
     desktop.events("key", "space")
     pictures = []
     for _ in range(20):

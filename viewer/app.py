@@ -59,6 +59,7 @@ class App:
         self.split = 0.5
         self.show_panels = self.show_overlay = True
         self.show_help = False
+        self.show_path = False  # in the panel, from the next draw on
         self.flying = False
         self.profiling = False
         self.message: str | None = None
@@ -272,6 +273,7 @@ class App:
 
     def add_key_frame(self) -> None:
         self.path.add(self.camera, self.clock.time)
+        self.show_path = True
 
     def toggle_overlay(self) -> None:
         self.show_overlay = not self.show_overlay

@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 def draw_path(app: App) -> None:
     """A section of the panel at the left: the key-frames, and what can be done with them."""
     editor = app.path
+    if app.show_path:
+        imgui.set_next_item_open(True)
+        app.show_path = False
     if not imgui.collapsing_header("Camera path"):
         return
     if imgui.button("Add (K)", (66, 0)):
