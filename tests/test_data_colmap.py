@@ -52,7 +52,7 @@ LENSES: dict[str, dict[str, float]] = {
     "SIMPLE_PINHOLE": {},
     "PINHOLE": {},
     "SIMPLE_RADIAL": {"k1": 0.25},
-    "RADIAL": {"k1": 0.2, "k2": -0.2},
+    "RADIAL": {"k1": 0.1, "k2": 0.8},
     "OPENCV": {"k1": -0.2, "k2": 0.05, "p1": 0.03, "p2": -0.02},
 }
 

@@ -382,7 +382,7 @@ def test_two_formats_in_one_folder(toy: Path, device: Device) -> None:
 
 
 def test_formats_are_told_by_their_files(toy: Path) -> None:
-    with pytest.raises(InputError, match=r"dataset\.json .*poses_bounds\.npy .*\(Neu3D\), .*; it holds the scenes toy"):
+    with pytest.raises(InputError, match=r"dataset\.json .*poses_bounds\.npy .*\(Neu3D\).*; it holds the scenes toy"):
         load_dataset(toy.parent)
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from lapgs_wgpu.gpu.buffer import BufferPool
 from lapgs_wgpu.gpu.device import Device
 
-pytestmark = pytest.mark.kernels
+pytestmark = [pytest.mark.kernels, pytest.mark.triangles]
 Floats = NDArray[np.float64]
 WIDTH, HEIGHT = 13, 7
 MARGIN = (0.2, 0.4, 0.6)

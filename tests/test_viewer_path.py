@@ -389,6 +389,7 @@ def test_saving_and_loading(tmp_path: Path) -> None:
 
 
 @pytest.mark.kernels
+@pytest.mark.triangles
 def test_the_window_shows_the_path_at_that_moment(
     device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -26,6 +26,7 @@ from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.rasterize import rasterize
 from lapgs_wgpu.train.evaluate import to_8_bit
 
+pytestmark = pytest.mark.triangles
 kernels = pytest.mark.kernels
 COUNT = 60
 
