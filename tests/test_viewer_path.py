@@ -293,7 +293,7 @@ def test_bad_files_are_refused_in_one_sentence(name: str, tmp_path: Path) -> Non
 @pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe", b"[" * 100_000])
 def test_what_is_no_json(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "a.json").write_bytes(content)
-    with pytest.raises(InputError, match=r"a\.json: is not JSON"):
+    with pytest.raises(InputError, match=r"a\.json: cannot be read as JSON"):
         read_path(tmp_path / "a.json")
 
 
