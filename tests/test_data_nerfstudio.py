@@ -128,6 +128,8 @@ def opencv_without_cloud(data: dict[str, Any]) -> None:
 
 SCALED = (2 * np.eye(4)).tolist()
 BAD: dict[str, tuple[Callable[[dict[str, Any]], Any], list[str]]] = {
+    "picture elsewhere": (frame(file_path="../other/a.png"), ["frame", "file_path", "leads out of the scene's folder"]),
+    "cloud elsewhere": (top(ply_file_path="/a.ply"), ["ply_file_path", "leads out of the scene's folder"]),
     "no frames": (top(frames=None), ["no field frames"]),
     "frames empty": (top(frames=[]), ["frames", "a list of 0"]),
     "a frame of text": (lambda data: data["frames"].__setitem__(1, "x"), ["frame 1", "JSON object"]),

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.data.fields import kind, leads_out, number, read_json, required
+from lapgs_wgpu.data.fields import check_inside, kind, number, read_json, required
 from lapgs_wgpu.data.pictures import PICTURE_SUFFIXES, check_pictures, read_picture, shrunk
 from lapgs_wgpu.data.poses import opengl_pose
 from lapgs_wgpu.data.views import Dataset, View
@@ -94,11 +94,7 @@ def _read_split(folder: Path, split: str) -> tuple[float, list[_Frame]]:
         if not isinstance(file_path, str) or not file_path:
             raise InputError(f"{where}: file_path must be the path of a picture, got {kind(file_path)}.")
         suffix = "" if file_path.lower().endswith(PICTURE_SUFFIXES) else ".png"
-        if leads_out(file_path):
-            raise InputError(
-                f"{where}: file_path {kind(file_path)} leads out of the scene's folder; put the pictures, or a link to "
-                "them, into it."
-            )
+        check_inside(file_path, "file_path", where)
         picture = folder / (file_path + suffix)
         if not os.path.isfile(picture):  # Path.is_file raises where a name is too long
             raise InputError(f"{picture} does not exist, but {where} names it as its file_path.")

@@ -60,13 +60,15 @@ def vector(value: Any, length: int, name: str, where: str | Path) -> NDArray[np.
     return np.array([finite(entry, name, where) for entry in value])
 
 
-def leads_out(name: str) -> bool:
-    """Whether a file's relative path, on any system, leaves the folder that it is relative to. Links are not followed:
+def check_inside(name: str, field: str, where: str | Path) -> None:
+    """InputError where a path that a field names leaves the capture's folder, on any system. Links are not looked at:
     whoever made the folder put them there."""
-    return any(
-        bool(system(name).anchor) or ".." in system(os.path.normpath(name)).parts
-        for system in (PurePosixPath, PureWindowsPath)
-    )
+    for system in (PurePosixPath, PureWindowsPath):
+        if system(name).anchor or ".." in system(os.path.normpath(name)).parts:
+            raise InputError(
+                f"{where}: {field} {kind(name)} leads out of the scene's folder; put the file, or a link to it, into "
+                "the folder."
+            )
 
 
 def kind(value: Any) -> str:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from lapgs_wgpu.data.cloud import read_cloud
-from lapgs_wgpu.data.fields import finite, kind, read_json, required
+from lapgs_wgpu.data.fields import check_inside, finite, kind, read_json, required
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.moments import TIMES, Picture, disorder, from_0_to_1, held_out, times_of
 from lapgs_wgpu.data.poses import opengl_pose
@@ -62,6 +62,7 @@ def load_nerfstudio(folder: str | Path, *, image_size: int | None = None) -> Dat
         name = required(frame, "file_path", where, NEEDED)
         if not isinstance(name, str) or not name:
             raise InputError(f"{where}: file_path must be the path of a picture, got {kind(name)}.")
+        check_inside(name, "file_path", where)
         picture = folder / name
         if not os.path.isfile(picture):  # Path.is_file raises where a name is too long
             raise InputError(f"{picture} does not exist, but {where} names it as its file_path.")
@@ -87,6 +88,8 @@ def load_nerfstudio(folder: str | Path, *, image_size: int | None = None) -> Dat
     cloud_file, cloud = path, None
     if data.get("ply_file_path") is not None:
         ply = data["ply_file_path"]
+        if isinstance(ply, str):
+            check_inside(ply, "ply_file_path", path)
         if not isinstance(ply, str) or not os.path.isfile(folder / ply):
             raise InputError(
                 f"{folder / ply if isinstance(ply, str) else kind(ply)} does not exist, but {path} names it as its "
