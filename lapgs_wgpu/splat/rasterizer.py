@@ -123,7 +123,7 @@ class Rasterizer:
         needed = [int(count[0]) for count in counts]
         most = max(needed)
         if most <= self.capacity:
-            if not any(count[2] for count in counts):
+            if not self.shape.round_splats or not any(count[2] for count in counts):
                 return False
             self.rounds *= 2
             return True
