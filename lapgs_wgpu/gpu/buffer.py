@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import weakref
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +21,24 @@ if TYPE_CHECKING:
 _STORAGE = wgpu.BufferUsage.STORAGE | wgpu.BufferUsage.UNIFORM | wgpu.BufferUsage.COPY_SRC | wgpu.BufferUsage.COPY_DST
 _SMALL = 1 << 16  # bytes that go through the queue where buffers cannot be mapped
 _MAPPABLE = wgpu.BufferUsage.MAP_READ | wgpu.BufferUsage.MAP_WRITE
+
+
+_numbers = itertools.count()
+
+
+@dataclass(eq=False)
+class BindGroup:
+    """What a kernel is given, in wgpu's form, and the kernel's store of such groups, where it has the key."""
+
+    native: Any
+    textures: dict[str, Any]  # kept, so that an id in the key cannot come to mean another view
+    store: dict[Any, BindGroup]
+    key: Any
+
+
+def _forget(bound: weakref.WeakSet[BindGroup]) -> None:
+    for group in list(bound):
+        group.store.pop(group.key, None)
 
 
 @dataclass
@@ -46,6 +66,10 @@ class Buffer:
                 f"buffer {label!r} needs {self.nbytes} bytes, but a buffer of this device holds {limit}"
             )
         self.wgpu_buffer = self._create(_STORAGE | (_MAPPABLE if device.mappable else 0))
+        self.number = next(_numbers)  # no other buffer has it, not even later
+        # Bind groups keep the device's memory: those with this buffer go when it goes.
+        self.bound: weakref.WeakSet[BindGroup] = weakref.WeakSet()
+        weakref.finalize(self, _forget, self.bound).atexit = False
         self.version = 0  # counts the writes, so that a texture made from the buffer is known to be out of date
         self._textures: dict[str, _Texture] = {}
         self._upload: Any = None

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import wgpu
 
 from ..errors import DeviceMemoryError
-from .buffer import Buffer
+from .buffer import BindGroup, Buffer
 from .shader import Defines, ShaderError, compose, pack, reflect
 from .trouble import Guard, is_lost
 
@@ -53,7 +53,7 @@ class Kernel:
             layout=native.create_pipeline_layout(bind_group_layouts=[self._layout]),
             compute={"module": module, "entry_point": "main"},
         )
-        self._groups: dict[Any, Any] = {}
+        self._groups: dict[Any, BindGroup] = {}
 
     @staticmethod
     def get(device: Device, name: str, **defines: int) -> Kernel:
@@ -92,22 +92,20 @@ class Kernel:
 
     def bind(self, parts: dict[str, tuple[Buffer, int, int]], textures: dict[str, Any]) -> Any:
         """wgpu's bind group for parts of buffers, and for the textures that stand for some of them."""
-        key = tuple((name, id(textures.get(name, part[0].wgpu_buffer)), *part[1:]) for name, part in parts.items())
+        key = tuple((name, part[0].number, id(textures.get(name)), *part[1:]) for name, part in parts.items())
         group = self._groups.get(key)
         if group is None:
             entries = []
             for name, (buffer, offset, size) in parts.items():
                 whole = {"buffer": buffer.wgpu_buffer, "offset": offset, "size": size}
                 entries.append({"binding": self.bindings[name].number, "resource": textures.get(name, whole)})
-            if len(self._groups) > 64:  # buffers that grew leave groups behind
+            if len(self._groups) > 64:  # parts of other sizes leave groups behind
                 self._groups.clear()
-            # What is bound is kept with the group, so that an id in the key cannot come to mean another object.
-            group = self._groups[key] = (
-                self.device.wgpu_device.create_bind_group(layout=self._layout, entries=entries),
-                parts,
-                textures,
-            )
-        return group[0]
+            native = self.device.wgpu_device.create_bind_group(layout=self._layout, entries=entries)
+            group = self._groups[key] = BindGroup(native, textures, self._groups, key)
+            for buffer, _, _ in parts.values():
+                buffer.bound.add(group)
+        return group.native
 
 
 class Commands:
