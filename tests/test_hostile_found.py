@@ -31,6 +31,7 @@ from test_hostile_files import (
 from test_ply import columns_of, ply_bytes, random_still
 
 from lapgs_wgpu.data import load_dataset
+from lapgs_wgpu.data.cloud import read_npy
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.checkpoint import read_checkpoint
@@ -185,6 +186,24 @@ def test_a_picture_without_pixels(tmp_path: Path) -> None:
     file.write_bytes(with_checksums(file.read_bytes().replace(b"IDAT", b"IDAU")))
     with pytest.raises(InputError, match="is not a readable picture"):
         load_dataset(folder)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        (b"'descr'", b"\0\0\0\0\0\0\0"),  # Python's tokeniser
+        (b"'<f8'", b"'|O' "),  # a pickle
+        (b"(2, 17)", b"(9999999999, 17)"),  # 1.4 TB
+    ],
+)
+def test_found_in_arrays(old: bytes, new: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "poses_bounds.npy"
+    np.save(path, np.zeros((2, 17)))
+    data = path.read_bytes()
+    assert old in data
+    path.write_bytes(data.replace(old, new))
+    with pytest.raises(InputError, match=r"poses_bounds\.npy cannot be read as a NumPy array"):
+        read_npy(path)
 
 
 def test_nothing_is_written_through_a_link(tmp_path: Path) -> None:

@@ -71,11 +71,14 @@ def read_cloud(path: Path) -> Cloud:
 def read_npy(path: Path) -> NDArray[np.floating]:
     """An array of numbers. Raises InputError."""
     try:
-        array = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise InputError(f"{path} cannot be read as a NumPy array ({error}); copy or make it again.") from None
-    if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
-        what = array.dtype if isinstance(array, np.ndarray) else "an archive"
+        # Mapped, so that a declared shape takes no memory before it is compared with the file's size.
+        mapped = np.load(path, mmap_mode="r", allow_pickle=False)
+        array = np.array(mapped) if isinstance(mapped, np.ndarray) else None
+    except Exception as error:  # NumPy hands a damaged header to Python's own parser, and passes its errors on
+        reason = str(error)[:200]
+        raise InputError(f"{path} cannot be read as a NumPy array ({reason}); copy or make it again.") from None
+    if array is None or array.dtype.kind not in "fiu":
+        what = "an archive" if array is None else array.dtype
         raise InputError(f"{path} must hold an array of numbers, got {what}.")
     return array
 

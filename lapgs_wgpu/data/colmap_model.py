@@ -184,9 +184,9 @@ def _text_points(path: Path) -> tuple[Array, NDArray[np.uint8]]:
 
 def _image(name: str, camera: int, pose: Array, where: str) -> ColmapImage:
     """pose: (7,) quaternion and translation."""
-    length = float(np.linalg.norm(pose[:4]))
     if not (np.abs(pose) <= 1e9).all():
         raise InputError(f"{where}: its pose holds {pose[~(np.abs(pose) <= 1e9)][0]:g}; at most 1e+09 is allowed.")
+    length = float(np.linalg.norm(pose[:4]))
     if abs(length - 1) > 1e-3:
         raise InputError(f"{where}: its quaternion has length {length:g}, must be 1; export the model again.")
     return ColmapImage(name, camera, pose[:4] / length, pose[4:], where)

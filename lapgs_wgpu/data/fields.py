@@ -12,17 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.io import documents
 
 
 def read_json(path: Path, needs: str) -> dict[str, Any]:
     """The JSON object that a file holds. needs: what it must consist of, for errors. Raises InputError."""
-    try:
-        data = json.loads(path.read_text(encoding="utf-8-sig"))
-    except json.JSONDecodeError as error:
-        place = f"line {error.lineno}, column {error.colno}"
-        raise InputError(f"{path} is not valid JSON at {place}: {error.msg}.") from None
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{path} cannot be read as JSON text: {error}.") from None
+    data = documents.read_json(path)
     if not isinstance(data, dict):
         raise InputError(f"{path} must hold a JSON object with {needs}, got {kind(data)}.")
     return data

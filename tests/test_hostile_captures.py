@@ -1,0 +1,82 @@
+"""Captures of every layout, one of their files damaged at random: opened or refused in one sentence, and nothing else.
+
+See test_hostile_files.py, which does the same to the other formats.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from captures import write_colmap, write_nerfies, write_nerfstudio, write_neu3d
+from hostile import ByteEdits, TreeEdits, byte_edits, edit_bytes, edit_tree, fuzzed, json_text, refused_or, tree_edits
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lapgs_wgpu.data import load_dataset
+from lapgs_wgpu.gpu.device import Device
+
+MODEL = ("cameras", "images", "points3D")
+WORDS = [
+    *(b"PINHOLE", b"OPENCV_FISHEYE", b" nan", b" inf", b" 1e308", b" 99999999999", b"#", b"\t", b" ../../x.png"),
+    *(b"\xff" * 7, b"\0\0\0\0\0\0\xf8\x7f", b"\0\0\0\0\0\0\xf0\x7f", b"\0\0\0\0\0\0\0\x80"),
+]
+
+
+@pytest.fixture(scope="module")
+def captures(device: Device, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    folder = tmp_path_factory.mktemp("captures")
+    return {
+        "bin": write_colmap(folder / "bin", device),
+        "txt": write_colmap(folder / "txt", device, binary=False),
+        "neu3d": write_neu3d(folder / "neu3d", device),
+        "nerfies": write_nerfies(folder / "nerfies", device),
+        "nerfstudio": write_nerfstudio(folder / "nerfstudio", device),
+    }
+
+
+def opened(folder: Path, file: Path, damaged: bytes) -> None:
+    """Open the capture, and its first and last picture, while one of its files is damaged."""
+    good = file.read_bytes()
+    file.write_bytes(damaged)
+    try:
+        found = refused_or(lambda: load_dataset(folder))
+        for view in (found.train[0], found.train[-1]) if found else ():
+            refused_or(view.load)
+            assert np.isfinite(view.camera.T_cam_world).all()
+        if found and found.cloud is not None:
+            assert np.isfinite(found.cloud.points).all()
+    finally:
+        file.write_bytes(good)
+
+
+@fuzzed()
+@given(st.sampled_from(MODEL), byte_edits(WORDS))
+@pytest.mark.parametrize("suffix", ["bin", "txt"])
+def test_sparse_models(captures: dict[str, Path], suffix: str, name: str, edits: ByteEdits) -> None:
+    file = captures[suffix] / "sparse/0" / f"{name}.{suffix}"
+    opened(captures[suffix], file, edit_bytes(file.read_bytes(), edits, head=120))
+
+
+@fuzzed()
+@given(
+    byte_edits(
+        [b"'<f8'", b"'|O'", b"'<U9'", b"'|V9'", b"(4, 17)", b"(99999999999, 17)", b"(0, 17)", b"True", b"\x93NUMPY\3"]
+    )
+)
+def test_arrays(captures: dict[str, Path], edits: ByteEdits) -> None:
+    file = captures["neu3d"] / "poses_bounds.npy"
+    opened(captures["neu3d"], file, edit_bytes(file.read_bytes(), edits, head=130))
+
+
+@fuzzed()
+@given(st.data(), tree_edits, byte_edits([b"[", b"{", b'"', b",", b":"], least=0).filter(lambda edits: len(edits) < 2))
+@pytest.mark.parametrize("layout", ["nerfies", "nerfstudio"])
+def test_descriptions(
+    captures: dict[str, Path], layout: str, data: st.DataObject, changes: TreeEdits, edits: ByteEdits
+) -> None:
+    files = sorted(captures[layout].rglob("*.json"))
+    file = data.draw(st.sampled_from(files))
+    opened(captures[layout], file, edit_bytes(json_text(edit_tree(json.loads(file.read_text()), changes)), edits))
