@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ..errors import NoAdapterError
+from .c_types import parse_only_what_is_named
 
 # Features that the kernels can use. Each is requested only where the adapter has it, and each has a fallback.
 _WANTED_FEATURES = ("subgroup", "mappable-primary-buffers", "timestamp-query")
@@ -44,8 +45,10 @@ def _instance() -> Any:
     """wgpu's instance, without the validation dispatch that wgpu otherwise adds before each indirect dispatch."""
     os.environ.setdefault("XDG_RUNTIME_DIR", "/tmp")  # Mesa warns on stderr where it is not set
     import wgpu
+    from wgpu.backends.wgpu_native import ffi
     from wgpu.backends.wgpu_native.extras import set_instance_extras
 
+    parse_only_what_is_named(ffi)
     # Not OpenGL: the same hardware again, with less of what the kernels need.
     set_instance_extras(backends=["Vulkan", "Metal", "DX12"], flags=["Empty"])
     return wgpu.gpu
