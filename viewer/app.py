@@ -38,7 +38,8 @@ class App:
     """What the window shows. The panels (viewer/panels) read and set its attributes, keys call its methods.
 
     scale: of the frame on show against the window, 1 at full resolution. message: for the user, None or one sentence.
-    moved_at: when what is shown was last changed, but for `refresh`. seconds: that the last draw took, GUI included.
+    moved_at: when what is shown was last changed, but for `refresh`. seconds: spent on drawing so far, GUI included.
+    stale: the scene has changed since it was drawn.
     training: the training under way, None where a file is shown.
     """
 
@@ -67,7 +68,7 @@ class App:
         self.scale = 1.0
         self._moving_scale = 1.0
         self._drawn_key: Any = None
-        self._stale = self._running = False
+        self.stale = self._running = False
         self.moved_at = self._drawn_at = time.perf_counter()
         self.seconds = 0.0
         self.training: Training | None = None
@@ -99,7 +100,7 @@ class App:
 
     def refresh(self) -> None:
         """The scene itself has changed: draw it again."""
-        self._stale = True
+        self.stale = True
         self.painter.forget()
         self.canvas.request_draw()
 
@@ -142,7 +143,7 @@ class App:
             self.canvas.request_draw()
         elif self.scale < 1:
             self.loop.call_later(_SETTLED, self.canvas.request_draw)
-        self.seconds = time.perf_counter() - now
+        self.seconds += time.perf_counter() - now
 
     def _paint(self, now: float) -> None:
         """Draw the scene where something changed: at a lower resolution while it changes, in full once it rests."""
@@ -151,7 +152,7 @@ class App:
         changed = key != self._drawn_key
         if changed:
             self.moved_at = now
-        elif not self._stale and (self.scale == 1 or now - self.moved_at < _SETTLED):
+        elif not self.stale and (self.scale == 1 or now - self.moved_at < _SETTLED):
             return
         first = self._drawn_key is None
         self.scale = self._moving_scale if changed and not first else 1.0
@@ -160,7 +161,7 @@ class App:
             camera = whole.resized(max(1, round(self.scale * whole.width)), max(1, round(self.scale * whole.height)))
         request = Request(camera, self.clock.time, self.mode, self.background)
         self.frame = self.painter.draw(request, profile=self.profiling)
-        self._drawn_key, self._stale = key, False
+        self._drawn_key, self.stale = key, False
         self._times.append(time.perf_counter())
         if not first:
             ideal = self.scale * math.sqrt(_TARGET_SECONDS / max(self.frame.seconds, 1e-4))

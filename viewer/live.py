@@ -22,7 +22,8 @@ from lapgs_wgpu.motion.scene_playback import ScenePlayback
 from .app import App
 from .opened import Opened
 
-SHARE = 0.03  # of the time may go into pictures while nobody moves anything
+SHARE = 0.02  # of the time may go into pictures while nobody moves anything
+_OPENING = 4.0  # seconds after the first step, in which the window draws what it begins with: shaders are compiled
 _ATTENTION = 0.5  # seconds after a move in which the pictures come first
 _PATIENCE = 0.02  # seconds between looks at mouse and keys while the training rests
 
@@ -66,7 +67,8 @@ def watch(scene: Scene4D, look: FirstLook, steps: Iterator[Progress]) -> None:
 
     async def drive() -> None:
         signal.signal(signal.SIGINT, on_interrupt)  # in place of the one of the window's loop
-        pictured = time.perf_counter()
+        begun: float | None = None
+        pictured = spent = 0.0  # when the last picture was asked for, and the time that had gone into drawing then
         while True:
             moving = not app.clock.playing and time.perf_counter() - app.moved_at < _ATTENTION
             if moving or (training.paused and not training.single):
@@ -78,9 +80,13 @@ def watch(scene: Scene4D, look: FirstLook, steps: Iterator[Progress]) -> None:
                 return
             training.last = progress
             training.single = max(0, training.single - 1)
-            if training.paused or time.perf_counter() - pictured > app.seconds / SHARE:
+            now = time.perf_counter()
+            begun = begun or now
+            if now - begun < _OPENING:
+                pictured, spent = now, app.seconds
+            if training.paused or (not app.stale and now - pictured > (app.seconds - spent) / SHARE):
                 app.refresh()
-                pictured = time.perf_counter()
+                pictured, spent = now, app.seconds
             await sleep(0.0)
 
     loop.add_task(drive)
