@@ -39,6 +39,13 @@ class _Renderer(ImguiRenderer):
             event["stop_propagation"] = True
 
 
+def _slider_value() -> float:
+    """0 to 1 where the grab of the last item, a slider, stands in its middle under the mouse."""
+    half_grab = imgui.get_style().grab_min_size / 2 + 2  # imgui's own padding
+    left, right = imgui.get_item_rect_min().x + half_grab, imgui.get_item_rect_max().x - half_grab
+    return float((imgui.get_mouse_pos().x - left) / max(right - left, 1.0))
+
+
 class Panels:
     """Draws the GUI of an App onto its canvas."""
 
@@ -98,9 +105,12 @@ class Panels:
         label = f"{clock.time:.3f}   frame {clock.frame} of {last}"
         # imgui reads % in a format; the label has none.
         moved, time = imgui.slider_float("##time", clock.time, 0.0, 1.0, label, imgui.SliderFlags_.no_input)
+        if imgui.is_item_deactivated() and imgui.is_mouse_released(imgui.MouseButton_.left):
+            # imgui leaves out where the mouse went since the last frame, which is far where frames take long.
+            moved, time = True, _slider_value()
         if moved:
             clock.playing = False
-            clock.seek(time)
+            clock.seek(min(max(time, 0.0), 1.0))
         for text, action in (("|<", app.first_frame), ("<", app.previous_frame)):
             if imgui.button(text, (32, 0)):
                 action()

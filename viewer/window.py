@@ -81,7 +81,8 @@ def _qt_canvas(options: dict[str, Any], drop: Callable[[Path], None] | None) -> 
             if drop is not None:
                 drop(Path(event.mimeData().urls()[0].toLocalFile()))
 
-    canvas = Window(**options)
+    # Without this rendercanvas takes each picture through the processor, and under load stops drawing.
+    canvas = Window(present_method="screen", **options)
     canvas.setAcceptDrops(drop is not None)
     return canvas, loop
 
