@@ -103,12 +103,16 @@ def check_cloud(cloud: Cloud, cameras: Sequence[Camera], path: Path) -> None:
         )
 
 
+def evenly_chosen(cameras: Sequence[Camera]) -> list[Camera]:
+    """All cameras, or PROBES of them."""
+    return [cameras[i] for i in np.unique(np.linspace(0, len(cameras) - 1, PROBES).round().astype(int))]
+
+
 def views_of(points: Array, cameras: Sequence[Camera], near: float = 0.0, far: float = np.inf) -> NDArray[np.int64]:
     """(N,) how many of the cameras (of PROBES evenly chosen ones, if there are more) see each point (N, 3), at a depth
     between near and far."""
-    chosen = [cameras[i] for i in np.unique(np.linspace(0, len(cameras) - 1, PROBES).round().astype(int))]
     seen = np.zeros(len(points), dtype=np.int64)
-    for camera in chosen:
+    for camera in evenly_chosen(cameras):
         local = points @ camera.T_cam_world[:3, :3].T + camera.T_cam_world[:3, 3]
         depth = np.where(local[:, 2] > 0, local[:, 2], np.nan)
         pixels = (local @ camera.K.T)[:, :2] / depth[:, None]

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lapgs_wgpu.data.init import first_points, initial_scales
+from lapgs_wgpu.data.init import first_points, initial_scales, see_through
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
@@ -287,9 +287,13 @@ class Training:
 def initial_points(
     config: PointsConfig, dataset: Dataset, seed: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """The first Gaussians (data/init.first_points): points (N, 3), colours (N, 3) and scales (N,)."""
+    """The first Gaussians (data/init): points (N, 3), colours (N, 3) and scales (N,)."""
     points, colours = first_points(dataset, config.count, config.box, seed)
-    return points, colours, initial_scales(points)
+    scales = initial_scales(points)
+    # Published figures of D-NeRF start from a fog, which the empty background there soon lifts.
+    if dataset.cloud is not None or dataset.depths is not None:
+        scales = see_through(points, scales, config.opacity, dataset.cameras)
+    return points, colours, scales
 
 
 def draw_nearby(config: SmoothnessConfig, count: int, t: float, generator: torch.Generator) -> Nearby | None:
