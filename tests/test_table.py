@@ -87,6 +87,8 @@ def test_the_fingerprint_is_that_of_the_training_not_of_the_machine(tmp_path: Pa
     moved = dataclasses.replace(config, data=dataclasses.replace(config.data, path="/elsewhere"))
     assert fingerprint(moved) == fingerprint(config)
     assert fingerprint(dataclasses.replace(config, seed=1)) != fingerprint(config)
+    exposed = dataclasses.replace(config.exposure, enabled=True)
+    assert fingerprint(dataclasses.replace(config, exposure=exposed)) != fingerprint(config)
     (tmp_path / "again.toml").write_text(write_toml(dataclasses.asdict(config)))
     assert fingerprint(load_config(str(tmp_path / "again.toml"))) == fingerprint(config)
 
@@ -413,3 +415,12 @@ def test_why_a_run_failed_is_told(
     assert last.startswith("lapgs-table: others, static, seed 5 failed: ")
     assert last.endswith(reason)
     assert "No run is finished yet." in (spec_file.parent / "out" / "table.md").read_text()
+
+
+def test_measured_runs_keep_their_fingerprints() -> None:
+    """Keys that are added to the configuration leave results as they are where their value is that of before."""
+    folder = Path(__file__).parents[1] / "docs" / "tables"
+    planned = {(run.key, run.fingerprint) for run in read_spec(folder / "method.toml").runs}
+    measured = read_results(folder / "method.results.json").runs
+    assert len(measured) == 56
+    assert {(run.key, run.fingerprint) for run in measured} <= planned

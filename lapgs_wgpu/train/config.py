@@ -1,4 +1,5 @@
-"""The configuration of a training: frozen dataclasses without defaults, whose values stand in the presets (configs/).
+"""The configuration of a training: frozen dataclasses without defaults, whose values stand in the presets (configs/), but
+for keys that the config.toml of older runs lacks.
 
 Each key carries the text that lapgs-train --help shows of it.
 """
@@ -221,6 +222,20 @@ class SmoothnessConfig:
 
 
 @dataclass(frozen=True)
+class ExposureConfig:
+    """Colours of cameras that do not keep their exposure or their white balance. With defaults: older runs lack it."""
+
+    enabled: bool = described(
+        "whether each training picture has an affine correction of its colours, which is learnt; a correction is never "
+        "applied to the pictures that are measured",
+        False,
+    )
+    rate: Rate = dataclasses.field(
+        default=Rate(2e-2, 2e-3, 20_000), metadata={"help": "learning rate of a picture's correction"}
+    )
+
+
+@dataclass(frozen=True)
 class Config:
     """All that a training depends on, besides the pictures."""
 
@@ -233,3 +248,4 @@ class Config:
     loss: LossConfig
     smoothness: SmoothnessConfig
     seed: int = described("of every random draw")
+    exposure: ExposureConfig = dataclasses.field(default=ExposureConfig())

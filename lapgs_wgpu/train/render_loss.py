@@ -18,13 +18,15 @@ from ..splat.camera import Camera
 from ..splat.gaussians import Gaussians
 from ..splat.objective import Recorded, judge_image
 from ..splat.rasterize import rasterizer_of
+from .exposure import ExposurePasses
 from .image_loss import TERMS, ImageLoss
 from .losses import LEAST_ERROR, LossWeights
 
 
 class RenderLoss(NamedTuple):
-    """loss: a scalar, differentiable in the Gaussians' tensors. terms: l1, mse (mean squared error), ssim, pyramid and
-    ncc (losses), as far as they were computed. radii (N,) and means2d (N, 2): as those of splat.rasterize.Rendering."""
+    """loss: a scalar, differentiable in the Gaussians' tensors and in the correction. terms: l1, mse (mean squared
+    error), ssim, pyramid and ncc (losses), as far as they were computed. radii (N,) and means2d (N, 2): as those of
+    splat.rasterize.Rendering."""
 
     loss: Tensor
     terms: dict[str, float]
@@ -43,6 +45,12 @@ def image_loss_of(device: Device) -> ImageLoss:
     return ImageLoss(device)
 
 
+@functools.cache
+def exposure_of(device: Device) -> ExposurePasses:
+    """The passes of `render_loss`'s correction on this device."""
+    return ExposurePasses(device)
+
+
 def render_loss(
     gaussians: Gaussians,
     camera: Camera,
@@ -50,11 +58,13 @@ def render_loss(
     background: Tensor,
     weights: LossWeights,
     device: Device,
+    correction: Tensor | None = None,
 ) -> RenderLoss:
     """The loss of the Gaussians' image (train/losses.total), computed on the device from end to end.
 
     gaussians: activated, float32. truth: a picture as `upload_rgba` leaves it, of the
     camera's size. background: (3,) in [0, 1], under both; not differentiable. weights: of the terms.
+    correction: (3, 4), of the image's colours before they are compared (train/exposure); none where None.
     The same bits on every run of one adapter and driver. Without a gradient to compute (torch.no_grad()) none is.
     """
     red, green, blue = background.tolist()
@@ -62,13 +72,19 @@ def render_loss(
     losses = image_loss_of(device)
 
     def judge(commands: Commands, image: Buffer, wanted: bool) -> Recorded:
+        drawn, exposing = image, exposure_of(device)
+        if correction is not None:
+            image = exposing.record(commands, drawn, size, correction)
         done = losses.record(commands, image, truth, size, (red, green, blue), weights, gradient=wanted)
-        return Recorded(done.terms, TERMS, done.d_image)
+        if correction is None or done.d_image is None:
+            return Recorded(done.terms, TERMS, done.d_image)
+        exposed = exposing.record_bwd(commands, drawn, done.d_image, size, correction)
+        return Recorded(done.terms, TERMS, exposed.d_image, (exposed.d_rows, "float32", (size[0], 3, 4), 0))
 
     def loss_of(terms: NDArray[np.float32]) -> float:
         return float(np.dot(terms.astype(np.float64), [weights.l1, 0, weights.ssim, weights.pyramid, weights.ncc]))
 
-    judged = judge_image(rasterizer_of(device), gaussians, camera, (red, green, blue), judge, loss_of)
+    judged = judge_image(rasterizer_of(device), gaussians, camera, (red, green, blue), judge, loss_of, correction)
     names = ("l1", "mse", "ssim", "pyramid", "ncc")
     used = (True, True, weights.ssim, weights.pyramid, weights.ncc)
     terms = {name: value for name, value, use in zip(names, judged.terms.tolist(), used, strict=True) if use}

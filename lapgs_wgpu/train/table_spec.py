@@ -117,8 +117,11 @@ def fingerprint(config: Config) -> str:
     """Of all that the result of a training depends on: not of where its pictures lie, or how often it is saved."""
     values = dataclasses.asdict(config)
     del values["data"]["path"], values["schedule"]["save_interval"]
-    if values["schedule"]["batch"] == 1:  # the key is younger than results that are worth keeping
+    # These keys are younger than results that are worth keeping.
+    if values["schedule"]["batch"] == 1:
         del values["schedule"]["batch"]
+    if not config.exposure.enabled:
+        del values["exposure"]
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:16]
 
 

@@ -20,6 +20,7 @@ from lapgs_wgpu.motion.field import Nearby
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.config import Config, PointsConfig, SmoothnessConfig
 from lapgs_wgpu.train.densify import Statistics, densify, reset_opacities
+from lapgs_wgpu.train.exposure import Exposures
 from lapgs_wgpu.train.health import Health, Skipped, check_parameters, describe, finite
 from lapgs_wgpu.train.optimise import FrequencyOptimiser, Optimiser
 from lapgs_wgpu.train.pictures import Pictures
@@ -79,6 +80,9 @@ class Training:
         if scene.spectrum is not None:
             limit = len(dataset.times) / 2
             self._frequencies = FrequencyOptimiser(scene.spectrum, config.rates.frequencies, limit)
+        self._exposures = Exposures(len(dataset.train), config.exposure.rate) if config.exposure.enabled else None
+        self._beside = [each for each in (self._frequencies, self._exposures) if each is not None]
+        self._numbers = {view.name: number for number, view in enumerate(dataset.train)}
         # Cameras that all stand at one place have no extent; the scene's own size must serve.
         self._extent = dataset.extent or config.points.box
         self._statistics = Statistics(len(scene), scene.parameters["means"].device)
@@ -115,7 +119,7 @@ class Training:
         drawn = self._generator.get_state()
         looks = [_Look(*each, self._nearby(each[0]) if moving else None) for each in chosen]
 
-        self._optimiser.zero_grad()
+        self._zero_grad()
         seen = Statistics(len(scene), scene.parameters["means"].device)
         renderings, totals = [], torch.zeros(2, dtype=torch.float64)
         for look in looks[ranks.rank :: ranks.count]:
@@ -134,16 +138,14 @@ class Training:
         self.whole = False
         if skipped is None:
             self._optimiser.step(step)
-            if self._frequencies is not None:
-                self._frequencies.step(step)
+            for beside in self._beside:
+                beside.step(step)
             # After the optimiser's step, so that no gradient is lost with the rows that change.
             if step < config.density.stop:
                 self._statistics.merge(self._seen_by_all(seen))
         else:
             self._generator.set_state(drawn)
-            self._optimiser.zero_grad()
-            if self._frequencies is not None:
-                self._frequencies.zero_grad()
+            self._zero_grad()
         self._change_density(step)
         if step % config.schedule.sh_interval == 0:
             scene.sh_degree = min(scene.sh_degree + 1, MAX_SH_DEGREE)
@@ -164,7 +166,8 @@ class Training:
             gaussians, smoothness = scene.canonical(), None
         weights = config.loss.weights(warm=moving)
         truth = self._pictures.on_device(view)
-        rendering = render_loss(gaussians, view.camera, truth, look.background, weights, scene.device)
+        correction = None if self._exposures is None else self._exposures.values[self._numbers[view.name]]
+        rendering = render_loss(gaussians, view.camera, truth, look.background, weights, scene.device, correction)
         loss = rendering.loss
         if smoothness is not None:
             loss = loss + smoothness
@@ -176,7 +179,13 @@ class Training:
     def _gradients(self) -> dict[str, list[Tensor]]:
         """By group, of all parameters that have one."""
         gradients = self._optimiser.gradients()
-        return gradients | (self._frequencies.gradients() if self._frequencies is not None else {})
+        for beside in self._beside:
+            gradients |= beside.gradients()
+        return gradients
+
+    def _zero_grad(self) -> None:
+        for each in (self._optimiser, *self._beside):
+            each.zero_grad()
 
     def _put_together(self) -> None:
         """Every rank's gradients become the sums over the ranks."""
@@ -198,8 +207,8 @@ class Training:
         """Whether the step of these gradients is to be skipped, and why. Raises NumericalError for a parameter, whose
         values a step cannot mend."""
         parameters, gradients = self._optimiser.parameters(), self._gradients()
-        if self._frequencies is not None:
-            parameters |= self._frequencies.parameters()
+        for beside in self._beside:
+            parameters |= beside.parameters()
         places = [each.means2d.grad for each in renderings if each.means2d.grad is not None]
         gradients |= {"the places in the image": places} if places else {}
         if not self.ranks.any(not (math.isfinite(loss) and finite(parameters, gradients))):
@@ -248,6 +257,7 @@ class Training:
             "field": scene.field.state_dict() if scene.field else {},
             "adam": self._optimiser.state(),
             "frequencies": self._frequencies.state() if self._frequencies else {},
+            "exposure": self._exposures.state() if self._exposures else {},
             "statistics": self._statistics.state(),
             "training": {
                 "done": torch.tensor(self.done),
@@ -277,6 +287,8 @@ class Training:
         self._optimiser.restore(parts.get("adam", {}))
         if self._frequencies is not None:
             self._frequencies.restore(parts["frequencies"])
+        if self._exposures is not None:
+            self._exposures.restore(parts["exposure"])
         self._statistics.restore(parts["statistics"])
         own = parts["training"]
         self.done, scene.sh_degree = int(own["done"]), int(own["sh_degree"])

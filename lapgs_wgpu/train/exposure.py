@@ -1,0 +1,133 @@
+"""Exposure: an affine correction of the colours for each training picture of a camera that does not keep its own.
+
+A correction is a matrix (3, 4): corrected colour = its first three columns times the colour, plus its last one. It is
+applied to the rendered image before the losses, and never to a view that is measured.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from ..gpu.buffer import Buffer, BufferPool
+from ..gpu.device import Device
+from ..gpu.kernel import Commands, Kernel
+from .config import Rate
+
+MEAN_DECAY, SQUARE_DECAY = 0.9, 0.999  # Adam's
+TINY = 1e-15  # keeps 0 / 0 away
+
+
+def exposure(image: Tensor, correction: Tensor) -> Tensor:
+    """The image (H, W, 3) after a correction (3, 4): the twin of the passes."""
+    return image @ correction[:, :3].mT + correction[:, 3]
+
+
+class Exposed(NamedTuple):
+    """An image (4, H, W) whose gradient was carried back: d_image, by the rendered image's planes; and d_rows
+    (H, 3, 4), whose sum is the gradient by the correction."""
+
+    d_image: Buffer
+    d_rows: Buffer
+
+
+class ExposurePasses:
+    """Records the passes between a rendered image and its losses. Keeps its buffers from image to image."""
+
+    def __init__(self, device: Device) -> None:
+        self.device = device
+        self.pool = BufferPool(device)
+        self._lanes = 8 if device.is_cpu else 64
+
+    def record(self, commands: Commands, image: Buffer, size: tuple[int, int], correction: Tensor) -> Buffer:
+        """The corrected image. image: planes (4, H, W) of float32, the first three red, green, blue. size: (H, W)."""
+        height, width = size
+        exposed = self.pool.get("exposed", 16 * height * width)
+        self._dispatch(commands, "exposure", size, correction, image=(image, 0, 16 * height * width), exposed=exposed)
+        return exposed
+
+    def record_bwd(
+        self, commands: Commands, image: Buffer, d_exposed: Buffer, size: tuple[int, int], correction: Tensor
+    ) -> Exposed:
+        """d_exposed: the gradient by the corrected image; its fourth plane counts as zeros."""
+        height, width = size
+        done = Exposed(self.pool.get("d_image", 16 * height * width), self.pool.get("d_rows", 48 * height))
+        tables = {name: (part, 0, 16 * height * width) for name, part in (("image", image), ("d_exposed", d_exposed))}
+        self._dispatch(commands, "exposure_bwd", size, correction, **tables, **done._asdict())
+        return done
+
+    def _dispatch(
+        self,
+        commands: Commands,
+        name: str,
+        size: tuple[int, int],
+        correction: Tensor,
+        **buffers: Buffer | tuple[Buffer, int, int],
+    ) -> None:
+        kernel = Kernel.get(self.device, name, LANES=self._lanes)
+        rows = dict(zip(("red", "green", "blue"), correction.tolist(), strict=True))
+        uniform = self.pool.constant("exposure", kernel.uniform("Exposure", size=(size[1], size[0]), **rows))
+        commands.dispatch_grid(kernel, (1, size[0]), exposure=uniform, **buffers)
+
+
+class Exposures:
+    """The corrections of all training pictures, (V, 3, 4), the identity at first, and how they learn.
+
+    Adam, but a picture's moments and step count stand still while other pictures are trained on. Colours that all
+    corrections share belong to the scene, which is measured without any: the mean of all stays the identity.
+    """
+
+    def __init__(self, count: int, rate: Rate) -> None:
+        self._identity = torch.eye(3, 4)
+        self._rate = rate
+        self.values = nn.Parameter(self._identity.repeat(count, 1, 1))
+        self._mean = torch.zeros(count, 3, 4)
+        self._square = torch.zeros(count, 3, 4)
+        self._steps = torch.zeros(count, 1, 1)
+
+    def parameters(self) -> dict[str, list[Tensor]]:
+        """The corrections."""
+        return {"exposures": [self.values]}
+
+    def gradients(self) -> dict[str, list[Tensor]]:
+        """Their gradient, if they have one."""
+        return {} if self.values.grad is None else {"exposures": [self.values.grad]}
+
+    def zero_grad(self) -> None:
+        """Forget it."""
+        self.values.grad = None
+
+    @torch.no_grad()
+    def step(self, step: int) -> None:
+        """Move the corrections that have a gradient, at the rate of this step (counted from 1), and forget it."""
+        if self.values.grad is None:
+            return
+        rows = self.values.grad.flatten(1).any(dim=1).nonzero()[:, 0]
+        gradient = self.values.grad[rows]
+        self._steps[rows] += 1
+        self._mean[rows] = MEAN_DECAY * self._mean[rows] + (1 - MEAN_DECAY) * gradient
+        self._square[rows] = SQUARE_DECAY * self._square[rows] + (1 - SQUARE_DECAY) * gradient.square()
+        mean = self._mean[rows] / (1 - MEAN_DECAY ** self._steps[rows])
+        size = (self._square[rows] / (1 - SQUARE_DECAY ** self._steps[rows])).sqrt()
+        self.values[rows] -= self._rate.at(step) * mean / (size + TINY)
+        self.values.sub_(self.values.mean(dim=0) - self._identity)
+        self.values.grad = None
+
+    def state(self) -> dict[str, Tensor]:
+        """Everything that the next step depends on, besides the gradient."""
+        return {"values": self.values, "mean": self._mean, "square": self._square, "steps": self._steps}
+
+    def restore(self, state: Mapping[str, Tensor]) -> None:
+        """Go on from what `state` gave. Raises ValueError where it is of other pictures."""
+        for name, mine in self.state().items():
+            value = state[name]
+            if value.shape != mine.shape or value.dtype != mine.dtype or not bool(value.isfinite().all()):
+                raise ValueError(f"its exposure {name} is {value.dtype} of shape {tuple(value.shape)}, or not finite")
+        if bool((state["square"] < 0).any() or (state["steps"] < 0).any()):
+            raise ValueError("its exposures' moments are negative")
+        with torch.no_grad():
+            for name, mine in self.state().items():
+                mine.copy_(state[name])

@@ -1,0 +1,18 @@
+// A rendered image with the colours that the camera of a picture would have given it. A workgroup takes a row.
+#import common/exposure
+
+@group(0) @binding(0) var<uniform> exposure: Exposure;
+#table 1 image: f32
+@group(0) @binding(2) var<storage, read_write> exposed: array<f32>;
+
+@compute @workgroup_size($LANES)
+fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
+    let count = exposure.size.x * exposure.size.y;
+    for (var column = lane; column < exposure.size.x; column += u32($LANES)) {
+        let i = group.y * exposure.size.x + column;
+        let colour = vec4(image_at(i), image_at(count + i), image_at(2u * count + i), 1.0);
+        exposed[i] = dot(exposure.red, colour);
+        exposed[count + i] = dot(exposure.green, colour);
+        exposed[2u * count + i] = dot(exposure.blue, colour);
+    }
+}

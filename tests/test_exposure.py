@@ -1,0 +1,222 @@
+"""Exposure: the passes against their twin, the corrections, and what they are for."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from contextlib import closing
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from scenes import relative
+from test_image_loss import BACKGROUND, CAMERA, TRUTH, WEIGHTS, gaussians, gradients, step
+from test_resume import interrupt_at
+from test_train import configure
+
+from lapgs_wgpu.data import Dataset, load_dataset
+from lapgs_wgpu.data.synthetic import write_synthetic
+from lapgs_wgpu.data.views import View, composite
+from lapgs_wgpu.gpu.buffer import Buffer
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.kernel import Commands
+from lapgs_wgpu.splat.rasterize import rasterize
+from lapgs_wgpu.splat.rasterizer import Rasterizer
+from lapgs_wgpu.train.config import Rate
+from lapgs_wgpu.train.exposure import ExposurePasses, Exposures, exposure
+from lapgs_wgpu.train.loop import resume, train
+from lapgs_wgpu.train.losses import total
+from lapgs_wgpu.train.render_loss import RenderLoss, render_loss, upload_rgba
+from lapgs_wgpu.train.training import Training
+
+CORRECTION = torch.tensor([[0.9, 0.1, -0.05, 0.02], [0.03, 1.2, 0.0, -0.1], [-0.02, 0.05, 0.8, 0.2]])
+IDENTITY = torch.eye(3, 4)
+RATE = Rate(2e-2, 2e-3, 100)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    folder = tmp_path_factory.mktemp("data") / "scene"
+    return load_dataset(write_synthetic(folder, size=32, train_views=8, test_views=2))
+
+
+# The passes
+
+
+@pytest.mark.kernels
+@pytest.mark.parametrize("size", [(1, 1), (3, 5), (12, 30), (37, 61), (64, 200)])
+def test_exposure(device: Device, size: tuple[int, int]) -> None:
+    """The image, and its gradient to the image and to the correction, are the twin's in float64."""
+    rng = np.random.default_rng(size[0])
+    image, d_exposed = (rng.random((4, *size), np.float32) for _ in range(2))
+    passes = ExposurePasses(device)
+    drawn, d = Buffer(device, image.nbytes, "image"), Buffer(device, image.nbytes, "d_exposed")
+    drawn.write(image)
+    d.write(d_exposed)
+    with Commands(device) as commands:
+        exposed = passes.record(commands, drawn, size, CORRECTION)
+        back = passes.record_bwd(commands, drawn, d, size, CORRECTION)
+
+    def tensor(planes: NDArray[np.float32]) -> torch.Tensor:
+        return torch.from_numpy(planes[:3]).permute(1, 2, 0).double()
+
+    leaves = tensor(image).requires_grad_(), CORRECTION.double().requires_grad_()
+    expected = exposure(*leaves)
+    expected.backward(tensor(d_exposed))
+    assert leaves[0].grad is not None
+    assert leaves[1].grad is not None
+    found = tensor(exposed.read("float32", (4, *size)))
+    torch.testing.assert_close(found, expected.detach(), rtol=0, atol=1e-6)
+    d_image = back.d_image.read("float32", (4, *size))
+    assert relative(tensor(d_image), leaves[0].grad) < 1e-6
+    assert (d_image[3] == 0).all()
+    d_rows = back.d_rows.read("float32", (size[0], 3, 4)).astype(np.float64)
+    assert relative(torch.from_numpy(d_rows.sum(axis=0)), leaves[1].grad) < 1e-5
+
+
+@pytest.mark.kernels
+def test_a_step_is_that_of_the_rasteriser_and_the_twins(device: Device) -> None:
+    scene, other = gaussians(), gaussians()
+    mine, theirs = (CORRECTION.clone().requires_grad_() for _ in range(2))
+    done = render_loss(scene, CAMERA, upload_rgba(device, TRUTH), BACKGROUND, WEIGHTS["all"], device, mine)
+    done.loss.backward()
+    drawn = rasterize(
+        other.means, other.quats, other.scales, other.opacities, other.sh, CAMERA,
+        sh_degree=1, background=BACKGROUND, depth=False, device=device,
+    )  # fmt: skip
+    truth = torch.from_numpy(TRUTH.astype(np.float32) / 255).double()
+    loss = total(exposure(drawn.image.double(), theirs.double()), truth, WEIGHTS["all"])
+    loss.backward()
+    assert done.loss.item() == pytest.approx(loss.item(), rel=1e-5)
+    assert mine.grad is not None
+    assert theirs.grad is not None
+    assert relative(mine.grad, theirs.grad) < 1e-4
+    expected = gradients(other, RenderLoss(loss, {}, drawn.radii, drawn.means2d))
+    for name, gradient in gradients(scene, done).items():
+        assert relative(gradient, expected[name]) < 1e-4, name
+
+
+@pytest.mark.kernels
+def test_the_identity_changes_no_bit(device: Device) -> None:
+    scene, other = gaussians(), gaussians()
+    plain = step(device, scene)
+    done = render_loss(other, CAMERA, upload_rgba(device, TRUTH), BACKGROUND, WEIGHTS["all"], device, IDENTITY)
+    plain.loss.backward()
+    done.loss.backward()
+    assert done.loss.item() == plain.loss.item()
+    for name, gradient in gradients(scene, plain).items():
+        assert torch.equal(gradient, gradients(other, done)[name]), name
+
+
+@pytest.mark.kernels
+def test_without_a_gradient_no_backward_pass_runs(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Rasterizer, "backward", None)
+    monkeypatch.setattr(ExposurePasses, "record_bwd", None)
+    with torch.no_grad():
+        render_loss(gaussians(), CAMERA, upload_rgba(device, TRUTH), BACKGROUND, WEIGHTS["all"], device, CORRECTION)
+
+
+# The corrections
+
+
+def test_corrections_move_against_their_gradient_and_leave_the_scene_its_colours() -> None:
+    exposures = Exposures(4, RATE)
+    exposures.step(1)  # without a gradient
+    assert torch.equal(exposures.values, IDENTITY.expand(4, 3, 4))
+    (3.0 * exposures.values[2].sum()).backward()
+    exposures.step(1)
+    moved = (exposures.values - IDENTITY).detach()
+    torch.testing.assert_close(moved.mean(dim=0), torch.zeros(3, 4), rtol=0, atol=1e-7)
+    torch.testing.assert_close(moved[2] - moved[0], torch.full((3, 4), -RATE.at(1)))
+    assert torch.equal(moved[0], moved[3])
+    assert exposures.gradients() == {}
+    assert exposures.state()["steps"].flatten().tolist() == [0, 0, 1, 0]
+
+
+def test_what_was_saved_goes_on() -> None:
+    def some_steps(exposures: Exposures, first: int) -> None:
+        for number in range(first, first + 3):
+            (number * exposures.values[number % 2].square().sum()).backward()
+            exposures.step(number)
+
+    one, other = Exposures(2, RATE), Exposures(2, RATE)
+    some_steps(one, 1)
+    other.restore({name: value.detach().clone() for name, value in one.state().items()})
+    some_steps(one, 4)
+    some_steps(other, 4)
+    for name, value in one.state().items():
+        assert torch.equal(value, other.state()[name]), name
+
+
+@pytest.mark.parametrize("name", ["values", "mean", "square", "steps"])
+def test_a_state_of_other_pictures_is_refused(name: str) -> None:
+    exposures = Exposures(3, RATE)
+    state = {key: value.detach().clone() for key, value in exposures.state().items()}
+    for bad in (Exposures(2, RATE).state()[name], state[name].double(), state[name] + math.nan):
+        with pytest.raises(ValueError, match=f"its exposure {name}"):
+            exposures.restore({**state, name: bad})
+
+
+# In a training
+
+
+@pytest.mark.parametrize("at", [3, 16])
+def test_an_interrupted_run_goes_on_to_the_same_bytes(
+    at: int, dataset: Dataset, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = configure(exposure__enabled="true", schedule__batch="2", schedule__steps="20")
+    train(config, dataset, tmp_path / "whole", device=device)
+    with monkeypatch.context() as patched:
+        interrupt_at(at, patched)
+        with pytest.raises(KeyboardInterrupt):
+            train(config, dataset, tmp_path / "run", device=device)
+    resume(config, dataset, tmp_path / "run", device=device)
+    first, second = (tmp_path / name / "checkpoint.ply" for name in ("run", "whole"))
+    assert first.read_bytes() == second.read_bytes()
+
+
+def test_it_is_off_unless_asked_for(dataset: Dataset, device: Device) -> None:
+    with closing(Training(configure(), dataset, device)) as training:
+        training.step()
+        assert not [name for name in training.state() if name.startswith("exposure")]
+
+
+def flickering(dataset: Dataset) -> Dataset:
+    """All pictures opaque, on dark grey. Each training picture has a gain and an offset of its own for each channel;
+    their means over all pictures are 1 and 0."""
+    rng = np.random.default_rng(0)
+    count = len(dataset.train)
+    gains = np.stack([rng.permutation(np.linspace(0.7, 1.3, count)) for _ in range(3)], axis=1)
+    offsets = np.stack([rng.permutation(np.linspace(-0.1, 0.1, count)) for _ in range(3)], axis=1)
+
+    def pixels(view: View, gain: NDArray[np.float64], offset: NDArray[np.float64]) -> NDArray[np.uint8]:
+        colours = 0.2 + 0.5 * composite(view.load(), np.zeros(3)) / 255
+        return (255 * (gain * colours + offset)).clip(0, 255).round().astype(np.uint8)
+
+    def changed(views: tuple[View, ...], gains: NDArray[np.float64], offsets: NDArray[np.float64]) -> tuple[View, ...]:
+        return tuple(
+            dataclasses.replace(view, pixels=partial(pixels, view, *change))
+            for view, *change in zip(views, gains, offsets, strict=True)
+        )
+
+    plain = np.ones((len(dataset.test), 3))
+    return dataclasses.replace(
+        dataset,
+        train=changed(dataset.train, gains, offsets),
+        test=changed(dataset.test, plain, 0 * plain),
+    )
+
+
+def test_corrections_recover_the_scene_from_flickering_pictures(device: Device, tmp_path: Path) -> None:
+    still = write_synthetic(tmp_path / "scene", size=48, train_views=16, test_views=4, frequencies=[0.0])
+    data = flickering(load_dataset(still))
+    changes = {"schedule__steps": "400", "density__start": "400", "points__count": "1500"}
+    found = {}
+    for name in ("false", "true"):
+        train(configure("static", exposure__enabled=name, **changes), data, tmp_path / name, device=device)
+        found[name] = json.loads((tmp_path / name / "metrics.json").read_text())["psnr"]
+    assert found["true"] > found["false"] + 1, found
