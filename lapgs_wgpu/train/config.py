@@ -1,5 +1,5 @@
-"""The configuration of a training: frozen dataclasses without defaults, whose values stand in the presets (configs/), but
-for keys that the config.toml of older runs lacks.
+"""The configuration of a training: frozen dataclasses without defaults, whose values stand in the presets (configs/),
+but for keys that the config.toml of older runs lacks.
 
 Each key carries the text that lapgs-train --help shows of it.
 """
