@@ -60,13 +60,14 @@ def _train(arguments: list[str]) -> None:
     if "--list-devices" in arguments:
         print_devices()
         return
+    from lapgs_wgpu.train.presets import config_keys, load_config
+
+    given = _parse(arguments)
     from lapgs_wgpu.gpu.device import open_device  # what follows needs torch, which takes seconds to import
     from lapgs_wgpu.train.loop import train
-    from lapgs_wgpu.train.presets import config_keys, load_config
     from lapgs_wgpu.train.ranks import join_ranks
     from lapgs_wgpu.train.run_folder import check_run_folder
 
-    given = _parse(arguments)
     overrides = {key.name: given[key.name] for key in config_keys() if key.name in given}
     if given["eval"]:
         _evaluate(Path(given["eval"]), given["device"], overrides, given["lpips_weights"])

@@ -80,6 +80,8 @@ def test_the_rule_sees_imports(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
 # What `import` does
 
+SLOW = {"torch", "wgpu", "numpy", "scipy"}  # from a tenth of a second to several
+
 
 def run(program: str) -> str:
     done = subprocess.run([sys.executable, "-W", "error", "-c", program], capture_output=True, text=True)
@@ -91,7 +93,7 @@ def run(program: str) -> str:
 def test_import_is_light_and_silent() -> None:
     assert run("import lapgs_wgpu") == ""
     loaded = run("import sys, lapgs_wgpu; print(*sys.modules)").split()
-    assert not {"torch", "wgpu", "numpy", "scipy"} & set(loaded)
+    assert not SLOW & set(loaded)
 
 
 @pytest.mark.parametrize(
@@ -107,9 +109,32 @@ def test_import_is_light_and_silent() -> None:
         "data.colmap",
     ],
 )
-def test_readers_need_neither_torch_nor_a_device(module: str) -> None:
+def test_readers_need_neither_torch_nor_a_device_nor_scipy(module: str) -> None:
     loaded = run(f"import sys, lapgs_wgpu.{module}; print(*sys.modules)").split()
-    assert not {"torch", "wgpu"} & set(loaded)
+    assert not {"torch", "wgpu", "scipy"} & set(loaded)
+
+
+@pytest.mark.parametrize(
+    ("command", "slow"),
+    [
+        ("viewer.cli.view_command", SLOW),
+        ("cli.train_command", SLOW),
+        ("cli.table_command", SLOW),
+        ("prepare.prepare_command", SLOW - {"numpy"}),
+    ],
+)
+def test_help_loads_nothing_that_is_slow(command: str, slow: set[str]) -> None:
+    """Which is what makes it quick: the test counts, since times depend on the machine."""
+    module, name = command.rsplit(".", 1)
+    program = f"""
+import contextlib, io, sys
+from lapgs_wgpu.{module} import {name}
+shown = io.StringIO()
+with contextlib.redirect_stdout(shown), contextlib.suppress(SystemExit):
+    {name}(["--help"])
+assert "--help" in shown.getvalue()
+print(*sys.modules)"""
+    assert not slow & set(run(program).split())
 
 
 def test_torchs_threads_are_told_to_sleep() -> None:

@@ -13,10 +13,11 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.splat.camera import Camera
 
 from .capture import Capture, open_capture
+from .choices import BACKGROUNDS, Mode
 from .clock import LOOPS, SPEEDS
 from .controls import Controls
-from .frame import Frame, Mode, Painter, Request
-from .opened import BACKGROUNDS, Opened, open_scene
+from .frame import Frame, Painter, Request
+from .opened import Opened, open_scene
 from .path import Pose
 from .path_editor import PathEditor
 from .present import Placed, Presenter

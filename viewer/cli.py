@@ -13,6 +13,9 @@ from typing import TYPE_CHECKING, Any
 from lapgs_wgpu.command import HelpFormatter, Parser, guarded, print_devices
 from lapgs_wgpu.errors import InputError
 
+from .choices import BACKGROUNDS, MODES
+from .clock import LOOPS
+
 if TYPE_CHECKING:
     from lapgs_wgpu.gpu.device import Device
 
@@ -110,7 +113,6 @@ def _place(given: Any) -> Any:
 
 
 def _window(given: Any, opened: Opened, place: Any) -> None:
-    from .opened import BACKGROUNDS
     from .start import Start
 
     start = Start(
@@ -135,7 +137,6 @@ def _window(given: Any, opened: Opened, place: Any) -> None:
 
 
 def _screenshot(given: Any, opened: Opened) -> None:
-    from .opened import BACKGROUNDS
     from .shoot import Shooter, find_view, framed, write_png
 
     file = _named(given.screenshot, ".png", "--screenshot")
@@ -153,7 +154,6 @@ def _screenshot(given: Any, opened: Opened) -> None:
 def _video(given: Any, opened: Opened) -> None:
     from . import video
     from .camera import ViewCamera
-    from .opened import BACKGROUNDS
     from .path_file import read_path
     from .shoot import Shooter, find_view, framed
 
@@ -241,10 +241,6 @@ def _option(name: str) -> str:
 
 
 def _parse(arguments: list[str]) -> Any:
-    from .clock import LOOPS
-    from .frame import MODES
-    from .opened import BACKGROUNDS
-
     parser = Parser("lapgs-view", description=DESCRIPTION, formatter_class=HelpFormatter, allow_abbrev=False)
     add = parser.add_argument
     # Every default is None: what was given is told from what was not.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,17 +16,9 @@ from lapgs_wgpu.motion.playback import Playback
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.rasterizer import GaussianBuffers, Rasterizer
 
+from .choices import MODES, Mode
 from .present import Placed
 
-Mode = Literal["rgb", "depth", "alpha", "motion", "dynamics", "scale"]
-MODES: dict[Mode, str] = {
-    "rgb": "colours",
-    "depth": "depth, world units",
-    "alpha": "how much is covered",
-    "motion": "how far each Gaussian moves over the clip, world units",
-    "dynamics": "length of each Gaussian's dynamics attribute",
-    "scale": "largest standard deviation of each Gaussian, world units",
-}
 _MOMENTS = 9  # times at which the Gaussians' places are compared
 
 

@@ -16,9 +16,9 @@ from lapgs_wgpu.motion.scene_file import read_scene
 from lapgs_wgpu.splat.camera import Camera
 
 from .camera import ViewCamera
+from .choices import BACKGROUNDS
 from .clock import Clock
 
-BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "grey": (0.5, 0.5, 0.5)}
 _ELEVATION = math.radians(35)  # of the guessed camera above the middle
 _FLAT = 0.5  # of the extents along x and y: what is lower lies on the ground
 _FRAMES = 150  # of a clip whose file does not say how many it has

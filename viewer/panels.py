@@ -9,10 +9,9 @@ from imgui_bundle import imgui
 from wgpu.utils.imgui import ImguiRenderer
 
 from .app import COMPARES, App
+from .choices import BACKGROUNDS, MODES
 from .clock import LOOPS, SPEEDS
-from .frame import MODES
 from .keys import KEYS, MOUSE
-from .opened import BACKGROUNDS
 from .path_panel import draw_path
 from .present import HEAT
 

@@ -15,7 +15,8 @@ from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.splat.camera import Camera
 
 from .capture import open_capture
-from .frame import Mode, Painter, Request
+from .choices import Mode
+from .frame import Painter, Request
 from .opened import Opened
 from .present import Offscreen
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
+from .choices import Mode
 from .clock import Loop
-from .frame import Mode
 from .shoot import check_mode, find_view
 
 if TYPE_CHECKING:

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
-from scipy.ndimage import map_coordinates
 
 from lapgs_wgpu.data.pictures import decode, shrink
 from lapgs_wgpu.errors import InputError
@@ -76,6 +75,8 @@ class Lens:
 
     def straighten(self, picture: NDArray[np.uint8], K: Array) -> NDArray[np.uint8]:
         """The picture (H, W, C) as a pinhole camera K of the same size sees it, bilinearly resampled."""
+        from scipy.ndimage import map_coordinates  # scipy takes most of a second to import: only where it is used
+
         height, width = picture.shape[:2]
         columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
         source = self.project(_rays(K, np.stack([columns, rows], axis=-1))) - 0.5

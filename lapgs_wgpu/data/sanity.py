@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
-from scipy.ndimage import laplace
 
 from lapgs_wgpu.data.cloud import Cloud, views_of
 from lapgs_wgpu.data.pictures import PICTURE_ERRORS, PICTURE_FORMATS
@@ -79,6 +78,8 @@ def check_views(cloud: Cloud, cameras: Sequence[Camera], names: Sequence[str], w
 
 def check_film(pictures: Sequence[Path]) -> list[str]:
     """Warnings about pictures, in the order in which one camera took them, that are blurred or repeated."""
+    from scipy.ndimage import laplace  # slow to import
+
     if len(pictures) < 3:
         return []
     with ThreadPoolExecutor(4, thread_name_prefix="thumbnails") as pool:

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from lapgs_wgpu.data.cloud import Cloud, check_cloud, points_in_view
 from lapgs_wgpu.data.lens import LARGEST_ZOOM, Lens, read_straight
@@ -152,6 +151,8 @@ def _filled(cloud: Cloud, cameras: Sequence[Camera]) -> Cloud:
     depths = np.concatenate([points @ c.T_cam_world[2, :3] + c.T_cam_world[2, 3] for c in cameras])
     near, far = np.percentile(depths[depths > 0], [1, 99])
     added = points_in_view(cameras, float(near), float(far) * 1.01, missing, 0)
+    from scipy.spatial import cKDTree  # slow to import
+
     _, nearest = cKDTree(points).query(added)
     return Cloud(
         np.concatenate([cloud.points, added.astype(np.float32)]),

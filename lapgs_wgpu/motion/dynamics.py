@@ -5,12 +5,10 @@ d: (N, 16) float32, without a unit. The distance of a Gaussian is that of its ro
 
 from __future__ import annotations
 
-from typing import Literal
-
 import torch
 from torch import Tensor
 
-DynamicsMode = Literal["literal", "promote", "off"]
+from .field import DynamicsMode
 
 # Distances that are equal but for float32's rounding must not stand out. Where they differ it changes nothing.
 ROUNDING = 1e-6

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 FieldKind = Literal["static", "mlp", "hexplane", "grid4d", "laplacian"]
 Motion = Literal["laplacian", "mlp"]
 Appearance = Literal["none", "color", "color+opacity"]
+DynamicsMode = Literal["literal", "promote", "off"]  # of the regularisation of the dynamics attribute (motion/dynamics)
 MIN_SCALE = 1e-7  # of a Gaussian, after its deformation; world units
 PLANES = ((0, 1), (0, 2), (1, 2), (0, TIME), (1, TIME), (2, TIME))  # of the field hexplane: pairs of x, y, z, t
 TEMPORAL_AXES = ((0, 1, TIME), (1, 2, TIME), (0, 2, TIME))  # of the temporal hash grids

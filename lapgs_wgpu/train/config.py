@@ -1,7 +1,7 @@
 """The configuration of a training: frozen dataclasses without defaults, whose values stand in the presets (configs/),
 but for keys that the config.toml of older runs lacks.
 
-Each key carries the text that lapgs-train --help shows of it.
+Each key carries the text that lapgs-train --help shows of it. No torch here, which takes seconds to import.
 """
 
 # ruff: noqa: RUF009 (described() makes a dataclass field)
@@ -11,12 +11,10 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
-from lapgs_wgpu.motion.dynamics import DynamicsMode
-from lapgs_wgpu.motion.field import FieldConfig
+from lapgs_wgpu.motion.field import DynamicsMode, FieldConfig
 from lapgs_wgpu.motion.hashgrid import option
-from lapgs_wgpu.train.losses import LossWeights
 
 Background = Literal["black", "white", "random"]
 Split = Literal["plain", "adaptive"]
@@ -182,6 +180,18 @@ class DensityConfig:
     def resets_at(self, step: int) -> bool:
         """Whether opacities are lowered after this step."""
         return step < self.stop and step % self.reset_interval == 0
+
+
+class LossWeights(NamedTuple):
+    """Of each term in the loss of an image; a term of weight 0 is not computed.
+
+    l1, ssim (of 1 - SSIM), pyramid and ncc multiply the terms as they are.
+    """
+
+    l1: float
+    ssim: float
+    pyramid: float = 0.0
+    ncc: float = 0.0
 
 
 @dataclass(frozen=True)

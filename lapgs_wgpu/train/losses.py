@@ -7,11 +7,12 @@ held to.
 from __future__ import annotations
 
 import functools
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn import functional
+
+from .config import LossWeights
 
 SSIM_WINDOW = 11
 SSIM_SIGMA = 1.5  # pixels
@@ -26,18 +27,6 @@ NCC_E = 1e-4  # a covariance; what varies less counts as flat
 NCC_TINY = 1e-14  # keeps the square root differentiable; its own root lies far below NCC_E
 LUMINANCE = (0.299, 0.587, 0.114)  # Rec. 601, which is meant for gamma-encoded pictures such as ours
 LEAST_ERROR = 1e-10  # mean squared error that PSNR takes equal images to have: 100 dB
-
-
-class LossWeights(NamedTuple):
-    """Of each term in the loss of an image; a term of weight 0 is not computed.
-
-    l1, ssim (of 1 - SSIM), pyramid and ncc multiply the terms as they are.
-    """
-
-    l1: float
-    ssim: float
-    pyramid: float = 0.0
-    ncc: float = 0.0
 
 
 def total(image: Tensor, target: Tensor, weights: LossWeights) -> Tensor:
