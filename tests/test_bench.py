@@ -11,43 +11,53 @@ import numpy as np
 import pytest
 
 BENCH = Path(__file__).parent / "bench"
+SCENE = "300@40x40"
 
 
 def bench(*arguments: str | Path) -> str:
-    command = [sys.executable, BENCH, "--gaussians", "300", "--size", "40", "--repeat", "1", *arguments]
+    command = [sys.executable, BENCH, "--scenes", SCENE, "--repeat", "1", *arguments]
     return subprocess.run(command, check=True, capture_output=True, text=True, timeout=300).stdout
 
 
 @pytest.fixture(scope="module")
-def results(tmp_path_factory: pytest.TempPathFactory) -> dict:
-    file = tmp_path_factory.mktemp("bench") / "bench.json"
-    table = bench("--json", file)
+def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("bench") / "bench.json"
+
+
+@pytest.fixture(scope="module")
+def results(file: Path) -> dict:
+    table = bench("--parts", "raster", "encoder", "losses", "step", "shares", "--json", file)
     for words in (
         "rasterize_bwd",
         "forward + backward",
         "0 of them before the sort",
         "times as fast as the twin;",
         "as fast as the twins",
+        "at the ceiling",
     ):
         assert words in table
     return json.loads(file.read_text())
 
 
+def raster(results: dict) -> dict:
+    return results["raster"][SCENE]
+
+
 def test_the_passes_add_up(results: dict) -> None:
-    passes = {one["shader"]: one["dispatches"] for one in results["raster"]["passes"]}
+    passes = {shader: one["dispatches"] for shader, one in raster(results)["passes"]["passes"].items()}
     assert {"project", "sort_scatter", "rasterize", "rasterize_bwd", "gather_gradients", "project_bwd"} <= passes.keys()
-    assert sum(passes.values()) == results["raster"]["torch_traffic"]["dispatches"]
+    assert sum(passes.values()) == raster(results)["torch_traffic"]["dispatches"]
 
 
 def test_nothing_is_read_back_before_the_sort(results: dict) -> None:
     """A step waits twice: for the picture and for the gradients."""
-    step = results["raster"]["torch_traffic"]
+    step = raster(results)["torch_traffic"]
     assert step["read_backs_before_sort"] == 0
     assert step["read_backs"] == 2
 
 
 def test_bytes_of_a_step_are_those_of_its_tensors(results: dict) -> None:
-    step, n, pixels = results["raster"]["torch_traffic"], 300, 40 * 40
+    step, n, pixels = raster(results)["torch_traffic"], 300, 40 * 40
     gaussians, planes = 4 * n * (3 + 4 + 3 + 1 + 3), 4 * 5 * pixels
     constants = 4096  # what the kernels are told besides
     assert gaussians + planes <= step["uploaded_bytes"] <= gaussians + planes + constants
@@ -72,7 +82,7 @@ def test_a_training_step_waits_three_times(results: dict) -> None:
 
 
 def test_the_parts_of_a_step_add_up(results: dict) -> None:
-    shares = dict(results["shares"])
+    shares = {name: time["median"] for name, time in results["shares"].items()}
     step = shares.pop("step")
     assert all(share > 0 for share in shares.values()), shares
     assert sum(shares.values()) == pytest.approx(step, rel=0.01)
@@ -86,3 +96,109 @@ def test_the_scene_can_be_saved_for_other_rasterisers(tmp_path: Path) -> None:
     assert np.linalg.norm(scene["means"], axis=1).max() <= 1.3
     assert (int(scene["width"]), int(scene["height"])) == (40, 40)
     np.testing.assert_allclose(scene["T_cam_world"] @ [0, 0, -4, 1], [0, 0, 0, 1], atol=1e-6)
+
+
+# Ceilings, and what is counted
+
+
+def test_the_machine_is_told(results: dict) -> None:
+    told = {"adapter", "driver", "processor", "load before", "load afterwards", "lapgs-wgpu", "torch", "wgpu", "python"}
+    assert told <= results["machine"].keys()
+
+
+def test_what_the_rasteriser_has_to_do_is_counted(results: dict) -> None:
+    counts = raster(results)["counts"]
+    assert counts["gaussians"] == 300
+    assert 0 < counts["visible"] <= 300
+    assert counts["visible"] <= counts["intersections"]
+    assert 0 < counts["drawn"] <= counts["intersections"]
+    assert counts["pixels"] == 40 * 40
+    assert counts["pairs"] % counts["drawn"] == 0
+    work = {shader: one["work"] for shader, one in raster(results)["passes"]["passes"].items()}
+    assert work["rasterize"]["exponentials"] == counts["pairs"]
+    assert work["rasterize"]["bytes"] > 56 * counts["drawn"]
+    assert work["rasterize_bwd"]["operations"] > work["rasterize"]["operations"]
+    assert work["project"]["bytes"] == 300 * 96 + 52 * counts["visible"]
+    encoder = {shader: one["work"] for shader, one in results["encoder"]["passes"]["passes"].items()}
+    assert encoder["hashgrid"]["bytes"] == 300 * 112 * 24 + 8 * corners(results["encoder"]["levels"], 300)
+
+
+def corners(levels: int, points: int) -> int:
+    """All temporal levels of the preset are cut, the 16 of space are not."""
+    return points * (16 * 8 + (levels - 16) * 4)
+
+
+def test_every_counted_pass_stands_beside_its_ceiling(results: dict) -> None:
+    for part in (raster(results), results["encoder"]):
+        ceilings = part["passes"]["ceilings"]
+        assert min(ceilings["copied_bytes"], ceilings["operations"], ceilings["exponentials"]) > 0
+        for shader, one in part["passes"]["passes"].items():
+            assert one["ceiling"] > 0, shader
+            assert one["share"] == pytest.approx(one["ceiling"] / one["milliseconds"]["median"])
+
+
+@pytest.mark.parametrize("name", ["ceiling_copy", "ceiling_fma", "ceiling_exp"])
+def test_a_ceiling_is_really_computed(name: str) -> None:
+    """What the kernels leave behind is what their loops say."""
+    program = f"""
+import sys
+sys.path.insert(0, {str(BENCH)!r})
+import numpy as np
+from ceilings import CHAINS, STEPS, TURNS, CeilingKernels
+from lapgs_wgpu import open_device
+from lapgs_wgpu.gpu.kernel import Commands
+device = open_device()
+kernels = CeilingKernels(device, shortest=0.0)
+with Commands(device) as commands:
+    kernels._dispatches[{name!r}](commands)
+got = kernels._target.read("float32", (64,))
+chains = np.arange(CHAINS, dtype=np.float32)[None]
+if {name!r} == "ceiling_copy":
+    expected = kernels._source.read("float32", (64,))
+else:
+    x = np.arange(64, dtype=np.float32)[:, None] + chains
+    x = x if {name!r} == "ceiling_fma" else -x
+    for _ in range(STEPS * TURNS):
+        x = x * np.float32(0.999) + np.float32(0.001) if {name!r} == "ceiling_fma" else -np.exp2(x)
+    expected = x.sum(axis=1) + (0.001 if {name!r} == "ceiling_exp" else 0)
+np.testing.assert_allclose(got, expected, rtol=1e-4)
+"""
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=300)
+
+
+# Comparing
+
+
+def test_results_compare_with_themselves(results: dict, file: Path) -> None:
+    table = bench("--compare", file, file)
+    assert f"raster / {SCENE} / rasterize_bwd" in table
+    assert "losses / kernels" in table
+    assert "*" not in table.split("\n", 1)[1]
+
+
+def test_a_comparison_tells_what_is_worse(tmp_path: Path) -> None:
+    def write(name: str, adapter: str, **medians: tuple[float, float, float]) -> Path:
+        times = {key: dict(zip(("low", "median", "high"), values, strict=True)) for key, values in medians.items()}
+        passes = {shader: {"milliseconds": time} for shader, time in times.items()}
+        content = {"machine": {"adapter": adapter, "torch": "2"}, "raster": {"a": {"passes": {"passes": passes}}}}
+        (tmp_path / name).write_text(json.dumps(content))
+        return tmp_path / name
+
+    old = write("old.json", "one", sort=(1, 2, 3), emit=(1.9, 2, 2.1), ranges=(1, 1, 1), gone=(1, 1, 1))
+    new = write("new.json", "two", sort=(2, 3, 4), emit=(3.8, 4, 4.2), ranges=(0.4, 0.5, 0.6))
+    lines = bench("--compare", old, new).splitlines()
+    assert lines[0] == "adapter: one -> two"
+    assert [line.split()[:3] for line in lines[2:5]] == [["raster", "/", "a"]] * 3
+    assert [line.split()[4:] for line in lines[2:5]] == [
+        ["emit", "2.00", "4.00", "2.00", "*"],
+        ["sort", "2.00", "3.00", "1.50"],
+        ["ranges", "1.00", "0.50", "0.50", "*"],
+    ]
+    assert lines[5] == f"only in {old}: raster / a / gone"
+    assert len(lines) == 6
+
+
+def test_scenes_have_names() -> None:
+    done = subprocess.run([sys.executable, BENCH, "--scenes", "50k"], capture_output=True, text=True)
+    assert done.returncode == 2
+    assert "expected GAUSSIANS@WIDTHxHEIGHT, such as 50k@400x400, got '50k'" in done.stderr

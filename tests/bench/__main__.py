@@ -13,13 +13,17 @@ import os
 import platform
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import torch
+from ceilings import CeilingKernels, describe
+from compare import compare
 from encoder import EncoderReport, bench_encoder
 from losses import LossReport, bench_losses
 from measure import Timing, Traffic
+from passes import PassTimes
 from raster import RasterReport, bench_raster
-from scene import make_scene, save_scene
+from scene import FIXED_SET, SceneSize, make_scene, save_scene
 from shares import bench_shares
 from step import StepReport, bench_step
 
@@ -27,50 +31,83 @@ from lapgs_wgpu.gpu.device import Device, open_device
 from lapgs_wgpu.train.presets import load_config
 from viewer import bench_viewer, print_viewer
 
+PARTS = ("raster", "encoder", "losses", "step", "shares", "viewer")
+
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python tests/bench", description=__doc__)
-    parser.add_argument("--gaussians", type=int, default=50_000, metavar="N", help="of the scene (default: 50000)")
-    parser.add_argument("--size", type=int, default=400, metavar="PIXELS", help="of the square image (default: 400)")
-    parser.add_argument("--repeat", type=int, default=15, metavar="R", help="timed runs of each (default: 15)")
+    parser.add_argument(
+        "--scenes",
+        type=SceneSize.parse,
+        nargs="+",
+        default=FIXED_SET,
+        metavar="N@WxH",
+        help=f"Gaussians and image of what is drawn; the first one's also in losses and shares [{_names(FIXED_SET)}]",
+    )
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS, help=f"what is timed [{' '.join(PARTS)}]")
+    parser.add_argument("--repeat", type=int, default=15, metavar="R", help="timed runs of each [15]")
     parser.add_argument("--device", metavar="NAME", help="adapter: a part of its name, or its kind")
     parser.add_argument("--no-textures", action="store_true", help="tables in storage buffers on CPU devices, too")
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write the results to FILE")
     parser.add_argument(
-        "--save-scene", type=Path, metavar="FILE", help="write the scene as .npz for other rasterisers, and stop"
+        "--compare", type=Path, nargs=2, metavar=("OLD", "NEW"), help="set two such files against each other, and stop"
+    )
+    parser.add_argument(
+        "--save-scene", type=Path, metavar="FILE", help="write the first scene as .npz for other rasterisers, and stop"
     )
     options = parser.parse_args()
-    arrays, camera = make_scene(options.gaussians, options.size)
-    if options.save_scene:
-        save_scene(options.save_scene, arrays, camera)
-        return
+    if options.compare:
+        print(compare(*options.compare))
+    elif options.save_scene:
+        save_scene(options.save_scene, *make_scene(options.scenes[0]))
+    else:
+        run(options)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Time the chosen parts, print what was found as it comes, and write it as JSON."""
     device = open_device(options.device)
     device.textures &= not options.no_textures
     machine = describe_machine(device)
     print(*(f"{name}: {value}" for name, value in machine.items()), sep="\n")
-    raster = bench_raster(device, arrays, camera, options.repeat)
-    print_raster(raster)
-    encoder = bench_encoder(device, load_config("dnerf").field, arrays["means"], options.repeat)
-    print_encoder(encoder)
-    losses = bench_losses(device, options.size, options.repeat)
-    print_losses(losses)
-    step = bench_step(device, options.repeat)
-    print_step(step)
-    shares = bench_shares(device, max(1, options.repeat // 2), options.gaussians, options.size)
-    print_shares(shares, options.gaussians, options.size)
-    viewer = bench_viewer(device, options.repeat)
-    for one in viewer:
-        print_viewer(one)
+    ceilings = CeilingKernels(device) if "timestamp-query" in device.features else None
+    first, repeat = options.scenes[0], options.repeat
+    results: dict[str, Any] = {"machine": machine}
+    if "raster" in options.parts:
+        results["raster"] = {}
+        for scene in options.scenes:
+            raster = bench_raster(device, *make_scene(scene), ceilings, repeat)
+            print_raster(str(scene), raster)
+            results["raster"][str(scene)] = raster
+    if "encoder" in options.parts:
+        means = make_scene(first)[0]["means"]
+        results["encoder"] = bench_encoder(device, load_config("dnerf").field, means, ceilings, repeat)
+        print_encoder(results["encoder"])
+    if "losses" in options.parts:
+        results["losses"] = bench_losses(device, first.height, ceilings, repeat)
+        print_losses(results["losses"])
+    if "step" in options.parts:
+        results["step"] = bench_step(device, repeat)
+        print_step(results["step"])
+    if "shares" in options.parts:
+        results["shares"] = bench_shares(device, max(1, repeat // 2), first.gaussians, first.height)
+        print_shares(results["shares"], first)
+    if "viewer" in options.parts:
+        results["viewer"] = bench_viewer(device, repeat)
+        for one in results["viewer"].values():
+            print_viewer(one)
+    machine["load afterwards"] = _load()
     if options.json:
-        reports = {
-            "raster": dataclasses.asdict(raster),
-            "encoder": dataclasses.asdict(encoder),
-            "losses": dataclasses.asdict(losses),
-            "step": dataclasses.asdict(step),
-            "shares": shares,
-            "viewer": [dataclasses.asdict(one) for one in viewer],
-        }
-        options.json.write_text(json.dumps({"machine": machine, **reports}, indent=1) + "\n")
+        options.json.write_text(json.dumps(results, indent=1, default=dataclasses.asdict) + "\n", encoding="utf-8")
+
+
+def _names(scenes: list[SceneSize]) -> str:
+    return " ".join(map(str, scenes))
+
+
+def _load() -> str:
+    """How many threads wanted a processor in the last minute."""
+    return f"{os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else "unknown"
 
 
 def describe_machine(device: Device) -> dict[str, str | int]:
@@ -85,10 +122,21 @@ def describe_machine(device: Device) -> dict[str, str | int]:
         "tables": "textures" if device.textures else "buffers",
         "processors": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 0,
         "torch threads": torch.get_num_threads(),
+        "processor": _processor(),
+        "load before": _load(),
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
         **versions,
     }
+
+
+def _processor() -> str:
+    """Its name, where the system says it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), platform.machine())
 
 
 def print_row(name: str, time: Timing, note: str = "") -> None:
@@ -99,22 +147,27 @@ def print_header(title: str) -> None:
     print(f"\n{title}\n  {'':28}{'median':>9}{'min':>9}  milliseconds")
 
 
-def print_raster(report: RasterReport) -> None:
-    print_header(
-        f"rasteriser: {report.gaussians:,} Gaussians, {report.size}x{report.size}, "
-        f"{report.intersections:,} intersections with tiles"
-    )
-    for one in report.passes:
-        print_row(one.shader, one.milliseconds, f"{one.dispatches} dispatches" if one.dispatches > 1 else "")
-    if report.passes:
-        total = Timing(
-            sum(one.milliseconds.median for one in report.passes),
-            sum(one.milliseconds.minimum for one in report.passes),
-            report.forward.runs,
-        )
-        print_row("all passes", total, f"{sum(one.dispatches for one in report.passes)} dispatches")
-    else:
+def print_passes(report: PassTimes) -> None:
+    """A row a shader: its time, the least that the ceilings allow, and the share of that in the time."""
+    if report.ceilings is None:
         print("  (this adapter has no timestamps: no times of single passes)")
+        return
+    print(f"  ceilings: {describe(report.ceilings)}")
+    for shader, one in report.passes.items():
+        dispatches = f"{one.dispatches} dispatches" if one.dispatches > 1 else ""
+        share = "" if one.share is None else f"{one.ceiling:9.2f} at the ceiling {one.share:5.0%}  "
+        print_row(shader, one.milliseconds, share + dispatches)
+    total = sum(one.milliseconds.median for one in report.passes.values())
+    print(f"  {'all passes':28}{total:9.2f}{'':9}  {sum(one.dispatches for one in report.passes.values())} dispatches")
+
+
+def print_raster(name: str, report: RasterReport) -> None:
+    counts = report.counts
+    print_header(
+        f"rasteriser, {name}: {counts.visible:,} splats visible, {counts.intersections:,} intersections with tiles, "
+        f"{counts.drawn:,} of them drawn"
+    )
+    print_passes(report.passes)
     print_row("forward", report.forward)
     print_row("forward + backward", report.forward_backward)
     print_row("torch: forward", report.torch_forward)
@@ -132,6 +185,7 @@ def print_traffic(title: str, step: Traffic) -> None:
 
 def print_encoder(report: EncoderReport) -> None:
     print_header(f"hash encoder: {report.points:,} points, {report.levels} levels, {report.entries:,} entries")
+    print_passes(report.passes)
     print_row("forward", report.forward)
     print_row("forward + backward", report.forward_backward)
     print_row("torch twin: forward", report.twin_forward)
@@ -142,17 +196,19 @@ def print_encoder(report: EncoderReport) -> None:
 
 def print_losses(report: LossReport) -> None:
     print_header(f"image losses, forward + backward: L1, SSIM, pyramid and NCC, {report.size}x{report.size}")
+    print_passes(report.passes)
     print_row("kernels", report.kernels)
     print_row("torch twins", report.twins)
     ratio = report.twins.median / report.kernels.median
     print(f"  {ratio:.1f} times as fast as the twins; gradients differ by {report.difference:.1e}")
 
 
-def print_shares(shares: dict[str, float], gaussians: int, size: int) -> None:
-    print(f"\ntraining step, preset dnerf: {gaussians:,} Gaussians, {size}x{size}, everything moving")
+def print_shares(shares: dict[str, Timing], scene: SceneSize) -> None:
+    size = f"{scene.height}x{scene.height}"
+    print(f"\ntraining step, preset dnerf: {scene.gaussians:,} Gaussians, {size}, everything moving")
     print(f"  {'':46s}{'median':>8s}  milliseconds")
-    for name, milliseconds in shares.items():
-        print(f"  {name:46s}{milliseconds:8.2f}  {milliseconds / shares['step']:4.0%}")
+    for name, time in shares.items():
+        print(f"  {name:46s}{time.median:8.2f}  {time.median / shares['step'].median:4.0%}")
 
 
 def print_step(report: StepReport) -> None:

@@ -7,9 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from ceilings import CeilingKernels
 from measure import Timing, timed
 from numpy.typing import NDArray
+from passes import PassTimes, time_passes
 from torch import Tensor
+from work import encoder_work
 
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.field import FieldConfig
@@ -30,10 +33,13 @@ class EncoderReport:
     forward_backward: Timing
     twin_forward: Timing
     twin_forward_backward: Timing
+    passes: PassTimes
     largest_difference: float  # of the gradients, relative to the largest gradient of a grid's table
 
 
-def bench_encoder(device: Device, config: FieldConfig, means: NDArray[np.float32], repeat: int) -> EncoderReport:
+def bench_encoder(
+    device: Device, config: FieldConfig, means: NDArray[np.float32], ceilings: CeilingKernels | None, repeat: int
+) -> EncoderReport:
     """Encode the means with all four grids of the field."""
     grids = GridField(config, device, seed=0).grids
     encoder = HashEncoder(device, grids, config.bound)
@@ -56,6 +62,7 @@ def bench_encoder(device: Device, config: FieldConfig, means: NDArray[np.float32
 
     pairs = zip(gradients(kernels), gradients(twin), strict=True)
     differences = [float((ours - theirs).abs().max() / theirs.abs().max()) for ours, theirs in pairs]
+    work = encoder_work(grids, len(points), lane_levels=device.is_cpu)
     twin_repeat = max(1, repeat // 3)  # it takes seconds, and has run once to be compared
     return EncoderReport(
         points=len(points),
@@ -65,5 +72,6 @@ def bench_encoder(device: Device, config: FieldConfig, means: NDArray[np.float32
         forward_backward=timed(lambda: gradients(kernels), repeat),
         twin_forward=timed(forward(twin), twin_repeat, warm_up=0),
         twin_forward_backward=timed(lambda: gradients(twin), twin_repeat, warm_up=0),
+        passes=time_passes(device, lambda: gradients(kernels), work, ceilings, repeat),
         largest_difference=max(differences),
     )

@@ -6,8 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from ceilings import CeilingKernels
 from measure import Timing, timed
 from numpy.typing import NDArray
+from passes import PassTimes, time_passes
 
 from lapgs_wgpu.gpu.buffer import Buffer
 from lapgs_wgpu.gpu.device import Device
@@ -27,10 +29,11 @@ class LossReport:
     size: int
     kernels: Timing
     twins: Timing
+    passes: PassTimes
     difference: float  # of the gradients, |kernels - twins| / |twins|
 
 
-def bench_losses(device: Device, size: int, repeat: int) -> LossReport:
+def bench_losses(device: Device, size: int, ceilings: CeilingKernels | None, repeat: int) -> LossReport:
     """With a picture of noise: the time does not depend on what is in it."""
     rng = np.random.default_rng(0)
     picture, truth = rng.random((3, size, size), np.float32), rng.integers(0, 256, (size, size, 3), np.uint8)
@@ -58,5 +61,6 @@ def bench_losses(device: Device, size: int, repeat: int) -> LossReport:
         size=size,
         kernels=timed(kernels, repeat),
         twins=timed(twins, repeat),
+        passes=time_passes(device, kernels, {}, ceilings, repeat),
         difference=float(np.linalg.norm(ours - theirs) / np.linalg.norm(theirs)),
     )

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 from unittest import mock
 
+import numpy as np
 from wgpu.backends.wgpu_native import GPUBuffer
 
 from lapgs_wgpu.gpu.buffer import Buffer
@@ -20,15 +21,18 @@ Event = tuple[str, Any]
 
 @dataclass(frozen=True)
 class Timing:
-    """Milliseconds of several runs."""
+    """Milliseconds of several runs. low, high: the quartiles."""
 
     median: float
     minimum: float
+    low: float
+    high: float
     runs: int
 
 
 def summary(milliseconds: list[float]) -> Timing:
-    return Timing(statistics.median(milliseconds), min(milliseconds), len(milliseconds))
+    low, high = np.percentile(milliseconds, (25, 75)).tolist()
+    return Timing(statistics.median(milliseconds), min(milliseconds), low, high, len(milliseconds))
 
 
 def timed(function: Callable[[], object], repeat: int, *, warm_up: int = 2) -> Timing:

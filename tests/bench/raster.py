@@ -3,30 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
-from collections import defaultdict
 from typing import Any
 
 import numpy as np
 import torch
-from measure import Timing, Traffic, summary, timed, traffic
+from ceilings import CeilingKernels
+from measure import Timing, Traffic, timed, traffic
 from numpy.typing import NDArray
+from passes import PassTimes, time_passes
+from work import SceneCounts, count_scene, raster_work
 
 from lapgs_wgpu import Camera, rasterize
-from lapgs_wgpu.gpu.buffer import Buffer, read_all
+from lapgs_wgpu.gpu.buffer import Buffer
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.gpu.profile import Profile
 from lapgs_wgpu.splat.rasterizer import GaussianBuffers, Rasterizer
 
 NAMES = ("means", "quats", "scales", "opacities", "colors")
-
-
-@dataclasses.dataclass(frozen=True)
-class PassTime:
-    """All dispatches of one shader in a forward and backward pass together."""
-
-    shader: str
-    dispatches: int
-    milliseconds: Timing
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,11 +26,9 @@ class RasterReport:
     """forward, forward_backward: with everything on the device, until it is done. torch_...: the same through
     `rasterize` and autograd, every input and output exchanged with torch."""
 
-    gaussians: int
-    size: int
-    intersections: int
+    counts: SceneCounts
     shape: dict[str, Any]
-    passes: list[PassTime]
+    passes: PassTimes
     forward: Timing
     forward_backward: Timing
     torch_forward: Timing
@@ -46,7 +36,13 @@ class RasterReport:
     torch_traffic: Traffic
 
 
-def bench_raster(device: Device, arrays: dict[str, NDArray[np.float32]], camera: Camera, repeat: int) -> RasterReport:
+def bench_raster(
+    device: Device,
+    arrays: dict[str, NDArray[np.float32]],
+    camera: Camera,
+    ceilings: CeilingKernels | None,
+    repeat: int,
+) -> RasterReport:
     """Time the scene on the device. The gradient of the image is random, of unit variance."""
     rasterizer = Rasterizer(device)
     means, quats, scales, opacities, colors = (_buffer(device, name, arrays[name]) for name in NAMES)
@@ -68,10 +64,13 @@ def bench_raster(device: Device, arrays: dict[str, NDArray[np.float32]], camera:
 
     forward()
     whole = timed(forward, repeat), timed(forward_backward, repeat)
-    intersections = sum(int(count[0]) for count in read_all(rasterizer.needed_requests()))
-    passes = []
-    if "timestamp-query" in device.features:
-        passes = _passes(device, rasterizer, gaussians, camera, d_image, repeat)
+    counts = count_scene(rasterizer)
+
+    def submit() -> None:
+        rasterizer.draw(gaussians, camera)
+        rasterizer.backward(d_image)
+
+    passes = time_passes(device, submit, raster_work(counts, rasterizer), ceilings, repeat)
 
     inputs = [torch.from_numpy(arrays[name]).requires_grad_() for name in NAMES]
     d_rgb = torch.from_numpy(gradient[:3]).permute(1, 2, 0).contiguous()
@@ -89,9 +88,7 @@ def bench_raster(device: Device, arrays: dict[str, NDArray[np.float32]], camera:
 
     torch_whole = timed(torch_forward, repeat), timed(torch_forward_backward, repeat)
     return RasterReport(
-        gaussians.count,
-        camera.width,
-        intersections,
+        counts,
         dataclasses.asdict(rasterizer.shape),
         passes,
         forward=whole[0],
@@ -106,21 +103,3 @@ def _buffer(device: Device, name: str, array: NDArray[np.float32]) -> Buffer:
     buffer = Buffer(device, array.nbytes, name)
     buffer.write(array)
     return buffer
-
-
-def _passes(
-    device: Device, rasterizer: Rasterizer, gaussians: GaussianBuffers, camera: Camera, d_image: Buffer, repeat: int
-) -> list[PassTime]:
-    profile = Profile(device)
-    times: dict[str, list[float]] = {}
-    counts: dict[str, int] = {}
-    for _ in range(2 + repeat):
-        rasterizer.draw(gaussians, camera, profile=profile)
-        rasterizer.backward(d_image, profile=profile)
-        run: dict[str, list[float]] = defaultdict(list)
-        for shader, milliseconds in profile.read():
-            run[shader].append(milliseconds)
-        for shader, parts in run.items():
-            times.setdefault(shader, []).append(sum(parts))
-            counts[shader] = len(parts)
-    return [PassTime(shader, counts[shader], summary(runs[2:])) for shader, runs in times.items()]

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import argparse
+import math
+import re
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -9,12 +13,40 @@ from numpy.typing import NDArray
 
 from lapgs_wgpu import Camera
 
-BALL_RADIUS, CAMERA_DISTANCE, FOV_X = 1.3, 4.0, 0.69
+BALL_RADIUS, CAMERA_DISTANCE, FOV = 1.3, 4.0, 0.69  # the field of view along the shorter side, radians
 MEAN_SCALE, SPREAD = 0.02, 0.3  # standard deviations are log-normal; the mean shrinks so that the ball stays as full
 
 
-def make_scene(count: int, size: int) -> tuple[dict[str, NDArray[np.float32]], Camera]:
-    """Activated Gaussians as `rasterize` takes them (colors: RGB), and a camera of size x size pixels."""
+@dataclass(frozen=True)
+class SceneSize:
+    """Named as in "50k@400x400": Gaussians, width and height of the image."""
+
+    gaussians: int
+    width: int
+    height: int
+
+    @staticmethod
+    def parse(name: str) -> SceneSize:
+        found = re.fullmatch(r"(\d+)([kM]?)@(\d+)x(\d+)", name)
+        if found is None:
+            raise argparse.ArgumentTypeError(f"expected GAUSSIANS@WIDTHxHEIGHT, such as 50k@400x400, got {name!r}")
+        count = int(found[1]) * {"": 1, "k": 1_000, "M": 1_000_000}[found[2]]
+        return SceneSize(count, int(found[3]), int(found[4]))
+
+    def __str__(self) -> str:
+        count = str(self.gaussians)
+        for zeros, letter in (("000000", "M"), ("000", "k")):
+            if count.endswith(zeros):
+                count = count.removesuffix(zeros) + letter
+        return f"{count}@{self.width}x{self.height}"
+
+
+FIXED_SET = [SceneSize(n, *size) for size in ((400, 400), (1920, 1080)) for n in (50_000, 200_000, 1_000_000)]
+
+
+def make_scene(size: SceneSize) -> tuple[dict[str, NDArray[np.float32]], Camera]:
+    """Activated Gaussians as `rasterize` takes them (colors: RGB), and a camera that sees the whole ball."""
+    count, width, height = size.gaussians, size.width, size.height
     rng = np.random.default_rng(0)
     direction = rng.standard_normal((count, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
@@ -26,7 +58,10 @@ def make_scene(count: int, size: int) -> tuple[dict[str, NDArray[np.float32]], C
     opacities = rng.uniform(0.05, 0.95, count)
     colors = rng.random((count, 3))
     arrays = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors}
-    camera = Camera.looking_at([0, 0, -CAMERA_DISTANCE], [0, 0, 0], up=[0, -1, 0], fov_x=FOV_X, width=size, height=size)
+    fov_x = 2 * math.atan(math.tan(FOV / 2) * width / min(width, height))
+    camera = Camera.looking_at(
+        [0, 0, -CAMERA_DISTANCE], [0, 0, 0], up=[0, -1, 0], fov_x=fov_x, width=width, height=height
+    )
     return {name: np.ascontiguousarray(array, np.float32) for name, array in arrays.items()}, camera
 
 

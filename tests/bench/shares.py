@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import statistics
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
@@ -11,6 +10,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 from unittest import mock
+
+from measure import Timing, summary
 
 from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.data.synthetic import write_synthetic
@@ -32,8 +33,8 @@ TRANSFERS, OPTIMISER, REST = "transfers", "optimiser", "torch: decoder, activati
 ORDER = (RASTER, ENCODER, LOSSES, TRANSFERS, OPTIMISER, REST)
 
 
-def bench_shares(device: Device, repeat: int, gaussians: int = 50_000, size: int = 400) -> dict[str, float]:
-    """Milliseconds a step, the median of each part, and under "step" of the whole.
+def bench_shares(device: Device, repeat: int, gaussians: int = 50_000, size: int = 400) -> dict[str, Timing]:
+    """Milliseconds a step of each part, and under "step" of the whole.
 
     Kernels by the device's timestamps. Transfers are the host's copies, timed when the device has finished, and the
     device's own between buffers and textures.
@@ -53,7 +54,7 @@ def bench_shares(device: Device, repeat: int, gaussians: int = 50_000, size: int
         scene = write_synthetic(Path(folder) / "scene", size=size, train_views=8, test_views=1)
         train(config, load_dataset(scene), Path(folder) / "run", device=device)
     counted = clock.steps[WARM_UP:steps]
-    return {name: statistics.median(step[name] for step in counted) for name in (*ORDER, "step")}
+    return {name: summary([step[name] for step in counted]) for name in (*ORDER, "step")}
 
 
 class _Clock:

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from lapgs_wgpu.viewer.frame import Painter, Request
 from measure import Timing, summary
-from scene import make_scene
+from scene import SceneSize, make_scene
 
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.first_look import FirstLook
@@ -25,7 +25,8 @@ from lapgs_wgpu.train.presets import load_config
 
 SIZE = (640, 480)
 SHARES = (1.0, 0.5, 0.25)  # of the window's width and height
-SCENES = (("tiny", 20_000), ("tiny", 50_000), ("dnerf", 20_000), ("dnerf", 50_000))
+Scenes = tuple[tuple[str, int], ...]
+SCENES: Scenes = (("tiny", 20_000), ("tiny", 50_000), ("dnerf", 20_000), ("dnerf", 50_000))
 
 
 @dataclass(frozen=True)
@@ -37,25 +38,27 @@ class ViewerReport:
     gaussians: int
     window: Timing | None
     screenshot: Timing
-    scrub: dict[float, Timing]
+    scrub: dict[str, Timing]
 
 
-def bench_viewer(device: Device, repeat: int) -> list[ViewerReport]:
+def bench_viewer(device: Device, repeat: int, scenes: Scenes = SCENES) -> dict[str, ViewerReport]:
+    """By preset and number of Gaussians."""
     with TemporaryDirectory() as folder:
-        reports = []
-        for preset, gaussians in SCENES:
+        reports = {}
+        for preset, gaussians in scenes:
             file = Path(folder) / f"{preset}-{gaussians}.ply"
             write_moving_scene(file, preset, gaussians, device)
             starts = max(3, repeat // 3)
             window = summary([_window(file) for _ in range(starts)]) if _has_screen() else None
             shots = summary([_screenshot(file) for _ in range(starts)])
-            reports.append(ViewerReport(preset, gaussians, window, shots, _scrub(device, file, repeat)))
+            scrub = _scrub(device, file, repeat)
+            reports[f"{preset} {gaussians}"] = ViewerReport(preset, gaussians, window, shots, scrub)
         return reports
 
 
 def write_moving_scene(file: Path, preset: str, gaussians: int, device: Device) -> None:
     """The ball of the other benchmarks, moved a little by a field of this preset with random weights."""
-    arrays, camera = make_scene(gaussians, SIZE[1])
+    arrays, camera = make_scene(SceneSize(gaussians, SIZE[1], SIZE[1]))
     config = load_config(preset).field
     scene = Scene4D.from_points(arrays["means"], arrays["colors"], arrays["scales"][:, 0], config, device=device)
     generator = torch.Generator().manual_seed(0)
@@ -73,7 +76,7 @@ def write_moving_scene(file: Path, preset: str, gaussians: int, device: Device) 
     scene.save(file, {"view": look.to_json()})
 
 
-def _scrub(device: Device, file: Path, repeat: int) -> dict[float, Timing]:
+def _scrub(device: Device, file: Path, repeat: int) -> dict[str, Timing]:
     painter = Painter(open_playback(file, device))
     look = FirstLook.from_json(painter.playback.metadata["view"])
     assert look is not None
@@ -82,7 +85,7 @@ def _scrub(device: Device, file: Path, repeat: int) -> dict[float, Timing]:
     for share in SHARES:
         camera = look.camera.resized(*(round(share * side) for side in SIZE))
         frames = [painter.draw(Request(camera, next(times), "rgb", (0, 0, 0))) for _ in range(repeat + 1)]
-        found[share] = summary([1e3 * frame.seconds for frame in frames[1:]])
+        found[f"{share:.0%}"] = summary([1e3 * frame.seconds for frame in frames[1:]])
     return found
 
 
@@ -118,14 +121,14 @@ def main() -> None:
     from lapgs_wgpu.gpu.device import open_device
 
     os.environ.setdefault("XDG_RUNTIME_DIR", "/tmp")
-    for report in bench_viewer(open_device(), int(sys.argv[1]) if len(sys.argv) > 1 else 9):
+    for report in bench_viewer(open_device(), int(sys.argv[1]) if len(sys.argv) > 1 else 9).values():
         print_viewer(report)
 
 
 def print_viewer(report: ViewerReport) -> None:
     print(f"\nviewer, {SIZE[0]}x{SIZE[1]}, preset {report.preset}: {report.gaussians:,} Gaussians")
     rows = {"command to first picture, window": report.window, "command with --screenshot": report.screenshot}
-    rows |= {f"frame at another time, {share:.0%} of the size": timing for share, timing in report.scrub.items()}
+    rows |= {f"frame at another time, {share} of the size": timing for share, timing in report.scrub.items()}
     for name, timing in rows.items():
         if timing is not None:
             print(f"  {name:46s}{timing.median:8.1f}{timing.minimum:9.1f}  ms (median, least)")

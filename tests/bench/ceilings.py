@@ -1,0 +1,113 @@
+"""What the device can do at most, measured by small kernels of our own beside what is timed: bytes copied,
+multiply-adds and powers of two in a second."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import numpy as np
+from measure import Timing
+from work import Work
+
+from lapgs_wgpu.gpu import shader
+from lapgs_wgpu.gpu.buffer import Buffer
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.kernel import Commands, Kernel
+from lapgs_wgpu.gpu.profile import Profile
+from lapgs_wgpu.splat.shape import raster_shape
+
+COPY, FMA, EXP = KERNELS = ("ceiling_copy", "ceiling_fma", "ceiling_exp")
+COPIED = 64 << 20  # bytes: more than what the caches of processors and GPUs hold
+CHAINS, STEPS, TURNS = 8, 32, 64  # of the two others: eight chains keep the units busy and fit into the registers
+package_text = shader.shader_text
+LONG = (
+    20.0  # milliseconds that a kernel takes at least: as long as the longest passes, so that other work slows it alike
+)
+
+
+@dataclass(frozen=True)
+class Ceilings:
+    """Rates a second. together: exponentials keep the same units busy as all other operations, as on processors."""
+
+    copied_bytes: float
+    operations: float
+    exponentials: float
+    together: bool
+
+    def milliseconds(self, work: Work) -> float:
+        """The least time for it: moving its bytes, or computing, whichever takes longer."""
+        operations, exponentials = work.operations / self.operations, work.exponentials / self.exponentials
+        computing = operations + exponentials if self.together else max(operations, exponentials)
+        return 1e3 * max(work.bytes / self.copied_bytes, computing)
+
+
+class CeilingKernels:
+    """The three kernels; those that compute are so large that the device needs `shortest` milliseconds for each."""
+
+    def __init__(self, device: Device, shortest: float = LONG) -> None:
+        self._device = device
+        shape = raster_shape(device)
+        defines = shape.raster_defines(depth=False) | {"CHAINS": CHAINS, "STEPS": STEPS}
+        with mock.patch.object(shader, "shader_text", _shader_text):
+            copy = Kernel.get(device, COPY)
+            computing = {name: Kernel.get(device, name, **defines) for name in (FMA, EXP)}
+        self._source, self._target = (Buffer(device, COPIED, name) for name in ("copied from", "copied to"))
+        self._source.write(np.random.default_rng(0).random(COPIED // 4, np.float32))
+        factors = Buffer(device, 16, "factors")
+        content = computing[FMA].uniform("Factors", multiply=0.999, add=0.001, turns=TURNS)
+        factors.write(np.frombuffer(content, np.uint8))
+        self._dispatches: dict[str, Callable[[Commands], None]] = {
+            COPY: lambda commands: commands.dispatch(
+                copy, COPIED // (16 * 64), source=self._source, copied=self._target
+            )
+        }
+        self._amounts = {COPY: 2 * COPIED}
+        for name, kernel in computing.items():
+            groups = self._long_enough(lambda n, kernel=kernel: _compute(kernel, n, factors, self._target), shortest)
+            self._dispatches[name] = _compute(kernel, groups, factors, self._target)
+            self._amounts[name] = groups * 64 * CHAINS * STEPS * TURNS
+
+    def _long_enough(self, dispatch: Callable[[int], Callable[[Commands], None]], shortest: float) -> int:
+        profile, groups = Profile(self._device), 16
+        while True:
+            for _ in range(2):  # the first one may wait for the driver's compiler
+                with Commands(self._device, profile) as commands:
+                    dispatch(groups)(commands)
+            if profile.read()[-1][1] > shortest or groups >= 1 << 15:
+                return groups
+            groups *= 2
+
+    def run(self, profile: Profile) -> None:
+        """Submit each once."""
+        for dispatch in self._dispatches.values():
+            with Commands(self._device, profile) as commands:
+                dispatch(commands)
+
+    def ceilings(self, milliseconds: dict[str, Timing]) -> Ceilings:
+        """From the times of `run`."""
+        rates = (1e3 * self._amounts[name] / milliseconds[name].median for name in KERNELS)
+        return Ceilings(*rates, together=self._device.is_cpu)
+
+
+def _compute(kernel: Kernel, groups: int, factors: Buffer, sums: Buffer) -> Callable[[Commands], None]:
+    return lambda commands: commands.dispatch(kernel, groups, factors=factors, sums=sums)
+
+
+@functools.cache
+def _shader_text(name: str) -> str:
+    own = Path(__file__).with_name("shaders") / f"{name}.wgsl"
+    return own.read_text(encoding="utf-8") if own.is_file() else package_text(name)
+
+
+def describe(ceilings: Ceilings) -> str:
+    values: dict[str, Any] = {
+        "copy": (ceilings.copied_bytes, "GB/s, read and written together"),
+        "multiply-add": (ceilings.operations, "billion a second"),
+        "power of two": (ceilings.exponentials, "billion a second"),
+    }
+    return "; ".join(f"{name} {rate / 1e9:.1f} {unit}" for name, (rate, unit) in values.items())
