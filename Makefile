@@ -1,7 +1,9 @@
 # Everything lives in .venv; `make` or `make setup` makes it, and the other goals call that first.
 #   make demo   trains the built-in scene         make test   all tests        make lint   ruff and mypy
 #   make soak   what takes hours: 10,000 hostile files a format, failing disks, 20 kills, large scenes, 30 minutes of training
-#   make bench  times the kernels; options go into ARGS, for example: make bench ARGS="--json bench.json"
+#   make bench  times the kernels, beside what the device can do; options go into ARGS, for example:
+#               make bench ARGS="--scenes 50k@400x400 --parts raster --json new.json"
+#               make bench ARGS="--compare old.json new.json"
 
 BIN := .venv/bin
 READY := .venv/.ready

@@ -137,6 +137,16 @@ def test_every_counted_pass_stands_beside_its_ceiling(results: dict) -> None:
             assert one["share"] == pytest.approx(one["ceiling"] / one["milliseconds"]["median"])
 
 
+def test_processor_time_is_another_clock_for_the_same_passes(results: dict, tmp_path: Path) -> None:
+    if results["machine"]["kind"] != "cpu":
+        pytest.skip("the device is no processor")
+    bench("--parts", "raster", "--clock", "processor", "--json", tmp_path / "bench.json")
+    passes = raster(json.loads((tmp_path / "bench.json").read_text()))["passes"]["passes"]
+    assert passes.pop("copies to textures")["milliseconds"]["median"] > 0
+    counts = {shader: one["dispatches"] for shader, one in passes.items()}
+    assert counts == {shader: one["dispatches"] for shader, one in raster(results)["passes"]["passes"].items()}
+
+
 @pytest.mark.parametrize("name", ["ceiling_copy", "ceiling_fma", "ceiling_exp"])
 def test_a_ceiling_is_really_computed(name: str) -> None:
     """What the kernels leave behind is what their loops say."""

@@ -16,12 +16,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from ceilings import CeilingKernels, describe
+from ceilings import describe
 from compare import compare
 from encoder import EncoderReport, bench_encoder
 from losses import LossReport, bench_losses
 from measure import Timing, Traffic
-from passes import PassTimes
+from passes import Meter, PassTimes, by_processor_time, by_timestamps
 from raster import RasterReport, bench_raster
 from scene import FIXED_SET, SceneSize, make_scene, save_scene
 from shares import bench_shares
@@ -47,6 +47,13 @@ def main() -> None:
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS, help=f"what is timed [{' '.join(PARTS)}]")
     parser.add_argument("--repeat", type=int, default=15, metavar="R", help="timed runs of each [15]")
     parser.add_argument("--device", metavar="NAME", help="adapter: a part of its name, or its kind")
+    parser.add_argument(
+        "--clock",
+        choices=("device", "processor"),
+        default="device",
+        help="what times single passes: the device's timestamps, or, of a CPU device, processor time, which other work "
+        "on the machine hardly changes [device]",
+    )
     parser.add_argument("--no-textures", action="store_true", help="tables in storage buffers on CPU devices, too")
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write the results to FILE")
     parser.add_argument(
@@ -61,30 +68,34 @@ def main() -> None:
     elif options.save_scene:
         save_scene(options.save_scene, *make_scene(options.scenes[0]))
     else:
-        run(options)
+        run(options, parser)
 
 
-def run(options: argparse.Namespace) -> None:
+def run(options: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
     """Time the chosen parts, print what was found as it comes, and write it as JSON."""
     device = open_device(options.device)
     device.textures &= not options.no_textures
-    machine = describe_machine(device)
+    machine = describe_machine(device) | {"clock": options.clock}
     print(*(f"{name}: {value}" for name, value in machine.items()), sep="\n")
-    ceilings = CeilingKernels(device) if "timestamp-query" in device.features else None
+    if options.clock == "processor" and not device.is_cpu:
+        parser.error(f"--clock processor is for CPU devices, and {device.info.name} is {device.info.kind}")
+    meter = None
+    if "timestamp-query" in device.features:
+        meter = Meter(device, by_processor_time if options.clock == "processor" else by_timestamps)
     first, repeat = options.scenes[0], options.repeat
     results: dict[str, Any] = {"machine": machine}
     if "raster" in options.parts:
         results["raster"] = {}
         for scene in options.scenes:
-            raster = bench_raster(device, *make_scene(scene), ceilings, repeat)
+            raster = bench_raster(device, *make_scene(scene), meter, repeat)
             print_raster(str(scene), raster)
             results["raster"][str(scene)] = raster
     if "encoder" in options.parts:
         means = make_scene(first)[0]["means"]
-        results["encoder"] = bench_encoder(device, load_config("dnerf").field, means, ceilings, repeat)
+        results["encoder"] = bench_encoder(device, load_config("dnerf").field, means, meter, repeat)
         print_encoder(results["encoder"])
     if "losses" in options.parts:
-        results["losses"] = bench_losses(device, first.height, ceilings, repeat)
+        results["losses"] = bench_losses(device, first.height, meter, repeat)
         print_losses(results["losses"])
     if "step" in options.parts:
         results["step"] = bench_step(device, repeat)
@@ -147,9 +158,9 @@ def print_header(title: str) -> None:
     print(f"\n{title}\n  {'':28}{'median':>9}{'min':>9}  milliseconds")
 
 
-def print_passes(report: PassTimes) -> None:
+def print_passes(report: PassTimes | None) -> None:
     """A row a shader: its time, the least that the ceilings allow, and the share of that in the time."""
-    if report.ceilings is None:
+    if report is None:
         print("  (this adapter has no timestamps: no times of single passes)")
         return
     print(f"  ceilings: {describe(report.ceilings)}")

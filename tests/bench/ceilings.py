@@ -25,9 +25,7 @@ COPY, FMA, EXP = KERNELS = ("ceiling_copy", "ceiling_fma", "ceiling_exp")
 COPIED = 64 << 20  # bytes: more than what the caches of processors and GPUs hold
 CHAINS, STEPS, TURNS = 8, 32, 64  # of the two others: eight chains keep the units busy and fit into the registers
 package_text = shader.shader_text
-LONG = (
-    20.0  # milliseconds that a kernel takes at least: as long as the longest passes, so that other work slows it alike
-)
+LONG = 20.0  # milliseconds of a kernel: about those of the longest passes, so that other work slows all alike
 
 
 @dataclass(frozen=True)
@@ -82,10 +80,10 @@ class CeilingKernels:
                 return groups
             groups *= 2
 
-    def run(self, profile: Profile) -> None:
+    def run(self) -> None:
         """Submit each once."""
         for dispatch in self._dispatches.values():
-            with Commands(self._device, profile) as commands:
+            with Commands(self._device) as commands:
                 dispatch(commands)
 
     def ceilings(self, milliseconds: dict[str, Timing]) -> Ceilings:

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from ceilings import CeilingKernels
 from measure import Timing, timed
 from numpy.typing import NDArray
-from passes import PassTimes, time_passes
+from passes import Meter, PassTimes
 from torch import Tensor
 from work import encoder_work
 
@@ -33,12 +32,12 @@ class EncoderReport:
     forward_backward: Timing
     twin_forward: Timing
     twin_forward_backward: Timing
-    passes: PassTimes
+    passes: PassTimes | None
     largest_difference: float  # of the gradients, relative to the largest gradient of a grid's table
 
 
 def bench_encoder(
-    device: Device, config: FieldConfig, means: NDArray[np.float32], ceilings: CeilingKernels | None, repeat: int
+    device: Device, config: FieldConfig, means: NDArray[np.float32], meter: Meter | None, repeat: int
 ) -> EncoderReport:
     """Encode the means with all four grids of the field."""
     grids = GridField(config, device, seed=0).grids
@@ -72,6 +71,6 @@ def bench_encoder(
         forward_backward=timed(lambda: gradients(kernels), repeat),
         twin_forward=timed(forward(twin), twin_repeat, warm_up=0),
         twin_forward_backward=timed(lambda: gradients(twin), twin_repeat, warm_up=0),
-        passes=time_passes(device, lambda: gradients(kernels), work, ceilings, repeat),
+        passes=meter(lambda: gradients(kernels), work, repeat) if meter else None,
         largest_difference=max(differences),
     )

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from ceilings import CeilingKernels
 from measure import Timing, timed
 from numpy.typing import NDArray
-from passes import PassTimes, time_passes
+from passes import Meter, PassTimes
 
 from lapgs_wgpu.gpu.buffer import Buffer
 from lapgs_wgpu.gpu.device import Device
@@ -29,11 +28,11 @@ class LossReport:
     size: int
     kernels: Timing
     twins: Timing
-    passes: PassTimes
+    passes: PassTimes | None
     difference: float  # of the gradients, |kernels - twins| / |twins|
 
 
-def bench_losses(device: Device, size: int, ceilings: CeilingKernels | None, repeat: int) -> LossReport:
+def bench_losses(device: Device, size: int, meter: Meter | None, repeat: int) -> LossReport:
     """With a picture of noise: the time does not depend on what is in it."""
     rng = np.random.default_rng(0)
     picture, truth = rng.random((3, size, size), np.float32), rng.integers(0, 256, (size, size, 3), np.uint8)
@@ -61,6 +60,6 @@ def bench_losses(device: Device, size: int, ceilings: CeilingKernels | None, rep
         size=size,
         kernels=timed(kernels, repeat),
         twins=timed(twins, repeat),
-        passes=time_passes(device, kernels, {}, ceilings, repeat),
+        passes=meter(kernels, {}, repeat) if meter else None,
         difference=float(np.linalg.norm(ours - theirs) / np.linalg.norm(theirs)),
     )

@@ -1,19 +1,26 @@
-"""The time of each pass by the device's own clock, beside the least that the device's ceilings allow."""
+"""The time of each pass, beside the least that the device's ceilings allow."""
 
 from __future__ import annotations
 
+import os
+import time
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
+from typing import Any
 from unittest import mock
 
 from ceilings import KERNELS, CeilingKernels, Ceilings
 from measure import Timing, summary
 from work import Work
 
+from lapgs_wgpu.gpu.buffer import Buffer
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.gpu.kernel import Commands
+from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.profile import Profile
+
+COPIES = "copies to textures"
 
 
 @dataclass(frozen=True)
@@ -32,40 +39,86 @@ class PassTime:
 
 @dataclass(frozen=True)
 class PassTimes:
-    """By shader, in the order of the passes; empty where the adapter has no timestamps, and ceilings is None then."""
+    """By shader, in the order of the passes."""
 
-    ceilings: Ceilings | None
+    ceilings: Ceilings
     passes: dict[str, PassTime]
 
 
-def time_passes(
-    device: Device, function: Callable[[], object], work: dict[str, Work], kernels: CeilingKernels | None, repeat: int
-) -> PassTimes:
-    """Time the passes that `function` submits, and the ceilings, taking turns, since other work may run meanwhile."""
-    if kernels is None:
-        return PassTimes(None, {})
-    profile = Profile(device)
-    runs: list[dict[str, list[float]]] = []
+Times = list[tuple[str, float]]  # shader and milliseconds of each dispatch, in order
+Clock = Callable[[Device], AbstractContextManager[Times]]
+
+
+@contextmanager
+def by_timestamps(device: Device) -> Iterator[Times]:
+    """A list that holds, afterwards, what the device's own clock says of all that was submitted."""
+    profile, times = Profile(device), Times()
     prepare = Commands.__init__
 
     def profiled(commands: Commands, device: Device, other: Profile | None = None) -> None:
         prepare(commands, device, other or profile)
 
-    for _ in range(2 + repeat):
-        kernels.run(profile)
-        with mock.patch.object(Commands, "__init__", profiled):
-            function()
-        run: dict[str, list[float]] = defaultdict(list)
-        for shader, milliseconds in profile.read():
-            run[shader].append(milliseconds)
-        runs.append(run)
-    runs = runs[2:]
-    times = {shader: [sum(run[shader]) for run in runs] for shader in runs[0]}
-    ceilings = kernels.ceilings({name: summary(times.pop(name)) for name in KERNELS})
-    found = {}
-    for shader, milliseconds in times.items():
-        timing, todo = summary(milliseconds), work.get(shader)
-        ceiling = None if todo is None else ceilings.milliseconds(todo)
-        share = None if ceiling is None else ceiling / timing.median
-        found[shader] = PassTime(len(runs[0][shader]), timing, todo, ceiling, share)
-    return PassTimes(ceilings, found)
+    with mock.patch.object(Commands, "__init__", profiled):
+        yield times
+    times += profile.read()
+
+
+@contextmanager
+def by_processor_time(device: Device) -> Iterator[Times]:
+    """The same of a CPU device by processor time over the number of processors, which other work on the machine hardly
+    changes. Each dispatch is submitted and waited for alone, and so are the copies of its tables to textures (COPIES).
+    """
+    times, done = Times(), Buffer(device, 16, "done")
+    processors = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    dispatch_grid = Commands.dispatch_grid
+
+    def submit(commands: Commands, name: str) -> None:
+        commands.clear(done)
+        recorded = commands._encoder.finish()
+        start = time.process_time()
+        device.queue.submit([recorded])
+        done.read("uint32", (4,))
+        times.append((name, 1e3 * (time.process_time() - start) / processors))
+        commands._encoder = device.wgpu_device.create_command_encoder()
+
+    def alone(commands: Commands, kernel: Kernel, groups: tuple[int, int], **buffers: Any) -> None:
+        if min(groups) > 0:
+            parts = kernel.parts(buffers)
+            for name, binding in kernel.bindings.items():
+                if binding.kind == "texture":
+                    commands._texture(parts[name], binding.type)
+            submit(commands, COPIES)
+            dispatch_grid(commands, kernel, groups, **buffers)
+            submit(commands, kernel.name)
+
+    with mock.patch.object(Commands, "dispatch_grid", alone):
+        yield times
+
+
+class Meter:
+    """Times passes by a clock, and the device's ceilings beside them, taking turns, since other work may run besides."""
+
+    def __init__(self, device: Device, clock: Clock = by_timestamps) -> None:
+        self._device, self._clock, self._kernels = device, clock, CeilingKernels(device)
+
+    def __call__(self, function: Callable[[], object], work: dict[str, Work], repeat: int) -> PassTimes:
+        """The passes that `function` submits. work: of all dispatches of a shader together."""
+        runs: list[dict[str, list[float]]] = []
+        for _ in range(2 + repeat):
+            with self._clock(self._device) as times:
+                self._kernels.run()
+                function()
+            run: dict[str, list[float]] = defaultdict(list)
+            for shader, milliseconds in times:
+                run[shader].append(milliseconds)
+            runs.append(run)
+        runs = runs[2:]
+        summaries = {shader: summary([sum(run[shader]) for run in runs]) for shader in runs[0]}
+        ceilings = self._kernels.ceilings({name: summaries.pop(name) for name in KERNELS})
+        passes = {}
+        for shader, milliseconds in summaries.items():
+            todo = work.get(shader)
+            ceiling = None if todo is None else ceilings.milliseconds(todo)
+            share = None if ceiling is None else ceiling / milliseconds.median
+            passes[shader] = PassTime(len(runs[0][shader]), milliseconds, todo, ceiling, share)
+        return PassTimes(ceilings, passes)

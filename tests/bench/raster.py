@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from ceilings import CeilingKernels
 from measure import Timing, Traffic, timed, traffic
 from numpy.typing import NDArray
-from passes import PassTimes, time_passes
+from passes import Meter, PassTimes
 from work import SceneCounts, count_scene, raster_work
 
 from lapgs_wgpu import Camera, rasterize
@@ -28,7 +27,7 @@ class RasterReport:
 
     counts: SceneCounts
     shape: dict[str, Any]
-    passes: PassTimes
+    passes: PassTimes | None
     forward: Timing
     forward_backward: Timing
     torch_forward: Timing
@@ -40,7 +39,7 @@ def bench_raster(
     device: Device,
     arrays: dict[str, NDArray[np.float32]],
     camera: Camera,
-    ceilings: CeilingKernels | None,
+    meter: Meter | None,
     repeat: int,
 ) -> RasterReport:
     """Time the scene on the device. The gradient of the image is random, of unit variance."""
@@ -70,7 +69,7 @@ def bench_raster(
         rasterizer.draw(gaussians, camera)
         rasterizer.backward(d_image)
 
-    passes = time_passes(device, submit, raster_work(counts, rasterizer), ceilings, repeat)
+    passes = meter(submit, raster_work(counts, rasterizer), repeat) if meter else None
 
     inputs = [torch.from_numpy(arrays[name]).requires_grad_() for name in NAMES]
     d_rgb = torch.from_numpy(gradient[:3]).permute(1, 2, 0).contiguous()
