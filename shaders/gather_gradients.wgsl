@@ -1,4 +1,4 @@
-// Sums each Gaussian's records, which lie side by side, in order, and turns the moments into gradients of the splat.
+// Sums each Gaussian's records in the order of its slots, which lie side by side, and turns the moments into gradients of the splat.
 #import common/count
 #import common/index
 #import common/splat
@@ -9,11 +9,10 @@
 #table 3 offsets: u32
 #table 4 splats: vec4<f32>
 #table 5 records: vec4<f32>
-#table 6 record_tails: f32
-#ifdef DEPTH
-struct Tails { depth: u32 }   // where the depths begin
+// place of each slot's record, from 1; blue of each record (, then depth)
+#table 6 record_tails: u32
+struct Tails { capacity: u32 }
 @group(0) @binding(8) var<uniform> tails: Tails;
-#endif
 @group(0) @binding(7) var<storage, read_write> d_splats: array<vec4<f32>>;
 
 @compute @workgroup_size(64)
@@ -34,12 +33,15 @@ fn main(
     var b = vec4(0.0);   // moments x y, y^2; red, green
     var c = vec2(0.0);   // blue, depth
     for (var slot = first; slot < last; slot++) {
-        a += records_at(2u * slot);
-        b += records_at(2u * slot + 1u);
-        c.x += record_tails_at(slot);
+        let place = record_tails_at(slot);
+        if (place != 0u) {   // the tile was not full before it
+            a += records_at(2u * place - 2u);
+            b += records_at(2u * place - 1u);
+            c.x += bitcast<f32>(record_tails_at(tails.capacity + place - 1u));
 #ifdef DEPTH
-        c.y += record_tails_at(tails.depth + slot);
+            c.y += bitcast<f32>(record_tails_at(2u * tails.capacity + place - 1u));
 #endif
+        }
     }
     let s0 = splats_at(id * SPLAT_STRIDE);
     let s1 = splats_at(id * SPLAT_STRIDE + 1u);

@@ -1,5 +1,7 @@
 // The gradient of the image for each intersection, front to back, summed over the tile's pixels in a fixed order and
-// written to the intersection's own slot, so that no atomics are needed and every run gives the same bits.
+// written where the intersection stands in the sorted lists, so that no atomics are needed and every run gives the same
+// bits. Neighbours in a list are written one after the other, which caches like better than a record at each slot;
+// `gather_gradients` finds a slot's record by its place.
 //
 // Per pixel: T, and `rest`, what the splats not yet passed (and the background) add to sum(image * d_image). Then
 //   d_loss / d_alpha = T (color . d_color) - rest_after / (1 - alpha).
@@ -13,11 +15,12 @@
 // image as the forward pass left it; d_image: planes red, green, blue, alpha (, depth)
 #table 5 image: f32
 #table 6 d_image: f32
-@group(0) @binding(7) var<storage, read_write> records: array<f32>;        // 8 a slot: the moments, red, green
-@group(0) @binding(8) var<storage, read_write> record_tails: array<f32>;   // blue of each slot (, then depth of each)
+@group(0) @binding(7) var<storage, read_write> records: array<f32>;        // 8 a record: the moments, red, green
+// Of each slot the place of its record, from 1, or 0 where nobody saw it; then of each record blue (, then depth), as bits.
+@group(0) @binding(8) var<storage, read_write> record_tails: array<u32>;
 #ifdef ROUNDS
 // Of a list that is drawn in rounds, each round takes ROUND_SPLATS splats, and leaves transmittance and rest of its pixels
-// behind the tails of all slots. Records are zero before.
+// behind all tails. Places are zero before.
 struct Piece { number: u32, state: u32 }   // the place of the state among the tails
 @group(0) @binding(9) var<uniform> piece: Piece;
 #endif
@@ -106,8 +109,8 @@ fn main(
 #unroll r $ROWS
         if (corner.x + my.column < frame.size.x && corner.y + my.row + $(r)u < frame.size.y) {
             let at = piece.state + 2u * ((corner.y + my.row + $(r)u) * frame.size.x + corner.x + my.column);
-            T[$r] = record_tails[at];
-            rest[$r] = record_tails[at + 1u];
+            T[$r] = bitcast<f32>(record_tails[at]);
+            rest[$r] = bitcast<f32>(record_tails[at + 1u]);
         }
 #end
     }
@@ -132,10 +135,8 @@ fn main(
         for (var j = 0u; j < count; j++) {
 #ifdef SUBGROUPS
             let s = hand_round(mine, j);
-            let s_slot = subgroupShuffle(slot, j);
 #else
             let s = batch[j];
-            let s_slot = slots_at(first + j);
 #endif
             let dx = x - s.mean.x;
             let dy = y - s.mean.y;
@@ -200,7 +201,7 @@ fn main(
             value += subgroupShuffleXor(value, 16u);
 #endif
             if (lane < 8u) {
-                records[s_slot * 8u + lane] = value;
+                records[(first + j) * 8u + lane] = value;
             }
 #else
             partials[0][lane] = m0;
@@ -222,42 +223,36 @@ fn main(
                     sum += partials[k][other];
                 }
                 if (k < 8u) {
-                    records[s_slot * 8u + k] = sum;
+                    records[(first + j) * 8u + k] = sum;
                 } else {
-                    record_tails[(k - 8u) * frame.capacity + s_slot] = sum;
+                    record_tails[(k - 7u) * frame.capacity + first + j] = bitcast<u32>(sum);
                 }
             }
             workgroupBarrier();
 #endif
         }
-#ifdef SUBGROUPS
         if (lane < count) {   // each lane keeps the last values of its own splat, to write them for all at once
-            record_tails[slot] = my_blue;
+            record_tails[slot] = first + lane + 1u;
+#ifdef SUBGROUPS
+            record_tails[frame.capacity + first + lane] = bitcast<u32>(my_blue);
 #ifdef DEPTH
-            record_tails[frame.capacity + slot] = my_depth;
+            record_tails[2u * frame.capacity + first + lane] = bitcast<u32>(my_depth);
+#endif
 #endif
         }
-#endif
     }
 #ifdef ROUNDS
 #unroll r $ROWS
     if (corner.x + my.column < frame.size.x && corner.y + my.row + $(r)u < frame.size.y) {
         let at = piece.state + 2u * ((corner.y + my.row + $(r)u) * frame.size.x + corner.x + my.column);
-        record_tails[at] = T[$r];
-        record_tails[at + 1u] = rest[$r];
+        record_tails[at] = bitcast<u32>(T[$r]);
+        record_tails[at + 1u] = bitcast<u32>(rest[$r]);
     }
 #end
 #else
     // What no pixel of the tile sees has no gradient.
     for (var i = range.z + lane; i < range.y; i += u32(LANES)) {
-        let slot = slots_at(i);
-#unroll k 8
-        records[slot * 8u + $(k)u] = 0.0;
-#end
-        record_tails[slot] = 0.0;
-#ifdef DEPTH
-        record_tails[frame.capacity + slot] = 0.0;
-#endif
+        record_tails[slots_at(i)] = 0u;
     }
 #endif
 }

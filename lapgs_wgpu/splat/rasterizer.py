@@ -319,13 +319,11 @@ class Rasterizer:
     def _backward_band(self, commands: Commands, drawn: _Drawn, band: int, d_image: Buffer, d_splats: Buffer) -> None:
         device, pool, n = self.device, self.pool, drawn.gaussians.count
         records = pool.get("records", _RECORD_BYTES * self.capacity)
-        tails_size = (2 if drawn.depth else 1) * self.capacity
+        tails_size = (3 if drawn.depth else 2) * self.capacity
         pixels = drawn.camera.width * drawn.camera.height if self.rounds > 1 else 0
         record_tails = pool.get("record tails", 4 * tails_size + 8 * pixels)
         gather = Kernel.get(device, "gather_gradients", **({"DEPTH": 1} if drawn.depth else {}))
-        tails = {}
-        if drawn.depth:
-            tails["tails"] = pool.constant("tails", gather.uniform("Tails", depth=self.capacity))
+        tails = pool.constant("tails", gather.uniform("Tails", capacity=self.capacity))
         splats = pool.get("splats", 0)
         kernel = Kernel.get(
             device,
@@ -334,8 +332,7 @@ class Rasterizer:
             **({"ROUNDS": 1} if self.rounds > 1 else {}),
         )
         if self.rounds > 1:
-            commands.clear(records)
-            commands.clear(record_tails)
+            commands.clear(record_tails, 4 * self.capacity)  # no slot has a record yet
         for number in range(self.rounds):
             piece = {}
             if self.rounds > 1:
@@ -366,7 +363,7 @@ class Rasterizer:
             records=records,
             record_tails=record_tails,
             d_splats=d_splats,
-            **tails,
+            tails=tails,
         )
 
     def _color_bwd(

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from ..gpu.device import Device
 
 # Mesa's software driver ends a shader without a word when all loops of an invocation together have turned 65,535 times.
-# A longer list is drawn in several rounds in any case: its records are then cleared beforehand, and the backward pass
-# need not turn to write zeros for splats that nobody sees.
+# A longer list is drawn in several rounds in any case: all its slots then have no record beforehand, and the backward
+# pass need not turn to say so of the splats that nobody sees.
 LONG_LIST = 1 << 16
 # Of an image, or a band of one: a splat that covers it all is counted, listed and summed up a turn a tile.
 MOST_TILES = 60_000
