@@ -70,9 +70,9 @@ class GridField(nn.Module):
         temporal = temporal or [static.new_zeros((len(means), 1))]
         gate = 2.0 * torch.sigmoid(self.spatial(static)) - 1.0
         gated = torch.relu(self.temporal(torch.cat(temporal, dim=1))) * gate
-        turn, shift, d_quats, d_scales = self._geometry(gated, static, t).split(GEOMETRY, dim=1)
+        geometry, look = self._decode(gated, static, t)
+        turn, shift, d_quats, d_scales = geometry.split(GEOMETRY, dim=1)
         rotation = nn.functional.normalize(turn + turn.new_tensor([1.0, 0.0, 0.0, 0.0]), dim=1)
-        look = APPEARANCE_SCALE * self.appearance(gated) if self.appearance is not None else None
         return Deformation(
             rotation,
             shift,
@@ -83,14 +83,21 @@ class GridField(nn.Module):
             _smoothness(encoded[0], encoded[1], nearby) if nearby is not None else None,
         )
 
-    def _geometry(self, gated: Tensor, static: Tensor, t: float) -> Tensor:
-        """(N, 14) outputs of the geometry heads."""
-        if self.motion is None:
-            return self.heads(self.hidden(gated))
-        motion = self.motion(static, t)
+    def _decode(self, gated: Tensor, static: Tensor, t: float) -> tuple[Tensor, Tensor | None]:
+        """Outputs of the geometry heads (N, 14), and of the appearance head, if there is one."""
+        motion = self.motion(static, t) if self.motion is not None else None
         if len(self.hidden):
-            return self.heads(self.hidden(gated + motion.features()))
-        return self.heads(gated) + motion.through(self.heads.weight)
+            fused = gated if motion is None else gated + motion.features()
+            look = None if self.appearance is None else APPEARANCE_SCALE * self.appearance(gated)
+            return self.heads(self.hidden(fused)), look
+        # All heads read the same features: one product, whose gradient goes through (N, width) once.
+        heads = [self.heads] if self.appearance is None else [self.heads, self.appearance]
+        weight, bias = torch.cat([head.weight for head in heads]), torch.cat([head.bias for head in heads])
+        outputs = nn.functional.linear(gated, weight, bias)
+        geometry, look = outputs[:, : sum(GEOMETRY)], outputs[:, sum(GEOMETRY) :]
+        if motion is not None:
+            geometry = geometry + motion.through(self.heads.weight)
+        return geometry, None if self.appearance is None else APPEARANCE_SCALE * look
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """See motion/field.py. The frequencies of the spectrum are in no group: they have an optimiser of their own."""
