@@ -24,14 +24,18 @@ fn main(
     if (number >= blocks * grid.levels) {
         return;
     }
-    let level = levels[number / blocks];
 #ifdef SLICED
+    // All slices fit into a cache: level after level of the same points, whose rows of the encoding then stay there, too.
+    let level = levels[number % grid.levels];
+    let block = number / grid.levels;
     let first = level.place.y;
 #else
+    let level = levels[number / blocks];
+    let block = number % blocks;
     let first = level.place.x;
 #endif
     for (var k = 0u; k < LANE_POINTS; k++) {
-        let i = (number % blocks * LANE_POINTS + k) * LANES + lane;
+        let i = (block * LANE_POINTS + k) * LANES + lane;
         if (i < grid.points) {
             let cell = find_cell(unit_point(points_at(i).xyz, grid), level);
             var sum = vec2(0.0);
