@@ -107,6 +107,7 @@ def run_remote(opened: Any, entry: Entry, *, transport: bool | None, start: Star
     print(entry.welcome(str(opened.path or name)), file=sys.stderr, flush=True)
     asyncio.run(uvicorn.Server(config).serve(sockets=[entry.listening]))
     del viewer
+    raise KeyboardInterrupt  # nothing else ends the server, but on a busy machine it may come to end without a word
 
 
 def pages(title: str, sockets: Application) -> Application:
