@@ -249,6 +249,7 @@ BAD: dict[str, tuple[Spoil, list[str]]] = {
     "no points file": (gone("sparse/0/points3D.txt"), ["points3D.txt does not exist"]),
     "fisheye": (line("cameras.txt", "PINHOLE", "OPENCV_FISHEYE"), ["cameras.txt, line 2", "OPENCV_FISHEYE", "OPENCV"]),
     "3 parameters": (words("cameras.txt", 1, 7, ""), ["cameras.txt, line 2", "4 parameters (fx, fy, cx, cy)", "are 3"]),
+    "focal tiny": (words("cameras.txt", 1, 4, "1e-9"), ["cameras.txt", "1e-09 pixels", "64x48", "0.05 to 1000"]),
     "focal 0": (words("cameras.txt", 1, 4, "0"), ["cameras.txt, line 2", "fx", "above 0", "got 0"]),
     "cx NaN": (words("cameras.txt", 1, 6, "nan"), ["cx", "nan"]),
     "width 0": (words("cameras.txt", 1, 2, "0"), ["width and height", "0x48"]),

@@ -242,6 +242,7 @@ BAD: dict[str, tuple[Change, list[str]]] = {
     "orientation mirrored": (json_file(CAMERA, orientation=np.diag([1, 1, -1]).tolist()), ["left-handed"]),
     "position of text": (json_file(CAMERA, position=[0, 0, "1"]), ["position", '"1"']),
     "position far": (json_file(CAMERA, position=[0, 0, 1e12]), ["position", "1e+12", "1e+09"]),
+    "focal length huge": (json_file(CAMERA, focal_length=1e9), [CAMERA, "focal_length", "1e+09 pixels", "0.05 to"]),
     "focal length 0": (json_file(CAMERA, focal_length=0), ["focal_length", "got 0"]),
     "aspect 0": (json_file(CAMERA, pixel_aspect_ratio=0), ["pixel_aspect_ratio", "got 0"]),
     "principal point NaN": (json_file(CAMERA, principal_point=[math.nan, 0]), ["principal_point", "nan"]),

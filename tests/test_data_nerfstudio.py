@@ -139,6 +139,7 @@ BAD: dict[str, tuple[Callable[[dict[str, Any]], Any], list[str]]] = {
     "no matrix": (frame(transform_matrix=None), ["frame 1", "no field transform_matrix"]),
     "matrix scaled": (frame(transform_matrix=SCALED), ["frame 1", "transform_matrix", "0 0 0 1"]),
     "no fl_x": (top(fl_x=None), ["frame 0", "no field fl_x"]),
+    "fl_x tiny": (top(fl_x=1e-9), ["transforms.json", "1e-09 pixels", "0.05 to 1000"]),
     "fl_x 0": (top(fl_x=0), ["fl_x is 0"]),
     "fl_x of text": (top(fl_x="wide"), ["fl_x", '"wide"']),
     "cx NaN": (frame(cx=math.nan), ["frame 1", "cx", "nan"]),

@@ -317,6 +317,7 @@ BAD: dict[str, tuple[Change, list[str]]] = {
     "one row less": (other_array(GOOD[:3]), [FILE, "poses of 3 cameras", "4 recordings", "cam00 to cam03"]),
     "NaN": (poses(1, 2, math.nan), [FILE, "row 1 (cam01)", "nan", "column 2"]),
     "far away": (poses(1, 3, 1e12), [FILE, "row 1", "1e+12", "column 3"]),
+    "focal length tiny": (poses(2, 14, 1e-9), [FILE, "row 2 (cam02)", "1e-09 pixels", "0.05 to 1000"]),
     "focal length 0": (poses(2, 14, 0), [FILE, "row 2 (cam02)", "focal", "128 and 0"]),
     "height 0": (poses(2, 4, 0), [FILE, "row 2", "height", "got 0, 128"]),
     "near beyond far": (poses(3, slice(15, 17), [8, 2]), [FILE, "row 3", "near < far", "8 and 2"]),

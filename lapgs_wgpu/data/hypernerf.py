@@ -17,7 +17,7 @@ from lapgs_wgpu.data.cloud import check_cloud, find_cloud, points_in_view, read_
 from lapgs_wgpu.data.fields import finite, kind, read_json, required, vector
 from lapgs_wgpu.data.lens import LARGEST_ZOOM, Lens, read_straight
 from lapgs_wgpu.data.pictures import check_pictures, check_proportions, shrunk
-from lapgs_wgpu.data.poses import LARGEST_ENTRY, Placement, check_rotation, fitting, world_to_camera
+from lapgs_wgpu.data.poses import LARGEST_ENTRY, Placement, check_focal, check_rotation, fitting, world_to_camera
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
@@ -177,7 +177,9 @@ def _read_camera(path: Path) -> tuple[Camera, Lens]:
     # nerfies has written the second name, and its first releases the first one.
     tangential_name = "tangential" if "tangential" in data else "tangential_distortion"
     tangential = vector(data.get(tangential_name, [0.0] * 2), 2, tangential_name, path)
-    return Camera(K, world_to_camera(R_cam_world.T, position), width, height), Lens(K, radial, tangential)
+    camera = Camera(K, world_to_camera(R_cam_world.T, position), width, height)
+    check_focal(camera, f"{path}: focal_length")
+    return camera, Lens(K, radial, tangential)
 
 
 def _picture_folder(rgb: Path, names: Sequence[str], image_size: int | None) -> tuple[Path, tuple[int, int]]:

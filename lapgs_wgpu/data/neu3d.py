@@ -24,7 +24,7 @@ from lapgs_wgpu.data.pictures import (
     shrunk,
 )
 from lapgs_wgpu.data.pictures import text as size_text
-from lapgs_wgpu.data.poses import LARGEST_ENTRY, check_rotation, fitting, world_to_camera
+from lapgs_wgpu.data.poses import LARGEST_ENTRY, check_focal, check_rotation, fitting, world_to_camera
 from lapgs_wgpu.data.video import Video
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.errors import InputError
@@ -187,4 +187,5 @@ def _read_poses(path: Path, recordings: list[Path]) -> tuple[list[Camera], NDArr
         check_rotation(R_world_cam, f"{where}: the pose")
         K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
         cameras.append(Camera(K, world_to_camera(R_world_cam, pose[:, 3]), round(width), round(height)))
+        check_focal(cameras[-1], where)
     return cameras, rows[:, 15:]

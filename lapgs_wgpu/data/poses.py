@@ -16,6 +16,7 @@ Array = NDArray[np.float64]
 
 # Largest deviation of R^T R from the identity: files hold about seven digits, a scaled or sheared camera is far beyond.
 ROTATION_TOLERANCE = 1e-3
+SHORTEST_FOCAL, LONGEST_FOCAL = 0.05, 1000.0  # of a picture's longer side: 169 and 0.06 degrees of view
 LARGEST_ENTRY = 1e9  # of a pose: a camera further away is a mistake, and its matrix products lose all digits
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0])  # y up, z backward -> y down, z forward
 BOX = 1.3  # half side of the cube around the origin that a capture is brought to: that of D-NeRF's scenes
@@ -70,6 +71,17 @@ def check_rotation(R: Array, name: str) -> None:
         )
     if np.linalg.det(R) < 0:
         raise InputError(f"{name} is left-handed (determinant -1, must be 1); flip one of its axes.")
+
+
+def check_focal(camera: Camera, where: str) -> None:
+    """InputError, which begins with `where`, unless both focal lengths are those of a camera that could be built."""
+    longer = max(camera.width, camera.height)
+    for focal in (camera.K[0, 0], camera.K[1, 1]):
+        if not SHORTEST_FOCAL * longer <= focal <= LONGEST_FOCAL * longer:
+            raise InputError(
+                f"{where}: a focal length of {focal:.4g} pixels does not go with pictures of {camera.width}x"
+                f"{camera.height}; it must be {SHORTEST_FOCAL:g} to {LONGEST_FOCAL:g} times the longer side."
+            )
 
 
 def world_to_camera(R_world_cam: Array, position: Array) -> Array:

@@ -14,7 +14,7 @@ from lapgs_wgpu.data.cloud import Cloud, check_cloud, points_in_view
 from lapgs_wgpu.data.lens import LARGEST_ZOOM, Lens, read_straight
 from lapgs_wgpu.data.moments import Picture, natural
 from lapgs_wgpu.data.pictures import check_pictures, check_proportions, shrunk
-from lapgs_wgpu.data.poses import fitting
+from lapgs_wgpu.data.poses import check_focal, fitting
 from lapgs_wgpu.data.sanity import check_film, check_views
 from lapgs_wgpu.data.views import Dataset, View, focus_of
 from lapgs_wgpu.errors import InputError
@@ -57,6 +57,8 @@ def dataset_of(
     times: of the shots, in [0, 1]. tested: which shots are held out. cloud: in the cameras' coordinates; cloud_file:
     what errors call it. axes: advice for cameras that look the wrong way. Raises InputError.
     """
+    for shot in shots:
+        check_focal(shot.camera, shot.where)
     trained = [i for i in range(len(shots)) if i not in tested]
     if not trained:
         raise InputError(f"{folder}: all {len(shots)} pictures are held out for testing; none is left to train on.")
