@@ -39,7 +39,14 @@ class Desktop:
         os.close(write)
         with os.fdopen(read) as pipe:
             self.display = f":{pipe.readline().strip()}"
-        return self
+        for _ in range(50):  # it names the display a little before it takes connections
+            if (
+                subprocess.run(["xdotool", "getmouselocation"], env=self._environment(), capture_output=True).returncode
+                == 0
+            ):
+                return self
+            time.sleep(0.1)
+        raise AssertionError(f"Xvfb takes no connections on {self.display}")
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         for process in (*self._processes, self._server):
@@ -47,18 +54,21 @@ class Desktop:
             process.wait()
         self._folder.cleanup()
 
-    def start(self, *command: str) -> subprocess.Popen[str]:
-        """Run a program on this screen; it is ended with the screen."""
+    def _environment(self) -> dict[str, str]:
         environment = {**os.environ, "DISPLAY": self.display, "MESA_VK_WSI_PRESENT_MODE": "immediate"}
         environment.pop("WAYLAND_DISPLAY", None)
-        process = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
+        return environment
+
+    def start(self, *command: str) -> subprocess.Popen[str]:
+        """Run a program on this screen; it is ended with the screen."""
+        process = subprocess.Popen(command, env=self._environment(), stderr=subprocess.PIPE, text=True)
         self._processes.append(process)
         return process
 
     def events(self, *words: str | int) -> None:
         """Mouse and key events in xdotool's words."""
         command = ["xdotool", *map(str, words)]
-        subprocess.run(command, env={**os.environ, "DISPLAY": self.display}, check=True, timeout=PATIENCE)
+        subprocess.run(command, env=self._environment(), check=True, timeout=PATIENCE)
 
     def drag(self, start: tuple[int, int], end: tuple[int, int], button: int = 1, steps: int = 8) -> None:
         """Press a button, move in steps, release."""

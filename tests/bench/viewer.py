@@ -110,8 +110,10 @@ def _window(file: Path) -> float:
 
     with Desktop() as desktop:
         start = time.perf_counter()
-        desktop.start(*_command(file))
+        process = desktop.start(*_command(file))
         while desktop.picture()[: SIZE[1], : SIZE[0]].max() < 60:
+            if process.poll() is not None:
+                raise RuntimeError(f"lapgs-view ended: {process.communicate()[1]}")
             time.sleep(0.005)
         return 1e3 * (time.perf_counter() - start)
 
