@@ -34,7 +34,8 @@ class Desktop:
     def __enter__(self) -> Desktop:
         read, write = os.pipe()
         command = ["Xvfb", "-displayfd", str(write), "-screen", "0", f"{SIZE[0]}x{SIZE[1]}x24", "-nolisten", "tcp"]
-        command += ["-fbdir", self._folder.name]
+        # Without -noreset it starts anew, and takes no connections meanwhile, whenever the last program has left.
+        command += ["-noreset", "-fbdir", self._folder.name]
         self._server = subprocess.Popen(command, pass_fds=[write], stderr=subprocess.DEVNULL)
         os.close(write)
         with os.fdopen(read) as pipe:
