@@ -17,28 +17,17 @@ from .trouble import Guard
 
 if TYPE_CHECKING:
     from .device import Device
+    from .kernel import BindGroup
 
 _STORAGE = wgpu.BufferUsage.STORAGE | wgpu.BufferUsage.UNIFORM | wgpu.BufferUsage.COPY_SRC | wgpu.BufferUsage.COPY_DST
 _SMALL = 1 << 16  # bytes that go through the queue where buffers cannot be mapped
 _MAPPABLE = wgpu.BufferUsage.MAP_READ | wgpu.BufferUsage.MAP_WRITE
-
-
 _numbers = itertools.count()
-
-
-@dataclass(eq=False)
-class BindGroup:
-    """What a kernel is given, in wgpu's form, and the kernel's store of such groups, where it has the key."""
-
-    native: Any
-    textures: dict[str, Any]  # kept, so that an id in the key cannot come to mean another view
-    store: dict[Any, BindGroup]
-    key: Any
 
 
 def _forget(bound: weakref.WeakSet[BindGroup]) -> None:
     for group in list(bound):
-        group.store.pop(group.key, None)
+        group.drop()
 
 
 @dataclass

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 import wgpu
 
 from ..errors import DeviceMemoryError
-from .buffer import BindGroup, Buffer
+from .buffer import Buffer
 from .shader import Defines, ShaderError, compose, pack, reflect
 from .trouble import Guard, is_lost
 
@@ -16,6 +17,20 @@ if TYPE_CHECKING:
     from .device import Device
 
 _LAYOUT_TYPE = {"uniform": "uniform", "read": "read-only-storage", "read_write": "storage"}
+
+
+@dataclass(eq=False)
+class BindGroup:
+    """What a kernel is given, in wgpu's form, and the kernel's store of such groups, where it has the key."""
+
+    native: Any
+    textures: dict[str, Any]  # kept, so that an id in the key cannot come to mean another view
+    store: dict[Any, BindGroup]
+    key: Any
+
+    def drop(self) -> None:
+        """A buffer of it is gone."""
+        self.store.pop(self.key, None)
 
 
 class Kernel:
