@@ -39,7 +39,7 @@ class App:
     """What the window shows. The panels (viewer/panels) read and set its attributes, keys call its methods.
 
     scale: of the frame on show against the window, 1 at full resolution. message: for the user, None or one sentence.
-    moved_at: when what is shown was last changed, but for `refresh`. seconds: spent on drawing so far, GUI included.
+    moved_at: when what is shown was last changed, but for `refresh`. drawing_seconds: spent so far, GUI included.
     stale: the scene has changed since it was drawn.
     training: the training under way, None where a file is shown.
     """
@@ -71,7 +71,7 @@ class App:
         self._drawn_key: Any = None
         self.stale = self._running = False
         self.moved_at = self._drawn_at = time.perf_counter()
-        self.seconds = 0.0
+        self.drawing_seconds = 0.0
         self.training: Training | None = None
         self._capture: Capture | None = None
         self._capture_sought = False
@@ -144,7 +144,7 @@ class App:
             self.canvas.request_draw()
         elif self.scale < 1:
             self.loop.call_later(_SETTLED, self.canvas.request_draw)
-        self.seconds += time.perf_counter() - now
+        self.drawing_seconds += time.perf_counter() - now
 
     def _paint(self, now: float) -> None:
         """Draw the scene where something changed: at a lower resolution while it changes, in full once it rests."""

@@ -83,10 +83,10 @@ def watch(scene: Scene4D, look: FirstLook, steps: Iterator[Progress]) -> None:
             now = time.perf_counter()
             begun = begun or now
             if now - begun < _OPENING:
-                pictured, spent = now, app.seconds
-            if training.paused or (not app.stale and now - pictured > (app.seconds - spent) / SHARE):
+                pictured, spent = now, app.drawing_seconds
+            if training.paused or (not app.stale and now - pictured > (app.drawing_seconds - spent) / SHARE):
                 app.refresh()
-                pictured, spent = now, app.seconds
+                pictured, spent = now, app.drawing_seconds
             await sleep(0.0)
 
     loop.add_task(drive)
