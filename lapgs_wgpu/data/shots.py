@@ -146,6 +146,8 @@ class _Straight:
 def _filled(cloud: Cloud, cameras: Sequence[Camera]) -> Cloud:
     """The cloud, and DENSE points in all, those that it lacks at random where views overlap, between the depths of its
     own; each has the colour of the nearest of its own."""
+    from scipy.spatial import cKDTree  # slow to import
+
     missing = DENSE - len(cloud.points)
     if missing <= 0:
         return cloud
@@ -153,8 +155,6 @@ def _filled(cloud: Cloud, cameras: Sequence[Camera]) -> Cloud:
     depths = np.concatenate([points @ c.T_cam_world[2, :3] + c.T_cam_world[2, 3] for c in cameras])
     near, far = np.percentile(depths[depths > 0], [1, 99])
     added = points_in_view(cameras, float(near), float(far) * 1.01, missing, 0)
-    from scipy.spatial import cKDTree  # slow to import
-
     _, nearest = cKDTree(points).query(added)
     return Cloud(
         np.concatenate([cloud.points, added.astype(np.float32)]),
