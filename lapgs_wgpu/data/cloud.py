@@ -113,12 +113,18 @@ def views_of(points: Array, cameras: Sequence[Camera], near: float = 0.0, far: f
     between near and far."""
     seen = np.zeros(len(points), dtype=np.int64)
     for camera in evenly_chosen(cameras):
-        local = points @ camera.T_cam_world[:3, :3].T + camera.T_cam_world[:3, 3]
-        depth = np.where(local[:, 2] > 0, local[:, 2], np.nan)
-        pixels = (local @ camera.K.T)[:, :2] / depth[:, None]
-        inside = ((pixels >= 0) & (pixels < [camera.width, camera.height])).all(axis=1)
-        seen += inside & (depth >= near) & (depth <= far)
+        depths, inside = in_view(points, camera)
+        seen += inside & (depths >= near) & (depths <= far)
     return seen
+
+
+def in_view(points: NDArray[np.floating], camera: Camera) -> tuple[NDArray[np.floating], NDArray[np.bool_]]:
+    """Depths (N,) of points (N, 3), NaN behind the camera, and which of them lie in its picture."""
+    local = points @ camera.T_cam_world[:3, :3].T + camera.T_cam_world[:3, 3]
+    depths = np.where(local[:, 2] > 0, local[:, 2], np.nan)
+    pixels = (local @ camera.K.T)[:, :2] / depths[:, None]
+    within = (pixels >= 0) & (pixels < [camera.width, camera.height])
+    return depths, within[:, 0] & within[:, 1]
 
 
 def points_in_view(cameras: Sequence[Camera], near: float, far: float, count: int, seed: int) -> Array:

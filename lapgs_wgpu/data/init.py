@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from lapgs_wgpu.data.cloud import evenly_chosen, points_in_view
+from lapgs_wgpu.data.cloud import evenly_chosen, in_view, points_in_view
 from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.splat.camera import Camera
 
@@ -75,11 +75,7 @@ def see_through(
 
 def _optical_depth(points: NDArray[np.floating], scales: NDArray[np.floating], opacity: float, camera: Camera) -> float:
     """Of all Gaussians that a camera sees together, the mean over its image."""
-    local = points @ camera.T_cam_world[:3, :3].T + camera.T_cam_world[:3, 3]
-    ahead = local[:, 2] > 0
-    local, scales = local[ahead], scales[ahead]
-    pixels = (local @ camera.K.T)[:, :2] / local[:, 2:]
-    inside = ((pixels >= 0) & (pixels < [camera.width, camera.height])).all(axis=1)
-    radii = scales[inside] / local[inside, 2]
+    depths, inside = in_view(points, camera)
+    radii = scales[inside] / depths[inside]
     area = 2 * np.pi * radii**2 * camera.K[0, 0] * camera.K[1, 1] / (camera.width * camera.height)
     return float((opacity * np.minimum(area, 1.0)).sum())
