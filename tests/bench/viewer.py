@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import subprocess
 import sys
@@ -118,15 +117,6 @@ def _window(file: Path) -> float:
         return 1e3 * (time.perf_counter() - start)
 
 
-def main() -> None:
-    """For itself: python tests/bench/viewer.py [REPEAT]."""
-    from lapgs_wgpu.gpu.device import open_device
-
-    os.environ.setdefault("XDG_RUNTIME_DIR", "/tmp")
-    for report in bench_viewer(open_device(), int(sys.argv[1]) if len(sys.argv) > 1 else 9).values():
-        print_viewer(report)
-
-
 def print_viewer(report: ViewerReport) -> None:
     print(f"\nviewer, {SIZE[0]}x{SIZE[1]}, preset {report.preset}: {report.gaussians:,} Gaussians")
     rows = {"command to first picture, window": report.window, "command with --screenshot": report.screenshot}
@@ -135,6 +125,3 @@ def print_viewer(report: ViewerReport) -> None:
         if timing is not None:
             print(f"  {name:46s}{timing.median:8.1f}{timing.minimum:9.1f}  ms (median, least)")
 
-
-if __name__ == "__main__":
-    main()
