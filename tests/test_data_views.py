@@ -66,6 +66,26 @@ def test_view_refuses_pixels_of_another_shape(pixels: np.ndarray) -> None:
         view.load()
 
 
+@pytest.mark.parametrize(
+    ("mask", "got"),
+    [
+        (np.ones((5, 4), bool), r"\(5, 4\) bool with 20 set"),
+        (np.ones((4, 5), np.uint8), r"\(4, 5\) uint8"),
+        (np.zeros((4, 5), bool), "bool with 0 set"),
+    ],
+)
+def test_view_refuses_masks_of_another_shape_or_of_nothing(mask: np.ndarray, got: str) -> None:
+    view = View("test_000", CAMERA, 0.0, "a.png", Source(), lambda: mask)
+    with pytest.raises(InputError, match=rf"a\.png: expected a mask of 5x4 .*{got}"):
+        view.load_mask()
+
+
+def test_view_with_and_without_mask() -> None:
+    mask = np.eye(4, 5, dtype=bool)
+    np.testing.assert_array_equal(View("test_000", CAMERA, 0.0, "a.png", Source(), lambda: mask).load_mask(), mask)
+    assert view_of(Source()).load_mask() is None
+
+
 def test_extent_and_times() -> None:
     views = tuple(view_of(Source(), f"train_{i}", time) for i, time in enumerate((0.5, 0.0, 0.5)))
     data = Dataset("toy", views, ())

@@ -30,6 +30,8 @@ class View:
     source: what errors call the pixels: a file, or a video and its frame.
     pixels: decodes them, each time anew and from any thread: (height, width, 3) RGB or (height, width, 4) straight
         (not premultiplied) RGBA, uint8. Raises InputError where they cannot be read.
+    mask: decodes which pixels of a held-out view the masked metrics measure, such as DyCheck's covisibility masks (what
+        enough training cameras saw): (height, width) bool. Raises InputError, too.
     """
 
     name: str
@@ -37,6 +39,7 @@ class View:
     time: float
     source: str
     pixels: Callable[[], NDArray[np.uint8]]
+    mask: Callable[[], NDArray[np.bool_]] | None = None
 
     def load(self) -> NDArray[np.uint8]:
         """Decode: (H, W, 3) RGB or (H, W, 4) straight RGBA, uint8, read-only. Raises InputError."""
@@ -49,6 +52,19 @@ class View:
             )
         image.setflags(write=False)
         return image
+
+    def load_mask(self) -> NDArray[np.bool_] | None:
+        """Which pixels the masked metrics measure: (H, W) bool, at least one; None without mask. Raises InputError."""
+        if self.mask is None:
+            return None
+        mask = self.mask()
+        size = (self.camera.height, self.camera.width)
+        if mask.dtype != np.bool_ or mask.shape != size or not mask.any():
+            raise InputError(
+                f"{self.source}: expected a mask of {size[1]}x{size[0]} pixels, at least one of them set, got an array "
+                f"of {mask.shape} {mask.dtype} with {np.count_nonzero(mask)} set; make the mask again, or remove it."
+            )
+        return mask
 
 
 @dataclass(frozen=True, eq=False)
