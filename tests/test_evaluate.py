@@ -20,7 +20,7 @@ from lapgs_wgpu.motion.field import FieldConfig
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train.evaluate import evaluate, side_by_side, to_8_bit, write_metrics
-from lapgs_wgpu.train.losses import MS_SSIM_SMALLEST, ms_ssim
+from lapgs_wgpu.train.losses import MS_SSIM_SMALLEST, masked_ssim, ms_ssim, psnr
 from lapgs_wgpu.train.lpips import BLOCKS, Lpips
 
 CAMERA = Camera.looking_at([0, -4, 0], [0, 0, 0], up=[0, 0, 1], fov_x=0.7, width=24, height=16)
@@ -33,8 +33,8 @@ def scene(device: Device) -> Scene4D:
     return Scene4D.from_points(points, colours, np.full(40, 0.1), FieldConfig(kind="static"), device=device)
 
 
-def view(name: str, pixels: np.ndarray) -> View:
-    return View(name, CAMERA, 0.5, name, lambda: pixels.copy())
+def view(name: str, pixels: np.ndarray, mask: np.ndarray | None = None) -> View:
+    return View(name, CAMERA, 0.5, name, lambda: pixels.copy(), None if mask is None else lambda: mask)
 
 
 def test_pictures_are_clamped_and_rounded() -> None:
@@ -137,6 +137,98 @@ def test_ms_ssim_written_out(size: tuple[int, int]) -> None:
     assert float(ms_ssim(a, b)) == pytest.approx(np.mean(values), abs=1e-9)
     assert float(ms_ssim(a, a)) == pytest.approx(1.0, abs=1e-9)
     assert MS_SSIM_SMALLEST == 161
+
+
+def partial_convolution(line: list[float], seen: list[bool]) -> list[tuple[float, bool]]:
+    """Of each window wholly inside a line: the weighted sum of what is seen times 11 / its number; whether any is."""
+    weights = np.exp(-(np.arange(-5, 6) ** 2) / 4.5)
+    weights /= weights.sum()
+    found = []
+    for at in range(len(line) - 10):
+        taps = [line[at + k] * weights[k] for k in range(11) if seen[at + k]]
+        found.append((sum(taps) * 11 / len(taps), True) if taps else (0.0, False))
+    return found
+
+
+def masked_blur(plane: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    rows = [partial_convolution(*both) for both in zip(plane.tolist(), mask.tolist(), strict=True)]
+    columns = [partial_convolution(*map(list, zip(*column, strict=True))) for column in zip(*rows, strict=True)]
+    return np.array([[value for value, _ in column] for column in columns]).T
+
+
+MASKS = {
+    "blob": np.hypot(*(np.indices((31, 28)) - 12)) < 9,  # which leaves windows without any pixel
+    "scattered": np.random.default_rng(0).random((31, 28)) < 0.2,
+    "one pixel": np.arange(31 * 28).reshape(31, 28) == 400,
+    "all": np.ones((31, 28), bool),
+}
+
+
+@pytest.mark.parametrize("name", MASKS)
+def test_masked_ssim_written_out(name: str) -> None:
+    a, b = pictures(31, 28)
+    values = []
+    for p, q in zip(a.permute(2, 0, 1).numpy(), b.permute(2, 0, 1).numpy(), strict=True):
+        mp, mq, pp, qq, pq = (masked_blur(plane, MASKS[name]) for plane in (p, q, p * p, q * q, p * q))
+        vp, vq, cov = np.maximum(pp - mp**2, 0), np.maximum(qq - mq**2, 0), pq - mp * mq
+        cov = np.sign(cov) * np.minimum(np.abs(cov), np.sqrt(vp * vq))
+        values.append((2 * mp * mq + 0.01**2) * (2 * cov + 0.03**2) / ((mp**2 + mq**2 + 0.01**2) * (vp + vq + 0.03**2)))
+    mask = torch.from_numpy(MASKS[name])
+    assert float(masked_ssim(a, b, mask)) == pytest.approx(np.mean(values), abs=1e-9)
+    assert float(masked_ssim(a, a, mask)) == 1
+    assert (np.array(values)[:, -1, -1] == 1).all() == (name in ("blob", "one pixel"))
+
+
+def test_masked_ssim_of_all_pixels_is_that_of_the_windows_inside() -> None:
+    a, b = pictures(31, 28)
+    x = np.exp(-(np.arange(-5, 6) ** 2) / 4.5)
+    window = np.outer(x, x) / x.sum() ** 2
+    values = []
+    for p, q in zip(a.permute(2, 0, 1).numpy(), b.permute(2, 0, 1).numpy(), strict=True):
+        mp, mq, pp, qq, pq = (convolve2d(plane, window, "valid") for plane in (p, q, p * p, q * q, p * q))
+        similar = (2 * (pq - mp * mq) + 0.03**2) / (pp - mp**2 + qq - mq**2 + 0.03**2)
+        values.append(similar * (2 * mp * mq + 0.01**2) / (mp**2 + mq**2 + 0.01**2))
+    assert float(masked_ssim(a, b, torch.ones(31, 28, dtype=torch.bool))) == pytest.approx(np.mean(values), abs=1e-9)
+
+
+def test_masked_measures_see_the_pixels_of_the_mask_alone(scene: Scene4D, tmp_path: Path) -> None:
+    drawn = to_8_bit(scene.render(CAMERA, 0.5).image)
+    mask = np.zeros((16, 24), bool)
+    mask[3:14, 5:20] = True
+    inside = drawn.copy()
+    inside[3:14, 5:20, 1] ^= 8  # of all that is measured, in one of three channels
+    both = np.where(mask[..., None], inside, 255 - drawn)
+    metrics = evaluate(scene, [view("inside", inside, mask), view("both", both, mask)], "black")
+    first, second = metrics["views"]
+    assert first["masked_psnr"] == pytest.approx(-10 * np.log10((8 / 255) ** 2 / 3), abs=1e-4)
+    assert first["psnr"] > second["psnr"]
+    assert 0 < first["masked_ssim"] < 1
+    for name in ("masked_psnr", "masked_ssim"):
+        assert first[name] == second[name] == metrics[name]
+    write_metrics(tmp_path, metrics)
+    with (tmp_path / "metrics.csv").open(newline="") as file:
+        assert [float(row["masked_psnr"]) for row in csv.DictReader(file)] == [first["masked_psnr"]] * 2
+
+
+def test_a_mask_of_all_pixels_changes_no_psnr(scene: Scene4D) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (16, 24, 3), np.uint8)
+    metrics = evaluate(scene, [view("a", noise, np.ones((16, 24), bool))], "black")
+    assert metrics["masked_psnr"] == metrics["psnr"]
+    a, b = (image.float() for image in pictures(203, 301))
+    every = torch.ones(203, 301, dtype=torch.bool)
+    assert psnr(a[every], b[every]) == psnr(a, b)
+
+
+def test_what_no_mask_measures_is_not_available(scene: Scene4D) -> None:
+    drawn = to_8_bit(scene.render(CAMERA, 0.5).image)
+    metrics = evaluate(scene, [view("with", drawn, np.ones((16, 24), bool)), view("without", drawn)], "black")
+    assert metrics["views"][0]["masked_psnr"] == pytest.approx(100)
+    assert metrics["views"][1]["masked_psnr"] == metrics["masked_psnr"] == metrics["masked_ssim"] == "not available"
+    low = CAMERA.resized(24, 10)  # one row less than a window
+    flat = View("low", low, 0.5, "low", lambda: np.zeros((10, 24, 3), np.uint8), lambda: np.ones((10, 24), bool))
+    row = evaluate(scene, [flat], "black")["views"][0]
+    assert row["masked_psnr"] == row["psnr"]
+    assert row["masked_ssim"] == "not available"
 
 
 @pytest.fixture(scope="module")

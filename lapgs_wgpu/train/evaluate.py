@@ -23,11 +23,11 @@ from lapgs_wgpu.data.views import View, composite
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.log import environment
-from lapgs_wgpu.train.losses import MS_SSIM_SMALLEST, ms_ssim, psnr, ssim
+from lapgs_wgpu.train.losses import MS_SSIM_SMALLEST, SSIM_WINDOW, masked_ssim, ms_ssim, psnr, ssim
 from lapgs_wgpu.train.lpips import SMALLEST, Lpips
 
 ERROR_GAIN = 4  # of the error pictures
-MEASURES = ("psnr", "ssim", "ms_ssim", "lpips", "lpips_unscaled")
+MEASURES = ("psnr", "ssim", "ms_ssim", "lpips", "lpips_unscaled", "masked_psnr", "masked_ssim")
 NOT_AVAILABLE = "not available"
 COLOURS = {"black": 0.0, "white": 1.0, "random": 0.0}  # of the background under test views
 
@@ -42,8 +42,8 @@ def evaluate(
     are no weights for it.
     Each measure is one of an image, then the mean over the images (of PSNR of the dB): psnr over all channels; ssim,
     that of the loss; ms_ssim; lpips on inputs in [-1, 1], and lpips_unscaled on inputs in [0, 1], as 3DGS's code
-    reports it. "not available" stands for what cannot be measured: pictures too small, or no weights. Raises
-    InputError where a picture cannot be read.
+    reports it; masked_psnr and masked_ssim, of the pixels of the view's mask. "not available" stands for what cannot be
+    measured: pictures too small, no weights, no masks. Raises InputError where a picture or a mask cannot be read.
     """
     start = time.perf_counter()
     colour = torch.full((3,), COLOURS[background])
@@ -51,7 +51,8 @@ def evaluate(
     for view in views:
         truth = composite(view.load(), colour.numpy())
         image = to_8_bit(scene.render(view.camera, view.time, colour).image)
-        rows.append({"view": view.name, "time": view.time, **_measures(_unit(image), _unit(truth), lpips)})
+        measures = _measures(_unit(image), _unit(truth), view.load_mask(), lpips)
+        rows.append({"view": view.name, "time": view.time, **measures})
         if folder is not None:
             with atomic_write(folder / f"{view.name}.png") as file:
                 Image.fromarray(side_by_side(truth, image)).save(file, "PNG")
@@ -67,15 +68,22 @@ def evaluate(
     }
 
 
-def _measures(image: Tensor, truth: Tensor, lpips: Lpips | None) -> dict[str, float | str]:
+def _measures(
+    image: Tensor, truth: Tensor, pixels: NDArray[np.bool_] | None, lpips: Lpips | None
+) -> dict[str, float | str]:
     side = min(image.shape[:2])
     perceptual = lpips if side >= SMALLEST else None
+    mask = None if pixels is None else torch.from_numpy(pixels)
     return {
         "psnr": psnr(image, truth),
         "ssim": float(ssim(image, truth)),
         "ms_ssim": float(ms_ssim(image, truth)) if side >= MS_SSIM_SMALLEST else NOT_AVAILABLE,
         "lpips": perceptual(image, truth) if perceptual else NOT_AVAILABLE,
         "lpips_unscaled": perceptual(image, truth, unscaled=True) if perceptual else NOT_AVAILABLE,
+        "masked_psnr": psnr(image[mask], truth[mask]) if mask is not None else NOT_AVAILABLE,
+        "masked_ssim": (
+            float(masked_ssim(image, truth, mask)) if mask is not None and side >= SSIM_WINDOW else NOT_AVAILABLE
+        ),
     }
 
 
