@@ -109,10 +109,16 @@ def bent(blobs: Blobs, camera: Camera, device: Device, fields: dict[str, Any]) -
     return np.stack(channels, axis=-1).round().astype(np.uint8)
 
 
+def bright(picture: np.ndarray) -> np.ndarray:
+    """(H, W) bool: what `write_nerfies` makes a mask of."""
+    return picture.max(axis=2) > 64
+
+
 def write_nerfies(
     folder: Path, device: Device, *, count: int = 5, lens: dict[str, Any] | None = None, change: Change | None = None
 ) -> Path:
-    """A capture of `count` pictures, the last one for testing; scene.json moves and scales it; rgb/1x and rgb/2x.
+    """A capture of `count` pictures, the last one for testing; scene.json moves and scales it; rgb/1x and rgb/2x, and
+    covisible/ with masks of what is bright.
 
     lens: fields of the camera files. change: spoils files (by name without .json) before they are written.
     """
@@ -135,6 +141,9 @@ def write_nerfies(
             (folder / f"rgb/{factor}x").mkdir(parents=True, exist_ok=True)
             small = Image.fromarray(picture).resize((WIDTH // factor, HEIGHT // factor), Image.Resampling.BOX)
             small.save(folder / f"rgb/{factor}x/{name}.png")
+            if name == ids[-1]:
+                (folder / f"covisible/{factor}x/val").mkdir(parents=True)
+                Image.fromarray(bright(np.asarray(small))).save(folder / f"covisible/{factor}x/val/{name}.png")
         files[f"camera/{name}"] = {
             "orientation": camera.T_cam_world[:3, :3].tolist(),
             "position": camera.position.tolist(),

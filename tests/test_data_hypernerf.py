@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from captures import HEIGHT, WIDTH, Blobs, Change, agreement, write_nerfies, write_points
+from captures import HEIGHT, WIDTH, Blobs, Change, agreement, bright, write_nerfies, write_points
 from PIL import Image
+from scipy.ndimage import binary_erosion
 
 from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.errors import InputError
@@ -19,6 +20,7 @@ from lapgs_wgpu.gpu.device import Device
 
 SHARED = Path(__file__).parents[2] / "shared" / "data"
 ID = "left_000001"
+TEST_ID = "left_000004"
 
 LENSES: dict[str, dict[str, Any]] = {
     "principal point": {"principal_point": [WIDTH / 2 + 7, HEIGHT / 2 - 5]},
@@ -174,6 +176,59 @@ def test_a_cloud_in_other_coordinates_is_refused(change: Any, words: list[str], 
         assert word in str(caught.value)
 
 
+def mask_of(file: Path) -> np.ndarray:
+    return np.asarray(Image.open(file).convert("L")) == 255
+
+
+@pytest.mark.parametrize(("size", "factor"), [(None, 1), (32, 2)])
+def test_masks_come_from_the_folder_of_the_pictures_factor(size: int | None, factor: int, toy: Path) -> None:
+    data = load_dataset(toy, image_size=size)
+    mask = data.test[0].load_mask()
+    assert mask is not None
+    np.testing.assert_array_equal(mask, mask_of(toy / f"covisible/{factor}x/val/{TEST_ID}.png"))
+    np.testing.assert_array_equal(mask, bright(data.test[0].load()))
+    assert 0.1 < mask.mean() < 0.9
+    assert [view.mask for view in data.train] == [None] * 4
+
+
+def test_a_mask_of_another_factor_is_enlarged(toy: Path) -> None:
+    shutil.rmtree(toy / "covisible/1x/val")
+    small = mask_of(toy / f"covisible/2x/val/{TEST_ID}.png")
+    mask = load_dataset(toy).test[0].load_mask()
+    np.testing.assert_array_equal(mask, small.repeat(2, axis=0).repeat(2, axis=1))
+
+
+def test_a_pixel_is_measured_where_all_that_it_is_made_of_is_white(toy: Path) -> None:
+    shutil.rmtree(toy / "rgb/2x")
+    large = mask_of(toy / f"covisible/1x/val/{TEST_ID}.png")
+    mask = load_dataset(toy, image_size=32).test[0].load_mask()
+    np.testing.assert_array_equal(mask, large.reshape(24, 2, 32, 2).all(axis=(1, 3)))
+
+
+def test_rigs_whose_cameras_take_turns_have_masks_of_their_own(toy: Path) -> None:
+    (toy / "covisible/1x/val").rename(toy / "covisible/1x/val_intl")
+    mask = load_dataset(toy).test[0].load_mask()
+    np.testing.assert_array_equal(mask, mask_of(toy / f"covisible/1x/val_intl/{TEST_ID}.png"))
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_masks_are_straightened_as_the_pictures_are(name: str, device: Device, tmp_path: Path) -> None:
+    toy = write_nerfies(tmp_path / "toy", device, count=3, lens=LENSES[name])
+    view = load_dataset(toy).test[0]
+    mask, seen = view.load_mask(), bright(view.load())
+    assert mask is not None
+    assert not (mask & ~seen).any()
+    assert not (binary_erosion(seen, iterations=2) & ~mask).any()  # at edges, all of what a pixel mixes must be white
+
+
+def test_captures_without_masks_have_none(toy: Path) -> None:
+    shutil.rmtree(toy / "covisible")
+    assert load_dataset(toy).test[0].load_mask() is None
+    (toy / "covisible/1x/val").mkdir(parents=True)
+    Image.new("L", (WIDTH, HEIGHT)).save(toy / f"covisible/1x/val/{ID}.png")  # of no test picture
+    assert load_dataset(toy).test[0].load_mask() is None
+
+
 def json_file(name: str, **fields: Any) -> Change:
     return lambda folder, _: edit(folder / f"{name}.json", **fields)
 
@@ -202,8 +257,8 @@ def entry(**fields: Any) -> Change:
     return change
 
 
-def picture(size: tuple[int, int], mode: str = "RGB") -> Change:
-    return lambda folder, _: Image.new(mode, size).save(folder / f"rgb/1x/{ID}.png")
+def picture(size: tuple[int, int], mode: str = "RGB", file: str = f"rgb/1x/{ID}.png") -> Change:
+    return lambda folder, _: Image.new(mode, size).save(folder / file)
 
 
 def array(name: str, value: Any) -> Change:
@@ -211,6 +266,7 @@ def array(name: str, value: Any) -> Change:
 
 
 CAMERA = f"camera/{ID}"
+MASK = f"covisible/1x/val/{TEST_ID}.png"
 BAD: dict[str, tuple[Change, list[str]]] = {
     "no scene": (gone("scene.json"), ["scene.json", "does not exist"]),
     "no metadata": (gone("metadata.json"), ["metadata.json", "does not exist"]),
@@ -254,6 +310,14 @@ BAD: dict[str, tuple[Change, list[str]]] = {
     "sizes mixed": (picture((32, 24)), [f"{ID}.png", "32x24", "64x48"]),
     "16 bit": (picture((64, 48), "I;16"), [f"{ID}.png", "8 bits"]),
     "picture of text": (text(f"rgb/1x/{ID}.png", "hello"), [f"{ID}.png", "not a readable picture"]),
+    "mask absent": (
+        json_file("dataset", train_ids=["left_000000"], val_ids=[ID, TEST_ID]),
+        [f"covisible/1x/val/{ID}.png does not exist", "1 of 2 test pictures", "remove"],
+    ),
+    "mask of text": (text(MASK, "hello"), [MASK, "not a readable picture"]),
+    "mask of other proportions": (picture((64, 64), "L", MASK), [MASK, "64x64", "64x48", f"camera/{TEST_ID}.json"]),
+    "mask of 16 bit": (picture((64, 48), "I;16", MASK), [MASK, "8 bits"]),
+    "mask of nothing": (picture((64, 48), "L", MASK), [MASK, "no white pixel", "nothing to measure", "remove"]),
     "points of text": (text("points.npy", "hello"), ["points.npy", "NumPy array"]),
     "points of objects": (array("points.npy", np.array([{}])), ["points.npy", "NumPy array"]),
     "points of 2": (array("points.npy", np.zeros((5, 2))), ["points.npy", "(N, 3)", "(5, 2)"]),

@@ -38,13 +38,14 @@ def captures(device: Device, tmp_path_factory: pytest.TempPathFactory) -> dict[s
 
 
 def opened(folder: Path, file: Path, damaged: bytes) -> None:
-    """Open the capture, and its first and last picture, while one of its files is damaged."""
+    """Open the capture, its first and last picture, and a test picture with its mask, while one file is damaged."""
     good = file.read_bytes()
     file.write_bytes(damaged)
     try:
         found = refused_or(lambda: load_dataset(folder))
-        for view in (found.train[0], found.train[-1]) if found else ():
+        for view in (found.train[0], found.train[-1], found.test[0]) if found else ():
             refused_or(view.load)
+            refused_or(view.load_mask)
             assert np.isfinite(view.camera.T_cam_world).all()
         if found and found.cloud is not None:
             assert np.isfinite(found.cloud.points).all()
@@ -69,6 +70,13 @@ def test_sparse_models(captures: dict[str, Path], suffix: str, name: str, edits:
 def test_arrays(captures: dict[str, Path], edits: ByteEdits) -> None:
     file = captures["neu3d"] / "poses_bounds.npy"
     opened(captures["neu3d"], file, edit_bytes(file.read_bytes(), edits, head=130))
+
+
+@fuzzed()
+@given(byte_edits([b"IHDR", b"IDAT", b"PLTE", b"tRNS", b"\0\0\xff\xff"]))
+def test_masks(captures: dict[str, Path], edits: ByteEdits) -> None:
+    file = captures["nerfies"] / "covisible/1x/val/left_000004.png"
+    opened(captures["nerfies"], file, edit_bytes(file.read_bytes(), edits, head=60))
 
 
 @fuzzed()

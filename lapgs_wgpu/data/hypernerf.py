@@ -1,4 +1,4 @@
-"""Captures in the layout of nerfies and HyperNeRF: scene, dataset and metadata.json, camera/, rgb/ and points.npy.
+"""Captures in the layout of nerfies and HyperNeRF: scene, dataset and metadata.json, camera/, rgb/, points.npy; masks.
 
 docs/data.md says what each file holds and what is done with it. Everything but the pixels is checked at opening.
 """
@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 
 from lapgs_wgpu.data.cloud import check_cloud, find_cloud, points_in_view, read_cloud
+from lapgs_wgpu.data.covisible import check_mask, find_masks, read_mask
 from lapgs_wgpu.data.fields import finite, kind, read_json, required, vector
 from lapgs_wgpu.data.lens import LARGEST_ZOOM, Lens, read_straight
-from lapgs_wgpu.data.pictures import check_pictures, check_proportions, shrunk
+from lapgs_wgpu.data.pictures import check_pictures, check_proportions, factor_folders, shrunk
 from lapgs_wgpu.data.poses import LARGEST_ENTRY, Placement, check_focal, check_rotation, fitting, world_to_camera
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.errors import InputError
@@ -58,10 +59,14 @@ def load_hypernerf(folder: str | Path, *, image_size: int | None = None) -> Data
         cameras[name], lenses[name] = _read_camera(folder / "camera" / f"{name}.json")
     rgb, stored = _picture_folder(folder / "rgb", used, image_size)
     size = shrunk(stored, image_size)
+    masks = find_masks(folder / "covisible", test_ids, rgb.name)
     for name in used:
         camera, lens = cameras[name], lenses[name]
         taken = (camera.width, camera.height)
-        check_proportions(stored, taken, rgb / f"{name}.png", f"image_size of {folder / 'camera' / name}.json")
+        field = f"image_size of {folder / 'camera' / name}.json"
+        check_proportions(stored, taken, rgb / f"{name}.png", field)
+        if name in masks:
+            check_mask(masks[name], taken, field)
         resize = np.diag([stored[0] / taken[0], stored[1] / taken[1], 1.0])
         lenses[name] = Lens(resize @ lens.K, lens.radial, lens.tangential)
         K = lenses[name].pinhole(*stored)
@@ -82,22 +87,21 @@ def load_hypernerf(folder: str | Path, *, image_size: int | None = None) -> Data
     else:
         fit = fitting(points_in_view([cameras[name] for name in train_ids], depths[0], depths[1], PROBES, 0))
 
-    def views(split: str, names: Sequence[str]) -> tuple[View, ...]:
-        return tuple(
-            View(
-                name=f"{split}_{index:03d}",
-                camera=fit.camera(cameras[name]).resized(*size),
-                time=times[name],
-                source=str(rgb / f"{name}.png"),
-                pixels=partial(read_straight, rgb / f"{name}.png", lenses[name], cameras[name].K, stored, size),
-            )
-            for index, name in enumerate(names)
+    def view(name: str, split: str, index: int) -> View:
+        shape = (lenses[name], cameras[name].K, stored, size)
+        return View(
+            name=f"{split}_{index:03d}",
+            camera=fit.camera(cameras[name]).resized(*size),
+            time=times[name],
+            source=str(rgb / f"{name}.png"),
+            pixels=partial(read_straight, rgb / f"{name}.png", *shape),
+            mask=partial(read_mask, masks[name], *shape) if name in masks else None,
         )
 
     return Dataset(
         folder.resolve().name,
-        views("train", train_ids),
-        views("test", test_ids),
+        tuple(view(name, "train", index) for index, name in enumerate(train_ids)),
+        tuple(view(name, "test", index) for index, name in enumerate(test_ids)),
         cloud=None if cloud is None else cloud.moved(fit),
         depths=(depths[0] * fit.scale, depths[1] * fit.scale),
         placement=placement.then(fit),
@@ -184,26 +188,23 @@ def _read_camera(path: Path) -> tuple[Camera, Lens]:
 
 def _picture_folder(rgb: Path, names: Sequence[str], image_size: int | None) -> tuple[Path, tuple[int, int]]:
     """The folder rgb/Nx that suits the wanted size best, and the size of its pictures, all of which are there."""
-    factors = sorted(
-        int(match[1]) for child in rgb.glob("*x") if (match := re.fullmatch(r"([1-9]\d{0,3})x", child.name))
-    )
-    if not factors:
+    folders = factor_folders(rgb)
+    if not folders:
         raise InputError(f"{rgb} holds no folder 1x, 2x, ... of pictures, {NEEDED}.")
-    best: tuple[int, int] | None = None
-    for factor in factors:  # from the largest pictures on
-        first = rgb / f"{factor}x" / f"{names[0]}.png"
+    best: Path | None = None
+    for folder in folders:  # from the largest pictures on
+        first = folder / f"{names[0]}.png"
         if first.is_file():
             longer = max(check_pictures([first], whole=False))
             if best is None or (image_size is not None and longer >= image_size):
-                best = (factor, longer)
+                best = folder
     if best is None:
-        raise InputError(f"{rgb / f'{factors[0]}x' / names[0]}.png does not exist, but dataset.json names {names[0]}.")
-    folder = rgb / f"{best[0]}x"
-    paths = [folder / f"{name}.png" for name in names]
+        raise InputError(f"{folders[0] / names[0]}.png does not exist, but dataset.json names {names[0]}.")
+    paths = [best / f"{name}.png" for name in names]
     for name, path in zip(names, paths, strict=True):
         if not path.is_file():
             raise InputError(f"{path} does not exist, but dataset.json names {name}.")
-    return folder, check_pictures(paths)
+    return best, check_pictures(paths)
 
 
 def _object(path: Path, needs: str) -> dict[str, Any]:

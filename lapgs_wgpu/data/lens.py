@@ -106,6 +106,11 @@ def read_straight(
     picture = decode(path)
     if picture.size != stored:
         raise InputError(f"{path} is {picture.size[0]}x{picture.size[1]} pixels now and was {stored[0]}x{stored[1]}.")
+    return straightened(picture, lens, K, size)
+
+
+def straightened(picture: Image.Image, lens: Lens, K: Array, size: tuple[int, int]) -> NDArray[np.uint8]:
+    """An RGB or RGBA picture that `lens` took, for the pinhole camera K of its size and then shrunk to `size`."""
     if not lens.is_pinhole:
         picture = Image.fromarray(lens.straighten(np.asarray(picture), K))
     return shrink(picture, size)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import struct
 import zlib
 from pathlib import Path
@@ -85,6 +86,12 @@ def shrunk(stored: tuple[int, int], image_size: int | None) -> tuple[int, int]:
         return stored
     width, height = (max(1, math.floor(side * image_size / longer + 0.5)) for side in stored)
     return width, height
+
+
+def factor_folders(folder: Path) -> list[Path]:
+    """The folders 1x, 2x, ... in a folder, by number: nerfies' layout of the same pictures at 1 / N of their size."""
+    found = [child for child in folder.glob("*x") if re.fullmatch(r"[1-9]\d{0,3}x", child.name)]
+    return sorted(found, key=lambda child: int(child.name[:-1]))
 
 
 def check_proportions(stored: tuple[int, int], expected: tuple[int, int], picture: str | Path, camera: str) -> None:
