@@ -1,4 +1,5 @@
 // Encodes points: two features a level, interpolated between the corners of the cell in which a point lies.
+#import common/bfloat16
 #import common/hashgrid
 #import common/index
 
@@ -8,7 +9,11 @@
 #table 2 points: vec4<f32>
 #table 3 features: vec2<f32>
 // the table, or its slices
-@group(0) @binding(4) var<storage, read_write> encoding: array<f32>;         // (N, 2 x levels of the grid)
+#ifdef BFLOAT16
+@group(0) @binding(4) var<storage, read_write> encoding: array<u32>;         // (N, all levels), two features in each
+#else
+@group(0) @binding(4) var<storage, read_write> encoding: array<f32>;         // (N, 2 x all levels)
+#endif
 
 const LANES = 64u;
 const LANE_POINTS = 8u;   // so that a level's description is loaded once for several points
@@ -42,9 +47,13 @@ fn main(
 #unroll c $CORNERS
             sum += cell.weight[$c] * features_at(first + cell.index[$c]);
 #end
-            let at = 2u * (i * grid.all_levels + level.place.z);
-            encoding[at] = sum.x;
-            encoding[at + 1u] = sum.y;
+            let at = i * grid.all_levels + level.place.z;
+#ifdef BFLOAT16
+            encoding[at] = pack_bfloat16(sum);
+#else
+            encoding[2u * at] = sum.x;
+            encoding[2u * at + 1u] = sum.y;
+#endif
         }
     }
 }

@@ -2,6 +2,7 @@
 // last bit on every run:
 // LANE_LEVELS, for devices of few wide cores: a lane owns a level and adds the points in their order.
 // Otherwise: a lane owns a point and adds in 64-bit fixed point, whose sum does not depend on the order.
+#import common/bfloat16
 #import common/hashgrid
 #import common/index
 
@@ -9,8 +10,20 @@
 @group(0) @binding(1) var<storage, read> levels: array<Level>;
 // (N, 4): x, y, z, -
 #table 2 points: vec4<f32>
-// (N, levels of the grid)
+// (N, all levels)
+#ifdef BFLOAT16
+#table 3 d_encoding: u32
+
+fn gradient_at(i: u32) -> vec2<f32> {
+    return unpack_bfloat16(d_encoding_at(i));
+}
+#else
 #table 3 d_encoding: vec2<f32>
+
+fn gradient_at(i: u32) -> vec2<f32> {
+    return d_encoding_at(i);
+}
+#endif
 
 fn first_entry(level: Level) -> u32 {
 #ifdef SLICED
@@ -32,7 +45,7 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>) {
     let first = first_entry(level);
     for (var i = grid.first_point; i < grid.last_point; i++) {
         let cell = find_cell(unit_point(points_at(i).xyz, grid), level);
-        let gradient = d_encoding_at(i * grid.all_levels + level.place.z);
+        let gradient = gradient_at(i * grid.all_levels + level.place.z);
 #unroll c $CORNERS
         d_features[first + cell.index[$c]] += cell.weight[$c] * gradient;
 #end
@@ -70,7 +83,7 @@ fn main(
     let level = levels[number / blocks];
     let first = first_entry(level);
     let cell = find_cell(unit_point(points_at(i).xyz, grid), level);
-    let gradient = d_encoding_at(i * grid.all_levels + level.place.z);
+    let gradient = gradient_at(i * grid.all_levels + level.place.z);
 #unroll c $CORNERS
     add_fixed(4u * (first + cell.index[$c]), cell.weight[$c] * gradient.x);
     add_fixed(4u * (first + cell.index[$c]) + 2u, cell.weight[$c] * gradient.y);

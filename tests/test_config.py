@@ -125,7 +125,7 @@ def test_base_gives_what_a_file_leaves_out(tmp_path: Path) -> None:
 def test_presets_are_complete_without_defaults_in_the_code() -> None:
     """But for what the config.toml of older runs lacks, which is off then."""
     optional = {field.name for field in dataclasses.fields(Config) if field.default is not dataclasses.MISSING}
-    assert optional == {"exposure"}
+    assert optional == {"exposure", "precision"}
     assert not ExposureConfig().enabled
 
 
@@ -166,6 +166,11 @@ def test_unknown_preset(preset: str, message: str) -> None:
         ('base = "dnerf"\n[density]\nsplit = "adaptiv"', "must be plain or adaptive, got 'adaptiv'; did you mean"),
         ('base = "dnerf"\n[density]\nneighbours = 0', "neighbours must be at least 1"),
         ('base = "dnerf"\n[density]\nsplit_quantile = 1.1', "split_quantile between 0 and 1, got 10, 0.5 and 1.1"),
+        ('base = "dnerf"\nprecision = "float16"', "precision must be float32 or bfloat16, got 'float16'"),
+        (
+            'base = "dnerf"\nprecision = "bfloat16"\n[field]\nkind = "mlp"',
+            "for the fields grid4d and laplacian, not for mlp",
+        ),
         ("[data]\nsize = 1", 'start the file with base = "dnerf"'),
         ("base = 3", "base must be the name of a preset, got 3"),
         ('base = "nerf"', "there is no preset 'nerf'; did you mean dnerf?"),

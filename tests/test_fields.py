@@ -15,6 +15,7 @@ from lapgs_wgpu.motion.hash_encoder import encode_reference
 from lapgs_wgpu.motion.hashgrid import HashConfig
 from lapgs_wgpu.motion.hexplane_field import HexPlaneField
 from lapgs_wgpu.motion.laplacian import LaplacianMotion, TimeMotion
+from lapgs_wgpu.motion.layers import last_product
 from lapgs_wgpu.motion.mlp_field import MlpField, octaves
 from lapgs_wgpu.motion.scene import Field, make_field
 
@@ -177,6 +178,48 @@ def test_the_decoder_written_out(device: Device, depth: int) -> None:
     ]
     for found, wanted in zip(parts(field(POINTS, t, DYNAMICS)), expected, strict=True):
         torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-4)
+
+
+def test_bfloat16_rounds_features_and_not_what_the_heads_give(device: Device) -> None:
+    """With gradients alone: without, and after the training, everything is float32."""
+    field, d = grid_field(device, replace(OURS, width=256)), DYNAMICS.clone().requires_grad_()
+    found, grads = {}, {}
+    for precision in (torch.float32, torch.bfloat16):
+        field.precision = precision
+        move = field(POINTS, 0.3, d, NEARBY)
+        assert {part.dtype for part in parts(move)} == {torch.float32}
+        learnt = [*field.parameters(), d]
+        grads[precision] = torch.autograd.grad(sum(part.square().sum() for part in parts(move)), learnt)
+        found[precision] = torch.cat([part.detach() for part in parts(move) if part.ndim == 2], dim=1)
+        with torch.no_grad():
+            still = field(POINTS, 0.3, d)
+        assert torch.equal(still.translation, found[torch.float32][:, 4:7])
+    exact, rounded = found[torch.float32], found[torch.bfloat16]
+    assert 1e-5 < float((rounded - exact).norm() / exact.norm()) < 4e-3  # a bfloat16 has 8 bits: 2e-3 on average
+    assert not torch.equal(rounded, rounded.bfloat16().float())
+    for a, b in zip(grads[torch.bfloat16], grads[torch.float32], strict=True):
+        assert a.dtype == torch.float32
+        assert float((a - b).norm() / b.norm()) < 0.05
+
+
+@pytest.mark.parametrize("shape", [(0, 5, 3), (1, 1, 1), (300, 64, 17)])
+def test_last_product(shape: tuple[int, int, int]) -> None:
+    count, inputs, outputs = shape
+    generator = torch.Generator().manual_seed(0)
+    x, weight, bias, d_output = (
+        torch.randn(size, generator=generator)
+        for size in ((count, inputs), (outputs, inputs), (outputs,), (count, outputs))
+    )
+    rounded = x.bfloat16().requires_grad_()
+    leaves = [rounded, weight.requires_grad_(), bias.requires_grad_()]
+    found = last_product(*leaves)
+    wide = [leaf.detach().double().requires_grad_() for leaf in leaves]
+    expected = nn.functional.linear(*wide)
+    torch.testing.assert_close(found.double(), expected, rtol=1e-5, atol=1e-5)
+    gradients = torch.autograd.grad(found, leaves, d_output), torch.autograd.grad(expected, wide, d_output.double())
+    for got, exact, leaf in zip(*gradients, leaves, strict=True):
+        assert got.dtype == leaf.dtype
+        assert float((got.double() - exact).norm()) <= 0.01 * float(exact.norm())
 
 
 def test_ablations_of_the_field(device: Device) -> None:

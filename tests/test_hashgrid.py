@@ -40,6 +40,11 @@ def make_grids(*names: str) -> list[HashGrid]:
     return grids
 
 
+def apart(grids: list[HashGrid]) -> list[list[HashGrid]]:
+    """Each with an encoding of its own."""
+    return [[grid] for grid in grids]
+
+
 def random_points(count: int, seed: int = 0) -> Tensor:
     """Most of them inside the box; some outside, some on its faces, edges and corners."""
     generator = torch.Generator().manual_seed(seed)
@@ -125,7 +130,7 @@ def test_the_twin_is_the_loop(name: str) -> None:
 @both_shapes
 @pytest.mark.parametrize("name", GRIDS)
 def test_each_kind_of_grid(device: Device, lane_levels: bool, name: str) -> None:
-    encoder = HashEncoder(device, make_grids(name), BOUND, lane_levels=lane_levels)
+    encoder = HashEncoder(device, apart(make_grids(name)), BOUND, lane_levels=lane_levels)
     for time in (0.0, 0.37, 1.0):
         check(encoder, random_points(700), time)
 
@@ -133,21 +138,54 @@ def test_each_kind_of_grid(device: Device, lane_levels: bool, name: str) -> None
 @both_shapes
 def test_several_grids_at_once(device: Device, lane_levels: bool) -> None:
     grids = make_grids("dense", "sliced", "sliced and hashed", "too large to slice", "hashed")
-    encoder = HashEncoder(device, grids, BOUND, lane_levels=lane_levels)
+    encoder = HashEncoder(device, apart(grids), BOUND, lane_levels=lane_levels)
     check(encoder, random_points(2000), 0.613)
+
+
+@both_shapes
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_grids_of_a_group_lie_beside_one_another(device: Device, lane_levels: bool, dtype: torch.dtype) -> None:
+    names = ("dense", "sliced", "sliced and hashed", "hashed")
+    points, time = random_points(900), 0.613
+    encodings, upstream, gradients = [], [], []
+    for group in (apart, lambda grids: [grids[:1], grids[1:]]):
+        encoder = HashEncoder(device, group(make_grids(*names)), BOUND, lane_levels=lane_levels)
+        found = encoder(points, time, dtype)
+        encodings.append(torch.cat(found, dim=1))
+        generator = torch.Generator().manual_seed(0)
+        upstream = list(torch.randn(encodings[0].shape, generator=generator).split([e.shape[1] for e in found], dim=1))
+        gradients.append(encoder.backward([(points, time)], [d.to(dtype) for d in upstream]))
+    assert torch.equal(*encodings)
+    for a, b in zip(*gradients, strict=True):
+        assert torch.equal(a, b) if lane_levels else relative(a, b) < 1e-6  # fixed point has a scale for each group
+
+
+@both_shapes
+def test_bfloat16_is_float32_rounded(device: Device, lane_levels: bool) -> None:
+    """To the nearest, ties to even, as torch does it; and gradients in bfloat16 are taken as they are."""
+    encoder = HashEncoder(device, [make_grids("dense", "sliced"), make_grids("hashed")], BOUND, lane_levels=lane_levels)
+    places = [(random_points(700), 0.37), (random_points(70, seed=1), 0.9)]
+    full, rounded = encoder.encode_all(places), encoder.encode_all(places, torch.bfloat16)
+    for a, b in zip(full, rounded, strict=True):
+        assert all(torch.equal(y, x.bfloat16()) for x, y in zip(a, b, strict=True))
+    d_rounded = [torch.randn(e.shape).bfloat16() for encodings in rounded for e in encodings]
+    expected = encoder.backward(places, [d.float() for d in d_rounded])
+    for found, exact in zip(encoder.backward(places, d_rounded), expected, strict=True):
+        assert found.dtype == torch.float32
+        assert torch.equal(found, exact)
 
 
 @both_shapes
 @pytest.mark.parametrize("count", [0, 1, 2, 63, 64, 65, 511, 512, 513])
 def test_any_number_of_points(device: Device, lane_levels: bool, count: int) -> None:
-    encoder = HashEncoder(device, make_grids("sliced", "hashed"), BOUND, lane_levels=lane_levels)
+    encoder = HashEncoder(device, apart(make_grids("sliced", "hashed")), BOUND, lane_levels=lane_levels)
     check(encoder, 0.5 * random_points(count, seed=count), 0.9)
 
 
 @both_shapes
 def test_all_points_in_one_cell(device: Device, lane_levels: bool) -> None:
     """A few entries take the sums of all points."""
-    encoder = HashEncoder(device, make_grids("sliced", "hashed"), BOUND, lane_levels=lane_levels)
+    encoder = HashEncoder(device, apart(make_grids("sliced", "hashed")), BOUND, lane_levels=lane_levels)
     check(encoder, 0.2 + 1e-4 * random_points(3000), 0.5)
 
 
@@ -175,7 +213,7 @@ def corner(*place: int, resolution: int) -> list[float]:
 def test_entries_are_met_at_the_corners(device: Device) -> None:
     grid = make_grids("one level")[0]
     points = torch.tensor([corner(x, y, z, resolution=7) for z in range(7) for y in range(7) for x in range(7)])
-    (found,) = HashEncoder(device, [grid], BOUND)(points.clamp(-BOUND, BOUND))
+    (found,) = HashEncoder(device, [[grid]], BOUND)(points.clamp(-BOUND, BOUND))
     torch.testing.assert_close(found, grid.table.detach(), rtol=0, atol=1e-4)
 
 
@@ -189,7 +227,7 @@ def test_interpolation_is_smooth_and_keeps_constants(device: Device) -> None:
     share = torch.linspace(0, 1, 11)
     x = BOUND * (2 * (2 + share) / 6 - 1)
     points = torch.stack([x, 0.3 * torch.ones(11), -0.7 * torch.ones(11)], dim=1)
-    (found,) = HashEncoder(device, [grid], BOUND)(points)
+    (found,) = HashEncoder(device, [[grid]], BOUND)(points)
     torch.testing.assert_close(found[:, 0], torch.ones(11), rtol=0, atol=1e-6)
     torch.testing.assert_close(found[:, 1], share * share * (3 - 2 * share), rtol=0, atol=1e-5)
 
@@ -198,7 +236,7 @@ def test_interpolation_is_smooth_and_keeps_constants(device: Device) -> None:
 def test_nothing_outside_the_box(device: Device, lane_levels: bool) -> None:
     inside = 0.9 * BOUND * (torch.rand(50, 3) - 0.5)
     beyond = torch.tensor([[1.01, 0, 0], [0, -1.01, 0], [0, 0, 5.0], [-3, 3, -3], [math.nan, 0, 0], [0, math.inf, 0]])
-    encoder = HashEncoder(device, make_grids("dense", "sliced"), BOUND, lane_levels=lane_levels)
+    encoder = HashEncoder(device, apart(make_grids("dense", "sliced")), BOUND, lane_levels=lane_levels)
     alone = run(encoder, inside, 0.3)
     found, gradients = run(encoder, torch.cat([inside, BOUND * beyond]), 0.3)
     # "sliced" covers x, y and time alone: z may be anything there.
@@ -227,12 +265,12 @@ def test_levels_grow_from_the_coarsest_to_the_finest() -> None:
 def test_the_same_bits_again(device: Device, lane_levels: bool) -> None:
     names = ("sliced", "sliced and hashed", "too large to slice", "hashed")
     points = random_points(3000)
-    encoder = HashEncoder(device, make_grids(*names), BOUND, lane_levels=lane_levels)
+    encoder = HashEncoder(device, apart(make_grids(*names)), BOUND, lane_levels=lane_levels)
     first = run(encoder, points, 0.4)
     run(encoder, random_points(5000, seed=1), 0.9)
     run(encoder, random_points(10, seed=2), 0.0)
     again = run(encoder, points, 0.4)
-    fresh = run(HashEncoder(device, make_grids(*names), BOUND, lane_levels=lane_levels), points, 0.4)
+    fresh = run(HashEncoder(device, apart(make_grids(*names)), BOUND, lane_levels=lane_levels), points, 0.4)
     for other in (again, fresh):
         for a, b in zip((*first[0], *first[1]), (*other[0], *other[1]), strict=True):
             assert torch.equal(a, b)
@@ -242,7 +280,7 @@ def test_fixed_point_does_not_depend_on_the_order(device: Device) -> None:
     """Integer sums: the points in any order give the same bits, which sums of floats do not."""
     points, names = random_points(3000), ("hashed", "sliced")
     order = torch.randperm(3000, generator=torch.Generator().manual_seed(0))
-    encoder = HashEncoder(device, make_grids(*names), BOUND, lane_levels=False)
+    encoder = HashEncoder(device, apart(make_grids(*names)), BOUND, lane_levels=False)
     upstream = [torch.randn(3000, grid.features, generator=torch.Generator().manual_seed(1)) for grid in encoder.grids]
     forwards = encoder.backward([(points, 0.4)], upstream)
     shuffled = encoder.backward([(points[order], 0.4)], [d[order] for d in upstream])
@@ -255,7 +293,7 @@ def test_both_shapes_agree(device: Device) -> None:
     names = ("sliced", "too large to slice", "hashed")
     results = []
     for lane_levels in (True, False):
-        encoder = HashEncoder(device, make_grids(*names), BOUND, lane_levels=lane_levels)
+        encoder = HashEncoder(device, apart(make_grids(*names)), BOUND, lane_levels=lane_levels)
         results.append(run(encoder, random_points(3000), 0.4))
     (encodings, gradients), (other_encodings, other_gradients) = results
     assert all(torch.equal(a, b) for a, b in zip(encodings, other_encodings, strict=True))
@@ -266,7 +304,7 @@ def test_both_shapes_agree(device: Device) -> None:
 @pytest.mark.parametrize("size", [1e-30, 1e-12, 1.0, 1e12, 1e30])
 @both_shapes
 def test_gradients_of_any_size(device: Device, lane_levels: bool, size: float) -> None:
-    encoder = HashEncoder(device, make_grids("sliced", "hashed"), BOUND, lane_levels=lane_levels)
+    encoder = HashEncoder(device, apart(make_grids("sliced", "hashed")), BOUND, lane_levels=lane_levels)
     points = random_points(500)
     upstream = [torch.randn(500, grid.features, generator=torch.Generator().manual_seed(1)) for grid in encoder.grids]
     plain = encoder.backward([(points, 0.4)], upstream)
@@ -279,7 +317,7 @@ def test_gradients_of_any_size(device: Device, lane_levels: bool, size: float) -
 @both_shapes
 def test_small_gradients_beside_large_ones(device: Device, lane_levels: bool) -> None:
     """Seven orders of magnitude between points: the small ones are still there, each in its own entries."""
-    encoder = HashEncoder(device, make_grids("dense"), BOUND, lane_levels=lane_levels)
+    encoder = HashEncoder(device, apart(make_grids("dense")), BOUND, lane_levels=lane_levels)
     points = torch.tensor([[-1.4, -1.4, -1.4], [1.4, 1.4, 1.4]])
     upstream = torch.ones(2, encoder.grids[0].features)
     upstream[1] *= 1e-7
@@ -296,7 +334,7 @@ def test_small_gradients_beside_large_ones(device: Device, lane_levels: bool) ->
 
 def test_gradients_reach_the_tables_and_not_the_points(device: Device) -> None:
     grids = make_grids("dense", "sliced")
-    encoder = HashEncoder(device, grids, BOUND)
+    encoder = HashEncoder(device, apart(grids), BOUND)
     points = random_points(100).requires_grad_()
     first, _ = encoder(points, 0.2)
     first.square().sum().backward()
@@ -309,7 +347,7 @@ def test_gradients_reach_the_tables_and_not_the_points(device: Device) -> None:
 
 def test_tables_are_read_anew_at_each_call(device: Device) -> None:
     grids = make_grids("dense", "sliced")
-    encoder = HashEncoder(device, grids, BOUND)
+    encoder = HashEncoder(device, apart(grids), BOUND)
     points = random_points(50)
     before = [e.detach() for e in encoder(points, 0.2)]
     with torch.no_grad():

@@ -89,6 +89,7 @@ def test_the_fingerprint_is_that_of_the_training_not_of_the_machine(tmp_path: Pa
     assert fingerprint(dataclasses.replace(config, seed=1)) != fingerprint(config)
     exposed = dataclasses.replace(config.exposure, enabled=True)
     assert fingerprint(dataclasses.replace(config, exposure=exposed)) != fingerprint(config)
+    assert fingerprint(dataclasses.replace(config, precision="bfloat16")) != fingerprint(config)
     (tmp_path / "again.toml").write_text(write_toml(dataclasses.asdict(config)))
     assert fingerprint(load_config(str(tmp_path / "again.toml"))) == fingerprint(config)
 

@@ -152,7 +152,7 @@ class DeviceField:
         table.write(entries)
         with Commands(self._device) as commands:
             for number, block in enumerate(self._blocks):
-                encoder.encode(commands, number, block.points, block.count, 0.0, [table], [block.still])
+                encoder.encode(commands, number, block.points, block.count, 0.0, [table], block.still)
 
     # Weights ---------------------------------------------------------------------------------------------------------
 
@@ -216,7 +216,7 @@ class DeviceField:
                     block.count,
                     self._config.grid_time(t),
                     self._tables,
-                    [block.moving] * len(self._tables),
+                    block.moving,
                 )
                 uniform = self._pool.constant(
                     f"deform {number}",

@@ -34,11 +34,11 @@ class _Part:
 
 class DeviceEncoder:
     """Records the passes that encode points with several grids at once. Axes and levels are fixed; tables (entries, 2),
-    points (N, 4) and encodings (N, 2 x levels) are float32 buffers that come with each call.
+    points (N, 4) and the encoding are float32 buffers that come with each call.
 
     lane_levels: the shape of the backward pass for CPU devices; otherwise fixed-point atomics.
-    row, column: all encodings are parts of the rows of one buffer (N, row), one grid's behind the other's from `column`
-    on; both even. None: a buffer for each grid.
+    row, column: the encoding's rows have `row` floats, in which the features of one grid lie behind those of the other
+    from `column` on; both even. By default the rows hold just these.
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class DeviceEncoder:
         self.device, self.grids, self.bound = device, list(grids), bound
         self.pool = BufferPool(device)
         self.lane_levels = device.is_cpu if lane_levels is None else lane_levels
-        self._rows = [grid.features if row is None else row for grid in grids]
+        self._row = sum(grid.features for grid in grids) if row is None else row
         self._parts: list[_Part] = []
         for number, grid in enumerate(grids):
             sliced = grid.sliced
@@ -62,8 +62,7 @@ class DeviceEncoder:
             for chosen, cut in ((sliced, True), (direct, False)):
                 if chosen:
                     self._parts.append(self._part(number, chosen, cut, column // 2))
-            if row is not None:
-                column += grid.features
+            column += grid.features
 
     def _part(self, number: int, chosen: list[int], sliced: bool, first_pair: int) -> _Part:
         levels = self.grids[number].levels
@@ -90,7 +89,7 @@ class DeviceEncoder:
             "Grid",
             points=points,
             levels=part.count,
-            all_levels=self._rows[part.grid] // 2,
+            all_levels=self._row // 2,
             first_point=first,
             last_point=min(points, first + _DISPATCH_POINTS),
             axes=(*axes, 0),
@@ -112,11 +111,13 @@ class DeviceEncoder:
         n: int,
         time: float,
         tables: list[Buffer],
-        outputs: list[Buffer],
+        encoding: Buffer,
+        *,
+        bfloat16: bool = False,
     ) -> None:
         """Encode n points at a time in [0, 1]; outside the box [-bound, bound]^3 features are zero.
 
-        number: tells apart the calls that are submitted together.
+        number: tells apart the calls that are submitted together. bfloat16: of the encoding, instead of float32.
         """
         for part in self._parts:
             uniform = self._uniform(part, number, n, time)
@@ -134,13 +135,13 @@ class DeviceEncoder:
                 )
                 features = slices
             commands.dispatch(
-                Kernel.get(self.device, "hashgrid", **defines),
+                Kernel.get(self.device, "hashgrid", **defines, **_rounded(bfloat16)),
                 -(-n // 512) * part.count,
                 grid=uniform,
                 levels=part.levels,
                 points=points,
                 features=features,
-                encoding=outputs[part.grid],
+                encoding=encoding,
             )
 
     def add_gradient(
@@ -151,25 +152,34 @@ class DeviceEncoder:
         n: int,
         time: float,
         fixed_scale: float,
-        d_encodings: list[Buffer],
+        d_encoding: Buffer,
         d_tables: list[Buffer],
+        *,
+        bfloat16: bool = False,
     ) -> None:
-        """Add the gradient of the tables, from that of the encodings. fixed_scale: see `HashEncoder`."""
+        """Add the gradient of the tables, from that of the encoding. fixed_scale: see `HashEncoder`.
+
+        bfloat16: of `d_encoding`, instead of float32.
+        """
         for part in self._parts:
             inputs = {
                 "grid": self._uniform(part, number, n, time, fixed_scale),
                 "levels": part.levels,
                 "points": points,
-                "d_encoding": d_encodings[part.grid],
+                "d_encoding": d_encoding,
             }
             target = d_tables[part.grid]
             if part.sliced:
                 target = self.pool.get(f"d_slices {part.grid}", 8 * part.entries)
                 commands.clear(target)
+            defines = self._defines(part) | _rounded(bfloat16)
             if self.lane_levels:
-                self._add_lanes(commands, part, number, n, time, inputs, target)
+                kernel = Kernel.get(self.device, "hashgrid_bwd", LANE_LEVELS=1, **defines)
+                for first in range(0, n, _DISPATCH_POINTS):
+                    inputs["grid"] = self._uniform(part, number, n, time, first=first)
+                    commands.dispatch(kernel, -(-part.count // 8), **inputs, d_features=target)
             else:
-                self._add_fixed(commands, part, n, inputs, target)
+                self._add_fixed(commands, part, n, Kernel.get(self.device, "hashgrid_bwd", **defines), inputs, target)
             if part.sliced:
                 commands.dispatch_grid(
                     Kernel.get(self.device, "hashgrid_slice_bwd", **self._defines(part)),
@@ -180,18 +190,15 @@ class DeviceEncoder:
                     d_features=d_tables[part.grid],
                 )
 
-    def _add_lanes(
-        self, commands: Commands, part: _Part, number: int, n: int, time: float, inputs: dict[str, Buffer], out: Buffer
+    def _add_fixed(
+        self, commands: Commands, part: _Part, n: int, kernel: Kernel, inputs: dict[str, Buffer], out: Buffer
     ) -> None:
-        kernel = Kernel.get(self.device, "hashgrid_bwd", LANE_LEVELS=1, **self._defines(part))
-        for first in range(0, n, _DISPATCH_POINTS):
-            inputs["grid"] = self._uniform(part, number, n, time, first=first)
-            commands.dispatch(kernel, -(-part.count // 8), **inputs, d_features=out)
-
-    def _add_fixed(self, commands: Commands, part: _Part, n: int, inputs: dict[str, Buffer], out: Buffer) -> None:
         fixed = self.pool.get(f"d_fixed {part.grid} {part.sliced}", 2 * out.nbytes)
         commands.clear(fixed)
-        kernel = Kernel.get(self.device, "hashgrid_bwd", **self._defines(part))
         commands.dispatch(kernel, -(-n // 64) * part.count, **inputs, d_fixed=fixed)
         unfix = Kernel.get(self.device, "hashgrid_unfix", **self._defines(part))
         commands.dispatch(unfix, -(-out.nbytes // 256), grid=inputs["grid"], d_fixed=fixed, d_features=out)
+
+
+def _rounded(bfloat16: bool) -> dict[str, int]:
+    return {"BFLOAT16": 1} if bfloat16 else {}

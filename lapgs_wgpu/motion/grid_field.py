@@ -9,7 +9,7 @@ from ..gpu.device import Device
 from .field import APPEARANCE_SCALE, GEOMETRY, TEMPORAL_AXES, Deformation, FieldConfig, Nearby
 from .hash_encoder import HashEncoder, HashGrid
 from .laplacian import LaplacianMotion, TimeMotion
-from .layers import linear, zero_head
+from .layers import last_product, linear, product, zero_head
 
 
 class GridField(nn.Module):
@@ -18,6 +18,9 @@ class GridField(nn.Module):
     laplacian: each Gaussian's dynamics attribute stands beside its temporal features (eq. 8), the Laplacian motion is
     added before the heads (eq. 6), and an appearance head compensates for changes of brightness. Without these, or
     with all of them at zero, it is grid4d.
+
+    precision: torch.float32 or torch.bfloat16, of features and of the decoder's products where gradients are wanted;
+    the parameters, what the heads give and everything without gradients are float32.
     """
 
     def __init__(self, config: FieldConfig, device: Device, seed: int) -> None:
@@ -26,10 +29,12 @@ class GridField(nn.Module):
         ours = config.kind == "laplacian"
         width = config.width
         self.config = config
+        self.precision = torch.float32
         self.static_grid = HashGrid(config.static, (0, 1, 2), generator)
         axes = TEMPORAL_AXES if config.temporal_hash else ()
         self.temporal_grids = nn.ModuleList(HashGrid(config.temporal, three, generator) for three in axes)
-        self._encoder = HashEncoder(device, self.grids, config.bound)
+        groups = [[self.static_grid], self.grids[1:]] if axes else [[self.static_grid]]
+        self._encoder = HashEncoder(device, groups, config.bound)
         static, temporal = self.static_grid.features, sum(grid.features for grid in self.grids[1:])
         self.spatial = linear(static, width, generator)
         self.temporal = linear(max(1, config.dynamics_size + temporal), width, generator)
@@ -63,13 +68,10 @@ class GridField(nn.Module):
         places = [(means, self.config.grid_time(t))]
         if nearby is not None:
             places.append((means[nearby.rows] + nearby.offsets, self.config.grid_time(nearby.time)))
-        encoded = self._encoder.encode_all(places)
+        encoded = self._encoder.encode_all(places, self.precision if torch.is_grad_enabled() else torch.float32)
         static, *temporal = encoded[0]
-        if self.config.dynamics_size and dynamics is not None:
-            temporal = [dynamics, *temporal]
-        temporal = temporal or [static.new_zeros((len(means), 1))]
-        gate = 2.0 * torch.sigmoid(self.spatial(static)) - 1.0
-        gated = torch.relu(self.temporal(torch.cat(temporal, dim=1))) * gate
+        gate = torch.tanh(product(static, 0.5 * self.spatial.weight, 0.5 * self.spatial.bias))  # 2 sigmoid(x) - 1
+        gated = torch.relu(self._moving(dynamics, temporal, static)) * gate
         geometry, look = self._decode(gated, static, t)
         turn, shift, d_quats, d_scales = geometry.split(GEOMETRY, dim=1)
         rotation = nn.functional.normalize(turn + turn.new_tensor([1.0, 0.0, 0.0, 0.0]), dim=1)
@@ -83,17 +85,30 @@ class GridField(nn.Module):
             _smoothness(encoded[0], encoded[1], nearby) if nearby is not None else None,
         )
 
+    def _moving(self, dynamics: Tensor | None, temporal: list[Tensor], static: Tensor) -> Tensor:
+        """(N, width) of the dynamics attribute and the temporal features, as far as the field has them, side by side.
+        They are multiplied apart, since putting them together first would copy the largest tensors of all."""
+        size = self.config.dynamics_size
+        bias, weight = self.temporal.bias, self.temporal.weight
+        if size and dynamics is not None:
+            moving = product(dynamics.to(static.dtype), weight[:, :size], bias)
+        else:
+            moving = bias.to(static.dtype).expand(len(static), -1)
+        for features in temporal:
+            moving = torch.addmm(moving, features, weight[:, size:].to(features.dtype).T)
+        return moving
+
     def _decode(self, gated: Tensor, static: Tensor, t: float) -> tuple[Tensor, Tensor | None]:
         """Outputs of the geometry heads (N, 14), and of the appearance head, if there is one."""
         motion = self.motion(static, t) if self.motion is not None else None
         if len(self.hidden):
             fused = gated if motion is None else gated + motion.features()
-            look = None if self.appearance is None else APPEARANCE_SCALE * self.appearance(gated)
-            return self.heads(self.hidden(fused)), look
+            look = None if self.appearance is None else APPEARANCE_SCALE * self.appearance(gated.float())
+            return self.heads(self.hidden(fused.float())), look
         # All heads read the same features: one product, whose gradient goes through (N, width) once.
         heads = [self.heads] if self.appearance is None else [self.heads, self.appearance]
         weight, bias = torch.cat([head.weight for head in heads]), torch.cat([head.bias for head in heads])
-        outputs = nn.functional.linear(gated, weight, bias)
+        outputs = last_product(gated, weight, bias)
         geometry, look = outputs[:, : sum(GEOMETRY)], outputs[:, sum(GEOMETRY) :]
         if motion is not None:
             geometry = geometry + motion.through(self.heads.weight)
@@ -110,7 +125,7 @@ class GridField(nn.Module):
 
 def _smoothness(here: list[Tensor], there: list[Tensor], nearby: Nearby) -> Tensor:
     """Grid4D's smoothness loss: the mean squared distance between the features of near places, static and temporal."""
-    far = [(b - a[nearby.rows]).square().sum() for a, b in zip(here, there, strict=True)]
+    far = [(b - a[nearby.rows]).float().square().sum() for a, b in zip(here, there, strict=True)]
     count = max(1, len(nearby.rows))
     temporal = torch.stack(far[1:]).sum() if len(far) > 1 else far[0].new_zeros(())
     return (nearby.static_weight * far[0] + nearby.temporal_weight * temporal) / count

@@ -10,13 +10,14 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ..gpu.buffer import Buffer, Request, read_all
+from ..gpu.buffer import Buffer, BufferPool, Request, read_all
 from ..gpu.device import Device
 from ..gpu.kernel import Commands
 from .device_encoder import DeviceEncoder
 from .hashgrid import TIME, GridShape, HashConfig
 
 Place = tuple[Tensor, float]  # points (N, 3), world units, and a time in [0, 1]
+_NUMPY = {torch.float32: "float32", torch.bfloat16: "int16"}  # as which numpy, which has no bfloat16, takes them
 
 
 class HashGrid(GridShape, nn.Module):
@@ -29,96 +30,119 @@ class HashGrid(GridShape, nn.Module):
 
 
 class HashEncoder:
-    """Encodes points with several grids at once on one device. axes and levels are fixed; tables come with each call.
+    """Encodes points with several grids at once on one device. Axes and levels are fixed; tables come with each call.
 
+    groups: of grids whose features lie beside one another in one encoding.
     lane_levels: the shape of the backward pass for CPU devices; otherwise fixed-point atomics.
     """
 
-    def __init__(self, device: Device, grids: list[HashGrid], bound: float, *, lane_levels: bool | None = None) -> None:
-        self.grids = grids
-        self._encoder = DeviceEncoder(device, grids, bound, lane_levels=lane_levels)
-        self._pool = self._encoder.pool
+    def __init__(
+        self,
+        device: Device,
+        groups: Sequence[Sequence[HashGrid]],
+        bound: float,
+        *,
+        lane_levels: bool | None = None,
+    ) -> None:
+        self.groups = [list(group) for group in groups]
+        self._encoders = [DeviceEncoder(device, group, bound, lane_levels=lane_levels) for group in self.groups]
+        self._pool = BufferPool(device)
 
-    def __call__(self, points: Tensor, time: float = 0.0) -> list[Tensor]:
-        """Encode points (N, 3), world units, at a time in [0, 1]: one (N, 2 x levels) tensor a grid.
+    @property
+    def grids(self) -> list[HashGrid]:
+        """Those of all groups."""
+        return [grid for group in self.groups for grid in group]
+
+    def __call__(self, points: Tensor, time: float = 0.0, dtype: torch.dtype = torch.float32) -> list[Tensor]:
+        """Encode points (N, 3), world units, at a time in [0, 1]: an (N, features) tensor for each group.
 
         Differentiable in the tables, not in the points (the encoder sees sg[mean]). A point outside the box
-        [-bound, bound]^3 has zero features.
+        [-bound, bound]^3 has zero features. dtype: of the encodings and of their gradients, float32 or bfloat16, to
+        which sums in float32 are rounded; the tables and their gradients are float32.
         """
-        return self.encode_all([(points, time)])[0]
+        return self.encode_all([(points, time)], dtype)[0]
 
-    def encode_all(self, places: Sequence[Place]) -> list[list[Tensor]]:
+    def encode_all(self, places: Sequence[Place], dtype: torch.dtype = torch.float32) -> list[list[Tensor]]:
         """Encode several sets of points, each at its own time, and exchange the tables with the device only once."""
         detached = [(points.detach(), time) for points, time in places]
-        outputs = _Encode.apply(self, detached, *[grid.table for grid in self.grids])
-        count = len(self.grids)
+        outputs = _Encode.apply(self, detached, dtype, *[grid.table for grid in self.grids])
+        count = len(self.groups)
         return [list(outputs[i : i + count]) for i in range(0, len(outputs), count)]
 
-    def encode(self, places: Sequence[Place], tables: Sequence[Tensor]) -> list[Tensor]:
-        """The forward pass without autograd: the encodings of the first place, grid by grid, then of the second, ..."""
+    def encode(self, places: Sequence[Place], dtype: torch.dtype, tables: Sequence[Tensor]) -> list[Tensor]:
+        """The forward pass without autograd: the encodings of the first place, group by group, then of the second."""
         # Everything is written before anything is submitted: a buffer can only be mapped while the device rests.
-        table_buffers = [self._upload(f"table {i}", table) for i, table in enumerate(tables)]
+        table_buffers = self._by_group([self._upload(f"table {i}", table) for i, table in enumerate(tables)])
         point_buffers = [self._points(number, points) for number, (points, _) in enumerate(places)]
         requests: list[Request] = []
-        with Commands(self._encoder.device) as commands:
+        with Commands(self._pool.device) as commands:
             for number, (points, time) in enumerate(places):
-                n = len(points)
-                outputs = [
-                    self._pool.get(f"encoding {number} {i}", 4 * n * grid.features) for i, grid in enumerate(self.grids)
-                ]
-                requests += [(b, "float32", (n, g.features), 0) for b, g in zip(outputs, self.grids, strict=True)]
-                if n:
-                    self._encoder.encode(commands, number, point_buffers[number], n, time, table_buffers, outputs)
+                for i, encoder in enumerate(self._encoders):
+                    shape = len(points), sum(grid.features for grid in encoder.grids)
+                    buffer = self._pool.get(f"encoding {number} {i}", dtype.itemsize * math.prod(shape))
+                    requests.append((buffer, _NUMPY[dtype], shape, 0))
+                    if len(points):
+                        mine = point_buffers[number], len(points), time, table_buffers[i], buffer
+                        encoder.encode(commands, number, *mine, bfloat16=dtype == torch.bfloat16)
         device = places[0][0].device
-        return [torch.from_numpy(array).to(device) for array in read_all(requests)]
+        return [torch.from_numpy(array).view(dtype).to(device) for array in read_all(requests)]
 
     def backward(self, places: Sequence[Place], d_encodings: Sequence[Tensor]) -> list[Tensor]:
         """The gradients of the tables, from those of the encodings in the order of `encode`."""
-        count = len(self.grids)
         d_tables = [self._pool.get(f"d_table {i}", 8 * len(grid.table)) for i, grid in enumerate(self.grids)]
         point_buffers = [self._points(number, points) for number, (points, _) in enumerate(places)]
-        d_buffers = [self._upload(f"d_encoding {i // count} {i % count}", d) for i, d in enumerate(d_encodings)]
-        with Commands(self._encoder.device) as commands:
+        d_buffers = [self._upload(f"d_encoding {i}", d) for i, d in enumerate(d_encodings)]
+        with Commands(self._pool.device) as commands:
             for buffer in d_tables:
                 commands.clear(buffer)
             for number, (points, time) in enumerate(places):
-                if len(points):
-                    mine = slice(number * count, (number + 1) * count)
-                    scale = 1.0 if self._encoder.lane_levels else _fixed_scale(d_encodings[mine], len(points))
-                    buffer, n = point_buffers[number], len(points)
-                    self._encoder.add_gradient(commands, number, buffer, n, time, scale, d_buffers[mine], d_tables)
+                for i, encoder in enumerate(self._encoders):
+                    if len(points) == 0:
+                        continue
+                    at = number * len(self._encoders) + i
+                    gradient = d_encodings[at]
+                    scale = 1.0 if encoder.lane_levels else _fixed_scale(gradient)
+                    mine = point_buffers[number], len(points), time, scale, d_buffers[at], self._by_group(d_tables)[i]
+                    encoder.add_gradient(commands, number, *mine, bfloat16=gradient.dtype == torch.bfloat16)
         arrays = read_all([(b, "float32", tuple(g.table.shape), 0) for b, g in zip(d_tables, self.grids, strict=True)])
         return [torch.from_numpy(array).to(places[0][0].device) for array in arrays]
 
+    def _by_group(self, of_grids: Sequence[Buffer]) -> list[list[Buffer]]:
+        rest = iter(of_grids)
+        return [[next(rest) for _ in group] for group in self.groups]
+
     def _points(self, number: int, points: Tensor) -> Buffer:
-        return self._upload(f"points {number}", torch.nn.functional.pad(points, (0, 1)))
+        return self._upload(f"points {number}", torch.nn.functional.pad(points.float(), (0, 1)))
 
     def _upload(self, name: str, tensor: Tensor) -> Buffer:
-        array = tensor.detach().to("cpu", torch.float32).contiguous().numpy()
+        words = tensor.detach().to("cpu").contiguous()
+        array = words.view(torch.int16).numpy() if words.dtype == torch.bfloat16 else words.float().numpy()
         buffer = self._pool.get(name, array.nbytes)
         buffer.write(array)
         return buffer
 
 
-def _fixed_scale(gradients: Sequence[Tensor], points: int) -> float:
+def _fixed_scale(gradient: Tensor) -> float:
     """By which gradients are multiplied in fixed point: the largest sum that can occur stays below 2^61."""
-    largest = max(float(gradient.abs().max()) for gradient in gradients)
+    largest = float(gradient.abs().max())
     if largest == math.inf:
         return 1.0
-    return 2.0 ** min(120, math.floor(61 - math.log2(max(largest, 1e-30) * points)))
+    return 2.0 ** min(120, math.floor(61 - math.log2(max(largest, 1e-30) * len(gradient))))
 
 
 class _Encode(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, encoder: HashEncoder, places: Sequence[Place], *tables: Tensor) -> tuple[Tensor, ...]:
+    def forward(
+        ctx: Any, encoder: HashEncoder, places: Sequence[Place], dtype: torch.dtype, *tables: Tensor
+    ) -> tuple[Tensor, ...]:
         ctx.encoder, ctx.times = encoder, [time for _, time in places]
         ctx.save_for_backward(*[points for points, _ in places])
-        return tuple(encoder.encode(places, tables))
+        return tuple(encoder.encode(places, dtype, tables))
 
     @staticmethod
     def backward(ctx: Any, *d_encodings: Tensor) -> tuple[Tensor | None, ...]:
         places = list(zip(ctx.saved_tensors, ctx.times, strict=True))
-        return (None, None, *ctx.encoder.backward(places, d_encodings))
+        return (None, None, None, *ctx.encoder.backward(places, d_encodings))
 
 
 def encode_reference(grid: HashGrid, table: Tensor, points: Tensor, time: float, bound: float) -> Tensor:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from .layers import linear
+from .layers import last_product, linear, product
 
 VARIANCE_FLOOR = 1e-4
 VARIANCE_SPREAD = (
@@ -26,11 +26,11 @@ class Factors(NamedTuple):
 
     def features(self) -> Tensor:
         """(N, W)."""
-        return self.inner @ self.matrix.T + self.bias
+        return product(self.inner, self.matrix, self.bias)
 
     def through(self, weight: Tensor) -> Tensor:
         """features() @ weight.T for a weight of (outputs, W), in fewer operations."""
-        return self.inner @ (weight @ self.matrix).T + weight @ self.bias
+        return last_product(self.inner, weight @ self.matrix, weight @ self.bias)
 
 
 class LaplacianMotion(nn.Module):
@@ -70,7 +70,8 @@ class LaplacianMotion(nn.Module):
     def forward(self, static: Tensor, t: float) -> Factors:
         """A_L of Gaussians with the static features H_s (N, inputs)."""
         series = self.series(t)
-        return Factors(torch.relu(self.first(static)), series[:, None] * self.second.weight, series * self.second.bias)
+        inner = torch.relu(product(static, self.first.weight, self.first.bias))
+        return Factors(inner, series[:, None] * self.second.weight, series * self.second.bias)
 
     def amplitudes(self) -> Tensor:
         """(K,) |c_k|, the root of the mean over the channels of alpha^2 + beta^2; without gradient."""
@@ -104,5 +105,5 @@ class TimeMotion(nn.Module):
     def forward(self, static: Tensor, t: float) -> Factors:
         """The features of Gaussians with the static features H_s (N, inputs)."""
         time = static.new_full((len(static), 1), t)
-        inner = torch.relu(self.first(torch.cat([static, time], dim=1)))
+        inner = torch.relu(product(torch.cat([static, time], dim=1), self.first.weight, self.first.bias))
         return Factors(inner, self.second.weight, self.second.bias)

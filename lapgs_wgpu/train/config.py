@@ -18,6 +18,7 @@ from lapgs_wgpu.motion.hashgrid import option
 
 Background = Literal["black", "white", "random"]
 Split = Literal["plain", "adaptive"]
+Precision = Literal["float32", "bfloat16"]
 
 
 def described(text: str, default: Any = dataclasses.MISSING) -> Any:
@@ -259,3 +260,14 @@ class Config:
     smoothness: SmoothnessConfig
     seed: int = described("of every random draw")
     exposure: ExposureConfig = dataclasses.field(default=ExposureConfig())
+    precision: Precision = described(
+        "of the field's features, and of its decoder's products and their gradients; bfloat16 is faster on processors "
+        "that have instructions for it; parameters, sums, images and everything after the training are float32",
+        "float32",
+    )
+
+    def __post_init__(self) -> None:
+        if self.precision != "float32" and self.field.kind not in ("grid4d", "laplacian"):
+            raise ValueError(
+                f"precision {self.precision} is for the fields grid4d and laplacian, not for {self.field.kind}"
+            )

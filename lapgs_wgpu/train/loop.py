@@ -10,6 +10,8 @@ from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from types import FrameType
 
+import torch
+
 from lapgs_wgpu.data.sanity import check_times
 from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.errors import DeviceError, InputError, NumericalError
@@ -63,7 +65,7 @@ def train(
     check_times(dataset, moving=config.field.kind != "static")
     if ranks.first:
         check_run_folder(out, overwrite=overwrite)
-        for warning in dataset.warnings:
+        for warning in (*dataset.warnings, *_slow(config)):
             print(f"warning: {warning}", file=sys.stderr, flush=True)
     keep_freed_memory()
     training = Training(config, dataset, device or open_device(), ranks)
@@ -100,6 +102,14 @@ def resume(
                 reason = f"{type(error).__name__}: {error}".splitlines()[0]
                 raise InputError(f"{out}: its state and its config.toml do not belong together ({reason}).") from error
         return _run(training, dataset, out, watch) if ranks.first else _assist(training)
+
+
+def _slow(config: Config) -> list[str]:
+    """A sentence where the precision costs time instead of saving it."""
+    features: dict[str, object] = getattr(torch.cpu, "get_capabilities", dict)()  # not in every torch
+    if config.precision == "float32" or not features or any(features[name] for name in features if "bf16" in name):
+        return []
+    return ["this processor has no instructions for bfloat16: the training will be faster with --precision float32."]
 
 
 def _assist(training: Training) -> Scene4D:

@@ -122,6 +122,8 @@ def fingerprint(config: Config) -> str:
         del values["schedule"]["batch"]
     if not config.exposure.enabled:
         del values["exposure"]
+    if config.precision == "float32":
+        del values["precision"]
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:16]
 
 

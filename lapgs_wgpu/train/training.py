@@ -17,6 +17,7 @@ from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.dynamics import dynamics_loss
 from lapgs_wgpu.motion.field import Nearby
+from lapgs_wgpu.motion.grid_field import GridField
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.config import Config, PointsConfig, SmoothnessConfig
 from lapgs_wgpu.train.densify import Statistics, densify, reset_opacities
@@ -74,6 +75,8 @@ class Training:
 
     def _start(self, dataset: Dataset) -> None:
         config, scene = self.config, self.scene
+        if isinstance(scene.field, GridField):
+            scene.field.precision = getattr(torch, config.precision)
         groups = scene.field.parameter_groups() if scene.field else {}
         self._optimiser = Optimiser(scene.parameters, groups, config.rates.schedules())
         self._frequencies = None

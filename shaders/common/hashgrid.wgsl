@@ -4,14 +4,14 @@
 struct Level {
     scale: vec4<f32>,        // cells along each axis, not rounded
     resolution: vec4<u32>,   // entries along each axis; w: how many entries the level has
-    place: vec4<u32>,        // first entry of the level in its table (x) and in the slices (y); z: its number in the grid;
+    place: vec4<u32>,        // first entry of the level in its table (x) and in the slices (y); z: its number in the row;
                              // w: 1 where it is dense (on the device the product of the resolution may overflow)
 }
 
 struct Grid {
     points: u32,
     levels: u32,             // in `levels`
-    all_levels: u32,         // of the grid: an encoding has two features for each
+    all_levels: u32,         // in a row of the encoding, which has two features for each
     first_point: u32,        // the points that a dispatch takes, where one does not take all
     last_point: u32,         // one past
     axes: vec4<u32>,         // which of x, y, z, t (0 to 3) each axis of the grid is

@@ -41,7 +41,7 @@ def bench_encoder(
 ) -> EncoderReport:
     """Encode the means with all four grids of the field."""
     grids = GridField(config, device, seed=0).grids
-    encoder = HashEncoder(device, grids, config.bound)
+    encoder = HashEncoder(device, [[grid] for grid in grids], config.bound)
     tables = [grid.table for grid in grids]
     points = torch.from_numpy(means)
     generator = torch.Generator().manual_seed(0)

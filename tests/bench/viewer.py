@@ -124,4 +124,3 @@ def print_viewer(report: ViewerReport) -> None:
     for name, timing in rows.items():
         if timing is not None:
             print(f"  {name:46s}{timing.median:8.1f}{timing.minimum:9.1f}  ms (median, least)")
-
