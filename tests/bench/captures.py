@@ -1,7 +1,7 @@
 """Memory and waiting times of a training on many videos: python tests/bench/captures.py (its --help has the options).
 
 Writes a capture in Neu3D's layout into a temporary folder (and the pictures that its videos are unpacked into), draws
-pictures from it as a training does, at the pace of a fast device, and removes it all.
+pictures from it as a training does, at the pace of a fast device, or trains on it, and removes it all.
 """
 
 from __future__ import annotations
@@ -11,6 +11,8 @@ import json
 import os
 import resource
 import shutil
+import subprocess
+import sys
 import tempfile
 import threading
 import time
@@ -48,13 +50,45 @@ def write_capture(folder: Path, cameras: int, frames: int, width: int, height: i
         shutil.copyfile(folder / "cam00.mp4", folder / f"cam{camera:02d}.mp4")
 
 
-def megabytes() -> float:
-    """Peak resident memory of this process."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+def megabytes(who: int = resource.RUSAGE_SELF) -> float:
+    """Peak resident memory of this process, or of its largest child."""
+    return resource.getrusage(who).ru_maxrss / 1e3
+
+
+def unpack(folder: Path, films: int) -> None:
+    """Unpack so many of the films, which are copies of one; the pictures of the others become links to the first's."""
+    from lapgs_wgpu.data import load_dataset
+    from lapgs_wgpu.data.video import Video
+
+    data = load_dataset(folder)
+    first, *others = sorted(folder.glob("*.mp4"))
+    size = data.test[0].camera.width, data.test[0].camera.height
+    for video in (first, *others[: films - 1]):
+        Video(video).read(0, size)
+    for video in others[films - 1 :]:
+        if not Video(video)._folder(size).is_dir():
+            shutil.copytree(Video(first)._folder(size), Video(video)._folder(size), copy_function=os.link)
+
+
+def train(folder: Path, out: Path, cache_gb: float, still: int, moving: int) -> dict[str, float]:
+    """Peak memory of a training with the preset `neu3d`: its first steps without motion, which are fast and fill the
+    caches, then some with, and the evaluation."""
+    schedule = ["--steps", str(still + moving), "--schedule.warm_up", str(still), "--cache-gb", str(cache_gb)]
+    command = [sys.executable, "-m", "lapgs_wgpu.cli", "neu3d", "--data", str(folder), "--out", str(out), *schedule]
+    start = time.perf_counter()
+    subprocess.run(command, check=True)
+    metrics = json.loads((out / "metrics.json").read_text())
+    return {
+        "steps": still + moving,
+        "test views": len(metrics["views"]),
+        "Gaussians": metrics["gaussians"],
+        "seconds": time.perf_counter() - start,
+        "peak memory, MB": megabytes(resource.RUSAGE_CHILDREN),
+    }
 
 
 def draw(folder: Path, cache_gb: float, steps: int, step: float) -> dict[str, float]:
-    """Unpack every video, then draw `steps` pictures, each followed by `step` seconds of sleep for the training."""
+    """Draw `steps` pictures, each followed by `step` seconds of sleep for the training. Unpacks what is not yet."""
     import torch
 
     from lapgs_wgpu.data import load_dataset
@@ -113,6 +147,8 @@ def main() -> None:
     parser.add_argument("--cache-gb", type=float, default=1.0)
     parser.add_argument("--steps", type=int, default=600)
     parser.add_argument("--step", type=float, default=0.1, help="seconds that the device is busy in each step")
+    parser.add_argument("--unpack", type=int, metavar="N", help="only so many films; they are copies of one")
+    parser.add_argument("--train", type=int, nargs=2, metavar=("STILL", "MOVING"), help="train so many steps instead")
     parser.add_argument("--keep", type=Path, help="a folder in which the capture is written, or is already, and stays")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
@@ -121,7 +157,13 @@ def main() -> None:
         if not (home / "capture").is_dir():
             (home / "capture").mkdir(parents=True)
             write_capture(home / "capture", given.cameras, given.frames, *given.size)
-        print(json.dumps(draw(home / "capture", given.cache_gb, given.steps, given.step), indent=1))
+        if given.unpack:
+            unpack(home / "capture", given.unpack)
+        if given.train:
+            report = train(home / "capture", home / "run", given.cache_gb, *given.train)
+        else:
+            report = draw(home / "capture", given.cache_gb, given.steps, given.step)
+        print(json.dumps(report, indent=1))
 
 
 if __name__ == "__main__":
