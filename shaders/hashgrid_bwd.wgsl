@@ -43,7 +43,7 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>) {
     }
     let level = levels[id.x];
     let first = first_entry(level);
-    for (var i = grid.first_point; i < grid.last_point; i++) {
+    for (var i = 0u; i < grid.points; i++) {
         let cell = find_cell(unit_point(points_at(i).xyz, grid), level);
         let gradient = gradient_at(i * grid.all_levels + level.place.z);
 #unroll c $CORNERS

@@ -161,6 +161,21 @@ def test_grids_of_a_group_lie_beside_one_another(device: Device, lane_levels: bo
 
 
 @both_shapes
+def test_rows_beyond_a_binding_are_taken_in_blocks(
+    device: Device, lane_levels: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    groups = [make_grids("dense", "sliced"), make_grids("hashed")]
+    encoder, points = HashEncoder(device, groups, BOUND, lane_levels=lane_levels), random_points(40_000)
+    whole = run(encoder, points, 0.37)
+    largest = 16 * max(grid.entries for grid in encoder.grids)  # of what cannot be cut, in 64 bits
+    assert 40_000 * 4 * whole[0][0].shape[1] > 2 * largest
+    monkeypatch.setattr(Device, "max_binding", largest)
+    parts = run(encoder, points, 0.37)
+    for a, b in zip((*whole[0], *whole[1]), (*parts[0], *parts[1]), strict=True):
+        assert torch.equal(a, b)
+
+
+@both_shapes
 def test_bfloat16_is_float32_rounded(device: Device, lane_levels: bool) -> None:
     """To the nearest, ties to even, as torch does it; and gradients in bfloat16 are taken as they are."""
     encoder = HashEncoder(device, [make_grids("dense", "sliced"), make_grids("hashed")], BOUND, lane_levels=lane_levels)

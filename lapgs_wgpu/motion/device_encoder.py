@@ -6,7 +6,7 @@ the planes around it for each point.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +16,8 @@ from ..gpu.device import Device
 from ..gpu.kernel import Commands, Kernel
 from .hashgrid import GridShape
 
-_DISPATCH_POINTS = 1 << 15  # with lane_levels: Mesa's software driver ends a shader's loops after 65,535 rounds
+_LOOP_POINTS = 1 << 15  # with lane_levels: Mesa's software driver ends a shader's loops after 65,535 rounds
+_ALIGNED = 64  # so many rows are a multiple of 256 bytes, at which a binding may begin, whatever the row
 _LEVEL_WORDS = 12  # common/hashgrid.wgsl: struct Level
 
 
@@ -80,28 +81,30 @@ class DeviceEncoder:
         buffer.write(words)
         return _Part(number, sliced, len(chosen), buffer, largest, slices if sliced else 0)
 
-    def _uniform(
-        self, part: _Part, number: int, points: int, time: float, fixed_scale: float = 1.0, first: int = 0
-    ) -> Buffer:
-        """What the kernels are told of the place of this number; all places of a call are submitted at once."""
-        axes = self.grids[part.grid].axes
+    def _uniform(self, part: _Part, place: str, points: int, time: float, fixed_scale: float = 1.0) -> Buffer:
+        """What the kernels are told of a block of points; all blocks of all places are submitted at once."""
         content = Kernel.get(self.device, "hashgrid_slice", SLICED=1, CORNERS=4).uniform(
             "Grid",
             points=points,
             levels=part.count,
             all_levels=self._row // 2,
-            first_point=first,
-            last_point=min(points, first + _DISPATCH_POINTS),
-            axes=(*axes, 0),
+            axes=(*self.grids[part.grid].axes, 0),
             time=time,
             bound=self.bound,
             fixed_scale=fixed_scale,
         )
-        return self.pool.constant(f"grid {part.grid} {part.sliced} place {number} from {first}", content)
+        return self.pool.constant(f"grid {part.grid} {part.sliced} place {place}", content)
 
     @staticmethod
     def _defines(part: _Part) -> dict[str, int]:
         return {"SLICED": 1, "CORNERS": 4} if part.sliced else {"CORNERS": 8}
+
+    def _blocks(self, n: int, row: int, most: int | None = None) -> Iterator[tuple[int, int]]:
+        """First and number of the points that a dispatch takes, at most so many, whose rows of so many bytes fit into a
+        binding."""
+        size = self.device.max_binding // max(row, 1) // _ALIGNED * _ALIGNED
+        size = size if most is None else min(size, most)
+        return ((first, min(size, n - first)) for first in range(0, n, size))
 
     def encode(
         self,
@@ -119,30 +122,33 @@ class DeviceEncoder:
 
         number: tells apart the calls that are submitted together. bfloat16: of the encoding, instead of float32.
         """
+        sources = []
         for part in self._parts:
-            uniform = self._uniform(part, number, n, time)
-            features = tables[part.grid]
-            defines = self._defines(part)
+            source = tables[part.grid]
             if part.sliced:
                 slices = self.pool.get(f"slices {part.grid}", 8 * part.entries)
                 commands.dispatch_grid(
-                    Kernel.get(self.device, "hashgrid_slice", **defines),
+                    Kernel.get(self.device, "hashgrid_slice", **self._defines(part)),
                     (-(-part.cells // 64), part.count),
-                    grid=uniform,
+                    grid=self._uniform(part, f"{number}", n, time),
                     levels=part.levels,
-                    features=features,
+                    features=source,
                     slices=slices,
                 )
-                features = slices
-            commands.dispatch(
-                Kernel.get(self.device, "hashgrid", **defines, **_rounded(bfloat16)),
-                -(-n // 512) * part.count,
-                grid=uniform,
-                levels=part.levels,
-                points=points,
-                features=features,
-                encoding=encoding,
-            )
+                source = slices
+            sources.append(source)
+        row = self._row * (2 if bfloat16 else 4)
+        for first, count in self._blocks(n, row):
+            for part, source in zip(self._parts, sources, strict=True):
+                commands.dispatch(
+                    Kernel.get(self.device, "hashgrid", **self._defines(part), **_rounded(bfloat16)),
+                    -(-count // 512) * part.count,
+                    grid=self._uniform(part, f"{number} from {first}", count, time),
+                    levels=part.levels,
+                    points=_rows(points, 16, first, count),
+                    features=source,
+                    encoding=_rows(encoding, row, first, count),
+                )
 
     def add_gradient(
         self,
@@ -161,43 +167,51 @@ class DeviceEncoder:
 
         bfloat16: of `d_encoding`, instead of float32.
         """
+        targets, sums = [], []
         for part in self._parts:
-            inputs = {
-                "grid": self._uniform(part, number, n, time, fixed_scale),
-                "levels": part.levels,
-                "points": points,
-                "d_encoding": d_encoding,
-            }
             target = d_tables[part.grid]
             if part.sliced:
                 target = self.pool.get(f"d_slices {part.grid}", 8 * part.entries)
                 commands.clear(target)
-            defines = self._defines(part) | _rounded(bfloat16)
-            if self.lane_levels:
-                kernel = Kernel.get(self.device, "hashgrid_bwd", LANE_LEVELS=1, **defines)
-                for first in range(0, n, _DISPATCH_POINTS):
-                    inputs["grid"] = self._uniform(part, number, n, time, first=first)
-                    commands.dispatch(kernel, -(-part.count // 8), **inputs, d_features=target)
-            else:
-                self._add_fixed(commands, part, n, Kernel.get(self.device, "hashgrid_bwd", **defines), inputs, target)
+            targets.append(target)
+            if not self.lane_levels:
+                target = self.pool.get(f"d_fixed {part.grid} {part.sliced}", 2 * target.nbytes)
+                commands.clear(target)
+            sums.append(target)
+
+        shape = {"LANE_LEVELS": 1} if self.lane_levels else {}
+        row = self._row * (2 if bfloat16 else 4)
+        for first, count in self._blocks(n, row, _LOOP_POINTS if self.lane_levels else None):
+            for part, target in zip(self._parts, sums, strict=True):
+                commands.dispatch(
+                    Kernel.get(self.device, "hashgrid_bwd", **self._defines(part), **shape, **_rounded(bfloat16)),
+                    -(-part.count // 8) if self.lane_levels else -(-count // 64) * part.count,
+                    grid=self._uniform(part, f"{number} from {first}", count, time, fixed_scale),
+                    levels=part.levels,
+                    points=_rows(points, 16, first, count),
+                    d_encoding=_rows(d_encoding, row, first, count),
+                    **{"d_features" if self.lane_levels else "d_fixed": target},
+                )
+
+        for part, target, fixed in zip(self._parts, targets, sums, strict=True):
+            uniform = self._uniform(part, f"{number}", n, time, fixed_scale)
+            if not self.lane_levels:
+                unfix = Kernel.get(self.device, "hashgrid_unfix", **self._defines(part))
+                commands.dispatch(unfix, -(-target.nbytes // 256), grid=uniform, d_fixed=fixed, d_features=target)
             if part.sliced:
                 commands.dispatch_grid(
                     Kernel.get(self.device, "hashgrid_slice_bwd", **self._defines(part)),
                     (-(-part.cells // 64), part.count),
-                    grid=inputs["grid"],
+                    grid=uniform,
                     levels=part.levels,
                     d_slices=target,
                     d_features=d_tables[part.grid],
                 )
 
-    def _add_fixed(
-        self, commands: Commands, part: _Part, n: int, kernel: Kernel, inputs: dict[str, Buffer], out: Buffer
-    ) -> None:
-        fixed = self.pool.get(f"d_fixed {part.grid} {part.sliced}", 2 * out.nbytes)
-        commands.clear(fixed)
-        commands.dispatch(kernel, -(-n // 64) * part.count, **inputs, d_fixed=fixed)
-        unfix = Kernel.get(self.device, "hashgrid_unfix", **self._defines(part))
-        commands.dispatch(unfix, -(-out.nbytes // 256), grid=inputs["grid"], d_fixed=fixed, d_features=out)
+
+def _rows(buffer: Buffer, row: int, first: int, count: int) -> tuple[Buffer, int, int]:
+    """Part of a buffer with rows of so many bytes; no binding may be smaller than 16 bytes."""
+    return buffer, first * row, max(16, count * row)
 
 
 def _rounded(bfloat16: bool) -> dict[str, int]:

@@ -12,8 +12,6 @@ struct Grid {
     points: u32,
     levels: u32,             // in `levels`
     all_levels: u32,         // in a row of the encoding, which has two features for each
-    first_point: u32,        // the points that a dispatch takes, where one does not take all
-    last_point: u32,         // one past
     axes: vec4<u32>,         // which of x, y, z, t (0 to 3) each axis of the grid is
     time: f32,               // in [0, 1]
     bound: f32,              // half side of the box that the grid covers

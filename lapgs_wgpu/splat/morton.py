@@ -1,0 +1,26 @@
+"""An order of Gaussians in which neighbours in space are neighbours in memory.
+
+Passes over the splats of a tile, and over the hash grids' cells, then read from fewer lines of memory: on a CPU device
+the rasteriser's take a seventh less time (docs/results.md).
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+_BITS = 20  # an axis; three of them fit into int64
+
+
+def morton_order(points: Tensor) -> Tensor:
+    """The indices (N,), int64, of points (N, 3) along a Morton curve through their bounding box; equal ones stay in
+    their order."""
+    if len(points) == 0:
+        return torch.zeros(0, dtype=torch.int64)
+    low, high = points.min(dim=0).values, points.max(dim=0).values
+    cells = ((points - low) / (high - low).clamp(min=1e-30) * (2**_BITS - 1)).long()
+    code = torch.zeros(len(points), dtype=torch.int64)
+    for bit in range(_BITS):
+        for axis in range(3):
+            code |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
+    return torch.argsort(code, stable=True)
