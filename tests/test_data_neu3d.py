@@ -368,6 +368,32 @@ def test_a_damaged_video_is_named(clip: Path) -> None:
         load_dataset(clip).train[0].load()
 
 
+def test_found_in_videos(clip: Path) -> None:
+    """By fuzzing: a codec that nobody knows, and names that are no UTF-8."""
+    path = clip / "cam01.mp4"
+    good = path.read_bytes()
+    path.write_bytes(good.replace(b"avc1\0\0\0\0\0\0\0\1", b"xyz1\0\0\0\0\0\0\0\1"))
+    with pytest.raises(InputError, match=r"cam01\.mp4 is in a format that PyAV cannot decode"):
+        load_dataset(clip)
+    assert b"VideoHandler" in good
+    path.write_bytes(good.replace(b"VideoHandler", b"\xed\xa0\x80eoHandler"))
+    assert load_dataset(clip).train[0].load().shape == (HEIGHT, WIDTH, 3)
+
+
+def test_videos_have_bounds(clip: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    recording = video.Video(clip / "cam01.mp4")
+    recording.size = (2 * WIDTH, HEIGHT)
+    with pytest.raises(InputError, match=f"frame 0 has {WIDTH}x{HEIGHT} pixels, and its header says {2 * WIDTH}x"):
+        recording.read(0, (WIDTH, HEIGHT))
+    monkeypatch.setattr(video, "LARGEST_FRAME", WIDTH * HEIGHT - 1)
+    with pytest.raises(InputError, match=r"cam00\.mp4 has 3 frames of 64x48 pixels, and at most 3,071 pixels"):
+        load_dataset(clip)
+    recording = video.Video.__new__(video.Video)
+    recording.path, recording.frames, recording.size = clip / "cam02.mp4", 3, (WIDTH, HEIGHT)
+    with pytest.raises(InputError, match=r"cam02\.mp4"):  # the decoder has the bound, too
+        recording.read(0, (WIDTH, HEIGHT))
+
+
 def test_a_video_of_another_length(device: Device, clip: Path, tmp_path: Path) -> None:
     shutil.copyfile(
         write_neu3d(tmp_path / "b", device, count=2, frames=2, video=True) / "cam01.mp4", clip / "cam02.mp4"

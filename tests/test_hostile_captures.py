@@ -6,6 +6,7 @@ See test_hostile_files.py, which does the same to the other formats.
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +33,7 @@ def captures(device: Device, tmp_path_factory: pytest.TempPathFactory) -> dict[s
         "bin": write_colmap(folder / "bin", device),
         "txt": write_colmap(folder / "txt", device, binary=False),
         "neu3d": write_neu3d(folder / "neu3d", device),
+        "films": write_neu3d(folder / "films", device, count=3, video=True),
         "nerfies": write_nerfies(folder / "nerfies", device),
         "nerfstudio": write_nerfstudio(folder / "nerfstudio", device),
     }
@@ -77,6 +79,21 @@ def test_arrays(captures: dict[str, Path], edits: ByteEdits) -> None:
 def test_masks(captures: dict[str, Path], edits: ByteEdits) -> None:
     file = captures["nerfies"] / "covisible/1x/val/left_000004.png"
     opened(captures["nerfies"], file, edit_bytes(file.read_bytes(), edits, head=60))
+
+
+@fuzzed()
+@given(byte_edits([b"moov", b"stsz", b"stts", b"avcC", b"mdat", b"hev1", b"vp09", b"\0\0\0\x01", b"\0\0\xff\xff"]))
+def test_videos(captures: dict[str, Path], tmp_path_factory: pytest.TempPathFactory, edits: ByteEdits) -> None:
+    """What stands before the frames is at both ends of the file."""
+    file = captures["films"] / "cam01.mp4"
+    data = file.read_bytes()
+    front = len(edits) % 2 == 0
+    damaged = edit_bytes(data if front else data[::-1], edits, head=1500)
+    unpacked = tmp_path_factory.getbasetemp() / "unpacked"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(unpacked))
+        opened(captures["films"], file, damaged if front else damaged[::-1])
+    shutil.rmtree(unpacked, ignore_errors=True)
 
 
 @fuzzed()

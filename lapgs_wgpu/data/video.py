@@ -26,6 +26,7 @@ from lapgs_wgpu.errors import InputError
 # Flags of swscale: bicubic, accurate rounding, chroma interpolated along rows. Its default darkens by 1 or 2 levels.
 EXACT_COLOURS = 0x4 | 0x40000 | 0x2000
 COMPRESSION = 1  # of PNG: the next levels take twice as long for a tenth of the bytes
+LARGEST_FRAME = 8192 * 8192  # pixels; the decoder holds several frames
 WRITERS = min(8, os.cpu_count() or 1)  # threads that shrink and write the frames of the video that is being unpacked
 _unpacking = Lock()  # one video at a time, with all processors: what is under way then has a bound
 
@@ -39,18 +40,23 @@ class Video:
         av = _pyav(path)
         self.path = path
         try:
-            with av.open(str(path)) as file:
+            with av.open(str(path), metadata_errors="replace") as file:
                 if not file.streams.video:
                     raise InputError(f"{path} has no video stream; give the camera's recording.")
                 stream = file.streams.video[0]
+                if stream.codec_context is None:
+                    raise InputError(f"{path} is in a format that PyAV cannot decode; record or convert it to H.264.")
                 self.size = (int(stream.width), int(stream.height))
                 self.frames = stream.frames or sum(packet.size > 0 for packet in file.demux(stream))
         except (av.error.FFmpegError, OSError) as error:
             raise InputError(f"{path} is not a readable video ({error}); copy or record it again.") from None
+        what = f"{path} has {self.frames} frames of {self.size[0]}x{self.size[1]} pixels"
         if self.frames < 1 or min(self.size) < 1:
-            raise InputError(
-                f"{path} has {self.frames} frames of {self.size[0]}x{self.size[1]} pixels; none is usable."
-            )
+            raise InputError(f"{what}; none is usable.")
+        if self.size[0] * self.size[1] > LARGEST_FRAME:
+            raise InputError(f"{what}, and at most {LARGEST_FRAME:,} pixels a frame are allowed; shrink it.")
+        if self.frames > path.stat().st_size:
+            raise InputError(f"{what}, it says, in {path.stat().st_size} bytes; copy it again.")
 
     def read(self, frame: int, size: tuple[int, int]) -> NDArray[np.uint8]:
         """(H, W, 3) RGB of a frame, counted from 0, shrunk to (width, height). From any thread; the first call unpacks
@@ -83,10 +89,19 @@ class Video:
             unfinished = Path(tempfile.mkdtemp(suffix=".partial", dir=folder.parent))
             written: deque[Future[None]] = deque()
             count = 0
-            with ThreadPoolExecutor(WRITERS, thread_name_prefix="unpack") as pool, av.open(str(self.path)) as file:
+            with (
+                ThreadPoolExecutor(WRITERS, thread_name_prefix="unpack") as pool,
+                av.open(str(self.path), metadata_errors="replace") as file,
+            ):
                 stream = file.streams.video[0]
                 stream.thread_type = "AUTO"
+                stream.codec_context.options = {"max_pixels": str(LARGEST_FRAME)}  # whatever the header says
                 for frame in file.decode(stream):
+                    if (frame.width, frame.height) != self.size:
+                        raise InputError(
+                            f"{self.path}: frame {count} has {frame.width}x{frame.height} pixels, and its header says "
+                            f"{self.size[0]}x{self.size[1]}; record it with one size."
+                        )
                     picture = frame.to_ndarray(format="rgb24", interpolation=EXACT_COLOURS)
                     if len(written) == 2 * WRITERS:  # the decoder is ahead; frames must not pile up
                         written.popleft().result()
