@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.motion import grid_field as grid_field_module
 from lapgs_wgpu.motion.field import PLANES, Deformation, FieldConfig, FieldKind, Nearby, PlaneConfig
 from lapgs_wgpu.motion.grid_field import GridField
 from lapgs_wgpu.motion.hash_encoder import encode_reference
@@ -200,6 +201,31 @@ def test_bfloat16_rounds_features_and_not_what_the_heads_give(device: Device) ->
     for a, b in zip(grads[torch.bfloat16], grads[torch.float32], strict=True):
         assert a.dtype == torch.float32
         assert float((a - b).norm() / b.norm()) < 0.05
+
+
+@pytest.mark.parametrize("depth", [0, 1])
+@pytest.mark.parametrize("kind", ["grid4d", "laplacian"])
+def test_many_gaussians_are_decoded_in_blocks(
+    device: Device, kind: FieldKind, depth: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same values and gradients, and of the decoder's activations none is kept for the backward pass."""
+    field = grid_field(device, replace(OURS, kind=kind, depth=depth, width=64))
+    d = DYNAMICS.clone().requires_grad_() if kind == "laplacian" else None
+    learnt = [*field.parameters(), *([] if d is None else [d])]
+    found, kept = [], []
+    for most in (COUNT, COUNT - 1):
+        monkeypatch.setattr(grid_field_module, "_KEPT", most)
+        monkeypatch.setattr(grid_field_module, "_BLOCK", 16)
+        shapes: list[tuple[int, ...]] = []
+        with torch.autograd.graph.saved_tensors_hooks(lambda x, to=shapes: to.append(tuple(x.shape)) or x, lambda x: x):
+            move = field(POINTS, 0.3, d, NEARBY)
+        kept.append(sum(shape[0] in (16, 8, COUNT) and shape[1:] == (64,) for shape in shapes))
+        gradients = torch.autograd.grad(sum(part.square().sum() for part in parts(move)), learnt)
+        found.append([*(part.detach() for part in parts(move)), *gradients])
+    assert kept[0] > 0
+    assert kept[1] == 0
+    for whole, blocks in zip(*found, strict=True):
+        torch.testing.assert_close(blocks, whole, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("shape", [(0, 5, 3), (1, 1, 1), (300, 64, 17)])

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
 
 from ..gpu.device import Device
 from .field import APPEARANCE_SCALE, GEOMETRY, TEMPORAL_AXES, Deformation, FieldConfig, Nearby
 from .hash_encoder import HashEncoder, HashGrid
 from .laplacian import LaplacianMotion, TimeMotion
 from .layers import last_product, linear, product, zero_head
+
+_KEPT = 1 << 16  # Gaussians up to which a step keeps the decoder's activations instead of computing them once more
+_BLOCK = 1 << 14
 
 
 class GridField(nn.Module):
@@ -69,10 +73,8 @@ class GridField(nn.Module):
         if nearby is not None:
             places.append((means[nearby.rows] + nearby.offsets, self.config.grid_time(nearby.time)))
         encoded = self._encoder.encode_all(places, self.precision if torch.is_grad_enabled() else torch.float32)
-        static, *temporal = encoded[0]
-        gate = torch.tanh(product(static, 0.5 * self.spatial.weight, 0.5 * self.spatial.bias))  # 2 sigmoid(x) - 1
-        gated = torch.relu(self._moving(dynamics, temporal, static)) * gate
-        geometry, look = self._decode(gated, static, t)
+        outputs = self._decode_blocks(t, dynamics, *encoded[0])
+        geometry, look = outputs[:, : sum(GEOMETRY)], outputs[:, sum(GEOMETRY) :] if self.appearance else None
         turn, shift, d_quats, d_scales = geometry.split(GEOMETRY, dim=1)
         rotation = nn.functional.normalize(turn + turn.new_tensor([1.0, 0.0, 0.0, 0.0]), dim=1)
         return Deformation(
@@ -85,7 +87,41 @@ class GridField(nn.Module):
             _smoothness(encoded[0], encoded[1], nearby) if nearby is not None else None,
         )
 
-    def _moving(self, dynamics: Tensor | None, temporal: list[Tensor], static: Tensor) -> Tensor:
+    def _decode_blocks(self, t: float, dynamics: Tensor | None, *features: Tensor) -> Tensor:
+        """`_decode`, which for many Gaussians is done anew in the backward pass, block by block: what it would have to
+        keep of each one is a multiple of everything else, 4 KB at a width of 256."""
+        if len(features[0]) <= _KEPT:
+            return self._decode(t, dynamics, *features)
+        blocks = [part.split(_BLOCK) for part in features]
+        of_dynamics = [None] * len(blocks[0]) if dynamics is None else dynamics.split(_BLOCK)
+        done = [
+            checkpoint(self._decode, t, *block, use_reentrant=False, preserve_rng_state=False)
+            for block in zip(of_dynamics, *blocks, strict=True)
+        ]
+        return torch.cat(done)
+
+    def _decode(self, t: float, dynamics: Tensor | None, static: Tensor, *temporal: Tensor) -> Tensor:
+        """Outputs of the geometry heads (N, 14) and, beside them, of the appearance head."""
+        gate = torch.tanh(product(static, 0.5 * self.spatial.weight, 0.5 * self.spatial.bias))  # 2 sigmoid(x) - 1
+        gated = torch.relu(self._moving(dynamics, static, *temporal)) * gate
+        motion = self.motion(static, t) if self.motion is not None else None
+        if len(self.hidden):
+            fused = gated if motion is None else gated + motion.features()
+            outputs = self.heads(self.hidden(fused.float()))
+            if self.appearance is None:
+                return outputs
+            return torch.cat([outputs, APPEARANCE_SCALE * self.appearance(gated.float())], dim=1)
+        # All heads read the same features: one product, whose gradient goes through (N, width) once.
+        looks = [] if self.appearance is None else [self.appearance]
+        weight = torch.cat([self.heads.weight, *(APPEARANCE_SCALE * head.weight for head in looks)])
+        bias = torch.cat([self.heads.bias, *(APPEARANCE_SCALE * head.bias for head in looks)])
+        outputs = last_product(gated, weight, bias)
+        if motion is not None:
+            moved = motion.through(self.heads.weight)
+            outputs = outputs + nn.functional.pad(moved, (0, outputs.shape[1] - moved.shape[1]))
+        return outputs
+
+    def _moving(self, dynamics: Tensor | None, static: Tensor, *temporal: Tensor) -> Tensor:
         """(N, width) of the dynamics attribute and the temporal features, as far as the field has them, side by side.
         They are multiplied apart, since putting them together first would copy the largest tensors of all."""
         size = self.config.dynamics_size
@@ -97,22 +133,6 @@ class GridField(nn.Module):
         for features in temporal:
             moving = torch.addmm(moving, features, weight[:, size:].to(features.dtype).T)
         return moving
-
-    def _decode(self, gated: Tensor, static: Tensor, t: float) -> tuple[Tensor, Tensor | None]:
-        """Outputs of the geometry heads (N, 14), and of the appearance head, if there is one."""
-        motion = self.motion(static, t) if self.motion is not None else None
-        if len(self.hidden):
-            fused = gated if motion is None else gated + motion.features()
-            look = None if self.appearance is None else APPEARANCE_SCALE * self.appearance(gated.float())
-            return self.heads(self.hidden(fused.float())), look
-        # All heads read the same features: one product, whose gradient goes through (N, width) once.
-        heads = [self.heads] if self.appearance is None else [self.heads, self.appearance]
-        weight, bias = torch.cat([head.weight for head in heads]), torch.cat([head.bias for head in heads])
-        outputs = last_product(gated, weight, bias)
-        geometry, look = outputs[:, : sum(GEOMETRY)], outputs[:, sum(GEOMETRY) :]
-        if motion is not None:
-            geometry = geometry + motion.through(self.heads.weight)
-        return geometry, None if self.appearance is None else APPEARANCE_SCALE * look
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """See motion/field.py. The frequencies of the spectrum are in no group: they have an optimiser of their own."""

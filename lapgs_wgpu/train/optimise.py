@@ -61,6 +61,12 @@ class Optimiser:
             moments = {key: torch.cat([moment[keep], zeros]) for key, moment in self.moments(name).items()}
             self._replace(name, torch.cat([old.detach()[keep], rows]), moments)
 
+    def reorder(self, order: Tensor) -> None:
+        """Put the Gaussians, with their state, into another order: indices (N,)."""
+        for name, old in self.gaussians.items():
+            moments = {key: moment[order] for key, moment in self.moments(name).items()}
+            self._replace(name, old.detach()[order], moments)
+
     def reset(self, name: str, values: Tensor) -> None:
         """Give one of the Gaussians' parameters new values (N, ...) and a zero state."""
         self._replace(name, values, {key: torch.zeros_like(values) for key in self.moments(name)})

@@ -52,8 +52,9 @@ class Pictures:
         self.order: list[int] = []  # the views that are still to come in this epoch, by number
 
     def close(self) -> None:
-        """End the decoding."""
+        """End the decoding, and forget the pictures on the device: what follows a training needs the memory."""
         self._cache.close()
+        self._truths.clear()
 
     def choose(self) -> tuple[View, Tensor]:
         """The next view, and the background (3,) that its picture lies on."""

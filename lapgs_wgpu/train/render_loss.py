@@ -111,6 +111,10 @@ class TruthCache:
         """Bytes kept at present."""
         return sum(buffer.nbytes for buffer in self._held.values())
 
+    def clear(self) -> None:
+        """Keep none of them any more."""
+        self._held.clear()
+
     def get(self, key: Hashable, load: Callable[[], NDArray[np.uint8]]) -> Buffer:
         """The picture of this key; `load` is called where it is not held: (H, W, 3) RGB or (H, W, 4) straight RGBA."""
         buffer = self._held.pop(key, None) or upload_rgba(self.device, load())

@@ -19,6 +19,7 @@ from lapgs_wgpu.motion.dynamics import dynamics_loss
 from lapgs_wgpu.motion.field import Nearby
 from lapgs_wgpu.motion.grid_field import GridField
 from lapgs_wgpu.motion.scene import Scene4D
+from lapgs_wgpu.splat.morton import morton_order
 from lapgs_wgpu.train.config import Config, PointsConfig, SmoothnessConfig
 from lapgs_wgpu.train.densify import Statistics, densify, reset_opacities
 from lapgs_wgpu.train.exposure import Exposures
@@ -245,6 +246,7 @@ class Training:
                     f"density control leaves no Gaussian at step {step}; lower density.min_opacity or density.gradient."
                 )
             self._optimiser.edit_rows(change.keep, change.added)
+            self._optimiser.reorder(morton_order(scene.parameters["means"].detach()))
             self._statistics = Statistics(len(scene), scene.parameters["means"].device)
         if density.resets_at(step):
             logits = reset_opacities(scene.parameters["opacity_logits"], density.reset_opacity)
@@ -308,7 +310,8 @@ def initial_points(
     # Published figures of D-NeRF start from a fog, which the empty background there soon lifts.
     if dataset.cloud is not None or dataset.depths is not None:
         scales = see_through(points, scales, config.opacity, dataset.cameras)
-    return points, colours, scales
+    order = morton_order(torch.from_numpy(points)).numpy()
+    return points[order], colours[order], scales[order]
 
 
 def draw_nearby(config: SmoothnessConfig, count: int, t: float, generator: torch.Generator) -> Nearby | None:
