@@ -79,7 +79,8 @@ class HashEncoder:
             for number, (points, time) in enumerate(places):
                 for i, encoder in enumerate(self._encoders):
                     shape = len(points), sum(grid.features for grid in encoder.grids)
-                    buffer = self._pool.get(f"encoding {number} {i}", dtype.itemsize * math.prod(shape))
+                    name = f"encoding {number * len(self._encoders) + i}"
+                    buffer = self._pool.get(name, dtype.itemsize * math.prod(shape))
                     requests.append((buffer, _NUMPY[dtype], shape, 0))
                     if len(points):
                         mine = point_buffers[number], len(points), time, table_buffers[i], buffer
@@ -89,9 +90,10 @@ class HashEncoder:
 
     def backward(self, places: Sequence[Place], d_encodings: Sequence[Tensor]) -> list[Tensor]:
         """The gradients of the tables, from those of the encodings in the order of `encode`."""
-        d_tables = [self._pool.get(f"d_table {i}", 8 * len(grid.table)) for i, grid in enumerate(self.grids)]
+        # In the buffers of `encode`, none of which is needed any more.
+        d_tables = [self._pool.get(f"table {i}", 8 * len(grid.table)) for i, grid in enumerate(self.grids)]
         point_buffers = [self._points(number, points) for number, (points, _) in enumerate(places)]
-        d_buffers = [self._upload(f"d_encoding {i}", d) for i, d in enumerate(d_encodings)]
+        d_buffers = [self._upload(f"encoding {i}", d) for i, d in enumerate(d_encodings)]
         with Commands(self._pool.device) as commands:
             for buffer in d_tables:
                 commands.clear(buffer)
