@@ -13,7 +13,7 @@ from .laplacian import LaplacianMotion, TimeMotion
 from .layers import last_product, linear, product, zero_head
 
 _KEPT = 1 << 16  # Gaussians up to which a step keeps the decoder's activations instead of computing them once more
-_BLOCK = 1 << 14
+_BLOCK = 1 << 13
 
 
 class GridField(nn.Module):

@@ -22,7 +22,7 @@ from lapgs_wgpu.train.config import Background, Config
 from lapgs_wgpu.train.evaluate import evaluate, write_metrics
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.lpips import Lpips
-from lapgs_wgpu.train.memory import keep_freed_memory
+from lapgs_wgpu.train.memory import keep_freed_memory, return_freed_memory
 from lapgs_wgpu.train.ranks import ALONE, Ranks
 from lapgs_wgpu.train.run_folder import (
     STATE,
@@ -141,6 +141,7 @@ def _run(training: Training, dataset: Dataset, out: Path, watch: Watch | None) -
             pass
         seconds = log.seconds
 
+    return_freed_memory()
     done, all_steps = training.done, config.schedule.steps
     if done < all_steps or config.schedule.save_interval:
         save_state(out, training.state())
