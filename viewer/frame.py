@@ -81,10 +81,12 @@ class Painter:
         """Draw, and wait until it is done. profile: take the time of each pass, where the device can."""
         start = time.perf_counter()
         camera, mode = request.camera, request.mode
-        gaussians = self.playback.at(request.time)
         low, high, background = 0.0, 1.0, request.background
-        if mode in ("motion", "dynamics", "scale"):
-            colours, low, high = self._value(mode, request.time)
+        # Before the Gaussians: measuring may take them to other times.
+        value = self._value(mode, request.time) if mode in ("motion", "dynamics", "scale") else None
+        gaussians = self.playback.at(request.time)
+        if value is not None:
+            colours, low, high = value
             gaussians = dataclasses.replace(gaussians, colors=colours, sh_degree=None, sh_stored=1)
             background = (0.0, 0.0, 0.0)
         taken = self._profiler() if profile else None
