@@ -1,4 +1,5 @@
 // Encodes points: two features a level, interpolated between the corners of the cell in which a point lies.
+// ROWS: of some of the points only, into their own rows of the encoding.
 #import common/bfloat16
 #import common/hashgrid
 #import common/index
@@ -13,6 +14,10 @@
 @group(0) @binding(4) var<storage, read_write> encoding: array<u32>;         // (N, all levels), two features in each
 #else
 @group(0) @binding(4) var<storage, read_write> encoding: array<f32>;         // (N, 2 x all levels)
+#endif
+#ifdef ROWS
+#table 5 rows: u32
+// ascending, grid.points of them
 #endif
 
 const LANES = 64u;
@@ -40,8 +45,13 @@ fn main(
     let first = level.place.x;
 #endif
     for (var k = 0u; k < LANE_POINTS; k++) {
-        let i = (block * LANE_POINTS + k) * LANES + lane;
-        if (i < grid.points) {
+        let n = (block * LANE_POINTS + k) * LANES + lane;
+        if (n < grid.points) {
+#ifdef ROWS
+            let i = rows_at(n);
+#else
+            let i = n;
+#endif
             let cell = find_cell(unit_point(points_at(i).xyz, grid), level);
             var sum = vec2(0.0);
 #unroll c $CORNERS

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from lapgs_wgpu.gpu.buffer import BufferPool
 from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.motion.deform import DeviceField, parameter_shapes, runs_on_device
 from lapgs_wgpu.motion.field import FieldConfig
 from lapgs_wgpu.motion.grid_field import GridField
@@ -186,6 +187,56 @@ def test_the_same_bits_again(device: Device) -> None:
         field.move(t, out)
         found.append(out.means.read("float32", (500, 3)).tobytes())
     assert found[0] == found[2] != found[1]
+
+
+CHOSEN = {
+    "none": [],
+    "one": [299],
+    "all": list(range(300)),
+    "those of one block": list(range(70, 120)),
+    "any": np.flatnonzero(np.random.default_rng(0).random(300) < 0.4).tolist(),
+}
+
+
+@pytest.mark.parametrize("block", [None, 64, 192])
+@pytest.mark.parametrize("name", ["grid4d", "laplacian", "color", "dynamics alone"])
+def test_some_are_moved_and_the_others_left(device: Device, name: str, block: int | None) -> None:
+    """To the bit as when all are moved."""
+    scene = trained(device, CONFIGS[name], 300)
+    field, out = device_field(scene, block)
+    field.move(0.7, out)
+    after = contents(out)
+    for rows in (np.array(rows, np.int64) for rows in CHOSEN.values()):
+        field.move(0.2, out)
+        before = contents(out)
+        field.move(0.7, out, rows)
+        for part, found in contents(out).items():
+            expected = before[part].copy()
+            expected[rows] = after[part][rows]
+            np.testing.assert_array_equal(found, expected, err_msg=part)
+
+
+def contents(out: GaussianBuffers) -> dict[str, np.ndarray]:
+    """(N, values) of each buffer."""
+    parts = {"means": 3, "quats": 4, "scales": 3, "opacities": 1, "colors": 3 * out.sh_stored}
+    return {part: getattr(out, part).read("uint32", (out.count, n)) for part, n in parts.items()}
+
+
+def test_work_goes_with_the_number_of_those_moved(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    field, out = device_field(trained(device, GRID4D, 5000))
+    groups: dict[str, int] = {}
+
+    def dispatch(self: Commands, kernel: Kernel, number: int, **buffers: object) -> None:
+        groups[kernel.name] = groups.get(kernel.name, 0) + number
+
+    monkeypatch.setattr(Commands, "dispatch", dispatch)
+    field.move(0.5, out)
+    whole = groups.copy()
+    groups.clear()
+    field.move(0.5, out, np.arange(0, 5000, 10))
+    assert groups.keys() == whole.keys() == {"hashgrid", "deform"}
+    for name in groups:
+        assert groups[name] <= 0.11 * whole[name] + 1
 
 
 @pytest.mark.parametrize("name", CONFIGS)

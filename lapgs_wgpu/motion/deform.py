@@ -109,8 +109,8 @@ class DeviceField:
         self._channels = 4 * self._defines["QUADS"]  # a round
         self._rounds = -(-config.width // self._channels)
         row = max(_CANONICAL + 4 * sizes.still_quads, 4 * sizes.moving_quads)
-        size = block or _BLOCK_BYTES // (4 * row) // _LANES * _LANES
-        count = len(gaussians["means"])
+        self._size = size = block or _BLOCK_BYTES // (4 * row) // _LANES * _LANES
+        self._count = count = len(gaussians["means"])
         self._blocks = [self._block(gaussians, first, min(size, count - first)) for first in range(0, count, size)]
         self._temporal = DeviceEncoder(
             device, temporal_grids(config), config.bound, row=4 * sizes.moving_quads, column=sizes.first_temporal
@@ -121,8 +121,9 @@ class DeviceField:
         ]
         self._encode_static(parameters["static_grid.table"])
         heads, stream = self._heads(0.0), self._stream()
-        self._stream_at = len(heads)
-        self._weights = self._filled("weights", np.concatenate([heads, stream]))
+        self._stream_at, self._rows_at = len(heads), len(heads) + len(stream)
+        self._weights = self._pool.get("weights", 16 * self._rows_at + 4 * count)
+        self._weights.write(np.concatenate([heads, stream]))
 
     def _filled(self, name: str, array: Floats) -> Buffer:
         buffer = self._pool.get(name, array.nbytes)
@@ -201,28 +202,42 @@ class DeviceField:
 
     # A time ----------------------------------------------------------------------------------------------------------
 
-    def move(self, t: float, out: GaussianBuffers) -> None:
+    def move(self, t: float, out: GaussianBuffers, rows: NDArray[np.integer] | None = None) -> None:
         """Submit the passes that write the Gaussians at a time in [0, 1]: all of `out` but the colours above their
-        constant part, which stay, and the constant part, too, where the field changes no colours."""
+        constant part, which stay, and the constant part, too, where the field changes no colours.
+
+        rows: (M,) ascending, the Gaussians to be moved, None for all; the others stay as they are in `out`.
+        """
         kernel = Kernel.get(self._device, "deform", **self._defines)
+        rows = np.arange(self._count) if rows is None else rows
+        of_block = rows % self._size
         self._weights.write(self._heads(t))
+        self._weights.write(of_block.astype(np.float32), 16 * self._rows_at)
         points, stored = self._defines["POINTS"], out.sh_stored
         with Commands(self._device) as commands:
             for number, block in enumerate(self._blocks):
+                start, end = np.searchsorted(rows, (block.first, block.first + block.count)).tolist()
+                if start == end:
+                    continue
+                chosen = self._pool.get(f"rows from {block.first}", 4 * block.count)
+                chosen.write(of_block[start:end].astype(np.uint32))
                 self._temporal.encode(
                     commands,
                     number,
                     block.points,
-                    block.count,
+                    end - start,
                     self._config.grid_time(t),
                     self._tables,
                     block.moving,
+                    rows=chosen,
                 )
                 uniform = self._pool.constant(
                     f"deform {number}",
                     kernel.uniform(
                         "Deform",
-                        gaussians=block.count,
+                        gaussians=end - start,
+                        first=start,
+                        rows=self._rows_at,
                         rounds=self._rounds,
                         still_quads=self._sizes.still_quads,
                         moving_quads=self._sizes.moving_quads,
@@ -230,16 +245,16 @@ class DeviceField:
                         sh_stored=stored,
                     ),
                 )
-                rows = {"means": 12, "quats": 16, "scales": 12, "opacities": 4, "colors": 12 * stored}
+                strides = {"means": 12, "quats": 16, "scales": 12, "opacities": 4, "colors": 12 * stored}
                 if "COLOR" not in self._defines:
-                    del rows["colors"]
+                    del strides["colors"]
                 outputs = {
-                    name: (getattr(out, name), block.first * size, max(16, block.count * size))
-                    for name, size in rows.items()
+                    name: (getattr(out, name), block.first * stride, max(16, block.count * stride))
+                    for name, stride in strides.items()
                 }
                 commands.dispatch(
                     kernel,
-                    -(-block.count // (_LANES * points)),
+                    -(-(end - start) // (_LANES * points)),
                     deform=uniform,
                     still=block.still,
                     moving=block.moving,

@@ -117,10 +117,12 @@ class DeviceEncoder:
         encoding: Buffer,
         *,
         bfloat16: bool = False,
+        rows: Buffer | None = None,
     ) -> None:
         """Encode n points at a time in [0, 1]; outside the box [-bound, bound]^3 features are zero.
 
         number: tells apart the calls that are submitted together. bfloat16: of the encoding, instead of float32.
+        rows: (n,) uint32, which of the points; the encoding, which must fit into a binding, then keeps its other rows.
         """
         sources = []
         for part in self._parts:
@@ -138,16 +140,18 @@ class DeviceEncoder:
                 source = slices
             sources.append(source)
         row = self._row * (2 if bfloat16 else 4)
-        for first, count in self._blocks(n, row):
+        define, chosen = ({}, {}) if rows is None else ({"ROWS": 1}, {"rows": rows})
+        for first, count in self._blocks(n, row) if rows is None else [(0, n)]:
             for part, source in zip(self._parts, sources, strict=True):
                 commands.dispatch(
-                    Kernel.get(self.device, "hashgrid", **self._defines(part), **_rounded(bfloat16)),
+                    Kernel.get(self.device, "hashgrid", **self._defines(part), **_rounded(bfloat16), **define),
                     -(-count // 512) * part.count,
                     grid=self._uniform(part, f"{number} from {first}", count, time),
                     levels=part.levels,
-                    points=_rows(points, 16, first, count),
+                    points=_rows(points, 16, first, count) if rows is None else points,
                     features=source,
-                    encoding=_rows(encoding, row, first, count),
+                    encoding=_rows(encoding, row, first, count) if rows is None else encoding,
+                    **chosen,
                 )
 
     def add_gradient(
