@@ -5,9 +5,7 @@ One function per pass, named as its shader. Conventions (gsplat's) and numbers c
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
-from importlib.resources import files
 from typing import NamedTuple
 
 import torch
@@ -16,10 +14,8 @@ from torch.utils.checkpoint import checkpoint
 
 from ..errors import InputError
 from .camera import Camera
+from .constants import CONSTANTS
 from .rasterize import Rendering
-
-_SOURCE = files("lapgs_wgpu.shaders.common").joinpath("constants.wgsl").read_text(encoding="utf-8")
-CONSTANTS = {name: float(value) for name, value in re.findall(r"^const (\w+): f32 = ([^;]+);", _SOURCE, re.MULTILINE)}
 
 DILATION, NEAR, FRUSTUM_MARGIN, ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN = (
     CONSTANTS[name] for name in ("DILATION", "NEAR", "FRUSTUM_MARGIN", "ALPHA_MAX", "ALPHA_MIN", "TRANSMITTANCE_MIN")
