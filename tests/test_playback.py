@@ -25,7 +25,7 @@ from lapgs_wgpu.motion.scene_file import read_scene
 from lapgs_wgpu.motion.scene_playback import ScenePlayback
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.rasterize import rasterizer_of
-from lapgs_wgpu.splat.rasterizer import Rasterizer
+from lapgs_wgpu.splat.rasterizer import GaussianBuffers, Rasterizer
 
 TIMES = (0.0, 0.37, 1.0)
 CAMERA = Camera.looking_at([1.0, -4, 0.7], [0, 0, 0], up=[0, 0, 1], fov_x=0.8, width=64, height=48)
@@ -39,13 +39,14 @@ KINDS = {
 ON_DEVICE = {"static", *CONFIGS}
 
 
-def picture(playback: Playback, t: float) -> np.ndarray:
+def picture(playback: Playback, t: float, camera: Camera = CAMERA, *, passing: bool = False) -> np.ndarray:
     """(height, width, 3), drawn from the buffers as a viewer does."""
     rasterizer = Rasterizer(playback.device)
     while True:
-        planes = rasterizer.draw(playback.at(t), CAMERA, (0.1, 0.2, 0.3))
+        now = playback.at(t, camera if passing else None)
+        planes = rasterizer.draw(now, camera, (0.1, 0.2, 0.3))
         if not rasterizer.grow():
-            return planes.read("float32", (4, CAMERA.height, CAMERA.width))[:3].transpose(1, 2, 0)
+            return planes.read("float32", (4, camera.height, camera.width))[:3].transpose(1, 2, 0)
 
 
 def saved(device: Device, folder: Path, config: FieldConfig, count: int = 300) -> tuple[Scene4D, Path]:
@@ -110,7 +111,7 @@ def test_a_time_that_is_shown_is_not_computed_again(
     assert isinstance(playback, DevicePlayback)
     assert playback._field is not None
     times: list[float] = []
-    monkeypatch.setattr(playback._field, "move", lambda t, out: times.append(t))
+    monkeypatch.setattr(playback._field, "move", lambda t, out, rows: times.append(t))
     for t in (0.1, 0.1, 0.2, 0.1):
         playback.at(t)
     assert times == [0.1, 0.2, 0.1]
@@ -172,6 +173,63 @@ def test_blocks_make_no_difference(device: Device, tmp_path: Path) -> None:
         )
         for x, y in zip(a, b, strict=True):
             np.testing.assert_array_equal(x, y)
+
+
+def half_still(device: Device, folder: Path) -> DevicePlayback:
+    """Of 300 Gaussians those outside the field's box, which ends at 1.5 on each axis, stand still."""
+    scene = trained(device, GRID4D, 300)
+    with torch.no_grad():
+        for parameter in scene.field.heads.parameters():
+            parameter *= 0.1
+        scene.parameters["log_scales"] -= 1.5
+        scene.parameters["means"][100:200] += torch.tensor([4.0, 4, 0])
+        scene.parameters["means"][200:] += torch.tensor([-4.0, 4, 0])
+    scene.save(folder / "scene.ply")
+    playback = open_playback(folder / "scene.ply", device)
+    assert isinstance(playback, DevicePlayback)
+    return playback
+
+
+def contents(now: GaussianBuffers) -> list[np.ndarray]:
+    shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "colors": (now.sh_stored, 3)}
+    return read_all([(getattr(now, name), "uint32", (now.count, *shape), 0) for name, shape in shapes.items()])
+
+
+@pytest.mark.kernels
+def test_a_passing_picture_is_the_exact_one_for_less(
+    device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    playback, other = half_still(device, tmp_path), half_still(device, tmp_path)
+    assert playback._field is not None
+    moved: list[int] = []
+    move = playback._field.move
+    monkeypatch.setattr(playback._field, "move", lambda t, out, rows: (moved.append(len(rows)), move(t, out, rows)))
+    left, right = (
+        Camera.looking_at([x, -6, 0], [x, 0, 0], up=[0, 0, 1], fov_x=0.6, width=64, height=48) for x in (-2, 2)
+    )
+    for t in (np.arange(16) + 0.5) / 16:
+        playback.at(float(t), right)
+        assert playback.exact  # too little was seen so far
+    assert moved == 16 * [300]
+    moved.clear()
+    for t, camera in ((0.4, right), (0.45, right), (0.45, left), (0.1, right), (0.85, left)):
+        shown = picture(playback, t, camera, passing=True)
+        assert np.ptp(shown) > 0.3
+        assert playback.exact == (not device.mappable)
+        assert np.abs(shown - picture(other, t, camera)).max() < 1e-3
+    if device.mappable:
+        assert 0 < min(moved) < max(moved) < 80
+        assert moved[1] + moved[2] <= 100  # those alone that were not up to date
+    else:
+        assert moved == 4 * [300]
+
+    for found, expected in zip(contents(playback.at(0.85)), contents(other.at(0.85)), strict=True):
+        np.testing.assert_array_equal(found, expected)
+    assert playback.exact
+    moved.clear()
+    playback.at(0.85, right)
+    assert playback.exact
+    assert moved == []
 
 
 SHOW = """

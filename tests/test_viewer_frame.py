@@ -1,15 +1,16 @@
-"""Frames of a scene."""
+"""Frames: exact at rest, whatever was drawn while something moved."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from lapgs_wgpu.viewer.choices import Mode
 from lapgs_wgpu.viewer.frame import Frame, Painter, Request
 from test_deform import GRID4D, trained
-from test_playback import CAMERA
+from test_playback import CAMERA, half_still
 
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.playback import open_playback
@@ -28,3 +29,40 @@ def test_the_first_frame_of_a_mode_is_of_its_own_time(device: Device, tmp_path: 
     painter = Painter(open_playback(tmp_path / "scene.ply", device))
     first, second = (planes(painter.draw(Request(CAMERA, 0.3, mode, (0, 0, 0)))) for _ in range(2))
     np.testing.assert_array_equal(first, second)
+
+
+@pytest.mark.triangles
+def test_the_window_rests_on_the_exact_frame(device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    offscreen = pytest.importorskip("rendercanvas.offscreen")
+    pytest.importorskip("imgui_bundle")
+    from lapgs_wgpu.viewer import app as app_module
+    from lapgs_wgpu.viewer.opened import open_scene
+
+    half_still(device, tmp_path)
+    now = [50.0]
+    monkeypatch.setattr(app_module, "time", SimpleNamespace(perf_counter=lambda: now[0]))
+    canvas = offscreen.RenderCanvas(size=(64, 48), pixel_ratio=1)
+    loop = SimpleNamespace(call_later=lambda seconds, callback: None)
+    app = app_module.App(canvas, loop, open_scene(tmp_path / "scene.ply", lambda: device))
+    exact = Painter(open_playback(tmp_path / "scene.ply", device))
+    passing = []
+    for t in [*((np.arange(16) + 0.5) / 16), 0.3, 0.31]:
+        now[0] += 0.1
+        app.clock.seek(float(t))
+        canvas.draw()
+        assert app.frame is not None
+        passing.append(app.frame.exact)
+    assert all(passing[:16])
+    assert passing[16:] == 2 * [not device.mappable]
+    now[0] += 0.1
+    canvas.draw()
+    assert app.frame.exact == (not device.mappable)  # it may move on
+    now[0] += 0.2
+    canvas.draw()
+    assert app.frame.exact
+    assert app.scale == 1
+    np.testing.assert_array_equal(planes(app.frame), planes(exact.draw(app.frame.request)))
+    rests = app.frame
+    now[0] += 5
+    canvas.draw()
+    assert app.frame is rests

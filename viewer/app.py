@@ -142,32 +142,39 @@ class App:
             self._gui_draws -= 1
         if self.clock.playing or self.controls.flying or self._gui_draws > 0 or previewed is not None:
             self.canvas.request_draw()
-        elif self.scale < 1:
+        elif not self._rests():
             self.loop.call_later(_SETTLED, self.canvas.request_draw)
         self.drawing_seconds += time.perf_counter() - now
 
     def _paint(self, now: float) -> None:
-        """Draw the scene where something changed: at a lower resolution while it changes, in full once it rests."""
+        """Draw the scene where something changed: at a lower resolution and not quite exactly while it changes, in full
+        once it rests."""
         whole = self._whole()
         key = (_key(whole), self.clock.time, self.mode, self.background, self.profiling, id(self.painter))
         changed = key != self._drawn_key
         if changed:
             self.moved_at = now
-        elif not self.stale and (self.scale == 1 or now - self.moved_at < _SETTLED):
+        elif not self.stale and (self._rests() or now - self.moved_at < _SETTLED):
             return
         first = self._drawn_key is None
-        self.scale = self._moving_scale if changed and not first else 1.0
+        moving = changed and not first
+        self.scale = self._moving_scale if moving else 1.0
         camera = whole
         if self.scale < 1:
             camera = whole.resized(max(1, round(self.scale * whole.width)), max(1, round(self.scale * whole.height)))
         request = Request(camera, self.clock.time, self.mode, self.background)
-        self.frame = self.painter.draw(request, profile=self.profiling)
+        passing = moving and self.comparing() == "off"
+        self.frame = self.painter.draw(request, passing=passing, profile=self.profiling)
         self._drawn_key, self.stale = key, False
         self._times.append(time.perf_counter())
-        if not first:
+        if moving:
             ideal = self.scale * math.sqrt(_TARGET_SECONDS / max(self.frame.seconds, 1e-4))
             ideal = 0.5 * (self._moving_scale + ideal)
             self._moving_scale = min(max(math.floor(16 * ideal) / 16, _SMALLEST), 1.0)
+
+    def _rests(self) -> bool:
+        """Whether the frame on show is what is shown while nothing moves."""
+        return self.scale == 1 and self.frame is not None and self.frame.exact
 
     def _whole(self) -> Camera:
         """The camera at full resolution: the window's, or that of the picture from which ours is subtracted."""

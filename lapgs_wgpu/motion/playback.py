@@ -15,9 +15,11 @@ from numpy.typing import NDArray
 from ..gpu.buffer import BufferPool, read_all
 from ..gpu.device import Device
 from ..io.ply import StillGaussians
+from ..splat.camera import Camera
 from ..splat.rasterizer import GaussianBuffers
 from .deform import DeviceField, parameter_shapes, runs_on_device
 from .field import MIN_SCALE, FieldConfig
+from .motion_bounds import MotionBounds
 from .scene_file import SceneFile, read_scene
 
 Floats = NDArray[np.float32]
@@ -39,9 +41,16 @@ class Playback(Protocol):
     def sh_degree(self) -> int: ...
     @property
     def moves(self) -> bool: ...
+    @property
+    def exact(self) -> bool:
+        """Whether all that `at` gave last was of the time that was asked for."""
 
-    def at(self, t: float) -> GaussianBuffers:
-        """The activated Gaussians at a time, on the device: submitted, not waited for. Valid until the next call."""
+    def at(self, t: float, seen_by: Camera | None = None) -> GaussianBuffers:
+        """The activated Gaussians at a time, on the device: submitted, not waited for. Valid until the next call.
+
+        seen_by: the only camera that draws them, for a picture that passes; Gaussians that hardly move, or that it does
+        not see, may be of other times.
+        """
 
     def means(self, t: float) -> Floats:
         """(count, 3), world units, at a time."""
@@ -93,18 +102,52 @@ class DevicePlayback:
         self._buffers = GaussianBuffers(
             count=self.count, sh_degree=self.sh_degree, sh_stored=(self.sh_degree + 1) ** 2, **buffers
         )
+        self.exact = True
         self._field: DeviceField | None = None
-        self._time: float | None = None
         if self.moves:
+            self._times = np.full(self.count, np.nan)  # of what the buffers hold
+            # Features change from entry to entry of the temporal grids' time axis, so little within half of one.
+            self._bounds = MotionBounds(self.count, 2 * self.field_config.temporal.finest[2])
+            self._bounded = True  # do the bounds hold what is in the buffers?
             parameters = file.field(parameter_shapes(file.field_config))
             self._field = DeviceField(device, file.field_config, parameters, activated, block=block)
 
-    def at(self, t: float) -> GaussianBuffers:
+    def at(self, t: float, seen_by: Camera | None = None) -> GaussianBuffers:
         """See Playback."""
-        if self._field is not None and self._time != t:
-            self._field.move(t, self._buffers)
-            self._time = t
+        if self._field is None:
+            return self._buffers
+        old = self._times != t
+        moved = old
+        # The choice needs the values on the host each time: not where they lie in memory of the device's own.
+        if seen_by is not None and self.device.mappable and old.any():
+            self._bound()
+            moved = old & self._bounds.needed(t, seen_by)
+        self.exact = bool((moved == old).all())
+        if moved.any():
+            self._field.move(t, self._buffers, np.flatnonzero(moved))
+            self._times[moved] = t
+            self._bounded = False
         return self._buffers
+
+    def _bound(self) -> None:
+        """Widen the bounds by what the buffers hold. Done before each choice, it leaves no Gaussian outside of its own
+        bounds, whatever time it is of."""
+        if self._bounded:
+            return
+        now, n = self._buffers, self.count
+        values = read_all(
+            [
+                (now.means, "float32", (n, 3), 0),
+                (now.quats, "float32", (n, 4), 0),
+                (now.scales, "float32", (n, 3), 0),
+                (now.opacities, "float32", (n, 1), 0),
+                (now.colors, "float32", (n, 3 * now.sh_stored), 0),
+            ]
+        )
+        values[-1] = values[-1][:, :3]
+        whole = bool((self._times == self._times[0]).all())
+        self._bounds.add(np.concatenate(values, axis=1), float(self._times[0]) if whole else None)
+        self._bounded = True
 
     def means(self, t: float) -> Floats:
         """See Playback."""

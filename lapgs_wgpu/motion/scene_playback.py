@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from ..gpu.buffer import BufferPool
 from ..io.ply import StillGaussians
+from ..splat.camera import Camera
 from ..splat.rasterize import upload_gaussians
 from ..splat.rasterizer import GaussianBuffers
 from .scene import Scene4D
@@ -19,6 +20,7 @@ class ScenePlayback:
     def __init__(self, scene: Scene4D) -> None:
         self.scene = scene
         self.device, self.field_config, self.metadata = scene.device, scene.field_config, scene.metadata
+        self.exact = True
         self._pool = BufferPool(scene.device)  # a training draws with its own
 
     @property
@@ -36,7 +38,7 @@ class ScenePlayback:
         """See Playback."""
         return self.scene.field is not None
 
-    def at(self, t: float) -> GaussianBuffers:
+    def at(self, t: float, seen_by: Camera | None = None) -> GaussianBuffers:
         """See Playback."""
         with torch.no_grad():
             now = self.scene.at(t)
