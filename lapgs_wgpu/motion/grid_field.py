@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import torch
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
@@ -12,8 +14,8 @@ from .hash_encoder import HashEncoder, HashGrid
 from .laplacian import LaplacianMotion, TimeMotion
 from .layers import last_product, linear, product, zero_head
 
-_KEPT = 1 << 16  # Gaussians up to which a step keeps the decoder's activations instead of computing them once more
-_BLOCK = 1 << 13
+_BLOCK = 1 << 13  # Gaussians that are decoded at once
+_KEPT = 1 << 16  # of all, up to which a step keeps the decoder's activations instead of computing them once more
 
 
 class GridField(nn.Module):
@@ -88,17 +90,14 @@ class GridField(nn.Module):
         )
 
     def _decode_blocks(self, t: float, dynamics: Tensor | None, *features: Tensor) -> Tensor:
-        """`_decode`, which for many Gaussians is done anew in the backward pass, block by block: what it would have to
-        keep of each one is a multiple of everything else, 4 KB at a width of 256."""
-        if len(features[0]) <= _KEPT:
-            return self._decode(t, dynamics, *features)
+        """`_decode`, block by block, so that no step asks for large pieces of memory. Of many Gaussians it is done
+        anew in the backward pass: the activations would be most of a training's memory, 4 KB each at a width of 256."""
+        decode = self._decode
+        if len(features[0]) > _KEPT:
+            decode = partial(checkpoint, decode, use_reentrant=False, preserve_rng_state=False)
         blocks = [part.split(_BLOCK) for part in features]
         of_dynamics = [None] * len(blocks[0]) if dynamics is None else dynamics.split(_BLOCK)
-        done = [
-            checkpoint(self._decode, t, *block, use_reentrant=False, preserve_rng_state=False)
-            for block in zip(of_dynamics, *blocks, strict=True)
-        ]
-        return torch.cat(done)
+        return torch.cat([decode(t, *block) for block in zip(of_dynamics, *blocks, strict=True)])
 
     def _decode(self, t: float, dynamics: Tensor | None, static: Tensor, *temporal: Tensor) -> Tensor:
         """Outputs of the geometry heads (N, 14) and, beside them, of the appearance head."""

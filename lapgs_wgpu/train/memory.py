@@ -5,19 +5,21 @@ from __future__ import annotations
 import ctypes
 import platform
 
-_M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4  # glibc's malloc.h
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # glibc's malloc.h
 _LARGEST = 2**31 - 1
+_LARGEST_THRESHOLD = 1 << 25  # that glibc takes
 
 
 def keep_freed_memory() -> None:
-    """Let glibc keep the large blocks that are freed, for the whole process.
+    """Let glibc keep the blocks of up to 32 MB that are freed, for the whole process.
 
     By default it gives each back to the system at once. A step asks for the same ones again, and the system then clears
-    every page anew, which took most of the time of torch's part on a CPU. Other C libraries are left alone.
+    every page anew, which took most of the time of torch's part on a CPU. Larger ones, of which a step has few, still
+    go back: kept, they would leave holes that nothing fits into. Other C libraries are left alone.
     """
     if platform.libc_ver()[0] == "glibc":
         library = ctypes.CDLL(None)
-        library.mallopt(_M_MMAP_MAX, 0)
+        library.mallopt(_M_MMAP_THRESHOLD, _LARGEST_THRESHOLD)
         library.mallopt(_M_TRIM_THRESHOLD, _LARGEST)
 
 
