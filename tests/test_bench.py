@@ -142,7 +142,7 @@ def test_processor_time_is_another_clock_for_the_same_passes(results: dict, tmp_
         pytest.skip("the device is no processor")
     bench("--parts", "raster", "--clock", "processor", "--json", tmp_path / "bench.json")
     passes = raster(json.loads((tmp_path / "bench.json").read_text()))["passes"]["passes"]
-    assert passes.pop("copies to textures")["milliseconds"]["median"] > 0
+    assert passes.pop("copies to textures")["dispatches"] > 0
     counts = {shader: one["dispatches"] for shader, one in passes.items()}
     assert counts == {shader: one["dispatches"] for shader, one in raster(results)["passes"]["passes"].items()}
 
