@@ -70,11 +70,12 @@ def unpack(folder: Path, films: int) -> None:
             shutil.copytree(Video(first)._folder(size), Video(video)._folder(size), copy_function=os.link)
 
 
-def train(folder: Path, out: Path, cache_gb: float, still: int, moving: int) -> dict[str, float]:
-    """Peak memory of a training with the preset `neu3d`: its first steps without motion, which are fast and fill the
-    caches, then some with, and the evaluation."""
+def train(folder: Path, out: Path, preset: str, cache_gb: float, still: int, moving: int) -> dict[str, float]:
+    """Peak memory of a training at full size: its first steps without motion, which are fast and fill the caches, then
+    some with, and the evaluation."""
     schedule = ["--steps", str(still + moving), "--schedule.warm_up", str(still), "--cache-gb", str(cache_gb)]
-    command = [sys.executable, "-m", "lapgs_wgpu.cli", "neu3d", "--data", str(folder), "--out", str(out), *schedule]
+    data = ["--data", str(folder), "--data.size", "0", "--out", str(out)]
+    command = [sys.executable, "-m", "lapgs_wgpu.cli", preset, *data, *schedule]
     start = time.perf_counter()
     subprocess.run(command, check=True)
     metrics = json.loads((out / "metrics.json").read_text())
@@ -149,6 +150,7 @@ def main() -> None:
     parser.add_argument("--step", type=float, default=0.1, help="seconds that the device is busy in each step")
     parser.add_argument("--unpack", type=int, metavar="N", help="only so many films; they are copies of one")
     parser.add_argument("--train", type=int, nargs=2, metavar=("STILL", "MOVING"), help="train so many steps instead")
+    parser.add_argument("--preset", default="neu3d", help="for --train")
     parser.add_argument("--keep", type=Path, help="a folder in which the capture is written, or is already, and stays")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
@@ -160,7 +162,7 @@ def main() -> None:
         if given.unpack:
             unpack(home / "capture", given.unpack)
         if given.train:
-            report = train(home / "capture", home / "run", given.cache_gb, *given.train)
+            report = train(home / "capture", home / "run", given.preset, given.cache_gb, *given.train)
         else:
             report = draw(home / "capture", given.cache_gb, given.steps, given.step)
         print(json.dumps(report, indent=1))
