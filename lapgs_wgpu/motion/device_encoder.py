@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -35,7 +36,7 @@ class _Part:
 
 class DeviceEncoder:
     """Records the passes that encode points with several grids at once. Axes and levels are fixed; tables (entries, 2),
-    points (N, 4) and the encoding are float32 buffers that come with each call.
+    points (N, 4) and the encoding come with each call, in float32 but for an encoding that is wanted in bfloat16.
 
     lane_levels: the shape of the backward pass for CPU devices; otherwise fixed-point atomics.
     row, column: the encoding's rows have `row` floats, in which the features of one grid lie behind those of the other
@@ -140,18 +141,29 @@ class DeviceEncoder:
                 source = slices
             sources.append(source)
         row = self._row * (2 if bfloat16 else 4)
-        define, chosen = ({}, {}) if rows is None else ({"ROWS": 1}, {"rows": rows})
-        for first, count in self._blocks(n, row) if rows is None else [(0, n)]:
+        options = _precision(bfloat16)
+        blocks: list[tuple[int, int, dict[str, Any]]]
+        if rows is None:
+            blocks = [
+                (
+                    first,
+                    count,
+                    {"points": _block(points, 16, first, count), "encoding": _block(encoding, row, first, count)},
+                )
+                for first, count in self._blocks(n, row)
+            ]
+        else:
+            options |= {"ROWS": 1}
+            blocks = [(0, n, {"points": points, "encoding": encoding, "rows": rows})]
+        for first, count, buffers in blocks:
             for part, source in zip(self._parts, sources, strict=True):
                 commands.dispatch(
-                    Kernel.get(self.device, "hashgrid", **self._defines(part), **_rounded(bfloat16), **define),
+                    Kernel.get(self.device, "hashgrid", **self._defines(part), **options),
                     -(-count // 512) * part.count,
                     grid=self._uniform(part, f"{number} from {first}", count, time),
                     levels=part.levels,
-                    points=_rows(points, 16, first, count) if rows is None else points,
                     features=source,
-                    encoding=_rows(encoding, row, first, count) if rows is None else encoding,
-                    **chosen,
+                    **buffers,
                 )
 
     def add_gradient(
@@ -183,17 +195,17 @@ class DeviceEncoder:
                 commands.clear(target)
             sums.append(target)
 
-        shape = {"LANE_LEVELS": 1} if self.lane_levels else {}
+        options = _precision(bfloat16) | ({"LANE_LEVELS": 1} if self.lane_levels else {})
         row = self._row * (2 if bfloat16 else 4)
         for first, count in self._blocks(n, row, _LOOP_POINTS if self.lane_levels else None):
             for part, target in zip(self._parts, sums, strict=True):
                 commands.dispatch(
-                    Kernel.get(self.device, "hashgrid_bwd", **self._defines(part), **shape, **_rounded(bfloat16)),
+                    Kernel.get(self.device, "hashgrid_bwd", **self._defines(part), **options),
                     -(-part.count // 8) if self.lane_levels else -(-count // 64) * part.count,
                     grid=self._uniform(part, f"{number} from {first}", count, time, fixed_scale),
                     levels=part.levels,
-                    points=_rows(points, 16, first, count),
-                    d_encoding=_rows(d_encoding, row, first, count),
+                    points=_block(points, 16, first, count),
+                    d_encoding=_block(d_encoding, row, first, count),
                     **{"d_features" if self.lane_levels else "d_fixed": target},
                 )
 
@@ -213,10 +225,10 @@ class DeviceEncoder:
                 )
 
 
-def _rows(buffer: Buffer, row: int, first: int, count: int) -> tuple[Buffer, int, int]:
+def _block(buffer: Buffer, row: int, first: int, count: int) -> tuple[Buffer, int, int]:
     """Part of a buffer with rows of so many bytes; no binding may be smaller than 16 bytes."""
     return buffer, first * row, max(16, count * row)
 
 
-def _rounded(bfloat16: bool) -> dict[str, int]:
+def _precision(bfloat16: bool) -> dict[str, int]:
     return {"BFLOAT16": 1} if bfloat16 else {}

@@ -92,6 +92,7 @@ class HashEncoder:
         """The gradients of the tables, from those of the encodings in the order of `encode`."""
         # In the buffers of `encode`, none of which is needed any more.
         d_tables = [self._pool.get(f"table {i}", 8 * len(grid.table)) for i, grid in enumerate(self.grids)]
+        by_group = self._by_group(d_tables)
         point_buffers = [self._points(number, points) for number, (points, _) in enumerate(places)]
         d_buffers = [self._upload(f"encoding {i}", d) for i, d in enumerate(d_encodings)]
         with Commands(self._pool.device) as commands:
@@ -104,7 +105,7 @@ class HashEncoder:
                     at = number * len(self._encoders) + i
                     gradient = d_encodings[at]
                     scale = 1.0 if encoder.lane_levels else _fixed_scale(gradient)
-                    mine = point_buffers[number], len(points), time, scale, d_buffers[at], self._by_group(d_tables)[i]
+                    mine = point_buffers[number], len(points), time, scale, d_buffers[at], by_group[i]
                     encoder.add_gradient(commands, number, *mine, bfloat16=gradient.dtype == torch.bfloat16)
         arrays = read_all([(b, "float32", tuple(g.table.shape), 0) for b, g in zip(d_tables, self.grids, strict=True)])
         return [torch.from_numpy(array).to(places[0][0].device) for array in arrays]
