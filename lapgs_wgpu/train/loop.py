@@ -65,7 +65,7 @@ def train(
     check_times(dataset, moving=config.field.kind != "static")
     if ranks.first:
         check_run_folder(out, overwrite=overwrite)
-        for warning in (*dataset.warnings, *_slow(config)):
+        for warning in (*dataset.warnings, *_precision_warnings(config)):
             print(f"warning: {warning}", file=sys.stderr, flush=True)
     keep_freed_memory()
     training = Training(config, dataset, device or open_device(), ranks)
@@ -104,7 +104,7 @@ def resume(
         return _run(training, dataset, out, watch) if ranks.first else _assist(training)
 
 
-def _slow(config: Config) -> list[str]:
+def _precision_warnings(config: Config) -> list[str]:
     """A sentence where the precision costs time instead of saving it."""
     features: dict[str, object] = getattr(torch.cpu, "get_capabilities", dict)()  # not in every torch
     if config.precision == "float32" or not features or any(features[name] for name in features if "bf16" in name):
