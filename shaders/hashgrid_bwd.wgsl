@@ -2,7 +2,8 @@
 // last bit on every run:
 // LANE_LEVELS, for devices of few wide cores: a lane owns a level and adds the points in their order.
 // Otherwise: a lane owns a point and adds in 64-bit fixed point, whose sum does not depend on the order.
-#import common/bfloat16
+#import common/d_encoding
+#import common/fixed_scale
 #import common/hashgrid
 #import common/index
 
@@ -10,21 +11,6 @@
 @group(0) @binding(1) var<storage, read> levels: array<Level>;
 // (N, 4): x, y, z, -
 #table 2 points: vec4<f32>
-// (N, all levels)
-#ifdef BFLOAT16
-#table 3 d_encoding: u32
-
-fn gradient_at(i: u32) -> vec2<f32> {
-    return unpack_bfloat16(d_encoding_at(i));
-}
-#else
-#table 3 d_encoding: vec2<f32>
-
-fn gradient_at(i: u32) -> vec2<f32> {
-    return d_encoding_at(i);
-}
-#endif
-
 fn first_entry(level: Level) -> u32 {
 #ifdef SLICED
     return level.place.y;
@@ -53,10 +39,11 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>) {
 }
 #else
 @group(0) @binding(4) var<storage, read_write> d_fixed: array<atomic<u32>>;   // low and high word of each feature; zero before
+@group(0) @binding(5) var<storage, read> largest: u32;   // gradient's absolute value, of all points
 
-fn add_fixed(at: u32, value: f32) {
-    // |value| x fixed_scale < 2^62: two words by splitting the float, which loses nothing below its own last bit.
-    let magnitude = abs(value) * grid.fixed_scale;
+fn add_fixed(at: u32, value: f32, scale: f32) {
+    // |value| x scale < 2^62: two words by splitting the float, which loses nothing below its own last bit.
+    let magnitude = abs(value) * scale;
     let upper = floor(magnitude / 4294967296.0);
     var low = u32(magnitude - upper * 4294967296.0);
     var high = u32(upper);
@@ -84,9 +71,10 @@ fn main(
     let first = first_entry(level);
     let cell = find_cell(unit_point(points_at(i).xyz, grid), level);
     let gradient = gradient_at(i * grid.all_levels + level.place.z);
+    let scale = fixed_scale(largest, grid.all_points);
 #unroll c $CORNERS
-    add_fixed(4u * (first + cell.index[$c]), cell.weight[$c] * gradient.x);
-    add_fixed(4u * (first + cell.index[$c]) + 2u, cell.weight[$c] * gradient.y);
+    add_fixed(4u * (first + cell.index[$c]), cell.weight[$c] * gradient.x, scale);
+    add_fixed(4u * (first + cell.index[$c]) + 2u, cell.weight[$c] * gradient.y, scale);
 #end
 }
 #endif

@@ -1,10 +1,12 @@
 // Adds gradients in 64-bit fixed point to those in floats.
+#import common/fixed_scale
 #import common/hashgrid
 #import common/index
 
 @group(0) @binding(0) var<uniform> grid: Grid;
 @group(0) @binding(1) var<storage, read> d_fixed: array<vec2<u32>>;
 @group(0) @binding(2) var<storage, read_write> d_features: array<f32>;
+@group(0) @binding(3) var<storage, read> largest: u32;   // as hashgrid_bwd has it
 
 @compute @workgroup_size(64)
 fn main(
@@ -21,6 +23,6 @@ fn main(
     if (negative) {
         word = vec2(~word.x + 1u, ~word.y + select(0u, 1u, word.x == 0u));
     }
-    let magnitude = (f32(word.y) * 4294967296.0 + f32(word.x)) / grid.fixed_scale;
+    let magnitude = (f32(word.y) * 4294967296.0 + f32(word.x)) / fixed_scale(largest, grid.all_points);
     d_features[i] += select(magnitude, -magnitude, negative);
 }

@@ -82,17 +82,17 @@ class DeviceEncoder:
         buffer.write(words)
         return _Part(number, sliced, len(chosen), buffer, largest, slices if sliced else 0)
 
-    def _uniform(self, part: _Part, place: str, points: int, time: float, fixed_scale: float = 1.0) -> Buffer:
+    def _uniform(self, part: _Part, place: str, points: int, all_points: int, time: float) -> Buffer:
         """What the kernels are told of a block of points; all blocks of all places are submitted at once."""
         content = Kernel.get(self.device, "hashgrid_slice", SLICED=1, CORNERS=4).uniform(
             "Grid",
             points=points,
+            all_points=all_points,
             levels=part.count,
             all_levels=self._row // 2,
             axes=(*self.grids[part.grid].axes, 0),
             time=time,
             bound=self.bound,
-            fixed_scale=fixed_scale,
         )
         return self.pool.constant(f"grid {part.grid} {part.sliced} place {place}", content)
 
@@ -133,7 +133,7 @@ class DeviceEncoder:
                 commands.dispatch_grid(
                     Kernel.get(self.device, "hashgrid_slice", **self._defines(part)),
                     (-(-part.cells // 64), part.count),
-                    grid=self._uniform(part, f"{number}", n, time),
+                    grid=self._uniform(part, f"{number}", n, n, time),
                     levels=part.levels,
                     features=source,
                     slices=slices,
@@ -160,7 +160,7 @@ class DeviceEncoder:
                 commands.dispatch(
                     Kernel.get(self.device, "hashgrid", **self._defines(part), **options),
                     -(-count // 512) * part.count,
-                    grid=self._uniform(part, f"{number} from {first}", count, time),
+                    grid=self._uniform(part, f"{number} from {first}", count, n, time),
                     levels=part.levels,
                     features=source,
                     **buffers,
@@ -173,13 +173,12 @@ class DeviceEncoder:
         points: Buffer,
         n: int,
         time: float,
-        fixed_scale: float,
         d_encoding: Buffer,
         d_tables: list[Buffer],
         *,
         bfloat16: bool = False,
     ) -> None:
-        """Add the gradient of the tables, from that of the encoding. fixed_scale: see `HashEncoder`.
+        """Add the gradient of the tables, from that of the encoding, whose rows must hold nothing else.
 
         bfloat16: of `d_encoding`, instead of float32.
         """
@@ -195,25 +194,30 @@ class DeviceEncoder:
                 commands.clear(target)
             sums.append(target)
 
-        options = _precision(bfloat16) | ({"LANE_LEVELS": 1} if self.lane_levels else {})
+        options = _precision(bfloat16)
         row = self._row * (2 if bfloat16 else 4)
+        largest = {} if self.lane_levels else {"largest": self._largest(commands, number, n, time, d_encoding, options)}
+        options |= {"LANE_LEVELS": 1} if self.lane_levels else {}
         for first, count in self._blocks(n, row, _LOOP_POINTS if self.lane_levels else None):
             for part, target in zip(self._parts, sums, strict=True):
                 commands.dispatch(
                     Kernel.get(self.device, "hashgrid_bwd", **self._defines(part), **options),
                     -(-part.count // 8) if self.lane_levels else -(-count // 64) * part.count,
-                    grid=self._uniform(part, f"{number} from {first}", count, time, fixed_scale),
+                    grid=self._uniform(part, f"{number} from {first}", count, n, time),
                     levels=part.levels,
                     points=_block(points, 16, first, count),
                     d_encoding=_block(d_encoding, row, first, count),
                     **{"d_features" if self.lane_levels else "d_fixed": target},
+                    **largest,
                 )
 
         for part, target, fixed in zip(self._parts, targets, sums, strict=True):
-            uniform = self._uniform(part, f"{number}", n, time, fixed_scale)
+            uniform = self._uniform(part, f"{number}", n, n, time)
             if not self.lane_levels:
                 unfix = Kernel.get(self.device, "hashgrid_unfix", **self._defines(part))
-                commands.dispatch(unfix, -(-target.nbytes // 256), grid=uniform, d_fixed=fixed, d_features=target)
+                commands.dispatch(
+                    unfix, -(-target.nbytes // 256), grid=uniform, d_fixed=fixed, d_features=target, **largest
+                )
             if part.sliced:
                 commands.dispatch_grid(
                     Kernel.get(self.device, "hashgrid_slice_bwd", **self._defines(part)),
@@ -223,6 +227,24 @@ class DeviceEncoder:
                     d_slices=target,
                     d_features=d_tables[part.grid],
                 )
+
+    def _largest(
+        self, commands: Commands, number: int, n: int, time: float, d_encoding: Buffer, options: dict[str, int]
+    ) -> Buffer:
+        """The largest absolute value of a gradient, by which sums in fixed point are scaled."""
+        largest = self.pool.get(f"largest {number}", 4)
+        commands.clear(largest)
+        kernel = Kernel.get(self.device, "hashgrid_largest", CORNERS=4, **options)
+        row = self._row * (2 if options else 4)
+        for first, count in self._blocks(n, row):
+            commands.dispatch(
+                kernel,
+                -(-count * self._row // 4096),
+                grid=self._uniform(self._parts[0], f"{number} largest from {first}", count, n, time),
+                d_encoding=_block(d_encoding, row, first, count),
+                largest=largest,
+            )
+        return largest
 
 
 def _block(buffer: Buffer, row: int, first: int, count: int) -> tuple[Buffer, int, int]:

@@ -104,8 +104,7 @@ class HashEncoder:
                         continue
                     at = number * len(self._encoders) + i
                     gradient = d_encodings[at]
-                    scale = 1.0 if encoder.lane_levels else _fixed_scale(gradient)
-                    mine = point_buffers[number], len(points), time, scale, d_buffers[at], by_group[i]
+                    mine = point_buffers[number], len(points), time, d_buffers[at], by_group[i]
                     encoder.add_gradient(commands, number, *mine, bfloat16=gradient.dtype == torch.bfloat16)
         arrays = read_all([(b, "float32", tuple(g.table.shape), 0) for b, g in zip(d_tables, self.grids, strict=True)])
         return [torch.from_numpy(array).to(places[0][0].device) for array in arrays]
@@ -123,14 +122,6 @@ class HashEncoder:
         buffer = self._pool.get(name, array.nbytes)
         buffer.write(array)
         return buffer
-
-
-def _fixed_scale(gradient: Tensor) -> float:
-    """By which gradients are multiplied in fixed point: the largest sum that can occur stays below 2^61."""
-    largest = float(gradient.abs().max())
-    if largest == math.inf:
-        return 1.0
-    return 2.0 ** min(120, math.floor(61 - math.log2(max(largest, 1e-30) * len(gradient))))
 
 
 class _Encode(torch.autograd.Function):

@@ -9,13 +9,13 @@ struct Level {
 }
 
 struct Grid {
-    points: u32,
+    points: u32,             // of a dispatch
+    all_points: u32,         // of all dispatches that add to the same sums
     levels: u32,             // in `levels`
     all_levels: u32,         // in a row of the encoding, which has two features for each
     axes: vec4<u32>,         // which of x, y, z, t (0 to 3) each axis of the grid is
     time: f32,               // in [0, 1]
     bound: f32,              // half side of the box that the grid covers
-    fixed_scale: f32,        // of gradients in fixed point
 }
 
 #ifdef SLICED
