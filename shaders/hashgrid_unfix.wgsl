@@ -24,5 +24,8 @@ fn main(
         word = vec2(~word.x + 1u, ~word.y + select(0u, 1u, word.x == 0u));
     }
     let magnitude = (f32(word.y) * 4294967296.0 + f32(word.x)) / fixed_scale(largest, grid.all_points);
-    d_features[i] += select(magnitude, -magnitude, negative);
+    let sum = select(magnitude, -magnitude, negative);
+    // Fixed point has no infinity and no NaN, which the training must see.
+    let lost = bitcast<f32>(largest);
+    d_features[i] += select(sum, lost, (largest >> 23u) == 255u);
 }

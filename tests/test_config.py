@@ -125,7 +125,7 @@ def test_base_gives_what_a_file_leaves_out(tmp_path: Path) -> None:
 def test_presets_are_complete_without_defaults_in_the_code() -> None:
     """But for what the config.toml of older runs lacks, which is off then."""
     optional = {field.name for field in dataclasses.fields(Config) if field.default is not dataclasses.MISSING}
-    assert optional == {"exposure", "precision"}
+    assert optional == {"exposure", "precision", "decoder"}
     assert not ExposureConfig().enabled
 
 
@@ -167,6 +167,15 @@ def test_unknown_preset(preset: str, message: str) -> None:
         ('base = "dnerf"\n[density]\nneighbours = 0', "neighbours must be at least 1"),
         ('base = "dnerf"\n[density]\nsplit_quantile = 1.1', "split_quantile between 0 and 1, got 10, 0.5 and 1.1"),
         ('base = "dnerf"\nprecision = "float16"', "precision must be float32 or bfloat16, got 'float16'"),
+        (
+            'base = "dnerf"\ndecoder = "device"\n[field]\ndepth = 1',
+            "decoder device is for the fields grid4d and laplacian with field.depth 0 and field.motion laplacian, "
+            "not for laplacian with depth 1 and motion laplacian",
+        ),
+        (
+            'base = "dnerf"\ndecoder = "device"\nprecision = "bfloat16"',
+            "decoder device works in float32: precision bfloat16 needs decoder torch",
+        ),
         (
             'base = "dnerf"\nprecision = "bfloat16"\n[field]\nkind = "mlp"',
             "for the fields grid4d and laplacian, not for mlp",

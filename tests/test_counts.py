@@ -14,6 +14,9 @@ from stages import watch
 from wgpu.backends.wgpu_native import GPUBuffer, GPUQueue
 
 from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.motion.field import FieldConfig, Nearby
+from lapgs_wgpu.motion.grid_field import GridField
+from lapgs_wgpu.motion.hashgrid import HashConfig
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterize import rasterizer_of
 from lapgs_wgpu.train.losses import LossWeights
@@ -141,6 +144,29 @@ def test_rasterize_reads_back_twice(device: Device, scene: Scene, events: list[E
     written = COUNT * (geometry + harmonics) + PIXELS * planes
     read = (PIXELS * planes + COUNT * splat) + COUNT * (splat + 4 * (3 + 4 + 3) + harmonics)
     assert written <= totals(events)["write"] <= written + 2048
+    assert read <= totals(events)["read"] <= read + 256
+
+
+def test_a_decoder_on_the_device_keeps_its_features_there(device: Device, events: list[Event]) -> None:
+    """A step of the field exchanges tables, points, what stands beside the features, weights and outputs, once each."""
+    grid = HashConfig(4, (4, 4, 4), (16, 16, 8))
+    config = FieldConfig(static=grid, temporal=grid, width=32, dynamics=3)
+    field = GridField(config, device, seed=0)
+    field.on_device = True
+    means, dynamics, pairs = torch.rand(COUNT, 3), torch.zeros(COUNT, 3, requires_grad=True), 50
+    nearby = Nearby(torch.arange(pairs), torch.zeros(pairs, 3), 0.5, 1.0, 1.0)
+    for counted in (False, True):  # buffers are made in the first
+        events.clear()
+        move = field(means, 0.4, dynamics, nearby)
+        assert not counted or waits(events) == 1
+        (move.translation.square().sum() + move.smoothness).backward()
+    assert waits(events) == 2
+    tables = sum(grid.table.nbytes for grid in field.grids)
+    beside, outputs = 4 * 4 * COUNT, 4 * 17 * COUNT
+    weights = 4 * (96 * 4 + 64 * 8 + 32 * 24 + 17 * 64)
+    written = tables + 16 * (COUNT + 2 * pairs) + beside + weights + outputs
+    read = outputs + 4 * 2 * pairs + beside + weights + tables
+    assert written <= totals(events)["write"] <= written + 4096
     assert read <= totals(events)["read"] <= read + 256
 
 

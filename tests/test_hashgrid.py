@@ -330,6 +330,19 @@ def test_gradients_of_any_size(device: Device, lane_levels: bool, size: float) -
 
 
 @both_shapes
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_gradients_that_are_not_finite_stay_so(device: Device, bad: float, *, lane_levels: bool) -> None:
+    grids = make_grids("dense", "sliced")
+    encoder = HashEncoder(device, apart(grids), BOUND, lane_levels=lane_levels)
+    encodings = encoder(random_points(100), 0.4)
+    upstream = [torch.ones_like(e) for e in encodings]
+    for d in upstream:
+        d[40, 3] = bad
+    for gradient in torch.autograd.grad(encodings, [grid.table for grid in grids], upstream):
+        assert not gradient.isfinite().all()
+
+
+@both_shapes
 def test_small_gradients_beside_large_ones(device: Device, lane_levels: bool) -> None:
     """Seven orders of magnitude between points: the small ones are still there, each in its own entries."""
     encoder = HashEncoder(device, apart(make_grids("dense")), BOUND, lane_levels=lane_levels)

@@ -20,7 +20,7 @@ from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.scene import Scene4D, load
-from lapgs_wgpu.train import loop, training
+from lapgs_wgpu.train import decoder, loop, training
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.loop import train
@@ -28,6 +28,7 @@ from lapgs_wgpu.train.losses import LossWeights
 from lapgs_wgpu.train.pictures import Pictures
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.render_loss import RenderLoss, render_loss
+from lapgs_wgpu.train.training import Training
 
 STEPS = 36
 SMALL: dict[str, str | list[str]] = {
@@ -91,7 +92,7 @@ def test_a_run_is_whole(run: Path, dataset: Dataset) -> None:
     assert {file.name for file in run.iterdir()} == {
         "config.toml", "log.jsonl", "metrics.json", "metrics.csv", "checkpoint.ply", "eval",
     }  # fmt: skip
-    assert load_config(str(run / "config.toml")) == configure()
+    assert load_config(str(run / "config.toml")) == dataclasses.replace(configure(), decoder="torch")
     record = (run / "config.toml").read_text().split("[record]")[1]
     assert all(f"\n{key} = " in record for key in ("lapgs_wgpu", "torch", "adapter", "driver"))
     (last,) = lines(run)
@@ -169,6 +170,61 @@ def test_bfloat16_trains_as_well_and_repeats(run: Path, dataset: Dataset, device
     assert (tmp_path / "first/checkpoint.ply").read_bytes() != (run / "checkpoint.ply").read_bytes()
     psnrs = [json.loads((folder / "metrics.json").read_text())["psnr"] for folder in (tmp_path / "first", run)]
     assert psnrs[0] == pytest.approx(psnrs[1], abs=0.5)
+
+
+def test_the_decoder_on_the_device_trains_as_well_and_repeats(
+    run: Path, dataset: Dataset, device: Device, tmp_path: Path
+) -> None:
+    config = configure(decoder="device")
+    for name in ("first", "again"):
+        train(config, dataset, tmp_path / name, device=device)
+    assert load_config(str(tmp_path / "first/config.toml")) == config
+    assert (tmp_path / "first/checkpoint.ply").read_bytes() == (tmp_path / "again/checkpoint.ply").read_bytes()
+    psnrs = [json.loads((folder / "metrics.json").read_text())["psnr"] for folder in (tmp_path / "first", run)]
+    assert psnrs[0] == pytest.approx(psnrs[1], abs=0.5)
+
+
+@pytest.mark.parametrize(("seconds", "place"), [((0.3, 0.2), "device"), ((0.2, 0.3), "torch")])
+def test_a_trial_chooses_where_the_decoder_works(
+    seconds: tuple[float, float],
+    place: str,
+    dataset: Dataset,
+    device: Device,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """On devices that are no CPUs; the choice is written down, so that a resumed run keeps to it."""
+    monkeypatch.setattr(device, "is_cpu", False)
+    monkeypatch.setattr(decoder, "_seconds", lambda scene, field, there: seconds[there == "device"])
+    train(configure(schedule__steps="1"), dataset, tmp_path / "run", device=device)
+    assert load_config(str(tmp_path / "run/config.toml")).decoder == place
+    assert f"decoder: {place} (a trial took " in capsys.readouterr().out
+
+
+def test_the_trial_leaves_no_trace(dataset: Dataset, device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(device, "is_cpu", False)
+    with closing(Training(configure(), dataset, device)) as trained:
+        assert set(trained.decoder.seconds) == {"torch", "device"}
+        assert all(0 < seconds < 60 for seconds in trained.decoder.seconds.values())
+        scene, random = trained.scene, trained.state()["training.random"]
+        assert scene.field is not None
+        assert all(p.grad is None for p in (*scene.field.parameters(), *scene.parameters.values()))
+    with closing(Training(configure(decoder="torch"), dataset, device)) as untried:
+        assert not untried.decoder.seconds
+        assert untried.decoder.place == "torch"
+        assert np.array_equal(untried.state()["training.random"], random)
+
+
+@pytest.mark.parametrize(
+    "given", [{"method": "static"}, {"method": "hexplane"}, {"field__depth": "1"}, {"precision": "bfloat16"}]
+)
+def test_nothing_is_tried_where_only_torch_will_do(
+    given: dict[str, str], dataset: Dataset, device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(device, "is_cpu", False)
+    with closing(Training(configure(**given), dataset, device)) as trained:
+        assert trained.decoder == decoder.Choice("torch", {})
 
 
 def test_a_processor_without_bfloat16_is_told(

@@ -29,8 +29,7 @@ _BLOCK_BYTES = 128 << 20  # of the features that one dispatch sees: WebGPU's def
 
 def runs_on_device(config: FieldConfig) -> bool:
     """Whether `DeviceField` can show this field."""
-    shown = config.kind == "grid4d" or (config.kind == "laplacian" and config.motion == "laplacian")
-    if not shown or config.depth:
+    if not config.decodes_on_device:
         return False
     sizes = _Sizes(config)
     # Of 8 channels (on CPU devices), with the loops over channels and the round itself.

@@ -110,6 +110,12 @@ class FieldConfig:
         """Outputs of the appearance head of a grid field; 0 where it has none."""
         return {"none": 0, "color": 3, "color+opacity": 4}[self.appearance] if self.kind == "laplacian" else 0
 
+    @property
+    def decodes_on_device(self) -> bool:
+        """Whether our kernels have the field's decoder: that of grid4d and laplacian without hidden layers, and without
+        the decoder that stands in for the spectrum."""
+        return not self.depth and (self.kind == "grid4d" or (self.kind == "laplacian" and self.motion == "laplacian"))
+
     def grid_time(self, t: float) -> float:
         """A time in [0, 1] as the place on the temporal grids' time axis."""
         return 0.5 * ((2.0 * t - 1.0) * self.time_scale + 1.0)

@@ -9,6 +9,8 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from ..gpu.device import Device
+from .decoder import Decoder
+from .device_decoder import DecoderShape
 from .field import APPEARANCE_SCALE, GEOMETRY, TEMPORAL_AXES, Deformation, FieldConfig, Nearby
 from .hash_encoder import HashEncoder, HashGrid
 from .laplacian import LaplacianMotion, TimeMotion
@@ -25,8 +27,10 @@ class GridField(nn.Module):
     added before the heads (eq. 6), and an appearance head compensates for changes of brightness. Without these, or
     with all of them at zero, it is grid4d.
 
-    precision: torch.float32 or torch.bfloat16, of features and of the decoder's products where gradients are wanted;
-    the parameters, what the heads give and everything without gradients are float32.
+    Where gradients are wanted, the decoder works in torch, or by kernels of ours where `on_device` is set, for
+    which the configuration must be one that `decodes_on_device`; without gradients in torch.
+    precision: torch.float32 or torch.bfloat16, of features and of the decoder's products where gradients are wanted, in
+    torch; the parameters, what the heads give and everything without gradients are float32.
     """
 
     def __init__(self, config: FieldConfig, device: Device, seed: int) -> None:
@@ -61,6 +65,19 @@ class GridField(nn.Module):
             self.motion = TimeMotion(static, width, generator)
         changes = config.appearance_size
         self.appearance = zero_head(width, changes) if changes else None
+        self.on_device = False
+        self._decoder = Decoder(
+            device,
+            self._encoder,
+            DecoderShape(
+                width=width,
+                beside=config.dynamics_size + 1,
+                static=static,
+                temporal=temporal,
+                outputs=sum(GEOMETRY) + changes,
+                motion=ours,
+            ),
+        )
 
     @property
     def grids(self) -> list[HashGrid]:
@@ -71,11 +88,8 @@ class GridField(nn.Module):
         self, means: Tensor, t: float, dynamics: Tensor | None = None, nearby: Nearby | None = None
     ) -> Deformation:
         """See motion/field.py."""
-        places = [(means, self.config.grid_time(t))]
-        if nearby is not None:
-            places.append((means[nearby.rows] + nearby.offsets, self.config.grid_time(nearby.time)))
-        encoded = self._encoder.encode_all(places, self.precision if torch.is_grad_enabled() else torch.float32)
-        outputs = self._decode_blocks(t, dynamics, *encoded[0])
+        evaluate = self._on_device if self.on_device and torch.is_grad_enabled() else self._in_torch
+        outputs, apart = evaluate(means, t, dynamics, nearby)
         geometry, look = outputs[:, : sum(GEOMETRY)], outputs[:, sum(GEOMETRY) :] if self.appearance else None
         turn, shift, d_quats, d_scales = geometry.split(GEOMETRY, dim=1)
         rotation = nn.functional.normalize(turn + turn.new_tensor([1.0, 0.0, 0.0, 0.0]), dim=1)
@@ -86,8 +100,66 @@ class GridField(nn.Module):
             d_scales,
             look[:, :3] if look is not None else None,
             look[:, 3] if look is not None and look.shape[1] > 3 else None,
-            _smoothness(encoded[0], encoded[1], nearby) if nearby is not None else None,
+            _smoothness(apart, nearby) if nearby is not None else None,
         )
+
+    def _in_torch(
+        self, means: Tensor, t: float, dynamics: Tensor | None, nearby: Nearby | None
+    ) -> tuple[Tensor, Tensor]:
+        """Outputs of the geometry heads (N, 14) and, beside them, of the appearance head; and, for static and temporal
+        features, the sum of the squared differences between those of near places."""
+        places = [(means, self.config.grid_time(t))]
+        if nearby is not None:
+            places.append((means[nearby.rows] + nearby.offsets, self.config.grid_time(nearby.time)))
+        here, *there = self._encoder.encode_all(places, self.precision if torch.is_grad_enabled() else torch.float32)
+        apart = [
+            (b - a[nearby.rows]).float().square().sum()
+            for far in there
+            for a, b in zip(here, far, strict=True)
+            if nearby is not None
+        ]
+        return self._decode_blocks(t, dynamics, *here), torch.stack(apart) if apart else means.new_zeros(0)
+
+    def _on_device(
+        self, means: Tensor, t: float, dynamics: Tensor | None, nearby: Nearby | None
+    ) -> tuple[Tensor, Tensor]:
+        """The same, without features or their gradients ever coming to the host."""
+        time = self.config.grid_time(t)
+        compared = None
+        if nearby is not None:
+            near = means[nearby.rows]
+            compared = (near, time), (near + nearby.offsets, self.config.grid_time(nearby.time))
+        ones = means.new_ones(len(means), 1)
+        size = self.config.dynamics_size
+        if size:
+            beside = torch.cat([means.new_zeros(len(means), size) if dynamics is None else dynamics, ones], dim=1)
+        else:
+            beside = ones
+        # The gate's weights are halved: 2 sigmoid(x) - 1 = tanh(x / 2).
+        placed = [(0.5 * self.spatial.weight, 0.5 * self.spatial.bias)]
+        heads, bias = self._heads()
+        if isinstance(self.motion, LaplacianMotion):
+            placed.append((self.motion.first.weight, self.motion.first.bias))
+            folded, shift = (self.heads.weight @ factor for factor in self.motion.second_factor(t))
+            heads = torch.cat([heads, nn.functional.pad(folded, (0, 0, 0, len(heads) - len(folded)))], dim=1)
+            bias = bias + nn.functional.pad(shift, (0, len(bias) - len(shift)))
+        of_place = [nn.functional.pad(own[:, None], (size, 0)) for _, own in placed]
+        of_time = torch.cat([self.temporal.weight[:, :size], self.temporal.bias[:, None]], dim=1)
+        weights = {
+            "beside": torch.cat([*of_place, of_time]),
+            "static": torch.cat([weight for weight, _ in placed]),
+            "temporal": self.temporal.weight[:, size:],
+            "heads": heads,
+        }
+        outputs, apart = self._decoder((means, time), beside, weights, compared)
+        return outputs + bias, apart
+
+    def _heads(self) -> tuple[Tensor, Tensor]:
+        """Weight and bias of all heads, as one matrix: they read the same features, whose gradient goes through
+        (N, width) once then."""
+        looks = [] if self.appearance is None else [self.appearance]
+        weight = torch.cat([self.heads.weight, *(APPEARANCE_SCALE * head.weight for head in looks)])
+        return weight, torch.cat([self.heads.bias, *(APPEARANCE_SCALE * head.bias for head in looks)])
 
     def _decode_blocks(self, t: float, dynamics: Tensor | None, *features: Tensor) -> Tensor:
         """`_decode`, block by block, so that no step asks for large pieces of memory. Of many Gaussians it is done
@@ -110,11 +182,7 @@ class GridField(nn.Module):
             if self.appearance is None:
                 return outputs
             return torch.cat([outputs, APPEARANCE_SCALE * self.appearance(gated.float())], dim=1)
-        # All heads read the same features: one product, whose gradient goes through (N, width) once.
-        looks = [] if self.appearance is None else [self.appearance]
-        weight = torch.cat([self.heads.weight, *(APPEARANCE_SCALE * head.weight for head in looks)])
-        bias = torch.cat([self.heads.bias, *(APPEARANCE_SCALE * head.bias for head in looks)])
-        outputs = last_product(gated, weight, bias)
+        outputs = last_product(gated, *self._heads())
         if motion is not None:
             moved = motion.through(self.heads.weight)
             outputs = outputs + nn.functional.pad(moved, (0, outputs.shape[1] - moved.shape[1]))
@@ -142,9 +210,7 @@ class GridField(nn.Module):
         return {"hash": tables, "mlp": [p for p in self.parameters() if id(p) not in apart]}
 
 
-def _smoothness(here: list[Tensor], there: list[Tensor], nearby: Nearby) -> Tensor:
+def _smoothness(apart: Tensor, nearby: Nearby) -> Tensor:
     """Grid4D's smoothness loss: the mean squared distance between the features of near places, static and temporal."""
-    far = [(b - a[nearby.rows]).float().square().sum() for a, b in zip(here, there, strict=True)]
-    count = max(1, len(nearby.rows))
-    temporal = torch.stack(far[1:]).sum() if len(far) > 1 else far[0].new_zeros(())
-    return (nearby.static_weight * far[0] + nearby.temporal_weight * temporal) / count
+    weights = apart.new_tensor([nearby.static_weight, nearby.temporal_weight][: len(apart)])
+    return (weights * apart).sum() / max(1, len(nearby.rows))

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-import math
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -53,6 +53,11 @@ class HashEncoder:
         """Those of all groups."""
         return [grid for group in self.groups for grid in group]
 
+    @property
+    def features(self) -> list[int]:
+        """Of a point, for each group."""
+        return [sum(grid.features for grid in group) for group in self.groups]
+
     def __call__(self, points: Tensor, time: float = 0.0, dtype: torch.dtype = torch.float32) -> list[Tensor]:
         """Encode points (N, 3), world units, at a time in [0, 1]: an (N, features) tensor for each group.
 
@@ -71,50 +76,78 @@ class HashEncoder:
 
     def encode(self, places: Sequence[Place], dtype: torch.dtype, tables: Sequence[Tensor]) -> list[Tensor]:
         """The forward pass without autograd: the encodings of the first place, group by group, then of the second."""
-        # Everything is written before anything is submitted: a buffer can only be mapped while the device rests.
-        table_buffers = self._by_group([self._upload(f"table {i}", table) for i, table in enumerate(tables)])
-        point_buffers = [self._points(number, points) for number, (points, _) in enumerate(places)]
-        requests: list[Request] = []
+        self.write(places, tables)
         with Commands(self._pool.device) as commands:
-            for number, (points, time) in enumerate(places):
-                for i, encoder in enumerate(self._encoders):
-                    shape = len(points), sum(grid.features for grid in encoder.grids)
-                    name = f"encoding {number * len(self._encoders) + i}"
-                    buffer = self._pool.get(name, dtype.itemsize * math.prod(shape))
-                    requests.append((buffer, _NUMPY[dtype], shape, 0))
-                    if len(points):
-                        mine = point_buffers[number], len(points), time, table_buffers[i], buffer
-                        encoder.encode(commands, number, *mine, bfloat16=dtype == torch.bfloat16)
+            self.record(commands, places, dtype)
+        requests: list[Request] = [
+            (buffer, _NUMPY[dtype], (len(points), size), 0)
+            for number, (points, _) in enumerate(places)
+            for buffer, size in zip(self.encodings(number), self.features, strict=True)
+        ]
         device = places[0][0].device
         return [torch.from_numpy(array).view(dtype).to(device) for array in read_all(requests)]
 
     def backward(self, places: Sequence[Place], d_encodings: Sequence[Tensor]) -> list[Tensor]:
         """The gradients of the tables, from those of the encodings in the order of `encode`."""
-        # In the buffers of `encode`, none of which is needed any more.
-        d_tables = [self._pool.get(f"table {i}", 8 * len(grid.table)) for i, grid in enumerate(self.grids)]
-        by_group = self._by_group(d_tables)
-        point_buffers = [self._points(number, points) for number, (points, _) in enumerate(places)]
-        d_buffers = [self._upload(f"encoding {i}", d) for i, d in enumerate(d_encodings)]
+        self.write(places)
+        for i, d_encoding in enumerate(d_encodings):
+            self._upload("encoding {} {}".format(*divmod(i, len(self.groups))), d_encoding)
         with Commands(self._pool.device) as commands:
-            for buffer in d_tables:
-                commands.clear(buffer)
-            for number, (points, time) in enumerate(places):
-                for i, encoder in enumerate(self._encoders):
-                    if len(points) == 0:
-                        continue
-                    at = number * len(self._encoders) + i
-                    gradient = d_encodings[at]
-                    mine = point_buffers[number], len(points), time, d_buffers[at], by_group[i]
-                    encoder.add_gradient(commands, number, *mine, bfloat16=gradient.dtype == torch.bfloat16)
-        arrays = read_all([(b, "float32", tuple(g.table.shape), 0) for b, g in zip(d_tables, self.grids, strict=True)])
-        return [torch.from_numpy(array).to(places[0][0].device) for array in arrays]
+            requests = self.record_gradient(commands, places, d_encodings[0].dtype)
+        return [torch.from_numpy(array).to(places[0][0].device) for array in read_all(requests)]
 
-    def _by_group(self, of_grids: Sequence[Buffer]) -> list[list[Buffer]]:
-        rest = iter(of_grids)
-        return [[next(rest) for _ in group] for group in self.groups]
+    # What `encode` and `backward` consist of, without waiting for the device. Everything is written before anything is
+    # submitted: a buffer can only be mapped while the device rests.
 
-    def _points(self, number: int, points: Tensor) -> Buffer:
-        return self._upload(f"points {number}", torch.nn.functional.pad(points.float(), (0, 1)))
+    def write(self, places: Sequence[Place], tables: Sequence[Tensor] = ()) -> None:
+        """Bring points, and tables, to the device."""
+        for i, table in enumerate(tables):
+            self._upload(f"table {i}", table)
+        for number, (points, _) in enumerate(places):
+            self._upload(f"points {number}", torch.nn.functional.pad(points.detach().float(), (0, 1)))
+
+    def encodings(self, number: int) -> list[Buffer]:
+        """Those of a set of points, group by group; with `record_gradient` what holds their gradients."""
+        return [self._pool.get(f"encoding {number} {i}", 0) for i in range(len(self.groups))]
+
+    def record(self, commands: Commands, places: Sequence[Place], dtype: torch.dtype = torch.float32) -> None:
+        """The passes that encode what was written."""
+        tables = self._tables()
+        for number, (points, time) in enumerate(places):
+            for i, (encoder, size) in enumerate(zip(self._encoders, self.features, strict=True)):
+                encoding = self._pool.get(f"encoding {number} {i}", dtype.itemsize * len(points) * size)
+                if len(points):
+                    mine = self._pool.get(f"points {number}", 0), len(points), time, tables[i], encoding
+                    encoder.encode(commands, number, *mine, bfloat16=dtype == torch.bfloat16)
+
+    def record_gradient(
+        self, commands: Commands, places: Sequence[Place], dtype: torch.dtype = torch.float32
+    ) -> list[Request]:
+        """The passes that make the gradients of the tables, in the tables' buffers, of those of the encodings, in the
+        encodings' buffers; what to read to have them."""
+        tables = self._tables()
+        for buffer in itertools.chain(*tables):
+            commands.clear(buffer)
+        for number, (points, time) in enumerate(places):
+            for i, encoder in enumerate(self._encoders):
+                if len(points):
+                    mine = (
+                        self._pool.get(f"points {number}", 0),
+                        len(points),
+                        time,
+                        self.encodings(number)[i],
+                        tables[i],
+                    )
+                    encoder.add_gradient(commands, number, *mine, bfloat16=dtype == torch.bfloat16)
+        shapes = [tuple(grid.table.shape) for grid in self.grids]
+        return [(b, "float32", shape, 0) for b, shape in zip(itertools.chain(*tables), shapes, strict=True)]
+
+    def _tables(self) -> list[list[Buffer]]:
+        """The tables' buffers, group by group."""
+        numbers = itertools.count()
+        return [
+            [self._pool.get(f"table {next(numbers)}", 8 * len(grid.table)) for grid in group] for group in self.groups
+        ]
 
     def _upload(self, name: str, tensor: Tensor) -> Buffer:
         words = tensor.detach().to("cpu").contiguous()

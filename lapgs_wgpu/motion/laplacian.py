@@ -69,9 +69,13 @@ class LaplacianMotion(nn.Module):
 
     def forward(self, static: Tensor, t: float) -> Factors:
         """A_L of Gaussians with the static features H_s (N, inputs)."""
-        series = self.series(t)
         inner = torch.relu(product(static, self.first.weight, self.first.bias))
-        return Factors(inner, series[:, None] * self.second.weight, series * self.second.bias)
+        return Factors(inner, *self.second_factor(t))
+
+    def second_factor(self, t: float) -> tuple[Tensor, Tensor]:
+        """Matrix (W, W) and bias (W,) of `Factors`."""
+        series = self.series(t)
+        return series[:, None] * self.second.weight, series * self.second.bias
 
     def amplitudes(self) -> Tensor:
         """(K,) |c_k|, the root of the mean over the channels of alpha^2 + beta^2; without gradient."""

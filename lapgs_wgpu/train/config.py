@@ -19,6 +19,7 @@ from lapgs_wgpu.motion.hashgrid import option
 Background = Literal["black", "white", "random"]
 Split = Literal["plain", "adaptive"]
 Precision = Literal["float32", "bfloat16"]
+DecoderPlace = Literal["auto", "torch", "device"]
 
 
 def described(text: str, default: Any = dataclasses.MISSING) -> Any:
@@ -265,8 +266,21 @@ class Config:
         "that have instructions for it; parameters, sums, images and everything after the training are float32",
         "float32",
     )
+    decoder: DecoderPlace = described(
+        "where the decoder of the fields grid4d and laplacian works while training: torch, device (by kernels, which "
+        "changes the last bits), or auto: on the device where it is no CPU and a trial at the start finds it faster; "
+        "config.toml then says which it was",
+        "torch",
+    )
 
     def __post_init__(self) -> None:
+        if self.decoder == "device" and not self.field.decodes_on_device:
+            raise ValueError(
+                "decoder device is for the fields grid4d and laplacian with field.depth 0 and field.motion laplacian, "
+                f"not for {self.field.kind} with depth {self.field.depth} and motion {self.field.motion}"
+            )
+        if self.decoder == "device" and self.precision != "float32":
+            raise ValueError(f"decoder device works in float32: precision {self.precision} needs decoder torch")
         if self.precision != "float32" and self.field.kind not in ("grid4d", "laplacian"):
             raise ValueError(
                 f"precision {self.precision} is for the fields grid4d and laplacian, not for {self.field.kind}"

@@ -19,6 +19,7 @@ from lapgs_wgpu.gpu.device import Device, open_device
 from lapgs_wgpu.io.first_look import FirstLook
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.config import Background, Config
+from lapgs_wgpu.train.decoder import Choice
 from lapgs_wgpu.train.evaluate import evaluate, write_metrics
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.lpips import Lpips
@@ -72,7 +73,9 @@ def train(
     if not ranks.first:
         return _assist(training)
     with locked_run_folder(out):
-        start_run_folder(out, config, training.scene.device, dataset)
+        start_run_folder(out, training.config, training.scene.device, dataset)
+        if training.decoder.seconds:
+            print(_told(training.decoder), flush=True)
         return _run(training, dataset, out, watch)
 
 
@@ -110,6 +113,12 @@ def _precision_warnings(config: Config) -> list[str]:
     if config.precision == "float32" or not features or any(features[name] for name in features if "bf16" in name):
         return []
     return ["this processor has no instructions for bfloat16: the training will be faster with --precision float32."]
+
+
+def _told(choice: Choice) -> str:
+    """Where the decoder works, and why."""
+    times = ", ".join(f"{1e3 * seconds:.0f} ms with {place}" for place, seconds in choice.seconds.items())
+    return f"decoder: {choice.place} (a trial took {times})"
 
 
 def _assist(training: Training) -> Scene4D:

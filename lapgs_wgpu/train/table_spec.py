@@ -124,6 +124,8 @@ def fingerprint(config: Config) -> str:
         del values["exposure"]
     if config.precision == "float32":
         del values["precision"]
+    if config.decoder != "device":
+        del values["decoder"]
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:16]
 
 

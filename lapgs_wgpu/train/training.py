@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -21,6 +22,7 @@ from lapgs_wgpu.motion.grid_field import GridField
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.morton import morton_order
 from lapgs_wgpu.train.config import Config, PointsConfig, SmoothnessConfig
+from lapgs_wgpu.train.decoder import choose_decoder
 from lapgs_wgpu.train.densify import Statistics, densify, reset_opacities
 from lapgs_wgpu.train.exposure import Exposures
 from lapgs_wgpu.train.health import Health, Skipped, check_parameters, describe, finite
@@ -52,8 +54,11 @@ class _Look(NamedTuple):
 
 
 class Training:
-    """A training between two of its steps. done: the steps so far. whole: whether `state` is that of a whole step,
-    which it also is where `step` raised an error before anything that lasts had changed."""
+    """A training between two of its steps.
+
+    config: with the decoder's place chosen. done: the steps so far. whole: whether `state` is that of a whole step,
+    which it also is where `step` raised an error before anything that lasts had changed.
+    """
 
     def __init__(self, config: Config, dataset: Dataset, device: Device, ranks: Ranks = ALONE) -> None:
         if config.schedule.batch % ranks.count:
@@ -61,7 +66,7 @@ class Training:
                 f"{ranks.count} processes cannot share {config.schedule.batch} views a step evenly; give --batch "
                 f"{ranks.count}, or a multiple of it."
             )
-        self.config, self.ranks = config, ranks
+        self.ranks = ranks
         self.done = 0
         self._generator = torch.Generator().manual_seed(config.seed)
         self.scene = Scene4D.from_points(
@@ -71,6 +76,8 @@ class Training:
             device=device,
             seed=config.seed,
         )
+        self.decoder = choose_decoder(config, self.scene, device, ranks)
+        self.config = dataclasses.replace(config, decoder=self.decoder.place)
         self._start(dataset)
         self.whole = True
 
@@ -78,6 +85,7 @@ class Training:
         config, scene = self.config, self.scene
         if isinstance(scene.field, GridField):
             scene.field.precision = getattr(torch, config.precision)
+            scene.field.on_device = self.decoder.place == "device"
         groups = scene.field.parameter_groups() if scene.field else {}
         self._optimiser = Optimiser(scene.parameters, groups, config.rates.schedules())
         self._frequencies = None

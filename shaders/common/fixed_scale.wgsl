@@ -3,7 +3,7 @@
 fn fixed_scale(largest: u32, points: u32) -> f32 {
     let above = i32(largest >> 23u) - 126;   // the largest value is below 2^above
     if (above > 128) {
-        return 1.0;   // it is not finite
+        return 1.0;   // it is not finite, and neither will the sums be (hashgrid_unfix)
     }
     let most = 32 - i32(countLeadingZeros(points));
     return bitcast<f32>(u32(min(61 - above - most, 120) + 127) << 23u);

@@ -1,0 +1,60 @@
+"""Where a training's decoder works: in torch, or on the device, whichever is faster."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from typing import Literal, NamedTuple
+
+import torch
+
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.motion.grid_field import GridField
+from lapgs_wgpu.motion.scene import Scene4D
+from lapgs_wgpu.train.config import Config
+from lapgs_wgpu.train.ranks import Ranks
+
+Place = Literal["torch", "device"]
+_ROUNDS = 3  # of each, after one that compiles kernels and makes buffers
+
+
+class Choice(NamedTuple):
+    """Where, and how long the field took in each place, forward and backward, in seconds; none where none was timed."""
+
+    place: Place
+    seconds: dict[Place, float]
+
+
+def choose_decoder(config: Config, scene: Scene4D, device: Device, ranks: Ranks) -> Choice:
+    """What the configuration says or, with "auto", the faster place for the field of a scene at its start.
+
+    With "auto" a CPU device is not timed: it shares torch's processor, which torch makes ten times more of. All ranks
+    choose alike. Moves no random numbers, and leaves no gradients.
+    """
+    field = scene.field
+    if config.decoder != "auto":
+        return Choice(config.decoder, {})
+    allowed = config.field.decodes_on_device and config.precision == "float32"
+    if device.is_cpu or not allowed or not isinstance(field, GridField):
+        return Choice("torch", {})
+    places: tuple[Place, ...] = ("torch", "device")
+    seconds = torch.tensor([_seconds(scene, field, place) for place in places], dtype=torch.float64)
+    means = (ranks.sums([seconds])[0] / ranks.count).tolist()
+    taken = dict(zip(places, means, strict=True))
+    return Choice(min(places, key=taken.__getitem__), taken)
+
+
+def _seconds(scene: Scene4D, field: GridField, place: Place) -> float:
+    """Of the field's forward and backward pass."""
+    before, field.on_device = field.on_device, place == "device"
+    parameters = scene.parameters
+    times = []
+    for _ in range(1 + _ROUNDS):
+        start = time.perf_counter()
+        move = field(parameters["means"], 0.5, parameters.get("dynamics"))
+        (move.translation.sum() + move.d_scales.sum()).backward()
+        times.append(time.perf_counter() - start)
+    for each in (*field.parameters(), *parameters.values()):
+        each.grad = None
+    field.on_device = before
+    return statistics.median(times[1:])
