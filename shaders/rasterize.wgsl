@@ -1,6 +1,6 @@
 // Draws the image: each tile's splats front to back, until no pixel of the tile sees any further.
 @group(0) @binding(0) var<uniform> frame: Frame;
-@group(0) @binding(1) var<storage, read_write> ranges: array<vec4<u32>>;
+@group(0) @binding(1) var<storage, read_write> ranges: array<vec4<u32>>;   // a tile's; the last: common/raster
 #table 2 slots: u32
 #table 3 slot_ids: u32
 #table 4 splats: vec4<f32>
@@ -22,7 +22,15 @@ fn main(
     @builtin(workgroup_id) group: vec3<u32>,
     @builtin(num_workgroups) groups: vec3<u32>,
     @builtin(local_invocation_index) lane: u32,
+#ifdef SUBGROUPS
+    @builtin(subgroup_size) subgroup: u32,
+#endif
 ) {
+#ifdef SUBGROUPS
+    if (subgroup < u32(LANES)) {
+        ranges[arrayLength(&ranges) - 1u].z = 1u;
+    }
+#endif
     let tile = workgroup_number(group, groups);
     if (tile >= (frame.band.y - frame.band.x) * frame.tiles.x) {
         return;

@@ -8,7 +8,11 @@
 // A record holds the moments of v = alpha d_loss/d_alpha over the pixels (1, x, y, x^2, x y, y^2, relative to the mean),
 // since the gradients of opacity, mean and conic are linear in them; red, green, blue; depth.
 @group(0) @binding(0) var<uniform> frame: Frame;
+#ifdef SUBGROUPS
+@group(0) @binding(1) var<storage, read_write> ranges: array<vec4<u32>>;   // a tile's; the last: common/raster
+#else
 @group(0) @binding(1) var<storage, read> ranges: array<vec4<u32>>;
+#endif
 #table 2 slots: u32
 #table 3 slot_ids: u32
 #table 4 splats: vec4<f32>
@@ -16,11 +20,12 @@
 #table 5 image: f32
 #table 6 d_image: f32
 @group(0) @binding(7) var<storage, read_write> records: array<f32>;        // 8 a record: the moments, red, green
-// Of each slot the place of its record, from 1, or 0 where nobody saw it; then of each record blue (, then depth), as bits.
+// Of each slot the place of its record, from 1, or 0, as before, where nobody saw it; then of each record blue (, then
+// depth), as bits.
 @group(0) @binding(8) var<storage, read_write> record_tails: array<u32>;
 #ifdef ROUNDS
 // Of a list that is drawn in rounds, each round takes ROUND_SPLATS splats, and leaves transmittance and rest of its pixels
-// behind all tails. Places are zero before.
+// behind all tails.
 struct Piece { number: u32, state: u32 }   // the place of the state among the tails
 @group(0) @binding(9) var<uniform> piece: Piece;
 #endif
@@ -60,7 +65,15 @@ fn main(
     @builtin(workgroup_id) group: vec3<u32>,
     @builtin(num_workgroups) groups: vec3<u32>,
     @builtin(local_invocation_index) lane: u32,
+#ifdef SUBGROUPS
+    @builtin(subgroup_size) subgroup: u32,
+#endif
 ) {
+#ifdef SUBGROUPS
+    if (subgroup < u32(LANES)) {
+        ranges[arrayLength(&ranges) - 1u].w = 1u;
+    }
+#endif
     let tile = workgroup_number(group, groups);
     if (tile >= (frame.band.y - frame.band.x) * frame.tiles.x) {
         return;
@@ -249,10 +262,5 @@ fn main(
         record_tails[at + 1u] = bitcast<u32>(rest[$r]);
     }
 #end
-#else
-    // What no pixel of the tile sees has no gradient.
-    for (var i = range.z + lane; i < range.y; i += u32(LANES)) {
-        record_tails[slots_at(i)] = 0u;
-    }
 #endif
 }

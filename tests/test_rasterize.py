@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -180,6 +181,54 @@ def test_all_shapes_draw_the_same(device: Device, use: Callable[[Rasterizer], An
         assert torch.equal(other.radii, first.radii)
         for name, gradient in first.gradients.items():
             assert relative(other.gradients[name], gradient) < 2e-5
+
+
+def test_workgroups_that_are_cut_into_subgroups_are_noticed(device: Device, use: Callable[[Rasterizer], Any]) -> None:
+    """As a driver may do for one pass and not for another: both do without shuffles then."""
+    if not 0 < device.subgroup_size < 32:
+        pytest.skip("this device has no subgroups, or none of fewer than 32 lanes")
+    scene, camera = random_scene(500, 8, size=0.08), oblique_camera(101, 61)
+    whole, cut = gpu_shape(0), replace(gpu_shape(32), subgroups=True)
+    weights = Weights.random(camera)
+    steps = []
+    for shape in (whole, cut):
+        rasterizer = use(Rasterizer(device, shape=shape))
+        drawn = [step(scene, camera, device, background=BACKGROUND, weights=weights) for _ in range(2)]
+        assert not rasterizer.shape.subgroups
+        steps += drawn
+    for other in steps[1:]:
+        assert torch.equal(other.image, steps[0].image)
+        for name, gradient in steps[0].gradients.items():
+            assert torch.equal(other.gradients[name], gradient)
+
+
+def test_only_the_backward_pass_is_cut(
+    device: Device, use: Callable[[Rasterizer], Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not 0 < device.subgroup_size < 32:
+        pytest.skip("this device has no subgroups, or none of fewer than 32 lanes")
+    scene, camera = random_scene(500, 8, size=0.08), oblique_camera(101, 61)
+    use(Rasterizer(device, shape=gpu_shape(0)))
+    expected = step(scene, camera, device)
+    defines = RasterShape.raster_defines
+    rasterizer = use(Rasterizer(device, shape=replace(gpu_shape(32), subgroups=True)))
+    torn = rasterizer._torn
+
+    def forward_without(self: RasterShape, *, depth: bool) -> dict[str, int]:
+        found = defines(self, depth=depth)
+        if not rasterizer._trusted:  # the forward pass
+            found.pop("SUBGROUPS", None)
+        return found
+
+    monkeypatch.setattr(RasterShape, "raster_defines", forward_without)
+    asked: list[tuple[str, bool]] = []
+    monkeypatch.setattr(
+        rasterizer, "_torn", lambda name, drawn: asked.append((name, torn(name, drawn))) or asked[-1][1]
+    )
+    found = step(scene, camera, device)
+    assert asked == [("rasterize", False), ("rasterize_bwd", True), ("rasterize_bwd", False)]
+    for name, gradient in expected.gradients.items():
+        assert torch.equal(found.gradients[name], gradient)
 
 
 # The door for torch

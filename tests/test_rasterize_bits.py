@@ -10,6 +10,7 @@ import torch
 from scenes import Scene, Step, Weights, front_camera, oblique_camera, random_scene, relative, step
 from stages import watch
 
+from lapgs_wgpu.gpu import shader
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.splat.rasterize import rasterize, rasterizer_of
 from lapgs_wgpu.splat.rasterizer import Rasterizer
@@ -242,3 +243,22 @@ def test_the_passes_are_the_same_each_time(
         one_step(scene, device)
         rounds.append(tuple(seen))
     assert rounds[0] == rounds[1]
+
+
+def test_tiles_that_were_counted_and_not_found(device: Device, use: Use, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Should a driver round differently in the passes that count tiles and that list them: the slots that are left over
+    have no record, and take none of an earlier image."""
+    text = shader.shader_text
+    found, one_fewer = "&& slot < end;", "&& slot + select(0u, 1u, id % 50u == 0u) < end;"
+    assert found in text("emit")
+    monkeypatch.setattr(device, "kernel_cache", {})
+    monkeypatch.setattr(shader, "shader_text", lambda name: text(name).replace(found, one_fewer))
+    scene, other = random_scene(1500, 1, size=0.08), random_scene(1500, 2, size=0.12)
+    use(Rasterizer(device))
+    fresh = step(scene, CAMERA, device)
+    use(Rasterizer(device))
+    step(other, CAMERA, device)
+    used = step(scene, CAMERA, device)
+    assert torch.equal(used.image, fresh.image)
+    for name, gradient in fresh.gradients.items():
+        assert torch.equal(used.gradients[name], gradient)

@@ -1,11 +1,12 @@
 """The passes that draw an image from Gaussians, and those that carry its gradient back, on buffers of a device.
 
-See docs/architecture.md for the order of the passes. Nothing here waits for the device except `Rasterizer.grow`.
+See docs/architecture.md for the order of the passes. Nothing here waits for the device except `Rasterizer.grow` and,
+once a pass, `Rasterizer._torn`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -77,6 +78,7 @@ class Rasterizer:
         self._depth_sort = RadixSort(device, self.pool, "depth sort", lane_runs=self.shape.lane_runs)
         self._tile_sort = RadixSort(device, self.pool, "tile sort", lane_runs=self.shape.lane_runs)
         self._drawn: _Drawn | None = None
+        self._trusted: set[tuple[str, bool, bool]] = set()  # passes whose workgroups are known to be subgroups
 
     # Forward ---------------------------------------------------------------------------------------------------------
 
@@ -104,6 +106,8 @@ class Rasterizer:
         for band in range(self.bands):
             with Commands(self.device, profile) as commands:
                 self._draw_band(commands, drawn, band)
+        if self._torn("rasterize", drawn):
+            return self.draw(gaussians, camera, background, depth=depth, profile=profile)
         return image
 
     def grow(self) -> bool:
@@ -147,7 +151,7 @@ class Rasterizer:
         tiles = self._band_tiles(drawn, band)
         splats = pool.get("splats", 4 * SPLAT_FLOATS * n)
         tile_counts = pool.get("tile counts", 4 * n)
-        ranges = pool.get("ranges", 16 * max(1, tiles))
+        ranges = pool.get("ranges", 16 * tiles + 16)
         visible, needed = pool.get("visible", 4), self._needed(band)
         if shape.round_splats:
             commands.clear(needed)
@@ -277,6 +281,21 @@ class Rasterizer:
         )
         return self.pool.constant(f"frame {band}", content)
 
+    def _torn(self, name: str, drawn: _Drawn) -> bool:
+        """Whether the driver has cut the workgroups of a pass, which was submitted for the first time, into several
+        subgroups. The shape then does without subgroups, and the pass has to be done again. Waits for the device, but
+        once a pass."""
+        key = (name, drawn.depth, self.rounds > 1)
+        if not self.shape.subgroups or key in self._trusted:
+            return False
+        self._trusted.add(key)
+        ranges = self.pool.get("ranges", 0)
+        last = ranges.read("uint32", (4,), ranges.nbytes - 16)
+        if not last[3 if name == "rasterize_bwd" else 2]:
+            return False
+        self.shape = replace(self.shape, subgroups=False)
+        return True
+
     # Backward --------------------------------------------------------------------------------------------------------
 
     def backward(self, d_image: Buffer, *, profile: Any = None) -> GradientBuffers:
@@ -297,6 +316,8 @@ class Rasterizer:
                 if self.bands > 1:
                     self._draw_band(commands, drawn, band)  # the lists of the other bands are gone
                 self._backward_band(commands, drawn, band, d_image, d_splats)
+        if self._torn("rasterize_bwd", drawn):
+            return self.backward(d_image, profile=profile)
         d_colors = None
         with Commands(self.device, profile) as commands:
             commands.dispatch(
@@ -331,8 +352,7 @@ class Rasterizer:
             **self.shape.raster_defines(depth=drawn.depth),
             **({"ROUNDS": 1} if self.rounds > 1 else {}),
         )
-        if self.rounds > 1:
-            commands.clear(record_tails, 4 * self.capacity)  # no slot has a record yet
+        commands.clear(record_tails, 4 * self.capacity)  # no slot has a record yet
         for number in range(self.rounds):
             piece = {}
             if self.rounds > 1:

@@ -1,6 +1,8 @@
 // What the rasteriser's two passes share: a workgroup draws one tile, each lane ROWS pixels of one column, and a batch of
 // as many splats as lanes is loaded at once, one a lane, then handed round. With SUBGROUPS the workgroup lies in one
-// subgroup and splats are handed round by shuffles, otherwise through workgroup memory.
+// subgroup and splats are handed round by shuffles, otherwise through workgroup memory. A driver may choose narrower
+// subgroups for one pipeline than for another: then the pass says so behind the ranges of all tiles (z: rasterize, w:
+// rasterize_bwd), and what it has written is worth nothing.
 #import common/constants
 #import common/frame
 #import common/splat
