@@ -30,7 +30,7 @@ SYNTHETIC = "synthetic"
 
 USAGE = "lapgs-train PRESET --data DIR [--out RUN] [--KEY VALUE ...]"
 DESCRIPTION = """\
-Train a moving scene on the pictures of a folder, on any Vulkan, Metal or D3D12 adapter.
+Train a moving scene on the pictures of a folder, on any Vulkan adapter.
 
   lapgs-train demo --data synthetic             the built-in scene, in minutes on a CPU
   lapgs-train tiny --data DIR                   a D-NeRF scene at 200x200, sized for a CPU

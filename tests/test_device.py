@@ -133,6 +133,20 @@ def test_adapters_are_ordered(monkeypatch: pytest.MonkeyPatch) -> None:
     ]
 
 
+def test_vulkan_comes_before_the_same_card_through_d3d12(monkeypatch: pytest.MonkeyPatch) -> None:
+    there = [("card", "DiscreteGPU", "D3D12"), ("card", "DiscreteGPU", "Vulkan"), ("chip", "IntegratedGPU", "Vulkan")]
+    adapters = [_Adapter(*each[:2]) for each in there]
+    for adapter, each in zip(adapters, there, strict=True):
+        adapter.info = {**adapter.info, "backend_type": each[2]}
+    instance = type("Instance", (), {"enumerate_adapters_sync": lambda self: adapters})()
+    monkeypatch.setattr(module, "_instance", lambda: instance)
+    assert [(info.kind, info.backend) for info in list_devices()] == [
+        ("discrete", "Vulkan"),
+        ("discrete", "D3D12"),
+        ("integrated", "Vulkan"),
+    ]
+
+
 # What is asked of it
 
 

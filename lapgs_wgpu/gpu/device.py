@@ -62,7 +62,8 @@ def _adapters() -> list[tuple[DeviceInfo, Any]]:
         kind = kinds.get(info["adapter_type"], "other")
         found.append((DeviceInfo(info["device"], kind, info["backend_type"], info["description"]), adapter))
     order = ("discrete", "integrated", "other", "cpu")
-    return sorted(found, key=lambda pair: order.index(pair[0].kind))
+    # The same card through Vulkan and through D3D12: Vulkan is what the kernels were tested on.
+    return sorted(found, key=lambda pair: (order.index(pair[0].kind), pair[0].backend != "Vulkan"))
 
 
 def list_devices() -> list[DeviceInfo]:
