@@ -26,12 +26,13 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def results(file: Path) -> dict:
-    table = bench("--parts", "raster", "encoder", "losses", "step", "shares", "--json", file)
+    table = bench("--parts", "raster", "encoder", "decoder", "losses", "step", "shares", "--json", file)
     for words in (
         "rasterize_bwd",
         "forward + backward",
         "0 of them before the sort",
         "times as fast as the twin;",
+        "times as fast on the device;",
         "as fast as the twins",
         "at the ceiling",
     ):

@@ -18,6 +18,7 @@ from typing import Any
 import torch
 from ceilings import describe
 from compare import compare
+from decoder import DecoderReport, bench_decoder
 from encoder import EncoderReport, bench_encoder
 from losses import LossReport, bench_losses
 from measure import Timing, Traffic
@@ -31,7 +32,7 @@ from lapgs_wgpu.gpu.device import Device, open_device
 from lapgs_wgpu.train.presets import load_config
 from viewer import bench_viewer, print_viewer
 
-PARTS = ("raster", "encoder", "losses", "step", "shares", "viewer")
+PARTS = ("raster", "encoder", "decoder", "losses", "step", "shares", "viewer")
 
 
 def main() -> None:
@@ -42,7 +43,7 @@ def main() -> None:
         nargs="+",
         default=FIXED_SET,
         metavar="N@WxH",
-        help=f"Gaussians and image of what is drawn; the first one's also in losses and shares [{_names(FIXED_SET)}]",
+        help=f"Gaussians and image of what is drawn; the first one's also in encoder, decoder, losses and shares [{_names(FIXED_SET)}]",
     )
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS, help=f"what is timed [{' '.join(PARTS)}]")
     parser.add_argument("--repeat", type=int, default=15, metavar="R", help="timed runs of each [15]")
@@ -94,6 +95,10 @@ def run(options: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
         means = make_scene(first)[0]["means"]
         results["encoder"] = bench_encoder(device, load_config("dnerf").field, means, meter, repeat)
         print_encoder(results["encoder"])
+    if "decoder" in options.parts:
+        means = make_scene(first)[0]["means"]
+        results["decoder"] = bench_decoder(device, load_config("dnerf").field, means, repeat)
+        print_decoder(results["decoder"])
     if "losses" in options.parts:
         results["losses"] = bench_losses(device, first.height, meter, repeat)
         print_losses(results["losses"])
@@ -203,6 +208,14 @@ def print_encoder(report: EncoderReport) -> None:
     print_row("torch twin: both", report.twin_forward_backward)
     ratio = report.twin_forward_backward.median / report.forward_backward.median
     print(f"  {ratio:.1f} times as fast as the twin; gradients differ by {report.largest_difference:.1e} at most")
+
+
+def print_decoder(report: DecoderReport) -> None:
+    print_header(f"encoder and decoder, forward + backward: {report.gaussians:,} Gaussians, preset dnerf")
+    print_row("decoder in torch", report.torch)
+    print_row("decoder on the device", report.device)
+    ratio = report.torch.median / report.device.median
+    print(f"  {ratio:.2f} times as fast on the device; gradients differ by {report.largest_difference:.1e} at most")
 
 
 def print_losses(report: LossReport) -> None:

@@ -1,4 +1,5 @@
-"""The scene that is timed: a ball of Gaussians, the same for every rasteriser that is compared."""
+"""The scene that is timed: a ball of Gaussians, the same for every rasteriser that is compared, and in the order in which
+a training keeps them."""
 
 from __future__ import annotations
 
@@ -9,9 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from lapgs_wgpu import Camera
+from lapgs_wgpu.splat.morton import morton_order
 
 BALL_RADIUS, CAMERA_DISTANCE, FOV = 1.3, 4.0, 0.69  # the field of view along the shorter side, radians
 MEAN_SCALE, SPREAD = 0.02, 0.3  # standard deviations are log-normal; the mean shrinks so that the ball stays as full
@@ -51,6 +54,7 @@ def make_scene(size: SceneSize) -> tuple[dict[str, NDArray[np.float32]], Camera]
     direction = rng.standard_normal((count, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     means = direction * (BALL_RADIUS * rng.random((count, 1)) ** (1 / 3))
+    means = means[morton_order(torch.from_numpy(means)).numpy()]
     mean_scale = MEAN_SCALE * (50_000 / count) ** (1 / 3)
     scales = np.exp(rng.normal(np.log(mean_scale) - SPREAD**2 / 2, SPREAD, (count, 3)))
     quats = rng.standard_normal((count, 4))
