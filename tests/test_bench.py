@@ -70,6 +70,10 @@ def test_the_encoder_agrees_with_its_twin_at_the_sizes_that_are_timed(results: d
     assert results["encoder"]["largest_difference"] < 1e-5
 
 
+def test_the_decoders_agree(results: dict) -> None:
+    assert results["decoder"]["largest_difference"] < 1e-4
+
+
 def test_the_losses_agree_with_their_twins(results: dict) -> None:
     assert results["losses"]["size"] == 40
     assert results["losses"]["difference"] < 1e-4

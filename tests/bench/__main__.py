@@ -43,7 +43,8 @@ def main() -> None:
         nargs="+",
         default=FIXED_SET,
         metavar="N@WxH",
-        help=f"Gaussians and image of what is drawn; the first one's also in encoder, decoder, losses and shares [{_names(FIXED_SET)}]",
+        help="Gaussians and image of what is drawn; the first one's also in encoder, decoder, losses and shares "
+        f"[{_names(FIXED_SET)}]",
     )
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS, help=f"what is timed [{' '.join(PARTS)}]")
     parser.add_argument("--repeat", type=int, default=15, metavar="R", help="timed runs of each [15]")

@@ -1,5 +1,5 @@
-"""The scene that is timed: a ball of Gaussians, the same for every rasteriser that is compared, and in the order in which
-a training keeps them."""
+"""The scene that is timed: a ball of Gaussians, the same for every rasteriser that is compared, in the order in which a
+training keeps them."""
 
 from __future__ import annotations
 
