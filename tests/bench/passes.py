@@ -122,6 +122,7 @@ class Meter:
         for shader, milliseconds in summaries.items():
             todo = work.get(shader)
             ceiling = None if todo is None else ceilings.milliseconds(todo)
-            share = None if ceiling is None else ceiling / milliseconds.median
+            # A clock of processor time may not move at all in a short pass.
+            share = None if ceiling is None or not milliseconds.median else ceiling / milliseconds.median
             passes[shader] = PassTime(len(runs[0][shader]), milliseconds, todo, ceiling, share)
         return PassTimes(ceilings, passes)
