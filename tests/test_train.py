@@ -17,8 +17,9 @@ from PIL import Image
 
 from lapgs_wgpu.data import Dataset, load_dataset
 from lapgs_wgpu.data.synthetic import write_synthetic
-from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.errors import DeviceMemoryError, InputError
 from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.motion.device_decoder import DeviceDecoder
 from lapgs_wgpu.motion.scene import Scene4D, load
 from lapgs_wgpu.train import decoder, loop, training
 from lapgs_wgpu.train.config import Config
@@ -200,6 +201,22 @@ def test_a_trial_chooses_where_the_decoder_works(
     train(configure(schedule__steps="1"), dataset, tmp_path / "run", device=device)
     assert load_config(str(tmp_path / "run/config.toml")).decoder == place
     assert f"decoder: {place} (a trial took " in capsys.readouterr().out
+
+
+def test_a_device_too_small_for_the_decoder_leaves_it_to_torch(
+    dataset: Dataset,
+    device: Device,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def too_large(*arguments: Any) -> None:
+        raise DeviceMemoryError("buffer 'layers' needs more")
+
+    monkeypatch.setattr(device, "is_cpu", False)
+    monkeypatch.setattr(DeviceDecoder, "decode_bwd", too_large)
+    train(configure(schedule__steps="1"), dataset, tmp_path / "run", device=device)
+    assert "ms in torch, more memory than the device has)" in capsys.readouterr().out
 
 
 def test_the_trial_leaves_no_trace(dataset: Dataset, device: Device, monkeypatch: pytest.MonkeyPatch) -> None:

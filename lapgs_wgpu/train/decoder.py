@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import statistics
 import time
 from typing import Literal, NamedTuple
 
 import torch
 
+from lapgs_wgpu.errors import DeviceMemoryError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.grid_field import GridField
 from lapgs_wgpu.motion.scene import Scene4D
@@ -28,8 +30,9 @@ class Choice(NamedTuple):
 def choose_decoder(config: Config, scene: Scene4D, device: Device, ranks: Ranks) -> Choice:
     """What the configuration says or, with "auto", the faster place for the field of a scene at its start.
 
-    With "auto" a CPU device is not timed: it shares torch's processor, which torch makes ten times more of. All ranks
-    choose alike. Moves no random numbers, and leaves no gradients.
+    With "auto" a CPU device is not timed: it shares torch's processor, which torch makes ten times more of. A device
+    whose memory is too small for it takes forever. All ranks choose alike. Moves no random numbers, and leaves no
+    gradients.
     """
     field = scene.field
     if config.decoder != "auto":
@@ -37,24 +40,29 @@ def choose_decoder(config: Config, scene: Scene4D, device: Device, ranks: Ranks)
     allowed = config.field.decodes_on_device and config.precision == "float32"
     if device.is_cpu or not allowed or not isinstance(field, GridField):
         return Choice("torch", {})
-    places: tuple[Place, ...] = ("torch", "device")
-    seconds = torch.tensor([_seconds(scene, field, place) for place in places], dtype=torch.float64)
-    means = (ranks.sums([seconds])[0] / ranks.count).tolist()
-    taken = dict(zip(places, means, strict=True))
-    return Choice(min(places, key=taken.__getitem__), taken)
+    seconds = [_seconds(scene, field, "torch")]
+    try:
+        seconds.append(_seconds(scene, field, "device"))
+    except DeviceMemoryError:
+        seconds.append(math.inf)
+    of_all = ranks.sums([torch.tensor(seconds, dtype=torch.float64)])[0] / ranks.count
+    taken: dict[Place, float] = {"torch": float(of_all[0]), "device": float(of_all[1])}
+    return Choice("device" if taken["device"] < taken["torch"] else "torch", taken)
 
 
 def _seconds(scene: Scene4D, field: GridField, place: Place) -> float:
     """Of the field's forward and backward pass."""
-    before, field.on_device = field.on_device, place == "device"
     parameters = scene.parameters
+    before, field.on_device = field.on_device, place == "device"
     times = []
-    for _ in range(1 + _ROUNDS):
-        start = time.perf_counter()
-        move = field(parameters["means"], 0.5, parameters.get("dynamics"))
-        (move.translation.sum() + move.d_scales.sum()).backward()
-        times.append(time.perf_counter() - start)
-    for each in (*field.parameters(), *parameters.values()):
-        each.grad = None
-    field.on_device = before
+    try:
+        for _ in range(1 + _ROUNDS):
+            start = time.perf_counter()
+            move = field(parameters["means"], 0.5, parameters.get("dynamics"))
+            (move.translation.sum() + move.d_scales.sum()).backward()
+            times.append(time.perf_counter() - start)
+    finally:
+        field.on_device = before
+        for each in (*field.parameters(), *parameters.values()):
+            each.grad = None
     return statistics.median(times[1:])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import signal
 import sys
 import threading
@@ -116,9 +117,10 @@ def _precision_warnings(config: Config) -> list[str]:
 
 
 def _told(choice: Choice) -> str:
-    """Where the decoder works, and why."""
-    times = ", ".join(f"{1e3 * seconds:.0f} ms with {place}" for place, seconds in choice.seconds.items())
-    return f"decoder: {choice.place} (a trial took {times})"
+    """Where the decoder works, and why, after a trial."""
+    torch_time, device_time = (1e3 * choice.seconds[place] for place in ("torch", "device"))
+    there = f"{device_time:.0f} ms on the device" if math.isfinite(device_time) else "more memory than the device has"
+    return f"decoder: {choice.place} (a trial took {torch_time:.0f} ms in torch, {there})"
 
 
 def _assist(training: Training) -> Scene4D:
