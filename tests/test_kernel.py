@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import weakref
 from typing import Any
 
 import numpy as np
@@ -347,6 +348,30 @@ def test_writes_and_kernels_take_turns(either: Device, wgsl: dict[str, str]) -> 
             with Commands(either) as commands:
                 commands.dispatch(kernel, count, a=a, sum=total)
         assert set(total.read("uint32", (count,)).tolist()) == {10}
+
+
+def test_what_is_written_once_keeps_no_staging_buffer(monkeypatch: pytest.MonkeyPatch) -> None:
+    device = open_test_device("staging")
+    held: weakref.WeakSet[Any] = weakref.WeakSet()
+    made: list[str] = []
+    create = device.wgpu_device.create_buffer
+
+    def spy(**options: Any) -> Any:
+        buffer = create(**options)
+        held.add(buffer)
+        made.append(options["label"])
+        return buffer
+
+    monkeypatch.setattr(device.wgpu_device, "create_buffer", spy)
+    values = np.arange(100_000, dtype=np.uint32)
+    pictures = [numbers(device, values + k, f"picture {k}") for k in range(3)]
+    assert len(held) == 3
+    for _ in range(3):  # what is written again has a staging buffer to itself, and makes none for a third write
+        pictures[0].write(values)
+    assert made == [f"picture {k}" for k in (0, 0, 1, 1, 2, 2, 0)]
+    assert len(held) == 4
+    for k, picture in enumerate(pictures):
+        np.testing.assert_array_equal(picture.read("uint32", (len(values),)), values + k)
 
 
 # The pool

@@ -42,7 +42,8 @@ class Buffer:
     """A storage or uniform buffer of `nbytes` (rounded up to 16), zero at first.
 
     Where the device can map its own memory (CPU and integrated devices) reading and writing is one copy by the
-    processor; elsewhere it goes through staging buffers that live as long as the buffer.
+    processor; elsewhere it goes through staging buffers of the same size, which are kept: for reading from the first
+    time on, for writing from the second one on, so that what is written once does not take its memory twice.
     """
 
     def __init__(self, device: Device, nbytes: int, label: str) -> None:
@@ -62,6 +63,7 @@ class Buffer:
         self.version = 0  # counts the writes, so that a texture made from the buffer is known to be out of date
         self._textures: dict[str, _Texture] = {}
         self._upload: Any = None
+        self._uploaded = False  # has a write gone through staging before?
         self._download: Any = None
 
     def _create(self, usage: int) -> Any:
@@ -82,13 +84,17 @@ class Buffer:
             elif data.nbytes <= _SMALL:
                 self.device.queue.write_buffer(self.wgpu_buffer, offset, data)
             else:
-                if self._upload is None:
-                    self._upload = self._create(wgpu.BufferUsage.MAP_WRITE | wgpu.BufferUsage.COPY_SRC)
-                self._fill(self._upload, data, offset)
+                staging = self._upload
+                if staging is None:
+                    staging = self._create(wgpu.BufferUsage.MAP_WRITE | wgpu.BufferUsage.COPY_SRC)
+                self._fill(staging, data, offset)
                 encoder = self.device.wgpu_device.create_command_encoder()
                 size = (data.nbytes + 3) & ~3
-                encoder.copy_buffer_to_buffer(self._upload, offset, self.wgpu_buffer, offset, size)
+                encoder.copy_buffer_to_buffer(staging, offset, self.wgpu_buffer, offset, size)
                 self.device.queue.submit([encoder.finish()])
+                if self._uploaded:
+                    self._upload = staging
+                self._uploaded = True
 
     @staticmethod
     def _fill(target: Any, data: NDArray[np.uint8], offset: int) -> None:
