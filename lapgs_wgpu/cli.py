@@ -7,7 +7,7 @@ import functools
 import json
 import sys
 import typing
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from lapgs_wgpu.command import HelpFormatter, Parser, guarded, print_devices
@@ -27,6 +27,8 @@ SHORTCUTS = {
     "data.cache_gb": "--cache-gb",
 }
 SYNTHETIC = "synthetic"
+# Of the keys, what goes with --eval: where the pictures lie now, and how they are read. The size must be the run's own.
+EVAL_KEYS = ("data.path", "data.size", "data.background", "data.cache_gb")
 
 USAGE = "lapgs-train PRESET --data DIR [--out RUN] [--KEY VALUE ...]"
 DESCRIPTION = """\
@@ -70,7 +72,7 @@ def _train(arguments: list[str]) -> None:
 
     overrides = {key.name: given[key.name] for key in config_keys() if key.name in given}
     if given["eval"]:
-        _evaluate(Path(given["eval"]), given["device"], overrides, given["lpips_weights"])
+        _evaluate(Path(given["eval"]), given, overrides)
         return
     if given["lpips_weights"]:
         raise InputError("--lpips-weights goes with --eval RUN, after the training.")
@@ -105,11 +107,9 @@ def _resume(
     from lapgs_wgpu.train.presets import load_config
     from lapgs_wgpu.train.run_folder import changes_since
 
-    others = [f"--{name}" for name in ("preset", "field", "ablate", "out", "overwrite") if given[name]]
-    if others or overrides:
-        raise InputError(
-            f"--resume goes on as the run began, so {(others + [f'--{key}' for key in overrides])[0]} cannot be given."
-        )
+    others = _others(given, ("preset", "field", "ablate", "out", "overwrite"), overrides)
+    if others:
+        raise InputError(f"--resume goes on as the run began, so {others[0]} cannot be given.")
     if not (run / "config.toml").is_file():
         raise InputError(f"{run / 'config.toml'} does not exist; --resume needs the folder of a run.")
     config = load_config(str(run / "config.toml"))
@@ -122,9 +122,13 @@ def _resume(
         _report(run)
 
 
-def _evaluate(
-    run: Path, device_name: str | None, overrides: dict[str, str | list[str]], lpips_weights: str | None
-) -> None:
+def _others(given: dict[str, typing.Any], names: Sequence[str], keys: Iterable[str]) -> list[str]:
+    """Those of the options `names` that were given, and the keys, as they stand on the command line."""
+    words = [given[name] if name == "preset" else f"--{name}" for name in names if given[name]]
+    return words + [f"--{key}" for key in keys]
+
+
+def _evaluate(run: Path, given: dict[str, typing.Any], overrides: dict[str, str | list[str]]) -> None:
     from lapgs_wgpu.gpu.device import open_device
     from lapgs_wgpu.io.documents import read_json
     from lapgs_wgpu.motion.scene import load
@@ -133,12 +137,22 @@ def _evaluate(
     from lapgs_wgpu.train.lpips import Lpips
     from lapgs_wgpu.train.presets import load_config
 
-    lpips = Lpips(Path(lpips_weights)) if lpips_weights else None
+    names = ("preset", "field", "ablate", "out", "resume", "overwrite", "view")
+    others = _others(given, names, [key for key in overrides if key not in EVAL_KEYS])
+    if others:
+        raise InputError(f"--eval measures a run as it is, so {others[0]} cannot be given.")
+    lpips = Lpips(Path(given["lpips_weights"])) if given["lpips_weights"] else None
     for name in ("config.toml", "checkpoint.ply"):
         if not (run / name).is_file():
             raise InputError(f"{run / name} does not exist; --eval needs the folder of a finished run.")
+    size = load_config(str(run / "config.toml")).data.size
     config = load_config(str(run / "config.toml"), overrides)
-    device = open_device(device_name)
+    if config.data.size != size:
+        raise InputError(
+            f"--eval measures a run at its own size, so --data.size {config.data.size} cannot be given; "
+            f"{run / 'config.toml'} says {size}."
+        )
+    device = open_device(given["device"])
     config, dataset = _open_data(config, run.parent / SYNTHETIC)
     scene = load(run / "checkpoint.ply", device)
     try:
@@ -274,7 +288,12 @@ def _parse(arguments: list[str]) -> dict[str, typing.Any]:
     )
     parser.add_argument("--device", metavar="NAME", help="part of an adapter's name, or cpu, integrated, discrete")
     parser.add_argument("--list-devices", action="store_true", help="list the adapters, the default one first")
-    parser.add_argument("--eval", metavar="RUN", help="measure a finished run again, on the data it was trained on")
+    parser.add_argument(
+        "--eval",
+        metavar="RUN",
+        help="measure a finished run again, on the data it was trained on; --data, "
+        "--data.background, --cache-gb, --device and --lpips-weights may go with it",
+    )
     parser.add_argument(
         "--lpips-weights",
         metavar="FILE",

@@ -69,6 +69,49 @@ def test_evaluation_keeps_the_record_of_the_training(run: Path, scene: Path) -> 
     assert json.loads((run / "metrics.json").read_text())["training"]["seconds"] == 12.5
 
 
+def test_evaluation_takes_what_changes_no_protocol(run: Path, scene: Path) -> None:
+    before = json.loads((run / "metrics.json").read_text())
+    given = ["--data", str(scene), "--data.size", "200", "--data.background", "white", "--cache-gb", "0.1"]
+    assert cli.train_command(["--eval", str(run), *given, "--device", before["environment"]["adapter"]]) == 0
+    after = json.loads((run / "metrics.json").read_text())
+    assert (before["background"], after["background"]) == ("black", "white")
+    assert cli.train_command(["--eval", str(run)]) == 0
+    assert json.loads((run / "metrics.json").read_text())["views"] == before["views"]
+
+
+def test_evaluation_at_another_size_is_refused(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = (run / "metrics.json").read_bytes()
+    assert cli.train_command(["--eval", str(run), "--data.size", "12"]) == 2
+    error = capsys.readouterr().err
+    assert "so --data.size 12 cannot be given" in error
+    assert f"{run / 'config.toml'} says 200" in error
+    assert (run / "metrics.json").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("given", "named"),
+    [
+        (["tiny"], "tiny"),
+        (["--out", "OUT"], "--out"),
+        (["--field", "static"], "--field"),
+        (["--ablate", "ncc"], "--ablate"),
+        (["--resume", "OUT"], "--resume"),
+        (["--overwrite"], "--overwrite"),
+        (["--view"], "--view"),
+        (["--schedule.steps", "7"], "--schedule.steps"),
+        (["--data", "nowhere", "--seed", "1", "--overwrite"], "--overwrite"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else None,
+)
+def test_evaluation_refuses_what_it_has_no_use_for(
+    given: list[str], named: str, run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = (run / "metrics.json").read_bytes()
+    assert cli.train_command(["--eval", str(run), *given]) == 2
+    assert capsys.readouterr().err == f"lapgs-train: --eval measures a run as it is, so {named} cannot be given.\n"
+    assert (run / "metrics.json").read_bytes() == before
+
+
 def test_the_built_in_scene_is_written_beside_the_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
