@@ -53,6 +53,16 @@ def test_step_is_adam_at_the_rate_of_the_step() -> None:
     assert torch.allclose(gaussians["means"], expected, atol=1e-7)
 
 
+def test_what_a_step_writes_is_counted() -> None:
+    """By which a viewer sees that a parameter has changed."""
+    gaussians, mlp, optimiser = make()
+    parameters = [*gaussians.values(), mlp]
+    for steps in (range(1, 2), range(2, 3)):
+        versions = [parameter._version for parameter in parameters]
+        run(optimiser, gaussians, mlp, steps, torch.arange(6.0))
+        assert all(parameter._version > before for parameter, before in zip(parameters, versions, strict=True))
+
+
 def test_kept_rows_go_on_as_if_nothing_had_happened() -> None:
     numbers = torch.arange(6.0)
     gaussians, mlp, optimiser = make()

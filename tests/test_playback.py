@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,19 +14,24 @@ import torch
 from test_deform import CONFIGS, GRID4D, OURS, trained
 from test_ply import columns_of, ply_bytes, random_still
 from test_scene import DAMAGE, moving_scene, rewrite
+from test_train import configure
 
+from lapgs_wgpu.data import load_dataset
+from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.errors import InputError
-from lapgs_wgpu.gpu.buffer import read_all
+from lapgs_wgpu.gpu.buffer import BufferPool, read_all
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.ply import StillGaussians, write_ply
+from lapgs_wgpu.motion import scene_playback
 from lapgs_wgpu.motion.field import FieldConfig
 from lapgs_wgpu.motion.playback import DevicePlayback, Playback, open_playback
 from lapgs_wgpu.motion.scene import Scene4D, load
 from lapgs_wgpu.motion.scene_file import read_scene
 from lapgs_wgpu.motion.scene_playback import ScenePlayback
 from lapgs_wgpu.splat.camera import Camera
-from lapgs_wgpu.splat.rasterize import rasterizer_of
+from lapgs_wgpu.splat.rasterize import rasterizer_of, upload_gaussians
 from lapgs_wgpu.splat.rasterizer import GaussianBuffers, Rasterizer
+from lapgs_wgpu.train.training import Training
 
 TIMES = (0.0, 0.37, 1.0)
 CAMERA = Camera.looking_at([1.0, -4, 0.7], [0, 0, 0], up=[0, 0, 1], fov_x=0.8, width=64, height=48)
@@ -115,6 +121,67 @@ def test_a_time_that_is_shown_is_not_computed_again(
     for t in (0.1, 0.1, 0.2, 0.1):
         playback.at(t)
     assert times == [0.1, 0.2, 0.1]
+
+
+@pytest.mark.parametrize("name", ["mlp", "hexplane", "hidden layers"])
+def test_torch_evaluates_what_has_changed_alone(
+    device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    _, path = saved(device, tmp_path, KINDS[name])
+    playback = open_playback(path, device)
+    assert isinstance(playback, ScenePlayback)
+    scene, times = playback.scene, []
+    at = scene.at
+    monkeypatch.setattr(scene, "at", lambda t: (times.append(t), at(t))[1])
+
+    def evaluated(t: float = 0.1) -> bool:
+        times.clear()
+        shown = contents(playback.at(t))
+        for found, expected in zip(shown, contents(ScenePlayback(load(path, device)).at(t)), strict=True):
+            np.testing.assert_array_equal(found, expected)
+        return times == [t]
+
+    assert [evaluated(t) for t in (0.1, 0.1, 0.2, 0.1)] == [True, False, True, True]
+    for parameter in (*scene.parameters.values(), *scene.field.parameters()):
+        with torch.no_grad():
+            parameter *= 1
+        assert [evaluated(), evaluated()] == [True, False]
+    for key, parameter in scene.parameters.items():
+        scene.parameters[key] = torch.nn.Parameter(parameter.detach())
+        assert [evaluated(), evaluated()] == [True, False]
+    scene.sh_degree = 1
+    playback.at(0.1)
+    assert len(times) == 1
+
+
+def test_an_upload_that_failed_is_made_again(device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    _, path = saved(device, tmp_path, KINDS["mlp"])
+    playback = open_playback(path, device)
+    expected = contents(playback.at(0.1))
+
+    def fail(pool: BufferPool, tensors: list[torch.Tensor], sh_degree: int) -> None:
+        upload_gaussians(pool, [0 * tensor for tensor in tensors], sh_degree)
+        raise MemoryError
+
+    with monkeypatch.context() as patched:
+        patched.setattr(scene_playback, "upload_gaussians", fail)
+        with pytest.raises(MemoryError):
+            playback.at(0.2)
+    for found, part in zip(contents(playback.at(0.1)), expected, strict=True):
+        np.testing.assert_array_equal(found, part)
+
+
+@pytest.mark.parametrize("kind", ["static", "mlp", "hexplane", "grid4d", "laplacian"])
+def test_each_step_of_a_training_is_shown(device: Device, tmp_path: Path, kind: str) -> None:
+    dataset = load_dataset(write_synthetic(tmp_path / "scene", size=16, train_views=4, test_views=1))
+    training = Training(configure(method=kind), dataset, device)
+    playback = ScenePlayback(training.scene)
+    with closing(training):
+        for _ in range(12):
+            training.step()
+            shown, anew = (contents(each.at(0.4)) for each in (playback, ScenePlayback(training.scene)))
+            for found, expected in zip(shown, anew, strict=True):
+                np.testing.assert_array_equal(found, expected)
 
 
 @pytest.mark.kernels

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import weakref
+from typing import NamedTuple
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from ..gpu.buffer import BufferPool
 from ..io.ply import StillGaussians
@@ -14,14 +18,40 @@ from ..splat.rasterizer import GaussianBuffers
 from .scene import Scene4D
 
 
+class _Shown(NamedTuple):
+    """What was uploaded last, and of which time, degree and parameters, each with torch's count of what was written."""
+
+    buffers: GaussianBuffers
+    t: float
+    sh_degree: int
+    parameters: list[tuple[weakref.ref[Tensor], int]]  # weak: a training replaces large ones, and drops them
+
+    def is_of(self, scene: Scene4D, t: float) -> bool:
+        """Whether an evaluation of the scene would give the same."""
+        parameters = _parameters(scene)
+        return (self.t, self.sh_degree, len(self.parameters)) == (t, scene.sh_degree, len(parameters)) and all(
+            known() is parameter and version == parameter._version
+            for (known, version), parameter in zip(self.parameters, parameters, strict=True)
+        )
+
+
+def _parameters(scene: Scene4D) -> list[Tensor]:
+    return [*scene.parameters.values(), *(scene.field.parameters() if scene.field is not None else [])]
+
+
 class ScenePlayback:
-    """A Scene4D as it is at each call: parameters, their number and sh_degree may change in between. See Playback."""
+    """A Scene4D as it is at each call: parameters, their number and sh_degree may change in between. See Playback.
+
+    It is evaluated only where the time, the degree or a parameter has changed, by torch's count of what was written to
+    it. Fused optimisers do not count by themselves (train/optimise).
+    """
 
     def __init__(self, scene: Scene4D) -> None:
         self.scene = scene
         self.device, self.field_config, self.metadata = scene.device, scene.field_config, scene.metadata
         self.exact = True
         self._pool = BufferPool(scene.device)  # a training draws with its own
+        self._shown: _Shown | None = None
 
     @property
     def count(self) -> int:
@@ -40,10 +70,16 @@ class ScenePlayback:
 
     def at(self, t: float, seen_by: Camera | None = None) -> GaussianBuffers:
         """See Playback."""
-        with torch.no_grad():
-            now = self.scene.at(t)
-        tensors = [now.means, now.quats, now.scales, now.opacities, now.sh]
-        return upload_gaussians(self._pool, tensors, now.sh_degree)
+        scene = self.scene
+        if self._shown is None or not self._shown.is_of(scene, t):
+            self._shown = None  # where it fails halfway, the buffers hold a mixture
+            known = [(weakref.ref(parameter), parameter._version) for parameter in _parameters(scene)]
+            with torch.no_grad():
+                now = scene.at(t)
+            tensors = [now.means, now.quats, now.scales, now.opacities, now.sh]
+            buffers = upload_gaussians(self._pool, tensors, now.sh_degree)
+            self._shown = _Shown(buffers, t, scene.sh_degree, known)
+        return self._shown.buffers
 
     def means(self, t: float) -> NDArray[np.float32]:
         """See Playback."""

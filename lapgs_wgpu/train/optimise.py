@@ -52,6 +52,11 @@ class Optimiser:
         for group in self._adam.param_groups:
             group["lr"] = self.rates[group["name"]].at(step)
         self._adam.step()
+        # Fused Adam does not count what it writes, and a viewer knows by the count that it has to look again.
+        for parameters in self.parameters().values():
+            for parameter in parameters:
+                if parameter.grad is not None:
+                    torch.autograd.graph.increment_version(parameter)
 
     def edit_rows(self, keep: Tensor, added: Mapping[str, Tensor]) -> None:
         """Keep the Gaussians of a mask (N,) with their state, and append rows (M, ...) with a zero state."""
