@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -10,7 +11,7 @@ import pytest
 from lapgs_wgpu.viewer.choices import Mode
 from lapgs_wgpu.viewer.frame import Frame, Painter, Request
 from test_deform import GRID4D, trained
-from test_playback import CAMERA, half_still
+from test_playback import CAMERA, KINDS, half_still
 
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.playback import open_playback
@@ -66,3 +67,62 @@ def test_the_window_rests_on_the_exact_frame(device: Device, tmp_path: Path, mon
     now[0] += 5
     canvas.draw()
     assert app.frame is rests
+
+
+TROUBLE = {
+    "no file": "scene.txt: cannot be read",
+    "a buffer": "buffer 'input means' needs 12000 bytes, but a buffer of this device holds 8192",
+    "a binding": "means of the pass project needs 12000 bytes in one binding, but .* allows 8192",
+    "memory": "out of memory",
+}
+
+
+@pytest.mark.triangles
+@pytest.mark.parametrize("what", TROUBLE)
+def test_a_file_that_cannot_be_shown_leaves_the_scene_as_it_is(
+    device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
+) -> None:
+    offscreen = pytest.importorskip("rendercanvas.offscreen")
+    pytest.importorskip("imgui_bundle")
+    from lapgs_wgpu.viewer import app as app_module
+    from lapgs_wgpu.viewer.opened import open_scene
+
+    trained(device, GRID4D, 100).save(tmp_path / "small.ply")
+    trained(device, KINDS["mlp"], 1000).save(tmp_path / "large.ply")  # whose buffers are made when it is drawn
+    now = [50.0]
+    monkeypatch.setattr(app_module, "time", SimpleNamespace(perf_counter=lambda: now[0]))
+    canvas = offscreen.RenderCanvas(size=(64, 48), pixel_ratio=1)
+    loop = SimpleNamespace(call_later=lambda seconds, callback: None)
+    app = app_module.App(canvas, loop, open_scene(tmp_path / "small.ply", lambda: device))
+    app.clock.seek(0.3)
+    canvas.draw()
+    before = vars(app) | {"message": None}
+    assert app.frame is not None
+    shown = planes(app.frame)
+
+    def give_out(*_: object) -> None:
+        raise MemoryError
+
+    large = tmp_path / ("scene.txt" if what == "no file" else "large.ply")
+    with monkeypatch.context() as patched:
+        if what == "a buffer":
+            patched.setitem(device.limits, "max-buffer-size", 8192)
+        elif what == "a binding":
+            patched.setitem(device.limits, "max-storage-buffer-binding-size", 8192)
+        elif what == "memory":
+            patched.setattr("lapgs_wgpu.viewer.opened.playback_of", give_out)
+        app.open(large)
+    assert app.message is not None
+    assert re.search(TROUBLE[what], app.message)
+    assert str(large) in app.message
+    assert vars(app) | {"message": None} == before
+    now[0] += 5
+    canvas.draw()
+    assert app.frame is before["frame"]
+    np.testing.assert_array_equal(planes(app.frame), shown)
+    app.open(tmp_path / "large.ply")
+    assert (app.opened.playback.count, app.clock.time, app.message) == (1000, 0.0, None)
+    opened = app.frame
+    assert opened is not before["frame"]
+    canvas.draw()
+    assert app.frame is opened  # drawn once

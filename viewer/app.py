@@ -8,7 +8,7 @@ from collections import deque
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.errors import DeviceError, InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.splat.camera import Camera
 
@@ -83,10 +83,15 @@ class App:
         canvas.request_draw(self._draw)
 
     def open(self, path: Path) -> None:
-        """Show another file; where it cannot be read, say why and keep the present one."""
+        """Show another file; where it cannot be read or is too large, say why and keep the present one."""
+        before = vars(self).copy()
         try:
             self._show(open_scene(path, lambda: self.device))
-        except InputError as error:
+            self._paint(time.perf_counter())  # some of what a device has no room for is only needed now
+        except (InputError, DeviceError, MemoryError) as error:
+            vars(self).update(before)
+            if not isinstance(error, InputError):
+                error = InputError(f"{path} cannot be shown: {str(error) or 'out of memory'}.")
             self.message = str(error)
         self.canvas.request_draw()
 
