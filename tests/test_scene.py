@@ -135,6 +135,17 @@ def test_no_gaussians(device: Device, tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.kernels
+def test_a_picture_is_the_same_without_its_depth(device: Device) -> None:
+    scene, background = moving_scene(device), torch.tensor([0.1, 0.2, 0.3])
+    for t in TIMES:
+        whole, bare = (scene.render(CAMERA, t, background, depth=depth) for depth in (True, False))
+        for name in ("image", "alpha", "radii", "means2d"):
+            assert torch.equal(getattr(whole, name), getattr(bare, name)), name
+        assert whole.depth.any()
+        assert not bare.depth.any()
+
+
 def test_from_points(device: Device) -> None:
     points, colors = np.array([[0.0, 1, 2], [3, 4, 5]]), np.array([[0.0, 0.5, 1.0], [0.2, 0.3, 0.4]])
     scene = Scene4D.from_points(points, colors, np.array([0.1, 0.2]), CONFIG, opacity=0.3, device=device)

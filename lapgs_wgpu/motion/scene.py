@@ -144,10 +144,13 @@ class Scene4D:
         )
         return moved, move.smoothness
 
-    def render(self, camera: Camera, t: float, background: Tensor | None = None) -> Rendering:
-        """The picture of a camera at time t in [0, 1], without gradients. background: (3,), black where None."""
+    def render(self, camera: Camera, t: float, background: Tensor | None = None, *, depth: bool = True) -> Rendering:
+        """The picture of a camera at time t in [0, 1], without gradients. background: (3,), black where None.
+
+        depth: whether to draw it; without, its picture is zero, and a tenth of the time is saved.
+        """
         with torch.no_grad():
-            return draw(self.at(t), camera, background, self.device)
+            return draw(self.at(t), camera, background, self.device, depth=depth)
 
     def still(self, t: float) -> StillGaussians:
         """The Gaussians at time t in [0, 1] before their activations, as 3DGS viewers read them."""
@@ -178,8 +181,10 @@ class Scene4D:
         write_checkpoint(path, arrays, tensors, {**self.metadata, **(metadata or {}), **header})
 
 
-def draw(gaussians: Gaussians, camera: Camera, background: Tensor | None, device: Device) -> Rendering:
-    """Rasterise activated Gaussians; differentiable."""
+def draw(
+    gaussians: Gaussians, camera: Camera, background: Tensor | None, device: Device, *, depth: bool = True
+) -> Rendering:
+    """Rasterise activated Gaussians; differentiable. depth: see `rasterize`."""
     return rasterize(
         gaussians.means,
         gaussians.quats,
@@ -189,6 +194,7 @@ def draw(gaussians: Gaussians, camera: Camera, background: Tensor | None, device
         camera,
         sh_degree=gaussians.sh_degree,
         background=background,
+        depth=depth,
         device=device,
     )
 

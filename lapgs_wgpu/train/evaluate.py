@@ -50,7 +50,7 @@ def evaluate(
     rows = []
     for view in views:
         truth = composite(view.load(), colour.numpy())
-        image = to_8_bit(scene.render(view.camera, view.time, colour).image)
+        image = to_8_bit(scene.render(view.camera, view.time, colour, depth=False).image)
         measures = _measures(_unit(image), _unit(truth), view.load_mask(), lpips)
         rows.append({"view": view.name, "time": view.time, **measures})
         if folder is not None:
