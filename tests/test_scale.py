@@ -160,9 +160,18 @@ def test_a_training_from_one_gaussian(dataset: Dataset, device: Device, tmp_path
     assert open_playback(tmp_path / "run" / "checkpoint.ply", device).count == 1
 
 
-def test_a_training_that_loses_all_gaussians_says_so(dataset: Dataset, device: Device, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"density control leaves no Gaussian at step 10; lower density\.min_opacity"):
-        train(configure(density__min_opacity="0.999"), dataset, tmp_path / "run", device=device)
+@pytest.mark.parametrize(
+    ("key", "value", "step"),
+    [("min_opacity", "0.999", 10), ("max_world_size", "1e-6", 30), ("max_screen_radius", "1", 30)],
+)
+def test_a_training_that_loses_all_gaussians_says_so(
+    key: str, value: str, step: int, dataset: Dataset, device: Device, tmp_path: Path
+) -> None:
+    none_born = {"density__max_world_size": "0", "density__max_screen_radius": "0", "density__gradient": "1"}
+    with pytest.raises(InputError, match=f"density control leaves no Gaussian at step {step}; ") as caught:
+        train(configure(**{**none_born, f"density__{key}": value}), dataset, tmp_path / "run", device=device)
+    for name in ("density.min_opacity", "density.max_world_size", "density.max_screen_radius (0 switches"):
+        assert name in str(caught.value)
 
 
 @pytest.mark.kernels
