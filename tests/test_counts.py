@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,12 +14,15 @@ from scenes import step as torch_step
 from stages import watch
 from wgpu.backends.wgpu_native import GPUBuffer, GPUQueue
 
+from lapgs_wgpu.gpu.buffer import Buffer
 from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.kernel import Kernel
 from lapgs_wgpu.motion.field import FieldConfig, Nearby
 from lapgs_wgpu.motion.grid_field import GridField
 from lapgs_wgpu.motion.hashgrid import HashConfig
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterize import rasterizer_of
+from lapgs_wgpu.splat.rasterizer import Rasterizer
 from lapgs_wgpu.train.losses import LossWeights
 from lapgs_wgpu.train.render_loss import TruthCache, image_loss_of, render_loss
 
@@ -168,6 +172,24 @@ def test_a_decoder_on_the_device_keeps_its_features_there(device: Device, events
     read = outputs + 4 * 2 * pairs + beside + weights + tables
     assert written <= totals(events)["write"] <= written + 4096
     assert read <= totals(events)["read"] <= read + 256
+
+
+def test_no_buffer_is_made_for_nothing(
+    device: Device, use: Callable[[Rasterizer], Rasterizer], scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A pass works with each buffer that the rasteriser holds."""
+    rasterizer = use(Rasterizer(device))
+    bound: set[Buffer] = set()
+    parts = Kernel.parts
+
+    def spy(self: Kernel, buffers: dict[str, Any]) -> dict[str, tuple[Buffer, int, int]]:
+        found = parts(self, buffers)
+        bound.update(buffer for buffer, _, _ in found.values())
+        return found
+
+    monkeypatch.setattr(Kernel, "parts", spy)
+    torch_step(scene, oblique_camera(200, 120), device, sh_degree=DEGREE)  # of so many tiles that no sort has one pass
+    assert [name for name, buffer in rasterizer.pool._buffers.items() if buffer not in bound] == []
 
 
 def test_nothing_grows_in_steady_state(

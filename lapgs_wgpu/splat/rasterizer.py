@@ -102,7 +102,6 @@ class Rasterizer:
             self.bands = max(self.bands, -(-rows // max(1, MOST_TILES // columns)))
         planes = 5 if depth else 4
         image = self.pool.get("image", 4 * planes * camera.width * camera.height)
-        self.pool.get("needed", 256 * self.bands)
         for band in range(self.bands):
             with Commands(self.device, profile) as commands:
                 self._draw_band(commands, drawn, band)
