@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import io
 import json
+import re
 import signal
 from contextlib import closing
 from pathlib import Path
@@ -17,8 +18,10 @@ from PIL import Image
 
 from lapgs_wgpu.data import Dataset, load_dataset
 from lapgs_wgpu.data.synthetic import write_synthetic
+from lapgs_wgpu.data.views import Placement
 from lapgs_wgpu.errors import DeviceMemoryError, InputError
 from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.io.checkpoint import read_checkpoint
 from lapgs_wgpu.motion.device_decoder import DeviceDecoder
 from lapgs_wgpu.motion.scene import Scene4D, load
 from lapgs_wgpu.train import decoder, loop, training
@@ -117,6 +120,19 @@ def test_the_checkpoint_is_the_last_model(run: Path, dataset: Dataset, device: D
     assert metrics["views"] == stored["views"]
     assert scene.sh_degree == 3
     assert scene.metadata["background"] == "black"
+
+
+def test_the_format_names_what_a_checkpoint_says_of_itself(dataset: Dataset, device: Device, tmp_path: Path) -> None:
+    moved = dataclasses.replace(dataset, placement=Placement(np.zeros(3), 1.0))
+    train(configure(schedule__steps="2"), moved, tmp_path / "run", device=device)
+    written = read_checkpoint(tmp_path / "run" / "checkpoint.ply").metadata
+    text = (Path(__file__).parents[1] / "docs" / "format.md").read_text(encoding="utf-8")
+    table = text.split("Metadata, all texts:")[1].split("\n\n")[1]
+    rows = [row.split("|")[1:3] for row in table.splitlines()]
+    about = {name: meaning for names, meaning in rows for name in re.findall(r"`(\w+)`", names)}
+    assert set(about) == set(written)
+    for name in ("view", "placement"):
+        assert set(json.loads(written[name])) <= set(re.findall(r"`(\w+)`", about[name]))
 
 
 def test_the_training_never_sees_the_test_views(
