@@ -17,7 +17,7 @@ struct Product {
 }
 
 const TILE = 64u;        // rows and columns of C
-const DEPTH = 16u;       // inner elements of a step
+const DEPTH = 16u;       // inner elements of a step; a lane loads TILE x DEPTH / LANES = 4 of A and 4 of B
 const LANES = 256u;
 const PITCH = TILE + 4u; // so that the elements that are stored together lie in different banks
 
@@ -59,12 +59,13 @@ fn main(
     var sum$i = vec4(0.0);
 #end
     for (var at = begin; at < end; at += DEPTH) {
-        for (var k = 0u; k < TILE * DEPTH / LANES; k++) {
+#unroll k 4
+        {
             {
 #ifdef A_INNER
-                let place = along_inner(lane, k);
+                let place = along_inner(lane, $(k)u);
 #else
-                let place = along_side(lane, k);
+                let place = along_side(lane, $(k)u);
 #endif
                 let row = tile.x + place.x;
                 let inner = at + place.y;
@@ -80,9 +81,9 @@ fn main(
             }
             {
 #ifdef B_INNER
-                let place = along_inner(lane, k);
+                let place = along_inner(lane, $(k)u);
 #else
-                let place = along_side(lane, k);
+                let place = along_side(lane, $(k)u);
 #endif
                 let column = tile.y + place.x;
                 let inner = at + place.y;
@@ -97,15 +98,18 @@ fn main(
                 of_b[place.y * PITCH + place.x] = value;
             }
         }
+#end
         workgroupBarrier();
-        for (var k = 0u; k < DEPTH; k++) {
-            let row = k * PITCH + mine.x;
-            let column = k * PITCH + mine.y;
-            let across = vec4(of_b[column], of_b[column + 1u], of_b[column + 2u], of_b[column + 3u]);
+#unroll k 16
+        {
+            let row = $(k)u * PITCH + mine.x;
+            let column = $(k)u * PITCH + mine.y;
+            let of_columns = vec4(of_b[column], of_b[column + 1u], of_b[column + 2u], of_b[column + 3u]);
 #unroll i 4
-            sum$i = fma(vec4(of_a[row + $(i)u]), across, sum$i);
+            sum$i = fma(vec4(of_a[row + $(i)u]), of_columns, sum$i);
 #end
         }
+#end
         workgroupBarrier();
     }
     let first = product.first.z + part * product.c_part;

@@ -12,21 +12,19 @@
 @group(0) @binding(5) var<storage, read_write> splats: array<vec4<f32>>;
 @group(0) @binding(6) var<storage, read_write> tile_counts: array<u32>;
 
-@compute @workgroup_size(64)
-fn main(
-    @builtin(workgroup_id) group: vec3<u32>,
-    @builtin(num_workgroups) groups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let i = workgroup_number(group, groups) * 64u + lane;
-    if (i >= frame.gaussians) {
-        return;
-    }
-    splats[i * SPLAT_STRIDE] = vec4(0.0);
-    splats[i * SPLAT_STRIDE + 1u] = vec4(0.0);
-    splats[i * SPLAT_STRIDE + 2u] = vec4(0.0);   // radius 0: invisible
-    tile_counts[i] = 0u;
+struct Projected {
+    mean: vec2<f32>,
+    conic: vec3<f32>,
+    log2_opacity: f32,
+    depth: f32,
+    radius: f32,
+    det: f32,
+    tiles: u32,
+}
 
+// All zero where the Gaussian cannot be seen.
+fn projected(i: u32) -> Projected {
+    var p: Projected;
     let mean = vec3(means_at(3u * i), means_at(3u * i + 1u), means_at(3u * i + 2u));
     let camera = (frame.view * vec4(mean, 1.0)).xyz;
     let opacity = opacities_at(i);
@@ -34,7 +32,7 @@ fn main(
     let norm = dot(q, q);
     // Written so that NaN fails each test.
     if (!(camera.z > NEAR) || !(opacity >= ALPHA_MIN) || !(norm > 0.0)) {
-        return;
+        return p;
     }
 
     let limits = jacobian_limits(frame);
@@ -52,24 +50,43 @@ fn main(
     let normal = cross(axes_x, axes_y);
     let det = dot(normal, normal) + DILATION * (xx + yy - DILATION);
     if (!(det > 0.0) || !(det < 1e30)) {
-        return;
+        return p;
     }
     let conic = vec3(yy, -xyc, xx) / det;
     let mean2d = frame.focal * camera.xy / camera.z + frame.center;
     let e = make_ellipse(mean2d, conic, det, log2(opacity));
     let size = vec2<f32>(frame.size);
     if (!all(mean2d + e.extent > vec2(0.0)) || !all(mean2d - e.extent < size)) {
-        return;
+        return p;
     }
 
-    var count = 0u;
     let rows = tile_rows(e, frame.band);
     for (var row = rows.x; row < rows.y; row++) {
         let columns = tile_columns(e, row, frame.tiles.x);
-        count += columns.y - columns.x;
+        p.tiles += columns.y - columns.x;
     }
-    tile_counts[i] = count;
-    splats[i * SPLAT_STRIDE] = vec4(mean2d, conic.xy);
-    splats[i * SPLAT_STRIDE + 1u] = vec4(conic.z, log2(opacity), 0.0, 0.0);
-    splats[i * SPLAT_STRIDE + 2u] = vec4(0.0, camera.z, ceil(max(e.extent.x, e.extent.y)), det);
+    p.mean = mean2d;
+    p.conic = conic;
+    p.log2_opacity = log2(opacity);
+    p.depth = camera.z;
+    p.radius = ceil(max(e.extent.x, e.extent.y));
+    p.det = det;
+    return p;
+}
+
+@compute @workgroup_size(64)
+fn main(
+    @builtin(workgroup_id) group: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let i = workgroup_number(group, groups) * 64u + lane;
+    if (i >= frame.gaussians) {
+        return;
+    }
+    let p = projected(i);
+    tile_counts[i] = p.tiles;
+    splats[i * SPLAT_STRIDE] = vec4(p.mean, p.conic.xy);
+    splats[i * SPLAT_STRIDE + 1u] = vec4(p.conic.z, p.log2_opacity, 0.0, 0.0);
+    splats[i * SPLAT_STRIDE + 2u] = vec4(0.0, p.depth, p.radius, p.det);
 }

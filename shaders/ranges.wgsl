@@ -5,10 +5,9 @@
 
 @group(0) @binding(0) var<uniform> frame: Frame;
 @group(0) @binding(1) var<uniform> needed: Count;   // intersections
-// sorted; the same buffer twice
+// sorted
 #table 2 tile_keys: vec4<u32>
-#table 3 tile_keys_singly: u32
-@group(0) @binding(4) var<storage, read_write> ranges: array<vec4<u32>>;   // first, one past the last, drawn, -
+@group(0) @binding(3) var<storage, read_write> ranges: array<vec4<u32>>;   // first, one past the last, drawn, -
 
 @compute @workgroup_size(64)
 fn main(
@@ -22,23 +21,25 @@ fn main(
         return;
     }
     let keys = tile_keys_at(quad);
-    // No key is so large: before the first and after the last element a range ends in any case.
-    var before = select(tile_keys_singly_at(max(4u * quad, 1u) - 1u), 0xffffffffu, quad == 0u);
-    let after = tile_keys_singly_at(min(4u * quad + 4u, count - 1u));
+    // No key is so large: a list begins at the first element in any case.
+    var before = select(tile_keys_at(max(quad, 1u) - 1u).w, 0xffffffffu, quad == 0u);
 #unroll k 4
     {
         let i = 4u * quad + $(k)u;
         let tile = keys[$k];
-        let next = select(after, keys[min($k + 1, 3)], $k < 3);
-        if (i < count && tile < arrayLength(&ranges)) {   // a pad has no tile
-            if (tile != before) {
+        if (i < count && tile != before) {
+            if (tile < arrayLength(&ranges)) {   // a pad has no tile
                 ranges[tile].x = i;
             }
-            if (i + 1u == count || tile != next) {
-                ranges[tile].y = i + 1u;
+            if (before < arrayLength(&ranges)) {
+                ranges[before].y = i;
             }
         }
         before = tile;
     }
 #end
+    let last = keys[(count - 1u) % 4u];
+    if (4u * quad + 4u >= count && last < arrayLength(&ranges)) {
+        ranges[last].y = count;
+    }
 }

@@ -214,7 +214,6 @@ class Rasterizer:
             frame=frame,
             needed=needed,
             tile_keys=sorted_keys,
-            tile_keys_singly=sorted_keys,
             ranges=ranges,
         )
         for number in range(self.rounds):
