@@ -157,7 +157,8 @@ def test_blocks_of_gaussians_give_the_same(device: Device) -> None:
         assert relative(a, b) < 1e-6
 
 
-def test_something_else_was_decoded_in_between(device: Device) -> None:
+@pytest.mark.parametrize("in_torch", [False, True])
+def test_something_else_was_decoded_in_between(device: Device, *, in_torch: bool) -> None:
     """And the gradient is asked for twice: the features are gone then, and are made again."""
     field = grid_field(device, PLAIN)
     field.on_device = True
@@ -165,7 +166,8 @@ def test_something_else_was_decoded_in_between(device: Device) -> None:
     alone = field(POINTS, 0.3, DYNAMICS, NEARBY)
     expected = torch.autograd.grad(alone.translation.square().sum() + alone.smoothness, learnt, allow_unused=True)
     move = field(POINTS, 0.3, DYNAMICS, NEARBY)
-    field(POINTS[:30], 0.8, DYNAMICS[:30])
+    with torch.set_grad_enabled(not in_torch):
+        field(POINTS[:30], 0.8, DYNAMICS[:30])
     total = move.translation.square().sum() + move.smoothness
     for _ in range(2):
         found = torch.autograd.grad(total, learnt, retain_graph=True, allow_unused=True)

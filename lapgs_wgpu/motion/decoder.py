@@ -37,7 +37,6 @@ class Decoder:
         self._device = device
         self._decoder = DeviceDecoder(device, shape, block=block)
         self._pool = BufferPool(device)
-        self._held: object = None  # the pass whose features are still on the device
 
     def __call__(
         self,
@@ -143,7 +142,7 @@ class _Decode(torch.autograd.Function):
         decoder.write(places, beside, tensors[:count], tensors[count:])
         with Commands(decoder._device) as commands:
             requests = decoder.record(commands, places)
-        decoder._held = ctx.token = object()
+        ctx.written = decoder.encoder.written
         outputs, *sums = read_all(requests)
         apart = np.array([each.sum(dtype=np.float64) for each in sums], np.float32)
         return torch.from_numpy(outputs).to(beside.device), torch.from_numpy(apart).to(beside.device)
@@ -155,11 +154,11 @@ class _Decode(torch.autograd.Function):
         sets = len(ctx.times)
         places = list(zip(ctx.saved_tensors[:sets], ctx.times, strict=True))
         beside, *tensors = ctx.saved_tensors[sets:]
-        lost = decoder._held is not ctx.token  # something else was decoded in between
+        lost = decoder.encoder.written is not ctx.written  # something else was encoded in between
         if lost:
             decoder.write(places, beside, tensors[: ctx.count], tensors[ctx.count :])
         decoder._upload("d outputs", d_outputs)
-        decoder._held = None
+        decoder.encoder.written = None  # features become gradients
         with Commands(decoder._device) as commands:
             if lost:
                 decoder.record(commands, places)

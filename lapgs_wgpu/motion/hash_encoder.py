@@ -47,6 +47,7 @@ class HashEncoder:
         self.groups = [list(group) for group in groups]
         self._encoders = [DeviceEncoder(device, group, bound, lane_levels=lane_levels) for group in self.groups]
         self._pool = BufferPool(device)
+        self.written: object = None  # another one with each `write`, whose encodings are on the device until the next
 
     @property
     def grids(self) -> list[HashGrid]:
@@ -101,6 +102,7 @@ class HashEncoder:
 
     def write(self, places: Sequence[Place], tables: Sequence[Tensor] = ()) -> None:
         """Bring points, and tables, to the device."""
+        self.written = object()
         for i, table in enumerate(tables):
             self._upload(f"table {i}", table)
         for number, (points, _) in enumerate(places):
