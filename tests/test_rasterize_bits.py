@@ -207,6 +207,17 @@ def test_bands_with_backward_after_another_image(device: Device, use: Use, scene
         assert torch.equal(leaf.grad, expected.gradients[name])
 
 
+def test_bands_do_not_outlive_images_of_a_size(device: Device, use: Use, scene: Scene, total: int) -> None:
+    rasterizer = banded(device, use, total // 3)
+    expected = one_step(scene, device)
+    bands = rasterizer.bands
+    assert bands > 1
+    rasterize(**random_scene(30, 9), camera=oblique_camera(40, 90), device=device)
+    assert rasterizer.bands == 1
+    same(one_step(scene, device), expected)
+    assert rasterizer.bands == bands
+
+
 def test_a_row_of_tiles_that_does_not_fit_is_refused(device: Device, use: Use) -> None:
     camera = front_camera(64, 8)
     scene = random_scene(500, 10, size=2.0)

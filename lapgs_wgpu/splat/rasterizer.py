@@ -96,6 +96,9 @@ class Rasterizer:
 
         The picture is valid once `grow` has returned False.
         """
+        before = self._drawn.camera if self._drawn is not None else camera
+        if (before.width, before.height) != (camera.width, camera.height):
+            self.bands = self.rounds = 1  # what an image of another size needed would slow this one down
         self._drawn = drawn = _Drawn(gaussians, camera, background, depth)
         if self.shape.round_splats:
             rows, columns = -(-camera.height // self.shape.tile_height), -(-camera.width // self.shape.tile_width)
