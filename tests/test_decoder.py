@@ -9,6 +9,7 @@ import pytest
 import torch
 from scenes import relative
 from test_fields import DYNAMICS, NEARBY, OURS, POINTS, grid_field, parts
+from test_matrix import on_device, random, read
 from torch import Tensor
 
 from lapgs_wgpu.gpu.buffer import Buffer
@@ -30,20 +31,6 @@ FIELDS = {
     "no dynamics": replace(PLAIN, dynamics=0),
     "no temporal grids": replace(PLAIN, temporal_hash=False),
 }
-
-
-def random(*shape: int, seed: int = 0) -> Tensor:
-    return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
-
-
-def on_device(device: Device, tensor: Tensor) -> Buffer:
-    buffer = Buffer(device, 4 * tensor.numel(), "tensor")
-    buffer.write(tensor.numpy())
-    return buffer
-
-
-def read(buffer: Buffer, *shape: int) -> Tensor:
-    return torch.from_numpy(buffer.read("float32", shape))
 
 
 def gate_reference(layers: Tensor, *, motion: bool) -> Tensor:

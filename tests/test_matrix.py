@@ -18,7 +18,7 @@ pytestmark = pytest.mark.kernels
 
 
 def random(*shape: int, seed: int = 0) -> Tensor:
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
 
 
 def on_device(device: Device, tensor: Tensor) -> Buffer:
