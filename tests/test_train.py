@@ -24,7 +24,7 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.checkpoint import read_checkpoint
 from lapgs_wgpu.motion.device_decoder import DeviceDecoder
 from lapgs_wgpu.motion.scene import Scene4D, load
-from lapgs_wgpu.train import decoder, loop, training
+from lapgs_wgpu.train import decoder_choice, loop, training
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.loop import train
@@ -213,7 +213,7 @@ def test_a_trial_chooses_where_the_decoder_works(
 ) -> None:
     """On devices that are no CPUs; the choice is written down, so that a resumed run keeps to it."""
     monkeypatch.setattr(device, "is_cpu", False)
-    monkeypatch.setattr(decoder, "_seconds", lambda scene, field, there: seconds[there == "device"])
+    monkeypatch.setattr(decoder_choice, "_seconds", lambda scene, field, there: seconds[there == "device"])
     train(configure(schedule__steps="1"), dataset, tmp_path / "run", device=device)
     assert load_config(str(tmp_path / "run/config.toml")).decoder == place
     assert f"decoder: {place} (a trial took " in capsys.readouterr().out
@@ -257,7 +257,7 @@ def test_nothing_is_tried_where_only_torch_will_do(
 ) -> None:
     monkeypatch.setattr(device, "is_cpu", False)
     with closing(Training(configure(**given), dataset, device)) as trained:
-        assert trained.decoder == decoder.Choice("torch", {})
+        assert trained.decoder == decoder_choice.Choice("torch", {})
 
 
 def test_a_processor_without_bfloat16_is_told(

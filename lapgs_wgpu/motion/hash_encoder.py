@@ -92,7 +92,8 @@ class HashEncoder:
         """The gradients of the tables, from those of the encodings in the order of `encode`."""
         self.write(places)
         for i, d_encoding in enumerate(d_encodings):
-            self._upload("encoding {} {}".format(*divmod(i, len(self.groups))), d_encoding)
+            number, group = divmod(i, len(self.groups))
+            self._upload(f"encoding {number} {group}", d_encoding)
         with Commands(self._pool.device) as commands:
             requests = self.record_gradient(commands, places, d_encodings[0].dtype)
         return [torch.from_numpy(array).to(places[0][0].device) for array in read_all(requests)]

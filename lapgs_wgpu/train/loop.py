@@ -20,7 +20,7 @@ from lapgs_wgpu.gpu.device import Device, open_device
 from lapgs_wgpu.io.first_look import FirstLook
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.config import Background, Config
-from lapgs_wgpu.train.decoder import Choice
+from lapgs_wgpu.train.decoder_choice import Choice
 from lapgs_wgpu.train.evaluate import evaluate, write_metrics
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.lpips import Lpips

@@ -22,7 +22,7 @@ from lapgs_wgpu.motion.grid_field import GridField
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.morton import morton_order
 from lapgs_wgpu.train.config import Config, PointsConfig, SmoothnessConfig
-from lapgs_wgpu.train.decoder import choose_decoder
+from lapgs_wgpu.train.decoder_choice import choose_decoder
 from lapgs_wgpu.train.densify import Statistics, densify, reset_opacities
 from lapgs_wgpu.train.exposure import Exposures
 from lapgs_wgpu.train.health import Health, Skipped, check_parameters, describe, finite

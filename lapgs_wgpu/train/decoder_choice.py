@@ -16,15 +16,16 @@ from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.ranks import Ranks
 
-Place = Literal["torch", "device"]
+Where = Literal["torch", "device"]
 _ROUNDS = 3  # of each, after one that compiles kernels and makes buffers
 
 
 class Choice(NamedTuple):
-    """Where, and how long the field took in each place, forward and backward, in seconds; none where none was timed."""
+    """Where it works, and how long the field took in each place, forward and backward, in seconds; none where none was
+    timed."""
 
-    place: Place
-    seconds: dict[Place, float]
+    place: Where
+    seconds: dict[Where, float]
 
 
 def choose_decoder(config: Config, scene: Scene4D, device: Device, ranks: Ranks) -> Choice:
@@ -46,11 +47,11 @@ def choose_decoder(config: Config, scene: Scene4D, device: Device, ranks: Ranks)
     except DeviceMemoryError:
         seconds.append(math.inf)
     of_all = ranks.sums([torch.tensor(seconds, dtype=torch.float64)])[0] / ranks.count
-    taken: dict[Place, float] = {"torch": float(of_all[0]), "device": float(of_all[1])}
+    taken: dict[Where, float] = {"torch": float(of_all[0]), "device": float(of_all[1])}
     return Choice("device" if taken["device"] < taken["torch"] else "torch", taken)
 
 
-def _seconds(scene: Scene4D, field: GridField, place: Place) -> float:
+def _seconds(scene: Scene4D, field: GridField, place: Where) -> float:
     """Of the field's forward and backward pass."""
     parameters = scene.parameters
     before, field.on_device = field.on_device, place == "device"
