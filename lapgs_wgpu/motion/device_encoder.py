@@ -235,7 +235,7 @@ class DeviceEncoder:
         largest = self.pool.get(f"largest {number}", 4)
         commands.clear(largest)
         kernel = Kernel.get(self.device, "hashgrid_largest", CORNERS=4, **options)
-        row = self._row * (2 if options else 4)
+        row = self._row * (2 if "BFLOAT16" in options else 4)
         for first, count in self._blocks(n, row):
             commands.dispatch(
                 kernel,

@@ -88,9 +88,12 @@ class HashEncoder:
         device = places[0][0].device
         return [torch.from_numpy(array).view(dtype).to(device) for array in read_all(requests)]
 
-    def backward(self, places: Sequence[Place], d_encodings: Sequence[Tensor]) -> list[Tensor]:
-        """The gradients of the tables, from those of the encodings in the order of `encode`."""
-        self.write(places)
+    def backward(self, places: Sequence[Place], d_encodings: Sequence[Tensor], written: object = None) -> list[Tensor]:
+        """The gradients of the tables, from those of the encodings in the order of `encode`. written: what that left in
+        `self.written`; while it is there, so are the points."""
+        if written is None or written is not self.written:
+            self.write(places)
+        self.written = None  # encodings and tables become gradients
         for i, d_encoding in enumerate(d_encodings):
             number, group = divmod(i, len(self.groups))
             self._upload(f"encoding {number} {group}", d_encoding)
@@ -167,12 +170,14 @@ class _Encode(torch.autograd.Function):
     ) -> tuple[Tensor, ...]:
         ctx.encoder, ctx.times = encoder, [time for _, time in places]
         ctx.save_for_backward(*[points for points, _ in places])
-        return tuple(encoder.encode(places, dtype, tables))
+        encodings = encoder.encode(places, dtype, tables)
+        ctx.written = encoder.written
+        return tuple(encodings)
 
     @staticmethod
     def backward(ctx: Any, *d_encodings: Tensor) -> tuple[Tensor | None, ...]:
         places = list(zip(ctx.saved_tensors, ctx.times, strict=True))
-        return (None, None, None, *ctx.encoder.backward(places, d_encodings))
+        return (None, None, None, *ctx.encoder.backward(places, d_encodings, ctx.written))
 
 
 def encode_reference(grid: HashGrid, table: Tensor, points: Tensor, time: float, bound: float) -> Tensor:
