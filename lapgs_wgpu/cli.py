@@ -26,7 +26,6 @@ SHORTCUTS = {
     "schedule.batch": "--batch",
     "data.cache_gb": "--cache-gb",
 }
-SYNTHETIC = "synthetic"
 # Of the keys, what goes with --eval: where the pictures lie now, and how they are read. The size must be the run's own.
 EVAL_KEYS = ("data.path", "data.size", "data.background", "data.cache_gb")
 
@@ -35,6 +34,7 @@ DESCRIPTION = """\
 Train a moving scene on the pictures of a folder, on any Vulkan adapter.
 
   lapgs-train demo --data synthetic             the built-in scene, in minutes on a CPU
+  lapgs-train tiny --data motion:path=4,cycles=2   a built-in scene that measures motion (docs/metrics.md)
   lapgs-train tiny --data DIR                   a D-NeRF scene at 200x200, sized for a CPU
   lapgs-train dnerf --data DIR --out RUN        the same with the paper's pictures and schedule
   lapgs-train hypernerf --data DIR              a capture of nerfies or HyperNeRF; for a CPU: hypernerf-tiny
@@ -93,7 +93,7 @@ def _train(arguments: list[str]) -> None:
     if ranks.first:
         check_run_folder(out, overwrite=given["overwrite"])
     device = open_device(given["device"], number=ranks.on_machine)
-    config, dataset = _open_data(config, out.parent / SYNTHETIC, ranks)
+    config, dataset = _open_data(config, out.parent, ranks)
     train(config, dataset, out, device=device, overwrite=given["overwrite"], watch=watch, ranks=ranks)
     if ranks.first:
         _report(out)
@@ -114,7 +114,7 @@ def _resume(
         raise InputError(f"{run / 'config.toml'} does not exist; --resume needs the folder of a run.")
     config = load_config(str(run / "config.toml"))
     device = open_device(given["device"], number=ranks.on_machine)
-    config, dataset = _open_data(config, run.parent / SYNTHETIC, ranks)
+    config, dataset = _open_data(config, run.parent, ranks)
     for what, before, now in changes_since(run, device, dataset) if ranks.first else ():
         print(f"lapgs-train: {what} was {before} when {run} began and is {now}: bits may differ.", file=sys.stderr)
     resume(config, dataset, run, device=device, watch=watch, ranks=ranks)
@@ -153,7 +153,7 @@ def _evaluate(run: Path, given: dict[str, typing.Any], overrides: dict[str, str 
             f"{run / 'config.toml'} says {size}."
         )
     device = open_device(given["device"])
-    config, dataset = _open_data(config, run.parent / SYNTHETIC)
+    config, dataset = _open_data(config, run.parent)
     scene = load(run / "checkpoint.ply", device)
     try:
         training = read_json(run / "metrics.json")["training"]
@@ -178,16 +178,20 @@ def _report(run: Path) -> None:
 
 
 def _scene_name(config: Config) -> str:
+    from lapgs_wgpu.data.builtin import builtin_folder, is_builtin
+
+    if is_builtin(config.data.path):
+        return builtin_folder(config.data.path)
     return Path(config.data.path).resolve().name or "scene"
 
 
-def _open_data(config: Config, synthetic: Path, ranks: Ranks | None = None) -> tuple[Config, Dataset]:
-    """The dataset, and the configuration with the folder in which it lies. synthetic: where the built-in scene goes,
-    which the first of several processes writes."""
+def _open_data(config: Config, parent: Path, ranks: Ranks | None = None) -> tuple[Config, Dataset]:
+    """The dataset, and the configuration with its folder. parent: folder for built-in scenes, which the first of
+    several processes writes."""
     import dataclasses
 
     from lapgs_wgpu.data import load_dataset
-    from lapgs_wgpu.data.synthetic import write_synthetic
+    from lapgs_wgpu.data.builtin import SYNTHETIC, is_builtin, write_builtin
 
     path = config.data.path
     if not path.isprintable():
@@ -196,7 +200,7 @@ def _open_data(config: Config, synthetic: Path, ranks: Ranks | None = None) -> t
         raise InputError(f"name the folder of the scene with --data DIR, or take --data {SYNTHETIC}.")
     if ranks is not None and not ranks.first:
         ranks.any(False)  # waits until the first has done so
-    folder = write_synthetic(synthetic) if path == SYNTHETIC else Path(path)
+    folder = write_builtin(path, parent) if is_builtin(path) else Path(path)
     if ranks is not None and ranks.first:
         ranks.any(False)
     dataset = load_dataset(folder, image_size=config.data.size or None)

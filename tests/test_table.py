@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from lapgs_wgpu import cli, command
+from lapgs_wgpu.data import synthetic
 from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.train import table
@@ -379,7 +380,7 @@ def test_the_built_in_scene_is_written_once(
         written.append(folder)
         return folder
 
-    monkeypatch.setattr(table, "write_synthetic", write)
+    monkeypatch.setattr(synthetic, "write_synthetic", write)
     (tmp_path / "spec.toml").write_text(
         SPEC.replace('"toys"\n', '"synthetic"\n').replace('folder = "toys"', 'folder = "synthetic"')
     )

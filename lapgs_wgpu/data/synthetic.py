@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
-import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,22 +18,29 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
+from lapgs_wgpu.data.dnerf_writer import already_holds, frame_name, new_folder, split_times, write_transforms
+from lapgs_wgpu.data.raytrace import (
+    Colour,
+    Floats,
+    Solid,
+    Vector,
+    combine,
+    pixel_rays,
+    plane_hits,
+    solid_hits,
+    to_pixels,
+)
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
-
-Floats = NDArray[np.float64]
-Colour = tuple[float, float, float]
 
 FREQUENCIES = (1.0, 2.0, 3.5, 0.5)  # cycles over the clip, of the toys in their order
 CAMERA_ANGLE_X = 0.6911112070083618  # horizontal field of view in radians, that of D-NeRF's scenes
 CAMERA_RADIUS = 4.0
 CAMERA_HEIGHT = (0.3, 0.9)  # range of the sine of the camera's elevation
+RECORD = "synthetic.json"  # the file of the scene's parameters
 VERSION = 1  # of the scene's looks: raise it with every change of what is rendered
-SAMPLES = 3  # a pixel is the mean of SAMPLES x SAMPLES rays
 
 TABLE_HEIGHT, TABLE_RADIUS = -0.6, 1.15
-LIGHT = np.array([0.30, -0.35, 0.887])  # unit vector towards the light
-AMBIENT, SKY, DIFFUSE = 0.42, 0.13, 0.45  # sum to 1; SKY: how much more light comes from above than from the side
 
 
 @dataclass(frozen=True)
@@ -49,11 +54,15 @@ class Toy:
     name: str
     shape: Literal["beach ball", "ringed ball", "box"]
     radius: float
-    centre: tuple[float, float, float]
-    cosine: tuple[float, float, float]
-    sine: tuple[float, float, float]
+    centre: Vector
+    cosine: Vector
+    sine: Vector
     colours: tuple[Colour, Colour]
     turns: bool = False
+
+    @property
+    def solid(self) -> Solid:
+        return Solid(self.shape, (self.radius,) * 3, self.colours)
 
 
 # Each moves by about its own radius, so that the mean over time still shows it: a model that first fits a still scene
@@ -83,111 +92,49 @@ def trajectories(times: ArrayLike, frequencies: Sequence[float] = FREQUENCIES) -
 
 def render(camera: Camera, time: float, frequencies: Sequence[float] = FREQUENCIES) -> NDArray[np.uint8]:
     """Ray trace one picture: (H, W, 4) straight RGBA."""
-    n = SAMPLES
-    x = (np.arange(camera.width * n) + 0.5) / n
-    y = (np.arange(camera.height * n) + 0.5) / n
-    K, R = camera.K, camera.T_cam_world[:3, :3]
-    u, v = np.meshgrid((x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1])
-    # Sums are written out, here and below: a matrix product may round differently on another machine.
-    rays = np.stack([(R[0, i] * u + R[1, i] * v + R[2, i]).ravel() for i in range(3)])
-    rays /= np.sqrt(_dot(rays, rays))
-
-    nearest = np.full(rays.shape[1], np.inf)
-    colour = np.zeros_like(rays)
+    rays = pixel_rays(camera)
     centres = trajectories([time], frequencies)
+    surfaces = []
     for toy, f in zip(TOYS, frequencies, strict=False):
         angle = 2 * np.pi * f * time if toy.turns else 0.0
-        _draw_toy(toy, centres[toy.name][0], angle, camera.position, rays, nearest, colour)
-    _draw_table(camera.position, rays, nearest, colour)
-
-    rgba = np.concatenate([colour, np.isfinite(nearest)[None]]).reshape(4, camera.height, n, camera.width, n)
-    rgba = rgba.mean(axis=(2, 4))
-    rgba[:3] /= np.maximum(rgba[3], 1e-9)  # so far colours are premultiplied by the share of rays that hit
-    return np.floor(np.moveaxis(rgba, 0, 2) * 255 + 0.5).astype(np.uint8)
+        surfaces.append(solid_hits(toy.solid, centres[toy.name][0], camera.position, rays, angle=angle))
+    surfaces.append(plane_hits(2, TABLE_HEIGHT, 1, _table, camera.position, rays))
+    colour, owner = combine(surfaces, rays.shape[1])
+    return to_pixels(colour, owner >= 0, camera)
 
 
-def _dot(a: Floats, b: Floats) -> Floats:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def _turned(p: Floats, angle: float) -> Floats:
-    """Vectors (3, ...) rotated about z."""
-    c, s = math.cos(angle), math.sin(angle)
-    return np.stack([c * p[0] - s * p[1], s * p[0] + c * p[1], p[2]])
-
-
-def _lit(albedo: Floats, normal: Floats) -> Floats:
-    """Diffuse shading: albedo (3, n), unit normals (3, n) -> colours (3, n)."""
-    return albedo * (AMBIENT + SKY * normal[2] + DIFFUSE * np.maximum(_dot(normal, LIGHT), 0))
-
-
-def _draw_toy(
-    toy: Toy, centre: Floats, angle: float, eye: Floats, rays: Floats, nearest: Floats, colour: Floats
-) -> None:
-    """Where rays (3, n) meet the toy first, update `nearest` (n,), the distance along the ray, and `colour` (3, n)."""
-    to_eye = eye - centre
-    along = -_dot(rays, to_eye)
-    beside = _dot(to_eye, to_eye) - along**2  # squared distance at which a ray passes the centre
-    near = np.flatnonzero(beside < toy.radius**2 * (3 if toy.shape == "box" else 1))
-    origin, d = _turned(to_eye, -angle), _turned(rays[:, near], -angle)
-    if toy.shape == "box":
-        with np.errstate(divide="ignore", invalid="ignore"):
-            entry = ((-np.sign(d) * toy.radius - origin[:, None]) / d).max(axis=0)
-            leave = ((np.sign(d) * toy.radius - origin[:, None]) / d).min(axis=0)
-        distance = np.where(entry < leave, entry, np.inf)
-    else:
-        distance = along[near] - np.sqrt(toy.radius**2 - beside[near])
-    first = distance < nearest[near]
-    hit, d, distance = near[first], d[:, first], distance[first]
-
-    p = (origin[:, None] + distance * d) / toy.radius
-    if toy.shape == "box":  # one half of each colour, and a belt of the other
-        normal = np.where(np.arange(3)[:, None] == np.argmax(np.abs(p), axis=0), np.sign(p), 0.0)
-        pattern = (p[0] > 0) != (np.abs(p[2]) < 0.35)
-    else:
-        normal = p
-        if toy.shape == "beach ball":  # six segments, and caps of one colour
-            pattern = (np.floor(np.arctan2(p[1], p[0]) * (3 / np.pi)) % 2 == 0) | (np.abs(p[2]) > 0.88)
-        else:
-            pattern = np.floor(p[2] * 2 + 0.5) % 2 == 0
-    one, other = np.array(toy.colours)[:, :, None]
-    colour[:, hit] = _lit(np.where(pattern, one, other), _turned(normal, angle))
-    nearest[hit] = distance
-
-
-def _draw_table(eye: Floats, rays: Floats, nearest: Floats, colour: Floats) -> None:
-    """The same as `_draw_toy` for the static disc below, seen from above only: a checkered top with a plain rim."""
-    down = np.flatnonzero(rays[2] < 0)
-    distance = (TABLE_HEIGHT - eye[2]) / rays[2, down]
-    x, y = eye[:2, None] + distance * rays[:2, down]
+def _table(x: Floats, y: Floats) -> tuple[NDArray[np.bool_], Floats]:
+    """The static disc below: a checkered top with a plain rim."""
     square = x * x + y * y
-    seen = (square < TABLE_RADIUS**2) & (distance < nearest[down])
-    hit, x, y, square = down[seen], x[seen], y[seen], square[seen]
+    inside = square < TABLE_RADIUS**2
+    x, y, square = x[inside], y[inside], square[inside]
     light = (np.floor(x / 0.42) + np.floor(y / 0.42)) % 2 == 0
     albedo = np.where(light, np.array([[0.86], [0.83], [0.76]]), np.array([[0.34], [0.42], [0.50]]))
     albedo = np.where(square > (0.9 * TABLE_RADIUS) ** 2, np.array([[0.58], [0.40], [0.27]]), albedo)
-    colour[:, hit] = _lit(albedo, np.array([0.0, 0.0, 1.0])[:, None].repeat(len(hit), axis=1))
-    nearest[hit] = distance[seen]
+    return inside, albedo
 
 
 def cameras(n: int, seed: int, *, size: int) -> list[Camera]:
     """n cameras on the upper hemisphere that look at the origin: one far from the next, all together well spread."""
+    return [
+        camera_at(2 * math.pi * turn, CAMERA_HEIGHT[0] + (CAMERA_HEIGHT[1] - CAMERA_HEIGHT[0]) * lift, size=size)
+        for turn, lift in jumps(n, seed)
+    ]
+
+
+def jumps(n: int, seed: int) -> Floats:
+    """(n, 2) points of the unit square, one far from the next, all together well spread."""
     # Roberts' R2 sequence: multiples of 1/g and 1/g^2 modulo 1, where g^3 = g + 1
     g = 1.324717957244746
     start = np.random.default_rng(seed).random(2)
-    low, high = CAMERA_HEIGHT
-    result = []
-    for i in range(n):
-        turn, lift = (start + np.array([i / g, i / g**2])) % 1
-        z = low + (high - low) * lift
-        ring = math.sqrt(1 - z * z)
-        direction = np.array([ring * math.cos(2 * math.pi * turn), ring * math.sin(2 * math.pi * turn), z])
-        result.append(
-            Camera.looking_at(
-                CAMERA_RADIUS * direction, [0, 0, 0], up=[0, 0, 1], fov_x=CAMERA_ANGLE_X, width=size, height=size
-            )
-        )
-    return result
+    return np.array([(start + np.array([i / g, i / g**2])) % 1 for i in range(n)])
+
+
+def camera_at(azimuth: float, height: float, *, size: int, fov_x: float = CAMERA_ANGLE_X) -> Camera:
+    """A camera at CAMERA_RADIUS that looks at the origin. azimuth: radians. height: sine of the elevation."""
+    ring = math.sqrt(1 - height * height)
+    direction = np.array([ring * math.cos(azimuth), ring * math.sin(azimuth), height])
+    return Camera.looking_at(CAMERA_RADIUS * direction, [0, 0, 0], up=[0, 0, 1], fov_x=fov_x, width=size, height=size)
 
 
 def write_synthetic(
@@ -223,54 +170,16 @@ def write_synthetic(
         "seed": seed,
         "frequencies": [float(f) for f in frequencies],
     }
-    if _already_holds(folder, parameters):
+    if already_holds(folder, RECORD, parameters):
         return folder
 
-    ends = np.linspace(0, 1, train_views)
-    between = (np.floor((np.arange(test_views) + 0.5) / test_views * (train_views - 1)) + 0.5) / (train_views - 1)
-    unfinished = folder.with_name(f"{folder.name}.{os.getpid()}.partial")
-    try:
-        for index, (split, times) in enumerate((("train", ends), ("val", between), ("test", between))):
-            (unfinished / split).mkdir(parents=True)
-            frames = []
-            for i, (camera, time) in enumerate(
-                zip(cameras(len(times), 3 * seed + index, size=size), times, strict=True)
-            ):
-                name = f"{split}/r_{i:03d}"
-                Image.fromarray(render(camera, time, frequencies)).save(unfinished / f"{name}.png")
-                T_world_cam = np.eye(4)
-                T_world_cam[:3, :3] = camera.T_cam_world[:3, :3].T * [1, -1, -1]  # OpenGL's axes: y up, z backward
-                T_world_cam[:3, 3] = camera.position
-                frames.append({"file_path": f"./{name}", "time": time, "transform_matrix": T_world_cam.tolist()})
-            data = {"camera_angle_x": CAMERA_ANGLE_X, "frames": frames}
-            (unfinished / f"transforms_{split}.json").write_text(json.dumps(data, indent=1) + "\n")
-        (unfinished / "synthetic.json").write_text(json.dumps(parameters, indent=1) + "\n")
-        if folder.is_dir():
-            folder.rmdir()  # it is empty
-        unfinished.rename(folder)
-    except OSError as error:
-        raise InputError(f"{folder} cannot be written: {error}.") from None
-    finally:
-        shutil.rmtree(unfinished, ignore_errors=True)
+    train, test = split_times(train_views, test_views)
+    with new_folder(folder) as unfinished:
+        for index, (split, times) in enumerate((("train", train), ("val", test), ("test", test))):
+            (unfinished / split).mkdir()
+            taken = cameras(len(times), 3 * seed + index, size=size)
+            for i, (camera, time) in enumerate(zip(taken, times, strict=True)):
+                Image.fromarray(render(camera, time, frequencies)).save(unfinished / f"{frame_name(split, i)}.png")
+            write_transforms(unfinished, split, taken, times, CAMERA_ANGLE_X)
+        (unfinished / RECORD).write_text(json.dumps(parameters, indent=1) + "\n")
     return folder
-
-
-def _already_holds(folder: Path, parameters: dict[str, object]) -> bool:
-    """Whether the folder holds the scene of these parameters; InputError where it holds something else."""
-    if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
-        return False
-    try:
-        found = json.loads((folder / "synthetic.json").read_text())
-    except (OSError, ValueError):
-        found = None
-    if found == parameters:
-        return True
-    what = "is not empty"
-    if isinstance(found, dict):
-        other = [
-            f"{key} {found.get(key)} instead of {value}" for key, value in parameters.items() if found.get(key) != value
-        ]
-        what = f"holds another built-in scene ({', '.join(other)})"
-    raise InputError(
-        f"{folder} {what} and is left alone; name another folder for the built-in scene, or remove this one."
-    )

@@ -39,7 +39,9 @@ class DataConfig:
         "bound on decoded pictures kept in memory, and on those on the device, in gigabytes; on both together where "
         "the device shares the memory"
     )
-    path: str = described('folder of the scene, or "synthetic", the built-in scene, written beside the run', "")
+    path: str = described(
+        'folder of the scene, or a built-in scene, "synthetic" or "motion:path=4,cycles=2", written beside the run', ""
+    )
 
 
 @dataclass(frozen=True)

@@ -17,15 +17,13 @@ from pathlib import Path
 from statistics import mean
 
 from lapgs_wgpu.data import load_dataset
-from lapgs_wgpu.data.synthetic import write_synthetic
+from lapgs_wgpu.data.builtin import is_builtin, write_builtin
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import open_device
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.train.presets import write_toml
 from lapgs_wgpu.train.table_results import Result, Results, read_results, read_run, write_results
 from lapgs_wgpu.train.table_spec import Run, RunKey, Spec
-
-SYNTHETIC = "synthetic"  # the folder of the built-in scene
 
 
 def make_table(
@@ -97,13 +95,13 @@ def _finished(spec: Spec, out: Path, known: Sequence[Results]) -> dict[RunKey, R
 def _scene_folders(pending: Sequence[Run], data: Path, out: Path) -> dict[str, Path]:
     """Where the scenes of these runs lie; each is opened once, so that its mistakes show before any training."""
     folders = {}
-    for name in dict.fromkeys(run.folder for run in pending):
-        if name != SYNTHETIC:
+    names = list(dict.fromkeys(run.folder for run in pending))
+    for name in names:
+        if not is_builtin(name):
             folders[name] = (data / name).resolve()
             load_dataset(folders[name])
-    if any(run.folder == SYNTHETIC for run in pending):
-        # Names of scenes start with no dot.
-        folders[SYNTHETIC] = write_synthetic(out / ".data" / SYNTHETIC).resolve()
+    for name in filter(is_builtin, names):
+        folders[name] = write_builtin(name, out / ".data").resolve()  # names of scenes start with no dot
     return folders
 
 

@@ -7,7 +7,7 @@ seeds = [0, 1, 2]
 data.background = "black"
 
 [scenes]                          # name = folder, relative to --data; "synthetic" is the built-in scene
-toys = "synthetic"
+toys = "synthetic"                # and "motion:path=4,cycles=2" one that measures motion
 lego = { folder = "lego", points.box = 1.5 }
 
 [rows]                            # name = a method (--field) and what it is without (--ablate), keys of the
@@ -26,6 +26,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from lapgs_wgpu.data.builtin import builtin_folder, is_builtin
 from lapgs_wgpu.errors import InputError, shown
 from lapgs_wgpu.io.documents import read_toml
 from lapgs_wgpu.train.config import Config
@@ -139,6 +140,8 @@ def _scenes(value: Any, path: Path) -> dict[str, tuple[str, Table]]:
                 f"{path}: scenes.{name} must be a folder, or a table with the key folder, got {shown(entry)}."
             )
         folder = entry.pop("folder")
+        if is_builtin(folder):
+            builtin_folder(folder)  # checks its keys
         scenes[name] = (folder, _overrides(entry, f"{path}: scenes.{name}"))
     return scenes
 

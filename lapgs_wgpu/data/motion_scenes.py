@@ -1,0 +1,230 @@
+"""Built-in scenes that measure motion: two objects travel a known path, seen by cameras of a known kind.
+
+A ball runs along a circle and a box along a line, both `path` of their diameters wide and `cycles` times over the clip;
+a small ball below them stands still. z is up. Everything lies in [-1.3, 1.3]^3, and within the view of all cameras
+except where the scene says otherwise, so the objects' size follows from the path. `write_motion` writes a scene in
+the D-NeRF layout with its true trajectories, masks and clean plates (`objects.json`, docs/metrics.md).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lapgs_wgpu.data.raytrace import Floats, Hits, Solid, Vector, pixel_rays, plane_hits, rays_around, solid_hits
+from lapgs_wgpu.data.synthetic import camera_at, jumps
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.splat.camera import Camera
+
+CameraMotion = Literal["jump", "walk", "still"]
+Backdrop = Literal["black", "white", "room"]
+ObjectSet = Literal["two", "enter", "occluded"]
+
+FOV_X, ROOM_FOV_X = 0.69, 0.6  # horizontal field of view of all cameras, radians; in the room
+STILL_CAMERAS = 6  # that take the training images of camera="still"
+WALK_AZIMUTH, ROOM_AZIMUTH = 2.1, 0.87  # radians that a walk covers; in the room, all cameras
+ROOM_CENTRE = -math.pi / 4  # azimuth of the room's cameras, which look into the corner of its two walls
+JUMP_HEIGHT, ROOM_HEIGHT = (0.3, 0.9), (0.38, 0.6)  # ranges of the sine of a camera's elevation
+WALK_HEIGHT, WALK_BOB = 0.47, 0.05  # mean and amplitude of a walk's
+FLOOR, WALL = -1.05, 1.3  # z of the room's floor; distance of its walls from the origin, and their height
+ENTER_HEIGHT, ENTER_TIMES = 3.0, (0.3, 0.5)  # the box drops into the scene from this much above its path
+SHORTEST_OCCLUDED_PATH = 3  # leaves space for a column
+
+
+@dataclass(frozen=True)
+class MotionScene:
+    """What moves in a scene, and how it is seen.
+
+    path: width of each path in diameters of the object. cycles: how often each path is travelled over the clip.
+    camera: "jump" takes each image from elsewhere, as D-NeRF does; "walk" moves slowly around the scene, as a phone;
+    "still" is six cameras that stand still and see each time together.
+    background: "black" or "white" gives transparent images, to be trained and measured on that colour
+    (data.background); "room" a textured floor and two walls.
+    objects: "two" moving ones; "enter": the box drops into the scene at t = 0.4; "occluded": both circle a column.
+    """
+
+    path: float = 2.0
+    cycles: float = 2.0
+    camera: CameraMotion = "jump"
+    background: Backdrop = "black"
+    objects: ObjectSet = "two"
+
+    def __post_init__(self) -> None:
+        for name, most in (("path", 20), ("cycles", 20)):
+            value = float(getattr(self, name))
+            object.__setattr__(self, name, value)  # 4 and 4.0 are written alike
+            if not (math.isfinite(value) and 0 < value <= most):
+                raise InputError(f"a motion scene needs {name} above 0 and up to {most}, got {value:g}.")
+        for name, kind in (("camera", CameraMotion), ("background", Backdrop), ("objects", ObjectSet)):
+            if getattr(self, name) not in get_args(kind):
+                known = ", ".join(get_args(kind))
+                raise InputError(f"a motion scene needs {name} of {known}, got {getattr(self, name)!r}.")
+        if self.objects == "occluded" and self.path < SHORTEST_OCCLUDED_PATH:
+            raise InputError(
+                f"a motion scene with objects=occluded needs a path of at least {SHORTEST_OCCLUDED_PATH}, which leaves "
+                f"space for the column, got {self.path:g}."
+            )
+
+
+@dataclass(frozen=True)
+class MovingObject:
+    """A solid whose centre is at `centre + cosine cos(2 pi f t) + sine sin(2 pi f t)`, f = `cycles`, world units.
+
+    diameter: of the ball, or of the ball of the same volume as the box. drop: height from which it enters.
+    A still object has `cycles` 0 and no mask is asked of it.
+    """
+
+    name: str
+    solid: Solid
+    diameter: float
+    centre: Vector
+    cosine: Vector = (0.0, 0.0, 0.0)
+    sine: Vector = (0.0, 0.0, 0.0)
+    cycles: float = 0.0
+    drop: float = 0.0
+
+    @property
+    def moves(self) -> bool:
+        return self.cycles > 0
+
+    @property
+    def reach(self) -> float:
+        """Radius of the smallest ball around the centre that holds the object."""
+        return math.hypot(*self.solid.half) if self.solid.shape == "box" else self.solid.half[0]
+
+    def positions(self, times: ArrayLike) -> Floats:
+        """Centre of the object at times (T,): (T, 3) world units."""
+        time = np.asarray(times, dtype=np.float64)[:, None]
+        phase = 2 * np.pi * self.cycles * time
+        path = np.array(self.centre) + np.cos(phase) * self.cosine + np.sin(phase) * self.sine
+        start, end = ENTER_TIMES
+        left = 1 - np.clip((time - start) / (end - start), 0, 1)
+        return path + self.drop * left * left * (3 - 2 * left) * [0, 0, 1]
+
+
+def moving_objects(scene: MotionScene) -> tuple[MovingObject, ...]:
+    """All objects of a scene, those that move first."""
+    diameter = min(0.55, 2.1 / (scene.path + 1))
+    edge = 0.806 * diameter  # of the box that has the ball's volume
+    radius = scene.path * diameter / 2  # of the circle, and half the length of the line
+    aside = min(max(1.0 - radius - diameter / 2, 0.0), 0.45)  # short paths need not share the middle
+    height = 0.6 * diameter  # of the box's path above z = 0, and of the ball's below
+    ball = MovingObject(
+        "ball",
+        Solid("beach ball", (diameter / 2,) * 3, ((0.85, 0.22, 0.18), (0.95, 0.68, 0.15))),
+        diameter,
+        centre=(-aside, 0, -height),
+        cosine=(radius * math.cos(0.6), radius * math.sin(0.6), 0),
+        sine=(-radius * math.sin(0.6), radius * math.cos(0.6), 0),
+        cycles=scene.cycles,
+    )
+    occluded = scene.objects == "occluded"
+    box = MovingObject(
+        "box",
+        Solid("box", (edge / 2,) * 3, ((0.12, 0.42, 0.80), (0.22, 0.72, 0.35))),
+        diameter,
+        centre=(aside, 0, height),
+        cosine=(0, radius, 0),
+        sine=(radius, 0, 0) if occluded else (0, 0, 0),
+        cycles=scene.cycles,
+        drop=ENTER_HEIGHT if scene.objects == "enter" else 0.0,
+    )
+    still = MovingObject(
+        "still",
+        Solid("ringed ball", (0.2,) * 3, ((0.56, 0.26, 0.62), (0.85, 0.55, 0.72))),
+        0.4,
+        (0.25, -0.2, FLOOR + 0.2),
+    )
+    if not occluded:
+        return ball, box, still
+    half = 0.85 * (radius - box.reach) / math.sqrt(2)  # within the circles of both
+    top = height + edge / 2
+    column = Solid("box", (half, half, (top - FLOOR) / 2), ((0.48, 0.44, 0.30), (0.66, 0.60, 0.44)))
+    return ball, box, MovingObject("column", column, 2 * half, (0, 0, (top + FLOOR) / 2))
+
+
+def trace(scene: MotionScene, camera: Camera, time: float) -> list[Hits]:
+    """Hits of every surface: first those of `moving_objects`, in their order, then those of the room."""
+    rays = pixel_rays(camera)
+    eye = camera.position
+    surfaces = []
+    for one in moving_objects(scene):
+        centre = one.positions([time])[0]
+        among = rays_around(camera, centre, one.reach)
+        surfaces.append(solid_hits(one.solid, centre, eye, rays, among=among))
+    if scene.background == "room":
+        surfaces.append(plane_hits(2, FLOOR, 1, _floor, eye, rays))
+        surfaces.append(plane_hits(0, -WALL, 1, _bricks, eye, rays))
+        surfaces.append(plane_hits(1, WALL, -1, _panels, eye, rays))
+    return surfaces
+
+
+def _floor(x: Floats, y: Floats) -> tuple[NDArray[np.bool_], Floats]:
+    """Tiles of two greys, each third one warmer."""
+    inside = (np.abs(x) <= WALL) & (np.abs(y) <= WALL)
+    column, row = np.floor(x[inside] / 0.29), np.floor(y[inside] / 0.29)
+    light = (column + row) % 2 == 0
+    albedo = np.where(light, np.array([[0.62], [0.60], [0.56]]), np.array([[0.40], [0.40], [0.42]]))
+    warm = (column + 2 * row) % 3 == 0
+    return inside, np.where(warm, albedo * [[1.1], [0.95], [0.8]], albedo)
+
+
+def _bricks(y: Floats, z: Floats) -> tuple[NDArray[np.bool_], Floats]:
+    inside = (np.abs(y) <= WALL) & (z >= FLOOR) & (z <= WALL)
+    row = np.floor(z[inside] / 0.2)
+    along = y[inside] / 0.4 + 0.5 * (row % 2)
+    joint = (z[inside] / 0.2 - row < 0.15) | (along - np.floor(along) < 0.08)
+    shade = 0.9 + 0.1 * ((np.floor(along) + 3 * row) % 3)
+    brick = np.array([[0.56], [0.46], [0.42]]) * shade
+    return inside, np.where(joint, np.array([[0.72], [0.70], [0.66]]), brick)
+
+
+def _panels(x: Floats, z: Floats) -> tuple[NDArray[np.bool_], Floats]:
+    inside = (np.abs(x) <= WALL) & (z >= FLOOR) & (z <= WALL)
+    stripe = np.floor(x[inside] / 0.22) % 3
+    low = z[inside] < -0.35
+    tone = np.where(low, 0.36 + 0.06 * stripe, 0.58 + 0.06 * stripe)
+    return inside, tone * np.array([[1.0], [1.02], [0.94]])
+
+
+def fov_x(scene: MotionScene) -> float:
+    """Horizontal field of view of all cameras of a scene, radians."""
+    return ROOM_FOV_X if scene.background == "room" else FOV_X
+
+
+def scene_cameras(scene: MotionScene, split: str, times: ArrayLike, seed: int, *, size: int) -> list[Camera]:
+    """The cameras of the images of a split taken at `times` (T,): for training cameras that stand still T is a
+    multiple of STILL_CAMERAS, image by image camera 0 to 5. seed: of the jumps."""
+    time = np.asarray(times, dtype=np.float64)
+    room = scene.background == "room"
+    places: Sequence[tuple[float, float]]
+    if scene.camera == "jump":
+        low, high = ROOM_HEIGHT if room else JUMP_HEIGHT
+        start, width = (ROOM_CENTRE - ROOM_AZIMUTH / 2, ROOM_AZIMUTH) if room else (0.0, 2 * math.pi)
+        spread = jumps(len(time), 3 * seed + ("train", "val", "test").index(split))
+        places = [(start + width * turn, low + (high - low) * lift) for turn, lift in spread]
+    elif scene.camera == "walk":
+        width = ROOM_AZIMUTH if room else WALK_AZIMUTH
+        off = {"train": 0.0, "val": -0.04, "test": 0.04}[split]  # beside the walk, by turns on either side
+        sides = off * (-1.0) ** np.arange(len(time))
+        places = [
+            (ROOM_CENTRE + width * (t - 0.5) + side, WALK_HEIGHT + WALK_BOB * math.sin(4 * math.pi * t) + side)
+            for t, side in zip(time, sides, strict=True)
+        ]
+    else:
+        width = ROOM_AZIMUTH if room else 2 * math.pi * (1 - 1 / STILL_CAMERAS)
+        heights = (0.40, 0.55)
+        if split == "train":
+            places = [
+                (ROOM_CENTRE + width * (i / (STILL_CAMERAS - 1) - 0.5), heights[i % 2])
+                for i in np.arange(len(time)) % STILL_CAMERAS
+            ]
+        else:  # one more camera for each split, between two of training
+            between = 0.5 if split == "test" else 1.5
+            places = [(ROOM_CENTRE + width * (between / (STILL_CAMERAS - 1)), sum(heights) / 2)] * len(time)
+    return [camera_at(azimuth, height, size=size, fov_x=fov_x(scene)) for azimuth, height in places]

@@ -1,0 +1,119 @@
+"""Writes a motion scene in the D-NeRF layout, with the truth about its objects beside the images.
+
+objects.json: parameters of the scene; of every object its size, and its positions at the times of each split's images.
+masks/SPLIT/VIEW_OBJECT.png: which pixels of a held-out image show a moving object, 8-bit grey, antialiased.
+clean/SPLIT/VIEW_OBJECT.png: the same image without that object, RGBA.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from lapgs_wgpu.data.dnerf_writer import already_holds, frame_name, new_folder, split_times, write_transforms
+from lapgs_wgpu.data.motion_scenes import STILL_CAMERAS, MotionScene, fov_x, moving_objects, scene_cameras, trace
+from lapgs_wgpu.data.raytrace import SAMPLES, Hits, combine, pixel_means, to_bytes, to_pixels
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.splat.camera import Camera
+
+RECORD = "objects.json"
+FORMAT = "lapgs-objects 1"
+VERSION = 1  # of the scenes' looks: raise it with every change of what is rendered
+
+
+def write_motion(
+    folder: str | Path,
+    scene: MotionScene,
+    *,
+    size: int = 200,
+    train_times: int | None = None,
+    test_views: int = 20,
+    seed: int = 0,
+) -> Path:
+    """Write a scene: training images evenly spread over the clip, and test and validation images halfway between them.
+
+    The same arguments give the same bytes. A folder that already holds this very scene is left as it is.
+
+    Args:
+        folder: to write; it appears only when it is whole.
+        size: of the square images, pixels.
+        train_times: training times; cameras that stand still take STILL_CAMERAS images of each, others one.
+            None for 120, or 40 where the cameras stand still.
+        test_views: of each of the splits test and val.
+        seed: of the cameras that jump.
+
+    Returns:
+        The folder.
+
+    Raises:
+        InputError: bad arguments, a folder that holds anything else, or errors of the file system.
+    """
+    still = scene.camera == "still"
+    if train_times is None:
+        train_times = 40 if still else 120
+    if size < 1 or train_times < 2 or test_views < 1 or seed < 0:
+        raise InputError(
+            "a motion scene needs a size of at least 1, 2 training times, 1 test view and a seed from 0 up, "
+            f"got {size}, {train_times}, {test_views} and {seed}."
+        )
+    folder = Path(folder)
+    parameters = {
+        "format": FORMAT,
+        "version": VERSION,
+        "scene": dataclasses.asdict(scene),
+        "size": size,
+        "train_times": train_times,
+        "test_views": test_views,
+        "seed": seed,
+    }
+    if already_holds(folder, RECORD, parameters):
+        return folder
+
+    train, test = split_times(train_times, test_views)
+    splits = {"train": np.repeat(train, STILL_CAMERAS) if still else train, "val": test, "test": test}
+    with new_folder(folder) as unfinished:
+        for split, times in splits.items():
+            for kind in ("", "masks", "clean")[: 1 if split == "train" else 3]:
+                (unfinished / kind / split).mkdir(parents=True)
+            cameras = scene_cameras(scene, split, times, seed, size=size)
+            for index, (camera, time) in enumerate(zip(cameras, times, strict=True)):
+                _write_image(unfinished, frame_name(split, index), scene, camera, time, truth=split != "train")
+            write_transforms(unfinished, split, cameras, times, fov_x(scene))
+        objects = [
+            {
+                "name": one.name,
+                "moves": one.moves,
+                "shape": one.solid.shape,
+                "half": one.solid.half,
+                "diameter": one.diameter,
+                "positions": {split: one.positions(times).tolist() for split, times in splits.items()},
+            }
+            for one in moving_objects(scene)
+        ]
+        record = {**parameters, "objects": objects}
+        (unfinished / RECORD).write_text(json.dumps(record, indent=1) + "\n")
+    return folder
+
+
+def _write_image(folder: Path, name: str, scene: MotionScene, camera: Camera, time: float, *, truth: bool) -> None:
+    """Write one image and, with `truth`, the mask and the clean plate of each moving object."""
+    surfaces = trace(scene, camera, time)
+    count = camera.width * camera.height * SAMPLES**2
+
+    def image(hits: list[Hits]) -> Image.Image:
+        colour, owner = combine(hits, count)
+        return Image.fromarray(to_pixels(colour, owner >= 0, camera))
+
+    image(surfaces).save(folder / f"{name}.png")
+    if not truth:
+        return
+    _, owner = combine(surfaces, count)
+    for number, one in enumerate(moving_objects(scene)):
+        if one.moves:
+            mask = to_bytes(pixel_means(owner == number, camera))
+            Image.fromarray(mask).save(folder / "masks" / f"{name}_{one.name}.png")
+            image([*surfaces[:number], *surfaces[number + 1 :]]).save(folder / "clean" / f"{name}_{one.name}.png")

@@ -1,0 +1,187 @@
+"""A small ray tracer for the built-in scenes: textured balls and boxes, diffuse light, antialiased RGBA.
+
+A renderer traces each surface on its own (`solid_hits`, `plane_hits`) and combines any subset of the hits (`combine`).
+The same arguments give the same bytes on every machine.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lapgs_wgpu.splat.camera import Camera
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Vector = tuple[float, float, float]
+Colour = tuple[float, float, float]
+
+SAMPLES = 3  # a pixel is the mean of SAMPLES x SAMPLES rays
+LIGHT = np.array([0.30, -0.35, 0.887])  # unit vector towards the light
+AMBIENT, SKY, DIFFUSE = 0.42, 0.13, 0.45  # sum to 1; SKY: how much more light comes from above than from the side
+
+
+@dataclass(frozen=True)
+class Solid:
+    """A textured ball or box around its own centre.
+
+    half: half of its size along each axis, world units; three equal numbers for a ball.
+    colours: the two between which its pattern alternates, RGB in [0, 1].
+    """
+
+    shape: Literal["beach ball", "ringed ball", "box"]
+    half: Vector
+    colours: tuple[Colour, Colour]
+
+
+@dataclass(frozen=True, eq=False)
+class Hits:
+    """Where rays meet one surface: index (n,) of the rays, distance (n,) along them, colour (3, n) there."""
+
+    index: Ints
+    distance: Floats
+    colour: Floats
+
+
+def pixel_rays(camera: Camera) -> Floats:
+    """Unit directions (3, N) of all rays of an image: N = (SAMPLES height) (SAMPLES width), row by row."""
+    x = (np.arange(camera.width * SAMPLES) + 0.5) / SAMPLES
+    y = (np.arange(camera.height * SAMPLES) + 0.5) / SAMPLES
+    K, R = camera.K, camera.T_cam_world[:3, :3]
+    u, v = np.meshgrid((x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1])
+    # Sums are written out, here and below: a matrix product may round differently on another machine.
+    rays = np.stack([(R[0, i] * u + R[1, i] * v + R[2, i]).ravel() for i in range(3)])
+    rays /= np.sqrt(dot(rays, rays))
+    return rays
+
+
+def rays_around(camera: Camera, centre: Floats, reach: float) -> Ints:
+    """Indices (n,) of all rays that can meet the ball of radius `reach` around `centre`, and of some more."""
+    corners = np.array(np.meshgrid([-reach, reach], [-reach, reach], [-reach, reach])).reshape(3, 8)
+    R, t = camera.T_cam_world[:3, :3], camera.T_cam_world[:3, 3]
+    x, y, z = R @ (centre[:, None] + corners) + t[:, None]
+    columns, rows = camera.width * SAMPLES, camera.height * SAMPLES
+    if z.max() <= 0:
+        return np.empty(0, dtype=np.int64)
+    if z.min() <= 0:
+        return np.arange(rows * columns)
+    K = camera.K
+    left, right = _bounds((K[0, 0] * x / z + K[0, 2]) * SAMPLES, columns)
+    top, bottom = _bounds((K[1, 1] * y / z + K[1, 2]) * SAMPLES, rows)
+    return (np.arange(top, bottom)[:, None] * columns + np.arange(left, right)).ravel()
+
+
+def _bounds(values: Floats, limit: int) -> tuple[int, int]:
+    return max(math.floor(values.min()) - 1, 0), min(math.ceil(values.max()) + 1, limit)
+
+
+def solid_hits(
+    solid: Solid, centre: Floats, eye: Floats, rays: Floats, *, angle: float = 0.0, among: Ints | None = None
+) -> Hits:
+    """Where rays (3, N) from `eye` first meet a solid.
+
+    angle: by which it is turned about z, radians. among: indices of the rays that can meet it; None for all.
+    """
+    half = np.array(solid.half)
+    if among is not None:
+        rays = rays[:, among]
+    to_eye = eye - centre
+    along = -dot(rays, to_eye)
+    beside = dot(to_eye, to_eye) - along**2  # squared distance at which a ray passes the centre
+    near = np.flatnonzero(beside < (half @ half if solid.shape == "box" else half[0] ** 2))
+    origin, d = _turned(to_eye, -angle), _turned(rays[:, near], -angle)
+    if solid.shape == "box":
+        with np.errstate(divide="ignore", invalid="ignore"):
+            entry = ((-np.sign(d) * half[:, None] - origin[:, None]) / d).max(axis=0)
+            leave = ((np.sign(d) * half[:, None] - origin[:, None]) / d).min(axis=0)
+        distance = np.where(entry < leave, entry, np.inf)
+    else:
+        distance = along[near] - np.sqrt(half[0] ** 2 - beside[near])
+    met = np.isfinite(distance) & (distance > 0)
+    near, d, distance = near[met], d[:, met], distance[met]
+
+    p = (origin[:, None] + distance * d) / half[:, None]
+    if solid.shape == "box":  # one half of each colour, and a belt of the other
+        normal = np.where(np.arange(3)[:, None] == np.argmax(np.abs(p), axis=0), np.sign(p), 0.0)
+        pattern = (p[0] > 0) != (np.abs(p[2]) < 0.35)
+    else:
+        normal = p
+        if solid.shape == "beach ball":  # six segments, and caps of one colour
+            pattern = (np.floor(np.arctan2(p[1], p[0]) * (3 / np.pi)) % 2 == 0) | (np.abs(p[2]) > 0.88)
+        else:
+            pattern = np.floor(p[2] * 2 + 0.5) % 2 == 0
+    one, other = np.array(solid.colours)[:, :, None]
+    colour = _lit(np.where(pattern, one, other), _turned(normal, angle))
+    return Hits(near if among is None else among[near], distance, colour)
+
+
+def plane_hits(
+    axis: int, at: float, facing: int, albedo: Callable[[Floats, Floats], tuple[NDArray[np.bool_], Floats]],
+    eye: Floats, rays: Floats,
+) -> Hits:  # fmt: skip
+    """Where rays (3, N) meet the plane on which coordinate `axis` is `at`, from the side of its normal only.
+
+    facing: 1 or -1, the normal's direction along the axis. albedo: of the two other coordinates (n,) of the points, in
+    their order: which belong to the surface (n,), and the colours (3, k) of those k that do.
+    """
+    towards = np.flatnonzero(rays[axis] * facing < 0)
+    distance = (at - eye[axis]) / rays[axis, towards]
+    a, b = (i for i in range(3) if i != axis)
+    inside, colours = albedo(eye[a] + distance * rays[a, towards], eye[b] + distance * rays[b, towards])
+    normal = np.zeros((3, colours.shape[1]))
+    normal[axis] = facing
+    return Hits(towards[inside], distance[inside], _lit(colours, normal))
+
+
+def combine(surfaces: Sequence[Hits], count: int) -> tuple[Floats, NDArray[np.int64]]:
+    """The nearest surface along each of `count` rays: its colour (3, count), 0 where there is none, and its number
+    (count,) in `surfaces`, -1 where there is none."""
+    nearest = np.full(count, np.inf)
+    colour = np.zeros((3, count))
+    owner = np.full(count, -1)
+    for number, hits in enumerate(surfaces):
+        first = hits.distance < nearest[hits.index]
+        index = hits.index[first]
+        nearest[index] = hits.distance[first]
+        colour[:, index] = hits.colour[:, first]
+        owner[index] = number
+    return colour, owner
+
+
+def to_pixels(colour: Floats, hit: NDArray[np.bool_], camera: Camera) -> NDArray[np.uint8]:
+    """Average the rays of each pixel: colours (3, N) and whether a ray hit anything (N,) -> (H, W, 4) straight RGBA."""
+    rgba = pixel_means(np.concatenate([colour, hit[None]]), camera)
+    rgba[:3] /= np.maximum(rgba[3], 1e-9)  # so far colours are premultiplied by the share of rays that hit
+    return to_bytes(np.moveaxis(rgba, 0, 2))
+
+
+def pixel_means(values: Floats | NDArray[np.bool_], camera: Camera) -> Floats:
+    """Means over the rays of each pixel: (..., N) -> (..., H, W)."""
+    shape = (*values.shape[:-1], camera.height, SAMPLES, camera.width, SAMPLES)
+    return values.reshape(shape).mean(axis=(-3, -1))
+
+
+def to_bytes(values: Floats) -> NDArray[np.uint8]:
+    """Values in [0, 1], rounded to the nearest 8-bit value."""
+    return np.floor(values * 255 + 0.5).astype(np.uint8)
+
+
+def dot(a: Floats, b: Floats) -> Floats:
+    """Dot products of vectors (3, ...)."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _turned(p: Floats, angle: float) -> Floats:
+    """Vectors (3, ...) rotated about z."""
+    c, s = math.cos(angle), math.sin(angle)
+    return np.stack([c * p[0] - s * p[1], s * p[0] + c * p[1], p[2]])
+
+
+def _lit(albedo: Floats, normal: Floats) -> Floats:
+    """Diffuse shading: albedo (3, n), unit normals (3, n) -> colours (3, n)."""
+    return albedo * (AMBIENT + SKY * normal[2] + DIFFUSE * np.maximum(dot(normal, LIGHT), 0))
