@@ -15,6 +15,8 @@ from lapgs_wgpu.errors import InputError
 
 if typing.TYPE_CHECKING:
     from lapgs_wgpu.data import Dataset
+    from lapgs_wgpu.gpu.device import Device
+    from lapgs_wgpu.motion.scene import Scene4D
     from lapgs_wgpu.train.config import Config
     from lapgs_wgpu.train.loop import Watch
     from lapgs_wgpu.train.ranks import Ranks
@@ -76,6 +78,8 @@ def _train(arguments: list[str]) -> None:
         return
     if given["lpips_weights"]:
         raise InputError("--lpips-weights goes with --eval RUN, after the training.")
+    if given["motion_from"]:
+        raise InputError("--motion-from goes with --eval RUN, after the training.")
     watch = None
     if given["view"]:
         from lapgs_wgpu.viewer import live
@@ -160,12 +164,27 @@ def _evaluate(run: Path, given: dict[str, typing.Any], overrides: dict[str, str 
     except (InputError, KeyError, TypeError):
         step = scene.metadata.get("step", "")
         training = {"steps": int(step[:15]) if step.isascii() and step.isdigit() else 0}
-    evaluate_run(run, scene, dataset, config.data.background, training, lpips)
+    static = _static_fit(Path(given["motion_from"]), device) if given["motion_from"] else None
+    evaluate_run(run, scene, dataset, config.data.background, training, lpips, static)
     if plots.available():
         plots.plot_run(run, scene)
     else:
         print(f"no plots: pip install 'lapgs-wgpu[plots]' adds them to {run / 'eval'}.", file=sys.stderr)
     _report(run)
+
+
+def _static_fit(run: Path, device: Device) -> Scene4D:
+    """The scene of a run that was trained without motion."""
+    from lapgs_wgpu.motion.scene import load
+
+    if not (run / "checkpoint.ply").is_file():
+        raise InputError(f"{run / 'checkpoint.ply'} does not exist; --motion-from needs the folder of a finished run.")
+    scene = load(run / "checkpoint.ply", device)
+    if scene.field_config.kind != "static":
+        raise InputError(
+            f"{run} has the field {scene.field_config.kind}; --motion-from needs a run trained with --field static."
+        )
+    return scene
 
 
 def _report(run: Path) -> None:
@@ -296,12 +315,17 @@ def _parse(arguments: list[str]) -> dict[str, typing.Any]:
         "--eval",
         metavar="RUN",
         help="measure a finished run again, on the data it was trained on; --data, "
-        "--data.background, --cache-gb, --device and --lpips-weights may go with it",
+        "--data.background, --cache-gb, --device, --lpips-weights and --motion-from may go with it",
     )
     parser.add_argument(
         "--lpips-weights",
         metavar="FILE",
         help="with --eval: measure LPIPS (VGG), too (docs/metrics.md)",
+    )
+    parser.add_argument(
+        "--motion-from",
+        metavar="RUN",
+        help="with --eval: measure the pixels where this static run of the same capture is wrong (docs/metrics.md)",
     )
     groups: dict[str, argparse._ArgumentGroup] = {}
     for name, kind, about in config_keys():

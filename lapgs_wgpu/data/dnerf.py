@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.data.fields import check_inside, kind, number, read_json, required
+from lapgs_wgpu.data.objects import read_objects
 from lapgs_wgpu.data.pictures import PICTURE_SUFFIXES, check_pictures, read_picture, shrunk
 from lapgs_wgpu.data.poses import opengl_pose
 from lapgs_wgpu.data.views import Dataset, View
@@ -41,6 +42,7 @@ def load_dnerf(folder: str | Path, *, image_size: int | None = None) -> Dataset:
     image_size: longer side in pixels to which pictures are shrunk by averaging; None keeps them as they are.
     The training views come from transforms_train.json alone and the test views from transforms_test.json alone;
     transforms_val.json is not read. Frames without `time` are taken as evenly spaced over the clip.
+    objects.json, where there is one, says where moving objects are in the test views.
     Raises InputError, naming file, frame and field, where the scene cannot be trained on as it stands.
     """
     folder = Path(folder)
@@ -57,15 +59,19 @@ def load_dnerf(folder: str | Path, *, image_size: int | None = None) -> Dataset:
         # camera_angle_x is the horizontal field of view, and pixels are square: one focal length serves both axes.
         focal = 0.5 * stored[0] / math.tan(0.5 * fov_x)
         K = np.array([[focal, 0, stored[0] / 2], [0, focal, stored[1] / 2], [0, 0, 1]])
+        cameras = [Camera(K, frame.T_cam_world, *stored).resized(*size) for frame in frames]
+        stems = [frame.picture.stem for frame in frames]
+        truths = read_objects(folder, split, stems, cameras) if split == "test" else [[] for _ in frames]
         return tuple(
             View(
                 name=f"{split}_{index:03d}",
-                camera=Camera(K, frame.T_cam_world, *stored).resized(*size),
+                camera=camera,
                 time=frame.time,
                 source=str(frame.picture),
                 pixels=partial(read_picture, frame.picture, size),
+                objects=tuple(objects),
             )
-            for index, frame in enumerate(frames)
+            for index, (frame, camera, objects) in enumerate(zip(frames, cameras, truths, strict=True))
         )
 
     return Dataset(folder.resolve().name, views("train", train_fov, train), views("test", test_fov, test))

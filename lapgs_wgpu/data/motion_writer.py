@@ -16,12 +16,11 @@ from PIL import Image
 
 from lapgs_wgpu.data.dnerf_writer import already_holds, frame_name, new_folder, split_times, write_transforms
 from lapgs_wgpu.data.motion_scenes import STILL_CAMERAS, MotionScene, fov_x, moving_objects, scene_cameras, trace
+from lapgs_wgpu.data.objects import FORMAT, RECORD
 from lapgs_wgpu.data.raytrace import SAMPLES, Hits, combine, pixel_means, to_bytes, to_pixels
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
 
-RECORD = "objects.json"
-FORMAT = "lapgs-objects 1"
 VERSION = 1  # of the scenes' looks: raise it with every change of what is rendered
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lapgs_wgpu.data.cloud import Cloud
+from lapgs_wgpu.data.objects import ObjectTruth
 from lapgs_wgpu.data.poses import Placement
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
@@ -32,6 +33,7 @@ class View:
         (not premultiplied) RGBA, uint8. Raises InputError where they cannot be read.
     mask: decodes which pixels of a held-out view the masked metrics measure, such as DyCheck's covisibility masks (what
         enough training cameras saw): (height, width) bool. Raises InputError, too.
+    objects: the truth about moving objects in a held-out view of a generated scene (data/objects.py).
     """
 
     name: str
@@ -40,6 +42,7 @@ class View:
     source: str
     pixels: Callable[[], NDArray[np.uint8]]
     mask: Callable[[], NDArray[np.bool_]] | None = None
+    objects: tuple[ObjectTruth, ...] = ()
 
     def load(self) -> NDArray[np.uint8]:
         """Decode: (H, W, 3) RGB or (H, W, 4) straight RGBA, uint8, read-only. Raises InputError."""

@@ -10,6 +10,7 @@ import io
 import json
 import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,39 +26,68 @@ from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.log import environment
 from lapgs_wgpu.train.losses import MS_SSIM_SMALLEST, SSIM_WINDOW, masked_ssim, ms_ssim, psnr, ssim
 from lapgs_wgpu.train.lpips import SMALLEST, Lpips
+from lapgs_wgpu.train.motion_masks import differs_from_median, differs_from_static, still_backgrounds
+from lapgs_wgpu.train.object_metrics import masked_psnr, measure_objects, summarise
 
 ERROR_GAIN = 4  # of the error pictures
 MEASURES = ("psnr", "ssim", "ms_ssim", "lpips", "lpips_unscaled", "masked_psnr", "masked_ssim")
+MOTION_MEASURES = ("psnr_moving", "psnr_still")  # of views of which motion masks are known
 NOT_AVAILABLE = "not available"
 COLOURS = {"black": 0.0, "white": 1.0, "random": 0.0}  # of the background under test views
 
 
 def evaluate(
-    scene: Scene4D, views: Sequence[View], background: str, folder: Path | None = None, *, lpips: Lpips | None = None
+    scene: Scene4D,
+    views: Sequence[View],
+    background: str,
+    folder: Path | None = None,
+    *,
+    lpips: Lpips | None = None,
+    static: Scene4D | None = None,
 ) -> dict[str, Any]:
     """Render every view and compare: the content of metrics.json.
 
     background: black, white, or random, which is black here. folder: where a picture of each view is written, the
     ground truth beside the rendering and their error, 4 times enlarged; an existing folder. lpips: None where there
-    are no weights for it.
+    are no weights for it. static: a static fit of the capture, whose residual says what moves (`motion_masks`).
     Each measure is one of an image, then the mean over the images (of PSNR of the dB): psnr over all channels; ssim,
     that of the loss; ms_ssim; lpips on inputs in [-1, 1], and lpips_unscaled on inputs in [0, 1], as 3DGS's code
     reports it; masked_psnr and masked_ssim, of the pixels of the view's mask. "not available" stands for what cannot be
-    measured: pictures too small, no weights, no masks. Raises InputError where a picture or a mask cannot be read.
+    measured: pictures too small, no weights, no masks.
+    psnr_moving is that of moving pixels. They belong to the objects of a generated scene, with found and track_error
+    (`object_metrics`); otherwise they differ from the static fit or, without one, from the median of a test camera that
+    stands still, and psnr_still is that of the other pixels. Absent where no moving pixel is known.
+    Raises InputError where a picture or a mask cannot be read.
     """
     start = time.perf_counter()
     colour = torch.full((3,), COLOURS[background])
     rows = []
-    for view in views:
-        truth = composite(view.load(), colour.numpy())
-        image = to_8_bit(scene.render(view.camera, view.time, colour, depth=False).image)
-        measures = _measures(_unit(image), _unit(truth), view.load_mask(), lpips)
-        rows.append({"view": view.name, "time": view.time, **measures})
+    frames = []
+    listed = any(view.objects for view in views)
+    medians = still_backgrounds(views, partial(_on, colour)) if not listed and static is None else [None] * len(views)
+    for view, still in zip(views, medians, strict=True):
+        truth = _on(colour, view)
+        image = _render(scene, view, colour)
+        row: dict[str, Any] = {"view": view.name, "time": view.time}
+        row |= _measures(_unit(image), _unit(truth), view.load_mask(), lpips)
+        frames.append(measure_objects(image, truth, view.objects, colour.numpy()))
+        if not listed:
+            if static is not None:
+                row |= _moving(image, truth, differs_from_static(truth, _render(static, view, colour)))
+            elif still is not None:
+                row |= _moving(image, truth, differs_from_median(truth, still))
+        rows.append(row)
         if folder is not None:
             with atomic_write(folder / f"{view.name}.png") as file:
                 Image.fromarray(side_by_side(truth, image)).save(file, "PNG")
+    motion = summarise(frames, [view.name for view in views])
+    for name in MOTION_MEASURES:
+        values = [row[name] for row in rows if name in row]
+        if values:
+            motion |= {name: _mean(values), "motion": "static fit" if static is not None else "median of the clip"}
     return {
         **{name: _mean([row[name] for row in rows]) for name in MEASURES},
+        **motion,
         "gaussians": len(scene),
         "field": scene.field_config.kind,
         "size": [views[0].camera.width, views[0].camera.height],
@@ -66,6 +96,22 @@ def evaluate(
         "seconds": round(time.perf_counter() - start, 3),
         "environment": environment(scene.device),
     }
+
+
+def _on(colour: Tensor, view: View) -> NDArray[np.uint8]:
+    """The ground truth of a view on a background: (H, W, 3)."""
+    return composite(view.load(), colour.numpy())
+
+
+def _render(scene: Scene4D, view: View, colour: Tensor) -> NDArray[np.uint8]:
+    """The rendering of a view on a background: (H, W, 3)."""
+    return to_8_bit(scene.render(view.camera, view.time, colour, depth=False).image)
+
+
+def _moving(image: NDArray[np.uint8], truth: NDArray[np.uint8], pixels: NDArray[np.bool_]) -> dict[str, float]:
+    """psnr_moving and psnr_still of a view, each only where it has such pixels."""
+    parts = {"psnr_moving": pixels, "psnr_still": ~pixels}
+    return {name: masked_psnr(image, truth, part) for name, part in parts.items() if part.any()}
 
 
 def _measures(
@@ -93,7 +139,8 @@ def _mean(values: list[Any]) -> float | str:
 
 def write_metrics(folder: Path, metrics: dict[str, Any]) -> None:
     """Write metrics.json, and metrics.csv with a line a view. Atomic; InputError where they cannot be written."""
-    columns = ("view", "time", *MEASURES)
+    columns = ["view", "time", *MEASURES]
+    columns += [name for name in MOTION_MEASURES if any(name in row for row in metrics["views"])]
     text = io.StringIO()
     table = csv.DictWriter(text, columns, lineterminator="\n")
     table.writeheader()

@@ -212,13 +212,18 @@ def evaluate_run(
     background: Background,
     training: dict[str, float],
     lpips: Lpips | None = None,
+    static: Scene4D | None = None,
 ) -> dict[str, object]:
-    """Evaluate on the test views; write metrics.json, metrics.csv and eval/ of a run folder; returns the metrics."""
+    """Evaluate on the test views; write metrics.json, metrics.csv and eval/ of a run folder; returns the metrics.
+
+    lpips, static: as `evaluate` takes them.
+    """
     for folder in (out / "eval", out / "eval" / "plots"):
         if folder.is_symlink():
             raise InputError(f"{folder} is a link, and pictures are written into the run's own folder only; remove it.")
     (out / "eval").mkdir(exist_ok=True)
-    metrics = {**evaluate(scene, dataset.test, background, out / "eval", lpips=lpips), "training": training}
+    metrics = evaluate(scene, dataset.test, background, out / "eval", lpips=lpips, static=static)
+    metrics["training"] = training
     write_metrics(out, metrics)
     return metrics
 

@@ -19,11 +19,15 @@ from lapgs_wgpu.train.table_spec import Run, RunKey, fingerprint
 
 FORMAT = "lapgs-table 1"
 LARGEST = 1e15  # of a figure
+MOTION = ("psnr_moving", "found", "track_error")  # the figures that a run may lack
 
 
 @dataclass(frozen=True)
 class Result:
-    """A finished run. seconds: of the training alone. overrides: what its configuration changed of the preset."""
+    """A finished run. seconds: of the training alone. overrides: what its configuration changed of the preset.
+
+    psnr_moving, found, track_error: where they were measured (docs/metrics.md).
+    """
 
     scene: str
     row: str
@@ -38,6 +42,9 @@ class Result:
     views: int
     overrides: Table
     environment: dict[str, str]
+    psnr_moving: float | None = None
+    found: float | None = None
+    track_error: float | None = None
 
     @property
     def key(self) -> RunKey:
@@ -79,6 +86,7 @@ def read_run(folder: Path, run: Run) -> Result | None:
             "views": len(metrics["views"]),
             "overrides": run.overrides,
             "environment": record,
+            **{name: metrics[name] for name in MOTION if isinstance(metrics.get(name), int | float)},
         }
         return _read_result(entry, str(folder))
     except (OSError, ValueError, KeyError, TypeError):  # missing or damaged: it is trained again
@@ -101,11 +109,18 @@ def read_results(path: Path) -> Results:
 
 
 def _read_result(entry: Any, where: str) -> Result:
-    kinds = {"str": str, "int": int, "float": int | float, "list[int]": list}  # what is left are tables
+    kinds = {
+        "str": str,
+        "int": int,
+        "float": int | float,
+        "float | None": int | float,
+        "list[int]": list,
+    }  # what is left are tables
     return Result(
         **{
             field.name: _checked(entry, field.name, kinds.get(str(field.type), dict), where)
             for field in dataclasses.fields(Result)
+            if field.name not in MOTION or (isinstance(entry, dict) and entry.get(field.name) is not None)
         }
     )
 
@@ -139,9 +154,19 @@ def merge_results(parts: Sequence[Results]) -> Results:
 def write_results(folder: Path, results: Results) -> None:
     """Write results.json and table.md. Atomic."""
     with atomic_write(folder / "results.json") as file:
-        file.write((json.dumps({"format": FORMAT, **dataclasses.asdict(results)}, indent=1) + "\n").encode())
+        file.write((json.dumps(_content(results), indent=1) + "\n").encode())
     with atomic_write(folder / "table.md") as file:
         file.write(markdown(results).encode())
+
+
+def _content(results: Results) -> dict[str, Any]:
+    """What a results.json holds; figures that a run lacks are left out."""
+    content = {"format": FORMAT, **dataclasses.asdict(results)}
+    for run in content["runs"]:
+        for name in MOTION:
+            if run[name] is None:
+                del run[name]
+    return content
 
 
 def markdown(results: Results) -> str:
@@ -152,33 +177,51 @@ def markdown(results: Results) -> str:
     cells: dict[tuple[str, str], list[Result]] = {}
     for run in results.runs:
         cells.setdefault((run.scene, run.row), []).append(run)
-    lines += _head("scene", "model", "seeds")
+    formats = _formats(results.runs)
+    lines += _head(formats, "scene", "model", "seeds")
     lines += [
-        _line((scene, row, str(len(runs))), _spread([run.psnr for run in runs]), _means(runs))
+        _line(formats, (scene, row, str(len(runs))), _spread([run.psnr for run in runs]), _means(runs, formats))
         for (scene, row), runs in cells.items()
     ]
     scenes = {scene for scene, _ in cells}
     if len(scenes) > 1:
-        lines += ["", "Means over the scenes; only lines with the same scenes compare.", "", *_head("model", "scenes")]
+        lines += ["", "Means over the scenes; only lines with the same scenes compare.", ""]
+        lines += _head(formats, "model", "scenes")
         for row in dict.fromkeys(row for _, row in cells):
             parts = [runs for (_, other), runs in cells.items() if other == row]
-            means = {name: mean(_means(runs)[name] for runs in parts) for name in _FORMATS}
-            lines.append(_line((row, f"{len(parts)} of {len(scenes)}"), _spread(_means_of_seeds(parts)), means))
+            of_scenes = [_means(runs, formats) for runs in parts]
+            means = {name: _mean([each[name] for each in of_scenes]) for name in formats}
+            texts = (row, f"{len(parts)} of {len(scenes)}")
+            lines.append(_line(formats, texts, _spread(_means_of_seeds(parts)), means))
     return "\n".join([*lines, "", *_environments(results), ""])
 
 
-# The figures that are averaged, in the order of their columns, and how each is shown.
+# The figures that are averaged, in the order of their columns: the name of the column, and how each is shown.
 _FORMATS = {
-    "psnr": "{:.2f}",
-    "ssim": "{:.4f}",
-    "gaussians": "{:,.0f}",
-    "steps_per_second": "{:.1f}",
-    "seconds": "{:,.0f}",
+    "psnr": ("PSNR", "{:.2f}"),
+    "ssim": ("SSIM", "{:.4f}"),
+    "gaussians": ("Gaussians", "{:,.0f}"),
+    "steps_per_second": ("steps/s", "{:.1f}"),
+    "seconds": ("training, s", "{:,.0f}"),
+    "psnr_moving": ("moving PSNR", "{:.2f}"),
+    "found": ("found", "{:.0%}"),
+    "track_error": ("track", "{:.2f}"),
 }
 
 
-def _means(runs: Sequence[Result]) -> dict[str, float]:
-    return {name: mean(getattr(run, name) for run in runs) for name in _FORMATS}
+def _formats(runs: Sequence[Result]) -> dict[str, tuple[str, str]]:
+    """Those of _FORMATS that any run has."""
+    return {name: text for name, text in _FORMATS.items() if any(getattr(run, name) is not None for run in runs)}
+
+
+def _means(runs: Sequence[Result], names: Iterable[str]) -> dict[str, float | None]:
+    return {name: _mean([getattr(run, name) for run in runs]) for name in names}
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    """The mean, None where any value is missing."""
+    known = [value for value in values if value is not None]
+    return mean(known) if len(known) == len(values) else None
 
 
 def _means_of_seeds(parts: Sequence[Sequence[Result]]) -> list[float]:
@@ -194,14 +237,18 @@ def _spread(values: Sequence[float]) -> str:
     return f"{stdev(values):.2f}" if len(values) > 1 else "-"
 
 
-def _head(*columns: str) -> list[str]:
-    names = [*columns, "PSNR", "±", "SSIM", "Gaussians", "steps/s", "training, s"]
+def _head(formats: Mapping[str, tuple[str, str]], *columns: str) -> list[str]:
+    psnr, *others = (name for name, _ in formats.values())
+    names = [*columns, psnr, "±", *others]
     left = sum(name in ("scene", "model") for name in columns)
     return [f"| {' | '.join(names)} |", f"|{'|'.join(['---'] * left + ['---:'] * (len(names) - left))}|"]
 
 
-def _line(texts: Sequence[str], spread: str, means: Mapping[str, float]) -> str:
-    psnr, *others = (text.format(means[name]) for name, text in _FORMATS.items())
+def _line(
+    formats: Mapping[str, tuple[str, str]], texts: Sequence[str], spread: str, means: Mapping[str, float | None]
+) -> str:
+    shown = {name: "-" if means[name] is None else text.format(means[name]) for name, (_, text) in formats.items()}
+    psnr, *others = shown.values()
     return f"| {' | '.join((*texts, psnr, spread, *others))} |"
 
 
@@ -211,6 +258,12 @@ def _environments(results: Results) -> Iterable[str]:
         f"{len(results.runs)} runs of the preset `{results.preset}`. ± is the sample standard deviation of the PSNR "
         "over the seeds; the training's time is without evaluation."
     )
+    if any(run.psnr_moving is not None for run in results.runs):
+        yield ""
+        yield (
+            "moving PSNR is of moving pixels; found, the share of test frames with each moving object in its place; "
+            "track, the error of its position in diameters, - where it is not found (docs/metrics.md)."
+        )
     sizes = Counter(f"{run.views} test views of {'x'.join(map(str, run.size))}" for run in results.runs)
     shown = ("adapter", "driver", "system", "python", "torch", "wgpu", "lapgs_wgpu", "revision")
     made = Counter(

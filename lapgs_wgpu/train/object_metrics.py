@@ -1,0 +1,198 @@
+"""How well a rendering shows a moving object, from images alone: PSNR, silhouette and displacement of each object.
+
+A rendering's silhouette of an object is found by colour, so the measure is the same for every representation. A pixel
+is claimed for the object where the rendering
+
+- differs from the clean plate (the true view without the object) by at least CONTRAST of what the truth differs there
+  or, outside the true mask, of the median of that difference over the mask: a ghost of low opacity claims nothing; and
+- is nearer to a colour of the object than to any colour of the clean plate: blurred or misplaced parts of the rest of
+  the scene claim nothing.
+
+Pixels count within REACH diameters of the true mask, except those of other moving objects, and except those of the
+object that have the clean plate's colour.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from statistics import mean, median
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import distance_transform_edt
+
+from lapgs_wgpu.data.objects import ObjectTruth
+from lapgs_wgpu.data.views import composite
+
+CONTRAST = 0.5
+REACH = 1.0  # diameters from the true mask within which a silhouette is looked for
+MARGIN = 1.0  # pixels by which the true mask is dilated for the PSNR
+LEAST_DIFFERENCE = 16.0  # levels of 255, over the channels: less between object and clean plate cannot be told apart
+VISIBLE_PIXELS, VISIBLE_SHARE = 20, 0.25  # least of an object that must be seen: pixels, share of its whole disc
+LEAST_CLAIM = 0.1  # a silhouette of fewer pixels than this share of the true one has no centroid
+FOUND_IOU = 0.5
+BEST_PSNR = 100.0  # of equal images
+NOT_FOUND = "not found"  # the track error where most frames have no silhouette
+
+Image = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class ObjectFrame:
+    """One object in one test view. psnr: dB where it is, or is claimed to be. iou: of the silhouettes.
+    distance: between their centroids, diameters; None where the rendering has no silhouette."""
+
+    name: str
+    psnr: float
+    iou: float
+    distance: float | None
+
+
+def measure_objects(
+    image: Image, truth: Image, objects: Sequence[ObjectTruth], background: ArrayLike
+) -> list[ObjectFrame]:
+    """Measure every object that is visible in a view.
+
+    Args:
+        image: (H, W, 3) uint8, the rendering.
+        truth: (H, W, 3) uint8, the ground truth on the background.
+        objects: the truth about the view's objects.
+        background: (3,) in [0, 1], behind transparent clean plates.
+
+    Raises:
+        InputError: a mask or clean plate cannot be read.
+    """
+    masks = [one.mask() for one in objects]
+    frames = []
+    for one, mask in zip(objects, masks, strict=True):
+        if not visible(mask, one.diameter):
+            continue
+        others = np.zeros(mask.shape, dtype=bool)
+        for other in masks:
+            others |= (other > 0) & (other is not mask)
+        clean = composite(one.clean(), background)
+        frames.append(measure_object(one.name, image, truth, clean, mask, others, one.diameter))
+    return frames
+
+
+def visible(mask: Image, diameter: float) -> bool:
+    """Whether enough of an object is visible. mask: (H, W) uint8. diameter: of the whole object, pixels."""
+    disc = np.pi / 4 * diameter**2
+    return bool(np.count_nonzero(mask >= 128) >= max(VISIBLE_PIXELS, VISIBLE_SHARE * disc))
+
+
+def measure_object(
+    name: str, image: Image, truth: Image, clean: Image, mask: Image, others: Mask, diameter: float
+) -> ObjectFrame:
+    """Compare one visible object.
+
+    Args:
+        image, truth, clean: (H, W, 3) uint8: rendering, ground truth, ground truth without the object.
+        mask: (H, W) uint8, the share of each pixel that shows the object.
+        others: (H, W) pixels that show other moving objects.
+        diameter: of the object, pixels.
+    """
+    shown = mask >= 128
+    claimed, counted = silhouette(image, truth, clean, mask, others, diameter)
+    true = shown & counted
+    union = np.count_nonzero(true | claimed)
+    iou = float(np.count_nonzero(true & claimed) / union) if union else 0.0
+    distance = None
+    if np.count_nonzero(claimed) >= max(1.0, LEAST_CLAIM * np.count_nonzero(true)) and true.any():
+        distance = float(np.linalg.norm(_centroid(claimed) - _centroid(true))) / diameter
+    pixels = (_distance_from(mask > 0) <= MARGIN) | claimed
+    return ObjectFrame(name, masked_psnr(image, truth, pixels), iou, distance)
+
+
+def silhouette(
+    image: Image, truth: Image, clean: Image, mask: Image, others: Mask, diameter: float
+) -> tuple[Mask, Mask]:
+    """The pixels (H, W) that a rendering claims for an object, and those (H, W) that count. Arguments as above."""
+    shown = mask >= 128
+    contrast = _norm(truth, clean)
+    counted = (_distance_from(shown) <= REACH * diameter) & ~others & ~(shown & (contrast < LEAST_DIFFERENCE))
+    claimed = np.zeros_like(counted)
+    whole = mask == 255 if (mask == 255).any() else shown
+    if not (shown & counted).any():
+        return claimed, counted
+    needed = CONTRAST * np.where(shown, contrast, np.median(contrast[shown & counted]))
+    candidates = counted & (_norm(image, clean) >= np.maximum(needed, CONTRAST * LEAST_DIFFERENCE))
+    colours = image[candidates]
+    own = _to_nearest(colours, truth[whole])
+    rest = _to_nearest(colours, clean.reshape(-1, 3))
+    claimed[candidates] = own <= rest
+    return claimed, counted
+
+
+def masked_psnr(image: Image, truth: Image, pixels: Mask) -> float:
+    """PSNR in dB over all channels of the chosen pixels (H, W), at least one; at most BEST_PSNR."""
+    error = np.square(image[pixels].astype(np.float64) - truth[pixels]).mean() / 255**2
+    return min(BEST_PSNR, float(-10 * np.log10(max(error, 1e-12))))
+
+
+def summarise(frames: Sequence[Sequence[ObjectFrame]], views: Sequence[str]) -> dict[str, object]:
+    """The entries of metrics.json, from the frames of each view: means over objects, each object, each of its views.
+
+    An object's psnr_moving is the mean of dB over the views in which it is visible; found, the share of these with an
+    IoU of at least FOUND_IOU; track_error, the median of their distances, a missing silhouette counting as infinite.
+    """
+    objects: dict[str, list[tuple[str, ObjectFrame]]] = {}
+    for view, shown in zip(views, frames, strict=True):
+        for frame in shown:
+            objects.setdefault(frame.name, []).append((view, frame))
+    if not objects:
+        return {}
+    figures = {name: _figures([frame for _, frame in shown]) for name, shown in objects.items()}
+    entries = {
+        name: {
+            **_entries(figures[name]),
+            "views": [
+                {"view": view, "psnr": frame.psnr, "iou": frame.iou, "distance": frame.distance}
+                for view, frame in objects[name]
+            ],
+        }
+        for name in sorted(objects)
+    }
+    return {**_entries(np.mean(list(figures.values()), axis=0)), "objects": entries}
+
+
+def _figures(frames: Sequence[ObjectFrame]) -> tuple[float, float, float]:
+    """psnr_moving, found and track_error of one object, the last infinite where it is not found."""
+    distances = [np.inf if frame.distance is None else frame.distance for frame in frames]
+    return mean(frame.psnr for frame in frames), mean(frame.iou >= FOUND_IOU for frame in frames), median(distances)
+
+
+def _entries(figures: Sequence[float] | NDArray[np.float64]) -> dict[str, float | str]:
+    psnr, found, track = map(float, figures)
+    return {"psnr_moving": psnr, "found": found, "track_error": track if np.isfinite(track) else NOT_FOUND}
+
+
+def _norm(a: Image, b: Image) -> NDArray[np.float64]:
+    """Euclidean distance of the colours of two (H, W, 3) images, levels of 255: (H, W)."""
+    return np.sqrt(np.square(a.astype(np.float64) - b).sum(axis=2))
+
+
+def _to_nearest(colours: Image, palette: Image) -> NDArray[np.float64]:
+    """Squared distances (n,) of colours (n, 3) from the nearest of a palette (m, 3), which is rounded to 8 levels."""
+    if not len(colours) or not len(palette):
+        return np.full(len(colours), np.inf)
+    coarse = np.unique(palette // 8, axis=0).astype(np.float32) * 8 + 3.5
+    distance = np.full(len(colours), np.inf, dtype=np.float32)
+    points = colours.astype(np.float32)
+    for start in range(0, len(coarse), 256):
+        apart = np.square(points[:, None] - coarse[None, start : start + 256]).sum(axis=2)
+        np.minimum(distance, apart.min(axis=1), out=distance)
+    return distance.astype(np.float64)
+
+
+def _distance_from(mask: Mask) -> NDArray[np.float64]:
+    """Distance of each pixel from the nearest one of the mask, pixels; infinite where the mask is empty."""
+    if not mask.any():
+        return np.full(mask.shape, np.inf)
+    return distance_transform_edt(~mask)
+
+
+def _centroid(mask: Mask) -> NDArray[np.float64]:
+    return np.stack(np.nonzero(mask)).mean(axis=1)
