@@ -95,8 +95,10 @@ def test_masks_and_clean_plates_match_the_images(scene: MotionScene, tmp_path: P
     assert centred > 0 or scene.objects == "occluded"
 
 
-def test_the_box_enters_from_outside_the_view() -> None:
-    scene = MotionScene(objects="enter")
+@pytest.mark.parametrize("camera_motion", ["jump", "walk", "still"])
+@pytest.mark.parametrize("path", [0.5, 2, 8])
+def test_the_box_enters_from_outside_the_view(camera_motion: Any, path: float) -> None:
+    scene = MotionScene(path=path, objects="enter", camera=camera_motion)
     seen = {}
     for time in (0.0, 0.3, 0.5, 0.8):
         cameras = scene_cameras(scene, "train", np.linspace(0, 1, 12), 0, size=24)

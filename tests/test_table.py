@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from lapgs_wgpu import cli, command
-from lapgs_wgpu.data import synthetic
+from lapgs_wgpu.data import motion_writer, synthetic
+from lapgs_wgpu.data.motion_scenes import MotionScene
 from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.train import table
@@ -101,6 +102,7 @@ def test_the_committed_specs_are_valid(file: Path) -> None:
 
 
 MISTAKES = {
+    "motion scene": ('toys = "toys"', 'toys = "motion:pth=2"', "no key 'pth'; did you mean path?"),
     "no TOML": ('preset = "tiny"', "preset = tiny", "cannot be read as TOML"),
     "unknown key": ("seeds = [3, 5]", "sedes = [3, 5]", "no key sedes; did you mean seeds?"),
     "no seeds": ("seeds = [3, 5]\n", "", "seeds must be a list of different whole numbers from 0 up, got None"),
@@ -369,6 +371,52 @@ def test_runs_are_trained_in_processes_and_a_failed_one_stops_no_other(
     assert (only.psnr, only.steps, only.views) == (metrics["psnr"], 3, 2)
     assert only.environment["adapter"] == metrics["environment"]["adapter"]
     assert load_config(str(run / "config.toml")).data.path == str(data / "toys")
+
+
+def test_motion_scenes_are_written_beside_the_runs(
+    tmp_path: Path, trained: list[RunKey], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written = []
+
+    def write(folder: Path, scene: MotionScene) -> Path:
+        written.append((folder.name, scene))
+        return folder
+
+    monkeypatch.setattr(motion_writer, "write_motion", write)
+    name = "motion:path=4,camera=walk"
+    (tmp_path / "spec.toml").write_text(
+        SPEC.replace('"toys"\n', f'"{name}"\n').replace('folder = "toys"', f'folder = "{name}"')
+    )
+    assert make(tmp_path / "spec.toml", tmp_path / "nowhere") == 0
+    assert len(trained) == 5
+    assert written == [("motion-path4-cycles2-walk-black-two", MotionScene(path=4, camera="walk"))]
+
+
+def test_figures_of_motion_have_columns_where_any_run_has_them(tmp_path: Path) -> None:
+    plain = Results("t", "tiny", (result(),))
+    assert "moving PSNR" not in markdown(plain)
+    measured = result("b", psnr_moving=21.25, found=0.875, track_error=0.125)
+    lost = result("b", seed=1, psnr_moving=12.75, found=0.125)  # whose object is not found
+    both = Results("t", "tiny", (result(), measured, lost))
+    text = markdown(both)
+    assert "| seconds" not in text
+    assert "| training, s | moving PSNR | found | track |" in text
+    assert "| 10 | - | - | - |" in text
+    assert "| 10 | 17.00 | 50% | - |" in text
+    assert "| 10 | 21.25 | 88% | 0.12 |" in markdown(Results("t", "tiny", (measured,)))
+    write_results(tmp_path, both)
+    assert read_results(tmp_path / "results.json") == both
+    stored = json.loads((tmp_path / "results.json").read_text())["runs"]
+    assert ["found" in run for run in stored] == [False, True, True]
+
+
+@pytest.mark.parametrize("value", ["high", True, 1e20])
+def test_damaged_figures_of_motion_are_refused(value: object, tmp_path: Path) -> None:
+    write_results(tmp_path, Results("t", "tiny", (result(found=0.5),)))
+    file = tmp_path / "results.json"
+    file.write_text(file.read_text().replace('"found": 0.5', f'"found": {json.dumps(value)}'))
+    with pytest.raises(InputError, match="run 1: found is missing or has the wrong type"):
+        read_results(file)
 
 
 def test_the_built_in_scene_is_written_once(

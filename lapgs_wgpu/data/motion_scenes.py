@@ -30,9 +30,10 @@ STILL_CAMERAS = 6  # that take the training images of camera="still"
 WALK_AZIMUTH, ROOM_AZIMUTH = 2.1, 0.87  # radians that a walk covers; in the room, all cameras
 ROOM_CENTRE = -math.pi / 4  # azimuth of the room's cameras, which look into the corner of its two walls
 JUMP_HEIGHT, ROOM_HEIGHT = (0.3, 0.9), (0.38, 0.6)  # ranges of the sine of a camera's elevation
+ENTER_JUMP_HEIGHT = (0.3, 0.6)  # of objects="enter": the box comes from above, where no camera may be
 WALK_HEIGHT, WALK_BOB = 0.47, 0.05  # mean and amplitude of a walk's
 FLOOR, WALL = -1.05, 1.3  # z of the room's floor; distance of its walls from the origin, and their height
-ENTER_HEIGHT, ENTER_TIMES = 3.0, (0.3, 0.5)  # the box drops into the scene from this much above its path
+ENTER_HEIGHT, ENTER_TIMES = 2.3, (0.3, 0.5)  # the box drops into the scene from this much above its path
 SHORTEST_OCCLUDED_PATH = 3  # leaves space for a column
 
 
@@ -204,7 +205,7 @@ def scene_cameras(scene: MotionScene, split: str, times: ArrayLike, seed: int, *
     room = scene.background == "room"
     places: Sequence[tuple[float, float]]
     if scene.camera == "jump":
-        low, high = ROOM_HEIGHT if room else JUMP_HEIGHT
+        low, high = ROOM_HEIGHT if room else ENTER_JUMP_HEIGHT if scene.objects == "enter" else JUMP_HEIGHT
         start, width = (ROOM_CENTRE - ROOM_AZIMUTH / 2, ROOM_AZIMUTH) if room else (0.0, 2 * math.pi)
         spread = jumps(len(time), 3 * seed + ("train", "val", "test").index(split))
         places = [(start + width * turn, low + (high - low) * lift) for turn, lift in spread]

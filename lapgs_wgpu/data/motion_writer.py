@@ -21,7 +21,7 @@ from lapgs_wgpu.data.raytrace import SAMPLES, Hits, combine, pixel_means, to_byt
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
 
-VERSION = 1  # of the scenes' looks: raise it with every change of what is rendered
+VERSION = 2  # of the scenes' looks: raise it with every change of what is rendered
 
 
 def write_motion(
