@@ -14,14 +14,17 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lapgs_wgpu.data.cloud import Cloud, check_cloud, find_cloud, read_cloud
 from lapgs_wgpu.data.fields import check_inside, kind, number, read_json, required
 from lapgs_wgpu.data.pictures import PICTURE_SUFFIXES, check_pictures, read_picture, shrunk
-from lapgs_wgpu.data.poses import opengl_pose
+from lapgs_wgpu.data.poses import BOX, opengl_pose
+from lapgs_wgpu.data.standard_box import cube_in_view, cube_of_cloud, is_random
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
 
 NEEDED = "which a D-NeRF scene needs"
+CLOUDS = ("fused.ply", "points3d.ply", "points3D.ply")
 
 
 class _Frame(NamedTuple):
@@ -35,12 +38,13 @@ def is_dnerf(folder: str | Path) -> bool:
     return any((Path(folder) / f"transforms_{split}.json").is_file() for split in ("train", "test"))
 
 
-def load_dnerf(folder: str | Path, *, image_size: int | None = None) -> Dataset:
+def load_dnerf(folder: str | Path, *, image_size: int | None = None, normalize: bool = True) -> Dataset:
     """Open a D-NeRF scene; pictures are decoded later, view by view.
 
     image_size: longer side in pixels to which pictures are shrunk by averaging; None keeps them as they are.
     The training views come from transforms_train.json alone and the test views from transforms_test.json alone;
     transforms_val.json is not read. Frames without `time` are taken as evenly spaced over the clip.
+    normalize: move and scale a scene that does not fit the presets' cube (`standard_box`); False keeps its coordinates.
     Raises InputError, naming file, frame and field, where the scene cannot be trained on as it stands.
     """
     folder = Path(folder)
@@ -53,22 +57,62 @@ def load_dnerf(folder: str | Path, *, image_size: int | None = None) -> Dataset:
     stored = check_pictures([frame.picture for frame in train + test])
     size = shrunk(stored, image_size)
 
-    def views(split: str, fov_x: float, frames: list[_Frame]) -> tuple[View, ...]:
+    def cameras(fov_x: float, frames: list[_Frame]) -> list[Camera]:
         # camera_angle_x is the horizontal field of view, and pixels are square: one focal length serves both axes.
         focal = 0.5 * stored[0] / math.tan(0.5 * fov_x)
         K = np.array([[focal, 0, stored[0] / 2], [0, focal, stored[1] / 2], [0, 0, 1]])
+        return [Camera(K, frame.T_cam_world, *stored).resized(*size) for frame in frames]
+
+    train_cameras, test_cameras = cameras(train_fov, train), cameras(test_fov, test)
+    cloud = _surfaces(folder, train_cameras)
+    cube = cube_of_cloud(cloud) if cloud is not None else cube_in_view(train_cameras)
+    warnings = []
+    if cube is None:
+        warnings.append(
+            f"{folder / 'transforms_train.json'}: half or more of {len(train)} cameras look away from the point "
+            "nearest to all lines of sight, so the size of the scene is unknown and it stays where it is: if that is "
+            f"not [-{BOX:g}, {BOX:g}]^3, raise points.box and field.bound, or add a cloud ({CLOUDS[0]})."
+        )
+    placement = cube.placement if cube is not None and normalize else None
+    if placement is not None:
+        train_cameras = [placement.camera(camera) for camera in train_cameras]
+        test_cameras = [placement.camera(camera) for camera in test_cameras]
+        cloud = None if cloud is None else cloud.moved(placement)
+
+    def views(split: str, cameras: list[Camera], frames: list[_Frame]) -> tuple[View, ...]:
         return tuple(
             View(
                 name=f"{split}_{index:03d}",
-                camera=Camera(K, frame.T_cam_world, *stored).resized(*size),
+                camera=camera,
                 time=frame.time,
                 source=str(frame.picture),
                 pixels=partial(read_picture, frame.picture, size),
             )
-            for index, frame in enumerate(frames)
+            for index, (camera, frame) in enumerate(zip(cameras, frames, strict=True))
         )
 
-    return Dataset(folder.resolve().name, views("train", train_fov, train), views("test", test_fov, test))
+    return Dataset(
+        folder.resolve().name,
+        views("train", train_cameras, train),
+        views("test", test_cameras, test),
+        cloud=cloud,
+        placement=placement,
+        warnings=tuple(warnings),
+        time_source=f"time in {folder / 'transforms_train.json'}",
+    )
+
+
+def _surfaces(folder: Path, cameras: list[Camera]) -> Cloud | None:
+    """The cloud in the folder, in the cameras' coordinates; None without one. Raises InputError.
+
+    A random cloud, as other trainers write it, says nothing about the scene: points, colours and extent are ignored.
+    """
+    path = find_cloud(folder, CLOUDS)
+    cloud = None if path is None else read_cloud(path)
+    if path is None or cloud is None or is_random(cloud):
+        return None
+    check_cloud(cloud, cameras, path)
+    return cloud
 
 
 def _read_split(folder: Path, split: str) -> tuple[float, list[_Frame]]:

@@ -69,6 +69,8 @@ def train(
         check_run_folder(out, overwrite=overwrite)
         for warning in (*dataset.warnings, *_precision_warnings(config)):
             print(f"warning: {warning}", file=sys.stderr, flush=True)
+        if dataset.placement is not None:
+            print(f"placement: {dataset.placement}", flush=True)
     keep_freed_memory()
     training = Training(config, dataset, device or open_device(), ranks)
     if not ranks.first:
