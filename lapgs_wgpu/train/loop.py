@@ -13,7 +13,8 @@ from types import FrameType
 
 import torch
 
-from lapgs_wgpu.data.sanity import check_times
+from lapgs_wgpu.data.init import first_points
+from lapgs_wgpu.data.sanity import check_in_view, check_times
 from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.errors import DeviceError, InputError, NumericalError
 from lapgs_wgpu.gpu.device import Device, open_device
@@ -37,6 +38,8 @@ from lapgs_wgpu.train.run_folder import (
     start_run_folder,
 )
 from lapgs_wgpu.train.training import Progress, Training
+
+PROBES = 2048  # points of the scene that say whether a camera sees it
 
 # Takes over a training's steps, such as a viewer does: called with the scene, where to look at it from, and the steps,
 # of which it takes as many as it likes, each one a step of the training. The rest follows when it returns.
@@ -64,10 +67,11 @@ def train(
     when that state has been written.
     """
     out = Path(out)
-    check_times(dataset, moving=config.field.kind != "static")
+    found = check_times(dataset, moving=config.field.kind != "static")
+    found += check_in_view(dataset, first_points(dataset, PROBES, config.points.box, config.seed)[0])
     if ranks.first:
         check_run_folder(out, overwrite=overwrite)
-        for warning in (*dataset.warnings, *_precision_warnings(config)):
+        for warning in (*dataset.warnings, *found, *_precision_warnings(config)):
             print(f"warning: {warning}", file=sys.stderr, flush=True)
         if dataset.placement is not None:
             print(f"placement: {dataset.placement}", flush=True)
