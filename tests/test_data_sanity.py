@@ -223,6 +223,16 @@ def test_one_time_trains_without_motion(device: Device, tmp_path: Path) -> None:
         assert not (tmp_path / kind).exists()
 
 
+def test_gaussians_outside_of_the_field_are_told(
+    device: Device, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fast = {"schedule.steps": "2", "points.count": "60", "field.width": "16"}
+    for bound, outside in (("0.5", True), ("5", False)):
+        config = load_config("tiny", {**fast, "field.bound": bound})
+        train(config, timed(np.linspace(0, 1, 6)), tmp_path / bound, device=device)
+        assert ("Gaussians lie outside the field's box of half side 0.5" in capsys.readouterr().err) == outside
+
+
 def test_frames_out_of_order() -> None:
     pictures = [Picture(f"frame_{i:03d}.jpg", ".") for i in range(10)]
     times = [float(i) for i in range(10)]
