@@ -157,8 +157,8 @@ def _evaluate(run: Path, given: dict[str, typing.Any], overrides: dict[str, str 
             f"{run / 'config.toml'} says {size}."
         )
     device = open_device(given["device"])
-    config, dataset = _open_data(config, run.parent)
     scene = load(run / "checkpoint.ply", device)
+    config, dataset = _open_data(config, run.parent, normalize="placement" in scene.metadata)
     try:
         training = read_json(run / "metrics.json")["training"]
     except (InputError, KeyError, TypeError):
@@ -204,9 +204,11 @@ def _scene_name(config: Config) -> str:
     return Path(config.data.path).resolve().name or "scene"
 
 
-def _open_data(config: Config, parent: Path, ranks: Ranks | None = None) -> tuple[Config, Dataset]:
+def _open_data(
+    config: Config, parent: Path, ranks: Ranks | None = None, *, normalize: bool = True
+) -> tuple[Config, Dataset]:
     """The dataset, and the configuration with its folder. parent: folder for built-in scenes, which the first of
-    several processes writes."""
+    several processes writes. normalize: of `load_dataset`."""
     import dataclasses
 
     from lapgs_wgpu.data import load_dataset
@@ -222,7 +224,7 @@ def _open_data(config: Config, parent: Path, ranks: Ranks | None = None) -> tupl
     folder = write_builtin(path, parent) if is_builtin(path) else Path(path)
     if ranks is not None and ranks.first:
         ranks.any(False)
-    dataset = load_dataset(folder, image_size=config.data.size or None)
+    dataset = load_dataset(folder, image_size=config.data.size or None, normalize=normalize)
     data = dataclasses.replace(config.data, path=str(folder.resolve()))
     return dataclasses.replace(config, data=data), dataset
 

@@ -15,7 +15,7 @@ from PIL import Image
 from lapgs_wgpu.data import composite, load_dataset
 from lapgs_wgpu.errors import InputError
 
-WIDTH, HEIGHT, FOV_X = 12, 8, 1.0
+WIDTH, HEIGHT, FOV_X = 12, 8, 0.7
 SHARED = Path(__file__).parents[2] / "shared" / "data"
 
 Scene = dict[str, Any]  # split -> the transforms file's object
@@ -313,6 +313,7 @@ def test_published_scenes(scene: str) -> None:
     assert len(data.test) == 20
     assert (data.times[0], data.times[-1]) == (0, 1)
     assert 4 < data.extent < 8
+    assert data.placement is data.cloud is None
     for view in data.train + data.test:  # the cameras stand on a sphere about the origin and look at it
         assert np.linalg.norm(view.camera.position) == pytest.approx(4.03, abs=0.04)
         origin = view.camera.T_cam_world[:3, 3]

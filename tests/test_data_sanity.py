@@ -3,22 +3,37 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
-from dataclasses import replace
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
-from captures import Blobs, cameras, write_colmap, write_rig
+from captures import (
+    HEIGHT,
+    WIDTH,
+    Blobs,
+    cameras,
+    write_colmap,
+    write_nerfies,
+    write_nerfstudio,
+    write_neu3d,
+    write_rig,
+)
 from PIL import Image, ImageFilter
+from test_data_dnerf import make_scene
 
 from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.data.cloud import Cloud
 from lapgs_wgpu.data.moments import Picture, disorder, frame_numbers, held_out, natural, times_of
-from lapgs_wgpu.data.sanity import check_film, check_times, check_views
+from lapgs_wgpu.data.sanity import check_film, check_in_view, check_times, check_views
+from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.train.loop import train
+from lapgs_wgpu.train.presets import load_config
 
 CLOUD = Cloud(Blobs.random(200).means.numpy(), Blobs.random(200).colors.numpy())
 WHERE = Path("points3D.bin")
@@ -85,9 +100,137 @@ def test_all_times_equal(device: Device, tmp_path: Path) -> None:
     data = load_dataset(folder)
     assert (len(data.train), len(data.test)) == (5, 1), "then pictures are counted, not moments"
     check_times(data, moving=False)
-    with pytest.raises(InputError, match=r"all 5 training pictures have the same time, 0.*--field static"):
+    with pytest.raises(
+        InputError, match=r"toy: .*times\.json: all 5 training pictures have the same time, 0.*--field static"
+    ):
         check_times(data, moving=True)
-    check_times(replace(data, train=(data.train[0], replace(data.train[1], time=1.0))), moving=True)
+
+
+LAYOUTS: dict[str, Callable[[Path, Device], Path]] = {
+    "transforms_train.json": lambda folder, device: make_scene(
+        folder, lambda _, scene: [frame.update(time=0.25) for frame in scene["train"]["frames"]]
+    ),
+    "metadata.json": lambda folder, device: write_nerfies(
+        folder, device, change=lambda _, files: [entry.update(warp_id=7) for entry in files["metadata"].values()]
+    ),
+    "frames in": lambda folder, device: write_neu3d(folder, device, frames=1),
+    "transforms.json": lambda folder, device: write_nerfstudio(
+        folder, device, change=lambda _, data: [frame.update(time=3.0) for frame in data["frames"]]
+    ),
+}
+
+
+@pytest.mark.parametrize("named", LAYOUTS)
+def test_one_time_in_every_layout(named: str, device: Device, tmp_path: Path) -> None:
+    """The error names the file and the field that say so."""
+    data = load_dataset(LAYOUTS[named](tmp_path / "toy", device))
+    with pytest.raises(InputError, match=rf"toy: .*{re.escape(named)}.* same time.*give each picture its time\.$"):
+        check_times(data, moving=True)
+    check_times(data, moving=False)
+
+
+def timed(times: Sequence[float], tested: Sequence[float] = (0.5,), taken: list[Camera] | None = None) -> Dataset:
+    """A capture with a camera of its own for each time, unless given."""
+    taken = taken or cameras(len(times))
+
+    def views(split: str, times: Sequence[float]) -> tuple[View, ...]:
+        return tuple(
+            View(f"{split}_{i}", taken[i], time, "memory", lambda: np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+            for i, time in enumerate(times)
+        )
+
+    return Dataset("toy", views("train", times), views("test", tested), CLOUD)
+
+
+def test_even_times_are_fine() -> None:
+    assert check_times(timed(np.linspace(0, 1, 20)), moving=True) == []
+    assert check_times(timed(np.repeat(np.linspace(0, 0.95, 20), 3)), moving=True) == [], "three cameras"
+
+
+def test_two_times() -> None:
+    (warning,) = check_times(timed([0, 0, 1, 1]), moving=True)
+    assert "4 training pictures have only 2 different times (0, 1)" in warning
+    assert "at least 5 times" in warning
+    assert check_times(timed([0, 0, 1, 1]), moving=False) == []
+
+
+def test_a_gap_in_time() -> None:
+    times = np.concatenate([np.linspace(0, 0.3, 10), np.linspace(0.6, 1, 10)])
+    (warning,) = check_times(timed(times, tested=[0.1, 0.4, 0.5]), moving=True)
+    assert "no training picture has a time between 0.3 and 0.6" in warning
+    assert "in 2 test pictures" in warning
+    (warning,) = check_times(timed(np.linspace(0, 0.4, 20)), moving=True)
+    assert "between 0.4 and 1," in warning
+    (warning,) = check_times(timed([*np.linspace(0.2, 0.4, 10), *np.linspace(0.8, 1, 10)]), moving=True)
+    assert "between 0.4 and 0.8" in warning
+    assert "(1 more such gaps)" in warning
+
+
+def test_one_camera_twice_at_a_time() -> None:
+    times = [0, 0.1, 0.1, 0.3, 0.5, 0.7, 0.9]
+    (warning,) = check_times(timed(times, taken=[cameras(1)[0]] * 7), moving=True)
+    assert "1 of 7 training pictures repeat the time" in warning
+    assert "train_2 and train_1 at 0.1" in warning
+    assert check_times(timed(times), moving=True) == [], "two cameras"
+
+
+def test_cameras_that_look_away_for_a_while() -> None:
+    times, taken = np.linspace(0, 1, 11), cameras(11)
+    assert check_in_view(timed(times, taken=taken), CLOUD.points) == []
+    for i in (1, 4, 5, 6):
+        taken[i] = turned(taken[i])
+    (warning,) = check_in_view(timed(times, taken=taken), CLOUD.points)
+    assert "toy: all cameras look away from time 0.4 to 0.6 (1 more such spans): train_4, train_5, train_6" in warning
+    together = timed(np.repeat(times, 2), taken=[camera for one in taken for camera in (one, cameras(1)[0])])
+    assert check_in_view(together, CLOUD.points) == [], "another camera sees it"
+    with pytest.raises(InputError, match="none of 11 training cameras sees where the first Gaussians lie"):
+        check_in_view(timed(times, taken=[turned(camera) for camera in cameras(11)]), CLOUD.points)
+
+
+def test_training_tells_where_cameras_look_away(
+    device: Device, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    taken = cameras(10)
+    config = load_config("tiny", {"schedule.steps": "1", "points.count": "60", "field.width": "16"})
+    data = timed(np.linspace(0, 1, 10), taken=[*map(turned, taken[:3]), *taken[3:]])
+    train(config, data, tmp_path / "run", device=device)
+    assert "warning: toy: all cameras look away from time 0 to 0.2222: train_0, " in capsys.readouterr().err
+    with pytest.raises(InputError, match="none of 10 training cameras"):
+        train(config, timed(np.linspace(0, 1, 10), taken=[*map(turned, taken)]), tmp_path / "none", device=device)
+    assert not (tmp_path / "none").exists()
+
+
+@pytest.mark.parametrize("kind", ["static", "mlp", "hexplane", "grid4d", "laplacian"])
+def test_two_times_train(kind: str, device: Device, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Such captures, whose Nyquist limit is one cycle, stay finite."""
+    fast = {"schedule.steps": "6", "schedule.warm_up": "2", "points.count": "60", "field.width": "16"}
+    data = timed([0, 0, 1, 1])
+    out = tmp_path / "run"
+    scene = train(load_config("tiny", fast, method=kind), data, out, device=device)
+    assert all(parameter.isfinite().all() for parameter in scene.parameters.values())
+    assert np.isfinite(json.loads((out / "metrics.json").read_text())["psnr"])
+    assert ("only 2 different times" in capsys.readouterr().err) == (kind != "static")
+    if scene.spectrum is not None:
+        assert scene.spectrum.frequencies.max() <= 1
+
+
+def test_one_time_trains_without_motion(device: Device, tmp_path: Path) -> None:
+    fast = {"schedule.steps": "3", "points.count": "60"}
+    train(load_config("tiny", fast, method="static"), timed([0.5, 0.5]), tmp_path / "run", device=device)
+    for kind in ("mlp", "hexplane", "grid4d", "laplacian"):
+        with pytest.raises(InputError, match=r"same time, 0\.5.*--field static"):
+            train(load_config("tiny", fast, method=kind), timed([0.5, 0.5]), tmp_path / kind, device=device)
+        assert not (tmp_path / kind).exists()
+
+
+def test_gaussians_outside_of_the_field_are_told(
+    device: Device, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fast = {"schedule.steps": "2", "points.count": "60", "field.width": "16"}
+    for bound, outside in (("0.5", True), ("5", False)):
+        config = load_config("tiny", {**fast, "field.bound": bound})
+        train(config, timed(np.linspace(0, 1, 6)), tmp_path / bound, device=device)
+        assert ("Gaussians lie outside the field's box of half side 0.5" in capsys.readouterr().err) == outside
 
 
 def test_frames_out_of_order() -> None:

@@ -308,7 +308,7 @@ def test_finished_runs(
         write_results(folder, Results("a", "tiny", (result,)))
         read_results(folder / "results.json")
     refused_or(lambda: changes_since_without_device(folder))
-    open_capture(folder / "checkpoint.ply")
+    open_capture(folder / "checkpoint.ply", {})
 
 
 def read_spec_text(folder: Path, config: Config) -> Any:

@@ -151,7 +151,7 @@ def test_found_in_a_run_folder(tmp_path: Path) -> None:
     (tmp_path / "config.toml").write_text('record = "x"\n')
     assert changes_since_without_device(tmp_path) == []
     (tmp_path / "config.toml").write_text(f'[data]\npath = "{tmp_path}"\nsize = inf\n')
-    assert open_capture(tmp_path / "checkpoint.ply") is None
+    assert open_capture(tmp_path / "checkpoint.ply", {}) is None
 
 
 # Names that lead elsewhere -------------------------------------------------------------------------------------------

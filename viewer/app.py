@@ -100,7 +100,8 @@ class App:
         """What the scene was trained on, where that is here. Looked for when it is first needed, not before the first
         picture."""
         if not self._capture_sought:
-            self._capture = open_capture(self.opened.path) if self.opened.path else None
+            opened = self.opened
+            self._capture = open_capture(opened.path, opened.playback.metadata) if opened.path else None
             self._capture_sought = True
         return self._capture
 

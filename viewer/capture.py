@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -41,8 +42,10 @@ class Capture:
         return self._held[1]
 
 
-def open_capture(checkpoint: Path) -> Capture | None:
-    """The capture that the config.toml beside a checkpoint names; None where there is none, or it is not here."""
+def open_capture(checkpoint: Path, metadata: Mapping[str, str]) -> Capture | None:
+    """The capture that the config.toml beside a checkpoint names; None where there is none, or it is not here.
+
+    metadata: of the checkpoint, empty for files of other projects; it tells whether the capture was normalized."""
     from lapgs_wgpu.data import load_dataset  # not before the first picture
 
     try:
@@ -50,7 +53,7 @@ def open_capture(checkpoint: Path) -> Capture | None:
         path, size = Path(data["path"]), int(data["size"])
         if str(path) == SYNTHETIC:
             path = checkpoint.parent.parent / SYNTHETIC
-        dataset = load_dataset(path, image_size=size or None)
+        dataset = load_dataset(path, image_size=size or None, normalize=not metadata or "placement" in metadata)
     except (OSError, ValueError, KeyError, TypeError, OverflowError):  # InputError is a ValueError
         return None
     return Capture((*dataset.test, *dataset.train))

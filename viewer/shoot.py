@@ -51,7 +51,7 @@ def check_mode(opened: Opened, painter: Painter, mode: Mode) -> None:
 def find_view(opened: Opened, wanted: str) -> View:
     """The view of the capture beside the file with this number (the held-out ones come first) or name. Raises
     InputError."""
-    capture = open_capture(opened.path) if opened.path else None
+    capture = open_capture(opened.path, opened.playback.metadata) if opened.path else None
     if capture is None:
         raise InputError(
             f"--view {wanted}: {opened.path} stands beside no config.toml that names a capture which is here."

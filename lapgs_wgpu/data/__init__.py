@@ -23,10 +23,11 @@ FORMATS = (
 )
 
 
-def load_dataset(folder: str | Path, *, image_size: int | None = None) -> Dataset:
+def load_dataset(folder: str | Path, *, image_size: int | None = None, normalize: bool = True) -> Dataset:
     """Open a capture, its format (docs/data.md) told by the files it holds.
 
     image_size: longer side in pixels, 1 or more, to which larger pictures are shrunk; None keeps all as they are.
+    normalize: False keeps the coordinates of a D-NeRF scene, whatever its size; other formats are always normalized.
     Raises InputError.
     """
     folder = Path(folder)
@@ -35,7 +36,10 @@ def load_dataset(folder: str | Path, *, image_size: int | None = None) -> Datase
         raise InputError(f"{folder} {problem}; give the folder of a scene.")
     fitting = [entry for entry in FORMATS if entry[2](folder)]
     if len(fitting) == 1:
-        return fitting[0][3](folder, image_size=image_size)
+        load = fitting[0][3]
+        if load is load_dnerf:
+            return load_dnerf(folder, image_size=image_size, normalize=normalize)
+        return load(folder, image_size=image_size)
     if fitting:
         both = " and of ".join(f"{name} ({files})" for name, files, _, _ in fitting)
         raise InputError(f"{folder} holds the files of {both}; keep one format's in it.")

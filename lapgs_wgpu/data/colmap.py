@@ -14,7 +14,7 @@ import numpy as np
 from lapgs_wgpu.data.cloud import Cloud
 from lapgs_wgpu.data.colmap_model import ColmapCamera, ColmapImage, ColmapModel, count_images, is_model, read_model
 from lapgs_wgpu.data.lens import Lens
-from lapgs_wgpu.data.moments import Picture, held_out, natural, times_of
+from lapgs_wgpu.data.moments import Picture, held_out, natural, time_source, times_of
 from lapgs_wgpu.data.pictures import PICTURE_SUFFIXES
 from lapgs_wgpu.data.poses import check_rotation
 from lapgs_wgpu.data.shots import Shot, dataset_of
@@ -77,6 +77,7 @@ def load_colmap(folder: str | Path, *, image_size: int | None = None) -> Dataset
         image_size=image_size,
         axes=AXES,
         warnings=[*warnings, *disordered],
+        time_source=time_source(folder),
     )
 
 

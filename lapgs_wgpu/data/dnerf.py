@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -14,15 +15,18 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lapgs_wgpu.data.cloud import Cloud, check_cloud, find_cloud, read_cloud
 from lapgs_wgpu.data.fields import check_inside, kind, number, read_json, required
-from lapgs_wgpu.data.objects import read_objects
+from lapgs_wgpu.data.objects import ObjectTruth, read_objects
 from lapgs_wgpu.data.pictures import PICTURE_SUFFIXES, check_pictures, read_picture, shrunk
-from lapgs_wgpu.data.poses import opengl_pose
+from lapgs_wgpu.data.poses import BOX, opengl_pose
+from lapgs_wgpu.data.standard_box import cube_in_view, cube_of_cloud, is_random
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
 
 NEEDED = "which a D-NeRF scene needs"
+CLOUDS = ("fused.ply", "points3d.ply", "points3D.ply")
 
 
 class _Frame(NamedTuple):
@@ -36,13 +40,14 @@ def is_dnerf(folder: str | Path) -> bool:
     return any((Path(folder) / f"transforms_{split}.json").is_file() for split in ("train", "test"))
 
 
-def load_dnerf(folder: str | Path, *, image_size: int | None = None) -> Dataset:
+def load_dnerf(folder: str | Path, *, image_size: int | None = None, normalize: bool = True) -> Dataset:
     """Open a D-NeRF scene; pictures are decoded later, view by view.
 
     image_size: longer side in pixels to which pictures are shrunk by averaging; None keeps them as they are.
     The training views come from transforms_train.json alone and the test views from transforms_test.json alone;
     transforms_val.json is not read. Frames without `time` are taken as evenly spaced over the clip.
     objects.json, where there is one, says where moving objects are in the test views.
+    normalize: move and scale a scene that does not fit the presets' cube (`standard_box`); False keeps its coordinates.
     Raises InputError, naming file, frame and field, where the scene cannot be trained on as it stands.
     """
     folder = Path(folder)
@@ -55,13 +60,32 @@ def load_dnerf(folder: str | Path, *, image_size: int | None = None) -> Dataset:
     stored = check_pictures([frame.picture for frame in train + test])
     size = shrunk(stored, image_size)
 
-    def views(split: str, fov_x: float, frames: list[_Frame]) -> tuple[View, ...]:
+    def cameras(fov_x: float, frames: list[_Frame]) -> list[Camera]:
         # camera_angle_x is the horizontal field of view, and pixels are square: one focal length serves both axes.
         focal = 0.5 * stored[0] / math.tan(0.5 * fov_x)
         K = np.array([[focal, 0, stored[0] / 2], [0, focal, stored[1] / 2], [0, 0, 1]])
-        cameras = [Camera(K, frame.T_cam_world, *stored).resized(*size) for frame in frames]
-        stems = [frame.picture.stem for frame in frames]
-        truths = read_objects(folder, split, stems, cameras) if split == "test" else [[] for _ in frames]
+        return [Camera(K, frame.T_cam_world, *stored).resized(*size) for frame in frames]
+
+    train_cameras, test_cameras = cameras(train_fov, train), cameras(test_fov, test)
+    objects = read_objects(folder, "test", [frame.picture.stem for frame in test], test_cameras)
+    cloud = _surfaces(folder, train_cameras)
+    cube = cube_of_cloud(cloud) if cloud is not None else cube_in_view(train_cameras)
+    warnings = []
+    if cube is None:
+        warnings.append(
+            f"{folder / 'transforms_train.json'}: half or more of {len(train)} cameras look away from the point "
+            "nearest to all lines of sight, so the size of the scene is unknown and it stays where it is: if that is "
+            f"not [-{BOX:g}, {BOX:g}]^3, raise points.box and field.bound, or add a cloud ({CLOUDS[0]})."
+        )
+    placement = cube.placement if cube is not None and normalize else None
+    if placement is not None:
+        train_cameras = [placement.camera(camera) for camera in train_cameras]
+        test_cameras = [placement.camera(camera) for camera in test_cameras]
+        cloud = None if cloud is None else cloud.moved(placement)
+
+    def views(
+        split: str, cameras: list[Camera], frames: list[_Frame], truths: Sequence[Sequence[ObjectTruth]]
+    ) -> tuple[View, ...]:
         return tuple(
             View(
                 name=f"{split}_{index:03d}",
@@ -74,7 +98,28 @@ def load_dnerf(folder: str | Path, *, image_size: int | None = None) -> Dataset:
             for index, (frame, camera, objects) in enumerate(zip(frames, cameras, truths, strict=True))
         )
 
-    return Dataset(folder.resolve().name, views("train", train_fov, train), views("test", test_fov, test))
+    return Dataset(
+        folder.resolve().name,
+        views("train", train_cameras, train, [()] * len(train)),
+        views("test", test_cameras, test, objects),
+        cloud=cloud,
+        placement=placement,
+        warnings=tuple(warnings),
+        time_source=f"time in {folder / 'transforms_train.json'}",
+    )
+
+
+def _surfaces(folder: Path, cameras: list[Camera]) -> Cloud | None:
+    """The cloud in the folder, in the cameras' coordinates; None without one. Raises InputError.
+
+    A random cloud, as other trainers write it, says nothing about the scene: points, colours and extent are ignored.
+    """
+    path = find_cloud(folder, CLOUDS)
+    cloud = None if path is None else read_cloud(path)
+    if path is None or cloud is None or is_random(cloud):
+        return None
+    check_cloud(cloud, cameras, path)
+    return cloud
 
 
 def _read_split(folder: Path, split: str) -> tuple[float, list[_Frame]]:

@@ -105,6 +105,7 @@ def load_hypernerf(folder: str | Path, *, image_size: int | None = None) -> Data
         cloud=None if cloud is None else cloud.moved(fit),
         depths=(depths[0] * fit.scale, depths[1] * fit.scale),
         placement=placement.then(fit),
+        time_source=f"time_id (else warp_id) in {folder / 'metadata.json'}",
     )
 
 

@@ -36,6 +36,12 @@ def times_of(pictures: Sequence[Picture], folder: Path) -> tuple[list[float], li
     return from_0_to_1(values), disorder(pictures, values)
 
 
+def time_source(folder: Path) -> str:
+    """What errors call the times that `times_of` reads."""
+    path = folder / TIMES
+    return str(path) if path.is_file() else f"the frame numbers in the names of {folder}"
+
+
 def from_0_to_1(values: Sequence[float]) -> list[float]:
     """The first at 0 and the last at 1; all 0 where they are equal."""
     first, last = min(values), max(values)

@@ -14,7 +14,7 @@ import numpy as np
 from lapgs_wgpu.data.cloud import read_cloud
 from lapgs_wgpu.data.fields import check_inside, finite, kind, read_json, required
 from lapgs_wgpu.data.lens import Lens
-from lapgs_wgpu.data.moments import TIMES, Picture, disorder, from_0_to_1, held_out, times_of
+from lapgs_wgpu.data.moments import TIMES, Picture, disorder, from_0_to_1, held_out, time_source, times_of
 from lapgs_wgpu.data.poses import opengl_pose
 from lapgs_wgpu.data.shots import Shot, dataset_of
 from lapgs_wgpu.data.views import Dataset
@@ -107,6 +107,7 @@ def load_nerfstudio(folder: str | Path, *, image_size: int | None = None) -> Dat
         image_size=image_size,
         axes=AXES,
         warnings=warnings,
+        time_source=f"time in {path}" if "time" in frames[0] else time_source(folder),
     )
 
 

@@ -107,6 +107,7 @@ def load_neu3d(folder: str | Path, *, image_size: int | None = None) -> Dataset:
         cloud=None if cloud is None else cloud.moved(placement),
         depths=(near * placement.scale, far * placement.scale),
         placement=placement,
+        time_source=f"the number of frames in {recordings[1].path}",
     )
 
 

@@ -37,6 +37,11 @@ class Placement(NamedTuple):
         """One line of JSON."""
         return json.dumps({"center": self.center.tolist(), "scale": self.scale})
 
+    def __str__(self) -> str:
+        half = BOX / self.scale
+        at = ", ".join(f"{value if abs(value) > 1e-4 * half else 0:.4g}" for value in self.center)
+        return f"the cube of half side {half:.4g} around ({at}) in the capture's files becomes [-{BOX:g}, {BOX:g}]^3"
+
     def then(self, other: Placement) -> Placement:
         """This one first, the other afterwards."""
         return Placement(self.center + other.center / self.scale, self.scale * other.scale)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from lapgs_wgpu.data.cloud import Cloud, views_of
+from lapgs_wgpu.data.cloud import Cloud, in_view, views_of
 from lapgs_wgpu.data.pictures import PICTURE_ERRORS, PICTURE_FORMATS
 from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.errors import InputError
@@ -26,15 +26,107 @@ EQUAL = 3  # levels of 255 by which no pixel of a repeated picture differs: abov
 NAMED = 5  # pictures that a warning names
 STANDING = 0.01  # cameras spread less than this, in distances from the cloud, see no depth
 FEW_POINTS = 100
+FEW_TIMES = 5  # fewer different times do not show how anything moves
+GAP, GAP_FACTOR = 0.1, 4.0  # a gap is longer than so much of the clip, and than so many usual steps
 
 
-def check_times(dataset: Dataset, *, moving: bool) -> None:
-    """InputError where everything was taken at one time, but something shall move. moving: whether the field does."""
-    if moving and len(dataset.times) == 1:
+def check_times(dataset: Dataset, *, moving: bool) -> list[str]:
+    """Warnings about training times that are few, repeated, or missing from a part of the clip.
+
+    moving: whether the field moves anything; if not, times do not matter. Raises InputError where all times are equal.
+    """
+    times, count, source = dataset.times, len(dataset.train), f"{dataset.name}: {dataset.time_source}"
+    if not moving:
+        return []
+    if len(times) == 1:
         raise InputError(
-            f"{dataset.name}: all {len(dataset.train)} training pictures have the same time, {dataset.times[0]:g}, so "
+            f"{source}: all {count} training pictures have the same time, {times[0]:g}, so "
             "nothing can move: train with --field static, or give each picture its time."
         )
+    warnings = []
+    if len(times) < FEW_TIMES:
+        listed = ", ".join(f"{time:g}" for time in times)
+        warnings.append(
+            f"{source}: {count} training pictures have only {len(times)} different times ({listed}), so the motion "
+            f"between them is a guess; give at least {FEW_TIMES} times, or train with --field static."
+        )
+    else:
+        warnings += _gaps(dataset, source)
+    first: dict[tuple[bytes, bytes, float], str] = {}
+    repeated = []
+    for view in dataset.train:
+        camera = view.camera
+        before = first.setdefault((camera.K.tobytes(), camera.T_cam_world.tobytes(), view.time), view.name)
+        if before != view.name:
+            repeated.append((before, view))
+    if repeated:
+        before, view = repeated[0]
+        warnings.append(
+            f"{source}: {len(repeated)} of {count} training pictures repeat the time of another picture of the same "
+            f"camera, such as {view.name} and {before} at {view.time:g}; the training averages them, so give each "
+            "picture its own time, or remove it."
+        )
+    return warnings
+
+
+def _gaps(dataset: Dataset, source: str) -> list[str]:
+    """A warning about the longest part of the clip [0, 1] without any training view."""
+    times = dataset.times
+    edges = np.concatenate([[0.0], times, [1.0]])
+    gaps = np.diff(edges)
+    usual = float(np.median(np.diff(times)))
+    found = np.flatnonzero((gaps > GAP) & (gaps > GAP_FACTOR * usual))
+    if not len(found):
+        return []
+    longest = found[np.argmax(gaps[found])]
+    low, high = edges[longest], edges[longest + 1]
+    tested = sum(low < view.time < high for view in dataset.test)
+    others = f" ({len(found) - 1} more such gaps)" if len(found) > 1 else ""
+    return [
+        f"{source}: no training picture has a time between {low:.4g} and {high:.4g}, though the usual step is "
+        f"{usual:.2g}{others}; the motion there, in {tested} test pictures too, is a guess: add pictures, or cut "
+        "the clip there."
+    ]
+
+
+def check_in_view(dataset: Dataset, points: NDArray[np.floating]) -> list[str]:
+    """A warning about the longest span of time in which no training view shows the scene.
+
+    points: (N, 3) where the first Gaussians lie, world units. Raises InputError where no view ever does.
+    """
+    seen: dict[int, bool] = {}
+    blind: dict[float, bool] = {}  # time -> whether all views of that time are
+    for view in dataset.train:
+        key = id(view.camera)
+        if key not in seen:
+            seen[key] = bool(in_view(points, view.camera)[1].any())
+        blind[view.time] = blind.get(view.time, True) and not seen[key]
+    if not any(seen.values()):
+        low, high = points.min(axis=0), points.max(axis=0)
+        box = ", ".join(f"{a:.3g} to {b:.3g}" for a, b in zip(low, high, strict=True))
+        raise InputError(
+            f"{dataset.name}: none of {len(dataset.train)} training cameras sees where the first Gaussians lie ({box} "
+            "along x, y, z); check the poses and their axes, or raise points.box and field.bound."
+        )
+    spans: list[list[float]] = []
+    before = False
+    for time in sorted(blind):
+        if blind[time]:
+            if before:
+                spans[-1].append(time)
+            else:
+                spans.append([time])
+        before = blind[time]
+    if not spans:
+        return []
+    longest = max(spans, key=len)
+    names = [view.name for view in dataset.train if longest[0] <= view.time <= longest[-1]]
+    others = f" ({len(spans) - 1} more such spans)" if len(spans) > 1 else ""
+    return [
+        f"{dataset.name}: all cameras look away from time {longest[0]:.4g} to {longest[-1]:.4g}{others}: "
+        f"{_named(names)} show nothing of the scene, so its motion there is a guess; check these poses, or remove "
+        "these pictures."
+    ]
 
 
 def check_views(cloud: Cloud, cameras: Sequence[Camera], names: Sequence[str], where: Path, axes: str) -> list[str]:

@@ -51,11 +51,13 @@ def dataset_of(
     image_size: int | None,
     axes: str,
     warnings: Sequence[str],
+    time_source: str,
 ) -> Dataset:
     """The dataset of these shots, moved and scaled into the cube that the presets expect (`poses.fitting`).
 
     times: of the shots, in [0, 1]. tested: which shots are held out. cloud: in the cameras' coordinates; cloud_file:
-    what errors call it. axes: advice for cameras that look the wrong way. Raises InputError.
+    what errors call it. axes: advice for cameras that look the wrong way. time_source: field and file of the times.
+    Raises InputError.
     """
     for shot in shots:
         check_focal(shot.camera, shot.where)
@@ -107,6 +109,7 @@ def dataset_of(
         cloud=None if cloud is None else cloud.moved(fit),
         depths=depths,
         placement=fit,
+        time_source=time_source,
         warnings=tuple(found),
     )
 

@@ -76,7 +76,8 @@ class Dataset:
 
     cloud: points that it brings, where Gaussians start. depths: nearest and furthest of what the cameras see, world
     units, where the capture says so. placement: how it was moved, None where its coordinates are those of its files.
-    warnings: what looks wrong but does not stop a training, a sentence each.
+    warnings: what looks wrong but does not stop a training, a sentence each. time_source: field and file of the times,
+    for errors.
     """
 
     name: str
@@ -86,6 +87,7 @@ class Dataset:
     depths: tuple[float, float] | None = None
     placement: Placement | None = None
     warnings: tuple[str, ...] = ()
+    time_source: str = "time"
 
     @cached_property
     def cameras(self) -> tuple[Camera, ...]:

@@ -13,11 +13,13 @@ from types import FrameType
 
 import torch
 
-from lapgs_wgpu.data.sanity import check_times
+from lapgs_wgpu.data.init import first_points
+from lapgs_wgpu.data.sanity import check_in_view, check_times
 from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.errors import DeviceError, InputError, NumericalError
 from lapgs_wgpu.gpu.device import Device, open_device
 from lapgs_wgpu.io.first_look import FirstLook
+from lapgs_wgpu.motion.grid_field import GridField
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.config import Background, Config
 from lapgs_wgpu.train.decoder_choice import Choice
@@ -37,6 +39,9 @@ from lapgs_wgpu.train.run_folder import (
     start_run_folder,
 )
 from lapgs_wgpu.train.training import Progress, Training
+
+PROBES = 2048  # points of the scene that say whether a camera sees it
+OUTSIDE = 0.05  # share of Gaussians outside of the encoder's box from which on it is told
 
 # Takes over a training's steps, such as a viewer does: called with the scene, where to look at it from, and the steps,
 # of which it takes as many as it likes, each one a step of the training. The rest follows when it returns.
@@ -64,11 +69,14 @@ def train(
     when that state has been written.
     """
     out = Path(out)
-    check_times(dataset, moving=config.field.kind != "static")
+    found = check_times(dataset, moving=config.field.kind != "static")
+    found += check_in_view(dataset, first_points(dataset, PROBES, config.points.box, config.seed)[0])
     if ranks.first:
         check_run_folder(out, overwrite=overwrite)
-        for warning in (*dataset.warnings, *_precision_warnings(config)):
+        for warning in (*dataset.warnings, *found, *_precision_warnings(config)):
             print(f"warning: {warning}", file=sys.stderr, flush=True)
+        if dataset.placement is not None:
+            print(f"placement: {dataset.placement}", flush=True)
     keep_freed_memory()
     training = Training(config, dataset, device or open_device(), ranks)
     if not ranks.first:
@@ -116,6 +124,21 @@ def _precision_warnings(config: Config) -> list[str]:
     return ["this processor has no instructions for bfloat16: the training will be faster with --precision float32."]
 
 
+def _outside(scene: Scene4D) -> str:
+    """A warning where the hash grids do not cover the canonical means of many Gaussians; else nothing."""
+    if not isinstance(scene.field, GridField):
+        return ""
+    bound = scene.field_config.bound
+    count = int((scene.parameters["means"].detach().abs() > bound).any(dim=1).sum())
+    if count < OUTSIDE * len(scene):
+        return ""
+    return (
+        f"warning: {count} of {len(scene)} Gaussians lie outside the field's box of half side {bound:g}, where it "
+        "cannot tell one from another; that is right for a background that stands still, but if something moves there, "
+        "raise field.bound."
+    )
+
+
 def _told(choice: Choice) -> str:
     """Where the decoder works, and why, after a trial."""
     torch_time, device_time = (1e3 * choice.seconds[place] for place in ("torch", "device"))
@@ -151,6 +174,8 @@ def _run(training: Training, dataset: Dataset, out: Path, watch: Watch | None) -
         for _ in steps:
             pass
         seconds = log.seconds
+        if training.done == config.schedule.steps and (outside := _outside(scene)):
+            log.tell(outside)
 
     return_freed_memory()
     done, all_steps = training.done, config.schedule.steps
