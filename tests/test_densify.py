@@ -172,3 +172,20 @@ def test_schedule() -> None:
     assert CONFIG.changes_at(14_900)
     assert not CONFIG.changes_at(15_000)
     assert [step for step in range(1, 20_000) if CONFIG.resets_at(step)] == [3000, 6000, 9000, 12_000]
+
+
+def test_the_number_of_gaussians_is_bounded_and_the_largest_gradients_come_first() -> None:
+    rows = make_rows([SMALL] * 8)
+    statistics = make_statistics([CONFIG.gradient * (1.5 + i) for i in range(8)])
+    config = dataclasses.replace(CONFIG, limit=10)
+    result = change(rows, statistics, config=config)
+    assert (int(result.keep.sum()), result.cloned) == (8, 2)
+    assert torch.equal(result.added["means"], rows["means"][6:])
+    assert change(rows, statistics, config=dataclasses.replace(CONFIG, limit=5)).cloned == 0
+    assert change(rows, statistics).cloned == 8
+
+
+def test_faint_gaussians_are_never_all_removed() -> None:
+    opacities = [1e-4 * (1 + i) for i in range(8)]
+    result = change(make_rows([SMALL] * 8, opacities), make_statistics([0.0] * 8))
+    assert result.keep.tolist() == [False] * 6 + [True] * 2

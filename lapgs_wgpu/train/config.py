@@ -150,7 +150,7 @@ class DensityConfig:
         "share of these Gaussians, those of the lowest scores, that the adaptive split leaves as they are, unless "
         "their dynamics stand out"
     )
-    min_opacity: float = described("Gaussians below it are removed")
+    min_opacity: float = described("Gaussians below it are removed, but for the 256 most opaque ones")
     max_screen_radius: float = described(
         "Gaussians that were larger on an image are removed, in pixels, from the first reset on; 0 for no bound"
     )
@@ -160,6 +160,9 @@ class DensityConfig:
     )
     reset_interval: int = described("steps from one reset of the opacities to the next")
     reset_opacity: float = described("what opacities are lowered to")
+    limit: int = described(
+        "no more Gaussians than this: those of the largest gradients are cloned or split first; 0 for no bound", 0
+    )
 
     def __post_init__(self) -> None:
         if self.interval < 1 or self.reset_interval < 1:
@@ -236,6 +239,30 @@ class SmoothnessConfig:
 
 
 @dataclass(frozen=True)
+class DiscoveryConfig:
+    """Search for what moves before the training (train/discovery). With defaults: older runs lack it."""
+
+    enabled: bool = described(
+        "whether things that move far are searched for before the first step, and start with Gaussians of their own; "
+        "left out by the field static and by trainings that are no longer than discovery.steps",
+        False,
+    )
+    steps: int = described("steps of the static fit that shows what stands still", 800)
+    size: int = described("longer side in pixels of the images that the static fit and the search see", 100)
+    field_steps: int = described("steps in which the field learns the motion that was found", 500)
+    least: float = described(
+        "share of the moving surface points that the static fit must lack, below which nothing is added", 0.05
+    )
+
+    def __post_init__(self) -> None:
+        if min(self.steps, self.field_steps) < 1 or self.size < 16 or self.least > 1:
+            raise ValueError(
+                "steps and field_steps must be at least 1, size at least 16 and least at most 1, "
+                f"got {self.steps}, {self.field_steps}, {self.size} and {self.least:g}"
+            )
+
+
+@dataclass(frozen=True)
 class ExposureConfig:
     """Colours of cameras that do not keep their exposure or their white balance. With defaults: older runs lack it."""
 
@@ -263,6 +290,7 @@ class Config:
     smoothness: SmoothnessConfig
     seed: int = described("of every random draw")
     exposure: ExposureConfig = dataclasses.field(default=ExposureConfig())
+    discovery: DiscoveryConfig = dataclasses.field(default=DiscoveryConfig())
     precision: Precision = described(
         "of the field's features, and of its decoder's products and their gradients; bfloat16 is faster on processors "
         "that have instructions for it; parameters, sums, images and everything after the training are float32",

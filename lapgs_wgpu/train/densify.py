@@ -20,6 +20,9 @@ from lapgs_wgpu.train.adaptive_split import adaptive_split
 from lapgs_wgpu.train.config import DensityConfig
 
 CHILDREN = 2  # of a split Gaussian
+# The most opaque Gaussians stay, these many or a quarter of all: where images show little but the background, all
+# become faint together, and nothing could come back without any.
+LEAST_KEPT = 256
 SHRINK = 0.8 * CHILDREN  # how much smaller the children are
 
 Rows = Mapping[str, Tensor]
@@ -95,18 +98,25 @@ def densify(
     extent: of the cameras, world units. generator: where the children of a split are drawn from, on the CPU.
     bound_sizes: whether the bounds on screen and world size hold, which they do after the first opacity reset.
     """
-    wanted = statistics.mean_gradients >= config.gradient
+    gradients = statistics.mean_gradients
+    wanted = gradients >= config.gradient
     large = rows["log_scales"].amax(dim=1) > math.log(config.split_size * extent)
     clone = wanted & ~large
     split = wanted & large
     if config.split == "adaptive":
         split = adaptive_split(rows, split, config)
+    prune = prunable(rows, statistics.radii, config, extent, bound_sizes=bound_sizes)
+    rescued = largest(rows["opacity_logits"], min(LEAST_KEPT, len(prune) // 4))
+    prune &= ~rescued | oversized(rows, statistics.radii, config, extent, bound_sizes=bound_sizes)
+    if config.limit:
+        room = config.limit - int((~prune).sum())
+        most = largest(torch.where((clone | split) & ~prune, gradients, -1.0), room)
+        clone, split = clone & most, split & most
     clones = {name: row[clone] for name, row in rows.items()}
     children = split_rows({name: row[split] for name, row in rows.items()}, generator)
     born = {name: torch.cat([clones[name], children[name]]) for name in rows}
 
     # A Gaussian that was just born has not been seen on any image.
-    prune = prunable(rows, statistics.radii, config, extent, bound_sizes=bound_sizes)
     unseen = torch.zeros_like(born["opacity_logits"])
     stillborn = prunable(born, unseen, config, extent, bound_sizes=bound_sizes)
     return Change(
@@ -130,12 +140,25 @@ def split_rows(parents: Rows, generator: torch.Generator) -> dict[str, Tensor]:
 
 def prunable(rows: Rows, radii: Tensor, config: DensityConfig, extent: float, *, bound_sizes: bool) -> Tensor:
     """(N,) which Gaussians are too faint, or too large (radii: (N,) largest so far on an image, pixels)."""
-    prune = rows["opacity_logits"] < _logit(config.min_opacity)
+    faint: Tensor = rows["opacity_logits"] < _logit(config.min_opacity)
+    return faint | oversized(rows, radii, config, extent, bound_sizes=bound_sizes)
+
+
+def oversized(rows: Rows, radii: Tensor, config: DensityConfig, extent: float, *, bound_sizes: bool) -> Tensor:
+    """(N,) which Gaussians are too large; see `prunable`."""
+    large = torch.zeros_like(rows["opacity_logits"], dtype=torch.bool)
     if bound_sizes and config.max_screen_radius > 0:
-        prune |= radii > config.max_screen_radius
+        large |= radii > config.max_screen_radius
     if bound_sizes and config.max_world_size > 0:
-        prune |= rows["log_scales"].amax(dim=1) > math.log(config.max_world_size * extent)
-    return prune
+        large |= rows["log_scales"].amax(dim=1) > math.log(config.max_world_size * extent)
+    return large
+
+
+def largest(values: Tensor, count: int) -> Tensor:
+    """(N,) bool: the `count` largest of values (N,), the first of equal ones."""
+    chosen = torch.zeros(len(values), dtype=torch.bool, device=values.device)
+    chosen[torch.argsort(values, descending=True, stable=True)[: max(count, 0)]] = True
+    return chosen
 
 
 @torch.no_grad()

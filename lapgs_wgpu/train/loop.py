@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import signal
 import sys
 import threading
@@ -23,6 +24,7 @@ from lapgs_wgpu.motion.grid_field import GridField
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.config import Background, Config
 from lapgs_wgpu.train.decoder_choice import Choice
+from lapgs_wgpu.train.discovery.discover import discover
 from lapgs_wgpu.train.evaluate import evaluate, write_metrics
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.lpips import Lpips
@@ -78,7 +80,8 @@ def train(
         if dataset.placement is not None:
             print(f"placement: {dataset.placement}", flush=True)
     keep_freed_memory()
-    training = Training(config, dataset, device or open_device(), ranks)
+    device = device or open_device()
+    training = Training(config, dataset, device, ranks, _discovered(config, dataset, device, ranks))
     if not ranks.first:
         return _assist(training)
     with locked_run_folder(out):
@@ -103,9 +106,11 @@ def resume(
     if (out / "metrics.json").exists():
         raise InputError(f"{out} is finished: there is nothing to resume.")
     keep_freed_memory()
-    training = Training(config, dataset, device or open_device(), ranks)
+    device = device or open_device()
     with locked_run_folder(out) if ranks.first else nullcontext():
         state = load_state(out)
+        scene = _discovered(config, dataset, device, ranks) if state is None else None
+        training = Training(config, dataset, device, ranks, scene)
         if state is not None:
             try:
                 check_state(state, views=len(dataset.train), steps=config.schedule.steps)
@@ -114,6 +119,18 @@ def resume(
                 reason = f"{type(error).__name__}: {error}".splitlines()[0]
                 raise InputError(f"{out}: its state and its config.toml do not belong together ({reason}).") from error
         return _run(training, dataset, out, watch) if ranks.first else _assist(training)
+
+
+def _discovered(config: Config, dataset: Dataset, device: Device, ranks: Ranks) -> Scene4D | None:
+    """The scene that discovery starts a training with; None where it is off, finds nothing, or is out of proportion."""
+    wanted = config.discovery.enabled and config.field.kind != "static"
+    if not wanted or config.schedule.steps <= config.discovery.steps:
+        return None
+    with open(os.devnull, "w") as nowhere:
+        found = discover(config, dataset, device, None if ranks.first else nowhere)
+    if ranks.first:
+        print(found.summary, flush=True)
+    return found.scene
 
 
 def _precision_warnings(config: Config) -> list[str]:

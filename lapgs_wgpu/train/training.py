@@ -56,11 +56,14 @@ class _Look(NamedTuple):
 class Training:
     """A training between two of its steps.
 
-    config: with the decoder's place chosen. done: the steps so far. whole: whether `state` is that of a whole step,
-    which it also is where `step` raised an error before anything that lasts had changed.
+    scene: to start from, as `discover` gives it, and to move from the first step on; made of `initial_points` where
+    None. config: with the decoder's place chosen. done: the steps so far. whole: whether `state` is that of a whole
+    step, which it also is where `step` raised an error before anything that lasts had changed.
     """
 
-    def __init__(self, config: Config, dataset: Dataset, device: Device, ranks: Ranks = ALONE) -> None:
+    def __init__(
+        self, config: Config, dataset: Dataset, device: Device, ranks: Ranks = ALONE, scene: Scene4D | None = None
+    ) -> None:
         if config.schedule.batch % ranks.count:
             raise InputError(
                 f"{ranks.count} processes cannot share {config.schedule.batch} views a step evenly; give --batch "
@@ -69,7 +72,9 @@ class Training:
         self.ranks = ranks
         self.done = 0
         self._generator = torch.Generator().manual_seed(config.seed)
-        self.scene = Scene4D.from_points(
+        # What discovery found moves from the first step on.
+        self._warm_up = config.schedule.warm_up if scene is None else 0
+        self.scene = scene or Scene4D.from_points(
             *initial_points(config.points, dataset, config.seed),
             config.field,
             opacity=config.points.opacity,
@@ -125,7 +130,7 @@ class Training:
     def _step(self) -> Progress:
         config, scene, ranks = self.config, self.scene, self.ranks
         step = self.done + 1
-        moving = step > config.schedule.warm_up
+        moving = step > self._warm_up
         # Every rank draws the numbers of all views, so that their random streams stay the same.
         chosen = [self._pictures.choose() for _ in range(config.schedule.batch)]
         drawn = self._generator.get_state()
@@ -275,6 +280,7 @@ class Training:
             "statistics": self._statistics.state(),
             "training": {
                 "done": torch.tensor(self.done),
+                "warm_up": torch.tensor(self._warm_up),
                 "sh_degree": torch.tensor(scene.sh_degree),
                 "random": self._generator.get_state(),
                 "order": torch.tensor(self._pictures.order, dtype=torch.int64),
@@ -306,6 +312,7 @@ class Training:
         self._statistics.restore(parts["statistics"])
         own = parts["training"]
         self.done, scene.sh_degree = int(own["done"]), int(own["sh_degree"])
+        self._warm_up = int(own.get("warm_up", self._warm_up))  # older states lack it
         self._generator.set_state(own["random"])
         self._pictures.order = own["order"].tolist()
 

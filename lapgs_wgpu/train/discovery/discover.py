@@ -1,0 +1,166 @@
+"""What a training starts from, where the capture shows things that a static fit loses."""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import NamedTuple, TextIO
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from lapgs_wgpu.data.init import initial_scales
+from lapgs_wgpu.data.views import Dataset
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.motion.scene import Scene4D
+from lapgs_wgpu.splat.constants import CONSTANTS
+from lapgs_wgpu.splat.morton import morton_order
+from lapgs_wgpu.train.config import Config
+
+from .field_fit import fit_field
+from .residual import Floats
+from .static_fit import static_fit
+from .surface_points import PointClouds, surface_points
+from .tracks import Tracks, find_tracks
+
+OPACITY = 0.3  # of a discovered Gaussian
+SCALE = 0.8  # of it, in mean distances to its nearest neighbours
+DYNAMICS = 0.5  # standard deviation of its dynamics attribute, which it shares with its part
+EMPTY = 0.1  # opacity of the static fit, below which a place counts as empty
+OPAQUE = 0.1  # least opacity of a Gaussian of the static fit that is looked at
+SHOWN = 2.0 / 255  # least difference from the background of an image that shows something
+
+
+class Discovery(NamedTuple):
+    """scene: to start from; None where nothing is lost without it. summary: what was found, a line."""
+
+    scene: Scene4D | None
+    summary: str
+
+
+def discover(config: Config, dataset: Dataset, device: Device, terminal: TextIO | None = None) -> Discovery:
+    """Find what moves, and build the scene that a training starts from.
+
+    It holds the Gaussians of the static fit and of the tracks, and a field that moves the latter.
+
+    The same configuration and capture give the same scene. Raises InputError where the images show nothing at all.
+    """
+    started = time.perf_counter()
+    steps = config.discovery.steps
+    fit_steps = config.discovery.field_steps
+    meter = _Meter(steps + fit_steps, terminal or sys.stderr)
+    static, images = static_fit(config, dataset, device, meter.at)
+    background = 1.0 if config.data.background == "white" else 0.0
+    if all(float(np.abs(image.image - background).max()) < SHOWN for image in images):
+        raise InputError(
+            f"{dataset.train[0].source} and the other {len(dataset.train) - 1} training images show nothing but the "
+            f"{config.data.background} background; check the images and data.background."
+        )
+    half_side = config.points.box
+    clouds = surface_points(images, half_side)
+    tracks = find_tracks(clouds, half_side).tracks
+    tracks = None if tracks is None else lost_tracks(tracks, static)
+    share = 0.0 if tracks is None else explained_share(clouds, tracks, half_side)
+    if tracks is None or share < config.discovery.least:
+        meter.close()
+        return Discovery(None, f"discovery: the static fit loses {share:.1%} of what moves: nothing is added")
+    generator = torch.Generator().manual_seed(config.seed)
+    scene = scene_with(static, tracks, config, device, generator)
+    error = fit_field(scene, tracks, clouds.times, len(static), fit_steps, generator, lambda s: meter.at(steps + s))
+    order = morton_order(scene.parameters["means"].detach())
+    for name, values in scene.parameters.items():
+        scene.parameters[name] = torch.nn.Parameter(values.detach()[order])
+    meter.close()
+    seconds = time.perf_counter() - started
+    return Discovery(
+        scene,
+        f"discovery: {len(np.unique(tracks.part))} moving parts with {len(tracks.part)} Gaussians beside {len(static)} "
+        f"of the static fit; {share:.0%} of what the static fit lacks, followed within {error:.3f} world units; "
+        f"{seconds:.0f} s",
+    )
+
+
+def lost_tracks(tracks: Tracks, static: Scene4D) -> Tracks | None:
+    """The parts that are, most of the time, where the static fit is empty; None where there are none."""
+    empty = density_at(static, tracks.paths.reshape(-1, 3)).reshape(tracks.supported.shape) < EMPTY
+    seen = np.maximum(np.bincount(tracks.part, tracks.supported.sum(axis=0)), 1)
+    share = np.bincount(tracks.part, (empty & tracks.supported).sum(axis=0)) / seen
+    kept = (share > 0.5)[tracks.part]
+    if not kept.any():
+        return None
+    part = np.unique(tracks.part[kept], return_inverse=True)[1].ravel()
+    return Tracks(tracks.positions[kept], tracks.colors[kept], part, tracks.paths[:, kept], tracks.supported[:, kept])
+
+
+def density_at(static: Scene4D, points: Floats) -> NDArray[np.float64]:
+    """(n,) opacity of the static fit at points (n, 3): the sum over the eight nearest Gaussians, as if round."""
+    with torch.no_grad():
+        gaussians = static.canonical()
+        means, opacities = gaussians.means.numpy(force=True), gaussians.opacities.numpy(force=True)
+        scales = gaussians.scales.amax(dim=1).numpy(force=True)
+    opaque = opacities > OPAQUE
+    count = min(8, int(opaque.sum()))
+    if count == 0:
+        return np.zeros(len(points))
+    distances, of = cKDTree(means[opaque]).query(points, k=range(1, count + 1))
+    falloff = np.exp(-0.5 * (distances / np.maximum(scales[opaque][of], 1e-6)) ** 2)
+    total: NDArray[np.float64] = (opacities[opaque][of] * falloff).sum(axis=1)
+    return total
+
+
+def explained_share(clouds: PointClouds, tracks: Tracks, half_side: float) -> float:
+    """Of the surface points, those that lie on a track."""
+    near = 0
+    for cloud, path in zip(clouds.clouds, tracks.paths, strict=True):
+        if len(cloud.scores):
+            near += int((cKDTree(path).query(cloud.positions)[0] < 0.1 * half_side).sum())
+    return near / max(clouds.total, 1)
+
+
+def scene_with(static: Scene4D, tracks: Tracks, config: Config, device: Device, generator: torch.Generator) -> Scene4D:
+    """The static fit's Gaussians, then one for each track; the field does not move them yet."""
+    count, size = len(tracks.part), config.field.dynamics_size
+    scales = SCALE * initial_scales(tracks.positions)
+    new = {
+        "means": torch.from_numpy(tracks.positions),
+        "log_scales": torch.from_numpy(np.log(scales))[:, None].repeat(1, 3),
+        "quats": torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
+        "opacity_logits": torch.full((count,), float(np.log(OPACITY / (1 - OPACITY)))),
+        "sh_dc": (torch.from_numpy(tracks.colors) - 0.5)[:, None] / CONSTANTS["SH_C0"],
+        "sh_rest": torch.zeros(count, 15, 3),
+    }
+    rows: dict[str, Tensor] = {
+        name: torch.cat([static.parameters[name].detach().cpu(), values.float()]) for name, values in new.items()
+    }
+    of_part = DYNAMICS * torch.randn(int(tracks.part.max()) + 1, size, generator=generator)
+    rows["dynamics"] = torch.cat([torch.zeros(len(static), size), of_part[torch.from_numpy(tracks.part)]])
+    return Scene4D(rows, config.field, device, sh_degree=static.sh_degree, seed=config.seed)
+
+
+class _Meter:
+    """The discovery's progress on the terminal."""
+
+    def __init__(self, steps: int, terminal: TextIO) -> None:
+        self._steps, self._terminal = steps, terminal
+        self._start = self._shown = time.perf_counter()
+
+    def at(self, step: int) -> None:
+        """After a step, counted from 1."""
+        now = time.perf_counter()
+        if now - self._shown < (0.25 if self._terminal.isatty() else 15.0):
+            return
+        self._shown = now
+        left = (now - self._start) / step * (self._steps - step)
+        text = f"looking for what moves: step {step}/{self._steps}  {left:.0f} s left"
+        self._terminal.write(f"\r\x1b[2K{text}" if self._terminal.isatty() else f"{text}\n")
+        self._terminal.flush()
+
+    def close(self) -> None:
+        """Remove the progress line."""
+        if self._terminal.isatty():
+            self._terminal.write("\r\x1b[2K")
+            self._terminal.flush()

@@ -1,0 +1,75 @@
+"""A deformation field fitted to tracks, before any image is looked at."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lapgs_wgpu.motion.scene import Scene4D, rotate
+from lapgs_wgpu.train.optimise import ADAM_EPS
+
+from .tracks import Tracks
+
+STILL = 300  # Gaussians of the static fit that a step asks to stay where they are
+HASH_RATE, MLP_RATE = 1e-2, 2e-3  # learning rates, as in the preset tiny
+LAST = 0.05  # of the learning rates, in the end; they fall over the second half
+SHAPE_WEIGHT = 0.1  # of changes of scales and quaternions, which the tracks do not know
+SOFTENING = 1e-2  # world units; distances below count as squares
+
+
+def fit_field(
+    scene: Scene4D,
+    tracks: Tracks,
+    times: NDArray[np.float64],
+    still: int,
+    steps: int,
+    generator: torch.Generator,
+    progress: Callable[[int], None],
+) -> float:
+    """Train the field of a scene so that its last Gaussians follow the tracks, and the first `still` ones stay.
+
+    Each step looks at one of the times (T,). Returns the mean distance of tracks and Gaussians in the end, world units.
+    """
+    field = scene.field
+    assert field is not None
+    groups = field.parameter_groups()
+    rates = {"hash": HASH_RATE, "mlp": MLP_RATE}
+    optimizer = torch.optim.Adam(
+        [{"params": parameters, "lr": rates[name]} for name, parameters in groups.items()], eps=ADAM_EPS, fused=True
+    )
+    device = scene.parameters["means"].device
+    paths, supported = torch.from_numpy(tracks.paths).to(device), torch.from_numpy(tracks.supported).to(device)
+    moving = torch.arange(still, still + len(tracks.part), device=device)
+    order: list[int] = []
+    errors: list[float] = []
+    for step in range(steps):
+        order = order or torch.randperm(len(times), generator=generator).tolist()
+        at = order.pop()
+        staying = torch.randint(max(still, 1), (min(still, STILL),), generator=generator).to(device)
+        rows = torch.cat([moving, staying])
+        means = scene.parameters["means"].detach()[rows]
+        dynamics = scene.parameters["dynamics"].detach()[rows] if "dynamics" in scene.parameters else None
+        move = field(means, float(times[at]), dynamics, None)
+        moved = (means if move.rotation is None else rotate(move.rotation, means)) + move.translation
+        weights = torch.cat([supported[at].float(), torch.ones(len(staying), device=device)])
+        squared = (moved - torch.cat([paths[at], means[len(moving) :]])).square().sum(dim=1)
+        loss = (weights * (squared + SOFTENING**2).sqrt()).mean()
+        loss = loss + SHAPE_WEIGHT * (move.d_scales.abs().mean() + move.d_quats.abs().mean())
+        for group, name in zip(optimizer.param_groups, groups, strict=True):
+            group["lr"] = rates[name] * max(LAST, min(1.0, 2.0 * (steps - step) / steps))
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        errors.append(_mean_distance(squared[: len(moving)].detach(), weights[: len(moving)]))
+        progress(step + 1)
+    optimizer.zero_grad()
+    last = errors[-max(1, len(errors) // 10) :]
+    return float(np.mean(last)) if last else 0.0
+
+
+def _mean_distance(squared: Tensor, weights: Tensor) -> float:
+    return float((weights * squared.sqrt()).sum() / weights.sum().clamp(min=1.0))

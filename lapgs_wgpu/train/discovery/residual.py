@@ -1,0 +1,103 @@
+"""Where a training image differs from the static fit, and what a point in space looks like there."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from lapgs_wgpu.splat.camera import Camera
+
+Floats = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+THRESHOLD = 0.1  # least residual of a moving pixel; colours are in [0, 1]
+REACH = 2  # pixels; texture that the static fit blurs or shifts by less is no residual
+FALLOFF = 1.5  # pixels; standard deviation of the mask's soft border
+BLUR = 2.0  # pixels; standard deviation of the colours that views are compared by
+
+
+class Samples(NamedTuple):
+    """Values of an image at projected points (...): mask in [0, 1], colors (..., 3), and whether the image has them."""
+
+    mask: Floats
+    colors: Floats
+    inside: Mask
+
+
+class Rays(NamedTuple):
+    """Rays of moving pixels: directions (n, 3) of depth 1, blurred colors (n, 3) and colors of the pixels (n, 3)."""
+
+    directions: Floats
+    blurred: Floats
+    colors: Floats
+
+
+class Residual:
+    """A training image and its moving pixels.
+
+    Args:
+        camera: of the image.
+        time: in [0, 1].
+        image: (H, W, 3) in [0, 1].
+        still: (H, W, 3), the static fit's image of the same camera.
+    """
+
+    def __init__(self, camera: Camera, time: float, image: Floats, still: Floats) -> None:
+        self.camera, self.time, self.image = camera, time, image
+        self.mask = moving_pixels(image, still)
+
+    @cached_property
+    def _soft(self) -> Floats:
+        """(H, W): 1 in the mask, falling off around it."""
+        if not self.mask.any():
+            return np.zeros(self.mask.shape, np.float32)
+        distance = ndimage.distance_transform_edt(~self.mask)
+        return np.exp(-0.5 * (distance / FALLOFF) ** 2).astype(np.float32)
+
+    @cached_property
+    def _blurred(self) -> Floats:
+        """(H, W, 3): mean colour of the moving pixels nearby."""
+        weight = ndimage.gaussian_filter(self.mask.astype(np.float32), BLUR)[..., None]
+        colors = ndimage.gaussian_filter(self.image * self.mask[..., None], (BLUR, BLUR, 0))
+        return (colors / np.maximum(weight, 1e-3)).astype(np.float32)
+
+    def sample(self, points: Floats) -> Samples:
+        """Values at points (..., 3), world units, at the pixels that they project to."""
+        K, T = self.camera.K.astype(np.float32), self.camera.T_cam_world.astype(np.float32)
+        seen = points @ T[:3, :3].T + T[:3, 3]
+        depth = seen[..., 2]
+        at = seen[..., :2] / np.maximum(depth, 1e-3)[..., None] * K[[0, 1], [0, 1]] + K[:2, 2]
+        height, width = self.mask.shape
+        column, row = np.floor(at[..., 0]), np.floor(at[..., 1])
+        inside = (depth > 1e-2) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        pixel = np.where(inside, row * width + column, 0).astype(np.int64)
+        return Samples(self._soft.ravel()[pixel] * inside, self._blurred.reshape(-1, 3)[pixel], inside)
+
+    def rays(self, most: int) -> Rays:
+        """Rays of at most `most` moving pixels, evenly chosen."""
+        rows, columns = np.nonzero(self.mask)
+        chosen = np.linspace(0, len(rows) - 1, min(most, len(rows))).astype(np.int64)
+        rows, columns = rows[chosen], columns[chosen]
+        K = self.camera.K
+        u, v = (columns + 0.5 - K[0, 2]) / K[0, 0], (rows + 0.5 - K[1, 2]) / K[1, 1]
+        directions = np.stack([u, v, np.ones(len(rows))], axis=1) @ self.camera.T_cam_world[:3, :3]
+        return Rays(directions.astype(np.float32), self._blurred[rows, columns], self.image[rows, columns])
+
+
+def moving_pixels(image: Floats, still: Floats) -> Mask:
+    """(H, W): where an image (H, W, 3) differs from the static fit's, but for thin lines and single pixels."""
+    residual = interval_residual(image, still)
+    core = ndimage.binary_opening(residual > THRESHOLD)
+    return ndimage.binary_dilation(core, iterations=2) & (residual > 0.5 * THRESHOLD)
+
+
+def interval_residual(image: Floats, still: Floats) -> Floats:
+    """(H, W): distance of an image's colours (H, W, 3) to the range of the static fit's colours within REACH pixels,
+    the largest over the channels."""
+    size = (2 * REACH + 1, 2 * REACH + 1, 1)
+    low, high = ndimage.minimum_filter(still, size), ndimage.maximum_filter(still, size)
+    return np.maximum(np.maximum(low - image, image - high), 0.0).max(axis=2)

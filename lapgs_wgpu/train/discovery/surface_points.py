@@ -1,0 +1,146 @@
+"""Points on the surfaces that move: rays of moving pixels, at depths on which images of neighbouring times agree.
+
+Cameras of neighbouring times see a moving object from other sides while it has hardly moved: its silhouettes meet in
+space. What lies in the residual at all times is no motion, but texture that the static fit blurs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from .residual import Floats, Residual
+
+RAYS = 300  # of an image, at most
+DEPTHS = 64  # that are tried along a ray
+NEIGHBORS = 6  # images of the nearest times that vote on a depth
+SPAN = 1.0  # time steps, at which a vote counts half
+COLOR_SPREAD = 0.25  # standard deviation of the colours of one surface in several images
+COLOR_SHARE = 0.7  # of a vote that depends on the colour
+GRID = 48  # cells along an axis of the grid of what is residual at all times
+ALWAYS, ALWAYS_WIDTH = 0.8, 0.25  # share of all images, above which a residual is no motion; width of the transition
+LEAST_SCORE = 0.5  # of a point
+PLATEAU = 0.1  # scores within this share of the best one count as equal; their middle is taken
+LONELY = 0.12  # box half sides; a point is dropped whose fourth neighbour is further
+
+
+class Points(NamedTuple):
+    """Surface points of one time: positions (n, 3) world units, colors (n, 3), scores (n,) in [0, 1]."""
+
+    positions: Floats
+    colors: Floats
+    scores: Floats
+
+
+class PointClouds(NamedTuple):
+    """The surface points of all times. times: (T,) ascending. clouds: of each."""
+
+    times: NDArray[np.float64]
+    clouds: tuple[Points, ...]
+
+    @property
+    def total(self) -> int:
+        """Of points, over all times."""
+        return sum(len(cloud.scores) for cloud in self.clouds)
+
+
+def surface_points(images: Sequence[Residual], half_side: float) -> PointClouds:
+    """Surface points of what moves, for each distinct time of the images, within [-half_side, half_side]^3."""
+    always = _Always(images, half_side)
+    found = [_points(image, _neighbors(images, i), always, half_side) for i, image in enumerate(images)]
+    times = np.unique([image.time for image in images])
+    clouds = []
+    for time in times:
+        parts = [points for points, image in zip(found, images, strict=True) if image.time == time]
+        clouds.append(_dense(Points(*(np.concatenate(values) for values in zip(*parts, strict=True))), half_side))
+    return PointClouds(times, tuple(clouds))
+
+
+def _neighbors(images: Sequence[Residual], of: int) -> list[tuple[Residual, float]]:
+    """The images of the nearest times, and the weights of their votes."""
+    times = np.array([image.time for image in images])
+    distinct = np.unique(times)
+    step = float(np.diff(distinct).mean()) if len(distinct) > 1 else 1.0
+    distances = np.abs(times - times[of])
+    order = [i for i in np.lexsort((np.arange(len(times)), distances)) if i != of][:NEIGHBORS]
+    return [(images[i], float(1.0 / (1.0 + (distances[i] / (SPAN * step)) ** 2))) for i in order]
+
+
+def _points(image: Residual, neighbors: list[tuple[Residual, float]], always: _Always, half_side: float) -> Points:
+    rays = image.rays(RAYS)
+    if len(rays.directions) == 0 or not neighbors:
+        empty = np.zeros((0, 3), np.float32)
+        return Points(empty, empty, np.zeros(0, np.float32))
+    eye = image.camera.position.astype(np.float32)
+    depths = _depths(eye, rays.directions, half_side)
+    places = eye + depths[..., None] * rays.directions[:, None]
+    votes, weights = np.zeros(depths.shape), np.zeros(depths.shape)
+    for neighbor, weight in neighbors:
+        samples = neighbor.sample(places)
+        apart = ((samples.colors - rays.blurred[:, None]) ** 2).sum(axis=2)
+        agreement = 1.0 - COLOR_SHARE + COLOR_SHARE * np.exp(-apart / (2 * COLOR_SPREAD**2))
+        votes += weight * samples.mask * agreement
+        weights += weight * samples.inside
+    scores = votes / np.maximum(weights, 1e-6)
+    scores[weights < 0.5 * sum(weight for _, weight in neighbors)] = 0.0  # hardly seen by others
+    scores *= np.clip((ALWAYS - always.at(places)) / ALWAYS_WIDTH, 0.0, 1.0)
+    row = np.arange(len(scores))
+    middle = _middle_of_best(scores)
+    low = np.floor(middle).astype(np.int64)
+    depth = depths[row, low] + (middle - low) * (depths[:, 1] - depths[:, 0])
+    positions = eye + depth[:, None] * rays.directions
+    kept = scores.max(axis=1) > LEAST_SCORE
+    return Points(positions[kept].astype(np.float32), rays.colors[kept], scores.max(axis=1)[kept].astype(np.float32))
+
+
+def _depths(eye: Floats, directions: Floats, half_side: float) -> Floats:
+    """(n, DEPTHS) depths at which rays lie in the box; beside it a single one, many times."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        a, b = (-half_side - eye) / directions, (half_side - eye) / directions
+    near = np.nan_to_num(np.minimum(a, b).max(axis=1)).clip(1e-2)
+    far = np.maximum(np.nan_to_num(np.maximum(a, b).min(axis=1)), near + 1e-3)
+    steps = (np.arange(DEPTHS, dtype=np.float32) + 0.5) / DEPTHS
+    return (near[:, None] + (far - near)[:, None] * steps).astype(np.float32)
+
+
+def _middle_of_best(scores: NDArray[np.floating]) -> NDArray[np.float64]:
+    """(n,) index of the middle of the run of nearly best scores (n, k) around each best one."""
+    best, index = scores.argmax(axis=1)[:, None], np.arange(scores.shape[1])[None]
+    worse = scores < (1.0 - PLATEAU) * scores.max(axis=1, keepdims=True)
+    first = np.where(worse & (index < best), index, -1).max(axis=1) + 1
+    last = np.where(worse & (index > best), index, scores.shape[1]).min(axis=1) - 1
+    return 0.5 * (first + last)
+
+
+def _dense(points: Points, half_side: float) -> Points:
+    """The points without those that are alone."""
+    if len(points.scores) < 5:
+        return Points(*(values[:0] for values in points))
+    distances, _ = cKDTree(points.positions).query(points.positions, k=5)
+    kept = distances[:, 4] < LONELY * half_side
+    return Points(*(values[kept] for values in points))
+
+
+class _Always:
+    """The share of images in which a place is residual, on a grid over the box."""
+
+    def __init__(self, images: Sequence[Residual], half_side: float) -> None:
+        self._half_side = half_side
+        axis = ((np.arange(GRID, dtype=np.float32) + 0.5) / GRID * 2 - 1) * half_side
+        places = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.float32)
+        total, count = np.zeros(len(places), np.float32), np.zeros(len(places), np.float32)
+        for image in images:
+            samples = image.sample(places)
+            total += samples.mask
+            count += samples.inside
+        self._share = (total / np.maximum(count, 1.0)).reshape(GRID, GRID, GRID)
+
+    def at(self, points: Floats) -> Floats:
+        """At points (..., 3), interpolated."""
+        index = (points / self._half_side + 1) * 0.5 * GRID - 0.5
+        return ndimage.map_coordinates(self._share, np.moveaxis(index, -1, 0), order=1, mode="nearest")

@@ -1,0 +1,304 @@
+"""Discovery: what a static fit loses is found in space and time, followed, and given to the field."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from lapgs_wgpu.data import Dataset, load_dataset
+from lapgs_wgpu.data.motion_scenes import MotionScene
+from lapgs_wgpu.data.motion_writer import write_motion
+from lapgs_wgpu.data.synthetic import cameras
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.motion.field import FieldConfig
+from lapgs_wgpu.motion.scene import Scene4D
+from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.train.config import Config
+from lapgs_wgpu.train.discovery.discover import density_at, discover, lost_tracks
+from lapgs_wgpu.train.discovery.field_fit import fit_field
+from lapgs_wgpu.train.discovery.residual import Residual, moving_pixels
+from lapgs_wgpu.train.discovery.static_fit import small_view, static_config
+from lapgs_wgpu.train.discovery.surface_points import PointClouds, Points, surface_points
+from lapgs_wgpu.train.discovery.tracks import Tracks, find_tracks
+from lapgs_wgpu.train.loop import train
+from lapgs_wgpu.train.presets import load_config
+from lapgs_wgpu.train.training import Training
+
+RADIUS, BOX = 0.2, 1.3
+QUICK = {
+    "schedule.steps": "70",
+    "discovery.steps": "60",
+    "discovery.field_steps": "120",
+    "points.count": "400",
+    "field.width": "16",
+    "field.static.levels": "4",
+    "field.temporal.levels": "4",
+}
+
+
+def disc(camera: Camera, center: np.ndarray, color: tuple[float, float, float]) -> np.ndarray:
+    """(H, W, 3) image of a ball on black."""
+    seen = camera.T_cam_world[:3, :3] @ center + camera.T_cam_world[:3, 3]
+    x = (np.arange(camera.width) + 0.5 - camera.K[0, 2]) / camera.K[0, 0]
+    y = (np.arange(camera.height) + 0.5 - camera.K[1, 2]) / camera.K[1, 1]
+    inside = np.hypot(x[None] - seen[0] / seen[2], y[:, None] - seen[1] / seen[2]) < RADIUS / seen[2]
+    return (inside[..., None] * np.array(color)).astype(np.float32)
+
+
+def path(t: np.ndarray) -> np.ndarray:
+    """(T, 3): one turn on a circle, four diameters wide."""
+    return np.stack([0.8 * np.cos(2 * np.pi * t), 0.8 * np.sin(2 * np.pi * t), 0.2 + 0 * t], axis=1)
+
+
+@pytest.fixture(scope="module")
+def residuals() -> list[Residual]:
+    """60 images of a ball that the static fit, black, has lost."""
+    times = np.linspace(0, 1, 60)
+    views = zip(cameras(60, 0, size=64), times, path(times), strict=True)
+    black = np.zeros((64, 64, 3), np.float32)
+    return [Residual(camera, float(t), disc(camera, center, (0.9, 0.5, 0.2)), black) for camera, t, center in views]
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    folder = tmp_path_factory.mktemp("motion") / "scene"
+    return load_dataset(write_motion(folder, MotionScene(path=4, cycles=1), size=64, train_times=60, test_views=2))
+
+
+def configure(**overrides: str) -> Config:
+    given = {name.replace("__", "."): value for name, value in overrides.items()}
+    return load_config("tiny", {**QUICK, **given})
+
+
+# Residuals -----------------------------------------------------------------------------------------------------------
+
+
+def test_moving_pixels_are_those_of_the_ball_and_not_of_blurred_texture() -> None:
+    rng = np.random.default_rng(0)
+    texture = np.repeat(np.repeat(rng.random((16, 16, 3)), 4, axis=0), 4, axis=1).astype(np.float32)
+    shifted = np.roll(texture, 1, axis=1)
+    assert moving_pixels(texture, shifted).mean() < 0.01
+    image = texture.copy()
+    image[20:32, 24:40] = (0.0, 2.0, 0.0)  # brighter than anything there
+    found = moving_pixels(image, shifted)
+    assert found[20:32, 24:40].mean() > 0.95
+    found[18:34, 22:42] = False
+    assert found.mean() < 0.01
+
+
+def test_samples_beside_an_image_and_behind_a_camera_are_outside(residuals: list[Residual]) -> None:
+    camera = residuals[0].camera
+    ahead = camera.T_cam_world[2, :3]
+    points = np.stack([camera.position + 3 * ahead, camera.position - 3 * ahead, camera.position + 0.5 * ahead + 9])
+    assert residuals[0].sample(points.astype(np.float32)).inside.tolist() == [True, False, False]
+
+
+# Surface points ------------------------------------------------------------------------------------------------------
+
+
+def test_surface_points_lie_on_the_ball_at_every_time(residuals: list[Residual]) -> None:
+    clouds = surface_points(residuals, BOX)
+    centers = path(clouds.times)
+    counts = [len(cloud.scores) for cloud in clouds.clouds]
+    assert min(counts) >= 10
+    distances = np.concatenate(
+        [np.linalg.norm(cloud.positions - c, axis=1) for cloud, c in zip(clouds.clouds, centers, strict=True)]
+    )
+    assert np.median(distances) < 1.2 * RADIUS
+    assert (distances < 1.6 * RADIUS).mean() > 0.95
+    assert np.allclose(np.concatenate([c.colors for c in clouds.clouds]), (0.9, 0.5, 0.2), atol=1e-5)
+
+
+def test_what_is_residual_at_all_times_is_no_motion() -> None:
+    times = np.linspace(0, 1, 30)
+    black = np.zeros((64, 64, 3), np.float32)
+    still = [
+        Residual(camera, float(t), disc(camera, np.zeros(3), (1.0, 1.0, 1.0)), black)
+        for camera, t in zip(cameras(30, 0, size=64), times, strict=True)
+    ]
+    pixels = sum(int(image.mask.sum()) for image in still)
+    assert surface_points(still, BOX).total < 0.2 * pixels  # of a moving ball all of them
+
+
+def test_images_without_motion_have_no_points(residuals: list[Residual]) -> None:
+    empty = [Residual(r.camera, r.time, r.image, r.image) for r in residuals]
+    clouds = surface_points(empty, BOX)
+    assert clouds.total == 0
+    assert find_tracks(clouds, BOX).tracks is None
+
+
+# Tracks --------------------------------------------------------------------------------------------------------------
+
+
+def balls(*centers: np.ndarray, gone: range = range(0)) -> PointClouds:
+    """Clouds of balls on paths (T, 3), seen from one side at a time; at the times `gone` there are no points."""
+    rng = np.random.default_rng(1)
+    times = np.linspace(0, 1, len(centers[0]))
+    colors = ((0.9, 0.2, 0.2), (0.2, 0.8, 0.3), (0.2, 0.3, 0.9))
+    clouds = []
+    for i in range(len(times)):
+        normals = rng.normal(size=(len(centers), 60, 3))
+        normals /= np.linalg.norm(normals, axis=2, keepdims=True)
+        side = rng.normal(size=3)
+        parts = [
+            (center[i] + RADIUS * n[n @ side > 0], np.tile(color, ((n @ side > 0).sum(), 1)))
+            for center, n, color in zip(centers, normals, colors, strict=False)
+        ]
+        positions, of_color = (np.concatenate(values).astype(np.float32) for values in zip(*parts, strict=True))
+        count = 0 if i in gone else len(positions)
+        clouds.append(Points(positions[:count], of_color[:count], np.full(count, 0.9, np.float32)))
+    return PointClouds(times, tuple(clouds))
+
+
+def errors(tracks: Tracks, center: np.ndarray) -> np.ndarray:
+    """(T,) distance of the best part's median point from a ball's centre at each time, in radii."""
+    every = [
+        np.linalg.norm(np.median(tracks.paths[:, tracks.part == part], axis=1) - center, axis=1)
+        for part in np.unique(tracks.part)
+    ]
+    return np.min(every, axis=0) / RADIUS
+
+
+def test_two_balls_are_followed_over_the_whole_clip() -> None:
+    t = np.linspace(0, 1, 80)
+    one = path(t)
+    other = np.stack([0.7 * np.cos(4 * np.pi * t), 0.0 * t, -0.6 + 0.0 * t], axis=1)
+    found = find_tracks(balls(one, other), BOX)
+    assert found.tracks is not None
+    assert found.explained > 0.95
+    for center in (one, other):
+        assert np.median(errors(found.tracks, center)) < 0.4
+        assert (errors(found.tracks, center) < 0.8).mean() > 0.95
+
+
+def test_a_ball_that_is_hidden_for_a_while_is_found_again() -> None:
+    center = path(np.linspace(0, 1, 80))
+    found = find_tracks(balls(center, gone=range(50, 54)), BOX)
+    assert found.tracks is not None
+    assert (errors(found.tracks, center) < 1.0).mean() > 0.9
+    assert not found.tracks.supported[51].any()
+
+
+def test_a_ball_that_enters_late_has_a_key_time_of_its_own() -> None:
+    first, late = path(np.linspace(0, 1, 60)), np.tile([0.0, 0.0, -0.9], (60, 1))
+    early, both = balls(first), balls(first, late)
+    clouds = PointClouds(both.times, early.clouds[:40] + both.clouds[40:])
+    found = find_tracks(clouds, BOX)
+    assert found.tracks is not None
+    assert (errors(found.tracks, late)[42:] < 0.8).all()
+
+
+def test_the_same_points_give_the_same_tracks() -> None:
+    clouds = balls(path(np.linspace(0, 1, 30)))
+    one, other = find_tracks(clouds, BOX).tracks, find_tracks(clouds, BOX).tracks
+    assert one is not None
+    assert other is not None
+    assert all(np.array_equal(a, b) for a, b in zip(one, other, strict=True))
+
+
+# The static fit and what it loses ------------------------------------------------------------------------------------
+
+
+def still_scene(device: Device) -> Scene4D:
+    """Opaque Gaussians at the origin."""
+    points = 0.1 * np.random.default_rng(0).normal(size=(50, 3))
+    return Scene4D.from_points(
+        points, np.full((50, 3), 0.5), np.full(50, 0.05), FieldConfig(kind="static"), opacity=0.9, device=device
+    )
+
+
+def tracks_along(*paths: np.ndarray) -> Tracks:
+    """Parts of 20 points around paths (T, 3)."""
+    spread = 0.03 * np.random.default_rng(0).normal(size=(20, 3))
+    every = np.concatenate([p[:, None] + spread for p in paths], axis=1).astype(np.float32)
+    part = np.repeat(np.arange(len(paths)), 20)
+    return Tracks(every[0], np.full((len(part), 3), 0.7, np.float32), part, every, np.ones(every.shape[:2], bool))
+
+
+def test_density_is_that_of_the_static_fit(device: Device) -> None:
+    density = density_at(still_scene(device), np.array([[0, 0, 0], [1, 0, 0]], np.float32))
+    assert density[0] > 0.5
+    assert density[1] < 1e-6
+
+
+def test_only_parts_in_empty_places_are_lost(device: Device) -> None:
+    scene, away = still_scene(device), path(np.linspace(0, 1, 9))
+    kept = lost_tracks(tracks_along(0 * away, away), scene)
+    assert kept is not None
+    assert np.array_equal(kept.positions, tracks_along(away).positions)
+    assert set(kept.part) == {0}
+    assert lost_tracks(tracks_along(0 * away), scene) is None
+
+
+def test_the_static_fit_has_no_motion_and_small_images(dataset: Dataset) -> None:
+    config = static_config(configure())
+    assert (config.field.kind, config.schedule.steps, config.schedule.warm_up) == ("static", 60, 60)
+    view = small_view(dataset.train[0], 32)
+    assert (view.camera.width, view.camera.height) == (32, 32)
+    assert view.load().shape == (32, 32, 4)
+    assert small_view(dataset.train[0], 64) is dataset.train[0]
+
+
+# The field, and all together -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["laplacian", "grid4d", "hexplane", "mlp"])
+def test_every_field_learns_tracks(device: Device, kind: str) -> None:
+    center = path(np.linspace(0, 1, 20)) * 0.5
+    config = load_config("tiny", {k: v for k, v in QUICK.items() if k.startswith("field.")}, method=kind).field
+    tracks = tracks_along(center)
+    scene = Scene4D.from_points(
+        tracks.positions, np.full((20, 3), 0.5), np.full(20, 0.05), config, device=device, seed=1
+    )
+    at_rest = np.linalg.norm(tracks.paths - tracks.positions, axis=2).mean()
+    times, generator = np.linspace(0, 1, 20), torch.Generator().manual_seed(0)
+    error = fit_field(scene, tracks, times, 0, 250, generator, lambda step: None)
+    assert error < {"laplacian": 0.35, "grid4d": 0.35, "hexplane": 0.65, "mlp": 0.65}[kind] * at_rest
+
+
+def test_discovery_starts_a_training_with_what_moves(dataset: Dataset, device: Device) -> None:
+    config = configure()
+    found = discover(config, dataset, device)
+    assert found.scene is not None
+    assert "moving parts" in found.summary
+    with closing(Training(config, dataset, device, scene=found.scene)) as training:
+        before = found.scene.parameters["means"].detach().clone()
+        training.step()
+        state = training.state()
+        field = training.scene.field
+        assert field is not None
+        assert any(p.grad is not None and p.grad.abs().sum() > 0 for p in field.parameters())  # from the first step on
+        assert not torch.equal(before, training.scene.parameters["means"])
+    with closing(Training(config, dataset, device)) as resumed:
+        resumed.restore(state)
+        assert int(resumed.state()["training.warm_up"]) == 0
+
+
+def test_a_whole_run_repeats_to_the_last_byte(dataset: Dataset, device: Device, tmp_path: Path) -> None:
+    for name in ("one", "other"):
+        train(configure(), dataset, tmp_path / name, device=device)
+    one, other = ((tmp_path / name / "checkpoint.ply").read_bytes() for name in ("one", "other"))
+    assert one == other
+
+
+def test_images_that_show_nothing_are_refused(dataset: Dataset, device: Device) -> None:
+    import dataclasses
+
+    def empty() -> np.ndarray:
+        return np.zeros((64, 64, 4), np.uint8)
+
+    views = tuple(dataclasses.replace(view, pixels=empty) for view in dataset.train)
+    with pytest.raises(InputError, match="show nothing but the black background"):
+        discover(configure(), dataclasses.replace(dataset, train=views), device)
+
+
+def test_short_trainings_go_without(
+    dataset: Dataset, device: Device, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    train(configure(schedule__steps="3", schedule__warm_up="1"), dataset, tmp_path / "run", device=device)
+    assert "discovery" not in capsys.readouterr().out
