@@ -123,6 +123,10 @@ def fingerprint(config: Config) -> str:
         del values["schedule"]["batch"]
     if not config.exposure.enabled:
         del values["exposure"]
+    if not config.discovery.enabled:
+        del values["discovery"]
+    if config.density.limit == 0:
+        del values["density"]["limit"]
     if config.precision == "float32":
         del values["precision"]
     if config.decoder != "device":
