@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
@@ -22,6 +23,7 @@ KEY_TIMES = 4  # from which is tracked, at most
 LEAST_REST = 0.05  # share of the points without a track that is worth another key time
 LEAST_PART = 12  # points
 ROUGH, FINE = 150, 300  # points of a key time: when first followed, and with the points of all times brought there
+PROBES = 300  # points of a time by which parts are counted, at most
 DATA = 160  # points of a time that a part is compared with, at most
 MEMORY = 6  # times from which a motion is predicted
 ROUNDS = 5  # of the registration
@@ -99,7 +101,8 @@ def find_tracks(clouds: PointClouds, half_side: float) -> Found:
 
 def _key_time(clouds: list[Points], half_side: float) -> int | None:
     """The time of most points among those at which no fewer parts than usual are apart."""
-    parts = np.array([_count_parts(_merged(clouds, i), half_side) for i in range(len(clouds))])
+    some = [_thinned(points, PROBES) for points in clouds]
+    parts = np.array([_count_parts(_merged(some, i), half_side) for i in range(len(clouds))])
     if not parts.any():
         return None
     usual = int(np.median(parts[parts > 0]))
@@ -123,8 +126,9 @@ def _count_parts(points: Points, half_side: float) -> int:
 
 def _parts(positions: Floats, link: float) -> NDArray[np.int64]:
     """(n,) number of the connected part of each point."""
-    tree = cKDTree(positions)
-    return connected_components(tree.sparse_distance_matrix(tree, link), directed=False)[1].astype(np.int64)
+    pairs, count = cKDTree(positions).query_pairs(link, output_type="ndarray"), len(positions)
+    graph = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    return connected_components(graph, directed=False)[1].astype(np.int64)
 
 
 def _voxels(points: Points, size: float, least: int) -> Points:
