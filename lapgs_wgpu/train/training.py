@@ -256,8 +256,8 @@ class Training:
             )
             if not change.keep.any() and len(change.added["means"]) == 0:
                 raise InputError(
-                    f"density control leaves no Gaussian at step {step}; lower density.min_opacity or density.gradient,"
-                    " or raise density.max_world_size or density.max_screen_radius (0 switches these two off)."
+                    f"density control leaves no Gaussian at step {step}; raise density.max_world_size or "
+                    "density.max_screen_radius (0 switches these two off)."
                 )
             self._optimiser.edit_rows(change.keep, change.added)
             self._optimiser.reorder(morton_order(scene.parameters["means"].detach()))
