@@ -286,6 +286,26 @@ def test_a_whole_run_repeats_to_the_last_byte(dataset: Dataset, device: Device, 
     assert one == other
 
 
+def test_a_training_that_discovery_started_goes_on_to_the_same_bits(dataset: Dataset, device: Device) -> None:
+    config = configure()
+    scene = discover(config, dataset, device).scene
+    with closing(Training(config, dataset, device, scene=scene)) as whole:
+        for _ in range(5):
+            whole.step()
+        state = {name: value.copy() for name, value in whole.state().items()}
+        for _ in range(5):
+            whole.step()
+        expected = whole.state()
+    with closing(Training(config, dataset, device)) as resumed:
+        resumed.restore(state)
+        for _ in range(5):
+            resumed.step()
+        found = resumed.state()
+    assert found.keys() == expected.keys()
+    for name, value in expected.items():
+        assert np.array_equal(found[name], value), name
+
+
 def test_images_that_show_nothing_are_refused(dataset: Dataset, device: Device) -> None:
     import dataclasses
 
