@@ -1,7 +1,7 @@
 """Built-in scenes that measure motion: two objects travel a known path, seen by cameras of a known kind.
 
 A ball runs along a circle and a box along a line, both `path` of their diameters wide and `cycles` times over the clip;
-a small ball below them stands still. z is up. Everything lies in [-1.3, 1.3]^3, and within the view of all cameras
+a small ball below them stands still. z is up. All objects stay within [-1.3, 1.3]^3 and within the view of all cameras
 except where the scene says otherwise, so the objects' size follows from the path. `write_motion` writes a scene in
 the D-NeRF layout with its true trajectories, masks and clean plates (`objects.json`, docs/metrics.md).
 """

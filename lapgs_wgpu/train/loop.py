@@ -43,7 +43,7 @@ from lapgs_wgpu.train.run_folder import (
 from lapgs_wgpu.train.training import Progress, Training
 
 PROBES = 2048  # points of the scene that say whether a camera sees it
-OUTSIDE = 0.05  # share of Gaussians outside of the encoder's box from which on it is told
+OUTSIDE = 0.05  # warn if this share of the Gaussians, or more, is outside the encoder's box
 
 # Takes over a training's steps, such as a viewer does: called with the scene, where to look at it from, and the steps,
 # of which it takes as many as it likes, each one a step of the training. The rest follows when it returns.

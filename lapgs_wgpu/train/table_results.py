@@ -115,7 +115,7 @@ def _read_result(entry: Any, where: str) -> Result:
         "float": int | float,
         "float | None": int | float,
         "list[int]": list,
-    }  # what is left are tables
+    }  # the remaining values are tables
     return Result(
         **{
             field.name: _checked(entry, field.name, kinds.get(str(field.type), dict), where)

@@ -1,7 +1,7 @@
 """Points on the surfaces that move: rays of moving pixels, at depths on which images of neighbouring times agree.
 
 Cameras of neighbouring times see a moving object from other sides while it has hardly moved: its silhouettes meet in
-space. What lies in the residual at all times is no motion, but texture that the static fit blurs.
+space. Places that differ at all times hold texture that the static fit blurs. They get no points.
 """
 
 from __future__ import annotations
