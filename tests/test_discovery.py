@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from contextlib import closing
 from pathlib import Path
 
@@ -307,8 +308,6 @@ def test_a_training_that_discovery_started_goes_on_to_the_same_bits(dataset: Dat
 
 
 def test_images_that_show_nothing_are_refused(dataset: Dataset, device: Device) -> None:
-    import dataclasses
-
     def empty() -> np.ndarray:
         return np.zeros((64, 64, 4), np.uint8)
 

@@ -74,7 +74,6 @@ def static_config(config: Config) -> Config:
         ),
         loss=dataclasses.replace(config.loss, pyramid=0.0, ncc=0.0, dynamics_mode="off"),
         smoothness=dataclasses.replace(config.smoothness, share=0.0),
-        discovery=dataclasses.replace(config.discovery, enabled=False),
         precision="float32",
         decoder="torch",
     )

@@ -156,24 +156,16 @@ def _tracks_from(
     key: int, start: Points, times: NDArray[np.float64], clouds: list[Points], half_side: float
 ) -> Tracks | None:
     """The points of a key time, followed twice: first those of that time, then with all that belongs to them."""
-    template = _voxels(start, VOXEL * half_side, least=1)
-    for most in (ROUGH, FINE):
-        template = _thinned(template, most)
-        follower = _Follower(template, half_side)
+    follower = _Follower(_thinned(_voxels(start, VOXEL * half_side, least=1), ROUGH), half_side)
+    if len(follower.positions) == 0:
+        return None
+    paths = follower.follow(key, times, clouds)
+    template = _at_key_time(key, paths, clouds, half_side)
+    if len(template.scores) >= LEAST_PART:
+        follower = _Follower(_thinned(template, FINE), half_side)
         if len(follower.positions) == 0:
             return None
         paths = follower.follow(key, times, clouds)
-        # All points of the clip that a track explains, brought back to the key time.
-        parts = []
-        for points, path in zip(clouds, paths, strict=True):
-            if len(points.scores):
-                distances, of = cKDTree(path).query(points.positions)
-                near = distances < REACH * half_side
-                moved = points.positions[near] + (paths[key] - path)[of[near]]
-                parts.append(Points(moved, points.colors[near], points.scores[near]))
-        template = _voxels(Points(*(np.concatenate(v) for v in zip(*parts, strict=True))), VOXEL * half_side, least=3)
-        if len(template.scores) < LEAST_PART:
-            break
     supported = np.zeros(paths.shape[:2], bool)
     for i, points in enumerate(clouds):
         if len(points.scores):
@@ -181,6 +173,19 @@ def _tracks_from(
             share = np.bincount(follower.part, near) / np.bincount(follower.part)
             supported[i] = share[follower.part] > SUPPORTED
     return Tracks(follower.positions, follower.colors, follower.part, paths, supported)
+
+
+def _at_key_time(key: int, paths: Floats, clouds: list[Points], half_side: float) -> Points:
+    """All points of the clip that a track (paths: (T, n, 3)) explains, moved with it to the key time."""
+    parts = []
+    for points, path in zip(clouds, paths, strict=True):
+        if len(points.scores):
+            distances, of = cKDTree(path).query(points.positions)
+            near = distances < REACH * half_side
+            moved = points.positions[near] + (paths[key] - path)[of[near]]
+            parts.append(Points(moved, points.colors[near], points.scores[near]))
+    merged = Points(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+    return _voxels(merged, VOXEL * half_side, least=3)
 
 
 class _Follower:
