@@ -32,6 +32,7 @@ SCALE = 0.8  # of it, in mean distances to its nearest neighbours
 DYNAMICS = 0.5  # standard deviation of its dynamics attribute, which it shares with its part
 EMPTY = 0.1  # opacity of the static fit, below which a place counts as empty
 OPAQUE = 0.1  # least opacity of a Gaussian of the static fit that is looked at
+NEAR = 0.1  # box half sides; distance within which a track explains a surface point
 SHOWN = 2.0 / 255  # least difference from the background of an image that shows something
 
 
@@ -117,7 +118,7 @@ def explained_share(clouds: PointClouds, tracks: Tracks, half_side: float) -> fl
     near = 0
     for cloud, path in zip(clouds.clouds, tracks.paths, strict=True):
         if len(cloud.scores):
-            near += int((cKDTree(path).query(cloud.positions)[0] < 0.1 * half_side).sum())
+            near += int((cKDTree(path).query(cloud.positions)[0] < NEAR * half_side).sum())
     return near / max(clouds.total, 1)
 
 
