@@ -80,6 +80,30 @@ def test_axes_and_field_of_view_of_wide_pictures(tmp_path: Path) -> None:
         np.testing.assert_allclose(p[:2] / p[2], pixel, atol=1e-9)
 
 
+def test_intrinsics_of_frames_and_file(tmp_path: Path) -> None:
+    """A frame's own focal lengths and principal point, else those of the file, else the angle; all scaled from w, h."""
+
+    def give(folder: Path, scene: Scene) -> None:
+        scene["train"]["fl_y"] = 30.0
+        scene["train"]["frames"][1].update(fl_x=20.0, fl_y=22.0, cx=5.0, cy=3.0)
+        scene["train"]["frames"][2].update(fl_x=40.0, cx=11.0, cy=9.0, w=2 * WIDTH, h=2 * HEIGHT)
+
+    first, second, third = (view.camera.K for view in load_dataset(make_scene(tmp_path / "toy", give)).train)
+    focal = WIDTH / 2 / math.tan(FOV_X / 2)
+    np.testing.assert_allclose(first, [[focal, 0, WIDTH / 2], [0, 30, HEIGHT / 2], [0, 0, 1]])
+    np.testing.assert_allclose(second, [[20, 0, 5], [0, 22, 3], [0, 0, 1]])
+    np.testing.assert_allclose(third, [[20, 0, 5.5], [0, 15, 4.5], [0, 0, 1]])
+
+
+def test_focal_lengths_need_no_angle(tmp_path: Path) -> None:
+    def give(folder: Path, scene: Scene) -> None:
+        for data in scene.values():
+            del data["camera_angle_x"]
+            data["fl_x"] = 17.0
+
+    assert load_dataset(make_scene(tmp_path / "toy", give)).train[0].camera.K[1, 1] == pytest.approx(17.0)
+
+
 def test_pixels_are_those_of_the_file(tmp_path: Path) -> None:
     view = load_dataset(make_scene(tmp_path / "toy")).train[1]
     pixels = view.load()
@@ -226,6 +250,10 @@ BAD: dict[str, tuple[Callable[[Path, Scene], Any], list[str]]] = {
     "angle in degrees": (scene_with(camera_angle_x=39.6), ["camera_angle_x", "radians", "39.6"]),
     "angle of zero": (scene_with(camera_angle_x=0), ["camera_angle_x", "got 0"]),
     "angle of a denormal": (scene_with(camera_angle_x=1e-320), ["camera_angle_x"]),
+    "no focal length": (scene_with(fl_x=0), ["transforms_train.json", "fl_x is 0", "pixels"]),
+    "focal length of a frame": (frame_with(fl_x=1e9), [*FRAME, "fl_x is 1e+09"]),
+    "principal point of text": (scene_with(cx="middle"), ["cx", '"middle"']),
+    "lens distortion": (scene_with(k1=0.1), ["k1 is 0.1", "undistort"]),
     "angle of NaN": (scene_with(camera_angle_x=math.nan), ["camera_angle_x", "nan"]),
     "no frames": (lambda folder, scene: scene["train"].pop("frames"), ["no field frames"]),
     "empty frames": (scene_with(frames=[]), ["frames", "at least one"]),

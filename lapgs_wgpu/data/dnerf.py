@@ -10,13 +10,13 @@ import os
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.data.cloud import Cloud, check_cloud, find_cloud, read_cloud
-from lapgs_wgpu.data.fields import check_inside, kind, number, read_json, required
+from lapgs_wgpu.data.fields import check_inside, finite, kind, number, read_json, required
 from lapgs_wgpu.data.objects import ObjectTruth, read_objects
 from lapgs_wgpu.data.pictures import PICTURE_SUFFIXES, check_pictures, read_picture, shrunk
 from lapgs_wgpu.data.poses import BOX, opengl_pose
@@ -26,13 +26,44 @@ from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
 
 NEEDED = "which a D-NeRF scene needs"
+LARGEST_INTRINSIC = 1e6  # pixels
+DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 CLOUDS = ("fused.ply", "points3d.ply", "points3D.ply")
+
+
+class _Intrinsics(NamedTuple):
+    """Focal lengths and principal point, in pixels of an image of size (w, h).
+
+    Where a file leaves one out, fov_x (radians) gives the focal lengths, the centre is the principal point, and (w, h)
+    is the size of the stored image."""
+
+    fov_x: float | None
+    fl_x: float | None
+    fl_y: float | None
+    cx: float | None
+    cy: float | None
+    w: float | None
+    h: float | None
+
+    def matrix(self, width: int, height: int) -> NDArray[np.float64]:
+        """(3, 3) K of a stored image of width x height pixels."""
+        across, down = width / (self.w or width), height / (self.h or height)
+        if self.fl_x is not None:
+            fx = self.fl_x * across
+        else:
+            assert self.fov_x is not None
+            fx = 0.5 * width / math.tan(0.5 * self.fov_x)
+        fy = fx if self.fl_y is None else self.fl_y * down
+        cx = 0.5 * width if self.cx is None else self.cx * across
+        cy = 0.5 * height if self.cy is None else self.cy * down
+        return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
 
 
 class _Frame(NamedTuple):
     picture: Path
     T_cam_world: NDArray[np.float64]
     time: float
+    intrinsics: _Intrinsics
 
 
 def is_dnerf(folder: str | Path) -> bool:
@@ -48,25 +79,22 @@ def load_dnerf(folder: str | Path, *, image_size: int | None = None, normalize: 
     transforms_val.json is not read. Frames without `time` are taken as evenly spaced over the clip.
     objects.json, where there is one, says where moving objects are in the test views.
     normalize: move and scale a scene that does not fit the presets' cube (`standard_box`); False keeps its coordinates.
+    fl_x, fl_y, cx, cy, of a frame or of the file, count more than camera_angle_x.
     Raises InputError, naming file, frame and field, where the scene cannot be trained on as it stands.
     """
     folder = Path(folder)
     if not folder.is_dir():
         problem = "is not a folder" if folder.exists() else "does not exist"
         raise InputError(f"{folder} {problem}; give the folder that holds transforms_train.json.")
-    train_fov, train = _read_split(folder, "train")
-    test_fov, test = _read_split(folder, "test")
+    train, test = _read_split(folder, "train"), _read_split(folder, "test")
 
     stored = check_pictures([frame.picture for frame in train + test])
     size = shrunk(stored, image_size)
 
-    def cameras(fov_x: float, frames: list[_Frame]) -> list[Camera]:
-        # camera_angle_x is the horizontal field of view, and pixels are square: one focal length serves both axes.
-        focal = 0.5 * stored[0] / math.tan(0.5 * fov_x)
-        K = np.array([[focal, 0, stored[0] / 2], [0, focal, stored[1] / 2], [0, 0, 1]])
-        return [Camera(K, frame.T_cam_world, *stored).resized(*size) for frame in frames]
+    def cameras(frames: list[_Frame]) -> list[Camera]:
+        return [Camera(frame.intrinsics.matrix(*stored), frame.T_cam_world, *stored).resized(*size) for frame in frames]
 
-    train_cameras, test_cameras = cameras(train_fov, train), cameras(test_fov, test)
+    train_cameras, test_cameras = cameras(train), cameras(test)
     objects = read_objects(folder, "test", [frame.picture.stem for frame in test], test_cameras)
     cloud = _surfaces(folder, train_cameras)
     cube = cube_of_cloud(cloud) if cloud is not None else cube_in_view(train_cameras)
@@ -122,15 +150,12 @@ def _surfaces(folder: Path, cameras: list[Camera]) -> Cloud | None:
     return cloud
 
 
-def _read_split(folder: Path, split: str) -> tuple[float, list[_Frame]]:
-    """One transforms file: the horizontal field of view in radians, and the frames."""
+def _read_split(folder: Path, split: str) -> list[_Frame]:
+    """The frames of one transforms file."""
     path = folder / f"transforms_{split}.json"
     if not path.is_file():
         raise InputError(f"{path} does not exist; a D-NeRF scene needs transforms_train.json and transforms_test.json.")
     data = read_json(path, "camera_angle_x and frames")
-    fov_x = number(required(data, "camera_angle_x", path, NEEDED), "camera_angle_x", path)
-    if not 1e-6 < fov_x < math.pi:
-        raise InputError(f"{path}: camera_angle_x must be an angle in radians between 0 and pi, got {fov_x:g}.")
     frames = required(data, "frames", path, NEEDED)
     if not isinstance(frames, list) or not frames:
         raise InputError(f"{path}: frames must be a list of at least one frame, got {kind(frames)}.")
@@ -157,5 +182,33 @@ def _read_split(folder: Path, split: str) -> tuple[float, list[_Frame]]:
             time = number(required(frame, "time", where, hint), "time", where)
             if not 0 <= time <= 1:
                 raise InputError(f"{where}: time must lie in [0, 1], got {time:g}; divide by the clip's duration.")
-        parsed.append(_Frame(picture, T_cam_world, time))
-    return fov_x, parsed
+        parsed.append(_Frame(picture, T_cam_world, time, _intrinsics(frame, data, where, path)))
+    return parsed
+
+
+def _intrinsics(frame: dict[str, Any], shared: dict[str, Any], where: str, path: Path) -> _Intrinsics:
+    """A frame's own values, else those of the file, which itself is `shared`."""
+    values: dict[str, float | None] = dict.fromkeys(_Intrinsics._fields)
+    for name in (*_Intrinsics._fields[1:], *DISTORTION):
+        source, at = (frame, where) if name in frame else (shared, str(path))
+        if source.get(name) is None:
+            continue
+        got = finite(source[name], name, at)
+        if name in DISTORTION:
+            if got:
+                raise InputError(
+                    f"{at}: {name} is {got:g}, but images in the D-NeRF layout must have no lens distortion; undistort "
+                    "them, or use nerfstudio's layout (transforms.json)."
+                )
+            continue
+        positive = name not in ("cx", "cy")
+        if abs(got) > LARGEST_INTRINSIC or (positive and got <= 0):
+            raise InputError(f"{at}: {name} is {got:g}, which no camera has; it must be in pixels.")
+        values[name] = got
+    if values["fl_x"] is None:
+        source, at = (frame, where) if "camera_angle_x" in frame else (shared, str(path))
+        fov_x = number(required(source, "camera_angle_x", at, NEEDED), "camera_angle_x", at)
+        if not 1e-6 < fov_x < math.pi:
+            raise InputError(f"{at}: camera_angle_x must be an angle in radians between 0 and pi, got {fov_x:g}.")
+        values["fov_x"] = fov_x
+    return _Intrinsics(**values)
