@@ -26,6 +26,7 @@ from lapgs_wgpu.train.discovery.residual import Residual, moving_pixels
 from lapgs_wgpu.train.discovery.static_fit import small_view, static_config
 from lapgs_wgpu.train.discovery.surface_points import PointClouds, Points, surface_points
 from lapgs_wgpu.train.discovery.tracks import Tracks, find_tracks
+from lapgs_wgpu.train.discovery.trajectories import find_trajectories
 from lapgs_wgpu.train.loop import train
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.training import Training
@@ -163,6 +164,54 @@ def errors(tracks: Tracks, center: np.ndarray) -> np.ndarray:
         for part in np.unique(tracks.part)
     ]
     return np.min(every, axis=0) / RADIUS
+
+
+LINK = 0.14
+
+
+def fast_path(t: np.ndarray) -> np.ndarray:
+    """(T, 3): five turns on the circle; at 100 times, 1.3 radii of the ball from one time to the next."""
+    return path(np.mod(5 * t, 1.0))
+
+
+def test_trajectories_follow_what_passes_its_own_radius_from_one_time_to_the_next() -> None:
+    t = np.linspace(0, 1, 100)
+    one, other = fast_path(t), np.stack([0.8 * np.cos(10 * np.pi * t), 0 * t, -0.7 + 0 * t], axis=1)
+    found = find_trajectories(balls(one, other), LINK, BOX)
+    assert len(found) == 2
+    for center in (one, other):
+        apart = min((np.linalg.norm(each.centers - center, axis=1) for each in found), key=np.median)
+        assert np.median(apart) < 0.8 * RADIUS
+        assert (apart < 2 * RADIUS).mean() > 0.9
+
+
+def test_a_trajectory_leaps_over_times_without_points() -> None:
+    center = path(np.linspace(0, 1, 80))
+    (found,) = find_trajectories(balls(center, gone=range(50, 54)), LINK, BOX)
+    assert not found.seen[50:54].any()
+    assert found.seen[:50].mean() > 0.9
+    assert found.seen[54:].mean() > 0.9
+    assert (np.linalg.norm(found.centers - center, axis=1) < 1.5 * RADIUS).all()
+
+
+def test_a_trajectory_does_not_change_over_to_another_colour_at_a_crossing() -> None:
+    t = np.linspace(-1, 1, 60)
+    one, other = np.stack([0.9 * t, 0.25 + 0 * t, 0 * t], axis=1), np.stack([0 * t, 0.9 * t - 0.3, 0 * t], axis=1)
+    found = find_trajectories(balls(one, other), LINK, BOX)
+    for center in (one, other):
+        assert min(np.linalg.norm(each.centers - center, axis=1)[[0, 10, 50, 59]].max() for each in found) < RADIUS
+
+
+def test_points_without_a_group_have_no_trajectory() -> None:
+    empty = Points(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), np.zeros(0, np.float32))
+    assert find_trajectories(PointClouds(np.linspace(0, 1, 9), (empty,) * 9), LINK, BOX) == []
+
+
+def test_what_is_fast_is_followed_over_the_whole_clip() -> None:
+    center = fast_path(np.linspace(0, 1, 100))
+    found = find_tracks(balls(center), BOX)
+    assert found.tracks is not None
+    assert (errors(found.tracks, center) < 0.8).mean() > 0.9
 
 
 def test_two_balls_are_followed_over_the_whole_clip() -> None:

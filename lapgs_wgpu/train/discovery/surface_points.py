@@ -12,6 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from .residual import Floats, Residual
@@ -124,6 +126,13 @@ def _dense(points: Points, half_side: float) -> Points:
     distances, _ = cKDTree(points.positions).query(points.positions, k=5)
     kept = distances[:, 4] < LONELY * half_side
     return Points(*(values[kept] for values in points))
+
+
+def parts_of(positions: Floats, link: float) -> NDArray[np.int64]:
+    """(n,) number of the connected part of each point (n, 3), where points closer than `link` are connected."""
+    pairs, count = cKDTree(positions).query_pairs(link, output_type="ndarray"), len(positions)
+    graph = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    return connected_components(graph, directed=False)[1].astype(np.int64)
 
 
 class _Always:

@@ -1,9 +1,9 @@
 """Tracks: surface points of all times linked to points that move.
 
 Points of a key time, at which things are apart, form parts. Each part is followed from there to both ends of the clip.
-Its motion so far predicts a translation; a search around it finds the translation that explains most points; and a
-registration in the manner of coherent point drift (Myronenko and Song 2010), stiff within a part, bends it. What no
-track explains forms the parts of the next key time.
+Its motion so far predicts a translation, and so does the trajectory of its center (`trajectories`); a search around
+both finds the translation that explains most points; and a registration in the manner of coherent point drift
+(Myronenko and Song 2010), stiff within a part, bends it. What no track explains forms the parts of the next key time.
 """
 
 from __future__ import annotations
@@ -12,12 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from .residual import Floats
-from .surface_points import PointClouds, Points
+from .surface_points import PointClouds, Points, parts_of
+from .trajectories import Trajectory, find_trajectories
 
 KEY_TIMES = 4  # from which is tracked, at most
 LEAST_REST = 0.05  # share of the points without a track that is worth another key time
@@ -33,11 +32,14 @@ VOXEL = 0.045  # spacing of a track's points
 REACH = 0.07  # distance within which a track explains a point
 UNIT = 0.077  # half the size of a small object: the search goes by this
 # In UNIT:
-SEARCH, SEARCH_STEP = 2.4, 0.6  # around the predicted place
+SEARCH = 2.4  # radius around the predicted place
+SEARCH_STEPS = 1.2, 0.6  # of a rough search, and of a fine one around its best places
+SEARCH_SPREADS = 0.9, 0.5  # standard deviation of the distance from a part at which it explains a point
 FAST = 2.5  # the search reaches as far as this many times the way from one time to the next
 PRIOR = 2.0  # standard deviation of the true place around it
 STIFF, SOFT = 5.0, 2.0  # standard deviation of the kernel over which a part moves together, first and last
 WIDE, NARROW = 0.6, 0.35  # standard deviation of the registration, first and last
+CANDIDATES = 4  # best places of the rough search
 COLOR_SPREAD = 0.3
 NOISE = 0.1  # weight of the hypothesis that a point belongs to no track
 EXPLAINED = 0.3  # weight of points that an earlier key time's tracks explain
@@ -69,6 +71,7 @@ class Found(NamedTuple):
 def find_tracks(clouds: PointClouds, half_side: float) -> Found:
     """Tracks of the surface points of a clip. half_side: of the box that they lie in, world units."""
     free = [np.ones(len(cloud.scores), bool) for cloud in clouds.clouds]
+    trajectories = find_trajectories(clouds, LINK * half_side, half_side)
     found: list[Tracks] = []
     for _ in range(KEY_TIMES):
         rest = [Points(*(values[mask] for values in cloud)) for cloud, mask in zip(clouds.clouds, free, strict=True)]
@@ -79,7 +82,7 @@ def find_tracks(clouds: PointClouds, half_side: float) -> Found:
             points._replace(scores=points.scores * np.where(mask, 1.0, EXPLAINED).astype(np.float32))
             for points, mask in zip(clouds.clouds, free, strict=True)
         ]
-        tracks = _tracks_from(key, _merged(rest, key), clouds.times, weighted, half_side)
+        tracks = _tracks_from(key, _merged(rest, key), clouds.times, weighted, trajectories, half_side)
         if tracks is None:
             break
         found.append(tracks)
@@ -121,14 +124,7 @@ def _merged(clouds: list[Points], i: int) -> Points:
 def _count_parts(points: Points, half_side: float) -> int:
     if len(points.scores) < LEAST_PART:
         return 0
-    return int((np.bincount(_parts(points.positions, LINK * half_side)) >= LEAST_PART).sum())
-
-
-def _parts(positions: Floats, link: float) -> NDArray[np.int64]:
-    """(n,) number of the connected part of each point."""
-    pairs, count = cKDTree(positions).query_pairs(link, output_type="ndarray"), len(positions)
-    graph = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
-    return connected_components(graph, directed=False)[1].astype(np.int64)
+    return int((np.bincount(parts_of(points.positions, LINK * half_side)) >= LEAST_PART).sum())
 
 
 def _voxels(points: Points, size: float, least: int) -> Points:
@@ -153,19 +149,24 @@ def _thinned(points: Points, most: int) -> Points:
 
 
 def _tracks_from(
-    key: int, start: Points, times: NDArray[np.float64], clouds: list[Points], half_side: float
+    key: int,
+    start: Points,
+    times: NDArray[np.float64],
+    clouds: list[Points],
+    trajectories: list[Trajectory],
+    half_side: float,
 ) -> Tracks | None:
     """The points of a key time, followed twice: first those of that time, then with all that belongs to them."""
     follower = _Follower(_thinned(_voxels(start, VOXEL * half_side, least=1), ROUGH), half_side)
     if len(follower.positions) == 0:
         return None
-    paths = follower.follow(key, times, clouds)
+    paths = follower.follow(key, times, clouds, trajectories)
     template = _at_key_time(key, paths, clouds, half_side)
     if len(template.scores) >= LEAST_PART:
         follower = _Follower(_thinned(template, FINE), half_side)
         if len(follower.positions) == 0:
             return None
-        paths = follower.follow(key, times, clouds)
+        paths = follower.follow(key, times, clouds, trajectories)
     supported = np.zeros(paths.shape[:2], bool)
     for i, points in enumerate(clouds):
         if len(points.scores):
@@ -193,7 +194,7 @@ class _Follower:
 
     def __init__(self, template: Points, half_side: float) -> None:
         unit = UNIT * half_side
-        part = _parts(template.positions, LINK * half_side)
+        part = parts_of(template.positions, LINK * half_side)
         kept = np.bincount(part)[part] >= LEAST_PART
         self.positions, self.colors = template.positions[kept], template.colors[kept]
         self.part = np.unique(part[kept], return_inverse=True)[1].ravel()
@@ -204,15 +205,18 @@ class _Follower:
         same = self.part[:, None] == self.part[None]
         apart = ((self.positions[:, None] - self.positions[None]) ** 2).sum(axis=2)
         self._kernels = [np.exp(-apart / (2 * (h * unit) ** 2)).astype(np.float32) * same for h in (STIFF, SOFT)]
-        axis = np.arange(-SEARCH, SEARCH + 1e-6, SEARCH_STEP)
-        grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-        self._shifts = (unit * grid[np.linalg.norm(grid, axis=1) <= SEARCH + 1e-6]).astype(np.float32)
+        rough = unit * _grid(SEARCH, SEARCH_STEPS[0])
+        self._rough = rough[np.linalg.norm(rough, axis=1) < (SEARCH + 1e-3) * unit]
+        self._fine = unit * _grid(SEARCH_STEPS[1], SEARCH_STEPS[1])
         self._usual: list[list[float]] = [[] for _ in self._members]
         self._lost = [0] * len(self._members)
         self._speed = [0.0] * len(self._members)  # world units from one time to the next
 
-    def follow(self, key: int, times: NDArray[np.float64], clouds: list[Points]) -> Floats:
+    def follow(
+        self, key: int, times: NDArray[np.float64], clouds: list[Points], trajectories: list[Trajectory]
+    ) -> Floats:
         """(T, n, 3) paths over all times."""
+        expected = [self._expected(members, key, trajectories) for members in self._members]
         paths = np.zeros((len(times), *self.positions.shape), np.float32)
         paths[key] = self.positions
         order = sorted((i for i in range(len(times)) if i != key), key=lambda i: (abs(i - key), i))
@@ -221,9 +225,20 @@ class _Follower:
             side = 1 if i > key else -1
             known = past[side] if len(past[side]) >= MEMORY else past[-side][1:MEMORY][::-1] + past[side]
             start = self._predict(times[known[-MEMORY:]], paths[known[-MEMORY:]], times[i])
-            paths[i] = self._register(start, clouds[i], first=len(past[side]) == 1)
+            centers = [None if path is None else path[i] for path in expected]
+            paths[i] = self._register(start, clouds[i], centers, first=len(past[side]) == 1)
             past[side].append(i)
         return paths
+
+    def _expected(self, members: NDArray[np.int64], key: int, trajectories: list[Trajectory]) -> Floats | None:
+        """(T, 3) centers of a part by the trajectory that passes it at the key time; None where none does."""
+        center = self.positions[members].mean(axis=0)
+        radius = float(np.linalg.norm(self.positions[members] - center, axis=1).max())
+        for trajectory in trajectories:
+            offset = center - trajectory.centers[key]
+            if trajectory.seen[max(0, key - 1) : key + 2].any() and np.linalg.norm(offset) < max(radius, self._unit):
+                return trajectory.centers + offset
+        return None
 
     def _predict(self, times: NDArray[np.float64], paths: Floats, t: float) -> Floats:
         """Positions (n, 3) at time t, from those at earlier times: each part goes on by its mean's path."""
@@ -244,15 +259,16 @@ class _Follower:
             positions[members] += step * min(1.0, longest / max(float(np.linalg.norm(step)), 1e-9))
         return positions
 
-    def _register(self, start: Floats, points: Points, *, first: bool) -> Floats:
-        """Positions (n, 3) of the tracks' points among the points of a time, from a prediction."""
+    def _register(self, start: Floats, points: Points, expected: list[Floats | None], *, first: bool) -> Floats:
+        """Positions (n, 3) of the tracks' points among the points of a time, from a prediction and from where the
+        parts' centers are expected."""
         points = _thinned(points, DATA)
         positions = start.copy()
         if len(points.scores) == 0:
             return positions
         free = np.ones(len(points.scores), np.float32)
         for k, members in enumerate(self._members):
-            free *= 1.0 - 0.9 * self._search(k, members, positions, points, free, first=first)
+            free *= 1.0 - 0.9 * self._search(k, members, positions, points, free, expected[k], first=first)
         data, weights = points.positions, points.scores[:, None]
         alike = 0.2 + 0.8 * np.exp(-_squared(points.colors, self.colors) / (2 * COLOR_SPREAD**2))
         for step in range(ROUNDS):
@@ -266,28 +282,71 @@ class _Follower:
         return positions
 
     def _search(
-        self, k: int, members: NDArray[np.int64], positions: Floats, points: Points, free: Floats, *, first: bool
+        self,
+        k: int,
+        members: NDArray[np.int64],
+        positions: Floats,
+        points: Points,
+        free: Floats,
+        expected: Floats | None,
+        *,
+        first: bool,
     ) -> Floats:
-        """Shift a part in `positions` to where it explains most; (m,) how well it explains each point there."""
-        some = members[np.linspace(0, len(members) - 1, min(24, len(members))).astype(np.int64)]
+        """Shift a part in `positions` to where it explains most, around where it is and around where its center is
+        expected; (m,) how well it explains each point there."""
         widening = min(max(1.0, FAST * self._speed[k] / (SEARCH * self._unit)), 2.0)
-        shifts = self._shifts * (1.5 if first else widening + 0.25 * min(self._lost[k], 4))
-        data = (points.positions[None] - shifts[:, None]).reshape(-1, 3)
-        squared = _squared(data, positions[some])
-        nearest = squared.argmin(axis=1)
-        near = np.exp(-squared[np.arange(len(data)), nearest] / (2 * (0.5 * self._unit) ** 2))
-        near = near.reshape(len(shifts), -1)
-        apart = ((points.colors[None] - self.colors[some][nearest].reshape(len(shifts), -1, 3)) ** 2).sum(axis=2)
-        scores = (near * (0.3 + 0.7 * np.exp(-apart / (2 * 0.35**2))) * free * points.scores).sum(axis=1)
-        prior = np.exp(-(shifts**2).sum(axis=1) / (2 * (PRIOR * widening * self._unit) ** 2))
-        best = int((scores * prior).argmax())
+        reach = 1.5 if first else widening + 0.25 * min(self._lost[k], 4)
+        starts = [np.zeros(3, np.float32)]
+        if expected is not None:
+            starts.append(expected - positions[members].mean(axis=0))
+        reaches, spreads = np.array([reach, 1.0], np.float32), np.array([widening, 1.0]) * PRIOR * self._unit
+
+        def prior(shifts: Floats) -> NDArray[np.float64]:
+            apart = [((shifts - start) ** 2).sum(axis=1) for start in starts]
+            return np.max([np.exp(-a / (2 * spread**2)) for a, spread in zip(apart, spreads, strict=False)], axis=0)
+
+        shifts = np.concatenate([start + scale * self._rough for start, scale in zip(starts, reaches, strict=False)])
+        scores = self._explained(members, positions, points, free, shifts, SEARCH_SPREADS[0])[0] * prior(shifts)
+        chosen = np.argsort(-scores, kind="stable")[:CANDIDATES]
+        scale = reaches[chosen // len(self._rough)][:, None, None]
+        shifts = (shifts[chosen][:, None] + scale * self._fine).reshape(-1, 3)
+        scores, near = self._explained(members, positions, points, free, shifts, SEARCH_SPREADS[1])
+        best = int((scores * prior(shifts)).argmax())
         if self._usual[k] and scores[best] < LOST * np.median(self._usual[k]):
             self._lost[k] += 1
+            if expected is not None:
+                positions[members] += expected - positions[members].mean(axis=0)
             return np.zeros(len(free), np.float32)
         self._usual[k].append(float(scores[best]))
         self._lost[k] = 0
         positions[members] += shifts[best]
-        return near[best].astype(np.float32)
+        return near[best]
+
+    def _explained(
+        self,
+        members: NDArray[np.int64],
+        positions: Floats,
+        points: Points,
+        free: Floats,
+        shifts: Floats,
+        spread: float,
+    ) -> tuple[Floats, Floats]:
+        """(s,) how much of the points a part explains when it is moved by each of the shifts (s, 3), and (s, m) how
+        near it then is to each of the points."""
+        some = members[np.linspace(0, len(members) - 1, min(24, len(members))).astype(np.int64)]
+        squared = _squared((points.positions[None] - shifts[:, None]).reshape(-1, 3), positions[some])
+        nearest = squared.argmin(axis=1)
+        near = np.exp(-squared[np.arange(len(squared)), nearest] / (2 * (spread * self._unit) ** 2))
+        near = near.reshape(len(shifts), -1).astype(np.float32)
+        apart = ((points.colors[None] - self.colors[some][nearest].reshape(len(shifts), -1, 3)) ** 2).sum(axis=2)
+        alike = 0.3 + 0.7 * np.exp(-apart / (2 * 0.35**2))
+        return (near * alike * free * points.scores).sum(axis=1), near
+
+
+def _grid(half: float, step: float) -> Floats:
+    """(n, 3) places of a cubic grid of this spacing, up to `half` from 0 along each axis."""
+    axis = np.arange(-half, half + 1e-6, step, dtype=np.float32)
+    return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def _squared(a: Floats, b: Floats) -> Floats:

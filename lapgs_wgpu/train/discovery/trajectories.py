@@ -1,0 +1,132 @@
+"""Trajectories: where groups of surface points go over the whole clip, as far as their centers tell.
+
+The points of a time form groups. Dynamic programming links the groups of all times to the path that explains most of
+them and bends least; the groups on it are then worth less, and the next path is looked for. A path may leap over times
+at which nothing is seen, and may turn sharply a few times. What follows parts step by step (`tracks`) takes the
+trajectories as a second opinion, since it goes astray where things are fast, hidden, or turn sharply.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .residual import Floats
+from .surface_points import PointClouds, parts_of
+
+LEAST_GROUP = 6  # points
+FULL_GROUP = 20  # points, from which on a group counts in full
+LEAP = 6  # time steps from one group of a path to the next, at most
+SKIPPED = 0.1  # cost of a time that a path leaps over; a group on it is worth 1
+AGAIN = 0.1  # worth of a group that is on an earlier path
+LEAST_WORTH = 8.0  # of a path
+MOST = 8  # paths
+COLOR_SPREAD = 0.15
+SHARP = 2.0  # highest cost of a bend, and of a change of colour
+WINDOW = 1.0  # time steps; standard deviation of the weights by which a path is smoothed
+# In half sides of the box:
+BEND = 0.3  # standard deviation of a group's center around the straight continuation of its path
+STEP = 0.7  # from one time to the next, at most
+
+
+class Trajectory(NamedTuple):
+    """centers: (T, 3) world units, interpolated where nothing is seen. seen: (T,) bool."""
+
+    centers: Floats
+    seen: NDArray[np.bool_]
+
+
+class _Groups(NamedTuple):
+    """The groups of all times. time: (n,) index. centers, colors: (n, 3). worth: (n,) in [0, 1]."""
+
+    time: NDArray[np.int64]
+    centers: NDArray[np.float64]
+    colors: NDArray[np.float64]
+    worth: NDArray[np.float64]
+
+
+def find_trajectories(clouds: PointClouds, link: float, half_side: float) -> list[Trajectory]:
+    """Trajectories of what the surface points show, those that explain most first.
+
+    link: distance of points of one group. half_side: of the box that they lie in. Both in world units.
+    """
+    groups = _groups(clouds, link)
+    trajectories: list[Trajectory] = []
+    while len(trajectories) < MOST:
+        path, worth = _best_path(groups, len(clouds.times), half_side)
+        if worth < LEAST_WORTH:
+            break
+        groups.worth[path] *= AGAIN
+        trajectories.append(_smooth(groups, path, len(clouds.times)))
+    return trajectories
+
+
+def _groups(clouds: PointClouds, link: float) -> _Groups:
+    rows = []
+    for i, points in enumerate(clouds.clouds):
+        part = parts_of(points.positions, link)
+        for k in np.flatnonzero(np.bincount(part, minlength=1) >= LEAST_GROUP):
+            members = part == k
+            center, color = points.positions[members].mean(axis=0), points.colors[members].mean(axis=0)
+            rows.append([i, *center, *color, min(1.0, members.sum() / FULL_GROUP)])
+    table = np.array(rows, np.float64).reshape(-1, 8)
+    return _Groups(table[:, 0].astype(np.int64), table[:, 1:4], table[:, 4:7], table[:, 7].copy())
+
+
+def _best_path(groups: _Groups, times: int, half_side: float) -> tuple[list[int], float]:
+    """The groups on the path of the highest worth, in the order of time, and that worth.
+
+    A state is a step from one group to another; what it is worth depends on the steps that end where it starts.
+    """
+    first = np.searchsorted(groups.time, np.arange(times + LEAP + 1))
+    # The steps that end in a group: the groups that they start from, their velocities and worths, and which step of
+    # their start they go on from (-1: none).
+    starts, velocities, worths, before = [], [], [], []
+    for b, (time, center, color) in enumerate(zip(groups.time, groups.centers, groups.colors, strict=True)):
+        a = np.arange(first[max(0, time - LEAP)], first[time])
+        lapse = (time - groups.time[a]).astype(np.float64)
+        velocity = (center - groups.centers[a]) / lapse[:, None]
+        near = np.abs(velocity).max(axis=1, initial=0.0) <= STEP * half_side
+        a, lapse, velocity = a[near], lapse[near], velocity[near]
+        apart = ((color - groups.colors[a]) ** 2).sum(axis=1) / (2 * COLOR_SPREAD**2)
+        gain = groups.worth[b] - SKIPPED * (lapse - 1) - np.minimum(SHARP, apart)
+        worth, origin = groups.worth[a], np.full(len(a), -1)
+        for i, group in enumerate(a):
+            if len(starts[group]):
+                bend = ((velocity[i] - velocities[group]) ** 2).sum(axis=1) / (2 * (BEND * half_side) ** 2)
+                totals = worths[group] - np.minimum(SHARP, bend)
+                best = int(totals.argmax())
+                if totals[best] > worth[i]:
+                    worth[i], origin[i] = totals[best], best
+        starts.append(a)
+        velocities.append(velocity)
+        worths.append(worth + gain)
+        before.append(origin)
+    totals = np.array([worth.max(initial=0.0) for worth in worths])
+    if not totals.any():
+        return [], 0.0
+    group = int(totals.argmax())
+    step = int(worths[group].argmax())
+    total, path = float(totals[group]), [group]
+    while step >= 0:
+        group, step = int(starts[group][step]), int(before[group][step])
+        path.append(group)
+    return path[::-1], total
+
+
+def _smooth(groups: _Groups, path: list[int], times: int) -> Trajectory:
+    """The path at every time: a straight line fitted to the groups around it, by weights that fall off in time."""
+    at, centers = groups.time[path].astype(np.float64), groups.centers[path]
+    result = np.zeros((times, 3), np.float32)
+    for i in range(times):
+        nearest = float(np.abs(at - i).min())
+        weight = np.exp(-0.5 * ((at - i) / (WINDOW + nearest)) ** 2)
+        basis = np.stack([np.ones(len(at)), at - i], axis=1)
+        product = basis.T * weight
+        ridge = np.diag([0.0, 1e-3 + nearest])  # beyond its ends a path hardly goes on
+        result[i] = np.linalg.solve(product @ basis + ridge, product @ centers)[0]
+    seen = np.zeros(times, bool)
+    seen[groups.time[path]] = True
+    return Trajectory(result, seen)
