@@ -20,7 +20,7 @@ ALLOWED = {
     "gpu": {"errors"},
     "splat": {"errors", "gpu"},
     "motion": {"errors", "gpu", "splat", "io"},
-    "data": {"errors", "splat.camera", "io.documents", "io.ply_points"},
+    "data": {"errors", "splat.camera", "io.safe_json_toml", "io.ply_points"},
     "io": {"errors", "splat.camera"},
     "train": {"errors", "gpu", "splat", "motion", "data", "io"},
     "command": {"errors", "gpu"},

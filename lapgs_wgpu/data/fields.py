@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.errors import InputError
-from lapgs_wgpu.io import documents
+from lapgs_wgpu.io import safe_json_toml
 
 
 def read_json(path: Path, needs: str) -> dict[str, Any]:
     """The JSON object that a file holds. needs: what it must consist of, for errors. Raises InputError."""
-    data = documents.read_json(path)
+    data = safe_json_toml.read_json(path)
     if not isinstance(data, dict):
         raise InputError(f"{path} must hold a JSON object with {needs}, got {kind(data)}.")
     return data

@@ -19,7 +19,7 @@ from lapgs_wgpu.data.sanity import check_in_view, check_times
 from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.errors import DeviceError, InputError, NumericalError
 from lapgs_wgpu.gpu.device import Device, open_device
-from lapgs_wgpu.io.first_look import FirstLook
+from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.motion.grid_field import GridField
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.config import Background, Config
@@ -47,7 +47,7 @@ OUTSIDE = 0.05  # warn if this share of the Gaussians, or more, is outside the e
 
 # Takes over a training's steps, such as a viewer does: called with the scene, where to look at it from, and the steps,
 # of which it takes as many as it likes, each one a step of the training. The rest follows when it returns.
-Watch = Callable[[Scene4D, FirstLook, Iterator[Progress]], None]
+Watch = Callable[[Scene4D, InitialView, Iterator[Progress]], None]
 
 
 def train(
@@ -183,7 +183,7 @@ def _goes_on(training: Training, interrupted: threading.Event) -> bool:
 
 def _run(training: Training, dataset: Dataset, out: Path, watch: Watch | None) -> Scene4D:
     config, scene = training.config, training.scene
-    look = FirstLook((dataset.test or dataset.train)[0].camera, dataset.focus, dataset.up, len(dataset.times))
+    look = InitialView((dataset.test or dataset.train)[0].camera, dataset.focus, dataset.up, len(dataset.times))
     with Log(out / "log.jsonl", config.schedule.steps, done=training.done) as log, _interruptible() as interrupted:
         steps = _steps(training, log, out, interrupted)
         if watch is not None:

@@ -18,8 +18,8 @@ from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.atomic import atomic_write
-from lapgs_wgpu.io.documents import read_toml
-from lapgs_wgpu.io.tensors import pack_tensors, unpack_tensors
+from lapgs_wgpu.io.safe_json_toml import read_toml
+from lapgs_wgpu.io.safetensors_file import pack_tensors, unpack_tensors
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.log import environment
 from lapgs_wgpu.train.presets import write_toml
