@@ -12,9 +12,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from lapgs_wgpu.command import guarded
-from lapgs_wgpu.data.colmap import IMAGES, SPARSE
-from lapgs_wgpu.data.colmap_model import count_images, is_model
-from lapgs_wgpu.data.moments import write_times
+from lapgs_wgpu.data.readers.colmap import IMAGES, SPARSE
+from lapgs_wgpu.data.readers.colmap_model import count_images, is_model
+from lapgs_wgpu.data.timestamps import write_times
 from lapgs_wgpu.errors import InputError
 
 DESCRIPTION = """\

@@ -237,9 +237,9 @@ BAD: dict[str, tuple[Callable[[Path, Scene], Any], list[str]]] = {
     "file_path too long": (frame_with(file_path="x" * 5000), [*FRAME, "does not exist"]),
     "picture absent": (frame_with(file_path="./train/r_777"), ["r_777.png", *FRAME, "does not exist"]),
     "picture a folder": (picture_a_folder, [*PICTURE, *FRAME, "does not exist"]),
-    "picture of text": (no_picture, [*PICTURE, "not a readable picture"]),
-    "picture cut short": (cut, [*PICTURE, "not a readable picture"]),
-    "picture with a wrong bit": (flip_a_bit, [*PICTURE, "not a readable picture"]),
+    "picture of text": (no_picture, [*PICTURE, "not a readable image"]),
+    "picture cut short": (cut, [*PICTURE, "not a readable image"]),
+    "picture with a wrong bit": (flip_a_bit, [*PICTURE, "not a readable image"]),
     "picture of 16 bit": (sixteen_bit, [*PICTURE, "8 bits"]),
     "sizes mixed": (other_size, ["test/r_000.png", "10x7", "train/r_000.png", "12x8"]),
     "time of one frame missing": (frame_without("time"), [*FRAME, "no field time", "2 of 3"]),
@@ -313,7 +313,7 @@ def test_published_scenes(scene: str) -> None:
     assert len(data.test) == 20
     assert (data.times[0], data.times[-1]) == (0, 1)
     assert 4 < data.extent < 8
-    assert data.placement is data.cloud is None
+    assert data.normalization is data.cloud is None
     for view in data.train + data.test:  # the cameras stand on a sphere about the origin and look at it
         assert np.linalg.norm(view.camera.position) == pytest.approx(4.03, abs=0.04)
         origin = view.camera.T_cam_world[:3, 3]

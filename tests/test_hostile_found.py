@@ -184,7 +184,7 @@ def test_a_picture_without_pixels(tmp_path: Path) -> None:
     folder = make_scene(tmp_path / "toy")
     file = folder / "train" / "r_000.png"
     file.write_bytes(with_checksums(file.read_bytes().replace(b"IDAT", b"IDAU")))
-    with pytest.raises(InputError, match="is not a readable picture"):
+    with pytest.raises(InputError, match="is not a readable image"):
         load_dataset(folder)
 
 

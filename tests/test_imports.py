@@ -102,11 +102,7 @@ def test_import_is_light_and_silent() -> None:
         "errors",
         "io.checkpoint",
         "splat.camera",
-        "data.dnerf",
-        "data.hypernerf",
-        "data.neu3d",
-        "data.nerfstudio",
-        "data.colmap",
+        "data.load",
     ],
 )
 def test_readers_need_neither_torch_nor_a_device_nor_scipy(module: str) -> None:

@@ -15,7 +15,7 @@ from types import FrameType
 import torch
 
 from lapgs_wgpu.data.init import first_points
-from lapgs_wgpu.data.sanity import check_in_view, check_times
+from lapgs_wgpu.data.validation import check_in_view, check_times
 from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.errors import DeviceError, InputError, NumericalError
 from lapgs_wgpu.gpu.device import Device, open_device
@@ -77,8 +77,8 @@ def train(
         check_run_folder(out, overwrite=overwrite)
         for warning in (*dataset.warnings, *found, *_precision_warnings(config)):
             print(f"warning: {warning}", file=sys.stderr, flush=True)
-        if dataset.placement is not None:
-            print(f"placement: {dataset.placement}", flush=True)
+        if dataset.normalization is not None:
+            print(f"placement: {dataset.normalization}", flush=True)
     keep_freed_memory()
     device = device or open_device()
     training = Training(config, dataset, device, ranks, _discovered(config, dataset, device, ranks))
@@ -199,8 +199,8 @@ def _run(training: Training, dataset: Dataset, out: Path, watch: Watch | None) -
     if done < all_steps or config.schedule.save_interval:
         save_state(out, training.state())
     metadata = {"scene": dataset.name, "background": config.data.background, "step": str(done), "view": look.to_json()}
-    if dataset.placement is not None:
-        metadata["placement"] = dataset.placement.to_json()
+    if dataset.normalization is not None:
+        metadata["placement"] = dataset.normalization.to_json()
     scene.save(out / "checkpoint.ply", metadata)
     if done < all_steps:
         raise KeyboardInterrupt(
