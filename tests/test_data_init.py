@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from lapgs_wgpu.data.cloud import Cloud
-from lapgs_wgpu.data.init import MIN_SCALE, initial_scales, random_points, limit_optical_depth
+from lapgs_wgpu.data.init import MIN_SCALE, initial_scales, limit_optical_depth, random_points
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.splat.camera import Camera
