@@ -8,32 +8,21 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, NamedTuple, Protocol
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.data.cloud import Cloud
-from lapgs_wgpu.data.images import Pixels, Size
+from lapgs_wgpu.data.images import ImageFile
 from lapgs_wgpu.data.normalize import Normalization
 from lapgs_wgpu.data.objects import ObjectRecord
 from lapgs_wgpu.data.timestamps import ImageName
 from lapgs_wgpu.data.undistort import Lens
+from lapgs_wgpu.data.video_frames import VideoFrame
 
 Split = Literal["train", "test"]
-
-
-class ImageSource(Protocol):
-    """An image that is decoded on demand: an image file, or a frame of a video. `str` is its name in errors."""
-
-    @property
-    def size(self) -> Size:
-        """(width, height) in pixels."""
-        ...
-
-    def read(self, size: Size) -> Pixels:
-        """Decode and shrink to (width, height): (H, W, 3) RGB or (H, W, 4) straight RGBA. Raises InputError."""
-        ...
+ImageSource = ImageFile | VideoFrame
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,6 +9,8 @@ from __future__ import annotations
 import math
 import struct
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -73,12 +75,26 @@ def check_image(path: Path, *, whole: bool = True) -> ImageFile:
 
 def decode(path: Path) -> Pixels:
     """Decode an 8-bit image: (H, W, 4) straight RGBA, or (H, W, 3) RGB if it has no transparency. Raises InputError."""
+    with _decoding(path), open(path, "rb") as file:  # not the path: imageio would look into archives
+        header = Image.open(file, formats=_FORMATS)
+        transparent = "A" in header.getbands() or "transparency" in header.info
+        file.seek(0)
+        return iio.imread(file, plugin="pillow", index=0, mode="RGBA" if transparent else "RGB")
+
+
+def gray_thumbnail(path: Path, side: int) -> NDArray[np.float32]:
+    """Gray levels 0 to 255 of a small version of an image, its longer side at most `side`. Raises InputError."""
+    with _decoding(path), Image.open(path, formats=_FORMATS) as file:
+        file.draft("L", (side, side))
+        image = file.convert("L")
+        image.thumbnail((side, side), Image.Resampling.BOX)
+        return np.asarray(image, dtype=np.float32)
+
+
+@contextmanager
+def _decoding(path: Path) -> Iterator[None]:
     try:
-        with open(path, "rb") as file:  # not the path: imageio would look into archives
-            header = Image.open(file, formats=_FORMATS)
-            transparent = "A" in header.getbands() or "transparency" in header.info
-            file.seek(0)
-            return iio.imread(file, plugin="pillow", index=0, mode="RGBA" if transparent else "RGB")
+        yield
     except _ERRORS as error:
         raise InputError(f"{path} cannot be decoded as an image ({error}); copy or render it again.") from None
 
@@ -86,11 +102,8 @@ def decode(path: Path) -> Pixels:
 def encode_png(image: Pixels, *, level: int = 6) -> bytes:
     """Encode an image (H, W) gray, (H, W, 3) RGB or (H, W, 4) RGBA as PNG. level: of the compression, 0 to 9."""
     mode = "L" if image.ndim == 2 else "RGBA" if image.shape[2] == 4 else "RGB"
-    png = iio.imwrite(
-        "<bytes>", image, extension=".png", plugin="pillow", mode=mode, is_batch=False, compress_level=level
-    )
-    assert png is not None
-    return png
+    options = {"mode": mode, "is_batch": False, "compress_level": level}
+    return iio.imwrite("<bytes>", image, extension=".png", plugin="pillow", **options) or b""
 
 
 def resize(image: Pixels, size: Size, resampling: Image.Resampling) -> Pixels:
@@ -104,18 +117,6 @@ def shrink(image: Pixels, size: Size) -> Pixels:
     # Averaging is exact if each new pixel covers whole old ones; otherwise it would shift details.
     whole = all(old % new == 0 for old, new in zip(image.shape[1::-1], size, strict=True))
     return resize(image, size, Image.Resampling.BOX if whole else Image.Resampling.HAMMING)
-
-
-def gray_thumbnail(path: Path, side: int) -> NDArray[np.float32]:
-    """Gray levels 0 to 255 of a small version of an image, its longer side at most `side`. Raises InputError."""
-    try:
-        with Image.open(path, formats=_FORMATS) as file:
-            file.draft("L", (side, side))
-            image = file.convert("L")
-            image.thumbnail((side, side), Image.Resampling.BOX)
-            return np.asarray(image, dtype=np.float32)
-    except _ERRORS as error:
-        raise InputError(f"{path} cannot be decoded as an image ({error}); copy or render it again.") from None
 
 
 def shrunk_size(stored: Size, image_size: int | None) -> Size:

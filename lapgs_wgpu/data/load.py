@@ -170,9 +170,7 @@ def _undistort(frames: Sequence[Frame], stored: Size, size: Size) -> tuple[list[
 
 
 def _read_pixels(image: ImageSource, undistortion: Undistortion | None, size: Size) -> Pixels:
-    if undistortion is None:
-        return image.read(size)
-    return shrink(undistortion.apply(image.read(undistortion.size)), size)
+    return image.read(size) if undistortion is None else shrink(undistortion.apply(image.read(image.size)), size)
 
 
 def _depths(capture: Capture, splits: Sequence[Split], cameras: Sequence[Camera]) -> tuple[float, float] | None:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.data.images import Pixels, Size
+from lapgs_wgpu.data.images import Pixels
 from lapgs_wgpu.errors import InputError
 
 Array = NDArray[np.float64]
@@ -117,11 +117,6 @@ class Undistortion(NamedTuple):
 
     lens: Lens
     K: Array
-
-    @property
-    def size(self) -> Size:
-        """(width, height) of the images."""
-        return self.lens.width, self.lens.height
 
     def apply(self, image: Pixels) -> Pixels:
         """The undistorted image, (H, W, C) like the given one."""

@@ -16,17 +16,11 @@ from lapgs_wgpu.data.cloud import Cloud
 from lapgs_wgpu.data.frames import Capture, Frame, Reader
 from lapgs_wgpu.data.images import SUFFIXES, check_image
 from lapgs_wgpu.data.poses import check_rotation
-from lapgs_wgpu.data.readers.colmap_model import (
-    ColmapCamera,
-    ColmapImage,
-    ColmapModel,
-    count_images,
-    is_model,
-    read_model,
-)
 from lapgs_wgpu.data.timestamps import ImageName, natural_key
 from lapgs_wgpu.data.undistort import Lens
 from lapgs_wgpu.errors import InputError
+
+from .colmap_model import ColmapCamera, ColmapImage, ColmapModel, count_images, is_model, read_model
 
 IMAGES, SPARSE = "images", "sparse"
 AXES = "the model is damaged, since COLMAP keeps only points in front of its cameras"
