@@ -12,7 +12,7 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import imageio.v3 as iio
 import numpy as np
@@ -102,7 +102,7 @@ def _decoding(path: Path) -> Iterator[None]:
 def encode_png(image: Pixels, *, level: int = 6) -> bytes:
     """Encode an image (H, W) gray, (H, W, 3) RGB or (H, W, 4) RGBA as PNG. level: of the compression, 0 to 9."""
     mode = "L" if image.ndim == 2 else "RGBA" if image.shape[2] == 4 else "RGB"
-    options = {"mode": mode, "is_batch": False, "compress_level": level}
+    options: dict[str, Any] = {"mode": mode, "is_batch": False, "compress_level": level}
     return iio.imwrite("<bytes>", image, extension=".png", plugin="pillow", **options) or b""
 
 

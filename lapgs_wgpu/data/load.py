@@ -90,10 +90,7 @@ def _dataset(folder: Path, capture: Capture, image_size: int | None, normalize: 
     fit = None if cube is None or kept else cube.normalization
     if cloud is not None and capture.own_footage:
         cloud = _filled(cloud, training)
-    order = list(range(len(frames)))
-    if capture.own_footage:
-        order = _film_order(frames, times, warnings)
-
+    order = _film_order(frames, times, warnings) if capture.own_footage else range(len(frames))
     placed = {id(camera): camera if fit is None else fit.camera(camera) for camera in cameras}
 
     def views(split: Split) -> tuple[View, ...]:
@@ -175,11 +172,8 @@ def _read_pixels(image: ImageSource, undistortion: Undistortion | None, size: Si
 
 def _depths(capture: Capture, splits: Sequence[Split], cameras: Sequence[Camera]) -> tuple[float, float] | None:
     """Nearest and furthest depth of the training cameras, if the files state it or there is no cloud to replace it."""
-    stated = [
-        frame.depths
-        for frame, split in zip(capture.frames, splits, strict=True)
-        if split == "train" and frame.depths is not None
-    ]
+    trained = [frame for frame, split in zip(capture.frames, splits, strict=True) if split == "train"]
+    stated = [frame.depths for frame in trained if frame.depths is not None]
     if stated:
         return min(near for near, _ in stated), float(np.median([far for _, far in stated]))
     if capture.cloud is not None or capture.keeps_coordinates:
