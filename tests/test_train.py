@@ -17,8 +17,8 @@ import torch
 from PIL import Image
 
 from lapgs_wgpu.data import Dataset, load_dataset
-from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.data.normalize import Normalization
+from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.errors import DeviceMemoryError, InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.checkpoint import read_checkpoint
