@@ -134,7 +134,7 @@ def _others(given: dict[str, typing.Any], names: Sequence[str], keys: Iterable[s
 
 def _evaluate(run: Path, given: dict[str, typing.Any], overrides: dict[str, str | list[str]]) -> None:
     from lapgs_wgpu.gpu.device import open_device
-    from lapgs_wgpu.io.documents import read_json
+    from lapgs_wgpu.io.safe_json_toml import read_json
     from lapgs_wgpu.motion.scene import load
     from lapgs_wgpu.train import plots
     from lapgs_wgpu.train.loop import evaluate_run

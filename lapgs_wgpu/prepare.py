@@ -1,4 +1,4 @@
-"""lapgs-prepare: films become a capture, by the programs ffmpeg and colmap (docs/own-data.md has their commands)."""
+"""lapgs-prepare: make a capture of videos with the programs ffmpeg and colmap (docs/own-data.md has the commands)."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from lapgs_wgpu.command import guarded
-from lapgs_wgpu.data.colmap import IMAGES, SPARSE
-from lapgs_wgpu.data.colmap_model import count_images, is_model
-from lapgs_wgpu.data.moments import write_times
+from lapgs_wgpu.data.readers.colmap import IMAGES, SPARSE
+from lapgs_wgpu.data.readers.colmap_model import count_images, is_model
+from lapgs_wgpu.data.timestamps import write_times
 from lapgs_wgpu.errors import InputError
 
 DESCRIPTION = """\
-Make a capture that lapgs-train opens: pictures from films with ffmpeg, cameras from the pictures with colmap.
+Make a capture that lapgs-train opens: images from videos with ffmpeg, cameras from the images with colmap.
 
-  lapgs-prepare walk.mp4 --out DIR              one camera that moves: every picture gets its own pose
-  lapgs-prepare a.mp4 b.mp4 c.mp4 --out DIR     cameras on tripods that film together, all started at the same moment
+  lapgs-prepare walk.mp4 --out DIR              one moving camera: each image gets its own pose
+  lapgs-prepare a.mp4 b.mp4 c.mp4 --out DIR     synchronized static cameras, all started at the same time
 """
 FRAMES_PER_SECOND = 10.0
-NEIGHBOURS = 20  # pictures before and after, with which each one of a moving camera is matched
-FEWEST = 0.5  # of the pictures must get a pose
-ADVICE = "they may share too little, so film slower, with more texture and overlap"
+NEIGHBOURS = 20  # a moving camera: match each image with so many before and after
+FEWEST = 0.5  # of the images need a pose
+ADVICE = "they may overlap too little, so film slower, with more texture and overlap"
 
 
 def prepare_command(arguments: Sequence[str] | None = None) -> int:
@@ -41,22 +41,22 @@ def _prepare(arguments: list[str]) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
-    parser.add_argument("videos", nargs="+", metavar="VIDEO", help="films, one a camera, of one size")
-    parser.add_argument("--out", required=True, metavar="DIR", help="folder of the capture, new or empty")
+    parser.add_argument("videos", nargs="+", metavar="VIDEO", help="videos, one per camera, all of one size")
+    parser.add_argument("--out", required=True, metavar="DIR", help="folder of the capture; must be new or empty")
     parser.add_argument(
-        "--fps", type=float, default=FRAMES_PER_SECOND, help=f"pictures a second, at most [{FRAMES_PER_SECOND:g}]"
+        "--fps", type=float, default=FRAMES_PER_SECOND, help=f"images per second, at most [{FRAMES_PER_SECOND:g}]"
     )
     given = parser.parse_args(arguments)
     prepare([Path(video) for video in given.videos], Path(given.out), given.fps)
 
 
 def prepare(videos: Sequence[Path], out: Path, fps: float) -> None:
-    """Write images/, times.json and sparse/0 of films. fps: pictures a second, at most. Raises InputError."""
+    """Write images/, times.json and sparse/0. fps: images per second, at most. Raises InputError."""
     if not 0 < fps <= 1000:
         raise InputError(f"--fps must be above 0 and at most 1000, got {fps:g}.")
     for video in videos:
         if not video.is_file():
-            raise InputError(f"{video} does not exist; name the films of the capture.")
+            raise InputError(f"{video} does not exist; name the videos of the capture.")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"{out} is not an empty folder; name a new one with --out.")
     programs = {name: _program(name) for name in ("ffmpeg", "colmap")}
@@ -75,18 +75,18 @@ def prepare(videos: Sequence[Path], out: Path, fps: float) -> None:
         registered = reconstruct(programs["colmap"], out, None)
         wanted = len(times)
     preset = "neu3d-tiny" if len(videos) > 1 else "hypernerf-tiny"
-    print(f"{out}: {len(times)} pictures, {registered} of {wanted} cameras placed; lapgs-train {preset} --data {out}")
+    print(f"{out}: {len(times)} images, {registered} of {wanted} cameras registered; lapgs-train {preset} --data {out}")
     if registered < max(2, FEWEST * wanted):
         raise InputError(
-            f"colmap placed {registered} of {wanted} pictures (at least half are needed): {ADVICE}; "
-            f"{out / 'colmap.log'} has what it said."
+            f"colmap registered {registered} of {wanted} images (at least half are needed): {ADVICE}; "
+            f"{out / 'colmap.log'} has its output."
         )
 
 
 def extract(ffmpeg: str, video: Path, folder: Path, fps: float) -> list[Path]:
-    """The pictures of a film, at most `fps` a second, in order; each one's name is its time in milliseconds."""
+    """Extract the images of a video, at most `fps` per second, in order. Each file name is a time in milliseconds."""
     folder.mkdir(parents=True, exist_ok=True)
-    # Frames as the film has them, the rate of a phone's varies: those that come 1 / fps after the last one taken.
+    # The frame rate of phones varies: take the next frame that comes 1 / fps after the last one taken.
     chosen = f"select=isnan(prev_selected_t)+gte(t-prev_selected_t\\,{1 / fps - 5e-4:.6f}),settb=1/1000"
     timed = ["-fps_mode", "passthrough", "-enc_time_base", "1/1000", "-frame_pts", "1"]
     command = [ffmpeg, "-nostdin", "-v", "error", "-i", str(video), "-vf", chosen, *timed, "-qscale:v", "2"]
@@ -94,14 +94,14 @@ def extract(ffmpeg: str, video: Path, folder: Path, fps: float) -> list[Path]:
     (folder.parent / "ffmpeg.log").unlink(missing_ok=True)
     pictures = sorted(folder.glob("*.jpg"))
     if len(pictures) < 2:
-        raise InputError(f"{video} gave {len(pictures)} pictures at {fps:g} a second; is it a film?")
+        raise InputError(f"{video} gave {len(pictures)} images at {fps:g} per second; is it a video?")
     return pictures
 
 
 def reconstruct(colmap: str, out: Path, pictures: Sequence[Path] | None) -> int:
-    """Run colmap on these pictures, all below images/ where None, and leave the largest model in sparse/0.
+    """Run colmap and copy the largest model to sparse/0. Return the number of its images, which share one lens.
 
-    Returns how many pictures it holds. All share one lens. None: a moving camera's film, in the order of the names.
+    pictures: one image of each static camera; None for all images of a moving camera, in the order of their names.
     """
     log, images, work = out / "colmap.log", out / IMAGES, out / "colmap"
     work.mkdir()
@@ -109,35 +109,28 @@ def reconstruct(colmap: str, out: Path, pictures: Sequence[Path] | None) -> int:
     listed: list[str] = []
     if pictures is not None:
         names = "\n".join(path.relative_to(images).as_posix() for path in pictures)
-        (work / "pictures.txt").write_text(names + "\n", encoding="utf-8")
-        listed = ["--image_list_path", str(work / "pictures.txt")]
-    model = "OPENCV" if pictures is None else "SIMPLE_RADIAL"  # few pictures do not tell more of a lens
+        (work / "list.txt").write_text(names + "\n", encoding="utf-8")
+        listed = ["--image_list_path", str(work / "list.txt")]
+    model = "OPENCV" if pictures is None else "SIMPLE_RADIAL"  # few images do not determine more parameters
 
     def run(step: str, *options: str) -> None:
         print(f"colmap {step} ...", file=sys.stderr, flush=True)
         _run([colmap, step, *options], log, f"colmap {step}")
 
     lens = ["--ImageReader.single_camera", "1", "--ImageReader.camera_model", model]
-    run(
-        "feature_extractor",
-        *database,
-        "--image_path",
-        str(images),
-        *listed,
-        *lens,
-        *_no_gpu(colmap, "feature_extractor"),
-    )
+    given = [*database, "--image_path", str(images)]
+    run("feature_extractor", *given, *listed, *lens, *_no_gpu(colmap, "feature_extractor"))
     matcher = "exhaustive_matcher" if pictures is not None else "sequential_matcher"
     overlap = [] if pictures is not None else ["--SequentialMatching.overlap", str(NEIGHBOURS)]
     run(matcher, *database, *overlap, *_no_gpu(colmap, matcher))
     (work / SPARSE).mkdir()
     try:
-        run("mapper", *database, "--image_path", str(images), "--output_path", str(work / SPARSE))
-    except InputError as error:  # some versions of colmap fail where they find nothing
+        run("mapper", *given, "--output_path", str(work / SPARSE))
+    except InputError as error:  # some versions of colmap fail if they find nothing
         raise InputError(f"{str(error).removesuffix('.')}: {ADVICE}.") from None
     models = [path for path in sorted((work / SPARSE).iterdir()) if is_model(path)]
     if not models:
-        raise InputError(f"colmap found no cameras for the pictures in {images}: {ADVICE}; {log} has what it said.")
+        raise InputError(f"colmap found no cameras for the images in {images}: {ADVICE}; {log} has its output.")
     best = max(models, key=count_images)
     (out / SPARSE).mkdir()
     shutil.copytree(best, out / SPARSE / "0")
@@ -145,7 +138,7 @@ def reconstruct(colmap: str, out: Path, pictures: Sequence[Path] | None) -> int:
 
 
 def _no_gpu(colmap: str, step: str) -> list[str]:
-    """The option that keeps a step on the processor: its name has changed over the versions of colmap."""
+    """The option that disables the GPU for a step; its name depends on the version of colmap."""
     done = subprocess.run([colmap, step, "-h"], capture_output=True, text=True, check=False, env=_environment())
     option = re.search(r"--(\w+\.use_gpu)", done.stdout + done.stderr)
     return [f"--{option[1]}", "0"] if option else []
@@ -159,7 +152,7 @@ def _program(name: str) -> str:
 
 
 def _run(command: list[str], log: Path, name: str) -> None:
-    """Run a program, with what it says appended to a file. InputError with the last line of it where it fails."""
+    """Run a program and append its output to a file. Raises InputError with the last line of output if it fails."""
     with log.open("ab") as file:
         done = subprocess.run(
             command, stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT, check=False, env=_environment()
@@ -171,5 +164,5 @@ def _run(command: list[str], log: Path, name: str) -> None:
 
 
 def _environment() -> dict[str, str]:
-    """colmap is linked with Qt, which wants a screen unless it is told that there is none."""
+    """The environment for colmap, whose Qt needs a display unless this variable is set."""
     return {**os.environ, "QT_QPA_PLATFORM": "offscreen"}

@@ -71,9 +71,9 @@ def shifted(camera: Camera, dx: float, dy: float) -> Camera:
 
 def agreement(data: Dataset, blobs: Blobs, device: Device, views: Sequence[int] | None = None) -> float:
     """The smallest PSNR, in dB, between the pictures of the views and the blobs drawn from the cameras as read."""
-    assert data.placement is not None
-    means = torch.from_numpy(data.placement.points(blobs.means.double().numpy())).float()
-    moved = Blobs(means, blobs.scales * data.placement.scale, blobs.colors)
+    assert data.normalization is not None
+    means = torch.from_numpy(data.normalization.points(blobs.means.double().numpy())).float()
+    moved = Blobs(means, blobs.scales * data.normalization.scale, blobs.colors)
     everything = [*data.train, *data.test]
     found = []
     for view in everything if views is None else [everything[i] for i in views]:

@@ -22,7 +22,7 @@ from test_ply import INRIA, assert_same, mutate, random_still
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.checkpoint import read_checkpoint, write_checkpoint
 from lapgs_wgpu.io.ply import read_ply, write_ply
-from lapgs_wgpu.io.tensors import MAX_HEADER_BYTES, pack_tensors
+from lapgs_wgpu.io.safetensors_file import MAX_HEADER_BYTES, pack_tensors
 
 STILL = random_still(4)
 TENSORS = {

@@ -203,7 +203,7 @@ def test_a_damaged_scene_starts_no_run(scene: Path, tmp_path: Path, capsys: pyte
     shutil.copytree(scene, damaged)
     (damaged / "train" / "r_001.png").write_bytes(b"no picture")
     assert cli.train_command(["tiny", "--data", str(damaged), "--out", str(tmp_path / "out"), *FAST]) == 2
-    assert "r_001.png is not a readable picture" in capsys.readouterr().err
+    assert "r_001.png is not a readable image" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.data.cloud import views_of
-from lapgs_wgpu.data.colmap import rotation
+from lapgs_wgpu.data.readers.colmap import rotation
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 
@@ -86,8 +86,8 @@ def test_the_cloud_brings_its_colours(name: str, request: pytest.FixtureRequest)
     data = load_dataset(request.getfixturevalue(name))
     blobs = Blobs.random()
     assert data.cloud is not None
-    assert data.placement is not None
-    np.testing.assert_allclose(data.cloud.points[:40], data.placement.points(blobs.means.numpy()), atol=1e-5)
+    assert data.normalization is not None
+    np.testing.assert_allclose(data.cloud.points[:40], data.normalization.points(blobs.means.numpy()), atol=1e-5)
     np.testing.assert_allclose(data.cloud.colours[:40], blobs.colors.numpy(), atol=0.5 / 255 + 1e-6)
     assert np.abs(data.cloud.points[:40]).max() == pytest.approx(1.3, rel=0.1)
 
@@ -151,14 +151,14 @@ def test_pictures_without_a_pose_are_left_out_with_a_warning(toy: Path) -> None:
     shutil.copyfile(toy / "images/frame_0001.png", toy / "images/frame_0099.png")
     data = load_dataset(toy)
     assert len(data.train) + len(data.test) == 6
-    assert any("1 of 7 pictures" in warning and "frame_0099.png" in warning for warning in data.warnings)
+    assert any("1 of 7 images" in warning and "frame_0099.png" in warning for warning in data.warnings)
 
 
 def test_a_camera_that_was_not_placed_is_left_out(rig: Path) -> None:
     shutil.copytree(rig / "images/cam01", rig / "images/cam04")
     data = load_dataset(rig)
     assert not any("cam04" in view.source for view in data.train)
-    assert any("3 of 15 pictures" in warning and "cam04" in warning for warning in data.warnings)
+    assert any("3 of 15 images" in warning and "cam04" in warning for warning in data.warnings)
 
 
 def test_the_largest_of_several_models_is_taken(toy: Path) -> None:
@@ -172,7 +172,7 @@ def test_the_largest_of_several_models_is_taken(toy: Path) -> None:
     )  # fmt: skip
     data = load_dataset(toy)
     assert len(data.train) == 5
-    assert any("2 models (0 with 1, 1 with 6 pictures): 1 is taken" in warning for warning in data.warnings)
+    assert any("2 models (0 with 1, 1 with 6 images): 1 is taken" in warning for warning in data.warnings)
 
 
 def test_a_model_in_sparse_itself(toy: Path) -> None:
@@ -264,14 +264,14 @@ BAD: dict[str, tuple[Spoil, list[str]]] = {
     "point of text": (words("points3D.txt", 1, 1, "x"), ["points3D.txt, line 2", "'x' is not a number"]),
     "point NaN": (words("points3D.txt", 3, 1, "nan"), ["points3D.txt", "1 of 40 points", "first 2"]),
     "no points": (lambda f: (f / "sparse/0/points3D.txt").write_text("#\n"), ["points3D.txt", "0 points"]),
-    "no images in it": (lambda f: (f / "sparse/0/images.txt").write_text("#\n"), ["sparse/0", "no picture"]),
+    "no images in it": (lambda f: (f / "sparse/0/images.txt").write_text("#\n"), ["sparse/0", "no image"]),
     "not text": (lambda f: (f / "sparse/0/images.txt").write_bytes(b"\xff\xfe"), ["images.txt", "not text"]),
     "sizes mixed": (picture((32, 24)), ["frame_0002.png", "32x24", "64x48"]),
     "no numbers": (renamed(lambda i: "abcdefg"[i] + ".png"), ["b.png", "0 numbers", "times.json"]),
     "two numbers": (renamed(lambda i: f"a{i}_{i * i}.png"), ["a1_1.png", "differ in 2 numbers", "times.json"]),
     "some numbers": (renamed(lambda i: f"a{i}.png" if i != 3 else "a.png"), ["a.png", "0", "times.json"]),
     "a number twice": (renamed(lambda i: f"{'ab'[i % 2]}{i // 2}.png"), ["frame number 1"]),
-    "no time": (times({"frame_0001.png": 1}), ["times.json", "5 of 6 pictures", "frame_0002.png"]),
+    "no time": (times({"frame_0001.png": 1}), ["times.json", "5 of 6 images", "frame_0002.png"]),
     "time of text": (times(ALL | {"frame_0002.png": "1"}), ["times.json", "frame_0002.png", '"1"']),
     "time NaN": (times(ALL | {"frame_0002.png": float("nan")}), ["times.json", "frame_0002.png", "nan"]),
     "times of a list": (times([1]), ["times.json", "a list of 1"]),
@@ -297,7 +297,7 @@ def test_bad_capture_is_refused_in_one_sentence(name: str, text: Path) -> None:
 
 
 def test_too_few_pictures(device: Device, tmp_path: Path) -> None:
-    refused(write_colmap(tmp_path / "toy", device, count=4), ["4 pictures at 4 times", "at least 5"])
+    refused(write_colmap(tmp_path / "toy", device, count=4), ["4 images at 4 times", "at least 5"])
 
 
 def test_points_behind_the_cameras(text: Path) -> None:
@@ -347,7 +347,7 @@ def test_counts_inside_are_bounded_too(toy: Path) -> None:
     whole = bytearray(path.read_bytes())
     whole[8 + 8 + 24 + 3 + 8 : 8 + 8 + 24 + 3 + 8 + 8] = struct.pack("<Q", 2**61)
     path.write_bytes(bytes(whole))
-    refused(toy, ["points3D.bin declares", "pictures that see point 0"])
+    refused(toy, ["points3D.bin declares", "images that see point 0"])
     path = toy / "sparse/0/images.bin"
     whole = bytearray(path.read_bytes())
     at = whole.index(b".png\0") + 5

@@ -95,6 +95,16 @@ def test_intrinsics_of_frames_and_file(tmp_path: Path) -> None:
     np.testing.assert_allclose(third, [[20, 0, 5.5], [0, 15, 4.5], [0, 0, 1]])
 
 
+def test_lens_distortion_is_removed(tmp_path: Path) -> None:
+    plain = load_dataset(make_scene(tmp_path / "plain")).train[1]
+    bent = load_dataset(make_scene(tmp_path / "bent", frame_with(k1=-0.2))).train[1]
+    assert bent.load().shape == plain.load().shape
+    assert (bent.load() != plain.load()).any()
+    np.testing.assert_array_equal(
+        load_dataset(tmp_path / "bent").train[0].load(), load_dataset(tmp_path / "plain").train[0].load()
+    )
+
+
 def test_focal_lengths_need_no_angle(tmp_path: Path) -> None:
     def give(folder: Path, scene: Scene) -> None:
         for data in scene.values():
@@ -253,7 +263,7 @@ BAD: dict[str, tuple[Callable[[Path, Scene], Any], list[str]]] = {
     "no focal length": (scene_with(fl_x=0), ["transforms_train.json", "fl_x is 0", "pixels"]),
     "focal length of a frame": (frame_with(fl_x=1e9), [*FRAME, "fl_x is 1e+09"]),
     "principal point of text": (scene_with(cx="middle"), ["cx", '"middle"']),
-    "lens distortion": (scene_with(k1=0.1), ["k1 is 0.1", "undistort"]),
+    "fourth radial coefficient": (scene_with(k4=0.1), ["k4 is 0.1", "undistort"]),
     "angle of NaN": (scene_with(camera_angle_x=math.nan), ["camera_angle_x", "nan"]),
     "no frames": (lambda folder, scene: scene["train"].pop("frames"), ["no field frames"]),
     "empty frames": (scene_with(frames=[]), ["frames", "at least one"]),
@@ -265,9 +275,9 @@ BAD: dict[str, tuple[Callable[[Path, Scene], Any], list[str]]] = {
     "file_path too long": (frame_with(file_path="x" * 5000), [*FRAME, "does not exist"]),
     "picture absent": (frame_with(file_path="./train/r_777"), ["r_777.png", *FRAME, "does not exist"]),
     "picture a folder": (picture_a_folder, [*PICTURE, *FRAME, "does not exist"]),
-    "picture of text": (no_picture, [*PICTURE, "not a readable picture"]),
-    "picture cut short": (cut, [*PICTURE, "not a readable picture"]),
-    "picture with a wrong bit": (flip_a_bit, [*PICTURE, "not a readable picture"]),
+    "picture of text": (no_picture, [*PICTURE, "not a readable image"]),
+    "picture cut short": (cut, [*PICTURE, "not a readable image"]),
+    "picture with a wrong bit": (flip_a_bit, [*PICTURE, "not a readable image"]),
     "picture of 16 bit": (sixteen_bit, [*PICTURE, "8 bits"]),
     "sizes mixed": (other_size, ["test/r_000.png", "10x7", "train/r_000.png", "12x8"]),
     "time of one frame missing": (frame_without("time"), [*FRAME, "no field time", "2 of 3"]),
@@ -341,7 +351,7 @@ def test_published_scenes(scene: str) -> None:
     assert len(data.test) == 20
     assert (data.times[0], data.times[-1]) == (0, 1)
     assert 4 < data.extent < 8
-    assert data.placement is data.cloud is None
+    assert data.normalization is data.cloud is None
     for view in data.train + data.test:  # the cameras stand on a sphere about the origin and look at it
         assert np.linalg.norm(view.camera.position) == pytest.approx(4.03, abs=0.04)
         origin = view.camera.T_cam_world[:3, 3]

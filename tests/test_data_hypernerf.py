@@ -129,12 +129,12 @@ def test_the_folder_suits_the_wanted_size(
 def test_cloud_and_cameras_are_moved_alike(toy: Path) -> None:
     data = load_dataset(toy)
     assert data.cloud is not None
-    assert data.placement is not None
+    assert data.normalization is not None
     means = Blobs.random().means.double().numpy()
-    np.testing.assert_allclose(data.cloud.points, data.placement.points(means), atol=1e-5)
+    np.testing.assert_allclose(data.cloud.points, data.normalization.points(means), atol=1e-5)
     assert (data.cloud.colours == 0.5).all()
     raw = json.loads((toy / f"camera/{ID}.json").read_text())["position"]
-    np.testing.assert_allclose(data.train[1].camera.position, data.placement.points(np.array(raw)), atol=1e-9)
+    np.testing.assert_allclose(data.train[1].camera.position, data.normalization.points(np.array(raw)), atol=1e-9)
     assert np.abs(data.cloud.points).max() == pytest.approx(1.3, rel=0.1)
 
 
@@ -143,8 +143,8 @@ def test_without_a_cloud_the_views_fill_the_box(toy: Path, device: Device) -> No
     data = load_dataset(toy)
     assert data.cloud is None
     assert data.depths is not None
-    assert data.placement is not None
-    np.testing.assert_allclose(np.array(data.depths) / data.placement.scale, [2, 8])
+    assert data.normalization is not None
+    np.testing.assert_allclose(np.array(data.depths) / data.normalization.scale, [2, 8])
     assert np.linalg.norm(data.focus) < 1.3
     assert agreement(data, Blobs.random(), device) > 50
 
@@ -309,12 +309,12 @@ BAD: dict[str, tuple[Change, list[str]]] = {
     "other proportions": (json_file(CAMERA, image_size=[64, 64]), ["rgb/1x", "64x48", "64x64", f"{CAMERA}.json"]),
     "sizes mixed": (picture((32, 24)), [f"{ID}.png", "32x24", "64x48"]),
     "16 bit": (picture((64, 48), "I;16"), [f"{ID}.png", "8 bits"]),
-    "picture of text": (text(f"rgb/1x/{ID}.png", "hello"), [f"{ID}.png", "not a readable picture"]),
+    "picture of text": (text(f"rgb/1x/{ID}.png", "hello"), [f"{ID}.png", "not a readable image"]),
     "mask absent": (
         json_file("dataset", train_ids=["left_000000"], val_ids=[ID, TEST_ID]),
-        [f"covisible/1x/val/{ID}.png does not exist", "1 of 2 test pictures", "remove"],
+        [f"covisible/1x/val/{ID}.png does not exist", "1 of 2 test images", "remove"],
     ),
-    "mask of text": (text(MASK, "hello"), [MASK, "not a readable picture"]),
+    "mask of text": (text(MASK, "hello"), [MASK, "not a readable image"]),
     "mask of other proportions": (picture((64, 64), "L", MASK), [MASK, "64x64", "64x48", f"camera/{TEST_ID}.json"]),
     "mask of 16 bit": (picture((64, 48), "I;16", MASK), [MASK, "8 bits"]),
     "mask of nothing": (picture((64, 48), "L", MASK), [MASK, "no white pixel", "nothing to measure", "remove"]),

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from lapgs_wgpu.data.cloud import Cloud
-from lapgs_wgpu.data.init import MIN_SCALE, initial_scales, random_points, see_through
+from lapgs_wgpu.data.init import MIN_SCALE, initial_scales, limit_optical_depth, random_points
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.splat.camera import Camera
@@ -100,7 +100,7 @@ def test_a_cloud_of_surfaces_keeps_its_sizes() -> None:
     x, z = np.meshgrid(np.linspace(-0.7, 0.7, 60), np.linspace(-0.5, 0.5, 40))
     wall = np.stack([x, 0 * x, z], axis=-1).reshape(-1, 3).astype(np.float32)
     scales = initial_scales(wall)
-    np.testing.assert_array_equal(see_through(wall, scales, 0.1, CAMERAS), scales)
+    np.testing.assert_array_equal(limit_optical_depth(wall, scales, 0.1, CAMERAS), scales)
     dataset = dataclasses.replace(ROOM, cloud=Cloud(wall, wall))
     points, _, kept = initial_points(load_config("neu3d-tiny").points, dataset, 0)
     np.testing.assert_array_equal(kept, initial_scales(points))  # in another order
@@ -112,6 +112,6 @@ def test_points_around_a_camera_count_as_one_picture_each() -> None:
     near = np.float32(CAMERAS[0].position + 1e-4 * CAMERAS[0].T_cam_world[2, :3])
     behind = np.float32(CAMERAS[0].position - 0.1 * CAMERAS[0].T_cam_world[2, :3])
     scales = np.full(40, 0.1, np.float32)
-    thinned = see_through(np.tile(near, (40, 1)), scales, 0.1, CAMERAS[:1])
+    thinned = limit_optical_depth(np.tile(near, (40, 1)), scales, 0.1, CAMERAS[:1])
     np.testing.assert_allclose(thinned, 0.1 * (40 * 0.1) ** -0.5, rtol=1e-6)
-    np.testing.assert_array_equal(see_through(np.tile(behind, (40, 1)), scales, 0.1, CAMERAS[:1]), scales)
+    np.testing.assert_array_equal(limit_optical_depth(np.tile(behind, (40, 1)), scales, 0.1, CAMERAS[:1]), scales)

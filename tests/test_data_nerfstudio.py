@@ -55,8 +55,8 @@ def test_times_splits_and_cloud(make: Any) -> None:
     assert [Path(view.source).name for view in data.test] == ["frame_00005.png"]
     blobs = Blobs.random()
     assert data.cloud is not None
-    assert data.placement is not None
-    np.testing.assert_allclose(data.cloud.points[:40], data.placement.points(blobs.means.numpy()), atol=1e-5)
+    assert data.normalization is not None
+    np.testing.assert_allclose(data.cloud.points[:40], data.normalization.points(blobs.means.numpy()), atol=1e-5)
     np.testing.assert_allclose(data.cloud.colours[:40], blobs.colors.numpy(), atol=0.5 / 255 + 1e-6)
 
 
@@ -135,7 +135,7 @@ BAD: dict[str, tuple[Callable[[dict[str, Any]], Any], list[str]]] = {
     "a frame of text": (lambda data: data["frames"].__setitem__(1, "x"), ["frame 1", "JSON object"]),
     "no file_path": (frame(file_path=None), ["frame 1", "no field file_path"]),
     "file_path absent": (frame(file_path="images/x.png"), ["images/x.png does not exist", "frame 1"]),
-    "file_path twice": (frame(file_path="images/frame_00001.png"), ["6 frames name 5 pictures", "frame_00001.png"]),
+    "file_path twice": (frame(file_path="images/frame_00001.png"), ["6 frames name 5 images", "frame_00001.png"]),
     "no matrix": (frame(transform_matrix=None), ["frame 1", "no field transform_matrix"]),
     "matrix scaled": (frame(transform_matrix=SCALED), ["frame 1", "transform_matrix", "0 0 0 1"]),
     "no fl_x": (top(fl_x=None), ["frame 0", "no field fl_x"]),
@@ -153,7 +153,7 @@ BAD: dict[str, tuple[Callable[[dict[str, Any]], Any], list[str]]] = {
     "ply absent": (top(ply_file_path="x.ply"), ["x.ply does not exist", "ply_file_path"]),
     "ply of a number": (top(ply_file_path=3), ["ply_file_path"]),
     "test unknown": (top(test_filenames=["x.png"]), ["test_filenames names x.png", "6 frames"]),
-    "test all": (top(test_filenames=[f"images/frame_{i:05d}.png" for i in range(1, 7)]), ["all 6 pictures"]),
+    "test all": (top(test_filenames=[f"images/frame_{i:05d}.png" for i in range(1, 7)]), ["all 6 images"]),
     "test of numbers": (top(test_filenames=[3]), ["test_filenames", "a list of 1"]),
     "OpenCV's axes": (opencv, ["6 of 6 see none", "100 % of them", "OpenGL"]),
     "the same without a cloud": (opencv_without_cloud, ["look away", "OpenGL", "5 of 5"]),

@@ -27,8 +27,9 @@ from captures import (
 )
 from PIL import Image
 
-from lapgs_wgpu.data import load_dataset, neu3d, video
+from lapgs_wgpu.data import load_dataset, video_frames
 from lapgs_wgpu.data.init import first_points
+from lapgs_wgpu.data.readers import neu3d
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 
@@ -134,7 +135,7 @@ def test_a_video_is_unpacked_once(clip: Path, cache: Path, monkeypatch: pytest.M
     assert sorted(file.name for file in unpacked[0].iterdir()) == ["00000.png", "00001.png", "00002.png"]
     assert not list(cache.rglob("*.partial"))
     assert sorted(file.name for file in clip.iterdir()) == before
-    monkeypatch.setattr(video.Video, "_unpack", lambda *_: pytest.fail("unpacked twice"))
+    monkeypatch.setattr(video_frames.Video, "_unpack", lambda *_: pytest.fail("unpacked twice"))
     data = load_dataset(clip)
     np.testing.assert_array_equal(data.train[2].load(), first)
     monkeypatch.undo()
@@ -145,7 +146,9 @@ def test_a_video_is_unpacked_once(clip: Path, cache: Path, monkeypatch: pytest.M
 
 def test_a_video_that_breaks_off_leaves_nothing(clip: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     data = load_dataset(clip)
-    monkeypatch.setattr(video, "_write", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left on device")))
+    monkeypatch.setattr(
+        video_frames, "_write", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left on device"))
+    )
     with pytest.raises(InputError, match=r"No space left.*XDG_CACHE_HOME.*GB"):
         data.train[0].load()
     assert not list(cache.rglob("cam01*"))
@@ -153,7 +156,7 @@ def test_a_video_that_breaks_off_leaves_nothing(clip: Path, cache: Path, monkeyp
 
 
 def test_a_video_with_fewer_frames_than_it_announces(clip: Path) -> None:
-    recording = video.Video(clip / "cam01.mp4")
+    recording = video_frames.Video(clip / "cam01.mp4")
     recording.frames = 4
     with pytest.raises(InputError, match=r"cam01\.mp4 announces 4 frames and holds 3"):
         recording.read(0, (WIDTH, HEIGHT))
@@ -173,8 +176,8 @@ def test_the_cloud_comes_along(toy: Path) -> None:
     write_points(toy / "points3D_downsample2.ply", blobs.means.numpy(), np.round(255 * blobs.colors.numpy()))
     data = load_dataset(toy)
     assert data.cloud is not None
-    assert data.placement is not None
-    np.testing.assert_allclose(data.cloud.points, data.placement.points(blobs.means.double().numpy()), atol=1e-5)
+    assert data.normalization is not None
+    np.testing.assert_allclose(data.cloud.points, data.normalization.points(blobs.means.double().numpy()), atol=1e-5)
     np.testing.assert_allclose(data.cloud.colours, blobs.colors, atol=0.5 / 255 + 1e-6)
     assert np.abs(data.cloud.points).max() == pytest.approx(1.3, rel=0.1)
     points, colours = first_points(data, 1000, 1.3, 0)
@@ -188,7 +191,7 @@ def test_the_cloud_comes_along(toy: Path) -> None:
 def test_without_a_cloud_gaussians_start_where_views_overlap(toy: Path) -> None:
     data = load_dataset(toy)
     assert data.cloud is None
-    assert data.placement is not None
+    assert data.normalization is not None
     points, colours = first_points(data, 2000, 99.0, 0)
     assert points.shape == colours.shape == (2000, 3)
     assert points.dtype == np.float32
@@ -197,7 +200,7 @@ def test_without_a_cloud_gaussians_start_where_views_overlap(toy: Path) -> None:
     for camera in data.cameras:
         local = points @ camera.T_cam_world[:3, :3].T + camera.T_cam_world[:3, 3]
         pixels = (local @ camera.K.T)[:, :2] / local[:, 2:]
-        depth = local[:, 2] / data.placement.scale
+        depth = local[:, 2] / data.normalization.scale
         seen = (pixels > -0.01).all(axis=1) & (pixels < [WIDTH + 0.01, HEIGHT + 0.01]).all(axis=1)
         inside += seen & (depth > NEAR - 1e-3) & (depth < FAR + 1e-3)
     assert inside.min() >= 2  # of three
@@ -262,7 +265,7 @@ def test_a_real_capture(monkeypatch: pytest.MonkeyPatch) -> None:
         for view, pixel in zip(views, seen, strict=True):
             local = view.camera.T_cam_world[:3, :3] @ ring + view.camera.T_cam_world[:3, 3]
             assert np.linalg.norm((view.camera.K @ local)[:2] / local[2] - pixel) < 2
-    decoded = video.Video(folder / "cam00.mp4").read(20, (336, 252)).astype(float)
+    decoded = video_frames.Video(folder / "cam00.mp4").read(20, (336, 252)).astype(float)
     error = decoded - data.test[20].load()[..., :3]
     assert 10 * np.log10(255**2 / np.square(error).mean()) > 30
     assert np.abs(error.mean(axis=(0, 1))).max() < 0.8  # another colour matrix, or range, shows here
@@ -325,7 +328,7 @@ BAD: dict[str, tuple[Change, list[str]]] = {
     "no rotation": (poses(0, slice(0, 3), [2, 0, 0]), [FILE, "row 0 (cam00)", "pose", "rotation"]),
     "OpenCV's axes": (other_array(OPENCV), [FILE, "row 0", "left-handed"]),
     "one camera": (gone("cam01", "cam02", "cam03"), ["recordings of 1 cameras", "at least 2"]),
-    "no pictures": (gone(*(f"cam01/images/{i:04d}.png" for i in range(3))), ["cam01/images", "no pictures"]),
+    "no pictures": (gone(*(f"cam01/images/{i:04d}.png" for i in range(3))), ["cam01/images", "no images"]),
     "a frame less": (gone("cam02/images/0001.png"), ["cam02", "2 frames", "cam00", "3"]),
     "other size": (picture("cam02/images/0000.png", (32, 24)), ["cam02", "32x24", "cam00", "64x48"]),
     "other proportions": (square, ["cam00", "64x64", "128x96", FILE]),
@@ -381,14 +384,14 @@ def test_found_in_videos(clip: Path) -> None:
 
 
 def test_videos_have_bounds(clip: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    recording = video.Video(clip / "cam01.mp4")
+    recording = video_frames.Video(clip / "cam01.mp4")
     recording.size = (2 * WIDTH, HEIGHT)
     with pytest.raises(InputError, match=f"frame 0 has {WIDTH}x{HEIGHT} pixels, and its header says {2 * WIDTH}x"):
         recording.read(0, (WIDTH, HEIGHT))
-    monkeypatch.setattr(video, "LARGEST_FRAME", WIDTH * HEIGHT - 1)
+    monkeypatch.setattr(video_frames, "LARGEST_FRAME", WIDTH * HEIGHT - 1)
     with pytest.raises(InputError, match=r"cam00\.mp4 has 3 frames of 64x48 pixels, and at most 3,071 pixels"):
         load_dataset(clip)
-    recording = video.Video.__new__(video.Video)
+    recording = video_frames.Video.__new__(video_frames.Video)
     recording.path, recording.frames, recording.size = clip / "cam02.mp4", 3, (WIDTH, HEIGHT)
     with pytest.raises(InputError, match=r"cam02\.mp4"):  # the decoder has the bound, too
         recording.read(0, (WIDTH, HEIGHT))
@@ -419,8 +422,9 @@ def test_rows_are_llffs() -> None:
     path = Path("poses_bounds.npy")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(neu3d, "read_npy", lambda _: np.array([row]))
-        (camera,), bounds = neu3d._read_poses(path, [Path("cam00")])
-    np.testing.assert_array_equal(camera.position, [5, 6, 7])
-    np.testing.assert_array_equal(camera.T_cam_world[:3, :3], [[1, 0, 0], [0, -1, 0], [0, 0, -1]])
-    np.testing.assert_array_equal(camera.K, [[80, 0, 32], [0, 80, 24], [0, 0, 1]])
-    np.testing.assert_array_equal(bounds, [[1, 9]])
+        (pose,) = neu3d._read_poses(path, [Path("cam00")])
+    R, t = pose.T_cam_world[:3, :3], pose.T_cam_world[:3, 3]
+    np.testing.assert_array_equal(-R.T @ t, [5, 6, 7])
+    np.testing.assert_array_equal(R, [[1, 0, 0], [0, -1, 0], [0, 0, -1]])
+    np.testing.assert_array_equal(pose.lens.K, [[80, 0, 32], [0, 80, 24], [0, 0, 1]])
+    assert (pose.lens.width, pose.lens.height, pose.depths) == (64, 48, (1, 9))

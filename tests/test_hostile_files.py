@@ -39,7 +39,7 @@ from test_viewer_path import nerfstudio
 
 from lapgs_wgpu.data import Dataset, load_dataset
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.io.first_look import FirstLook
+from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.motion.field import FieldConfig, PlaneConfig
 from lapgs_wgpu.motion.hashgrid import HashConfig
 from lapgs_wgpu.motion.playback import open_playback
@@ -161,7 +161,7 @@ def test_checkpoints_with_another_description(
 @np.errstate(all="ignore")
 def shown_at_all_times(file: Path, device: Device) -> None:
     playback = open_playback(file, device)
-    FirstLook.from_json(playback.metadata.get("view", ""))
+    InitialView.from_json(playback.metadata.get("view", ""))
     assert playback.means(0.5).shape == (playback.count, 3)
     assert len(playback.still(1.0)) == playback.count
 

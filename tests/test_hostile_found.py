@@ -35,8 +35,8 @@ from lapgs_wgpu.data.cloud import read_npy
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.checkpoint import read_checkpoint
-from lapgs_wgpu.io.documents import MAX_TOML_BYTES, read_json, read_toml
-from lapgs_wgpu.io.first_look import FirstLook
+from lapgs_wgpu.io.initial_view import InitialView
+from lapgs_wgpu.io.safe_json_toml import MAX_TOML_BYTES, read_json, read_toml
 from lapgs_wgpu.motion.scene_file import read_scene
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.loop import evaluate_run, resume
@@ -96,7 +96,7 @@ def test_found_in_results(tmp_path: Path) -> None:
 def test_found_in_metadata(text: str, device: Device, tmp_path: Path) -> None:
     """A place to look from is left out where it is no good; the description of a field is needed."""
     small_scene("grid4d", device).save(tmp_path / "a.ply", {"view": text})
-    assert FirstLook.from_json(read_checkpoint(tmp_path / "a.ply").metadata["view"]) is None
+    assert InitialView.from_json(read_checkpoint(tmp_path / "a.ply").metadata["view"]) is None
 
     def change(table: dict[str, Any]) -> bytes:
         table["__metadata__"]["field"] = text
@@ -184,7 +184,7 @@ def test_a_picture_without_pixels(tmp_path: Path) -> None:
     folder = make_scene(tmp_path / "toy")
     file = folder / "train" / "r_000.png"
     file.write_bytes(with_checksums(file.read_bytes().replace(b"IDAT", b"IDAU")))
-    with pytest.raises(InputError, match="is not a readable picture"):
+    with pytest.raises(InputError, match="is not a readable image"):
         load_dataset(folder)
 
 
@@ -275,7 +275,7 @@ def test_toml_of_the_largest_size_is_quick(tmp_path: Path) -> None:
     command = [
         sys.executable,
         "-c",
-        "import sys; from lapgs_wgpu.io.documents import read_toml; read_toml(sys.argv[1])",
+        "import sys; from lapgs_wgpu.io.safe_json_toml import read_toml; read_toml(sys.argv[1])",
     ]
     subprocess.run([*command, str(tmp_path / "a.toml")], check=True, timeout=60)
     (tmp_path / "a.toml").write_text("#" * (MAX_TOML_BYTES + 1))

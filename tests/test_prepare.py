@@ -94,7 +94,7 @@ def test_films_of_still_cameras(films: list[Path], tmp_path: Path, monkeypatch: 
     log = fake(tmp_path, monkeypatch, models={"0": 2})
     out = tmp_path / "out"
     assert prepare_command([*map(str, films), "--out", str(out)]) == 0
-    assert (out / "colmap/pictures.txt").read_text() == "cam00/00000000.jpg\ncam01/00000000.jpg\n"
+    assert (out / "colmap/list.txt").read_text() == "cam00/00000000.jpg\ncam01/00000000.jpg\n"
     assert "exhaustive_matcher" in log.read_text()
     assert sorted(json.loads((out / "times.json").read_text()))[4] == "cam01/00000000.jpg"
 
@@ -103,10 +103,10 @@ def test_films_of_still_cameras(films: list[Path], tmp_path: Path, monkeypatch: 
 @pytest.mark.parametrize(
     ("failing", "models", "words"),
     [
-        ("mapper", {"0": 4}, ["colmap mapper failed with code 1", "it says why", "share too little", "colmap.log"]),
+        ("mapper", {"0": 4}, ["colmap mapper failed with code 1", "it says why", "overlap too little", "colmap.log"]),
         ("feature_extractor", {"0": 4}, ["colmap feature_extractor failed", "it says why"]),
         ("", {}, ["found no cameras", "colmap.log"]),
-        ("", {"0": 1}, ["placed 1 of 4 pictures"]),
+        ("", {"0": 1}, ["registered 1 of 4 images"]),
     ],
 )
 def test_failures_of_colmap(

@@ -17,8 +17,8 @@ import torch
 from PIL import Image
 
 from lapgs_wgpu.data import Dataset, load_dataset
+from lapgs_wgpu.data.normalize import Normalization
 from lapgs_wgpu.data.synthetic import write_synthetic
-from lapgs_wgpu.data.views import Placement
 from lapgs_wgpu.errors import DeviceMemoryError, InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.checkpoint import read_checkpoint
@@ -123,7 +123,7 @@ def test_the_checkpoint_is_the_last_model(run: Path, dataset: Dataset, device: D
 
 
 def test_the_format_names_what_a_checkpoint_says_of_itself(dataset: Dataset, device: Device, tmp_path: Path) -> None:
-    moved = dataclasses.replace(dataset, placement=Placement(np.zeros(3), 1.0))
+    moved = dataclasses.replace(dataset, normalization=Normalization(np.zeros(3), 1.0))
     train(configure(schedule__steps="2"), moved, tmp_path / "run", device=device)
     written = read_checkpoint(tmp_path / "run" / "checkpoint.ply").metadata
     text = (Path(__file__).parents[1] / "docs" / "format.md").read_text(encoding="utf-8")

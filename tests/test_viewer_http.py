@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from lapgs_wgpu import Scene4D
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.io.first_look import FirstLook
+from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.motion.field import FieldConfig
 from lapgs_wgpu.motion.hashgrid import HashConfig
 from lapgs_wgpu.splat.camera import Camera
@@ -331,7 +331,7 @@ def scene(device: Device, tmp_path_factory: pytest.TempPathFactory) -> Path:
         for parameter in made.field.parameters():
             parameter.copy_(0.3 * torch.randn(parameter.shape, generator=generator))
     camera = Camera.looking_at([0, -0.5, -4], [0, 0, 0], up=[0, -1, 0], fov_x=0.8, width=400, height=300)
-    look = FirstLook(camera, np.zeros(3), np.array([0.0, -1.0, 0.0]), FRAMES)
+    look = InitialView(camera, np.zeros(3), np.array([0.0, -1.0, 0.0]), FRAMES)
     path = tmp_path_factory.mktemp("scene") / "moving.ply"
     made.save(path, {"view": look.to_json(), "background": "black"})
     return path

@@ -21,7 +21,7 @@ from test_scene import CONFIG
 from lapgs_wgpu.data import Dataset, load_dataset
 from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.io.first_look import FirstLook
+from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.motion.scene import Scene4D, load
 from lapgs_wgpu.train.evaluate import to_8_bit
 from lapgs_wgpu.train.presets import load_config, write_toml
@@ -51,8 +51,8 @@ def run(tmp_path_factory: pytest.TempPathFactory, device: Device) -> Path:
     return folder
 
 
-def look(dataset: Dataset) -> FirstLook:
-    return FirstLook(dataset.test[0].camera, dataset.focus, dataset.up, 31)
+def look(dataset: Dataset) -> InitialView:
+    return InitialView(dataset.test[0].camera, dataset.focus, dataset.up, 31)
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ import numpy as np
 
 from lapgs_wgpu.gpu.buffer import BufferPool
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.io.documents import read_toml
+from lapgs_wgpu.io.safe_json_toml import read_toml
 
 if TYPE_CHECKING:
     from lapgs_wgpu.data import View

@@ -15,7 +15,7 @@ from typing import Protocol
 
 from rendercanvas.utils.asyncs import sleep
 
-from lapgs_wgpu.io.first_look import FirstLook
+from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.motion.scene_playback import ScenePlayback
 
@@ -51,7 +51,7 @@ class Training:
         self.single = 0
 
 
-def watch(scene: Scene4D, look: FirstLook, steps: Iterator[Progress]) -> None:
+def watch(scene: Scene4D, look: InitialView, steps: Iterator[Progress]) -> None:
     """Show the scene in a window and take the training's steps, until the window is closed."""
     from .window import choose_backend, make_canvas
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.io.first_look import FirstLook
+from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.motion.playback import Playback, playback_of
 from lapgs_wgpu.motion.scene_file import read_scene
 from lapgs_wgpu.splat.camera import Camera
@@ -29,7 +29,7 @@ class Opened(NamedTuple):
 
     path: Path | None
     playback: Playback
-    look: FirstLook
+    look: InitialView
 
     def camera(self) -> ViewCamera:
         """A camera where the viewer begins."""
@@ -48,11 +48,11 @@ class Opened(NamedTuple):
 def open_scene(path: Path, device: Callable[[], Device]) -> Opened:
     """Open a checkpoint, or any 3DGS .ply. device: is asked for when the file has been read. Raises InputError."""
     playback = playback_of(read_scene(path), device())
-    look = FirstLook.from_json(playback.metadata.get("view", ""))
+    look = InitialView.from_json(playback.metadata.get("view", ""))
     return Opened(path, playback, look or guess_look(playback))
 
 
-def guess_look(playback: Playback) -> FirstLook:
+def guess_look(playback: Playback) -> InitialView:
     """For files that say nothing of cameras: the middle of the Gaussians from a distance that shows most of them.
 
     Up is -y, as in scenes whose poses come from COLMAP; z where the Gaussians lie flat in x and y, or the file is a
@@ -73,4 +73,4 @@ def guess_look(playback: Playback) -> FirstLook:
         up, ahead = np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, 1.0])
     away = math.sin(_ELEVATION) * up - math.cos(_ELEVATION) * ahead
     camera = Camera.looking_at(middle + 3.6 * radius * away, middle, up=up.tolist(), fov_x=0.9, width=640, height=480)
-    return FirstLook(camera, middle, up, _FRAMES)
+    return InitialView(camera, middle, up, _FRAMES)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lapgs_wgpu.errors import InputError, shown
 from lapgs_wgpu.io.atomic import atomic_write
-from lapgs_wgpu.io.documents import read_json
+from lapgs_wgpu.io.safe_json_toml import read_json
 
 from .path import CameraPath, KeyFrame, Pose
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from lapgs_wgpu.data import View
+from lapgs_wgpu.data.images import encode_png
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.splat.camera import Camera
@@ -76,7 +75,5 @@ def framed(camera: Camera, width: int, height: int) -> Camera:
 
 def write_png(file: Path, picture: NDArray[np.uint8]) -> None:
     """Write (height, width, 3) uint8. Atomic. Raises InputError where it cannot be written."""
-    encoded = io.BytesIO()
-    Image.fromarray(picture).save(encoded, "PNG")
     with atomic_write(file) as target:
-        target.write(encoded.getvalue())
+        target.write(encode_png(picture))

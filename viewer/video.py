@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from fractions import Fraction
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -69,32 +70,29 @@ def write_video(
 
     Raises InputError where PyAV is missing or the file cannot be written.
     """
-    opened = _video_writer()
+    try:
+        import av
+    except ImportError as error:
+        raise InputError("writing mp4 needs PyAV: pip install 'lapgs-wgpu[video]'") from error
+    rate = Fraction(fps).limit_denominator(65535)
     with atomic_write(file) as target:
         sink = _Sink(target)
-        _encode(opened(sink), sink, shots, frames, fps, shoot)
+        with Progress(frames, "frames") as progress, av.open(sink, "w", format="mp4") as container:
+            stream = container.add_stream("libx264", rate, options={"crf": _QUALITY, "preset": "medium"})
+            stream.pix_fmt = "yuv420p"
+            # Players guess the meaning of the values by the size unless they are stated: BT.601's matrix, as swscale
+            # converts, in the limited range, and sRGB's primaries.
+            context = stream.codec_context
+            context.colorspace, context.color_primaries, context.color_trc, context.color_range = 6, 1, 13, 1
+            for camera, time in shots:
+                image = shoot(camera, time)
+                if not context.is_open:  # the first encoded frame opens it
+                    stream.height, stream.width = image.shape[:2]
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(image, "rgb24")))
+                sink.check()
+                progress.step()
+            container.mux(stream.encode(None))
         sink.check()
-
-
-def _encode(
-    writer: Any,
-    sink: _Sink,
-    shots: Iterator[Shot],
-    frames: int,
-    fps: float,
-    shoot: Callable[[Camera, float], NDArray[np.uint8]],
-) -> None:
-    with Progress(frames, "frames") as progress, writer as video:
-        video.init_video_stream("libx264", fps=fps, pixel_format="yuv420p")
-        context = video._video_stream.codec_context
-        context.options = {"crf": _QUALITY, "preset": "medium"}
-        # What the numbers mean, for players guess by the size otherwise: BT.601's matrix, as swscale converts, in the
-        # limited range; and sRGB's primaries.
-        context.colorspace, context.color_primaries, context.color_trc, context.color_range = 6, 1, 13, 1
-        for camera, time in shots:
-            video.write_frame(shoot(camera, time))
-            sink.check()
-            progress.step()
 
 
 class _Sink:
@@ -126,13 +124,3 @@ class _Sink:
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._file, name)
-
-
-def _video_writer() -> Callable[[Any], Any]:
-    try:
-        import av  # noqa: F401
-        import imageio.v3 as iio
-    except ImportError as error:
-        raise InputError("writing mp4 needs PyAV: pip install 'lapgs-wgpu[video]'") from error
-
-    return lambda target: iio.imopen(target, "w", plugin="pyav", extension=".mp4", container="mp4")

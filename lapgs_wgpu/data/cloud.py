@@ -1,4 +1,4 @@
-"""The cloud of points that a capture brings: where Gaussians start. It is checked against the cameras first."""
+"""The point cloud of a capture, at which Gaussians start, and which cameras see its points."""
 
 from __future__ import annotations
 
@@ -9,17 +9,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.data.poses import Placement
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.ply_points import read_points
 from lapgs_wgpu.splat.camera import Camera
 
 Array = NDArray[np.float64]
 
-# A triangulated point was seen by cameras. Where most are not, cloud and cameras have different coordinates.
-LEAST_SEEN = 0.5
-LEAST_SPREAD = 1e-3  # of the cloud, in distances of the cameras from it: a smaller one is a speck in every picture
-PROBES = 64  # cameras that suffice to ask which points are seen
+PROBES = 64  # cameras that suffice to determine which points are seen
+DENSITY, MIN_CELLS = 8, 4  # points per cell, on average; cells along an axis
+FILLED = 0.95  # share of cells with points from which on a cloud is random: the surfaces of a scene leave most empty
 
 
 class Cloud(NamedTuple):
@@ -29,18 +27,15 @@ class Cloud(NamedTuple):
     colours: NDArray[np.float32]
 
     def at_most(self, count: int, seed: int) -> Cloud:
-        """All of it, or `count` points drawn at random where it has more, in their order."""
+        """Return at most `count` points: all of them, or a random subset in their order."""
         if len(self.points) <= count:
             return self
         chosen = np.sort(np.random.default_rng(seed).choice(len(self.points), count, replace=False))
         return Cloud(self.points[chosen], self.colours[chosen])
 
-    def moved(self, placement: Placement) -> Cloud:
-        return Cloud(placement.points(self.points.astype(np.float64)).astype(np.float32), self.colours)
-
 
 def find_cloud(folder: Path, patterns: Sequence[str]) -> Path | None:
-    """The first file that one of the patterns finds, the last of each pattern's by name."""
+    """Find the last file by name of the first pattern that matches any."""
     for pattern in patterns:
         found = sorted(folder.glob(pattern))
         if found:
@@ -49,7 +44,7 @@ def find_cloud(folder: Path, patterns: Sequence[str]) -> Path | None:
 
 
 def read_cloud(path: Path) -> Cloud:
-    """The points of a .npy or a .ply file, mid-grey where it says no colours. Raises InputError."""
+    """Read a .npy or a .ply file; points without colours are mid-gray. Raises InputError."""
     colours = None
     if path.suffix == ".npy":
         points = read_npy(path)
@@ -57,7 +52,7 @@ def read_cloud(path: Path) -> Cloud:
         points, colours = read_points(path)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
         raise InputError(f"{path} must hold at least one point of 3 numbers, an array of (N, 3), got {points.shape}.")
-    with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite, and is named
+    with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite, which is reported below
         points = points.astype(np.float32)
     bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
     if len(bad):
@@ -69,12 +64,12 @@ def read_cloud(path: Path) -> Cloud:
 
 
 def read_npy(path: Path) -> NDArray[np.floating]:
-    """An array of numbers. Raises InputError."""
+    """Read a .npy file of numbers. Raises InputError."""
     try:
-        # Mapped, so that a declared shape takes no memory before it is compared with the file's size.
+        # Memory-mapped: a declared shape must not allocate memory before it is compared with the file size.
         mapped = np.load(path, mmap_mode="r", allow_pickle=False)
         array = np.array(mapped) if isinstance(mapped, np.ndarray) else None
-    except Exception as error:  # NumPy hands a damaged header to Python's own parser, and passes its errors on
+    except Exception as error:  # NumPy passes a damaged header to Python's parser, with all its errors
         reason = str(error)[:200]
         raise InputError(f"{path} cannot be read as a NumPy array ({reason}); copy or make it again.") from None
     if array is None or array.dtype.kind not in "fiu":
@@ -83,34 +78,13 @@ def read_npy(path: Path) -> NDArray[np.floating]:
     return array
 
 
-def check_cloud(cloud: Cloud, cameras: Sequence[Camera], path: Path) -> None:
-    """InputError unless cloud and cameras, in the same coordinates, look like parts of one capture."""
-    points = cloud.points.astype(np.float64)
-    centres = np.stack([camera.position for camera in cameras])
-    middle = np.median(points, axis=0)
-    spread = float(np.percentile(np.linalg.norm(points - middle, axis=1), 90))
-    distance = float(np.median(np.linalg.norm(centres - middle, axis=1)))
-    seen = float((views_of(points, cameras) > 0).mean())
-    numbers = f"the cloud has a radius of {spread:.3g}, and the cameras stand {distance:.3g} away from it"
-    if seen < LEAST_SEEN:
-        raise InputError(
-            f"{path}: the training cameras see {100 * seen:.0f} % of its points (at least {100 * LEAST_SEEN:.0f} % are "
-            f"expected): {numbers}; it is in other coordinates than the cameras, so bring it to theirs or remove it."
-        )
-    if len(points) > 1 and spread < LEAST_SPREAD * distance:
-        raise InputError(
-            f"{path} is a speck: {numbers}; it has another scale than the cameras, so bring it to theirs or remove it."
-        )
-
-
 def evenly_chosen(cameras: Sequence[Camera]) -> list[Camera]:
-    """All cameras, or PROBES of them."""
+    """Return at most PROBES of the cameras, evenly spaced."""
     return [cameras[i] for i in np.unique(np.linspace(0, len(cameras) - 1, PROBES).round().astype(int))]
 
 
 def views_of(points: Array, cameras: Sequence[Camera], near: float = 0.0, far: float = np.inf) -> NDArray[np.int64]:
-    """(N,) how many of the cameras (of PROBES evenly chosen ones, if there are more) see each point (N, 3), at a depth
-    between near and far."""
+    """Count the cameras that see each point (N, 3) at a depth between near and far, of at most PROBES cameras: (N,)."""
     seen = np.zeros(len(points), dtype=np.int64)
     for camera in evenly_chosen(cameras):
         depths, inside = in_view(points, camera)
@@ -119,7 +93,7 @@ def views_of(points: Array, cameras: Sequence[Camera], near: float = 0.0, far: f
 
 
 def in_view(points: NDArray[np.floating], camera: Camera) -> tuple[NDArray[np.floating], NDArray[np.bool_]]:
-    """Depths (N,) of points (N, 3), NaN behind the camera, and which of them lie in its picture."""
+    """Return the depth (N,) of points (N, 3), NaN behind the camera, and whether each lies in its image (N,)."""
     local = points @ camera.T_cam_world[:3, :3].T + camera.T_cam_world[:3, 3]
     depths = np.where(local[:, 2] > 0, local[:, 2], np.nan)
     pixels = (local @ camera.K.T)[:, :2] / depths[:, None]
@@ -128,11 +102,11 @@ def in_view(points: NDArray[np.floating], camera: Camera) -> tuple[NDArray[np.fl
 
 
 def points_in_view(cameras: Sequence[Camera], near: float, far: float, count: int, seed: int) -> Array:
-    """(count, 3) random points where the cameras' views overlap, between the depths near and far, world units.
+    """Draw (count, 3) random points where the cameras' views overlap, at depths between near and far, world units.
 
-    Each lies on the ray of a random pixel of a random camera, uniform in 1 / depth, so that near and far things get
-    about as many points as they cover pixels. Kept are those that are seen by at least half as many cameras as the
-    points that are seen by most.
+    Each point lies on the ray of a random pixel of a random camera, uniform in 1 / depth, so that things get points in
+    proportion to the pixels that they cover. A point is kept if at least half as many cameras see it as see the point
+    that is seen by most.
     """
     rng = np.random.default_rng(seed)
     kept = np.empty((0, 3))
@@ -152,3 +126,14 @@ def points_in_view(cameras: Sequence[Camera], near: float, far: float, count: in
         least = least or seen.max() / 2
         kept = np.concatenate([kept, points[seen >= least]])
     return kept[:count]
+
+
+def is_random(cloud: Cloud) -> bool:
+    """Whether a cloud fills its bounding box evenly, like the random clouds that other trainers write into a folder."""
+    points = cloud.points.astype(np.float64)
+    low, high = points.min(axis=0), points.max(axis=0)
+    cells = min(int((len(points) / DENSITY) ** (1 / 3)), 32)
+    if cells < MIN_CELLS or not (high > low).all():
+        return False
+    at = np.minimum(((points - low) / (high - low) * cells).astype(int), cells - 1)
+    return len(np.unique(at @ [cells * cells, cells, 1])) >= FILLED * cells**3

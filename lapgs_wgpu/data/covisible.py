@@ -1,30 +1,30 @@
-"""DyCheck's covisibility masks (Gao et al. 2022) of held-out pictures: white is what enough training pictures show.
+"""Covisibility masks of DyCheck (Gao et al. 2022) for test images: white is what enough training images show.
 
-docs/data.md says where they lie.
+docs/data.md describes the files.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
-from lapgs_wgpu.data.lens import Array, Lens, straightened
-from lapgs_wgpu.data.pictures import check_picture, check_proportions, decode, factor_folders
+from lapgs_wgpu.data.images import NEAREST, Size, decode, resize, shrink
+from lapgs_wgpu.data.undistort import Undistortion
 from lapgs_wgpu.errors import InputError
 
-SPLITS = ("val", "val_intl")  # of DyCheck's own captures; of rigs whose cameras take turns to be trained on
+SPLITS = ("val", "val_intl")  # of DyCheck's captures; of rigs that alternate the training camera
 WHITE = 255
 
 
 def find_masks(covisible: Path, names: Sequence[str], factor: str) -> dict[str, Path]:
-    """Id -> mask of all these test pictures, or of none: {}.
+    """Find the masks of all these test images, by id; {} if there is none.
 
-    They come from one folder of `covisible`: that of the pictures' factor, such as "2x", or, if it holds none of them,
-    that of the smallest which does. Raises InputError where it holds some of them only.
+    They come from one folder of `covisible`: that of the images' factor, such as "2x", or, if it holds none of them,
+    that of the smallest factor which does. Raises InputError if a folder holds only some of them.
     """
     folders = [scale / split for scale in (covisible / factor, *factor_folders(covisible)) for split in SPLITS]
     for folder in folders:
@@ -34,30 +34,32 @@ def find_masks(covisible: Path, names: Sequence[str], factor: str) -> dict[str, 
             return masks
         if len(missing) < len(masks):
             raise InputError(
-                f"{missing[0]} does not exist, but {len(masks) - len(missing)} of {len(masks)} test pictures have a "
+                f"{missing[0]} does not exist, but {len(masks) - len(missing)} of {len(masks)} test images have a "
                 f"mask there; add it, or remove {covisible}."
             )
     return {}
 
 
-def check_mask(path: Path, expected: tuple[int, int], camera: str) -> None:
-    """InputError unless a file is a mask with the proportions of `expected` (width, height) and something to measure.
+def factor_folders(folder: Path) -> list[Path]:
+    """The folders 1x, 2x, ... in a folder, by number: in nerfies' layout, the same images at 1 / N of their size."""
+    found = [child for child in folder.glob("*x") if re.fullmatch(r"[1-9]\d{0,3}x", child.name)]
+    return sorted(found, key=lambda child: int(child.name[:-1]))
 
-    camera: what the error calls where that size stands.
-    """
-    check_proportions(check_picture(path), expected, path, camera)
-    if np.asarray(decode(path))[..., 0].max() < WHITE:
+
+def check_mask(path: Path) -> None:
+    """Check that a mask has a white pixel. Raises InputError."""
+    if decode(path)[..., 0].max() < WHITE:
         raise InputError(
             f"{path} has no white pixel ({WHITE}), which leaves nothing to measure; make it again, or remove the masks "
-            "of all test pictures."
+            "of all test images."
         )
 
 
-def read_mask(path: Path, lens: Lens, K: Array, stored: tuple[int, int], size: tuple[int, int]) -> NDArray[np.bool_]:
-    """Which pixels of the picture that `read_straight` makes with the same arguments are measured: (H, W).
+def read_mask(path: Path, undistortion: Undistortion | None, stored: Size, size: Size) -> NDArray[np.bool_]:
+    """Decode the mask of an image of (width, height) `stored` that is undistorted and shrunk to `size`: (H, W).
 
-    The mask, of any size, is brought to `stored` by nearest neighbours. Where straightening and shrinking mix several
-    pixels, all must be white. Raises InputError.
+    The mask is first resized to `stored` by nearest neighbours. Where undistorting and shrinking mix pixels, all must
+    be white. Raises InputError.
     """
-    mask = decode(path).convert("RGB").resize(stored, Image.Resampling.NEAREST)
-    return straightened(mask, lens, K, size)[..., 0] == WHITE
+    mask = resize(decode(path)[..., :3], stored, NEAREST)
+    return shrink(mask if undistortion is None else undistortion.apply(mask), size)[..., 0] == WHITE

@@ -12,9 +12,9 @@ import json
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
 from lapgs_wgpu.data.dnerf_writer import already_holds, frame_name, new_folder, split_times, write_transforms
+from lapgs_wgpu.data.images import encode_png
 from lapgs_wgpu.data.motion_scenes import STILL_CAMERAS, MotionScene, fov_x, moving_objects, scene_cameras, trace
 from lapgs_wgpu.data.objects import FORMAT, RECORD
 from lapgs_wgpu.data.raytrace import SAMPLES, Hits, combine, pixel_means, to_bytes, to_pixels
@@ -103,16 +103,17 @@ def _write_image(folder: Path, name: str, scene: MotionScene, camera: Camera, ti
     surfaces = trace(scene, camera, time)
     count = camera.width * camera.height * SAMPLES**2
 
-    def image(hits: list[Hits]) -> Image.Image:
+    def image(hits: list[Hits]) -> bytes:
         colour, owner = combine(hits, count)
-        return Image.fromarray(to_pixels(colour, owner >= 0, camera))
+        return encode_png(to_pixels(colour, owner >= 0, camera))
 
-    image(surfaces).save(folder / f"{name}.png")
+    (folder / f"{name}.png").write_bytes(image(surfaces))
     if not truth:
         return
     _, owner = combine(surfaces, count)
     for number, one in enumerate(moving_objects(scene)):
         if one.moves:
-            mask = to_bytes(pixel_means(owner == number, camera))
-            Image.fromarray(mask).save(folder / "masks" / f"{name}_{one.name}.png")
-            image([*surfaces[:number], *surfaces[number + 1 :]]).save(folder / "clean" / f"{name}_{one.name}.png")
+            mask = encode_png(to_bytes(pixel_means(owner == number, camera)))
+            (folder / "masks" / f"{name}_{one.name}.png").write_bytes(mask)
+            clean = image([*surfaces[:number], *surfaces[number + 1 :]])
+            (folder / "clean" / f"{name}_{one.name}.png").write_bytes(clean)

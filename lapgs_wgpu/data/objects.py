@@ -1,4 +1,4 @@
-"""The truth about moving objects that a generated scene stores beside its images (objects.json, masks/, clean/)."""
+"""Ground truth of moving objects that a generated scene stores beside its images (objects.json, masks/, clean/)."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.data.fields import finite, kind, read_json, required, vector
-from lapgs_wgpu.data.pictures import check_picture, read_picture
+from lapgs_wgpu.data.images import ImageFile, check_image
+from lapgs_wgpu.data.json_fields import finite, kind, read_json, required, vector
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
 
@@ -28,8 +28,8 @@ class ObjectTruth:
     """One moving object in one held-out view.
 
     centre: (2,) projection of its centre, pixels (column, row). diameter: of its projection, pixels.
-    mask: decodes the share of each pixel that shows it: (H, W) uint8. clean: decodes the view without it: (H, W, 3) RGB
-    or (H, W, 4) straight RGBA, uint8. Both raise InputError.
+    mask: decodes the coverage of each pixel by the object: (H, W) uint8. clean: decodes the view without the object:
+    (H, W, 3) RGB or (H, W, 4) straight RGBA, uint8. Both raise InputError.
     """
 
     name: str
@@ -39,13 +39,35 @@ class ObjectTruth:
     clean: Callable[[], NDArray[np.uint8]]
 
 
-def read_objects(folder: Path, split: str, images: Sequence[str], cameras: Sequence[Camera]) -> list[list[ObjectTruth]]:
-    """The moving objects of each image of a split; empty lists where the folder has no objects.json.
+class ObjectRecord(NamedTuple):
+    """One moving object in one frame. position: (3,) and diameter in the capture's units. mask, clean: image files."""
+
+    name: str
+    position: NDArray[np.float64]
+    diameter: float
+    mask: ImageFile
+    clean: ImageFile
+
+    def seen_by(self, camera: Camera) -> ObjectTruth:
+        """Project the object to a camera in the capture's coordinates."""
+        size = (camera.width, camera.height)
+        x, y, z = camera.T_cam_world[:3, :3] @ self.position + camera.T_cam_world[:3, 3]
+        z = max(z, 1e-6)
+        return ObjectTruth(
+            self.name,
+            centre=camera.K[:2, :2] @ [x / z, y / z] + camera.K[:2, 2],
+            diameter=camera.K[0, 0] * self.diameter / z,
+            mask=partial(_read_mask, self.mask, size),
+            clean=partial(self.clean.read, size),
+        )
+
+
+def read_objects(folder: Path, split: str, images: Sequence[str]) -> list[list[ObjectRecord]]:
+    """Read the moving objects of each image of a split; empty lists if the folder has no objects.json.
 
     Args:
         folder: of the scene.
         images: file names of the images without suffix, in the order of the split.
-        cameras: of the images, at the size that the masks are shrunk to.
 
     Raises:
         InputError: objects.json is damaged or does not fit the images, or a mask or clean plate is missing or damaged.
@@ -56,30 +78,18 @@ def read_objects(folder: Path, split: str, images: Sequence[str], cameras: Seque
     listed = required(read_json(path, "format and objects"), "objects", path, _HINT)
     if not isinstance(listed, list):
         raise InputError(f"{path}: objects must be a list, got {kind(listed)}.")
-    result: list[list[ObjectTruth]] = [[] for _ in images]
+    result: list[list[ObjectRecord]] = [[] for _ in images]
     for number, entry in enumerate(listed):
         where = f"{path}, object {number}"
         name, diameter, positions = _object(entry, split, len(images), where)
         if not positions:
             continue
-        for image, camera, position, found in zip(images, cameras, positions, result, strict=True):
+        for image, position, found in zip(images, positions, result, strict=True):
             files = [folder / part / split / f"{image}_{name}.png" for part in ("masks", "clean")]
             for file in files:
                 if not file.is_file():
                     raise InputError(f"{file} does not exist, but {where} is to be measured; {_HINT}.")
-                check_picture(file)
-            size = (camera.width, camera.height)
-            x, y, z = camera.T_cam_world[:3, :3] @ position + camera.T_cam_world[:3, 3]
-            z = max(z, 1e-6)
-            found.append(
-                ObjectTruth(
-                    name,
-                    centre=camera.K[:2, :2] @ [x / z, y / z] + camera.K[:2, 2],
-                    diameter=camera.K[0, 0] * diameter / z,
-                    mask=partial(_read_mask, files[0], size),
-                    clean=partial(read_picture, files[1], size),
-                )
-            )
+            found.append(ObjectRecord(name, position, diameter, check_image(files[0]), check_image(files[1])))
     return result
 
 
@@ -102,5 +112,5 @@ def _object(entry: Any, split: str, count: int, where: str) -> tuple[str, float,
     return name, diameter, [vector(position, 3, "positions", where) for position in positions]
 
 
-def _read_mask(path: Path, size: tuple[int, int]) -> NDArray[np.uint8]:
-    return read_picture(path, size)[..., 0]
+def _read_mask(file: ImageFile, size: tuple[int, int]) -> NDArray[np.uint8]:
+    return file.read(size)[..., 0]

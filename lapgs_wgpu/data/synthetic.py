@@ -16,9 +16,9 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from PIL import Image
 
 from lapgs_wgpu.data.dnerf_writer import already_holds, frame_name, new_folder, split_times, write_transforms
+from lapgs_wgpu.data.images import encode_png
 from lapgs_wgpu.data.raytrace import (
     Colour,
     Floats,
@@ -179,7 +179,8 @@ def write_synthetic(
             (unfinished / split).mkdir()
             taken = cameras(len(times), 3 * seed + index, size=size)
             for i, (camera, time) in enumerate(zip(taken, times, strict=True)):
-                Image.fromarray(render(camera, time, frequencies)).save(unfinished / f"{frame_name(split, i)}.png")
+                image = encode_png(render(camera, time, frequencies))
+                (unfinished / f"{frame_name(split, i)}.png").write_bytes(image)
             write_transforms(unfinished, split, taken, times, CAMERA_ANGLE_X)
         (unfinished / RECORD).write_text(json.dumps(parameters, indent=1) + "\n")
     return folder

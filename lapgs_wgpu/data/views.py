@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lapgs_wgpu.data.cloud import Cloud
+from lapgs_wgpu.data.normalize import Normalization
 from lapgs_wgpu.data.objects import ObjectTruth
-from lapgs_wgpu.data.poses import Placement
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
 
@@ -85,7 +85,7 @@ class Dataset:
     test: tuple[View, ...]
     cloud: Cloud | None = None
     depths: tuple[float, float] | None = None
-    placement: Placement | None = None
+    normalization: Normalization | None = None
     warnings: tuple[str, ...] = ()
     time_source: str = "time"
 

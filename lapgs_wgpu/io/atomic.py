@@ -1,4 +1,4 @@
-"""Files that are either whole or not there: what stood under the name before survives every failure."""
+"""Write files atomically: a failed write leaves the previous file unchanged."""
 
 from __future__ import annotations
 
@@ -14,17 +14,16 @@ from lapgs_wgpu.errors import InputError
 
 @contextmanager
 def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
-    """A binary file to write, which takes the name `path` only when the block ends without an exception.
+    """Open a binary file for writing that replaces `path` when the block ends without an exception.
 
-    The bytes go to `.NAME.XXXXXXXX.tmp` in the same folder, are forced to the disk and renamed; then the folder is
-    forced too. On any exception the temporary file is removed and the old file stays as it was; only a killed process
-    leaves its temporary file behind. Errors of the file system (disk full, read-only or missing folder) are raised as
-    InputError.
+    The bytes go to `.NAME.XXXXXXXX.tmp` in the same folder, which is synced to disk and renamed; then the folder is
+    synced. On any exception the temporary file is removed and the old file is unchanged; only a killed process leaves
+    its temporary file behind. Raises InputError on errors of the file system (disk full, read-only or missing folder).
     """
     path = Path(path)
     temporary = path.parent / f".{path.name}.{secrets.token_hex(4)}.tmp"
     try:
-        with open(temporary, "xb") as file:  # x: never through a link that somebody else put there
+        with open(temporary, "xb") as file:  # x: do not follow a symbolic link that another user created
             yield file
             file.flush()
             os.fsync(file.fileno())
@@ -42,13 +41,13 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
 
 
 def _remove(path: Path) -> None:
-    with suppress(OSError):  # the folder may be missing or read-only: the first error is the one to tell
+    with suppress(OSError):  # the folder may be missing or read-only; report the first error
         path.unlink()
 
 
 def _sync_folder(path: Path) -> None:
-    """Force the new name itself to the disk, so that it survives a power cut."""
-    if os.name != "posix":  # elsewhere a folder cannot be opened
+    """Sync the folder to disk, so that the new name survives a power cut."""
+    if os.name != "posix":  # other systems cannot open a folder
         return
     try:
         folder = os.open(path.parent, os.O_RDONLY)

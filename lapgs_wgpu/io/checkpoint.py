@@ -17,7 +17,7 @@ from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.io.ply import StillGaussians, ply_header, read_vertices, vertex_rows
 from lapgs_wgpu.io.ply_header import Element, PathLike, open_ply
-from lapgs_wgpu.io.tensors import pack_tensors, unpack_tensors
+from lapgs_wgpu.io.safetensors_file import pack_tensors, unpack_tensors
 
 VERSION = 1
 _ELEMENT = "lapgs4d"

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..io.checkpoint import read_checkpoint
-from ..io.documents import parse_json
+from ..io.safe_json_toml import parse_json
 from .field import FieldConfig, PlaneConfig, plane_shapes, static_grid, temporal_grids
 from .hashgrid import HashConfig
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,6 +65,10 @@ class Camera:
         R = np.stack([right, np.cross(forward, right), forward])
         T = np.eye(4)
         T[:3, :3], T[:3, 3] = R, -R @ eye
-        focal = 0.5 * width / np.tan(0.5 * fov_x)
-        K = np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
-        return Camera(K, T, width, height)
+        return Camera(intrinsics_of_fov(fov_x, width, height), T, width, height)
+
+
+def intrinsics_of_fov(fov_x: float, width: int, height: int) -> NDArray[np.float64]:
+    """(3, 3) K of a horizontal field of view in radians; square pixels, principal point in the middle of the image."""
+    focal = 0.5 * width / math.tan(0.5 * fov_x)
+    return np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import Image
 from torch import Tensor
 
+from lapgs_wgpu.data.images import encode_png
 from lapgs_wgpu.data.views import View, composite
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.motion.scene import Scene4D
@@ -79,7 +79,7 @@ def evaluate(
         rows.append(row)
         if folder is not None:
             with atomic_write(folder / f"{view.name}.png") as file:
-                Image.fromarray(side_by_side(truth, image)).save(file, "PNG")
+                file.write(encode_png(side_by_side(truth, image)))
     motion = summarise(frames, [view.name for view in views])
     for name in MOTION_MEASURES:
         values = [row[name] for row in rows if name in row]

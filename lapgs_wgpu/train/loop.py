@@ -15,11 +15,11 @@ from types import FrameType
 import torch
 
 from lapgs_wgpu.data.init import first_points
-from lapgs_wgpu.data.sanity import check_in_view, check_times
+from lapgs_wgpu.data.validation import check_in_view, check_times
 from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.errors import DeviceError, InputError, NumericalError
 from lapgs_wgpu.gpu.device import Device, open_device
-from lapgs_wgpu.io.first_look import FirstLook
+from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.motion.grid_field import GridField
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.config import Background, Config
@@ -47,7 +47,7 @@ OUTSIDE = 0.05  # warn if this share of the Gaussians, or more, is outside the e
 
 # Takes over a training's steps, such as a viewer does: called with the scene, where to look at it from, and the steps,
 # of which it takes as many as it likes, each one a step of the training. The rest follows when it returns.
-Watch = Callable[[Scene4D, FirstLook, Iterator[Progress]], None]
+Watch = Callable[[Scene4D, InitialView, Iterator[Progress]], None]
 
 
 def train(
@@ -77,8 +77,8 @@ def train(
         check_run_folder(out, overwrite=overwrite)
         for warning in (*dataset.warnings, *found, *_precision_warnings(config)):
             print(f"warning: {warning}", file=sys.stderr, flush=True)
-        if dataset.placement is not None:
-            print(f"placement: {dataset.placement}", flush=True)
+        if dataset.normalization is not None:
+            print(f"placement: {dataset.normalization}", flush=True)
     keep_freed_memory()
     device = device or open_device()
     training = Training(config, dataset, device, ranks, _discovered(config, dataset, device, ranks))
@@ -183,7 +183,7 @@ def _goes_on(training: Training, interrupted: threading.Event) -> bool:
 
 def _run(training: Training, dataset: Dataset, out: Path, watch: Watch | None) -> Scene4D:
     config, scene = training.config, training.scene
-    look = FirstLook((dataset.test or dataset.train)[0].camera, dataset.focus, dataset.up, len(dataset.times))
+    look = InitialView((dataset.test or dataset.train)[0].camera, dataset.focus, dataset.up, len(dataset.times))
     with Log(out / "log.jsonl", config.schedule.steps, done=training.done) as log, _interruptible() as interrupted:
         steps = _steps(training, log, out, interrupted)
         if watch is not None:
@@ -199,8 +199,8 @@ def _run(training: Training, dataset: Dataset, out: Path, watch: Watch | None) -
     if done < all_steps or config.schedule.save_interval:
         save_state(out, training.state())
     metadata = {"scene": dataset.name, "background": config.data.background, "step": str(done), "view": look.to_json()}
-    if dataset.placement is not None:
-        metadata["placement"] = dataset.placement.to_json()
+    if dataset.normalization is not None:
+        metadata["placement"] = dataset.normalization.to_json()
     scene.save(out / "checkpoint.ply", metadata)
     if done < all_steps:
         raise KeyboardInterrupt(

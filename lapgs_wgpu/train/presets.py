@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from lapgs_wgpu.errors import InputError, shown
-from lapgs_wgpu.io.documents import read_toml
+from lapgs_wgpu.io.safe_json_toml import read_toml
 from lapgs_wgpu.motion.field import FieldKind
 from lapgs_wgpu.train.config import Config
 

@@ -18,8 +18,8 @@ from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.atomic import atomic_write
-from lapgs_wgpu.io.documents import read_toml
-from lapgs_wgpu.io.tensors import pack_tensors, unpack_tensors
+from lapgs_wgpu.io.safe_json_toml import read_toml
+from lapgs_wgpu.io.safetensors_file import pack_tensors, unpack_tensors
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.log import environment
 from lapgs_wgpu.train.presets import write_toml
@@ -42,39 +42,33 @@ def check_run_folder(out: Path, *, overwrite: bool) -> None:
 
 @contextmanager
 def locked_run_folder(out: Path) -> Iterator[None]:
-    """The folder for one writer alone, made where it is missing. Raises InputError where another one has it."""
+    """Create the folder if needed and lock it for one writer. Raises InputError if another process holds the lock."""
+    from filelock import FileLock, Timeout
+
     out.mkdir(parents=True, exist_ok=True)
+    path, lock = out / LOCK, FileLock(out / LOCK, blocking=False)  # follows no symbolic link
     try:
-        import fcntl
-    except ImportError:  # Windows: two writers are not kept apart there
+        lock.acquire()
+    except Timeout:
+        who = ""
+        with suppress(OSError):
+            who = path.read_text(encoding="ascii", errors="replace")[:20].strip()
+        raise InputError(
+            f"{out} is being written by another lapgs-train (process {who if who.isdecimal() else 'unknown'}); wait "
+            "for it, or name another folder."
+        ) from None
+    try:
+        with suppress(OSError), open(path, "w", opener=_open_no_follow) as file:  # the disk may be full
+            file.write(str(os.getpid()))
         yield
-        return
-    lock = out / LOCK
-    with open(lock, "a+", opener=_not_through_a_link) as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if not lock.exists() or not os.path.samestat(os.fstat(file.fileno()), lock.stat()):
-                raise BlockingIOError  # whoever had it has just removed it, and a third one may have another
-        except OSError:
-            file.seek(0)
-            who = file.read(20).strip()
-            who = who if who.isdecimal() else "unknown"
-            raise InputError(
-                f"{out} is being written by another lapgs-train (process {who}); wait for it, or name another folder."
-            ) from None
-        with suppress(OSError):  # on a full disk nobody learns who has it
-            os.truncate(file.fileno(), 0)
-            os.write(file.fileno(), str(os.getpid()).encode())
-        try:
-            yield
-        finally:
-            with suppress(OSError):  # a lock that nobody holds stops nobody
-                lock.unlink(missing_ok=True)
+    finally:
+        with suppress(OSError):
+            path.unlink(missing_ok=True)
+        lock.release()
 
 
-def _not_through_a_link(path: str, flags: int) -> int:
-    """What is about to be overwritten must not lie elsewhere."""
-    return os.open(path, flags | os.O_NOFOLLOW, 0o666)
+def _open_no_follow(path: str, flags: int) -> int:
+    return os.open(path, flags | getattr(os, "O_NOFOLLOW", 0), 0o666)
 
 
 def start_run_folder(out: Path, config: Config, device: Device, dataset: Dataset) -> None:

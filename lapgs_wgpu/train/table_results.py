@@ -13,7 +13,7 @@ from typing import Any
 
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.atomic import atomic_write
-from lapgs_wgpu.io.documents import read_json, read_toml
+from lapgs_wgpu.io.safe_json_toml import read_json, read_toml
 from lapgs_wgpu.train.presets import Table, load_config
 from lapgs_wgpu.train.table_spec import Run, RunKey, fingerprint
 

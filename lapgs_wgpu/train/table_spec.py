@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 
 from lapgs_wgpu.data.builtin import builtin_folder, is_builtin
 from lapgs_wgpu.errors import InputError, shown
-from lapgs_wgpu.io.documents import read_toml
+from lapgs_wgpu.io.safe_json_toml import read_toml
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.presets import Table, build_config, did_you_mean, merge
 

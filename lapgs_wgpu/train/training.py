@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lapgs_wgpu.data.init import first_points, initial_scales, see_through
+from lapgs_wgpu.data.init import first_points, initial_scales, limit_optical_depth
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
@@ -325,7 +325,7 @@ def initial_points(
     scales = initial_scales(points)
     # Published figures of D-NeRF start from a fog, which the empty background there soon lifts.
     if dataset.cloud is not None or dataset.depths is not None:
-        scales = see_through(points, scales, config.opacity, dataset.cameras)
+        scales = limit_optical_depth(points, scales, config.opacity, dataset.cameras)
     order = morton_order(torch.from_numpy(points)).numpy()
     return points[order], colours[order], scales[order]
 

@@ -58,7 +58,7 @@ def megabytes(who: int = resource.RUSAGE_SELF) -> float:
 def unpack(folder: Path, films: int) -> None:
     """Unpack so many of the films, which are copies of one; the pictures of the others become links to the first's."""
     from lapgs_wgpu.data import load_dataset
-    from lapgs_wgpu.data.video import Video
+    from lapgs_wgpu.data.video_frames import Video
 
     data = load_dataset(folder)
     first, *others = sorted(folder.glob("*.mp4"))

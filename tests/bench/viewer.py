@@ -17,7 +17,7 @@ from measure import Timing, summary
 from scene import SceneSize, make_scene
 
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.io.first_look import FirstLook
+from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.motion.playback import open_playback
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.presets import load_config
@@ -71,13 +71,13 @@ def write_moving_scene(file: Path, preset: str, gaussians: int, device: Device) 
             if "heads" in name or "appearance" in name:
                 parameter.copy_(0.01 * torch.randn(*parameter.shape, generator=generator))
     scene.sh_degree = 3
-    look = FirstLook(camera.resized(*SIZE), np.zeros(3), np.array([0.0, -1.0, 0.0]), 150)
+    look = InitialView(camera.resized(*SIZE), np.zeros(3), np.array([0.0, -1.0, 0.0]), 150)
     scene.save(file, {"view": look.to_json()})
 
 
 def _scrub(device: Device, file: Path, repeat: int) -> dict[str, Timing]:
     painter = Painter(open_playback(file, device))
-    look = FirstLook.from_json(painter.playback.metadata["view"])
+    look = InitialView.from_json(painter.playback.metadata["view"])
     assert look is not None
     times = iter(np.linspace(0, 1, 3 + len(SHARES) * (repeat + 1)).tolist())
     found = {}

@@ -9,9 +9,8 @@ from functools import partial
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import Image
 
-from lapgs_wgpu.data.pictures import shrink
+from lapgs_wgpu.data.images import shrink
 from lapgs_wgpu.data.views import Dataset, View, composite
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.scene import Scene4D
@@ -90,4 +89,4 @@ def small_view(view: View, size: int) -> View:
 
 
 def _shrunk(view: View, size: tuple[int, int]) -> NDArray[np.uint8]:
-    return shrink(Image.fromarray(view.load()), size)
+    return shrink(view.load(), size)

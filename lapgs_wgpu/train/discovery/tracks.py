@@ -306,8 +306,8 @@ class _Follower:
             return np.max([np.exp(-a / (2 * spread**2)) for a, spread in zip(apart, spreads, strict=False)], axis=0)
 
         shifts = np.concatenate([start + scale * self._rough for start, scale in zip(starts, reaches, strict=False)])
-        scores = self._explained(members, positions, points, free, shifts, SEARCH_SPREADS[0])[0] * prior(shifts)
-        chosen = np.argsort(-scores, kind="stable")[:CANDIDATES]
+        rough, _ = self._explained(members, positions, points, free, shifts, SEARCH_SPREADS[0])
+        chosen = np.argsort(-rough * prior(shifts), kind="stable")[:CANDIDATES]
         scale = reaches[chosen // len(self._rough)][:, None, None]
         shifts = (shifts[chosen][:, None] + scale * self._fine).reshape(-1, 3)
         scores, near = self._explained(members, positions, points, free, shifts, SEARCH_SPREADS[1])

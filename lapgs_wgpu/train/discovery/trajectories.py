@@ -83,7 +83,10 @@ def _best_path(groups: _Groups, times: int, half_side: float) -> tuple[list[int]
     first = np.searchsorted(groups.time, np.arange(times + LEAP + 1))
     # The steps that end in a group: the groups that they start from, their velocities and worths, and which step of
     # their start they go on from (-1: none).
-    starts, velocities, worths, before = [], [], [], []
+    starts: list[NDArray[np.int64]] = []
+    velocities: list[NDArray[np.float64]] = []
+    worths: list[NDArray[np.float64]] = []
+    before: list[NDArray[np.int64]] = []
     for b, (time, center, color) in enumerate(zip(groups.time, groups.centers, groups.colors, strict=True)):
         a = np.arange(first[max(0, time - LEAP)], first[time])
         lapse = (time - groups.time[a]).astype(np.float64)

@@ -26,8 +26,9 @@ from test_data_dnerf import make_scene
 
 from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.data.cloud import Cloud
-from lapgs_wgpu.data.moments import Picture, disorder, frame_numbers, held_out, natural, times_of
-from lapgs_wgpu.data.sanity import check_film, check_in_view, check_times, check_views
+from lapgs_wgpu.data.split import held_out
+from lapgs_wgpu.data.timestamps import ImageName, disorder, frame_numbers, natural_key, read_times, to_unit_range
+from lapgs_wgpu.data.validation import check_film, check_in_view, check_times, check_views
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
@@ -101,7 +102,7 @@ def test_all_times_equal(device: Device, tmp_path: Path) -> None:
     assert (len(data.train), len(data.test)) == (5, 1), "then pictures are counted, not moments"
     check_times(data, moving=False)
     with pytest.raises(
-        InputError, match=r"toy: .*times\.json: all 5 training pictures have the same time, 0.*--field static"
+        InputError, match=r"toy: .*times\.json: all 5 training images have the same time, 0.*--field static"
     ):
         check_times(data, moving=True)
 
@@ -124,7 +125,7 @@ LAYOUTS: dict[str, Callable[[Path, Device], Path]] = {
 def test_one_time_in_every_layout(named: str, device: Device, tmp_path: Path) -> None:
     """The error names the file and the field that say so."""
     data = load_dataset(LAYOUTS[named](tmp_path / "toy", device))
-    with pytest.raises(InputError, match=rf"toy: .*{re.escape(named)}.* same time.*give each picture its time\.$"):
+    with pytest.raises(InputError, match=rf"toy: .*{re.escape(named)}.* same time.*give each image its time\.$"):
         check_times(data, moving=True)
     check_times(data, moving=False)
 
@@ -149,7 +150,7 @@ def test_even_times_are_fine() -> None:
 
 def test_two_times() -> None:
     (warning,) = check_times(timed([0, 0, 1, 1]), moving=True)
-    assert "4 training pictures have only 2 different times (0, 1)" in warning
+    assert "4 training images have only 2 different times (0, 1)" in warning
     assert "at least 5 times" in warning
     assert check_times(timed([0, 0, 1, 1]), moving=False) == []
 
@@ -157,8 +158,8 @@ def test_two_times() -> None:
 def test_a_gap_in_time() -> None:
     times = np.concatenate([np.linspace(0, 0.3, 10), np.linspace(0.6, 1, 10)])
     (warning,) = check_times(timed(times, tested=[0.1, 0.4, 0.5]), moving=True)
-    assert "no training picture has a time between 0.3 and 0.6" in warning
-    assert "in 2 test pictures" in warning
+    assert "no training image has a time between 0.3 and 0.6" in warning
+    assert "in 2 test images" in warning
     (warning,) = check_times(timed(np.linspace(0, 0.4, 20)), moving=True)
     assert "between 0.4 and 1," in warning
     (warning,) = check_times(timed([*np.linspace(0.2, 0.4, 10), *np.linspace(0.8, 1, 10)]), moving=True)
@@ -169,7 +170,7 @@ def test_a_gap_in_time() -> None:
 def test_one_camera_twice_at_a_time() -> None:
     times = [0, 0.1, 0.1, 0.3, 0.5, 0.7, 0.9]
     (warning,) = check_times(timed(times, taken=[cameras(1)[0]] * 7), moving=True)
-    assert "1 of 7 training pictures repeat the time" in warning
+    assert "1 of 7 training images repeat the time" in warning
     assert "train_2 and train_1 at 0.1" in warning
     assert check_times(timed(times), moving=True) == [], "two cameras"
 
@@ -234,18 +235,18 @@ def test_gaussians_outside_of_the_field_are_told(
 
 
 def test_frames_out_of_order() -> None:
-    pictures = [Picture(f"frame_{i:03d}.jpg", ".") for i in range(10)]
+    pictures = [ImageName(f"frame_{i:03d}.jpg", ".") for i in range(10)]
     times = [float(i) for i in range(10)]
     assert disorder(pictures, times) == []
     times[4], times[5] = times[5], times[4]
     (warning,) = disorder(pictures, times)
     assert "out of order" in warning
-    assert "1 times in 10 pictures" in warning
+    assert "1 times in 10 images" in warning
     assert "frame_004.jpg at 5 to frame_005.jpg at 4" in warning
 
 
 def test_cameras_with_no_time_in_common() -> None:
-    pictures = [Picture(f"cam{c}/{i + 10 * c:03d}.jpg", f"cam{c}") for c in range(2) for i in range(5)]
+    pictures = [ImageName(f"cam{c}/{i + 10 * c:03d}.jpg", f"cam{c}") for c in range(2) for i in range(5)]
     (warning,) = disorder(pictures, [float(n) for n in frame_numbers(pictures)])
     assert "cam0 from 0 to 4" in warning
     assert "cam1 from 10 to 14" in warning
@@ -258,8 +259,8 @@ def test_blurred_and_repeated_pictures(device: Device, tmp_path: Path) -> None:
     shutil.copyfile(folder / "images/frame_0007.png", folder / "images/frame_0008.png")
     warnings = [warning for warning in load_dataset(folder).warnings if "sparse" not in warning]
     assert len(warnings) == 2
-    assert warnings[0].startswith("blurred pictures: frame_0004.png (1 of 10)")
-    assert warnings[1].startswith("repeated pictures: frame_0008.png (1 of 10)")
+    assert warnings[0].startswith("blurred images: frame_0004.png (1 of 10)")
+    assert warnings[1].startswith("repeated images: frame_0008.png (1 of 10)")
 
 
 def test_what_moves_a_little_is_not_repeated(tmp_path: Path) -> None:
@@ -285,29 +286,31 @@ def test_each_camera_of_a_rig_is_looked_at_alone(device: Device, tmp_path: Path)
 
 
 def test_held_out_views() -> None:
-    one = [Picture(f"{i}.jpg", ".") for i in range(20)]
+    one = [ImageName(f"{i}.jpg", ".") for i in range(20)]
     assert held_out(one, [i / 19 for i in range(20)]) == {4, 12}
-    two = [Picture(f"{c}/{i}.jpg", c) for i in range(6) for c in "ab"]
+    two = [ImageName(f"{c}/{i}.jpg", c) for i in range(6) for c in "ab"]
     assert held_out(two, [i / 5 for i in range(6) for _ in "ab"]) == {8, 9}, "both pictures of the fifth moment"
-    three = [Picture(f"cam{c}/{i}.jpg", f"cam{c}") for c in (10, 2, 9) for i in range(2)]
+    three = [ImageName(f"cam{c}/{i}.jpg", f"cam{c}") for c in (10, 2, 9) for i in range(2)]
     assert held_out(three, [0, 1] * 3) == {2, 3}, "cam2 comes first"
-    with pytest.raises(InputError, match="4 pictures at 4 times are too few"):
+    with pytest.raises(InputError, match="4 images at 4 times are too few"):
         held_out(one[:4], [0, 0.1, 0.2, 0.3])
 
 
 def test_frame_numbers() -> None:
     def numbers(*names: str) -> list[int]:
-        return frame_numbers([Picture(name, str(Path(name).parent)) for name in names])
+        return frame_numbers([ImageName(name, str(Path(name).parent)) for name in names])
 
     assert numbers("IMG_20240101_001.jpg", "IMG_20240101_010.jpg") == [1, 10]
     assert numbers("a/x7.jpg", "b/x7.jpg") == [7, 7], "the same moment"
     assert numbers("cam00/v2_f1.jpg", "cam00/v2_f2.jpg", "cam01/v3_f1.jpg", "cam01/v3_f2.jpg") == [1, 2, 1, 2]
     with pytest.raises(InputError, match="differ in 2 numbers"):
         numbers("cam0_1.jpg", "cam1_2.jpg")
-    assert sorted(["cam10", "cam2", "cam"], key=natural) == ["cam", "cam2", "cam10"]
+    assert sorted(["cam10", "cam2", "cam"], key=natural_key) == ["cam", "cam2", "cam10"]
 
 
 def test_times_are_from_0_to_1(tmp_path: Path) -> None:
-    times, warnings = times_of([Picture(f"{i}.jpg", ".") for i in (1000, 1040, 1200)], tmp_path)
-    assert times == [0, 0.2, 1]
-    assert warnings == []
+    names = [ImageName(f"{i}.jpg", ".") for i in (1000, 1040, 1200)]
+    times, source = read_times(names, tmp_path)
+    assert to_unit_range(times, 1000, 1200) == [0, 0.2, 1]
+    assert disorder(names, times) == []
+    assert str(tmp_path) in source

@@ -15,8 +15,8 @@ from PIL import Image
 from lapgs_wgpu import cli
 from lapgs_wgpu.data import Dataset, load_dataset
 from lapgs_wgpu.data import synthetic as toys
-from lapgs_wgpu.data.cloud import Cloud, views_of
-from lapgs_wgpu.data.standard_box import cube_in_view, is_random
+from lapgs_wgpu.data.cloud import Cloud, is_random, views_of
+from lapgs_wgpu.data.normalize import cube_in_view
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.motion.scene import load
 from lapgs_wgpu.splat.camera import Camera
@@ -82,11 +82,11 @@ def test_the_standard_scenes_keep_their_coordinates(tmp_path: Path) -> None:
     assert cube.half == pytest.approx(1.3, rel=0.02)
     np.testing.assert_allclose(cube.center, 0, atol=1e-5)
     data = load_dataset(write_scene(tmp_path / "toy", taken))
-    assert data.placement is None
+    assert data.normalization is None
     for view, camera in zip(data.train, taken, strict=False):
         np.testing.assert_allclose(view.camera.T_cam_world, camera.T_cam_world, atol=1e-12)
     built_in = toys.write_synthetic(tmp_path / "built-in", size=8, train_views=20, test_views=1)
-    assert load_dataset(built_in).placement is None
+    assert load_dataset(built_in).normalization is None
 
 
 @pytest.mark.parametrize("scale", [0.01, 1.0, 50.0])
@@ -94,10 +94,10 @@ def test_any_scale_and_place_starts_equal(tmp_path: Path, scale: float) -> None:
     taken = around(12, target=(0, 0, 0.8), distance=6.0, fov_x=0.87)
     here = load_dataset(write_scene(tmp_path / "here", taken))
     there = load_dataset(write_scene(tmp_path / "there", [moved(camera, scale) for camera in taken]))
-    assert here.placement is not None
-    assert there.placement is not None
-    assert there.placement.scale * scale == pytest.approx(here.placement.scale, rel=1e-9)
-    np.testing.assert_allclose(there.placement.center, scale * here.placement.center + FAR, rtol=1e-9)
+    assert here.normalization is not None
+    assert there.normalization is not None
+    assert there.normalization.scale * scale == pytest.approx(here.normalization.scale, rel=1e-9)
+    np.testing.assert_allclose(there.normalization.center, scale * here.normalization.center + FAR, rtol=1e-9)
     same_cameras(here, there, 1e-9 / min(scale, 1))
     assert there.extent == pytest.approx(here.extent, rel=1e-9)
     config = load_config("tiny")
@@ -117,7 +117,7 @@ def test_a_few_stray_cameras_change_nothing() -> None:
     taken[4] = turned(taken[4])
     cube = cube_in_view(taken)
     assert cube is not None
-    assert cube.placement is None
+    assert cube.fits
 
 
 def test_a_still_camera(tmp_path: Path) -> None:
@@ -125,7 +125,7 @@ def test_a_still_camera(tmp_path: Path) -> None:
     (camera,) = around(1)
     cube = cube_in_view([camera] * 5)
     assert cube is not None
-    assert cube.placement is None
+    assert cube.fits
     away = moved(camera, 1.0)
     data = load_dataset(write_scene(tmp_path / "toy", [away] * 4))
     points = initial_points(load_config("tiny").points, data, 0)[0].astype(np.float64)
@@ -137,7 +137,7 @@ def test_cameras_that_look_outward(tmp_path: Path) -> None:
     inside = [moved(turned(camera), 0.1, np.zeros(3)) for camera in around(9)]
     assert cube_in_view(inside) is None
     data = load_dataset(write_scene(tmp_path / "toy", inside))
-    assert data.placement is None
+    assert data.normalization is None
     (warning,) = data.warnings
     assert "of 8 cameras look away from the point nearest" in warning
     assert "transforms_train.json" in warning
@@ -164,7 +164,7 @@ def test_a_random_cloud_is_ignored(tmp_path: Path, half: float) -> None:
     plain = load_dataset(write_scene(tmp_path / "plain", taken))
     with_cloud = load_dataset(write_scene(tmp_path / "cloud", taken, RNG.uniform(-half, half, (2000, 3))))
     assert with_cloud.cloud is None
-    assert with_cloud.placement is None
+    assert with_cloud.normalization is None
     same_cameras(plain, with_cloud, 0)
 
 
@@ -173,15 +173,15 @@ def test_a_cloud_of_surfaces_is_where_gaussians_start(tmp_path: Path) -> None:
     directions = RNG.normal(size=(3000, 3))
     sphere = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     data = load_dataset(write_scene(tmp_path / "here", around(6), sphere))
-    assert data.placement is None
+    assert data.normalization is None
     assert data.cloud is not None
     np.testing.assert_allclose(data.cloud.points, sphere, atol=1e-6)
 
     far = [moved(camera, 50) for camera in around(6)]
     data = load_dataset(write_scene(tmp_path / "there", far, 50 * sphere + FAR))
-    assert data.placement is not None
+    assert data.normalization is not None
     assert data.cloud is not None
-    assert data.placement.scale == pytest.approx(1.3 / 50, rel=0.03)
+    assert data.normalization.scale == pytest.approx(1.3 / 50, rel=0.03)
     np.testing.assert_allclose(data.cloud.points, 1.3 * sphere, atol=0.08)
     with pytest.raises(InputError, match=r"fused\.ply.* 0 % of its points"):
         load_dataset(write_scene(tmp_path / "wrong", far, sphere))
@@ -190,7 +190,7 @@ def test_a_cloud_of_surfaces_is_where_gaussians_start(tmp_path: Path) -> None:
 def test_coordinates_can_be_kept(tmp_path: Path) -> None:
     taken = [moved(camera, 50) for camera in around(4)]
     data = load_dataset(write_scene(tmp_path / "toy", taken), normalize=False)
-    assert data.placement is None
+    assert data.normalization is None
     np.testing.assert_allclose(data.train[0].camera.position, taken[0].position, rtol=1e-9)
 
 
@@ -223,6 +223,6 @@ def test_what_travels_far_is_inside(scene: str) -> None:
     if not (SHARED / "stress" / scene).is_dir():
         pytest.skip("scenes not at hand")
     data = load_dataset(SHARED / "stress" / scene, image_size=50)
-    assert data.placement is not None
+    assert data.normalization is not None
     assert data.cloud is None
-    assert 2.3 < 1.3 / data.placement.scale < 3
+    assert 2.3 < 1.3 / data.normalization.scale < 3

@@ -1,4 +1,4 @@
-"""Where a viewer begins: what a checkpoint's metadata says of the capture's cameras (docs/format.md, key `view`)."""
+"""The initial view of the viewer, stored in the metadata of a checkpoint (docs/format.md, key `view`)."""
 
 from __future__ import annotations
 
@@ -11,8 +11,12 @@ from numpy.typing import NDArray
 from lapgs_wgpu.splat.camera import Camera
 
 
-class FirstLook(NamedTuple):
-    """camera: the first to show. focus (3,): the point to turn about. up (3,): of unit length. frames: of the clip."""
+class InitialView(NamedTuple):
+    """Initial state of the viewer.
+
+    camera: the initial camera. focus: (3,) center of orbiting, world units. up: (3,) unit vector.
+    frames: number of frames of the clip.
+    """
 
     camera: Camera
     focus: NDArray[np.float64]
@@ -33,8 +37,8 @@ class FirstLook(NamedTuple):
         return json.dumps(values)
 
     @staticmethod
-    def from_json(text: str) -> FirstLook | None:
-        """What `to_json` wrote; None for anything else, since a viewer can do without it."""
+    def from_json(text: str) -> InitialView | None:
+        """Parse the output of `to_json`. Returns None for any other text; the viewer then guesses a view."""
         try:
             values: dict[str, Any] = json.loads(text)
             width, height = values["size"]
@@ -53,4 +57,4 @@ class FirstLook(NamedTuple):
             frames = int(values["frames"])
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError):
             return None
-        return FirstLook(camera, focus, up / np.linalg.norm(up), max(1, min(frames, 1_000_000))) if usable else None
+        return InitialView(camera, focus, up / np.linalg.norm(up), max(1, min(frames, 1_000_000))) if usable else None

@@ -1,7 +1,7 @@
 """Sparse models of COLMAP on disk, text or binary: cameras, images and points3D.
 
-The formats are those of COLMAP's documentation (colmap.github.io/format.html). Binary files come from strangers: every
-declared count is compared with the file's size before anything is read.
+The formats are those of COLMAP's documentation (colmap.github.io/format.html). Binary files are untrusted: every
+declared count is compared with the file size before anything is read.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ LONGEST_NAME = 4096  # bytes of an image's name
 
 UNSUPPORTED = (
     "is not among those that are read ({known}); run COLMAP again with --ImageReader.camera_model OPENCV, or "
-    "straighten the pictures with colmap image_undistorter"
+    "undistort the images with colmap image_undistorter"
 )
 
 
@@ -49,8 +49,8 @@ class ColmapCamera(NamedTuple):
 
 
 class ColmapImage(NamedTuple):
-    """A registered picture. name: of its file, relative to the folder of pictures. quaternion: (4,) wxyz and
-    translation: (3,) from world to camera, OpenCV's axes. where: what errors call it."""
+    """A registered image. name: of its file, relative to the folder of images. quaternion: (4,) wxyz and
+    translation: (3,) from world to camera, OpenCV's axes. where: file and entry, for errors."""
 
     name: str
     camera: int
@@ -60,7 +60,7 @@ class ColmapImage(NamedTuple):
 
 
 class ColmapModel(NamedTuple):
-    """cameras: by id. images: in the order of the file. points: (N, 3), colours: (N, 3) uint8. points_file: theirs."""
+    """cameras: by id. images: in file order. points: (N, 3), colours: (N, 3) uint8. points_file: their file."""
 
     cameras: dict[int, ColmapCamera]
     images: list[ColmapImage]
@@ -95,11 +95,11 @@ def read_model(folder: Path) -> ColmapModel:
 
 
 def count_images(folder: Path) -> int:
-    """How many pictures a model holds, without reading all of it where it is binary."""
+    """Count the images of a model, without reading all of a binary one."""
     path = folder / "images.bin"
     if path.is_file():
         with _binary(path) as reader:
-            return reader.count(BINARY_IMAGE_BYTES, "pictures")
+            return reader.count(BINARY_IMAGE_BYTES, "images")
     path = folder / "images.txt"
     return len(_text_images(path)) if path.is_file() else 0
 
@@ -116,7 +116,7 @@ def _camera(where: str, model: str, width: float, height: float, values: list[fl
         raise InputError(f"{where}: width and height must be 1 to 100000 pixels, got {width:g}x{height:g}.")
     parameters = dict(zip(names, values, strict=True))
     for name, value in parameters.items():
-        if not abs(value) <= 1e6 or (name[0] == "f" and value <= 0):  # so written, NaN is bad, too
+        if not abs(value) <= 1e6 or (name[0] == "f" and value <= 0):  # true for NaN, too
             bounds = "above 0 and at most" if name[0] == "f" else "at most"
             raise InputError(f"{where}: {name} must be {bounds} 1e+06, got {value:g}.")
     return ColmapCamera(int(width), int(height), parameters)
@@ -126,7 +126,7 @@ def _camera(where: str, model: str, width: float, height: float, values: list[fl
 
 
 def _lines(path: Path, *, blank: bool = False) -> Iterator[tuple[str, list[str]]]:
-    """What errors call each line, and its words; comments are left out, and empty lines unless `blank`."""
+    """Yield the place of each line, for errors, and its words; skip comments and, unless `blank`, empty lines."""
     try:
         with path.open(encoding="utf-8") as file:
             for number, line in enumerate(file, start=1):
@@ -157,14 +157,14 @@ def _text_cameras(path: Path) -> dict[int, ColmapCamera]:
 
 
 def _text_images(path: Path) -> list[ColmapImage]:
-    """Two lines a picture: pose and name, then its points, which may be none."""
+    """Two lines per image: pose and name, then its points, which may be none."""
     images = []
     lines = _lines(path, blank=True)
     for where, words in lines:
         if not words:
             continue
         if len(words) < 10:
-            raise InputError(f"{where} has {len(words)} fields; 10 are needed, the last one the picture's name.")
+            raise InputError(f"{where} has {len(words)} fields; 10 are needed, the last one the image's name.")
         _, camera = _numbers([words[0], words[8]], where, int)
         pose = np.array(_numbers(words[1:8], where, float))
         images.append(_image(" ".join(words[9:]), camera, pose, f"{where} ({' '.join(words[9:])[:80]})"))
@@ -200,7 +200,7 @@ BINARY_POINT_BYTES = 8 + 3 * 8 + 3 + 8 + 8  # at least: id, position, colour, er
 
 
 class _Reader:
-    """A binary file, held in memory, and how far it was read."""
+    """A binary file in memory, and the position up to which it was read."""
 
     def __init__(self, path: Path, data: bytes) -> None:
         self.path, self.data, self.at = path, data, 0
@@ -220,7 +220,7 @@ class _Reader:
         self.at += size
 
     def count(self, least: int, what: str) -> int:
-        """A declared count of things that take at least so many bytes each."""
+        """Read a count of items that take at least so many bytes each."""
         (count,) = self.take("Q")
         room = len(self.data) - self.at
         if count * least > room:
@@ -231,7 +231,7 @@ class _Reader:
         return int(count)
 
     def end(self) -> None:
-        """Nothing may be left."""
+        """Check that all bytes were read."""
         if self.at < len(self.data):
             raise InputError(
                 f"{self.path} declares {self.at} bytes, but has {len(self.data)}; it is damaged, so copy it again."
@@ -272,10 +272,10 @@ def _binary_cameras(path: Path) -> dict[int, ColmapCamera]:
 def _binary_images(path: Path) -> list[ColmapImage]:
     images = []
     with _binary(path) as reader:
-        for index in range(reader.count(BINARY_IMAGE_BYTES, "pictures")):
+        for index in range(reader.count(BINARY_IMAGE_BYTES, "images")):
             _, *pose, camera = reader.take("i7di")
             name = reader.name()
-            where = f"{path}, picture {index} ({name[:80]})"
+            where = f"{path}, image {index} ({name[:80]})"
             reader.skip(24 * reader.count(24, f"points of {name[:80]}"))
             images.append(_image(name, camera, np.array(pose), where))
         reader.end()
@@ -289,6 +289,6 @@ def _binary_points(path: Path) -> tuple[Array, NDArray[np.uint8]]:
         for index in range(count):
             _, *values, _ = reader.take("Q3d3Bd")
             points[index], colours[index] = values[:3], values[3:]
-            reader.skip(8 * reader.count(8, f"pictures that see point {index}"))
+            reader.skip(8 * reader.count(8, f"images that see point {index}"))
         reader.end()
     return points, colours

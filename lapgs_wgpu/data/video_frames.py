@@ -1,7 +1,7 @@
-"""Videos as pictures: each is unpacked once into lossless pictures outside the capture, and read from there.
+"""Read frames of videos. Each video is unpacked once into lossless images outside the capture, and read from there.
 
-A video's frames build on each other: a single one in the middle of a clip costs seconds, since everything from the last
-keyframe on has to be decoded (docs/results.md has the times). A training wants them in random order, again and again.
+Frames depend on each other: decoding one in the middle of a clip takes seconds, since all frames from the last keyframe
+on are decoded first (docs/results.md has the times), and a training reads frames in random order, again and again.
 """
 
 from __future__ import annotations
@@ -14,13 +14,9 @@ from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from threading import Lock
-from typing import Any
+from typing import Any, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-from PIL import Image
-
-from lapgs_wgpu.data.pictures import read_picture
+from lapgs_wgpu.data.images import LANCZOS, ImageFile, Pixels, Size, encode_png, resize
 from lapgs_wgpu.errors import InputError
 
 # Flags of swscale: bicubic, accurate rounding, chroma interpolated along rows. Its default darkens by 1 or 2 levels.
@@ -28,15 +24,15 @@ EXACT_COLOURS = 0x4 | 0x40000 | 0x2000
 COMPRESSION = 1  # of PNG: the next levels take twice as long for a tenth of the bytes
 LARGEST_FRAME = 8192 * 8192  # pixels; the decoder holds several frames
 WRITERS = min(8, os.cpu_count() or 1)  # threads that shrink and write the frames of the video that is being unpacked
-_unpacking = Lock()  # one video at a time, with all processors: what is under way then has a bound
+_unpacking = Lock()  # one video at a time, with all processors, which bounds memory
 
 
 class Video:
-    """A video file, its header checked. frames: how many. size: (width, height) in pixels."""
+    """A video file whose header was checked. frames: their number. size: (width, height) in pixels."""
 
     def __init__(self, path: Path) -> None:
-        """Reads the header, and counts the packets where it does not say how many frames there are. Raises InputError,
-        also where PyAV is missing."""
+        """Read the header; count the packets if it does not state the number of frames. Raises InputError, also if PyAV
+        is missing."""
         av = _pyav(path)
         self.path = path
         try:
@@ -56,20 +52,22 @@ class Video:
         if self.size[0] * self.size[1] > LARGEST_FRAME:
             raise InputError(f"{what}, and at most {LARGEST_FRAME:,} pixels a frame are allowed; shrink it.")
         if self.frames > path.stat().st_size:
-            raise InputError(f"{what}, it says, in {path.stat().st_size} bytes; copy it again.")
+            raise InputError(f"{what}, it states, in {path.stat().st_size} bytes; copy it again.")
 
-    def read(self, frame: int, size: tuple[int, int]) -> NDArray[np.uint8]:
-        """(H, W, 3) RGB of a frame, counted from 0, shrunk to (width, height). From any thread; the first call unpacks
-        the whole video. Raises InputError."""
+    def read(self, frame: int, size: Size) -> Pixels:
+        """Return a frame, counted from 0, shrunk to (width, height): (H, W, 3) RGB. Thread-safe.
+
+        The first call unpacks the whole video. Raises InputError.
+        """
         folder = self._folder(size)
         if not folder.is_dir():
             with _unpacking:
                 if not folder.is_dir():
                     self._unpack(folder, size)
-        return read_picture(folder / f"{frame:05d}.png", size)
+        return ImageFile(folder / f"{frame:05d}.png", size).read(size)
 
-    def _folder(self, size: tuple[int, int]) -> Path:
-        """Where this video, as it is now, is unpacked at this size."""
+    def _folder(self, size: Size) -> Path:
+        """The folder for the frames of this size; size and date of the video are part of its name."""
         try:
             stat = self.path.stat()
         except OSError as error:
@@ -79,8 +77,8 @@ class Video:
         place = "-".join(path.parent.parts[-2:]).strip("/")
         return cache_folder() / "frames" / place / f"{path.stem}-{size[0]}x{size[1]}-{state}"
 
-    def _unpack(self, folder: Path, size: tuple[int, int]) -> None:
-        """Write every frame as PNG. The folder appears only when it is whole."""
+    def _unpack(self, folder: Path, size: Size) -> None:
+        """Write every frame as PNG into a new folder, atomically."""
         av = _pyav(self.path)
         print(f"{self.path}: {self.frames} frames are unpacked once, into {folder}", file=sys.stderr, flush=True)
         unfinished = None
@@ -95,17 +93,17 @@ class Video:
             ):
                 stream = file.streams.video[0]
                 stream.thread_type = "AUTO"
-                stream.codec_context.options = {"max_pixels": str(LARGEST_FRAME)}  # whatever the header says
+                stream.codec_context.options = {"max_pixels": str(LARGEST_FRAME)}  # whatever the header states
                 for frame in file.decode(stream):
                     if (frame.width, frame.height) != self.size:
                         raise InputError(
                             f"{self.path}: frame {count} has {frame.width}x{frame.height} pixels, and its header says "
                             f"{self.size[0]}x{self.size[1]}; record it with one size."
                         )
-                    picture = frame.to_ndarray(format="rgb24", interpolation=EXACT_COLOURS)
-                    if len(written) == 2 * WRITERS:  # the decoder is ahead; frames must not pile up
+                    image = frame.to_ndarray(format="rgb24", interpolation=EXACT_COLOURS)
+                    if len(written) == 2 * WRITERS:  # the decoder is ahead of the writers: bound the frames in memory
                         written.popleft().result()
-                    written.append(pool.submit(_write, picture, size, unfinished / f"{count:05d}.png"))
+                    written.append(pool.submit(_write, image, size, unfinished / f"{count:05d}.png"))
                     count += 1
                 for each in written:
                     each.result()
@@ -115,7 +113,7 @@ class Video:
         except av.error.FFmpegError as error:
             raise InputError(f"{self.path} cannot be decoded ({error}); copy or record it again.") from None
         except OSError as error:
-            if not folder.is_dir():  # else another process was faster
+            if not folder.is_dir():  # otherwise another process was faster
                 raise InputError(
                     f"{folder} cannot be written ({error.strerror or error}); make room there, or set XDG_CACHE_HOME "
                     f"to a folder with room for about {self.frames * size[0] * size[1] * 1.5e-9:.1f} GB a video."
@@ -125,16 +123,33 @@ class Video:
                 shutil.rmtree(unfinished, ignore_errors=True)
 
 
+class VideoFrame(NamedTuple):
+    """A frame of a video. number: counted from 0."""
+
+    video: Video
+    number: int
+
+    @property
+    def size(self) -> Size:
+        """(width, height) in pixels."""
+        return self.video.size
+
+    def __str__(self) -> str:
+        return f"{self.video.path}, frame {self.number}"
+
+    def read(self, size: Size) -> Pixels:
+        """Return the frame, shrunk to (width, height): see `Video.read`. Raises InputError."""
+        return self.video.read(self.number, size)
+
+
 def cache_folder() -> Path:
-    """Where what can be made again is kept: the system's folder for caches (XDG_CACHE_HOME, else ~/.cache)."""
+    """The folder of caches: lapgs_wgpu in XDG_CACHE_HOME, else in ~/.cache."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "lapgs_wgpu"
 
 
-def _write(picture: NDArray[np.uint8], size: tuple[int, int], path: Path) -> None:
-    image = Image.fromarray(picture)
-    if image.size != size:
-        image = image.resize(size, Image.Resampling.LANCZOS)  # the filter of the figures published for Neu3D
-    image.save(path, compress_level=COMPRESSION)
+def _write(image: Pixels, size: Size, path: Path) -> None:
+    image = resize(image, size, LANCZOS)  # the filter of the figures published for Neu3D
+    path.write_bytes(encode_png(image, level=COMPRESSION))
 
 
 def _pyav(path: Path) -> Any:

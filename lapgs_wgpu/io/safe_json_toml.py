@@ -1,6 +1,6 @@
-"""JSON and TOML files from strangers: read, or refused in one sentence, within bounds on memory and time.
+"""Read JSON and TOML from untrusted files within bounds on memory and time.
 
-JSON takes at most 64 times the file's size in memory. TOML's parser is slow, but our files of it are small.
+Parsing JSON takes at most 64 times the file size in memory. The TOML parser is slow, so its size limit is low.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ PathLike = str | os.PathLike[str]
 
 MAX_JSON_BYTES = 64 << 20
 MAX_TOML_BYTES = 256 << 10
-MAX_DEPTH = 32  # of lists and tables in each other
-# tomllib takes time by the square of a dotted key's parts; all our keys have three at most.
+MAX_DEPTH = 32  # nesting of lists and tables
+# tomllib needs quadratic time in the number of parts of a dotted key. Our keys have at most three parts.
 _LONG_KEY = re.compile(r"""(?<![\w-])(?:(?:[\w-]+|"(?:[^"\\\n]|\\.)*"|'[^'\n]*')[ \t]*\.[ \t]*){16}""")
 
 
 def read_json(path: PathLike) -> Any:
-    """What a JSON file holds; of a name that stands twice in an object, the last one. Raises InputError."""
+    """Read a JSON file. Of duplicate names in an object, the last one counts. Raises InputError."""
     return parse_json(_read_text(path, MAX_JSON_BYTES, "JSON"), str(path))
 
 
 def parse_json(text: str, where: str) -> Any:
-    """The same of a text. The InputError begins with `where`."""
+    """Parse JSON text. Raises InputError; its message begins with `where`."""
     try:
         value = json.loads(text)
     except json.JSONDecodeError as error:
@@ -44,7 +44,7 @@ def parse_json(text: str, where: str) -> Any:
 
 
 def read_toml(path: PathLike) -> dict[str, Any]:
-    """What a TOML file holds. Raises InputError."""
+    """Read a TOML file. Raises InputError."""
     text = _read_text(path, MAX_TOML_BYTES, "TOML")
     if _LONG_KEY.search(text):
         raise InputError(f"{path}: cannot be read as TOML: it holds a dotted key of more than 16 parts.")
@@ -76,7 +76,7 @@ def _read_text(path: PathLike, most: int, language: str) -> str:
 
 
 def _check_depth(value: Any, where: str, language: str) -> None:
-    """What follows goes down into it by recursion: so that this ends."""
+    """Reject deep nesting: later code recurses. Raises InputError."""
     level = [value] if isinstance(value, list | dict) else []
     for _ in range(MAX_DEPTH):
         level = [

@@ -1,7 +1,7 @@
-"""Named arrays in the safetensors format, with bytes that depend on nothing but the content.
+"""Read and write named arrays in the safetensors format. Equal content gives equal bytes.
 
-The safetensors package itself writes its metadata in a random order, so two equal models would differ. Reading by hand
-is as short, allocates nothing that the bytes do not pay for, and can say what is wrong. Format:
+The safetensors package writes its metadata in random order, so two equal models would give different files. This reader
+allocates no more memory than the file has bytes, and its errors name the tensor. Format:
 https://github.com/huggingface/safetensors#format
 """
 
@@ -37,10 +37,10 @@ class _Spec(NamedTuple):
 
 
 def pack_tensors(tensors: Mapping[str, Array], metadata: Mapping[str, str]) -> list[bytes | memoryview]:
-    """The buffers which, written one after another, are a safetensors file. Floats must be finite.
+    """Return the consecutive buffers of a safetensors file.
 
-    Tensors stand by falling item size, then by name, so that each is aligned; metadata by key. Equal input gives equal
-    bytes. Raises InputError when a value is NaN or infinite, ValueError for a type that the format lacks.
+    Tensors are ordered by decreasing item size, then by name, so that each is aligned; metadata is ordered by key.
+    Raises InputError if a value is NaN or infinite, and ValueError if the format lacks a dtype.
     """
     header: dict[str, Any] = {_METADATA: dict(sorted(metadata.items()))} if metadata else {}
     buffers: list[bytes | memoryview] = []
@@ -61,10 +61,10 @@ def pack_tensors(tensors: Mapping[str, Array], metadata: Mapping[str, str]) -> l
 
 
 def unpack_tensors(file: BinaryIO, size: int, where: str) -> tuple[dict[str, Array], dict[str, str]]:
-    """The tensors and the metadata of the safetensors file that is the next `size` bytes of `file` (a file on disk).
+    """Read tensors and metadata from the next `size` bytes of `file`, a file on disk.
 
-    Takes as much memory as `size`, and at most some tens of MB for the header. Raises InputError, which begins with
-    `where`, unless every size agrees with every other and every float is finite.
+    Allocates `size` bytes, and at most some tens of MB for the header. Raises InputError, whose message begins with
+    `where`, if sizes contradict each other or a float is not finite.
     """
     if size < 8:
         raise InputError(f"{where}: has {size} bytes, where the shortest safetensors file has 10; the file is damaged")

@@ -1,4 +1,4 @@
-"""Fields of JSON files that strangers wrote: each error names the file, the field, and what was found in it."""
+"""Read fields of untrusted JSON files. Each error names the file, the field, and the value found."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.errors import InputError
-from lapgs_wgpu.io import documents
+from lapgs_wgpu.io import safe_json_toml
 
 
 def read_json(path: Path, needs: str) -> dict[str, Any]:
-    """The JSON object that a file holds. needs: what it must consist of, for errors. Raises InputError."""
-    data = documents.read_json(path)
+    """Read a file that holds a JSON object. needs: its expected content, for errors. Raises InputError."""
+    data = safe_json_toml.read_json(path)
     if not isinstance(data, dict):
         raise InputError(f"{path} must hold a JSON object with {needs}, got {kind(data)}.")
     return data
 
 
 def required(data: dict[str, Any], name: str, where: str | Path, hint: str) -> Any:
-    """A field that must be there; hint: why, for the error, after a comma."""
+    """Return a required field. hint: the reason, which ends the error after a comma. Raises InputError."""
     if name not in data:
         raise InputError(f"{where} has no field {name}, {hint}.")
     return data[name]
 
 
 def number(value: Any, name: str, where: str | Path) -> float:
-    """A JSON number as a float, infinite where it is beyond one; may be NaN."""
+    """Convert a JSON number to a float; infinity if it exceeds the range, NaN is allowed. Raises InputError."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise InputError(f"{where}: {name} must be made of numbers, got {kind(value)}.")
     try:
@@ -41,7 +41,7 @@ def number(value: Any, name: str, where: str | Path) -> float:
 
 
 def finite(value: Any, name: str, where: str | Path) -> float:
-    """A finite number."""
+    """Convert a finite JSON number to a float. Raises InputError."""
     got = number(value, name, where)
     if not math.isfinite(got):
         raise InputError(f"{where}: {name} must be a finite number, got {got:g}.")
@@ -49,15 +49,17 @@ def finite(value: Any, name: str, where: str | Path) -> float:
 
 
 def vector(value: Any, length: int, name: str, where: str | Path) -> NDArray[np.float64]:
-    """(length,) finite numbers."""
+    """Convert a JSON list to (length,) finite numbers. Raises InputError."""
     if not isinstance(value, list) or len(value) != length:
         raise InputError(f"{where}: {name} must be a list of {length} numbers, got {kind(value)}.")
     return np.array([finite(entry, name, where) for entry in value])
 
 
 def check_inside(name: str, field: str, where: str | Path) -> None:
-    """InputError where a path that a field names leaves the capture's folder, on any system. Links are not looked at:
-    whoever made the folder put them there."""
+    """Raise InputError if the path in a field leaves the capture's folder, on any system.
+
+    Symbolic links are allowed: the owner of the folder created them.
+    """
     for system in (PurePosixPath, PureWindowsPath):
         if system(name).anchor or ".." in system(os.path.normpath(name)).parts:
             raise InputError(
@@ -67,7 +69,7 @@ def check_inside(name: str, field: str, where: str | Path) -> None:
 
 
 def kind(value: Any) -> str:
-    """What a JSON value is, in JSON's words and short enough for an error."""
+    """Describe a JSON value in JSON's terms, short enough for an error."""
     if isinstance(value, list):
         return f"a list of {len(value)}"
     if isinstance(value, dict):

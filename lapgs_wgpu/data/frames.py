@@ -1,0 +1,98 @@
+"""What a reader returns: the frames of a capture and, if the files have one, its cloud, all in the files' coordinates.
+
+`load` does everything else: it undistorts, normalizes, splits and validates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lapgs_wgpu.data.cloud import Cloud
+from lapgs_wgpu.data.images import ImageFile
+from lapgs_wgpu.data.normalize import Normalization
+from lapgs_wgpu.data.objects import ObjectRecord
+from lapgs_wgpu.data.timestamps import ImageName
+from lapgs_wgpu.data.undistort import Lens
+from lapgs_wgpu.data.video_frames import VideoFrame
+
+Split = Literal["train", "test"]
+ImageSource = ImageFile | VideoFrame
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One image of a capture, as the files describe it.
+
+    image: its header was checked.
+    lens: at the size that the files state; the image may have another size. Frames of one camera share the object.
+    T_cam_world: (4, 4) pose, OpenCV axes, the capture's coordinates. Frames of a camera that stands still share it.
+    where: the description of camera and lens: file and entry, for errors.
+    name: file name and camera, for rules on own footage.
+    time: in any unit; None if the files state none. Either all frames of a capture have a time, or none.
+    split: None to apply the rule for own footage (`split.held_out`), for all frames of a capture or for none.
+    label: suffix of the view's name; None to number the views.
+    depths: nearest and furthest depth, the capture's units.
+    mask: image of the pixels that the masked metrics measure, of any size; white is measured.
+    objects: moving objects of a generated scene.
+    """
+
+    image: ImageSource
+    lens: Lens
+    T_cam_world: NDArray[np.float64]
+    where: str
+    name: ImageName
+    time: float | None = None
+    split: Split | None = None
+    label: str | None = None
+    depths: tuple[float, float] | None = None
+    mask: Path | None = None
+    objects: Sequence[ObjectRecord] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """Frames and cloud of a capture.
+
+    frames: at least one. The order is that of the views.
+    cloud: in the coordinates of the frames.
+    source: file of the cloud or, without a cloud, of the cameras, for errors.
+    time_source: file and field of the times, for errors.
+    time_range: times that become 0 and 1; None for the first and the last time of the frames.
+    warnings: what the reader left out, one sentence each.
+    moved: the transform from the files' coordinates to those of frames and cloud, if the files ask for one.
+    keeps_coordinates: the files may already use the presets' coordinates (D-NeRF); they are kept if the scene fits.
+    own_footage: poses and cloud come from structure from motion. Then `load` orders the frames by camera and time,
+        checks the images and the poses for what goes wrong with own footage, and fills up a sparse cloud.
+    axes_hint: advice for own footage whose cameras look the wrong way.
+    """
+
+    frames: Sequence[Frame]
+    cloud: Cloud | None
+    source: Path
+    time_source: str = ""
+    time_range: tuple[float, float] | None = None
+    warnings: Sequence[str] = ()
+    moved: Normalization | None = None
+    keeps_coordinates: bool = False
+    own_footage: bool = False
+    axes_hint: str = ""
+
+
+class Reader(NamedTuple):
+    """A capture format.
+
+    name: of the format. files: what identifies it, for errors. matches: whether a folder holds it. read: reads a
+    folder; the second argument is the wanted longer side in pixels, for formats that store images of several sizes, or
+    None. Raises InputError.
+    """
+
+    name: str
+    files: str
+    matches: Callable[[Path], bool]
+    read: Callable[[Path, int | None], Capture]

@@ -1,0 +1,133 @@
+"""Image files, PNG and JPEG: header checks, decoding, resampling, encoding.
+
+imageio decodes and encodes. Pillow, on which imageio's plugin is built, does what imageio does not offer: read a header
+without decoding the image, verify checksums, restrict the formats, decode a JPEG at a fraction of its size, resample.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import imageio.v3 as iio
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from lapgs_wgpu.errors import InputError
+
+Pixels = NDArray[np.uint8]
+Size = tuple[int, int]  # (width, height) in pixels
+
+SUFFIXES = (".png", ".jpg", ".jpeg")
+_FORMATS = ("PNG", "JPEG")  # no other decoder of Pillow gets a file
+_ERRORS = (  # what Pillow raises; the last five for damage that it takes for valid data
+    OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError,
+    IndexError, KeyError, TypeError, struct.error, zlib.error,
+)  # fmt: skip
+_EIGHT_BIT_MODES = {"1", "L", "LA", "P", "PA", "RGB", "RGBA"}
+
+LANCZOS, NEAREST = Image.Resampling.LANCZOS, Image.Resampling.NEAREST
+
+
+class ImageFile(NamedTuple):
+    """An image file whose header was checked. size: (width, height) in pixels."""
+
+    path: Path
+    size: Size
+
+    def __str__(self) -> str:
+        return str(self.path)
+
+    def read(self, size: Size) -> Pixels:
+        """Decode the image and shrink it to (width, height): see `decode`. Raises InputError."""
+        image = decode(self.path)
+        if image.shape[1::-1] != self.size:
+            raise InputError(
+                f"{self.path} is {size_text(image.shape[1::-1])} pixels now and was {size_text(self.size)} when the "
+                "capture was opened; put the image back."
+            )
+        return shrink(image, size)
+
+
+def check_image(path: Path, *, whole: bool = True) -> ImageFile:
+    """Check the header of an 8-bit image. Raises InputError.
+
+    whole: also read every byte (of a PNG, verify each checksum); no pixel is decoded.
+    """
+    try:
+        with Image.open(path, formats=_FORMATS) as file:
+            size, mode = file.size, file.mode
+            if whole:
+                file.verify()
+    except _ERRORS as error:
+        reason = "neither PNG nor JPEG" if isinstance(error, Image.UnidentifiedImageError) else error
+        raise InputError(f"{path} is not a readable image ({reason}); copy or render it again.") from None
+    if mode not in _EIGHT_BIT_MODES:
+        raise InputError(f"{path} has pixels of mode {mode}; save it as RGB or RGBA with 8 bits per channel.")
+    return ImageFile(path, size)
+
+
+def decode(path: Path) -> Pixels:
+    """Decode an 8-bit image: (H, W, 4) straight RGBA, or (H, W, 3) RGB if it has no transparency. Raises InputError."""
+    with _decoding(path), open(path, "rb") as file:  # not the path: imageio would look into archives
+        header = Image.open(file, formats=_FORMATS)
+        transparent = "A" in header.getbands() or "transparency" in header.info
+        file.seek(0)
+        return iio.imread(file, plugin="pillow", index=0, mode="RGBA" if transparent else "RGB")
+
+
+def gray_thumbnail(path: Path, side: int) -> NDArray[np.float32]:
+    """Gray levels 0 to 255 of a small version of an image, its longer side at most `side`. Raises InputError."""
+    with _decoding(path), Image.open(path, formats=_FORMATS) as file:
+        file.draft("L", (side, side))
+        image = file.convert("L")
+        image.thumbnail((side, side), Image.Resampling.BOX)
+        return np.asarray(image, dtype=np.float32)
+
+
+@contextmanager
+def _decoding(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except _ERRORS as error:
+        raise InputError(f"{path} cannot be decoded as an image ({error}); copy or render it again.") from None
+
+
+def encode_png(image: Pixels, *, level: int = 6) -> bytes:
+    """Encode an image (H, W) gray, (H, W, 3) RGB or (H, W, 4) RGBA as PNG. level: of the compression, 0 to 9."""
+    mode = "L" if image.ndim == 2 else "RGBA" if image.shape[2] == 4 else "RGB"
+    options: dict[str, Any] = {"mode": mode, "is_batch": False, "compress_level": level}
+    return iio.imwrite("<bytes>", image, extension=".png", plugin="pillow", **options) or b""
+
+
+def resize(image: Pixels, size: Size, resampling: Image.Resampling) -> Pixels:
+    """Resample an image (H, W, C) to (width, height)."""
+    # Pillow premultiplies RGBA around the filter: the colour of transparent pixels does not bleed into edges.
+    return image if image.shape[1::-1] == size else np.array(Image.fromarray(image).resize(size, resampling))
+
+
+def shrink(image: Pixels, size: Size) -> Pixels:
+    """Shrink an image (H, W, C) to (width, height): average whole pixels, else apply a Hamming filter."""
+    # Averaging is exact if each new pixel covers whole old ones; otherwise it would shift details.
+    whole = all(old % new == 0 for old, new in zip(image.shape[1::-1], size, strict=True))
+    return resize(image, size, Image.Resampling.BOX if whole else Image.Resampling.HAMMING)
+
+
+def shrunk_size(stored: Size, image_size: int | None) -> Size:
+    """(width, height) whose longer side is at most image_size, in the proportions of `stored`."""
+    longer = max(stored)
+    if image_size is None or image_size >= longer:
+        return stored
+    width, height = (max(1, math.floor(side * image_size / longer + 0.5)) for side in stored)
+    return width, height
+
+
+def size_text(size: Size) -> str:
+    """A size as errors show it."""
+    return f"{size[0]}x{size[1]}"

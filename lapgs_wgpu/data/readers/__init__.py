@@ -1,0 +1,1 @@
+"""Readers of capture formats, one per file. Each returns frames and an optional cloud (`frames.Capture`)."""

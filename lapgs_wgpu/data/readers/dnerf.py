@@ -1,0 +1,133 @@
+"""Reader of the D-NeRF format.
+
+transforms_train.json and transforms_test.json hold `camera_angle_x` (horizontal field of view, radians) or INTRINSICS
+(those of a frame override those of the file, and both override the angle), and `frames`:
+`file_path` of an image (.png is appended if it has no suffix), `transform_matrix` (camera to world, OpenGL axes) and
+`time` in [0, 1], in all frames of a file or in none; frames without times are evenly spaced. transforms_val.json is not
+read. objects.json (`objects`) is optional, and so is a cloud: fused.ply, points3d.ply or points3D.ply.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lapgs_wgpu.data.cloud import find_cloud, is_random, read_cloud
+from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
+from lapgs_wgpu.data.images import SUFFIXES, Size, check_image
+from lapgs_wgpu.data.json_fields import check_inside, finite, kind, number, read_json, required
+from lapgs_wgpu.data.objects import read_objects
+from lapgs_wgpu.data.poses import opengl_pose
+from lapgs_wgpu.data.timestamps import ImageName
+from lapgs_wgpu.data.undistort import Lens
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.splat.camera import intrinsics_of_fov
+
+NEEDED = "which a D-NeRF scene needs"
+INTRINSICS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2")  # pixels of an image w x h
+LARGEST = 1e6  # of them
+CLOUDS = ("fused.ply", "points3d.ply", "points3D.ply")
+
+
+def _matches(folder: Path) -> bool:
+    return any((folder / f"transforms_{split}.json").is_file() for split in ("train", "test"))
+
+
+def _read(folder: Path, image_size: int | None) -> Capture:
+    frames = [*_read_split(folder, "train"), *_read_split(folder, "test")]
+    path = find_cloud(folder, CLOUDS)
+    cloud = None if path is None else read_cloud(path)
+    if cloud is not None and is_random(cloud):  # other trainers write one, often of 1.3 whatever the scene's size
+        cloud = None
+    cameras = folder / "transforms_train.json"
+    return Capture(
+        frames,
+        cloud,
+        source=cameras if path is None or cloud is None else path,
+        time_source=f"time in {cameras}",
+        time_range=(0.0, 1.0),
+        keeps_coordinates=True,
+    )
+
+
+def _read_split(folder: Path, split: Split) -> list[Frame]:
+    """The frames of one transforms file."""
+    path = folder / f"transforms_{split}.json"
+    if not path.is_file():
+        raise InputError(f"{path} does not exist; a D-NeRF scene needs transforms_train.json and transforms_test.json.")
+    data = read_json(path, "camera_angle_x and frames")
+    entries = required(data, "frames", path, NEEDED)
+    if not isinstance(entries, list) or not entries:
+        raise InputError(f"{path}: frames must be a list of at least one frame, got {kind(entries)}.")
+
+    timed = sum(isinstance(entry, dict) and "time" in entry for entry in entries)
+    frames: list[Frame] = []
+    lenses: dict[tuple[float, ...], Lens] = {}
+    for index, entry in enumerate(entries):
+        where = f"{path}, frame {index}"
+        if not isinstance(entry, dict):
+            raise InputError(f"{where} must be a JSON object, got {kind(entry)}.")
+        file_path = required(entry, "file_path", where, NEEDED)
+        if not isinstance(file_path, str) or not file_path:
+            raise InputError(f"{where}: file_path must be the path of an image, got {kind(file_path)}.")
+        suffix = "" if file_path.lower().endswith(SUFFIXES) else ".png"
+        check_inside(file_path, "file_path", where)
+        file = folder / (file_path + suffix)
+        if not os.path.isfile(file):  # Path.is_file raises for names that are too long
+            raise InputError(f"{file} does not exist, but {where} names it as its file_path.")
+        T_cam_world = opengl_pose(required(entry, "transform_matrix", where, NEEDED), where)
+        if timed == 0:
+            time = index / max(len(entries) - 1, 1)
+        else:
+            hint = f"though {timed} of {len(entries)} frames have it; give it for all frames or for none"
+            time = number(required(entry, "time", where, hint), "time", where)
+            if not 0 <= time <= 1:
+                raise InputError(f"{where}: time must lie in [0, 1], got {time:g}; divide by the clip's duration.")
+        image = check_image(file)
+        lens = _lens(entry, data, image.size, where, path)
+        lens = lenses.setdefault((*lens.K.ravel(), *lens.radial, *lens.tangential), lens)
+        name, label = ImageName(file_path), f"{index:03d}"
+        frames.append(Frame(image, lens, T_cam_world, where, name, time=time, split=split, label=label))
+    if split == "test":
+        objects = read_objects(folder, split, [Path(str(frame.image)).stem for frame in frames])
+        frames = [dataclasses.replace(frame, objects=records) for frame, records in zip(frames, objects, strict=True)]
+    return frames
+
+
+def _lens(entry: dict[str, Any], shared: dict[str, Any], size: Size, where: str, path: Path) -> Lens:
+    """The lens of a frame, for images of this size."""
+    values: dict[str, float] = {}
+    for name in INTRINSICS:
+        source, at = (entry, where) if name in entry else (shared, str(path))
+        if source.get(name) is None:
+            continue
+        values[name] = finite(source[name], name, at)
+        if abs(values[name]) > LARGEST or (name in ("w", "h", "fl_x", "fl_y") and values[name] <= 0):
+            raise InputError(f"{at}: {name} is {values[name]:g}, which no camera has; it must be in pixels.")
+    across, down = size[0] / values.get("w", size[0]), size[1] / values.get("h", size[1])
+    if "fl_x" in values:
+        focal = values["fl_x"] * across
+        K = np.array([[focal, 0.0, size[0] / 2], [0.0, focal, size[1] / 2], [0.0, 0.0, 1.0]])
+    else:
+        source, at = (entry, where) if "camera_angle_x" in entry else (shared, str(path))
+        fov_x = number(required(source, "camera_angle_x", at, NEEDED), "camera_angle_x", at)
+        if not 1e-6 < fov_x < math.pi:
+            raise InputError(f"{at}: camera_angle_x must be an angle in radians between 0 and pi, got {fov_x:g}.")
+        K = intrinsics_of_fov(fov_x, *size)
+    for name, row, column, scale in (("fl_y", 1, 1, down), ("cx", 0, 2, across), ("cy", 1, 2, down)):
+        if name in values:
+            K[row, column] = values[name] * scale
+    k1, k2, k3, p1, p2 = (values.get(name, 0.0) for name in ("k1", "k2", "k3", "p1", "p2"))
+    if values.get("k4"):
+        raise InputError(
+            f"{where}: k4 is {values['k4']:g}, and only k1, k2, k3, p1 and p2 are read; undistort the images."
+        )
+    return Lens(K, *size, (k1, k2, k3), (p1, p2))
+
+
+READER = Reader("D-NeRF", "transforms_train.json and transforms_test.json", _matches, _read)

@@ -1,0 +1,125 @@
+"""Timestamps of own footage: from times.json or from the frame numbers in file names (docs/own-data.md)."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+
+from lapgs_wgpu.data.json_fields import finite, read_json
+from lapgs_wgpu.errors import InputError
+
+TIMES = "times.json"
+
+
+class ImageName(NamedTuple):
+    """file: relative path of an image, as in times.json. camera: the camera that took it, the name of its folder."""
+
+    file: str
+    camera: str = ""
+
+
+def read_times(names: Sequence[ImageName], folder: Path) -> tuple[list[float], str]:
+    """Read the time of each image, in any unit, and name the source of the times for errors.
+
+    The source is times.json in the folder, if it exists, else the frame numbers in the names. Raises InputError.
+    """
+    path = folder / TIMES
+    if path.is_file():
+        return _listed(names, path), str(path)
+    return [float(number) for number in frame_numbers(names)], f"the frame numbers in the names of {folder}"
+
+
+def to_unit_range(values: Sequence[float], first: float, last: float) -> list[float]:
+    """Scale times so that `first` becomes 0 and `last` 1; all become 0 if the two are equal."""
+    return [(value - first) / (last - first) if last > first else 0.0 for value in values]
+
+
+def _listed(names: Sequence[ImageName], path: Path) -> list[float]:
+    times = read_json(path, "a time for each image")
+    missing = [name.file for name in names if name.file not in times]
+    if missing:
+        example = f", such as {next(iter(times))[:80]}" if times else ""
+        raise InputError(
+            f"{path} has {len(times)} times{example}, but none for {len(missing)} of {len(names)} images, such "
+            f"as {missing[0]}; name each image by its path below images/."
+        )
+    return [finite(times[name.file], f"the time of {name.file}", path) for name in names]
+
+
+def frame_numbers(names: Sequence[ImageName]) -> list[int]:
+    """Return the frame number in each file name: the only number that differs between the images of a camera.
+
+    Raises InputError if no number differs, or more than one.
+    """
+    found: dict[int, int] = {}
+    for camera in dict.fromkeys(name.camera for name in names):
+        mine = [i for i, name in enumerate(names) if name.camera == camera]
+        files = [names[i].file for i in mine]
+        rows = [[int(digits) for digits in re.findall(r"\d+", Path(file).stem)] for file in files]
+        lengths = {len(row) for row in rows}
+        if lengths == {0} or len(lengths) > 1:
+            odd = next(i for i, row in enumerate(rows) if len(row) != max(lengths) or not row)
+            raise InputError(
+                f"the name {files[odd]} does not state a frame number: {files[0]} has {len(rows[0])} numbers and it "
+                f"has {len(rows[odd])}; write the times into {TIMES}, or number the frames."
+            )
+        varying = [column for column in range(len(rows[0])) if len({row[column] for row in rows}) > 1]
+        if len(varying) > 1:
+            raise InputError(
+                f"{files[0]} and {files[-1]} differ in {len(varying)} numbers, so the frame number is ambiguous; write "
+                f"the times into {TIMES}, or put the images of each camera into a folder of their own."
+            )
+        column = varying[0] if varying else len(rows[0]) - 1
+        numbers: dict[int, str] = {}
+        for i, file, row in zip(mine, files, rows, strict=True):
+            found[i] = row[column]
+            if row[column] in numbers:
+                raise InputError(f"{file} has the frame number {row[column]}, as {numbers[row[column]]} has.")
+            numbers[row[column]] = file
+    return [found[i] for i in range(len(names))]
+
+
+def disorder(names: Sequence[ImageName], times: Sequence[float]) -> list[str]:
+    """Warn about cameras whose times decrease with the frame number, and about cameras without a common time."""
+    warnings = []
+    spans: dict[str, tuple[float, float]] = {}
+    for camera in dict.fromkeys(name.camera for name in names):
+        mine = [(name, time) for name, time in zip(names, times, strict=True) if name.camera == camera]
+        spans[camera] = min(time for _, time in mine), max(time for _, time in mine)
+        try:
+            numbers = frame_numbers([name for name, _ in mine])
+        except InputError:
+            continue  # names without a frame number have no order
+        ordered = [entry for _, entry in sorted(zip(numbers, mine, strict=True), key=lambda pair: pair[0])]
+        back = [(a, b) for a, b in pairwise(ordered) if b[1] < a[1]]
+        if back:
+            (first, at), (second, then) = back[0]
+            warnings.append(
+                f"frames are out of order: time goes back {len(back)} times in {len(ordered)} images, first from "
+                f"{first.file} at {at:g} to {second.file} at {then:g}; check the times."
+            )
+    first_camera, *others = spans
+    a, b = spans[first_camera]
+    apart = [camera for camera in others if spans[camera][0] > b or spans[camera][1] < a]
+    if apart:
+        c, d = spans[apart[0]]
+        warnings.append(
+            f"cameras film at different times: {first_camera} from {a:g} to {b:g} and {apart[0]} from {c:g} to {d:g}; "
+            "if they filmed together, number their frames from a common time on."
+        )
+    return warnings
+
+
+def natural_key(name: str) -> tuple[tuple[int, int | str], ...]:
+    """Sort key that puts cam2 before cam10."""
+    parts = re.split(r"(\d+)", name)
+    return tuple((0, int(part)) if part.isdigit() else (1, part) for part in parts)
+
+
+def write_times(folder: Path, times: dict[str, float]) -> None:
+    """Write times.json. times: of each image in seconds, by its path below images/."""
+    (folder / TIMES).write_text(json.dumps(times, indent=0) + "\n", encoding="utf-8")

@@ -1,0 +1,128 @@
+"""Undistort: resample the images of a lens with distortion to those of a pinhole camera, which is what we render.
+
+The lens model is that of nerfies and of Brown (1966): three radial and two tangential coefficients, and a skew.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lapgs_wgpu.data.images import Pixels
+from lapgs_wgpu.errors import InputError
+
+Array = NDArray[np.float64]
+
+MAX_ZOOM = 4.0  # a lens that needs more has wrong coefficients
+
+
+@dataclass(frozen=True, eq=False)
+class Lens:
+    """Intrinsics and distortion of a camera.
+
+    K: (3, 3) float64 intrinsics in pixels, the skew in row 0, column 1; pixel centers at + 0.5.
+    width, height: size in pixels of the images for which K holds.
+    radial: (3,) coefficients of r^2, r^4 and r^6. tangential: (2,).
+    """
+
+    K: Array
+    width: int
+    height: int
+    radial: tuple[float, ...] = (0.0, 0.0, 0.0)
+    tangential: tuple[float, ...] = (0.0, 0.0)
+
+    @property
+    def is_pinhole(self) -> bool:
+        """Whether the lens has neither distortion nor skew."""
+        return not (any(self.radial) or any(self.tangential) or self.K[0, 1])
+
+    def resized(self, width: int, height: int) -> Lens:
+        """The same lens for images of another size."""
+        scale = np.diag([width / self.width, height / self.height, 1.0])
+        return Lens(scale @ self.K, width, height, self.radial, self.tangential)
+
+    def project(self, rays: Array) -> Array:
+        """Project rays (..., 2), x / z and y / z: (..., 2) pixel coordinates."""
+        x, y = rays[..., 0], rays[..., 1]
+        r2 = x * x + y * y
+        k1, k2, k3 = self.radial
+        p1, p2 = self.tangential
+        bend = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        bent_x = x * bend + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+        bent_y = y * bend + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)
+        u = self.K[0, 0] * bent_x + self.K[0, 1] * bent_y + self.K[0, 2]
+        return np.stack([u, self.K[1, 1] * bent_y + self.K[1, 2]], axis=-1)
+
+    def pinhole(self, where: str) -> Array:
+        """(3, 3) K of the pinhole camera of the same image size and the smallest zoom at which the image has no gaps.
+
+        Raises InputError, whose message begins with `where`, if that takes a zoom above MAX_ZOOM.
+        """
+        width, height = self.width, self.height
+        columns, rows = np.arange(width) + 0.5, np.arange(height) + 0.5
+        top = np.stack([columns, np.full(width, 0.5)], axis=1)
+        left = np.stack([np.full(height, 0.5), rows], axis=1)
+        bottom, right = top + np.array([0, height - 1]), left + np.array([width - 1, 0])
+        border = np.concatenate([top, bottom, left, right])
+
+        def covered(zoom: float) -> bool:
+            rays = _rays(self._zoomed(zoom), border)
+            source = self.project(rays)
+            return self._unfolds(rays) and bool(((source > 0) & (source < [width, height])).all())
+
+        low, high = 1.0, MAX_ZOOM
+        if covered(low):
+            return self._zoomed(low)
+        if not covered(high):
+            values = ", ".join(f"{value:.3g}" for value in (*self.radial, *self.tangential))
+            raise InputError(
+                f"{where}: its distortion ({values}) bends the image so much that enlarging it {MAX_ZOOM:g} times "
+                "leaves gaps; check the coefficients."
+            )
+        for _ in range(20):
+            middle = (low + high) / 2
+            low, high = (low, middle) if covered(middle) else (middle, high)
+        return self._zoomed(high)
+
+    def undistort(self, image: Pixels, K: Array) -> Pixels:
+        """Resample an image (H, W, C) bilinearly to that of a pinhole camera with intrinsics K (3, 3), same size."""
+        from scipy.ndimage import map_coordinates  # takes most of a second to import
+
+        height, width = image.shape[:2]
+        columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+        source = self.project(_rays(K, np.stack([columns, rows], axis=-1))) - 0.5
+        where = [source[..., 1], source[..., 0]]
+        out = np.empty_like(image)
+        for channel in range(image.shape[2]):
+            values = map_coordinates(image[..., channel], where, np.float32, order=1, mode="nearest")
+            out[..., channel] = np.floor(values + 0.5)
+        return out
+
+    def _unfolds(self, rays: Array) -> bool:
+        """Whether the radial distortion is monotonic up to these rays (N, 2)."""
+        r2 = np.linspace(0, 1, 64) * np.square(rays).sum(axis=-1).max()
+        k1, k2, k3 = self.radial
+        return bool((1 + r2 * (3 * k1 + r2 * (5 * k2 + r2 * 7 * k3)) > 0).all())
+
+    def _zoomed(self, zoom: float) -> Array:
+        fx, fy = zoom * self.K[0, 0], zoom * self.K[1, 1]
+        return np.array([[fx, 0, self.K[0, 2]], [0, fy, self.K[1, 2]], [0, 0, 1]])
+
+
+class Undistortion(NamedTuple):
+    """Undistorts images of `lens` (at their size) for a pinhole camera with intrinsics K (3, 3)."""
+
+    lens: Lens
+    K: Array
+
+    def apply(self, image: Pixels) -> Pixels:
+        """The undistorted image, (H, W, C) like the given one."""
+        return self.lens.undistort(image, self.K)
+
+
+def _rays(K: Array, pixels: Array) -> Array:
+    """Rays (..., 2), x / z and y / z, of `pixels` (..., 2) of a pinhole camera."""
+    return (pixels - K[:2, 2]) / K[[0, 1], [0, 1]]

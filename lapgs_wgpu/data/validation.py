@@ -1,0 +1,275 @@
+"""Validate a capture before training. Errors and warnings name the numbers, and what to change.
+
+A capture that cannot be trained on raises InputError; otherwise each problem is a warning of one sentence.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lapgs_wgpu.data.cloud import Cloud, in_view, views_of
+from lapgs_wgpu.data.covisible import check_mask
+from lapgs_wgpu.data.frames import Frame
+from lapgs_wgpu.data.images import check_image, gray_thumbnail, size_text
+from lapgs_wgpu.data.undistort import Lens
+from lapgs_wgpu.data.views import Dataset
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.splat.camera import Camera
+
+MIN_FOCAL, MAX_FOCAL = 0.05, 1000.0  # of an image's longer side: 169 and 0.06 degrees of view
+# A triangulated point was seen by cameras. If most points are not, cloud and cameras use different coordinates.
+MIN_SEEN = 0.5
+MIN_SPREAD = 1e-3  # of the cloud, relative to its distance from the cameras: a smaller one covers less than a pixel
+THUMBNAIL = 320  # longer side in pixels: what is blurred at this size is blurred for a training, too
+BLURRED = 0.3  # relative to the sharpness of the images before and after
+AROUND = 5  # number of images before, and after
+EQUAL = 3  # levels of 255: the largest difference of a repeated image, above noise at the thumbnail's size
+NAMED = 5  # images that a warning names
+STANDING = 0.01  # cameras with a spread below this, relative to their distance from the cloud, have no parallax
+FEW_POINTS = 100
+FEW_TIMES = 5  # fewer distinct times do not constrain motion
+GAP, GAP_FACTOR = 0.1, 4.0  # a gap is longer than this share of the clip, and than this multiple of the usual step
+
+
+def check_frames(frames: Sequence[Frame]) -> None:
+    """Check that all images have one size, which fits their cameras, and the same of masks. Raises InputError."""
+    checked: set[tuple[int, Path | None]] = set()
+    first = frames[0].image
+    for frame in frames:
+        if frame.image.size != first.size:
+            raise InputError(
+                f"{frame.image} is {size_text(frame.image.size)} pixels and {first} is {size_text(first.size)}; all "
+                "images must have one size."
+            )
+        key = id(frame.lens), frame.mask
+        if key in checked:
+            continue
+        checked.add(key)
+        check_focal(frame.lens, frame.where)
+        check_proportions(first.size, frame.lens, str(frame.image), frame.where)
+        if frame.mask is not None:
+            check_proportions(check_image(frame.mask).size, frame.lens, str(frame.mask), frame.where)
+            check_mask(frame.mask)
+
+
+def check_focal(lens: Lens, where: str) -> None:
+    """Check that both focal lengths are plausible. Raises InputError, whose message begins with `where`."""
+    longer = max(lens.width, lens.height)
+    for focal in (lens.K[0, 0], lens.K[1, 1]):
+        if not MIN_FOCAL * longer <= focal <= MAX_FOCAL * longer:
+            raise InputError(
+                f"{where}: a focal length of {focal:.4g} pixels does not fit images of {lens.width}x{lens.height}; it "
+                f"must be {MIN_FOCAL:g} to {MAX_FOCAL:g} times the longer side."
+            )
+
+
+def check_proportions(stored: tuple[int, int], lens: Lens, image: str, where: str) -> None:
+    """Check that an image of (width, height) `stored` has the proportions that a lens states. Raises InputError."""
+    # Whoever shrank the images may have rounded each side up or down.
+    if abs(stored[0] * lens.height / lens.width - stored[1]) > 1.5:
+        raise InputError(
+            f"{image} is {size_text(stored)} pixels, but {where} states {lens.width}x{lens.height}, which has other "
+            "proportions; they do not belong together."
+        )
+
+
+def check_cloud(cloud: Cloud, cameras: Sequence[Camera], path: Path) -> None:
+    """Check that a cloud and the training cameras use the same coordinates and scale. Raises InputError."""
+    points = cloud.points.astype(np.float64)
+    centres = np.stack([camera.position for camera in cameras])
+    middle = np.median(points, axis=0)
+    spread = float(np.percentile(np.linalg.norm(points - middle, axis=1), 90))
+    distance = float(np.median(np.linalg.norm(centres - middle, axis=1)))
+    seen = float((views_of(points, cameras) > 0).mean())
+    numbers = f"the cloud has a radius of {spread:.3g}, and the cameras stand {distance:.3g} away from it"
+    if seen < MIN_SEEN:
+        raise InputError(
+            f"{path}: the training cameras see {100 * seen:.0f} % of its points (at least {100 * MIN_SEEN:.0f} % are "
+            f"expected): {numbers}; it is in other coordinates than the cameras, so transform it, or remove it."
+        )
+    if len(points) > 1 and spread < MIN_SPREAD * distance:
+        raise InputError(
+            f"{path} is a speck: {numbers}; it has another scale than the cameras, so scale it to theirs or remove it."
+        )
+
+
+def check_times(dataset: Dataset, *, moving: bool) -> list[str]:
+    """Warn about training times that are few, repeated, or missing from a part of the clip.
+
+    moving: whether the field models motion; if not, times are ignored. Raises InputError if all times are equal.
+    """
+    times, count, source = dataset.times, len(dataset.train), f"{dataset.name}: {dataset.time_source}"
+    if not moving:
+        return []
+    if len(times) == 1:
+        raise InputError(
+            f"{source}: all {count} training images have the same time, {times[0]:g}, so "
+            "nothing can move: train with --field static, or give each image its time."
+        )
+    warnings = []
+    if len(times) < FEW_TIMES:
+        listed = ", ".join(f"{time:g}" for time in times)
+        warnings.append(
+            f"{source}: {count} training images have only {len(times)} different times ({listed}), so the motion "
+            f"between them is a guess; give at least {FEW_TIMES} times, or train with --field static."
+        )
+    else:
+        warnings += _gaps(dataset, source)
+    first: dict[tuple[bytes, bytes, float], str] = {}
+    repeated = []
+    for view in dataset.train:
+        camera = view.camera
+        before = first.setdefault((camera.K.tobytes(), camera.T_cam_world.tobytes(), view.time), view.name)
+        if before != view.name:
+            repeated.append((before, view))
+    if repeated:
+        before, view = repeated[0]
+        warnings.append(
+            f"{source}: {len(repeated)} of {count} training images repeat the time of another image of the same "
+            f"camera, such as {view.name} and {before} at {view.time:g}; the training averages them, so give each "
+            "image its own time, or remove it."
+        )
+    return warnings
+
+
+def _gaps(dataset: Dataset, source: str) -> list[str]:
+    """Warn about the longest part of the clip [0, 1] without a training view."""
+    times = dataset.times
+    edges = np.concatenate([[0.0], times, [1.0]])
+    gaps = np.diff(edges)
+    usual = float(np.median(np.diff(times)))
+    found = np.flatnonzero((gaps > GAP) & (gaps > GAP_FACTOR * usual))
+    if not len(found):
+        return []
+    longest = found[np.argmax(gaps[found])]
+    low, high = edges[longest], edges[longest + 1]
+    tested = sum(low < view.time < high for view in dataset.test)
+    others = f" ({len(found) - 1} more such gaps)" if len(found) > 1 else ""
+    return [
+        f"{source}: no training image has a time between {low:.4g} and {high:.4g}, though the usual step is "
+        f"{usual:.2g}{others}; the motion there, in {tested} test images too, is unconstrained: add images, or cut "
+        "the clip there."
+    ]
+
+
+def check_in_view(dataset: Dataset, points: NDArray[np.floating]) -> list[str]:
+    """Warn about the longest span of time in which no training view shows the scene.
+
+    points: (N, 3) means of the initial Gaussians, world units. Raises InputError if no view shows any.
+    """
+    seen: dict[int, bool] = {}
+    blind: dict[float, bool] = {}  # time -> whether no view of that time shows the scene
+    for view in dataset.train:
+        key = id(view.camera)
+        if key not in seen:
+            seen[key] = bool(in_view(points, view.camera)[1].any())
+        blind[view.time] = blind.get(view.time, True) and not seen[key]
+    if not any(seen.values()):
+        low, high = points.min(axis=0), points.max(axis=0)
+        box = ", ".join(f"{a:.3g} to {b:.3g}" for a, b in zip(low, high, strict=True))
+        raise InputError(
+            f"{dataset.name}: none of {len(dataset.train)} training cameras sees where the first Gaussians lie ({box} "
+            "along x, y, z); check the poses and their axes, or raise points.box and field.bound."
+        )
+    spans: list[list[float]] = []
+    before = False
+    for time in sorted(blind):
+        if blind[time]:
+            if before:
+                spans[-1].append(time)
+            else:
+                spans.append([time])
+        before = blind[time]
+    if not spans:
+        return []
+    longest = max(spans, key=len)
+    names = [view.name for view in dataset.train if longest[0] <= view.time <= longest[-1]]
+    others = f" ({len(spans) - 1} more such spans)" if len(spans) > 1 else ""
+    return [
+        f"{dataset.name}: all cameras look away from time {longest[0]:.4g} to {longest[-1]:.4g}{others}: "
+        f"{_named(names)} show nothing of the scene, so its motion there is a guess; check these poses, or remove "
+        "these images."
+    ]
+
+
+def check_views(cloud: Cloud, cameras: Sequence[Camera], names: Sequence[str], where: Path, axes: str) -> list[str]:
+    """Warn about cameras that see no point of the cloud or hardly move, and about a sparse cloud.
+
+    Cloud and cameras are in the same coordinates. names: of the cameras' images. axes: advice for cameras that look the
+    wrong way. Raises InputError if more than half of the cameras see no point.
+    """
+    points = cloud.points.astype(np.float64)
+    seen = np.array([views_of(points, [camera]).sum() for camera in cameras])
+    blind = np.flatnonzero(seen == 0).tolist()
+    if 2 * len(blind) > len(cameras):
+        back = [Camera(c.K, np.diag([1.0, -1, -1, 1]) @ c.T_cam_world, c.width, c.height) for c in cameras]
+        turned = float(np.mean([views_of(points, [camera]).any() for camera in back]))
+        hint = f"; turned round, {100 * turned:.0f} % of them would see some: {axes}" if turned > 0.5 else ""
+        raise InputError(
+            f"{where}: cameras look away from the cloud: {len(blind)} of {len(cameras)} see none of its {len(points)} "
+            f"points{hint or '; cloud and cameras have different coordinates or scales'}."
+        )
+    warnings = []
+    if len(blind):
+        warnings.append(
+            f"cameras look away from the cloud: {_named([names[i] for i in blind])} see none of its {len(points)} "
+            f"points ({len(blind)} of {len(cameras)} cameras); their poses may be wrong."
+        )
+    if len(points) < FEW_POINTS:
+        warnings.append(
+            f"the cloud is sparse: {where} holds {len(points)} points (at least {FEW_POINTS} are usual); more texture, "
+            "more images or larger ones give more."
+        )
+    centres = np.stack([camera.position for camera in cameras])
+    spread = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
+    distance = float(np.median(np.linalg.norm(np.median(points, axis=0) - centres, axis=1)))
+    if spread < STANDING * distance:
+        warnings.append(
+            f"the cameras hardly move: they lie within {spread:.3g} of each other, {distance:.3g} away from the cloud, "
+            "so depth cannot be told; walk around what moves."
+        )
+    return warnings
+
+
+def check_film(images: Sequence[Path]) -> list[str]:
+    """Warn about images of one camera, in the order of time, that are blurred or repeated."""
+    from scipy.ndimage import laplace  # slow to import
+
+    if len(images) < 3:
+        return []
+    with ThreadPoolExecutor(4, thread_name_prefix="thumbnails") as pool:
+        thumbnails = list(pool.map(lambda path: gray_thumbnail(path, THUMBNAIL), images))
+    sharpness = np.array([laplace(thumbnail).var() for thumbnail in thumbnails])
+    warnings = []
+    blurred = []
+    for i, value in enumerate(sharpness):
+        around = np.delete(sharpness[max(i - AROUND, 0) : i + AROUND + 1], min(i, AROUND))
+        if value < BLURRED * np.median(around):
+            blurred.append((images[i].name, value / np.median(around)))
+    if blurred:
+        name, share = min(blurred, key=lambda entry: entry[1])
+        warnings.append(
+            f"blurred images: {_named([name for name, _ in blurred])} ({len(blurred)} of {len(images)}) have less "
+            f"than {BLURRED:g} of their neighbours' sharpness, {name} {share:.2g}; leave them out."
+        )
+    repeated = [
+        images[i].name
+        for i in range(1, len(images))
+        if thumbnails[i].shape == thumbnails[i - 1].shape and np.abs(thumbnails[i] - thumbnails[i - 1]).max() <= EQUAL
+    ]
+    if repeated:
+        warnings.append(
+            f"repeated images: {_named(repeated)} ({len(repeated)} of {len(images)}) differ by at most {EQUAL} of "
+            "255 levels from the image before; motion stands still there, so leave them out."
+        )
+    return warnings
+
+
+def _named(names: Sequence[str]) -> str:
+    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return ", ".join(names[:NAMED]) + more
