@@ -18,8 +18,8 @@ if typing.TYPE_CHECKING:
     from lapgs_wgpu.gpu.device import Device
     from lapgs_wgpu.motion.scene import Scene4D
     from lapgs_wgpu.train.config import Config
-    from lapgs_wgpu.train.loop import Watch
-    from lapgs_wgpu.train.ranks import Ranks
+    from lapgs_wgpu.train.distributed import Ranks
+    from lapgs_wgpu.train.run import Watch
 
 # Short names for the keys that are given most often.
 SHORTCUTS = {
@@ -68,8 +68,8 @@ def _train(arguments: list[str]) -> None:
 
     given = _parse(arguments)
     from lapgs_wgpu.gpu.device import open_device  # what follows needs torch, which takes seconds to import
-    from lapgs_wgpu.train.loop import train
-    from lapgs_wgpu.train.ranks import join_ranks
+    from lapgs_wgpu.train.distributed import join_ranks
+    from lapgs_wgpu.train.run import train
     from lapgs_wgpu.train.run_folder import check_run_folder
 
     overrides = {key.name: given[key.name] for key in config_keys() if key.name in given}
@@ -107,8 +107,8 @@ def _resume(
     run: Path, given: dict[str, typing.Any], overrides: dict[str, typing.Any], watch: Watch | None, ranks: Ranks
 ) -> None:
     from lapgs_wgpu.gpu.device import open_device
-    from lapgs_wgpu.train.loop import resume
     from lapgs_wgpu.train.presets import load_config
+    from lapgs_wgpu.train.run import resume
     from lapgs_wgpu.train.run_folder import changes_since
 
     others = _others(given, ("preset", "field", "ablate", "out", "overwrite"), overrides)
@@ -137,9 +137,9 @@ def _evaluate(run: Path, given: dict[str, typing.Any], overrides: dict[str, str 
     from lapgs_wgpu.io.documents import read_json
     from lapgs_wgpu.motion.scene import load
     from lapgs_wgpu.train import plots
-    from lapgs_wgpu.train.loop import evaluate_run
     from lapgs_wgpu.train.lpips import Lpips
     from lapgs_wgpu.train.presets import load_config
+    from lapgs_wgpu.train.run import evaluate_run
 
     names = ("preset", "field", "ablate", "out", "resume", "overwrite", "view")
     others = _others(given, names, [key for key in overrides if key not in EVAL_KEYS])

@@ -28,10 +28,10 @@ from lapgs_wgpu.splat.rasterize import rasterize
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 from lapgs_wgpu.train.config import Rate
 from lapgs_wgpu.train.exposure import ExposurePasses, Exposures, exposure
-from lapgs_wgpu.train.loop import resume, train
 from lapgs_wgpu.train.losses import total
 from lapgs_wgpu.train.render_loss import RenderLoss, render_loss, upload_rgba
-from lapgs_wgpu.train.training import Training
+from lapgs_wgpu.train.run import resume, train
+from lapgs_wgpu.train.trainer import Trainer
 
 CORRECTION = torch.tensor([[0.9, 0.1, -0.05, 0.02], [0.03, 1.2, 0.0, -0.1], [-0.02, 0.05, 0.8, 0.2]])
 IDENTITY = torch.eye(3, 4)
@@ -180,7 +180,7 @@ def test_an_interrupted_run_goes_on_to_the_same_bytes(
 
 
 def test_it_is_off_unless_asked_for(dataset: Dataset, device: Device) -> None:
-    with closing(Training(configure(), dataset, device)) as training:
+    with closing(Trainer(configure(), dataset, device)) as training:
         training.step()
         assert not [name for name in training.state() if name.startswith("exposure")]
 

@@ -18,9 +18,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from faults import FAILING, Disk
-from lapgs_wgpu.viewer.cli import view_command
-from lapgs_wgpu.viewer.path import CameraPath
-from lapgs_wgpu.viewer.path_file import PathFile, read_path, write_path
 from test_train import configure
 from test_viewer_path import keys
 
@@ -35,6 +32,9 @@ from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.presets import write_toml
 from lapgs_wgpu.train.run_folder import load_state
+from lapgs_wgpu.viewer.cli import view_command
+from lapgs_wgpu.viewer.path import CameraPath
+from lapgs_wgpu.viewer.path_file import PathFile, read_path, write_path
 
 EVERY = bool(os.environ.get("LAPGS_FUZZ"))
 ERRORS = list(FAILING)

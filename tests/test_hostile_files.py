@@ -30,8 +30,6 @@ from hostile import (
 )
 from hypothesis import given
 from hypothesis import strategies as st
-from lapgs_wgpu.viewer.capture import open_capture
-from lapgs_wgpu.viewer.path_file import read_path
 from PIL import Image
 from test_data_dnerf import make_scene
 from test_ply import columns_of, ply_bytes, random_still
@@ -52,7 +50,9 @@ from lapgs_wgpu.train.presets import load_config, write_toml
 from lapgs_wgpu.train.run_folder import STATE, changes_since, check_state, load_state, save_state
 from lapgs_wgpu.train.table_results import Result, Results, markdown, read_results, read_run, write_results
 from lapgs_wgpu.train.table_spec import read_spec
-from lapgs_wgpu.train.training import Training
+from lapgs_wgpu.train.trainer import Trainer
+from lapgs_wgpu.viewer.capture import open_capture
+from lapgs_wgpu.viewer.path_file import read_path
 
 GRID = HashConfig(1, (2, 2, 2), (2, 2, 2), 4)
 PLANES = PlaneConfig(features=1, space=2, time=2, levels=1)
@@ -188,8 +188,8 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 
 
 @pytest.fixture(scope="module")
-def training(config: Config, dataset: Dataset, device: Device) -> Training:
-    training = Training(config, dataset, device)
+def training(config: Config, dataset: Dataset, device: Device) -> Trainer:
+    training = Trainer(config, dataset, device)
     training.step()
     return training
 
@@ -197,7 +197,7 @@ def training(config: Config, dataset: Dataset, device: Device) -> Training:
 @fuzzed()
 @given(byte_edits([b'"shape":[0', b'"dtype":"F64"', b'"I64"', b'"U8"'], least=0), tree_edits, st.booleans())
 def test_states(
-    training: Training, dataset: Dataset, folder: Path, edits: ByteEdits, changes: TreeEdits, whole: bool
+    training: Trainer, dataset: Dataset, folder: Path, edits: ByteEdits, changes: TreeEdits, whole: bool
 ) -> None:
     """A state that is accepted is one that a training can go on from."""
     run = folder / "run"
@@ -219,7 +219,7 @@ def test_states(
         check_state(state, views=len(dataset.train), steps=5)
         training.restore(state)
     except (IndexError, KeyError, RuntimeError, TypeError, ValueError):
-        return  # what loop.resume tells as an InputError
+        return  # what train.run.resume tells as an InputError
     assert 0 <= training.done <= 5
     assert len({len(value) for value in training.scene.parameters.values()}) == 1
 

@@ -7,10 +7,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-import lapgs_wgpu.viewer
 import pytest
 
 import lapgs_wgpu
+import lapgs_wgpu.viewer
 
 PACKAGE = Path(lapgs_wgpu.__file__).parent
 

@@ -31,7 +31,7 @@ from lapgs_wgpu.motion.scene_playback import ScenePlayback
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.rasterize import rasterizer_of, upload_gaussians
 from lapgs_wgpu.splat.rasterizer import GaussianBuffers, Rasterizer
-from lapgs_wgpu.train.training import Training
+from lapgs_wgpu.train.trainer import Trainer
 
 TIMES = (0.0, 0.37, 1.0)
 CAMERA = Camera.looking_at([1.0, -4, 0.7], [0, 0, 0], up=[0, 0, 1], fov_x=0.8, width=64, height=48)
@@ -174,7 +174,7 @@ def test_an_upload_that_failed_is_made_again(device: Device, tmp_path: Path, mon
 @pytest.mark.parametrize("kind", ["static", "mlp", "hexplane", "grid4d", "laplacian"])
 def test_each_step_of_a_training_is_shown(device: Device, tmp_path: Path, kind: str) -> None:
     dataset = load_dataset(write_synthetic(tmp_path / "scene", size=16, train_views=4, test_views=1))
-    training = Training(configure(method=kind), dataset, device)
+    training = Trainer(configure(method=kind), dataset, device)
     playback = ScenePlayback(training.scene)
     with closing(training):
         for _ in range(12):

@@ -29,7 +29,7 @@ from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.rasterize import rasterize, upload_gaussians
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 from lapgs_wgpu.splat.shape import raster_shape
-from lapgs_wgpu.train.loop import train
+from lapgs_wgpu.train.run import train
 
 soak = pytest.mark.skipif(os.environ.get("LAPGS_SOAK") != "1", reason="large: LAPGS_SOAK=1 runs it")
 Use = Callable[[Rasterizer], Rasterizer]

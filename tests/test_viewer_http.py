@@ -19,9 +19,6 @@ import numpy as np
 import pytest
 import torch
 from browser import CHROMIUM, Browser, wait_for
-from lapgs_wgpu.viewer import cli
-from lapgs_wgpu.viewer.guard import Guard, check_entry, new_token
-from lapgs_wgpu.viewer.remote import open_entry, pages
 from numpy.typing import NDArray
 
 from lapgs_wgpu import Scene4D
@@ -31,6 +28,9 @@ from lapgs_wgpu.io.first_look import FirstLook
 from lapgs_wgpu.motion.field import FieldConfig
 from lapgs_wgpu.motion.hashgrid import HashConfig
 from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.viewer import cli
+from lapgs_wgpu.viewer.guard import Guard, check_entry, new_token
+from lapgs_wgpu.viewer.remote import open_entry, pages
 
 TOKEN = "a-token_of-22-letters"
 FRAMES = 31

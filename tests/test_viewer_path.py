@@ -10,10 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from lapgs_wgpu.viewer.camera import ViewCamera
-from lapgs_wgpu.viewer.path import CameraPath, KeyFrame, Pose
-from lapgs_wgpu.viewer.path_editor import PathEditor, beside
-from lapgs_wgpu.viewer.path_file import PathFile, read_path, write_path
 from scipy.spatial.transform import Rotation
 
 from lapgs_wgpu.errors import InputError
@@ -21,6 +17,10 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.field import FieldConfig
 from lapgs_wgpu.motion.hashgrid import HashConfig
 from lapgs_wgpu.motion.scene import Scene4D
+from lapgs_wgpu.viewer.camera import ViewCamera
+from lapgs_wgpu.viewer.path import CameraPath, KeyFrame, Pose
+from lapgs_wgpu.viewer.path_editor import PathEditor, beside
+from lapgs_wgpu.viewer.path_file import PathFile, read_path, write_path
 
 
 def keys(seed: int = 0) -> list[KeyFrame]:

@@ -8,11 +8,6 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
-from lapgs_wgpu.viewer import shoot as shoot_module
-from lapgs_wgpu.viewer.cli import view_command
-from lapgs_wgpu.viewer.path import CameraPath, KeyFrame, Pose
-from lapgs_wgpu.viewer.path_file import PathFile, write_path
-from lapgs_wgpu.viewer.shoot import framed
 from PIL import Image
 
 from lapgs_wgpu.data import load_dataset
@@ -25,6 +20,11 @@ from lapgs_wgpu.motion.scene import Scene4D, load
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.rasterize import rasterize
 from lapgs_wgpu.train.evaluate import to_8_bit
+from lapgs_wgpu.viewer import shoot as shoot_module
+from lapgs_wgpu.viewer.cli import view_command
+from lapgs_wgpu.viewer.path import CameraPath, KeyFrame, Pose
+from lapgs_wgpu.viewer.path_file import PathFile, write_path
+from lapgs_wgpu.viewer.shoot import framed
 
 pytestmark = pytest.mark.triangles
 kernels = pytest.mark.kernels

@@ -94,7 +94,7 @@ def draw(folder: Path, cache_gb: float, steps: int, step: float) -> dict[str, fl
 
     from lapgs_wgpu.data import load_dataset
     from lapgs_wgpu.gpu.device import open_device
-    from lapgs_wgpu.train.pictures import Pictures
+    from lapgs_wgpu.train.dataloader import Pictures
 
     start = time.perf_counter()
     data = load_dataset(folder)

@@ -23,9 +23,9 @@ from lapgs_wgpu.gpu.profile import Profile
 from lapgs_wgpu.motion import hash_encoder
 from lapgs_wgpu.splat import objective
 from lapgs_wgpu.train.log import Log
-from lapgs_wgpu.train.loop import train
-from lapgs_wgpu.train.optimise import FrequencyOptimiser, Optimiser
+from lapgs_wgpu.train.optimizer import FrequencyOptimizer, Optimizer
 from lapgs_wgpu.train.presets import load_config
+from lapgs_wgpu.train.run import train
 
 WARM_UP = 2  # steps that are not counted
 RASTER, ENCODER, LOSSES = "rasteriser", "hash encoder", "image losses"
@@ -112,8 +112,8 @@ class _Clock:
         patches = [
             mock.patch.object(Commands, "__init__", profiled),
             mock.patch.object(Buffer, "write", self._timed(TRANSFERS, Buffer.write)),
-            mock.patch.object(Optimiser, "step", self._timed(OPTIMISER, Optimiser.step)),
-            mock.patch.object(FrequencyOptimiser, "step", self._timed(OPTIMISER, FrequencyOptimiser.step)),
+            mock.patch.object(Optimizer, "step", self._timed(OPTIMISER, Optimizer.step)),
+            mock.patch.object(FrequencyOptimizer, "step", self._timed(OPTIMISER, FrequencyOptimizer.step)),
             *(
                 mock.patch.object(module, "read_all", read_when_done)
                 for module in (buffer_module, hash_encoder, objective)

@@ -15,8 +15,8 @@ from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.train.log import Log
-from lapgs_wgpu.train.loop import train
 from lapgs_wgpu.train.presets import load_config
+from lapgs_wgpu.train.run import train
 
 WARM_UP = 5  # steps that are not counted: kernels are compiled, buffers grow
 

@@ -12,7 +12,6 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 import torch
-from lapgs_wgpu.viewer.frame import Painter, Request
 from measure import Timing, summary
 from scene import SceneSize, make_scene
 
@@ -21,6 +20,7 @@ from lapgs_wgpu.io.first_look import FirstLook
 from lapgs_wgpu.motion.playback import open_playback
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.presets import load_config
+from lapgs_wgpu.viewer.frame import Painter, Request
 
 SIZE = (640, 480)
 SHARES = (1.0, 0.5, 0.25)  # of the window's width and height

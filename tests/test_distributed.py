@@ -17,11 +17,11 @@ from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.scene import load
-from lapgs_wgpu.train import training as training_module
-from lapgs_wgpu.train.loop import train
+from lapgs_wgpu.train import trainer as training_module
+from lapgs_wgpu.train.distributed import Ranks
 from lapgs_wgpu.train.presets import write_toml
-from lapgs_wgpu.train.ranks import Ranks
-from lapgs_wgpu.train.training import Training
+from lapgs_wgpu.train.run import train
+from lapgs_wgpu.train.trainer import Trainer
 
 
 @pytest.fixture(scope="module")
@@ -41,9 +41,9 @@ def test_gradients_of_a_step_are_the_mean_over_its_views(
     found: list[tuple[dict[str, list[torch.Tensor]], torch.Tensor]] = []
     for views in ([0], [1], [0, 1]):
         config = configure(schedule__batch=str(len(views)), schedule__warm_up="0", smoothness__share="0")
-        training = Training(config, dataset, device)
+        training = Trainer(config, dataset, device)
         training._pictures.order = list(views)
-        monkeypatch.setattr(training._optimiser, "step", lambda step: None)
+        monkeypatch.setattr(training._optimizer, "step", lambda step: None)
         training.step()
         gradients = {name: [g.clone() for g in group] for name, group in training._gradients().items()}
         found.append((gradients, training._statistics.gradients.clone()))
@@ -63,25 +63,25 @@ def test_a_batch_repeats_to_the_last_bit(dataset: Dataset, device: Device, tmp_p
 
 def test_processes_share_views_evenly_or_not_at_all(dataset: Dataset, device: Device) -> None:
     with pytest.raises(InputError, match=r"2 processes cannot share 3 views a step evenly; give --batch 2"):
-        Training(configure(schedule__batch="3"), dataset, device, Ranks(0, 2))
+        Trainer(configure(schedule__batch="3"), dataset, device, Ranks(0, 2))
 
 
 def test_every_process_draws_the_same_numbers_and_other_views(
     dataset: Dataset, device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     looked: list[str] = []
-    original = training_module.Training._loss
+    original = training_module.Trainer._loss
 
-    def note(self: Training, look: training_module._Look, moving: bool) -> object:
+    def note(self: Trainer, look: training_module._Look, moving: bool) -> object:
         looked.append(look.view.name)
         return original(self, look, moving)
 
-    monkeypatch.setattr(Training, "_loss", note)
+    monkeypatch.setattr(Trainer, "_loss", note)
     monkeypatch.setattr(Ranks, "gather", lambda self, tensors: [[tensor] * self.count for tensor in tensors])
     monkeypatch.setattr(Ranks, "any", lambda self, here: here)
     states, views = [], []
     for rank in range(2):
-        training = Training(configure(schedule__batch="2", schedule__warm_up="0"), dataset, device, Ranks(rank, 2))
+        training = Trainer(configure(schedule__batch="2", schedule__warm_up="0"), dataset, device, Ranks(rank, 2))
         looked.clear()
         training.step()
         states.append(training._generator.get_state())

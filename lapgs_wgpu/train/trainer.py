@@ -21,14 +21,14 @@ from lapgs_wgpu.motion.field import Nearby
 from lapgs_wgpu.motion.grid_field import GridField
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.morton import morton_order
+from lapgs_wgpu.train.autotune import choose_decoder
 from lapgs_wgpu.train.config import Config, PointsConfig, SmoothnessConfig
-from lapgs_wgpu.train.decoder_choice import choose_decoder
+from lapgs_wgpu.train.dataloader import Pictures
 from lapgs_wgpu.train.densify import Statistics, densify, reset_opacities
+from lapgs_wgpu.train.distributed import SINGLE_PROCESS, Ranks
 from lapgs_wgpu.train.exposure import Exposures
-from lapgs_wgpu.train.health import Health, Skipped, check_parameters, describe, finite
-from lapgs_wgpu.train.optimise import FrequencyOptimiser, Optimiser
-from lapgs_wgpu.train.pictures import Pictures
-from lapgs_wgpu.train.ranks import ALONE, Ranks
+from lapgs_wgpu.train.nonfinite import Health, Skipped, check_parameters, describe, finite
+from lapgs_wgpu.train.optimizer import FrequencyOptimizer, Optimizer
 from lapgs_wgpu.train.render_loss import RenderLoss, render_loss
 
 MAX_SH_DEGREE = 3
@@ -53,7 +53,7 @@ class _Look(NamedTuple):
     nearby: Nearby | None
 
 
-class Training:
+class Trainer:
     """A training between two of its steps.
 
     scene: to start from, as `discover` gives it, and to move from the first step on; made of `initial_points` where
@@ -62,7 +62,12 @@ class Training:
     """
 
     def __init__(
-        self, config: Config, dataset: Dataset, device: Device, ranks: Ranks = ALONE, scene: Scene4D | None = None
+        self,
+        config: Config,
+        dataset: Dataset,
+        device: Device,
+        ranks: Ranks = SINGLE_PROCESS,
+        scene: Scene4D | None = None,
     ) -> None:
         if config.schedule.batch % ranks.count:
             raise InputError(
@@ -92,11 +97,11 @@ class Training:
             scene.field.precision = getattr(torch, config.precision)
             scene.field.on_device = self.decoder.place == "device"
         groups = scene.field.parameter_groups() if scene.field else {}
-        self._optimiser = Optimiser(scene.parameters, groups, config.rates.schedules())
+        self._optimizer = Optimizer(scene.parameters, groups, config.rates.schedules())
         self._frequencies = None
         if scene.spectrum is not None:
             limit = len(dataset.times) / 2
-            self._frequencies = FrequencyOptimiser(scene.spectrum, config.rates.frequencies, limit)
+            self._frequencies = FrequencyOptimizer(scene.spectrum, config.rates.frequencies, limit)
         self._exposures = Exposures(len(dataset.train), config.exposure.rate) if config.exposure.enabled else None
         self._beside = [each for each in (self._frequencies, self._exposures) if each is not None]
         self._numbers = {view.name: number for number, view in enumerate(dataset.train)}
@@ -154,7 +159,7 @@ class Training:
         skipped = self._examine(renderings, value, step, names)
         self.whole = False
         if skipped is None:
-            self._optimiser.step(step)
+            self._optimizer.step(step)
             for beside in self._beside:
                 beside.step(step)
             # After the optimiser's step, so that no gradient is lost with the rows that change.
@@ -195,13 +200,13 @@ class Training:
 
     def _gradients(self) -> dict[str, list[Tensor]]:
         """By group, of all parameters that have one."""
-        gradients = self._optimiser.gradients()
+        gradients = self._optimizer.gradients()
         for beside in self._beside:
             gradients |= beside.gradients()
         return gradients
 
     def _zero_grad(self) -> None:
-        for each in (self._optimiser, *self._beside):
+        for each in (self._optimizer, *self._beside):
             each.zero_grad()
 
     def _put_together(self) -> None:
@@ -223,7 +228,7 @@ class Training:
     def _examine(self, renderings: list[RenderLoss], loss: float, step: int, views: str) -> Skipped | None:
         """Whether the step of these gradients is to be skipped, and why. Raises NumericalError for a parameter, whose
         values a step cannot mend."""
-        parameters, gradients = self._optimiser.parameters(), self._gradients()
+        parameters, gradients = self._optimizer.parameters(), self._gradients()
         for beside in self._beside:
             parameters |= beside.parameters()
         places = [each.means2d.grad for each in renderings if each.means2d.grad is not None]
@@ -259,12 +264,12 @@ class Training:
                     f"density control leaves no Gaussian at step {step}; raise density.max_world_size or "
                     "density.max_screen_radius (0 switches these two off)."
                 )
-            self._optimiser.edit_rows(change.keep, change.added)
-            self._optimiser.reorder(morton_order(scene.parameters["means"].detach()))
+            self._optimizer.edit_rows(change.keep, change.added)
+            self._optimizer.reorder(morton_order(scene.parameters["means"].detach()))
             self._statistics = Statistics(len(scene), scene.parameters["means"].device)
         if density.resets_at(step):
             logits = reset_opacities(scene.parameters["opacity_logits"], density.reset_opacity)
-            self._optimiser.reset("opacity_logits", logits)
+            self._optimizer.reset("opacity_logits", logits)
 
     # The state between two steps -------------------------------------------------------------------------------------
 
@@ -274,7 +279,7 @@ class Training:
         parts: dict[str, Mapping[str, Tensor]] = {
             "gaussians": scene.parameters,
             "field": scene.field.state_dict() if scene.field else {},
-            "adam": self._optimiser.state(),
+            "adam": self._optimizer.state(),
             "frequencies": self._frequencies.state() if self._frequencies else {},
             "exposure": self._exposures.state() if self._exposures else {},
             "statistics": self._statistics.state(),
@@ -301,10 +306,10 @@ class Training:
         for name, value in parts["gaussians"].items():
             if value.shape[1:] != scene.parameters[name].shape[1:]:
                 raise ValueError(f"its {name} have the shape {tuple(value.shape)}")
-            self._optimiser.reset(name, value)
+            self._optimizer.reset(name, value)
         if scene.field is not None:
             scene.field.load_state_dict(parts["field"])
-        self._optimiser.restore(parts.get("adam", {}))
+        self._optimizer.restore(parts.get("adam", {}))
         if self._frequencies is not None:
             self._frequencies.restore(parts["frequencies"])
         if self._exposures is not None:

@@ -22,14 +22,14 @@ from lapgs_wgpu.gpu.device import Device, open_device
 from lapgs_wgpu.io.first_look import FirstLook
 from lapgs_wgpu.motion.grid_field import GridField
 from lapgs_wgpu.motion.scene import Scene4D
+from lapgs_wgpu.train.autotune import Choice
 from lapgs_wgpu.train.config import Background, Config
-from lapgs_wgpu.train.decoder_choice import Choice
 from lapgs_wgpu.train.discovery.discover import discover
+from lapgs_wgpu.train.distributed import SINGLE_PROCESS, Ranks
 from lapgs_wgpu.train.evaluate import evaluate, write_metrics
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.lpips import Lpips
-from lapgs_wgpu.train.memory import keep_freed_memory, return_freed_memory
-from lapgs_wgpu.train.ranks import ALONE, Ranks
+from lapgs_wgpu.train.malloc import keep_freed_memory, return_freed_memory
 from lapgs_wgpu.train.run_folder import (
     STATE,
     check_run_folder,
@@ -40,7 +40,7 @@ from lapgs_wgpu.train.run_folder import (
     save_state,
     start_run_folder,
 )
-from lapgs_wgpu.train.training import Progress, Training
+from lapgs_wgpu.train.trainer import Progress, Trainer
 
 PROBES = 2048  # points of the scene that say whether a camera sees it
 OUTSIDE = 0.05  # warn if this share of the Gaussians, or more, is outside the encoder's box
@@ -58,7 +58,7 @@ def train(
     device: Device | None = None,
     overwrite: bool = False,
     watch: Watch | None = None,
-    ranks: Ranks = ALONE,
+    ranks: Ranks = SINGLE_PROCESS,
 ) -> Scene4D:
     """Train on a dataset, evaluate on its test views, and leave config.toml, log.jsonl, metrics.json, checkpoint.ply
     and eval/ in the folder `out`, which must be new or empty, or hold an earlier run when `overwrite` is set.
@@ -81,7 +81,7 @@ def train(
             print(f"placement: {dataset.placement}", flush=True)
     keep_freed_memory()
     device = device or open_device()
-    training = Training(config, dataset, device, ranks, _discovered(config, dataset, device, ranks))
+    training = Trainer(config, dataset, device, ranks, _discovered(config, dataset, device, ranks))
     if not ranks.first:
         return _assist(training)
     with locked_run_folder(out):
@@ -98,7 +98,7 @@ def resume(
     *,
     device: Device | None = None,
     watch: Watch | None = None,
-    ranks: Ranks = ALONE,
+    ranks: Ranks = SINGLE_PROCESS,
 ) -> Scene4D:
     """Go on with an interrupted training of this configuration and dataset in its run folder, from its last saved
     state, or from the start where it has none. Otherwise as `train`."""
@@ -110,7 +110,7 @@ def resume(
     with locked_run_folder(out) if ranks.first else nullcontext():
         state = load_state(out)
         scene = _discovered(config, dataset, device, ranks) if state is None else None
-        training = Training(config, dataset, device, ranks, scene)
+        training = Trainer(config, dataset, device, ranks, scene)
         if state is not None:
             try:
                 check_state(state, views=len(dataset.train), steps=config.schedule.steps)
@@ -163,7 +163,7 @@ def _told(choice: Choice) -> str:
     return f"decoder: {choice.place} (a trial took {torch_time:.0f} ms in torch, {there})"
 
 
-def _assist(training: Training) -> Scene4D:
+def _assist(training: Trainer) -> Scene4D:
     """Take the steps of a process that is not the first: nothing is written."""
     with _interruptible() as interrupted:
         try:
@@ -176,12 +176,12 @@ def _assist(training: Training) -> Scene4D:
     return training.scene
 
 
-def _goes_on(training: Training, interrupted: threading.Event) -> bool:
+def _goes_on(training: Trainer, interrupted: threading.Event) -> bool:
     """Whether a step is left, and no process was interrupted."""
     return training.done < training.config.schedule.steps and not training.ranks.any(interrupted.is_set())
 
 
-def _run(training: Training, dataset: Dataset, out: Path, watch: Watch | None) -> Scene4D:
+def _run(training: Trainer, dataset: Dataset, out: Path, watch: Watch | None) -> Scene4D:
     config, scene = training.config, training.scene
     look = FirstLook((dataset.test or dataset.train)[0].camera, dataset.focus, dataset.up, len(dataset.times))
     with Log(out / "log.jsonl", config.schedule.steps, done=training.done) as log, _interruptible() as interrupted:
@@ -212,7 +212,7 @@ def _run(training: Training, dataset: Dataset, out: Path, watch: Watch | None) -
     return scene
 
 
-def _steps(training: Training, log: Log, out: Path, interrupted: threading.Event) -> Iterator[Progress]:
+def _steps(training: Trainer, log: Log, out: Path, interrupted: threading.Event) -> Iterator[Progress]:
     """The steps that are left, each logged, and the state saved now and then, until `interrupted` is set."""
     schedule = training.config.schedule
     try:
@@ -234,7 +234,7 @@ def _steps(training: Training, log: Log, out: Path, interrupted: threading.Event
         training.close()
 
 
-def _saved(training: Training, out: Path) -> str:
+def _saved(training: Trainer, out: Path) -> str:
     """Save the state of a training that cannot go on, if it has one worth saving; what a user should know of it."""
     if training.whole and training.done:
         try:

@@ -13,7 +13,7 @@ import pytest
 SCRIPT = """
 import resource, sys
 import torch
-from lapgs_wgpu.train.memory import keep_freed_memory
+from lapgs_wgpu.train.malloc import keep_freed_memory
 
 if sys.argv[1] == "keep":
     keep_freed_memory()
@@ -29,7 +29,7 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 
 RETURNED = """
 import torch
-from lapgs_wgpu.train.memory import keep_freed_memory, return_freed_memory
+from lapgs_wgpu.train.malloc import keep_freed_memory, return_freed_memory
 
 def resident():
     return int(open("/proc/self/statm").read().split()[1]) * 4096

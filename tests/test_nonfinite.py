@@ -19,14 +19,14 @@ from lapgs_wgpu.data import Dataset, load_dataset
 from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.errors import NumericalError
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.train import training as training_module
+from lapgs_wgpu.train import trainer as training_module
 from lapgs_wgpu.train.adaptive_split import adaptive_split
 from lapgs_wgpu.train.densify import Statistics, densify
-from lapgs_wgpu.train.health import IN_A_ROW, SHARE, Health, Skipped, describe, finite
-from lapgs_wgpu.train.loop import resume, train
+from lapgs_wgpu.train.nonfinite import IN_A_ROW, SHARE, Health, Skipped, describe, finite
 from lapgs_wgpu.train.render_loss import RenderLoss
+from lapgs_wgpu.train.run import resume, train
 from lapgs_wgpu.train.run_folder import STATE, load_state
-from lapgs_wgpu.train.training import Training
+from lapgs_wgpu.train.trainer import Trainer
 
 BAD = Skipped(3, "r_003", "1 of 9 values")
 
@@ -83,7 +83,7 @@ def test_a_bad_gradient_skips_the_step_and_leaves_everything_as_it_was(
 ) -> None:
     spoil(monkeypatch, lambda step: step == at, bad)
     # Ahead of any change of density, which a skipped step does not put off.
-    training = Training(configure(density__start="30", data__background="black"), dataset, device)
+    training = Trainer(configure(density__start="30", data__background="black"), dataset, device)
     with closing(training):
         for _ in range(at - 1):
             assert training.step().skipped is None
@@ -113,7 +113,7 @@ def test_a_bad_loss_is_named_by_its_term(dataset: Dataset, device: Device, monke
         return done._replace(loss=done.loss * math.nan, terms={**done.terms, "ssim": math.nan})
 
     monkeypatch.setattr(training_module, "render_loss", render)
-    with closing(Training(configure(), dataset, device)) as training:
+    with closing(Trainer(configure(), dataset, device)) as training:
         skipped = training.step().skipped
     assert skipped is not None
     assert skipped.what.startswith("the loss term ssim is nan; ")
@@ -165,14 +165,14 @@ def test_a_bad_parameter_stops_the_training_and_leaves_the_older_state(
             trainings[0].scene.parameters["means"].data[3, 1] = math.nan
         return original(gaussians, *rest)
 
-    trainings: list[Training] = []
-    start = Training._start
+    trainings: list[Trainer] = []
+    start = Trainer._start
 
-    def note(self: Training, dataset: Dataset) -> None:
+    def note(self: Trainer, dataset: Dataset) -> None:
         trainings.append(self)
         start(self, dataset)
 
-    monkeypatch.setattr(Training, "_start", note)
+    monkeypatch.setattr(Trainer, "_start", note)
     monkeypatch.setattr(training_module, "render_loss", render)
     out = tmp_path / "run"
     with pytest.raises(

@@ -7,23 +7,23 @@ import torch
 from torch import Tensor, nn
 
 from lapgs_wgpu.train.config import Rate
-from lapgs_wgpu.train.optimise import Optimiser
+from lapgs_wgpu.train.optimizer import Optimizer
 
 RATES = {"means": Rate(1e-2, 1e-3, 10), "weights": Rate(5e-2, 5e-2, 1), "mlp": Rate(1e-3, 1e-3, 1)}
 
 
-def make(rows: int = 6) -> tuple[dict[str, nn.Parameter], nn.Parameter, Optimiser]:
+def make(rows: int = 6) -> tuple[dict[str, nn.Parameter], nn.Parameter, Optimizer]:
     generator = torch.Generator().manual_seed(1)
     gaussians = {
         "means": nn.Parameter(torch.randn(rows, 3, generator=generator)),
         "weights": nn.Parameter(torch.randn(rows, generator=generator)),
     }
     mlp = nn.Parameter(torch.randn(4, 4, generator=generator))
-    return gaussians, mlp, Optimiser(gaussians, {"mlp": [mlp]}, RATES)
+    return gaussians, mlp, Optimizer(gaussians, {"mlp": [mlp]}, RATES)
 
 
 def run(
-    optimiser: Optimiser, gaussians: dict[str, nn.Parameter], mlp: nn.Parameter, steps: range, rows: Tensor
+    optimiser: Optimizer, gaussians: dict[str, nn.Parameter], mlp: nn.Parameter, steps: range, rows: Tensor
 ) -> None:
     """Steps down a bowl whose shape differs from row to row; rows: the rows' numbers."""
     for step in steps:

@@ -51,13 +51,13 @@ class Ranks:
         return bool(flag)
 
 
-ALONE = Ranks()
+SINGLE_PROCESS = Ranks()
 
 
 def join_ranks() -> Ranks:
     """What torchrun says of this process, connected with the others; one rank where it was not started by torchrun."""
     if "TORCHELASTIC_RUN_ID" not in os.environ:
-        return ALONE
+        return SINGLE_PROCESS
     if not distributed.is_available():
         raise InputError("this torch lacks torch.distributed, so several processes cannot train together.")
     if not distributed.is_initialized():

@@ -14,7 +14,7 @@ ADAM_EPS = 1e-15  # 3DGS's: gradients of single Gaussians are tiny
 LARGEST_FREQUENCY_STEP = 0.02  # cycles over the clip
 
 
-class Optimiser:
+class Optimizer:
     """Adam over the Gaussians' parameters, one group each, and over the field's groups.
 
     gaussians: name -> parameter with a row for each Gaussian. This very mapping is changed when rows come and go.
@@ -113,7 +113,7 @@ class Optimiser:
         next(group for group in self._adam.param_groups if group["name"] == name)["params"] = [parameter]
 
 
-class FrequencyOptimiser:
+class FrequencyOptimizer:
     """Moves the frequencies of a spectrum along eq. 5's gradient.
 
     Adam, but with one second moment shared by all frequencies: one for each would divide the factor 1 / sigma_k^2, by

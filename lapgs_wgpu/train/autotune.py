@@ -14,7 +14,7 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.grid_field import GridField
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.config import Config
-from lapgs_wgpu.train.ranks import Ranks
+from lapgs_wgpu.train.distributed import Ranks
 
 Where = Literal["torch", "device"]
 _ROUNDS = 3  # of each, after one that compiles kernels and makes buffers
