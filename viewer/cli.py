@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Any
 from lapgs_wgpu.command import HelpFormatter, Parser, guarded, print_devices
 from lapgs_wgpu.errors import InputError
 
-from .choices import BACKGROUNDS, MODES
 from .clock import LOOPS
+from .render_modes import BACKGROUNDS, MODES
 
 if TYPE_CHECKING:
     from lapgs_wgpu.gpu.device import Device
 
-    from .opened import Opened
+    from .loaded_scene import LoadedScene
 
 DESCRIPTION = """\
 Look at a trained scene, or any 3DGS .ply, at any time from any side.
@@ -70,17 +70,17 @@ def _view(arguments: list[str]) -> None:
         device = other.submit(_warm_device, given.device)
         # Before the scene is read, which may take a while: whether there is a place to show it.
         place = _place(given) if job == "window" else None
-        from .opened import open_scene
+        from .loaded_scene import load_scene
 
-        opened = open_scene(Path(given.file), device.result)
-    if not opened.playback.moves:
+        scene = load_scene(Path(given.file), device.result)
+    if not scene.playback.moves:
         for name in ("time", "play", "frames"):
             if getattr(given, name) is not None:
                 raise InputError(f"{given.file} holds no motion, so --{name} has no use.")
     if place is not None:
-        _window(given, opened, place)
+        _window(given, scene, place)
     else:
-        {"screenshot": _screenshot, "video": _video, "export": _export}[job](given, opened)
+        {"screenshot": _screenshot, "video": _video, "export": _export}[job](given, scene)
 
 
 def _warm_device(name: str | None) -> Device:
@@ -104,7 +104,7 @@ def _place(given: Any) -> Any:
         return choose_backend(given.backend or "auto")
     if given.size is not None:
         raise InputError("--size has no use with --backend http: the picture has the size of the browser's window.")
-    from .guard import new_token
+    from .auth import new_token
     from .remote import DEFAULT_HOST, DEFAULT_PORT, open_entry
 
     port = DEFAULT_PORT if given.port is None else given.port
@@ -112,10 +112,10 @@ def _place(given: Any) -> Any:
     return open_entry(given.host or DEFAULT_HOST, port, token)
 
 
-def _window(given: Any, opened: Opened, place: Any) -> None:
-    from .start import Start
+def _window(given: Any, scene: LoadedScene, place: Any) -> None:
+    from .initial_state import InitialState
 
-    start = Start(
+    start = InitialState(
         time=given.time,
         play=bool(given.play),
         fps=given.fps,
@@ -129,36 +129,36 @@ def _window(given: Any, opened: Opened, place: Any) -> None:
         from .window import run_window
 
         size = given.size or _WINDOW_SIZE
-        run_window(opened, backend=place, size=size, transport=given.time_slider, start=start)
+        run_window(scene, backend=place, size=size, transport=given.time_slider, start=start)
     else:
         from .remote import run_remote
 
-        run_remote(opened, place, transport=given.time_slider, start=start)
+        run_remote(scene, place, transport=given.time_slider, start=start)
 
 
-def _screenshot(given: Any, opened: Opened) -> None:
-    from .shoot import Shooter, find_view, framed, write_png
+def _screenshot(given: Any, scene: LoadedScene) -> None:
+    from .offscreen import OffscreenRenderer, find_view, framed, write_png
 
     file = _named(given.screenshot, ".png", "--screenshot")
-    view = find_view(opened, given.view) if given.view is not None else None
+    view = find_view(scene, given.view) if given.view is not None else None
     if view is not None:
         camera = framed(view.camera, *given.size) if given.size else view.camera
     else:
-        camera = opened.camera().camera(*(given.size or _WINDOW_SIZE))
-    shoot = Shooter(opened, given.mode or "rgb", BACKGROUNDS.get(given.background))
+        camera = scene.camera().camera(*(given.size or _WINDOW_SIZE))
+    shoot = OffscreenRenderer(scene, given.mode or "rgb", BACKGROUNDS.get(given.background))
     time = given.time if given.time is not None else view.time if view is not None else 0.0
     write_png(file, shoot(camera, time))
     print(f"{file}: {camera.width}x{camera.height}, time {time:g}")
 
 
-def _video(given: Any, opened: Opened) -> None:
+def _video(given: Any, scene: LoadedScene) -> None:
     from . import video
     from .camera import ViewCamera
+    from .offscreen import OffscreenRenderer, find_view, framed
     from .path_file import read_path
-    from .shoot import Shooter, find_view, framed
 
     file = _named(given.video, ".mp4", "--video")
-    moves = opened.playback.moves
+    moves = scene.playback.moves
     path = given.path or ("time" if moves else "view")
     if path not in video.PATHS and not path.endswith(".json"):
         raise InputError(f"--path {path}: expected time, view, both, or the .json file of a camera path.")
@@ -166,7 +166,7 @@ def _video(given: Any, opened: Opened) -> None:
         raise InputError(f"--time has no use with --path {path}, along which time passes.")
     if path in ("time", "both") and not moves:
         raise InputError(f"{given.file} holds no motion, so --path {path} has no use; --path view goes around it.")
-    view = find_view(opened, given.view) if given.view is not None else None
+    view = find_view(scene, given.view) if given.view is not None else None
     held = None if path in video.PATHS else read_path(Path(path))
     if held is not None and view is not None:
         raise InputError("--view has no use with a camera path, which says where the camera is.")
@@ -177,41 +177,41 @@ def _video(given: Any, opened: Opened) -> None:
               file=sys.stderr)  # fmt: skip
         size = video.even(size)
     fps = given.fps or (held.fps if held else 30.0)
-    usual = held.path.seconds if held else opened.clock().frames / fps if moves and path != "view" else 6.0
+    usual = held.path.seconds if held else scene.clock().frames / fps if moves and path != "view" else 6.0
     frames = video.count_frames(given.seconds or usual, fps)
 
     if held is not None:
         shots = video.path_shots(held.path, size, frames)
     elif path == "time":
-        camera = framed(view.camera, *size) if view else opened.camera().camera(*size)
+        camera = framed(view.camera, *size) if view else scene.camera().camera(*size)
         shots = video.clip_shots(camera, frames)
     else:
-        start = opened.camera()
+        start = scene.camera()
         if view is not None:
-            start = ViewCamera.of(view.camera, opened.look.focus, opened.look.up)
+            start = ViewCamera.of(view.camera, scene.look.focus, scene.look.up)
         usual_time = view.time if view is not None else 0.0
         time = None if path == "both" else usual_time if given.time is None else given.time
         shots = video.turn_shots(start, size, frames, time)
-    shoot = Shooter(opened, given.mode or "rgb", BACKGROUNDS.get(given.background))
+    shoot = OffscreenRenderer(scene, given.mode or "rgb", BACKGROUNDS.get(given.background))
     video.write_video(file, shots, frames, fps, shoot)
     print(f"{file}: {frames} frames of {size[0]}x{size[1]} at {fps:g} a second")
 
 
-def _export(given: Any, opened: Opened) -> None:
+def _export(given: Any, scene: LoadedScene) -> None:
     from .export import export_frames, export_still
 
     overwrite = bool(given.overwrite)
     if given.frames is None:
         file = _named(given.export, ".ply", "--export", "; a sequence of frames in a folder needs --frames")
-        export_still(opened, file, given.time or 0.0, overwrite=overwrite)
-        print(f"{file}: {opened.playback.count} Gaussians at time {given.time or 0.0:g}")
+        export_still(scene, file, given.time or 0.0, overwrite=overwrite)
+        print(f"{file}: {scene.playback.count} Gaussians at time {given.time or 0.0:g}")
         return
     if given.time is not None:
         raise InputError("--time has no use with --frames, which go from the start to the end of the clip.")
     if given.export.lower().endswith(".ply"):
         raise InputError(f"--export {given.export}: --frames need the name of a folder, not of a .ply file.")
-    export_frames(opened, Path(given.export), given.frames, overwrite=overwrite)
-    print(f"{given.export}: {given.frames} frames of {opened.playback.count} Gaussians")
+    export_frames(scene, Path(given.export), given.frames, overwrite=overwrite)
+    print(f"{given.export}: {given.frames} frames of {scene.playback.count} Gaussians")
 
 
 def _named(name: str, ending: str, option: str, more: str = "") -> Path:

@@ -20,7 +20,7 @@ from lapgs_wgpu.io.first_look import FirstLook
 from lapgs_wgpu.motion.playback import open_playback
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.presets import load_config
-from lapgs_wgpu.viewer.frame import Painter, Request
+from lapgs_wgpu.viewer.frame import FrameRenderer, FrameRequest
 
 SIZE = (640, 480)
 SHARES = (1.0, 0.5, 0.25)  # of the window's width and height
@@ -76,14 +76,14 @@ def write_moving_scene(file: Path, preset: str, gaussians: int, device: Device) 
 
 
 def _scrub(device: Device, file: Path, repeat: int) -> dict[str, Timing]:
-    painter = Painter(open_playback(file, device))
-    look = FirstLook.from_json(painter.playback.metadata["view"])
+    renderer = FrameRenderer(open_playback(file, device))
+    look = FirstLook.from_json(renderer.playback.metadata["view"])
     assert look is not None
     times = iter(np.linspace(0, 1, 3 + len(SHARES) * (repeat + 1)).tolist())
     found = {}
     for share in SHARES:
         camera = look.camera.resized(*(round(share * side) for side in SIZE))
-        frames = [painter.draw(Request(camera, next(times), "rgb", (0, 0, 0))) for _ in range(repeat + 1)]
+        frames = [renderer.draw(FrameRequest(camera, next(times), "rgb", (0, 0, 0))) for _ in range(repeat + 1)]
         found[f"{share:.0%}"] = summary([1e3 * frame.seconds for frame in frames[1:]])
     return found
 

@@ -1,10 +1,12 @@
-"""What can be chosen of a picture, known without loading what draws it."""
+"""Render modes, backgrounds and comparisons: constants that load neither torch nor wgpu."""
 
 from __future__ import annotations
 
 from typing import Literal
 
 Mode = Literal["rgb", "depth", "alpha", "motion", "dynamics", "scale"]
+Compare = Literal["off", "side", "split", "error"]
+COMPARES: tuple[Compare, ...] = ("off", "side", "split", "error")
 MODES: dict[Mode, str] = {
     "rgb": "colours",
     "depth": "depth, world units",

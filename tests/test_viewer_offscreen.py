@@ -20,11 +20,11 @@ from lapgs_wgpu.motion.scene import Scene4D, load
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.rasterize import rasterize
 from lapgs_wgpu.train.evaluate import to_8_bit
-from lapgs_wgpu.viewer import shoot as shoot_module
+from lapgs_wgpu.viewer import offscreen as offscreen_module
 from lapgs_wgpu.viewer.cli import view_command
+from lapgs_wgpu.viewer.offscreen import framed
 from lapgs_wgpu.viewer.path import CameraPath, KeyFrame, Pose
 from lapgs_wgpu.viewer.path_file import PathFile, write_path
-from lapgs_wgpu.viewer.shoot import framed
 
 pytestmark = pytest.mark.triangles
 kernels = pytest.mark.kernels
@@ -214,7 +214,7 @@ def test_a_video_along_a_camera_path(run: Path, scene: Scene4D, tmp_path: Path) 
 def test_ctrl_c_leaves_no_file(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    drawn = shoot_module.Shooter.__call__
+    drawn = offscreen_module.OffscreenRenderer.__call__
     calls: list[int] = []
 
     def interrupted(*arguments: object) -> object:
@@ -223,7 +223,7 @@ def test_ctrl_c_leaves_no_file(
             raise KeyboardInterrupt
         return drawn(*arguments)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(shoot_module.Shooter, "__call__", interrupted)
+    monkeypatch.setattr(offscreen_module.OffscreenRenderer, "__call__", interrupted)
     words = [str(run / "checkpoint.ply"), "--video", str(tmp_path / "a.mp4"), "--size", "32x24"]
     assert view_command(words) == 130
     assert list(tmp_path.iterdir()) == []

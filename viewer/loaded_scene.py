@@ -16,15 +16,15 @@ from lapgs_wgpu.motion.scene_file import read_scene
 from lapgs_wgpu.splat.camera import Camera
 
 from .camera import ViewCamera
-from .choices import BACKGROUNDS
 from .clock import Clock
+from .render_modes import BACKGROUNDS
 
 _ELEVATION = math.radians(35)  # of the guessed camera above the middle
 _FLAT = 0.5  # of the extents along x and y: what is lower lies on the ground
 _FRAMES = 150  # of a clip whose file does not say how many it has
 
 
-class Opened(NamedTuple):
+class LoadedScene(NamedTuple):
     """path: where it came from, None for a training under way. look: camera, focus, up and frames to begin with."""
 
     path: Path | None
@@ -45,11 +45,11 @@ class Opened(NamedTuple):
         return BACKGROUNDS.get(self.playback.metadata.get("background", ""), BACKGROUNDS["black"])
 
 
-def open_scene(path: Path, device: Callable[[], Device]) -> Opened:
+def load_scene(path: Path, device: Callable[[], Device]) -> LoadedScene:
     """Open a checkpoint, or any 3DGS .ply. device: is asked for when the file has been read. Raises InputError."""
     playback = playback_of(read_scene(path), device())
     look = FirstLook.from_json(playback.metadata.get("view", ""))
-    return Opened(path, playback, look or guess_look(playback))
+    return LoadedScene(path, playback, look or guess_look(playback))
 
 
 def guess_look(playback: Playback) -> FirstLook:

@@ -1,4 +1,4 @@
-"""Pictures without a screen."""
+"""Rendering without a window: screenshots and the frames of videos."""
 
 from __future__ import annotations
 
@@ -15,46 +15,43 @@ from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.splat.camera import Camera
 
 from .capture import open_capture
-from .choices import Mode
-from .frame import Painter, Request
-from .opened import Opened
+from .frame import FrameRenderer, FrameRequest
+from .loaded_scene import LoadedScene
 from .present import Offscreen
+from .render_modes import Mode
 
 Colour = tuple[float, float, float]
 
 
-class Shooter:
-    """Takes pictures of an opened scene. Raises InputError where the scene has nothing to show in this mode."""
+class OffscreenRenderer:
+    """Renders images of a scene. Raises InputError where the scene has nothing to show in this mode."""
 
-    def __init__(self, opened: Opened, mode: Mode = "rgb", background: Colour | None = None) -> None:
-        self._painter = Painter(opened.playback)
-        if mode not in self._painter.modes():
-            raise InputError(
-                f"{opened.path}: has nothing to show in mode {mode}; {', '.join(self._painter.modes())} do."
-            )
-        self._offscreen = Offscreen(opened.playback.device)
+    def __init__(self, scene: LoadedScene, mode: Mode = "rgb", background: Colour | None = None) -> None:
+        self._renderer = FrameRenderer(scene.playback)
+        check_mode(scene, self._renderer, mode)
+        self._offscreen = Offscreen(scene.playback.device)
         self._mode = mode
-        self._background = opened.background if background is None else background
+        self._background = scene.background if background is None else background
 
     def __call__(self, camera: Camera, time: float) -> NDArray[np.uint8]:
         """(height, width, 3) uint8: what the camera sees at a time in [0, 1]."""
-        frame = self._painter.draw(Request(camera, time, self._mode, self._background))
+        frame = self._renderer.draw(FrameRequest(camera, time, self._mode, self._background))
         return self._offscreen((camera.width, camera.height), [frame.placed], self._background)
 
 
-def check_mode(opened: Opened, painter: Painter, mode: Mode) -> None:
+def check_mode(scene: LoadedScene, renderer: FrameRenderer, mode: Mode) -> None:
     """Raises InputError where the scene has nothing to show in this mode."""
-    if mode not in painter.modes():
-        raise InputError(f"{opened.path}: has nothing to show in mode {mode}; it has {', '.join(painter.modes())}.")
+    if mode not in renderer.modes():
+        raise InputError(f"{scene.path}: has nothing to show in mode {mode}; it has {', '.join(renderer.modes())}.")
 
 
-def find_view(opened: Opened, wanted: str) -> View:
+def find_view(scene: LoadedScene, wanted: str) -> View:
     """The view of the capture beside the file with this number (the held-out ones come first) or name. Raises
     InputError."""
-    capture = open_capture(opened.path, opened.playback.metadata) if opened.path else None
+    capture = open_capture(scene.path, scene.playback.metadata) if scene.path else None
     if capture is None:
         raise InputError(
-            f"--view {wanted}: {opened.path} stands beside no config.toml that names a capture which is here."
+            f"--view {wanted}: {scene.path} stands beside no config.toml that names a capture which is here."
         )
     names = [view.name for view in capture.views]
     if wanted in names:

@@ -48,7 +48,7 @@ def check_entry(host: str, token: str | None) -> None:
         )
 
 
-class Guard:
+class AuthMiddleware:
     """ASGI: an app behind the checks, and with headers that keep other pages from using its answers.
 
     names: by which we may be called besides LOCAL, without a port. any_address: by any number, too, where we listen on
