@@ -58,7 +58,7 @@ soak: $(READY)
 	LAPGS_SOAK_MINUTES=$(LAPGS_SOAK_MINUTES) $(PYTEST) tests/soak
 
 bench: $(READY)
-	$(BIN)/python tests/bench $(ARGS)
+	$(BIN)/python benchmarks $(ARGS)
 
 lint: $(READY)
 	$(BIN)/ruff check

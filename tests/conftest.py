@@ -41,6 +41,9 @@ def open_test_device(configuration: str) -> Device:
     return Device(adapter, dataclasses.replace(info, kind=kind or info.kind), **switches)
 
 
+pytest.register_assert_rewrite("helpers")
+
+
 def pytest_configure() -> None:
     torch.set_num_threads(1)  # the tensors are small, and the software driver needs the processor
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from captures import (
+from helpers.captures import (
     HEIGHT,
     WIDTH,
     Blobs,
@@ -21,8 +21,8 @@ from captures import (
     write_neu3d,
     write_rig,
 )
+from helpers.dnerf_scene import make_scene
 from PIL import Image, ImageFilter
-from test_data_dnerf import make_scene
 
 from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.data.cloud import Cloud

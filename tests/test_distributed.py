@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from test_train import configure
+from helpers.training import configure
 
 from lapgs_wgpu.data import Dataset, load_dataset
 from lapgs_wgpu.data.synthetic import write_synthetic

@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers.image_losses import BACKGROUND, CAMERA, TRUTH, WEIGHTS, gaussians, gradients, step
+from helpers.interrupts import interrupt_at
+from helpers.scenes import relative
+from helpers.training import configure
 from numpy.typing import NDArray
-from scenes import relative
-from test_image_loss import BACKGROUND, CAMERA, TRUTH, WEIGHTS, gaussians, gradients, step
-from test_resume import interrupt_at
-from test_train import configure
 
 from lapgs_wgpu.data import Dataset, load_dataset
 from lapgs_wgpu.data.synthetic import write_synthetic

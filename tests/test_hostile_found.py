@@ -14,9 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hostile import refused_or
-from test_data_dnerf import make_scene
-from test_hostile_files import (
+from helpers.damaged_files import (
     FOREIGN,
     RESULTS,
     SPEC,
@@ -26,7 +24,9 @@ from test_hostile_files import (
     with_checksums,
     with_table,
 )
-from test_ply import columns_of, ply_bytes, random_still
+from helpers.dnerf_scene import make_scene
+from helpers.hostile import refused_or
+from helpers.ply_files import columns_of, ply_bytes, random_still
 
 from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.data.cloud import read_npy

@@ -195,3 +195,13 @@ def test_public_names_are_there() -> None:
         assert getattr(lapgs_wgpu, name).__name__ == name
     with pytest.raises(AttributeError, match="module 'lapgs_wgpu' has no attribute 'no_such_name'"):
         _ = lapgs_wgpu.no_such_name
+
+
+def test_no_test_module_imports_another() -> None:
+    """What they share is in tests/helpers."""
+    tests = Path(__file__).parent
+    for file in tests.rglob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom | ast.Import):
+                names = [node.module or ""] if isinstance(node, ast.ImportFrom) else [alias.name for alias in node.names]
+                assert not any(part.startswith("test_") for name in names for part in name.split(".")), file

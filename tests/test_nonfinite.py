@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from test_train import configure
+from helpers.training import configure
 
 from lapgs_wgpu import cli
 from lapgs_wgpu.command import NOT_FINITE, guarded

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from scenes import (
+from helpers.scenes import (
     Scene,
     Weights,
     fragile_pixels,

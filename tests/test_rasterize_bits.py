@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
-from scenes import Scene, Step, Weights, front_camera, oblique_camera, random_scene, relative, step
-from stages import watch
+from helpers.scenes import Scene, Step, Weights, front_camera, oblique_camera, random_scene, relative, step
+from helpers.stages import watch
 
 from lapgs_wgpu.gpu import shader
 from lapgs_wgpu.gpu.device import Device

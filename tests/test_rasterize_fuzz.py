@@ -8,9 +8,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
+from helpers.scenes import Scene, Step, front_camera, oblique_camera, random_scene, reference_step, relative, step
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import Scene, Step, front_camera, oblique_camera, random_scene, reference_step, relative, step
 
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.splat.rasterize import rasterize

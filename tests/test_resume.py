@@ -16,7 +16,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_train import STEPS, configure
+from helpers.interrupts import interrupt_at
+from helpers.training import STEPS, configure
 
 from lapgs_wgpu import cli
 from lapgs_wgpu.data import Dataset, load_dataset
@@ -26,7 +27,6 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io import atomic
 from lapgs_wgpu.train import run_folder
 from lapgs_wgpu.train.config import Config
-from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.presets import write_toml
 from lapgs_wgpu.train.run import resume, train
 from lapgs_wgpu.train.run_folder import STATE, STATE_BEFORE, load_state, locked_run_folder, save_state
@@ -51,17 +51,6 @@ def whole(dataset: Dataset, device: Device, tmp_path_factory: pytest.TempPathFac
     out = tmp_path_factory.mktemp("runs") / "whole"
     train(configure(), dataset, out, device=device)
     return out
-
-
-def interrupt_at(at: int, monkeypatch: pytest.MonkeyPatch, number: signal.Signals = signal.SIGINT) -> None:
-    original = Log.step
-
-    def interrupt(self: Log, step: int, *rest: Any) -> None:
-        original(self, step, *rest)
-        if step == at:
-            signal.raise_signal(number)
-
-    monkeypatch.setattr(Log, "step", interrupt)
 
 
 # In the warm-up, after it, at a change of density, at a reset, with an epoch just over, at the last step but one.

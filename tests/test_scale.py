@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from scenes import front_camera, random_scene
-from test_train import configure
+from helpers.scenes import front_camera, random_scene
+from helpers.training import configure
 from torch import Tensor
 
 from lapgs_wgpu.data import Dataset, load_dataset

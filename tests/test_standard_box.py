@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from captures import write_points
+from helpers.captures import write_points
 from numpy.typing import NDArray
 from PIL import Image
 

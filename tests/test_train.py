@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from helpers.training import STEPS, configure
 from PIL import Image
 
 from lapgs_wgpu.data import Dataset, load_dataset
@@ -26,7 +27,6 @@ from lapgs_wgpu.motion.device_decoder import DeviceDecoder
 from lapgs_wgpu.motion.scene import Scene4D, load
 from lapgs_wgpu.train import autotune, trainer
 from lapgs_wgpu.train import run as run_module
-from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.dataloader import Pictures
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.losses import LossWeights
@@ -34,27 +34,6 @@ from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.render_loss import RenderLoss, render_loss
 from lapgs_wgpu.train.run import train
 from lapgs_wgpu.train.trainer import Trainer
-
-STEPS = 36
-SMALL: dict[str, str | list[str]] = {
-    "schedule.steps": str(STEPS),
-    "schedule.warm_up": "10",
-    "schedule.sh_interval": "12",
-    "points.count": "300",
-    "field.width": "16",
-    "field.static.levels": "3",
-    "field.static.finest": ["16", "16", "16"],
-    "field.temporal.levels": "2",
-    "density.start": "5",
-    "density.interval": "10",
-    "density.reset_interval": "25",
-    "density.stop": "34",
-}
-
-
-def configure(method: str = "laplacian", **overrides: str) -> Config:
-    given = {name.replace("__", "."): value for name, value in overrides.items()}
-    return load_config("tiny", {**SMALL, **given}, method=method)
 
 
 @pytest.fixture(scope="module")

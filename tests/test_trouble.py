@@ -14,7 +14,7 @@ import pytest
 import torch
 import wgpu
 from conftest import open_test_device
-from test_train import configure
+from helpers.training import configure
 
 from lapgs_wgpu.command import OUT_OF_DEVICE, guarded
 from lapgs_wgpu.data import Dataset, load_dataset

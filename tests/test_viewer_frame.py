@@ -8,8 +8,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from test_deform import GRID4D, trained
-from test_playback import CAMERA, KINDS, half_still
+from helpers.still_scenes import CAMERA, KINDS, half_still
+from helpers.trained_scenes import GRID4D, trained
 
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.playback import open_playback

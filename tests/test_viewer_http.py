@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from browser import CHROMIUM, Browser, wait_for
+from helpers.browser import CHROMIUM, Browser, wait_for
 from numpy.typing import NDArray
 
 from lapgs_wgpu import Scene4D

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from test_train import configure
+from helpers.training import configure
 
 from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.data.synthetic import write_synthetic

@@ -104,8 +104,8 @@ def _has_screen() -> bool:
 
 
 def _window(file: Path) -> float:
-    sys.path.insert(0, str(Path(__file__).parents[1]))
-    from desktop import Desktop
+    sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+    from helpers.desktop import Desktop
 
     with Desktop() as desktop:
         start = time.perf_counter()

@@ -17,7 +17,6 @@ from hypothesis import strategies as st
 from lapgs_wgpu.errors import InputError
 
 T = TypeVar("T")
-
 COUNT = int(os.environ.get("LAPGS_FUZZ", "0"))  # inputs a format; 0: the suite's own few hundred, always the same
 TIMES = 1e3  # seconds that an input may take in milliseconds of hypothesis
 

@@ -1,4 +1,4 @@
-"""Memory and waiting times of a training on many videos: python tests/bench/captures.py (its --help has the options).
+"""Memory and waiting times of a training on many videos: python benchmarks/captures.py (its --help has the options).
 
 Writes a capture in Neu3D's layout into a temporary folder (and the pictures that its videos are unpacked into), draws
 pictures from it as a training does, at the pace of a fast device, or trains on it, and removes it all.

@@ -22,7 +22,6 @@ from lapgs_wgpu.splat.rasterize import rasterize
 
 WIDTH, HEIGHT = 64, 48
 NEAR, FAR = 2.0, 8.0  # around what the cameras see
-
 Change = Callable[[Path, dict[str, Any]], Any]
 
 

@@ -1,4 +1,4 @@
-"""Times the kernels on a fixed scene: `make bench`, or `python tests/bench --help`."""
+"""Times the kernels on a fixed scene: `make bench`, or `python benchmarks --help`."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ PARTS = ("raster", "encoder", "decoder", "losses", "step", "shares", "viewer")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="python tests/bench", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python benchmarks", description=__doc__)
     parser.add_argument(
         "--scenes",
         type=SceneSize.parse,
