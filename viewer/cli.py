@@ -1,55 +1,25 @@
-"""lapgs-view: the command."""
+"""The command lapgs-view."""
 
 from __future__ import annotations
 
-import argparse
-import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lapgs_wgpu.command import HelpFormatter, Parser, guarded, print_devices
+from lapgs_wgpu.command import guarded, print_devices
 from lapgs_wgpu.errors import InputError
 
-from .clock import LOOPS
-from .render_modes import BACKGROUNDS, MODES
+from .options import NEW_TOKEN, parse_options
+from .render_modes import BACKGROUNDS
 
 if TYPE_CHECKING:
     from lapgs_wgpu.gpu.device import Device
 
     from .loaded_scene import LoadedScene
 
-DESCRIPTION = """\
-Look at a trained scene, or any 3DGS .ply, at any time from any side.
-
-  lapgs-view runs/demo/checkpoint.ply --time-slider
-  lapgs-view runs/demo/checkpoint.ply --play --speed 0.5 --loop bounce
-  lapgs-view runs/demo/checkpoint.ply --backend http                  in a browser, also from another machine
-
-Without a screen:
-  lapgs-view CHECKPOINT.ply --screenshot a.png --time 0.5 --size 1920x1080
-  lapgs-view CHECKPOINT.ply --screenshot a.png --view test_000 --mode depth
-  lapgs-view CHECKPOINT.ply --video a.mp4                             the clip once; a still scene once around
-  lapgs-view CHECKPOINT.ply --video a.mp4 --path both --seconds 10    the clip while the camera goes once around
-  lapgs-view CHECKPOINT.ply --video a.mp4 --path CAMERAS.json         along a camera path (nerfstudio's format)
-  lapgs-view CHECKPOINT.ply --export still.ply --time 0.5             for any other splat viewer
-  lapgs-view CHECKPOINT.ply --export frames --frames 60               a sequence of stills, as SuperSplat plays it
-"""
-
-# What is done, and the options that it takes; each of these jobs is asked for by the option of its name.
-_COMMON = {"device"}
-_PICTURE = _COMMON | {"time", "mode", "background", "size", "view"}
-_TAKES = {
-    "list_devices": set[str](),
-    "screenshot": _PICTURE,
-    "video": _PICTURE | {"path", "fps", "seconds"},
-    "export": _COMMON | {"time", "frames", "overwrite"},
-    "window": _PICTURE | {"time_slider", "play", "fps", "speed", "loop", "backend", "host", "port", "token"},
-}
 _WINDOW_SIZE = (1280, 720)
-NEW_TOKEN = ""  # what --token without a text stands for
 
 
 def view_command(arguments: Sequence[str] | None = None) -> int:
@@ -58,8 +28,7 @@ def view_command(arguments: Sequence[str] | None = None) -> int:
 
 
 def _view(arguments: list[str]) -> None:
-    given = _parse(arguments)
-    job = _job(given)
+    given, job = parse_options(arguments)
     if job == "list_devices":
         print_devices()
         return
@@ -218,113 +187,6 @@ def _named(name: str, ending: str, option: str, more: str = "") -> Path:
     if not name.lower().endswith(ending):
         raise InputError(f"{option} {name}: expected a name that ends with {ending}{more}.")
     return Path(name)
-
-
-def _job(given: Any) -> str:
-    """What is to be done. Raises InputError for options that do not go together: none is silently ignored."""
-    jobs = [name for name in _TAKES if getattr(given, name, None) is not None]
-    if len(jobs) > 1:
-        raise InputError(f"{_option(jobs[0])} and {_option(jobs[1])} do not go together: one at a time.")
-    job = jobs[0] if jobs else "window"
-    for name, value in vars(given).items():
-        if value is None or name in ("file", job) or name in _TAKES[job]:
-            continue
-        needs = [_option(other) for other, takes in _TAKES.items() if name in takes and other != "window"]
-        if job != "window":
-            raise InputError(f"{_option(name)} has no use with {_option(job)}.")
-        raise InputError(f"{_option(name)} has no use without {' or '.join(needs)}.")
-    return job
-
-
-def _option(name: str) -> str:
-    return "--" + name.replace("_", "-")
-
-
-def _parse(arguments: list[str]) -> Any:
-    parser = Parser("lapgs-view", description=DESCRIPTION, formatter_class=HelpFormatter, allow_abbrev=False)
-    add = parser.add_argument
-    # Every default is None: what was given is told from what was not.
-    add("file", nargs="?", metavar="FILE.ply", help="a checkpoint, or any 3DGS .ply")
-    add("--device", metavar="NAME", help="part of an adapter's name, or cpu, integrated, discrete")
-    add("--list-devices", action="store_const", const=True, help="list the adapters, the default one first")
-
-    add = parser.add_argument_group("what is shown, in the window or in pictures").add_argument
-    add("--time", type=_number(0.0, 1.0), metavar="T", help="in the clip, 0 to 1 [0, or that of --view]")
-    add("--mode", choices=list(MODES), help="; ".join(f"{mode}: {about}" for mode, about in MODES.items()) + " [rgb]")
-    add("--background", choices=list(BACKGROUNDS), help="[the one of the training]")
-    add("--size", type=_size, metavar="WxH", help="of the picture [1280x720, or that of --view or the camera path]")
-    add("--view", metavar="N|NAME", help="a camera of the capture that the run was trained on, the held-out ones first")
-
-    add = parser.add_argument_group("window").add_argument
-    add("--time-slider", action=argparse.BooleanOptionalAction, help="show the time slider [where the scene moves]")
-    add("--play", action="store_const", const=True, help="play the clip from the start")
-    add("--fps", type=_number(0.1, 1000.0), metavar="F", help="frames a second of the clip, or of --video [30]")
-    add("--speed", type=_number(0.01, 100.0), metavar="X", help="of playing [1]")
-    add("--loop", choices=list(LOOPS), help="at the end of the clip [loop]")
-
-    add(
-        "--backend", choices=("auto", "glfw", "qt", "http"),
-        help="what shows it: a window (auto: glfw, else qt), or with http any browser [auto]",
-    )  # fmt: skip
-
-    add = parser.add_argument_group("with --backend http").add_argument
-    add("--host", metavar="ADDRESS", help="to listen on; any but this machine's own needs --token [127.0.0.1]")
-    add("--port", type=_port, metavar="N", help="0: any that is free [8080]")
-    add(
-        "--token", nargs="?", const=NEW_TOKEN, metavar="TEXT",
-        help="what a browser must know to come in, 16 characters or more; one is made where no TEXT is given",
-    )  # fmt: skip
-
-    add = parser.add_argument_group("pictures and videos").add_argument
-    add("--screenshot", metavar="FILE.png", help="write a picture")
-    add("--video", metavar="FILE.mp4", help="write a video (H.264)")
-    add(
-        "--path", metavar="time|view|both|CAMERAS.json",
-        help="of --video: the clip with a camera that stands; once around the focus while time stands; both at once; "
-        "or along a camera path [time; view where nothing moves]",
-    )  # fmt: skip
-    add("--seconds", type=_number(0.001, 86400.0), metavar="S", help="length of --video [that of the clip or the path; "
-        "6 for view]")  # fmt: skip
-
-    add = parser.add_argument_group("export").add_argument
-    add("--export", metavar="FILE.ply|DIR", help="write the Gaussians at --time, or --frames of them into a folder")
-    add("--frames", type=_count, metavar="N", help="how many stills --export writes, from time 0 to 1")
-    add("--overwrite", action="store_const", const=True, help="let --export replace what is there")
-    return parser.parse_args(arguments)
-
-
-def _port(text: str) -> int:
-    if not (text.isascii() and text.isdigit() and int(text) <= 65535):
-        raise argparse.ArgumentTypeError(f"expected a number from 0 to 65535, got {text!r}")
-    return int(text)
-
-
-def _size(text: str) -> tuple[int, int]:
-    found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text)
-    if found is None or not (0 < int(found[1]) <= 16384 and 0 < int(found[2]) <= 16384):
-        raise argparse.ArgumentTypeError(f"expected WIDTHxHEIGHT in pixels, such as 1280x720, got {text!r}")
-    return int(found[1]), int(found[2])
-
-
-def _number(low: float, high: float) -> Callable[[str], float]:
-    def number(text: str) -> float:
-        try:
-            value = float(text)
-        except ValueError:
-            value = float("nan")
-        if not low <= value <= high:
-            raise argparse.ArgumentTypeError(f"expected a number from {low:g} to {high:g}, got {text!r}")
-        return value
-
-    return number
-
-
-def _count(text: str) -> int:
-    from .export import MOST_FRAMES
-
-    if re.fullmatch(r"\d{1,9}", text) is None or not 1 <= int(text) <= MOST_FRAMES:
-        raise argparse.ArgumentTypeError(f"expected a whole number from 1 to {MOST_FRAMES}, got {text!r}")
-    return int(text)
 
 
 if __name__ == "__main__":

@@ -8,11 +8,11 @@ Mode = Literal["rgb", "depth", "alpha", "motion", "dynamics", "scale"]
 Compare = Literal["off", "side", "split", "error"]
 COMPARES: tuple[Compare, ...] = ("off", "side", "split", "error")
 MODES: dict[Mode, str] = {
-    "rgb": "colours",
-    "depth": "depth, world units",
-    "alpha": "how much is covered",
-    "motion": "how far each Gaussian moves over the clip, world units",
-    "dynamics": "length of each Gaussian's dynamics attribute",
+    "rgb": "colors",
+    "depth": "depth along the camera axis, world units",
+    "alpha": "opacity",
+    "motion": "distance that each Gaussian moves over the clip, world units",
+    "dynamics": "norm of each Gaussian's dynamics attribute",
     "scale": "largest standard deviation of each Gaussian, world units",
 }
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "grey": (0.5, 0.5, 0.5)}

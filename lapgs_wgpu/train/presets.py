@@ -21,9 +21,9 @@ from lapgs_wgpu.train.config import Config
 
 Table = dict[str, Any]
 
-# What only the paper's method has, besides its field: left out with every other one.
+# The paper's parts beside its field: off for every other method.
 PAPER_ONLY = {"loss.pyramid": 0.0, "loss.ncc": 0.0, "density.split": "plain"}
-# The parts of the method that --ablate takes out, and what is set then.
+# The parts of the method that --ablate turns off: the keys that it sets, and its help text.
 ABLATIONS: dict[str, dict[str, Any]] = {
     "laplacian": {"field.motion": "mlp"},
     "dynamics": {"field.dynamics": 0},
@@ -33,6 +33,16 @@ ABLATIONS: dict[str, dict[str, Any]] = {
     "dy": {"loss.dynamics_mode": "off"},
     "hash": {"field.temporal_hash": False},
     "appearance": {"field.appearance": "none"},
+}
+ABLATION_HELP = {
+    "laplacian": "motion spectrum, replaced by an MLP",
+    "dynamics": "dynamics attributes",
+    "split": "adaptive split",
+    "lap": "Laplacian pyramid loss",
+    "ncc": "cross-correlation loss",
+    "dy": "dynamics regularization",
+    "hash": "space-time hash grids",
+    "appearance": "color changes over time",
 }
 
 LARGEST_NUMBER = 2**31 - 1  # no key has a use for more
@@ -114,7 +124,7 @@ def config_keys(cls: type = Config, prefix: str = "", about: str = "") -> Iterat
     """Every key of the configuration."""
     types = _types(cls)
     for field in dataclasses.fields(cls):
-        text = ", ".join(filter(None, (about, field.metadata.get("help", ""))))
+        text = ": ".join(filter(None, (about, field.metadata.get("help", ""))))
         if dataclasses.is_dataclass(types[field.name]):
             yield from config_keys(types[field.name], f"{prefix}{field.name}.", text)
         else:
