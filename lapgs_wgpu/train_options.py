@@ -40,7 +40,8 @@ _METAVARS = {int: "INT", float: "FLOAT", str: "TEXT", bool: "true|false"}
 
 def parse_options(arguments: list[str]) -> dict[str, typing.Any]:
     """Option name -> value; configuration keys by their dotted names, only those that were given. Raises InputError."""
-    from lapgs_wgpu.train.presets import ABLATION_HELP, config_keys, did_you_mean, load_config, preset_names
+    from lapgs_wgpu.io.dataclass_table import did_you_mean
+    from lapgs_wgpu.train.presets import ABLATION_HELP, config_keys, load_config, preset_names
 
     shown = next((word for word in arguments if word in preset_names()), "dnerf")
     preset = load_config(shown)

@@ -9,9 +9,9 @@ import numpy as np
 
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.ply import write_ply
+from lapgs_wgpu.progress import Progress
 
 from .loaded_scene import LoadedScene
-from .progress import Progress
 
 _FRAME = re.compile(r"frame_\d+\.ply")
 MOST_FRAMES = 100_000

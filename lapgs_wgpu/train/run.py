@@ -40,14 +40,14 @@ from lapgs_wgpu.train.run_folder import (
     save_state,
     start_run_folder,
 )
-from lapgs_wgpu.train.trainer import Progress, Trainer
+from lapgs_wgpu.train.trainer import StepResult, Trainer
 
 PROBES = 2048  # points of the scene that say whether a camera sees it
 OUTSIDE = 0.05  # warn if this share of the Gaussians, or more, is outside the encoder's box
 
 # Takes over a training's steps, such as a viewer does: called with the scene, where to look at it from, and the steps,
 # of which it takes as many as it likes, each one a step of the training. The rest follows when it returns.
-Watch = Callable[[Scene4D, FirstLook, Iterator[Progress]], None]
+Watch = Callable[[Scene4D, FirstLook, Iterator[StepResult]], None]
 
 
 def train(
@@ -212,7 +212,7 @@ def _run(training: Trainer, dataset: Dataset, out: Path, watch: Watch | None) ->
     return scene
 
 
-def _steps(training: Trainer, log: Log, out: Path, interrupted: threading.Event) -> Iterator[Progress]:
+def _steps(training: Trainer, log: Log, out: Path, interrupted: threading.Event) -> Iterator[StepResult]:
     """The steps that are left, each logged, and the state saved now and then, until `interrupted` is set."""
     schedule = training.config.schedule
     try:

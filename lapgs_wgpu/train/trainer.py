@@ -34,7 +34,7 @@ from lapgs_wgpu.train.render_loss import RenderLoss, render_loss
 MAX_SH_DEGREE = 3
 
 
-class Progress(NamedTuple):
+class StepResult(NamedTuple):
     """A step that is done, of how many in all; loss, and PSNR in dB, means over its views. skipped: where its values
     were not finite, so that it moved nothing."""
 
@@ -116,7 +116,7 @@ class Trainer:
         """End what goes on beside the steps."""
         self._pictures.close()
 
-    def step(self) -> Progress:
+    def step(self) -> StepResult:
         """One step of the optimiser, on `schedule.batch` pictures, whose losses count as their mean.
 
         A step whose loss or gradients are not finite moves nothing: parameters, the optimisers' and the density
@@ -132,7 +132,7 @@ class Trainer:
                 self._pictures.order = order
             raise
 
-    def _step(self) -> Progress:
+    def _step(self) -> StepResult:
         config, scene, ranks = self.config, self.scene, self.ranks
         step = self.done + 1
         moving = step > self._warm_up
@@ -174,7 +174,7 @@ class Trainer:
         self.done = step
         self.whole = True
         self._health.note(skipped)
-        return Progress(step, config.schedule.steps, value, psnr, skipped)
+        return StepResult(step, config.schedule.steps, value, psnr, skipped)
 
     def _nearby(self, view: View) -> Nearby | None:
         return draw_nearby(self.config.smoothness, len(self.scene), view.time, self._generator)
