@@ -15,7 +15,7 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.splat.rasterize import rasterize, rasterizer_of
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 
-pytestmark = pytest.mark.kernels
+pytestmark = [pytest.mark.kernels, pytest.mark.subgroups]
 
 Use = Callable[[Rasterizer], Rasterizer]
 CAMERA = oblique_camera(101, 61)

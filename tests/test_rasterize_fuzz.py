@@ -17,7 +17,7 @@ from lapgs_wgpu.splat.rasterize import rasterize
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 from lapgs_wgpu.splat.reference import near_discontinuity
 
-pytestmark = pytest.mark.kernels
+pytestmark = [pytest.mark.kernels, pytest.mark.subgroups]
 
 Use = Callable[[Rasterizer], Rasterizer]
 BACKGROUND = torch.tensor([0.2, 0.4, 0.9])

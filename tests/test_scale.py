@@ -88,6 +88,7 @@ def check_pile(count: int, device: Device) -> None:
 
 
 @pytest.mark.kernels
+@pytest.mark.subgroups
 def test_lists_beyond_a_round_are_drawn_in_more(device: Device, use: Use) -> None:
     shape = raster_shape(device)
     if not shape.round_splats:
@@ -98,6 +99,7 @@ def test_lists_beyond_a_round_are_drawn_in_more(device: Device, use: Use) -> Non
 
 
 @pytest.mark.kernels
+@pytest.mark.subgroups
 @pytest.mark.parametrize("depth", [False, True])
 def test_rounds_change_no_bit(depth: bool, device: Device, use: Use, monkeypatch: pytest.MonkeyPatch) -> None:
     """Many short rounds, with other tiles that are done long before, in bands and at once."""
