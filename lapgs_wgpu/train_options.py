@@ -46,55 +46,30 @@ def parse_options(arguments: list[str]) -> dict[str, typing.Any]:
     shown = next((word for word in arguments if word in preset_names()), "dnerf")
     preset = load_config(shown)
     parser = Parser(
-        "lapgs-train",
-        usage=USAGE,
-        description=DESCRIPTION,
-        formatter_class=HelpFormatter,
-        allow_abbrev=False,
+        "lapgs-train", usage=USAGE, description=DESCRIPTION, formatter_class=HelpFormatter, allow_abbrev=False
     )
+    # fmt: off
     add = parser.add_argument
-    add(
-        "preset",
-        nargs="?",
-        metavar="PRESET",
-        help=f"preset configuration: {', '.join(preset_names())}, or the path of a .toml file, such as RUN/config.toml",
-    )
-    add(
-        "--field",
-        metavar="NAME",
-        help="method: static (3DGS, no motion), mlp (deformable 3DGS), hexplane (4D-GS), grid4d (Grid4D) or "
-        "laplacian (the paper's). All but laplacian also turn off the paper's losses and its adaptive split "
-        "[the preset's]",
-    )
-    add(
-        "--ablate",
-        metavar="PART[,PART]",
-        help="turn off parts of the paper's method, comma-separated: "
-        + "; ".join(f"{name} ({text})" for name, text in ABLATION_HELP.items()),
-    )
+    names, parts = ", ".join(preset_names()), "; ".join(f"{name} ({text})" for name, text in ABLATION_HELP.items())
+    add("preset", nargs="?", metavar="PRESET",
+        help=f"preset configuration: {names}, or the path of a .toml file, such as RUN/config.toml")
+    add("--field", metavar="NAME", help="method: static (3DGS, no motion), mlp (deformable 3DGS), hexplane (4D-GS), "
+        "grid4d (Grid4D) or laplacian (the paper's). All but laplacian also turn off the paper's losses and its "
+        "adaptive split [the preset's]")
+    add("--ablate", metavar="PART[,PART]", help=f"turn off parts of the paper's method, comma-separated: {parts}")
     add("--out", metavar="RUN", help="run folder for all output; must be new or empty [runs/SCENE-PRESET]")
     add("--resume", metavar="RUN", help="continue the interrupted training in run folder RUN from its last saved state")
     add("--overwrite", action="store_true", help="replace an existing run in the run folder")
     add("--view", action="store_true", help="show the training in a window, with pause and single step (P and S keys)")
     add("--device", metavar="NAME", help=DEVICE_HELP)
     add("--list-devices", action="store_true", help=LIST_DEVICES_HELP)
-    add(
-        "--eval",
-        metavar="RUN",
-        help="evaluate the finished run in folder RUN again, without training. Can be combined with --data, "
-        "--data.background, --cache-gb, --device, --lpips-weights and --motion-from only",
-    )
-    add(
-        "--lpips-weights",
-        metavar="FILE",
-        help="with --eval: also compute LPIPS (VGG) with the weights in FILE (docs/metrics.md)",
-    )
-    add(
-        "--motion-from",
-        metavar="RUN",
-        help="with --eval: also compute metrics of the moving pixels, found by comparison with RUN, a run on the "
-        "same capture with --field static (docs/metrics.md)",
-    )
+    add("--eval", metavar="RUN", help="evaluate the finished run in folder RUN again, without training. Can be "
+        "combined with --data, --data.background, --cache-gb, --device, --lpips-weights and --motion-from only")
+    add("--lpips-weights", metavar="FILE", help="with --eval: also compute LPIPS (VGG) with the weights in FILE "
+        "(docs/metrics.md)")
+    add("--motion-from", metavar="RUN", help="with --eval: also compute metrics of the moving pixels, found by "
+        "comparison with RUN, a run on the same capture with --field static (docs/metrics.md)")
+    # fmt: on
     groups: dict[str, argparse._ArgumentGroup] = {}
     for name, kind, about in config_keys():
         section = name.split(".")[0] if "." in name else "general"

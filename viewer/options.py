@@ -73,6 +73,7 @@ def _option(name: str) -> str:
 
 def _parse(arguments: Sequence[str]) -> Any:
     parser = Parser("lapgs-view", description=DESCRIPTION, formatter_class=HelpFormatter, allow_abbrev=False)
+    # fmt: off
     add = parser.add_argument
     # All defaults are None, which tells given options from others.
     add("file", nargs="?", metavar="FILE.ply", help="checkpoint of lapgs-train, or any 3DGS .ply file")
@@ -80,106 +81,51 @@ def _parse(arguments: Sequence[str]) -> Any:
     add("--list-devices", action="store_const", const=True, help=LIST_DEVICES_HELP)
 
     add = parser.add_argument_group("content of the window, screenshot or video").add_argument
-    add(
-        "--time",
-        type=_number(0.0, 1.0),
-        metavar="T",
-        help="time in the clip: 0 is its start, 1 its end [0, or the time of --view]",
-    )
-    add(
-        "--mode",
-        choices=list(MODES),
-        help="what to render; " + "; ".join(f"{mode}: {about}" for mode, about in MODES.items()) + " [rgb]",
-    )
+    add("--time", type=_number(0.0, 1.0), metavar="T", help="time in the clip: 0 is its start, 1 its end [0, or the "
+        "time of --view]")
+    modes = "; ".join(f"{mode}: {about}" for mode, about in MODES.items())
+    add("--mode", choices=list(MODES), help=f"what to render; {modes} [rgb]")
     add("--background", choices=list(BACKGROUNDS), help="background color [that of the training, otherwise black]")
-    add(
-        "--size",
-        type=_size,
-        metavar="WxH",
-        help="width and height of the window, screenshot or video, pixels [1280x720, or that of --view or of the "
-        "camera path]",
-    )
-    add(
-        "--view",
-        metavar="N|NAME",
-        help="use a camera of the training's capture, by name or by number from 0; test views come first [a "
-        "camera stored in the file, otherwise one chosen to show the whole scene]",
-    )
+    add("--size", type=_size, metavar="WxH", help="width and height of the window, screenshot or video, pixels "
+        "[1280x720, or that of --view or of the camera path]")
+    add("--view", metavar="N|NAME", help="use a camera of the training's capture, by name or by number from 0; test "
+        "views come first [a camera stored in the file, otherwise one chosen to show the whole scene]")
 
     add = parser.add_argument_group("window").add_argument
-    add(
-        "--time-slider",
-        action=argparse.BooleanOptionalAction,
-        help="show or hide the time slider [shown if the scene moves]",
-    )
+    add("--time-slider", action=argparse.BooleanOptionalAction, help="show or hide the time slider [shown if the "
+        "scene moves]")
     add("--play", action="store_const", const=True, help="start playing at once [paused]")
-    add(
-        "--fps",
-        type=_number(0.1, 1000.0),
-        metavar="F",
-        help="frames per second of the clip at speed 1, and of --video [30]",
-    )
+    add("--fps", type=_number(0.1, 1000.0), metavar="F", help="frames per second of the clip at speed 1, and of "
+        "--video [30]")
     add("--speed", type=_number(0.01, 100.0), metavar="X", help="playback speed, a factor [1]")
-    add(
-        "--loop",
-        choices=list(LOOPS),
-        help="at the end of the clip; loop: start again; bounce: play backwards; once: stop [loop]",
-    )
-    add(
-        "--backend",
-        choices=("auto", "glfw", "qt", "http"),
-        help="how to display; glfw or qt: desktop window of that library; auto: glfw if it works, otherwise qt; "
-        "http: web server for a browser [auto]",
-    )
+    add("--loop", choices=list(LOOPS), help="at the end of the clip; loop: start again; bounce: play backwards; "
+        "once: stop [loop]")
+    add("--backend", choices=("auto", "glfw", "qt", "http"), help="how to display; glfw or qt: desktop window of "
+        "that library; auto: glfw if it works, otherwise qt; http: web server for a browser [auto]")
 
     add = parser.add_argument_group("web server (with --backend http)").add_argument
-    add(
-        "--host",
-        metavar="ADDRESS",
-        help="network address to listen on; an address that other machines can reach requires --token "
-        "[127.0.0.1: this machine only]",
-    )
+    add("--host", metavar="ADDRESS", help="network address to listen on; an address that other machines can reach "
+        "requires --token [127.0.0.1: this machine only]")
     add("--port", type=_port, metavar="N", help="TCP port to listen on; 0: any free port [8080]")
-    add(
-        "--token",
-        nargs="?",
-        const=NEW_TOKEN,
-        metavar="TEXT",
-        help="require this token from browsers, 16 or more letters, digits, - or _; without TEXT a random token "
-        "is generated and printed [no token]",
-    )
+    add("--token", nargs="?", const=NEW_TOKEN, metavar="TEXT", help="require this token from browsers, 16 or more "
+        "letters, digits, - or _; without TEXT a random token is generated and printed [no token]")
 
     add = parser.add_argument_group("screenshot and video (no window)").add_argument
     add("--screenshot", metavar="FILE.png", help="render one image to a PNG file")
     add("--video", metavar="FILE.mp4", help="render a video to an MP4 file (H.264)")
-    add(
-        "--path",
-        metavar="time|view|both|CAMERAS.json",
-        help="camera motion of --video; time: static camera while the clip plays; view: one orbit around the "
-        "focus point at a fixed time; both: one orbit while the clip plays; CAMERAS.json: camera path in "
-        "nerfstudio's format [time, or view if the scene does not move]",
-    )
-    add(
-        "--seconds",
-        type=_number(0.001, 86400.0),
-        metavar="S",
-        help="length of --video, seconds [length of the clip or of the camera path; 6 for view]",
-    )
+    add("--path", metavar="time|view|both|CAMERAS.json", help="camera motion of --video; time: static camera while "
+        "the clip plays; view: one orbit around the focus point at a fixed time; both: one orbit while the clip "
+        "plays; CAMERAS.json: camera path in nerfstudio's format [time, or view if the scene does not move]")
+    add("--seconds", type=_number(0.001, 86400.0), metavar="S", help="length of --video, seconds [length of the clip "
+        "or of the camera path; 6 for view]")
 
     add = parser.add_argument_group("export (no window)").add_argument
-    add(
-        "--export",
-        metavar="FILE.ply|DIR",
-        help="write a static 3DGS .ply file of the Gaussians at --time; with --frames: a sequence of such files "
-        "in the folder DIR",
-    )
-    add(
-        "--frames",
-        type=_count,
-        metavar="N",
-        help="number of files that --export writes, at equally spaced times from 0 to 1",
-    )
+    add("--export", metavar="FILE.ply|DIR", help="write a static 3DGS .ply file of the Gaussians at --time; with "
+        "--frames: a sequence of such files in the folder DIR")
+    add("--frames", type=_count, metavar="N", help="number of files that --export writes, at equally spaced times "
+        "from 0 to 1")
     add("--overwrite", action="store_const", const=True, help="allow --export to replace existing files")
+    # fmt: on
     return parser.parse_args(arguments)
 
 
