@@ -381,10 +381,10 @@ def server(scene: Path) -> Iterator[Server]:
 
 def expected(scene: Path, device: Device, size: tuple[int, int], time: float) -> NDArray[np.int16]:
     """What the painter draws where the viewer begins."""
-    from lapgs_wgpu.viewer.app import MARGIN
     from lapgs_wgpu.viewer.frame import FrameRenderer, FrameRequest
     from lapgs_wgpu.viewer.loaded_scene import load_scene
     from lapgs_wgpu.viewer.present import Offscreen
+    from lapgs_wgpu.viewer.viewport import MARGIN
 
     opened = load_scene(scene, lambda: device)
     frame = FrameRenderer(opened.playback).draw(

@@ -14,7 +14,7 @@ from .present import Placed, Presenter
 from .view_state import ViewState
 
 SETTLED = 0.2  # seconds without a change after which the full resolution is drawn
-_MARGIN = (0.11, 0.11, 0.12)  # colour around an image that does not fill the canvas
+MARGIN = (0.11, 0.11, 0.12)  # colour around an image that does not fill the canvas
 _TARGET_SECONDS = 1 / 12  # for a frame while something moves; where it takes longer, the resolution falls
 _SMALLEST = 0.25  # least resolution, share of the canvas's width and height
 _ERROR_GAIN = 4.0
@@ -90,7 +90,7 @@ class Viewport:
     def present(self) -> None:
         """Copy the frame, with the ground truth where the two are compared, to the canvas's texture."""
         target = self._context.get_current_texture()
-        self._presenter(target.create_view(), self._placed(*target.size[:2]), _MARGIN)
+        self._presenter(target.create_view(), self._placed(*target.size[:2]), MARGIN)
 
     def _full_camera(self) -> Camera:
         """The camera at full resolution: the canvas's, or that of the image that is subtracted."""
