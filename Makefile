@@ -1,5 +1,6 @@
 # Everything lives in .venv; `make` or `make setup` makes it, and the other goals call that first.
 #   make demo   trains the built-in scene         make test   all tests        make lint   ruff and mypy
+#   make test-all  all tests, with all kernels in every configuration of the device (CI: every night)
 #   make soak   what takes hours: 10,000 hostile files a format, failing disks, 20 kills, large scenes, 30 minutes of training
 #   make bench  times the kernels, beside what the device can do; options go into ARGS, for example:
 #               make bench ARGS="--scenes 50k@400x400 --parts raster --json new.json"
@@ -10,7 +11,7 @@ READY := .venv/.ready
 PYTEST = $(BIN)/pytest
 export XDG_RUNTIME_DIR ?= /tmp
 
-.PHONY: setup demo test soak bench lint
+.PHONY: setup demo test test-shapes test-all soak bench lint
 setup: $(READY)
 
 # torch first: where there is no CUDA device, by exact version, so that an index with CPU builds can offer its own
@@ -58,22 +59,38 @@ soak: $(READY)
 	LAPGS_SOAK_MINUTES=$(LAPGS_SOAK_MINUTES) $(PYTEST) tests/soak
 
 bench: $(READY)
-	$(BIN)/python tests/bench $(ARGS)
+	$(BIN)/python benchmarks $(ARGS)
 
 lint: $(READY)
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 
-# What the kernels compute must not depend on the device's shape: on Mesa's software driver three subgroup sizes are
-# tried (its shader cache ignores the width), and on any adapter what LAPGS_TEST_DEVICE names (tests/conftest.py).
-# The whole suite comes last, so that its closing line is the last.
+# What the kernels compute must not depend on the device's shape. Besides the whole suite on the device as it is, `test`
+# runs each configuration that can fail alone once (test-shapes): all kernels as on a GPU (its shapes, staging and
+# WebGPU's default limits at once: tests/conftest.py), and the two passes that use subgroups without them and, on Mesa's
+# software driver, in the two widths that are not this processor's own (its shader cache ignores the width).
+# Both run side by side: compiling shaders, torch and Python take one core each. The suite's closing line comes last.
+# `test-all` runs all kernels in every configuration, each alone; CI does so every night.
+WIDTHS = $(shell $(BIN)/python -c 'from lapgs_wgpu import list_devices; name = list_devices()[0].name; \
+  print(*(w for w in (128, 256, 512) if "llvmpipe" in name and f" {w} bits" not in name))')
+kernels = echo "== $(2) tests, $(1)"; LAPGS_TEST_DEVICE=$(1) $(PYTEST) -m $(2)
+widths = echo "== $(1) tests, vectors of $$width bits"; \
+  LP_NATIVE_VECTOR_WIDTH=$$width MESA_SHADER_CACHE_DISABLE=true $(PYTEST) -m $(1)
+
 test: $(READY)
-	@if $(BIN)/python -c 'from lapgs_wgpu import list_devices; raise SystemExit("llvmpipe" not in list_devices()[0].name)'; \
-	then for width in 128 256 512; do echo "== kernel tests, vectors of $$width bits"; \
-	  LP_NATIVE_VECTOR_WIDTH=$$width MESA_SHADER_CACHE_DISABLE=true $(PYTEST) -m kernels || exit 1; done; fi
-	@for name in no-subgroups default-limits gpu-shape staging; do echo "== kernel tests, $$name"; \
-	  LAPGS_TEST_DEVICE=$$name $(PYTEST) -m kernels || exit 1; done
+	@logs=$$(mktemp -d); trap 'kill $$shapes 2>/dev/null; rm -rf "$$logs"' EXIT; \
+	$(MAKE) --no-print-directory test-shapes > "$$logs/shapes" 2>&1 & shapes=$$!; \
+	echo "== all tests"; { $(PYTEST); echo $$? > "$$logs/code"; } 2>&1 | tee "$$logs/suite"; \
+	wait $$shapes; code=$$?; cat "$$logs/shapes"; tail -n 1 "$$logs/suite"; exit $$((code || $$(cat "$$logs/code")))
+
+test-shapes: $(READY)
+	@$(call kernels,gpu,kernels)
+	@$(call kernels,no-subgroups,subgroups)
+	@for width in $(WIDTHS); do $(call widths,subgroups) || exit 1; done
+
+test-all: $(READY)
+	@for width in $(if $(WIDTHS),128 256 512); do $(call widths,kernels) || exit 1; done
+	@for name in no-subgroups default-limits gpu-shape staging; do $(call kernels,$$name,kernels) || exit 1; done
 	@echo "== all tests"
 	@$(PYTEST)
-

@@ -13,6 +13,11 @@ from typing import NoReturn
 from lapgs_wgpu.errors import DeviceError, InputError, NoAdapterError, NumericalError
 from lapgs_wgpu.gpu.device import list_devices
 
+DEVICE_HELP = (
+    "graphics adapter: cpu, integrated or discrete, or part of the adapter's name [environment variable LAPGS_DEVICE, "
+    "otherwise the first of --list-devices]"
+)
+LIST_DEVICES_HELP = "list the graphics adapters and exit; the default one comes first"
 OUT_OF_DEVICE, NOT_FINITE = 4, 5
 INTERRUPTED = 130  # the shell's code for a process that Ctrl-C ended
 

@@ -18,10 +18,12 @@ from lapgs_wgpu.data.timestamps import write_times
 from lapgs_wgpu.errors import InputError
 
 DESCRIPTION = """\
-Make a capture that lapgs-train opens: images from videos with ffmpeg, cameras from the images with colmap.
+Convert videos to a capture for lapgs-train: extract images with ffmpeg, estimate camera poses with COLMAP. The programs
+ffmpeg and colmap must be installed.
 
-  lapgs-prepare walk.mp4 --out DIR              one moving camera: each image gets its own pose
-  lapgs-prepare a.mp4 b.mp4 c.mp4 --out DIR     synchronized static cameras, all started at the same time
+  lapgs-prepare walk.mp4 --out DIR              one moving camera: a pose for each image
+  lapgs-prepare a.mp4 b.mp4 c.mp4 --out DIR     several static cameras: a pose for each video; all videos must start at
+                                                the same moment
 """
 FRAMES_PER_SECOND = 10.0
 NEIGHBOURS = 20  # a moving camera: match each image with so many before and after
@@ -41,10 +43,17 @@ def _prepare(arguments: list[str]) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
-    parser.add_argument("videos", nargs="+", metavar="VIDEO", help="videos, one per camera, all of one size")
-    parser.add_argument("--out", required=True, metavar="DIR", help="folder of the capture; must be new or empty")
     parser.add_argument(
-        "--fps", type=float, default=FRAMES_PER_SECOND, help=f"images per second, at most [{FRAMES_PER_SECOND:g}]"
+        "videos", nargs="+", metavar="VIDEO", help="video files, one per camera, all of the same resolution"
+    )
+    parser.add_argument(
+        "--out", required=True, metavar="DIR", help="output folder for the capture; must be new or empty"
+    )
+    parser.add_argument(
+        "--fps",
+        type=float,
+        default=FRAMES_PER_SECOND,
+        help=f"maximum number of extracted images per second of video [{FRAMES_PER_SECOND:g}]",
     )
     given = parser.parse_args(arguments)
     prepare([Path(video) for video in given.videos], Path(given.out), given.fps)

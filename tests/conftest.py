@@ -1,9 +1,7 @@
 """The device of the kernel tests, in the configuration that the environment variable LAPGS_TEST_DEVICE names.
 
-The tests marked `kernels` hold in each of them:
-    for name in default no-subgroups default-limits gpu-shape staging; do
-        LAPGS_TEST_DEVICE=$name pytest -m kernels
-    done
+The tests marked `kernels` hold in each configuration, for example `LAPGS_TEST_DEVICE=staging pytest -m kernels`.
+The Makefile says which configurations `make test` and `make test-all` run.
 """
 
 from __future__ import annotations
@@ -30,6 +28,7 @@ CONFIGURATIONS: dict[str, tuple[str | None, dict[str, bool]]] = {
     "default-limits": (None, {"default_limits": True}),
     "gpu-shape": ("integrated", {}),  # tables in buffers, the GPU shapes of rasteriser, sort and hash gradients
     "staging": ("discrete", {}),  # the same, and no buffer can be mapped where it is
+    "gpu": ("discrete", {"default_limits": True}),  # gpu-shape, staging and default-limits at once
 }
 
 
@@ -39,6 +38,9 @@ def open_test_device(configuration: str) -> Device:
     wanted = os.environ.get("LAPGS_DEVICE", "")
     info, adapter = next(pair for pair in _adapters() if not wanted or _matches(pair[0], wanted))
     return Device(adapter, dataclasses.replace(info, kind=kind or info.kind), **switches)
+
+
+pytest.register_assert_rewrite("helpers")
 
 
 def pytest_configure() -> None:

@@ -23,7 +23,7 @@ from lapgs_wgpu.train.adaptive_split import (
 )
 from lapgs_wgpu.train.config import Rate
 from lapgs_wgpu.train.densify import Change, Statistics, densify
-from lapgs_wgpu.train.optimise import Optimiser
+from lapgs_wgpu.train.optimizer import Optimizer
 from lapgs_wgpu.train.presets import load_config
 
 CONFIG = dataclasses.replace(load_config("dnerf").density, split="adaptive")
@@ -289,7 +289,7 @@ def test_dynamics_and_their_moments_survive_clone_split_and_prune() -> None:
     rows["log_scales"][:10] = -9.0
     rows["opacity_logits"][20:30] = -9.0  # pruned
     gaussians = {name: nn.Parameter(row.clone()) for name, row in rows.items()}
-    optimiser = Optimiser(gaussians, {}, {name: Rate(1e-3, 1e-3, 1) for name in gaussians})
+    optimiser = Optimizer(gaussians, {}, {name: Rate(1e-3, 1e-3, 1) for name in gaussians})
     torch.stack([parameter.square().sum() for parameter in gaussians.values()]).sum().backward()
     optimiser.step(1)
 

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 import pytest
 import safetensors.numpy
+from helpers.ply_files import INRIA, assert_same, mutate, random_still
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_ply import INRIA, assert_same, mutate, random_still
 
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.checkpoint import read_checkpoint, write_checkpoint

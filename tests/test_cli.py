@@ -147,7 +147,9 @@ def test_help_lists_every_key_with_the_presets_value(capsys: pytest.CaptureFixtu
         "--density.gradient",
     ):
         assert option in text
-    assert "half side of the cube around the origin in which they lie at random, world units" in " ".join(text.split())
+    assert "half side length of the cube around the origin in which initial Gaussians are placed" in " ".join(
+        text.split()
+    )
 
 
 MISTAKES = {
@@ -223,12 +225,12 @@ def test_without_any_adapter_the_exit_code_is_3(
 def test_ctrl_c_ends_with_130(
     scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from lapgs_wgpu.train import loop
+    from lapgs_wgpu.train import run as run_module
 
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt("stopped after step 1 of 2.")
 
-    monkeypatch.setattr(loop, "train", interrupted)
+    monkeypatch.setattr(run_module, "train", interrupted)
     assert cli.train_command(["tiny", "--data", str(scene), "--out", str(tmp_path / "out")]) == 130
     assert capsys.readouterr().err == "lapgs-train: stopped after step 1 of 2.\n"
 

@@ -6,7 +6,7 @@ import math
 
 import pytest
 import torch
-from scenes import Scene, front_camera, random_scene, relative, step
+from helpers.scenes import Scene, front_camera, random_scene, relative, step
 from torch import Tensor
 
 from lapgs_wgpu.gpu.device import Device

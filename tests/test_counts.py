@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 import torch
-from scenes import Scene, oblique_camera, random_scene
-from scenes import step as torch_step
-from stages import watch
+from helpers.scenes import Scene, oblique_camera, random_scene
+from helpers.scenes import step as torch_step
+from helpers.stages import watch
 from wgpu.backends.wgpu_native import GPUBuffer, GPUQueue
 
 from lapgs_wgpu.gpu.buffer import Buffer

@@ -11,7 +11,18 @@ from typing import Any
 
 import numpy as np
 import pytest
-from captures import HEIGHT, WIDTH, Blobs, agreement, cameras, moved, quaternion, write_colmap, write_model, write_rig
+from helpers.captures import (
+    HEIGHT,
+    WIDTH,
+    Blobs,
+    agreement,
+    cameras,
+    moved,
+    quaternion,
+    write_colmap,
+    write_model,
+    write_rig,
+)
 from PIL import Image
 from scipy.spatial import cKDTree
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from captures import HEIGHT, WIDTH, Blobs, Change, agreement, bright, write_nerfies, write_points
+from helpers.captures import HEIGHT, WIDTH, Blobs, Change, agreement, bright, write_nerfies, write_points
 from PIL import Image
 from scipy.ndimage import binary_erosion
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from captures import HEIGHT, WIDTH, cameras
+from helpers.captures import HEIGHT, WIDTH, cameras
 
 from lapgs_wgpu.data import Dataset, load, load_dataset
 from lapgs_wgpu.data.frames import Capture, Frame, Reader

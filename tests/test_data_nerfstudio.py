@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from captures import HEIGHT, WIDTH, Blobs, agreement, write_nerfstudio, write_points
+from helpers.captures import HEIGHT, WIDTH, Blobs, agreement, write_nerfstudio, write_points
 from PIL import Image
 
 from lapgs_wgpu.data import load_dataset

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from captures import (
+from helpers.captures import (
     FAR,
     HEIGHT,
     NEAR,

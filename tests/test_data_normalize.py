@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from captures import write_points
+from helpers.captures import write_points
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -21,7 +21,7 @@ from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.motion.scene import load
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train.presets import load_config
-from lapgs_wgpu.train.training import initial_points
+from lapgs_wgpu.train.trainer import initial_points
 
 SHARED = Path(__file__).parents[2] / "shared" / "data"
 FAR = np.array([100.0, -70.0, 30.0])

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from captures import (
+from helpers.captures import (
     HEIGHT,
     WIDTH,
     Blobs,
@@ -21,8 +21,8 @@ from captures import (
     write_neu3d,
     write_rig,
 )
+from helpers.dnerf_scene import make_scene
 from PIL import Image, ImageFilter
-from test_data_dnerf import make_scene
 
 from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.data.cloud import Cloud
@@ -33,8 +33,8 @@ from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.splat.camera import Camera
-from lapgs_wgpu.train.loop import train
 from lapgs_wgpu.train.presets import load_config
+from lapgs_wgpu.train.run import train
 
 CLOUD = Cloud(Blobs.random(200).means.numpy(), Blobs.random(200).colors.numpy())
 WHERE = Path("points3D.bin")

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from scenes import relative
-from test_fields import DYNAMICS, NEARBY, OURS, POINTS, grid_field, parts
-from test_matrix import on_device, random, read
+from helpers.fields import DYNAMICS, NEARBY, OURS, POINTS, grid_field, parts
+from helpers.matrices import on_device, random, read
+from helpers.scenes import relative
 from torch import Tensor
 
 from lapgs_wgpu.gpu.buffer import Buffer

@@ -201,6 +201,7 @@ def test_one_device_a_name(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.kernels
+@pytest.mark.subgroups
 def test_subgroup_size_is_measured(device: Device, configuration: str) -> None:
     assert "shader-float32-atomic" not in device.features
     if configuration == "no-subgroups" or "subgroup" not in device.features:

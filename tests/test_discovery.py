@@ -27,9 +27,9 @@ from lapgs_wgpu.train.discovery.static_fit import small_view, static_config
 from lapgs_wgpu.train.discovery.surface_points import PointClouds, Points, surface_points
 from lapgs_wgpu.train.discovery.tracks import Tracks, find_tracks
 from lapgs_wgpu.train.discovery.trajectories import find_trajectories
-from lapgs_wgpu.train.loop import train
 from lapgs_wgpu.train.presets import load_config
-from lapgs_wgpu.train.training import Training
+from lapgs_wgpu.train.run import train
+from lapgs_wgpu.train.trainer import Trainer
 
 RADIUS, BOX = 0.2, 1.3
 QUICK = {
@@ -316,7 +316,7 @@ def test_discovery_starts_a_training_with_what_moves(dataset: Dataset, device: D
     found = discover(config, dataset, device)
     assert found.scene is not None
     assert "moving parts" in found.summary
-    with closing(Training(config, dataset, device, scene=found.scene)) as training:
+    with closing(Trainer(config, dataset, device, scene=found.scene)) as training:
         before = found.scene.parameters["means"].detach().clone()
         training.step()
         state = training.state()
@@ -324,7 +324,7 @@ def test_discovery_starts_a_training_with_what_moves(dataset: Dataset, device: D
         assert field is not None
         assert any(p.grad is not None and p.grad.abs().sum() > 0 for p in field.parameters())  # from the first step on
         assert not torch.equal(before, training.scene.parameters["means"])
-    with closing(Training(config, dataset, device)) as resumed:
+    with closing(Trainer(config, dataset, device)) as resumed:
         resumed.restore(state)
         assert int(resumed.state()["training.warm_up"]) == 0
 
@@ -339,14 +339,14 @@ def test_a_whole_run_repeats_to_the_last_byte(dataset: Dataset, device: Device, 
 def test_a_training_that_discovery_started_goes_on_to_the_same_bits(dataset: Dataset, device: Device) -> None:
     config = configure()
     scene = discover(config, dataset, device).scene
-    with closing(Training(config, dataset, device, scene=scene)) as whole:
+    with closing(Trainer(config, dataset, device, scene=scene)) as whole:
         for _ in range(5):
             whole.step()
         state = {name: value.copy() for name, value in whole.state().items()}
         for _ in range(5):
             whole.step()
         expected = whole.state()
-    with closing(Training(config, dataset, device)) as resumed:
+    with closing(Trainer(config, dataset, device)) as resumed:
         resumed.restore(state)
         for _ in range(5):
             resumed.step()

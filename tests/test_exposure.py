@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers.image_losses import BACKGROUND, CAMERA, TRUTH, WEIGHTS, gaussians, gradients, step
+from helpers.interrupts import interrupt_at
+from helpers.scenes import relative
+from helpers.training import configure
 from numpy.typing import NDArray
-from scenes import relative
-from test_image_loss import BACKGROUND, CAMERA, TRUTH, WEIGHTS, gaussians, gradients, step
-from test_resume import interrupt_at
-from test_train import configure
 
 from lapgs_wgpu.data import Dataset, load_dataset
 from lapgs_wgpu.data.synthetic import write_synthetic
@@ -28,10 +28,10 @@ from lapgs_wgpu.splat.rasterize import rasterize
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 from lapgs_wgpu.train.config import Rate
 from lapgs_wgpu.train.exposure import ExposurePasses, Exposures, exposure
-from lapgs_wgpu.train.loop import resume, train
 from lapgs_wgpu.train.losses import total
 from lapgs_wgpu.train.render_loss import RenderLoss, render_loss, upload_rgba
-from lapgs_wgpu.train.training import Training
+from lapgs_wgpu.train.run import resume, train
+from lapgs_wgpu.train.trainer import Trainer
 
 CORRECTION = torch.tensor([[0.9, 0.1, -0.05, 0.02], [0.03, 1.2, 0.0, -0.1], [-0.02, 0.05, 0.8, 0.2]])
 IDENTITY = torch.eye(3, 4)
@@ -180,7 +180,7 @@ def test_an_interrupted_run_goes_on_to_the_same_bytes(
 
 
 def test_it_is_off_unless_asked_for(dataset: Dataset, device: Device) -> None:
-    with closing(Training(configure(), dataset, device)) as training:
+    with closing(Trainer(configure(), dataset, device)) as training:
         training.step()
         assert not [name for name in training.state() if name.startswith("exposure")]
 

@@ -17,12 +17,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from faults import FAILING, Disk
-from lapgs_wgpu.viewer.cli import view_command
-from lapgs_wgpu.viewer.path import CameraPath
-from lapgs_wgpu.viewer.path_file import PathFile, read_path, write_path
-from test_train import configure
-from test_viewer_path import keys
+from helpers.camera_paths import keys
+from helpers.faults import FAILING, Disk
+from helpers.training import configure
 
 from lapgs_wgpu import cli
 from lapgs_wgpu.data.synthetic import write_synthetic
@@ -35,6 +32,9 @@ from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.presets import write_toml
 from lapgs_wgpu.train.run_folder import load_state
+from lapgs_wgpu.viewer.cli import view_command
+from lapgs_wgpu.viewer.path import CameraPath
+from lapgs_wgpu.viewer.path_file import PathFile, read_path, write_path
 
 EVERY = bool(os.environ.get("LAPGS_FUZZ"))
 ERRORS = list(FAILING)
@@ -221,7 +221,7 @@ def test_camera_paths(tmp_path: Path) -> None:
 def test_a_sequence_of_stills_keeps_those_that_are_whole(
     device: Device, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    from test_hostile_files import small_scene
+    from helpers.damaged_files import small_scene
 
     small_scene("mlp", device).save(tmp_path / "a.ply")
     folder = tmp_path / "frames"
@@ -248,7 +248,7 @@ GOING_ON = [sys.executable, "-m", "lapgs_wgpu.cli", "--resume"]
 @pytest.fixture
 def half(preset: Path, device: Device, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> Path:
     """A run that was interrupted after its second state."""
-    from test_resume import interrupt_at
+    from helpers.interrupts import interrupt_at
 
     out = tmp_path / "half" / "run"
     with pytest.MonkeyPatch.context() as patch:

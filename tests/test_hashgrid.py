@@ -7,7 +7,7 @@ import math
 
 import pytest
 import torch
-from scenes import relative
+from helpers.scenes import relative
 from torch import Tensor
 
 from lapgs_wgpu.gpu.device import Device

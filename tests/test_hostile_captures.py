@@ -11,8 +11,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from captures import write_colmap, write_nerfies, write_nerfstudio, write_neu3d
-from hostile import ByteEdits, TreeEdits, byte_edits, edit_bytes, edit_tree, fuzzed, json_text, refused_or, tree_edits
+from helpers.captures import write_colmap, write_nerfies, write_nerfstudio, write_neu3d
+from helpers.hostile import (
+    ByteEdits,
+    TreeEdits,
+    byte_edits,
+    edit_bytes,
+    edit_tree,
+    fuzzed,
+    json_text,
+    refused_or,
+    tree_edits,
+)
 from hypothesis import given
 from hypothesis import strategies as st
 

@@ -10,13 +10,25 @@ import dataclasses
 import io
 import json
 import tomllib
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from hostile import (
+from helpers.camera_paths import nerfstudio
+from helpers.damaged_files import (
+    FOREIGN,
+    KINDS,
+    RESULTS,
+    SPEC,
+    changes_since_without_device,
+    short_config,
+    small_scene,
+    with_checksums,
+    with_table,
+)
+from helpers.dnerf_scene import make_scene
+from helpers.hostile import (
     ByteEdits,
     TreeEdits,
     byte_edits,
@@ -30,46 +42,29 @@ from hostile import (
 )
 from hypothesis import given
 from hypothesis import strategies as st
-from lapgs_wgpu.viewer.capture import open_capture
-from lapgs_wgpu.viewer.path_file import read_path
 from PIL import Image
-from test_data_dnerf import make_scene
-from test_ply import columns_of, ply_bytes, random_still
-from test_viewer_path import nerfstudio
 
 from lapgs_wgpu.data import Dataset, load_dataset
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.initial_view import InitialView
-from lapgs_wgpu.motion.field import FieldConfig, PlaneConfig
-from lapgs_wgpu.motion.hashgrid import HashConfig
 from lapgs_wgpu.motion.playback import open_playback
-from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.motion.scene_file import read_scene
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.plots import _columns, _read_log
 from lapgs_wgpu.train.presets import load_config, write_toml
-from lapgs_wgpu.train.run_folder import STATE, changes_since, check_state, load_state, save_state
-from lapgs_wgpu.train.table_results import Result, Results, markdown, read_results, read_run, write_results
+from lapgs_wgpu.train.run_folder import STATE, check_state, load_state, save_state
+from lapgs_wgpu.train.table_results import Results, markdown, read_results, read_run, write_results
 from lapgs_wgpu.train.table_spec import read_spec
-from lapgs_wgpu.train.training import Training
-
-GRID = HashConfig(1, (2, 2, 2), (2, 2, 2), 4)
-PLANES = PlaneConfig(features=1, space=2, time=2, levels=1)
-KINDS: dict[str, dict[str, Any]] = {
-    "static": {},
-    "mlp": {},
-    "hexplane": {},
-    "grid4d": {},
-    "laplacian": {},
-    "laplacian with hidden layers": {"kind": "laplacian", "depth": 1},
-}
+from lapgs_wgpu.train.trainer import Trainer
+from lapgs_wgpu.viewer.capture import open_capture
+from lapgs_wgpu.viewer.path_file import read_path
 
 
-def small_scene(kind: str, device: Device) -> Scene4D:
-    config = FieldConfig(**{"kind": kind, "static": GRID, "temporal": GRID, "planes": PLANES, "width": 4} | KINDS[kind])
-    points = np.random.default_rng(0).uniform(-1, 1, (3, 3))
-    return Scene4D.from_points(points, np.full((3, 3), 0.5), np.full(3, 0.1), config, device=device)
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One for all inputs of a test, which write the same names again."""
+    return tmp_path_factory.mktemp("hostile")
 
 
 @pytest.fixture(scope="module")
@@ -83,26 +78,6 @@ def checkpoints(device: Device, tmp_path_factory: pytest.TempPathFactory) -> lis
     return found
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """One for all inputs of a test, which write the same names again."""
-    return tmp_path_factory.mktemp("hostile")
-
-
-def with_table(checkpoint: bytes, change: Callable[[dict[str, Any]], bytes]) -> bytes:
-    """A checkpoint whose safetensors table `change` made anew, with sizes that agree."""
-    head, _, body = checkpoint.partition(b"end_header\n")
-    size = int(head.rpartition(b"safetensors ")[2].split(b"\n")[0])
-    words = -(-size // 4)
-    rows, payload = body[: -4 * words], body[-4 * words :][:size]
-    length = int.from_bytes(payload[:8], "little")
-    text = change(json.loads(payload[8 : 8 + length]))
-    new = len(text).to_bytes(8, "little") + text + payload[8 + length :]
-    head = head.replace(b"lapgs4d %d\n" % words, b"lapgs4d %d\n" % -(-len(new) // 4))
-    head = head.replace(b"safetensors %d\n" % size, b"safetensors %d\n" % len(new))
-    return head + b"end_header\n" + rows + new + bytes(-len(new) % 4)
-
-
 # PLY -----------------------------------------------------------------------------------------------------------------
 
 WORDS = [
@@ -112,9 +87,6 @@ WORDS = [
     b"uchar", b"element empty 999999999999999999\n", b"\r\n", b"lapgs4d", b"{\"a\":", b"\"shape\":[0,9007199254740991]",
     b"safetensors 18446744073709551615", b"packed_position",
 ]  # fmt: skip
-FOREIGN = [ply_bytes(columns_of(random_still(4, degree))) for degree in (0, 3)] + [
-    ply_bytes({name: ("double", values) for name, (_, values) in columns_of(random_still(3, 1)).items()})
-]
 COMPRESSED = (
     b"ply\nformat binary_little_endian 1.0\nelement chunk 1\nproperty float min_x\nelement vertex 2\n"
     b"property uint packed_position\nproperty uint packed_rotation\nproperty uint packed_scale\n"
@@ -169,12 +141,9 @@ def shown_at_all_times(file: Path, device: Device) -> None:
 # The state of a training ---------------------------------------------------------------------------------------------
 
 
-def short_config() -> Config:
-    """Of a training of five steps."""
-    few = {"points.count": "20", "field.width": "4", "field.static.levels": "1", "field.temporal.levels": "1"}
-    few |= {"schedule.warm_up": "0", "schedule.steps": "5"}
-    grids = {f"field.{name}.{end}": ["4", "4", "4"] for name in ("static", "temporal") for end in ("base", "finest")}
-    return load_config("tiny", {**few, **grids})
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    return load_dataset(make_scene(tmp_path_factory.mktemp("scene") / "toy"))
 
 
 @pytest.fixture(scope="module")
@@ -183,13 +152,8 @@ def config() -> Config:
 
 
 @pytest.fixture(scope="module")
-def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    return load_dataset(make_scene(tmp_path_factory.mktemp("scene") / "toy"))
-
-
-@pytest.fixture(scope="module")
-def training(config: Config, dataset: Dataset, device: Device) -> Training:
-    training = Training(config, dataset, device)
+def training(config: Config, dataset: Dataset, device: Device) -> Trainer:
+    training = Trainer(config, dataset, device)
     training.step()
     return training
 
@@ -197,7 +161,7 @@ def training(config: Config, dataset: Dataset, device: Device) -> Training:
 @fuzzed()
 @given(byte_edits([b'"shape":[0', b'"dtype":"F64"', b'"I64"', b'"U8"'], least=0), tree_edits, st.booleans())
 def test_states(
-    training: Training, dataset: Dataset, folder: Path, edits: ByteEdits, changes: TreeEdits, whole: bool
+    training: Trainer, dataset: Dataset, folder: Path, edits: ByteEdits, changes: TreeEdits, whole: bool
 ) -> None:
     """A state that is accepted is one that a training can go on from."""
     run = folder / "run"
@@ -219,7 +183,7 @@ def test_states(
         check_state(state, views=len(dataset.train), steps=5)
         training.restore(state)
     except (IndexError, KeyError, RuntimeError, TypeError, ValueError):
-        return  # what loop.resume tells as an InputError
+        return  # what train.run.resume tells as an InputError
     assert 0 <= training.done <= 5
     assert len({len(value) for value in training.scene.parameters.values()}) == 1
 
@@ -264,16 +228,6 @@ def test_camera_paths(folder: Path, changes: TreeEdits, edits: ByteEdits, cycle:
             pose, time = held.path.at(second)
             assert 0 <= time <= 1
             assert np.isfinite(pose.camera(*held.size).T_cam_world).all()
-
-
-RESULTS = Results(
-    "a table",
-    "tiny",
-    tuple(
-        Result("a", row, 0, "f", 20.0, 0.5, 9, 3, 1.0, [24, 24], 2, {"field": {"kind": "static"}}, {"torch": "2"})
-        for row in "xy"
-    ),
-)
 
 
 @fuzzed(300)
@@ -321,13 +275,6 @@ def read_spec_text(folder: Path, config: Config) -> Any:
     return read_spec(folder / "spec.toml")
 
 
-def changes_since_without_device(folder: Path) -> Any:
-    """`changes_since` with fixed words for what this machine is."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lapgs_wgpu.train.run_folder._record", lambda device, dataset: {"torch": "3"})
-        return changes_since(folder, None, None)  # type: ignore[arg-type]
-
-
 @fuzzed()
 @given(tree_edits, byte_edits([b"\n", b"[", b'"'], least=0), st.integers(0, 9))
 def test_logs(folder: Path, changes: TreeEdits, edits: ByteEdits, done: int) -> None:
@@ -354,20 +301,6 @@ def test_configurations(folder: Path, config: Config, changes: TreeEdits, edits:
     tree = {**dataclasses.asdict(config), "base": "tiny", "record": {"torch": "2"}}
     (folder / "config.toml").write_bytes(edit_bytes(toml_text(edit_tree(tree, changes)), edits))
     refused_or(lambda: load_config(str(folder / "config.toml")))
-
-
-SPEC = """
-preset = "tiny"
-seeds = [0, 1]
-[common]
-schedule.steps = 3
-[scenes]
-toys = "toys"
-lego = { folder = "lego", points.box = 1.5 }
-[rows]
-grid4d = { method = "grid4d" }
-no_ncc = { ablate = ["ncc"], scenes = ["toys"], seeds = [0], loss.pyramid = 0.1 }
-"""
 
 
 @fuzzed()
@@ -418,18 +351,3 @@ def test_pictures(capture: tuple[Path, dict[str, Any]], data: bytes, edits: Byte
     found = refused_or(lambda: load_dataset(scene))
     for view in found.train if found else ():
         refused_or(view.load)
-
-
-def with_checksums(data: bytes) -> bytes:
-    """A PNG whose chunks have right checksums, so that the damage gets further in."""
-    import zlib
-
-    done, at = data[:8], 8
-    while at + 12 <= len(data):
-        length = int.from_bytes(data[at : at + 4], "big")
-        body = data[at + 4 : at + 8 + length]
-        if at + 12 + length > len(data):
-            break
-        done += data[at : at + 4] + body + zlib.crc32(body).to_bytes(4, "big")
-        at += 12 + length
-    return done + data[at:]

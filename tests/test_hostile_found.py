@@ -14,11 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hostile import refused_or
-from lapgs_wgpu.viewer.capture import open_capture
-from lapgs_wgpu.viewer.path_file import read_path
-from test_data_dnerf import make_scene
-from test_hostile_files import (
+from helpers.damaged_files import (
     FOREIGN,
     RESULTS,
     SPEC,
@@ -28,7 +24,9 @@ from test_hostile_files import (
     with_checksums,
     with_table,
 )
-from test_ply import columns_of, ply_bytes, random_still
+from helpers.dnerf_scene import make_scene
+from helpers.hostile import refused_or
+from helpers.ply_files import columns_of, ply_bytes, random_still
 
 from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.data.cloud import read_npy
@@ -39,12 +37,14 @@ from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.io.safe_json_toml import MAX_TOML_BYTES, read_json, read_toml
 from lapgs_wgpu.motion.scene_file import read_scene
 from lapgs_wgpu.train.log import Log
-from lapgs_wgpu.train.loop import evaluate_run, resume
 from lapgs_wgpu.train.presets import load_config
+from lapgs_wgpu.train.run import evaluate_run, resume
 from lapgs_wgpu.train.run_folder import STATE, load_state, locked_run_folder, save_state, start_run_folder
 from lapgs_wgpu.train.table_results import read_results, write_results
 from lapgs_wgpu.train.table_spec import read_spec
-from lapgs_wgpu.train.training import Training
+from lapgs_wgpu.train.trainer import Trainer
+from lapgs_wgpu.viewer.capture import open_capture
+from lapgs_wgpu.viewer.path_file import read_path
 
 FOUND_TOML = {
     "deep lists": ("seed = " + "[" * 5000 + "]" * 5000, "nested too deeply"),
@@ -124,7 +124,7 @@ def test_a_wide_network_takes_no_memory_that_the_file_does_not_hold(kind: str, d
 
 def test_found_in_states(device: Device, tmp_path: Path) -> None:
     config, dataset = short_config(), load_dataset(make_scene(tmp_path / "toy"))
-    training = Training(config, dataset, device)
+    training = Trainer(config, dataset, device)
     training.step()
     state = training.state()
     training.close()

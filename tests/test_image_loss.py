@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
-import dataclasses
-from typing import NamedTuple
-
 import numpy as np
 import pytest
 import torch
+from helpers.image_losses import (
+    BACKGROUND,
+    CAMERA,
+    TRUTH,
+    WEIGHTS,
+    Pair,
+    Picture,
+    gaussians,
+    gradients,
+    random_pair,
+    step,
+)
+from helpers.scenes import relative
 from numpy.typing import NDArray
-from scenes import oblique_camera, random_scene, relative
 
 from lapgs_wgpu.data.views import composite
 from lapgs_wgpu.gpu.buffer import Buffer
@@ -22,32 +31,12 @@ from lapgs_wgpu.train import losses
 from lapgs_wgpu.train import render_loss as render_loss_module
 from lapgs_wgpu.train.image_loss import TERMS, ImageLoss
 from lapgs_wgpu.train.losses import LossWeights, total
-from lapgs_wgpu.train.render_loss import RenderLoss, TruthCache, render_loss, upload_rgba
+from lapgs_wgpu.train.render_loss import RenderLoss, TruthCache, upload_rgba
 
 pytestmark = pytest.mark.kernels
 
-WEIGHTS = {
-    "l1": LossWeights(1.0, 0.0),
-    "ssim": LossWeights(0.0, 1.0),
-    "pyramid": LossWeights(0.0, 0.0, pyramid=1.0),
-    "ncc": LossWeights(0.0, 0.0, ncc=1.0),
-    "all": LossWeights(0.8, 0.2, pyramid=0.2, ncc=0.05),
-}
 SIZES = [(1, 1), (1, 9), (2, 5), (3, 3), (3, 4), (5, 70), (10, 13), (11, 11), (12, 30), (37, 61), (64, 64), (131, 90)]
 BLACK = (0.0, 0.0, 0.0)
-Picture = NDArray[np.float32]
-
-
-class Pair(NamedTuple):
-    """An image (H, W, 3) and its ground truth in 8 bits."""
-
-    image: Picture
-    truth: NDArray[np.uint8]
-
-
-def random_pair(height: int, width: int) -> Pair:
-    rng = np.random.default_rng(1000 * height + width)
-    return Pair(rng.random((height, width, 3), np.float32), rng.integers(0, 256, (height, width, 3), np.uint8))
 
 
 def structured_pair(height: int, width: int, flat: bool = True) -> Pair:
@@ -190,25 +179,6 @@ def test_a_term_of_weight_0_runs_no_passes(device: Device, monkeypatch: pytest.M
 
 
 # With the rasteriser
-
-CAMERA = oblique_camera(61, 47)
-TRUTH = random_pair(CAMERA.height, CAMERA.width).truth
-BACKGROUND = torch.tensor([0.2, 0.5, 0.9])
-
-
-def gaussians(count: int = 200, **changes: torch.Tensor) -> Gaussians:
-    scene = random_scene(count, 1, sh=4)
-    tensors = {"sh" if name == "colors" else name: value for name, value in scene.items()} | changes
-    return Gaussians(**{name: value.clone().requires_grad_() for name, value in tensors.items()})
-
-
-def step(device: Device, scene: Gaussians, weights: LossWeights = WEIGHTS["all"]) -> RenderLoss:
-    return render_loss(scene, CAMERA, upload_rgba(device, TRUTH), BACKGROUND, weights, device)
-
-
-def gradients(scene: Gaussians, done: RenderLoss) -> dict[str, torch.Tensor]:
-    tensors = {field.name: getattr(scene, field.name) for field in dataclasses.fields(scene)}
-    return {name: t.grad for name, t in (tensors | {"means2d": done.means2d}).items()}
 
 
 def test_a_step_is_that_of_the_rasteriser_and_the_twins(device: Device) -> None:

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from lapgs_wgpu.motion.laplacian import LaplacianMotion, TimeMotion
 from lapgs_wgpu.train.config import Rate
-from lapgs_wgpu.train.optimise import FrequencyOptimiser
+from lapgs_wgpu.train.optimizer import FrequencyOptimizer
 
 K, WIDTH, INPUTS = 5, 6, 4
 
@@ -133,7 +133,7 @@ def test_faint_components_move_further() -> None:
         m.alpha[3] = m.beta[3] = 0.25
     before = m.frequencies.detach().clone()
     m.frequencies.grad = torch.ones_like(m.frequencies)
-    FrequencyOptimiser(m, STEADY, limit=100).step(1)
+    FrequencyOptimizer(m, STEADY, limit=100).step(1)
     moved = (before - m.frequencies.detach())[1:]
     ratio = float(m.variances()[0] / m.variances()[3])
     assert ratio > 3
@@ -146,16 +146,16 @@ def test_faint_components_move_further() -> None:
 def test_frequencies_stay_below_nyquist_and_steps_are_bounded() -> None:
     m = motion([0.001, 1.0, 2.0, 3.0, 3.999])
     m.frequencies.grad = torch.tensor([1e3, 0, 0, 0, -1e3], dtype=torch.float64)
-    FrequencyOptimiser(m, Rate(10.0, 10.0, 1), limit=4.0).step(1)
+    FrequencyOptimizer(m, Rate(10.0, 10.0, 1), limit=4.0).step(1)
     assert m.frequencies.tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
     m.frequencies.grad = torch.tensor([-1e3, 0, 0, 0, 1e3], dtype=torch.float64)
-    FrequencyOptimiser(m, Rate(10.0, 10.0, 1), limit=4.0).step(1)
+    FrequencyOptimizer(m, Rate(10.0, 10.0, 1), limit=4.0).step(1)
     assert m.frequencies.tolist() == pytest.approx([0.02, 1.0, 2.0, 3.0, 3.98])
 
 
 def test_without_a_gradient_nothing_moves() -> None:
     m = motion()
-    FrequencyOptimiser(m, STEADY, limit=4).step(1)
+    FrequencyOptimizer(m, STEADY, limit=4).step(1)
     assert m.frequencies.tolist() == [0, 1, 2, 3, 4]
 
 
@@ -167,7 +167,7 @@ def test_frequencies_find_a_motion() -> None:
         m.frequencies.copy_(torch.tensor([1.0, 3.0]))
     mixing = torch.randn(2, WIDTH, generator=torch.Generator().manual_seed(1))
     waves = torch.optim.Adam([m.alpha, m.beta], lr=1e-2)
-    frequencies = FrequencyOptimiser(m, Rate(4e-3, 4e-4, 3000), limit=20)
+    frequencies = FrequencyOptimizer(m, Rate(4e-3, 4e-4, 3000), limit=20)
     for step in range(1, 3001):
         t = float(torch.rand((), generator=generator))
         target = mixing[0] * math.sin(2 * math.pi * 1.3 * t) + mixing[1] * math.cos(2 * math.pi * 2.6 * t)

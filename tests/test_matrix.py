@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from scenes import relative
+from helpers.matrices import on_device, random, read
+from helpers.scenes import relative
 from torch import Tensor
 
 from lapgs_wgpu.gpu import matrix
-from lapgs_wgpu.gpu.buffer import Buffer, BufferPool
+from lapgs_wgpu.gpu.buffer import BufferPool
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands
 from lapgs_wgpu.gpu.matrix import Matrix, Product
@@ -17,24 +18,10 @@ from lapgs_wgpu.gpu.matrix import Matrix, Product
 pytestmark = pytest.mark.kernels
 
 
-def random(*shape: int, seed: int = 0) -> Tensor:
-    return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
-
-
-def on_device(device: Device, tensor: Tensor) -> Buffer:
-    buffer = Buffer(device, 4 * tensor.numel(), "matrix")
-    buffer.write(tensor.numpy())
-    return buffer
-
-
 def stored(device: Device, tensor: Tensor, *, transposed: bool) -> Matrix:
     if transposed:
         return Matrix.whole(on_device(device, tensor.T.contiguous()), *tensor.T.shape).transpose
     return Matrix.whole(on_device(device, tensor), *tensor.shape)
-
-
-def read(buffer: Buffer, *shape: int) -> Tensor:
-    return torch.from_numpy(buffer.read("float32", shape))
 
 
 @pytest.mark.parametrize("a_transposed", [False, True])

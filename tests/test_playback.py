@@ -5,16 +5,16 @@ from __future__ import annotations
 import subprocess
 import sys
 from contextlib import closing
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from test_deform import CONFIGS, GRID4D, OURS, trained
-from test_ply import columns_of, ply_bytes, random_still
-from test_scene import DAMAGE, moving_scene, rewrite
-from test_train import configure
+from helpers.ply_files import columns_of, ply_bytes, random_still
+from helpers.scene_files import DAMAGE, moving_scene, rewrite
+from helpers.still_scenes import CAMERA, KINDS, half_still
+from helpers.trained_scenes import CONFIGS, GRID4D, OURS, trained
+from helpers.training import configure
 
 from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.data.synthetic import write_synthetic
@@ -31,17 +31,9 @@ from lapgs_wgpu.motion.scene_playback import ScenePlayback
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.rasterize import rasterizer_of, upload_gaussians
 from lapgs_wgpu.splat.rasterizer import GaussianBuffers, Rasterizer
-from lapgs_wgpu.train.training import Training
+from lapgs_wgpu.train.trainer import Trainer
 
 TIMES = (0.0, 0.37, 1.0)
-CAMERA = Camera.looking_at([1.0, -4, 0.7], [0, 0, 0], up=[0, 0, 1], fov_x=0.8, width=64, height=48)
-KINDS = {
-    "static": FieldConfig(kind="static"),
-    "mlp": replace(OURS, kind="mlp"),
-    "hexplane": replace(OURS, kind="hexplane"),
-    "hidden layers": replace(OURS, depth=1),
-    "ablated motion": replace(OURS, motion="mlp"),
-} | CONFIGS
 ON_DEVICE = {"static", *CONFIGS}
 
 
@@ -174,7 +166,7 @@ def test_an_upload_that_failed_is_made_again(device: Device, tmp_path: Path, mon
 @pytest.mark.parametrize("kind", ["static", "mlp", "hexplane", "grid4d", "laplacian"])
 def test_each_step_of_a_training_is_shown(device: Device, tmp_path: Path, kind: str) -> None:
     dataset = load_dataset(write_synthetic(tmp_path / "scene", size=16, train_views=4, test_views=1))
-    training = Training(configure(method=kind), dataset, device)
+    training = Trainer(configure(method=kind), dataset, device)
     playback = ScenePlayback(training.scene)
     with closing(training):
         for _ in range(12):
@@ -240,21 +232,6 @@ def test_blocks_make_no_difference(device: Device, tmp_path: Path) -> None:
         )
         for x, y in zip(a, b, strict=True):
             np.testing.assert_array_equal(x, y)
-
-
-def half_still(device: Device, folder: Path) -> DevicePlayback:
-    """Of 300 Gaussians those outside the field's box, which ends at 1.5 on each axis, stand still."""
-    scene = trained(device, GRID4D, 300)
-    with torch.no_grad():
-        for parameter in scene.field.heads.parameters():
-            parameter *= 0.1
-        scene.parameters["log_scales"] -= 1.5
-        scene.parameters["means"][100:200] += torch.tensor([4.0, 4, 0])
-        scene.parameters["means"][200:] += torch.tensor([-4.0, 4, 0])
-    scene.save(folder / "scene.ply")
-    playback = open_playback(folder / "scene.ply", device)
-    assert isinstance(playback, DevicePlayback)
-    return playback
 
 
 def contents(now: GaussianBuffers) -> list[np.ndarray]:

@@ -8,7 +8,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from captures import cameras, moved, write_video
+from helpers.captures import cameras, moved, write_video
 
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.prepare import extract, prepare_command

@@ -6,11 +6,11 @@ import dataclasses
 
 import numpy as np
 import pytest
-from lapgs_wgpu.viewer.present import HEAT, Offscreen, Placed
 from numpy.typing import NDArray
 
 from lapgs_wgpu.gpu.buffer import BufferPool
 from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.viewer.present import HEAT, Offscreen, Placed
 
 pytestmark = [pytest.mark.kernels, pytest.mark.triangles]
 Floats = NDArray[np.float64]

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 import torch
-from scenes import Scene, front_camera, needles, oblique_camera, random_scene
-from stages import all_of, capture
+from helpers.scenes import Scene, front_camera, needles, oblique_camera, random_scene
+from helpers.stages import all_of, capture
 
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.splat.camera import Camera

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from scenes import oblique_camera, random_scene
-from stages import all_of, capture
+from helpers.scenes import oblique_camera, random_scene
+from helpers.stages import all_of, capture
 
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.splat.rasterize import rasterize, rasterizer_of

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from scenes import (
+from helpers.scenes import (
     Scene,
     Weights,
     fragile_pixels,
@@ -28,7 +28,7 @@ from lapgs_wgpu.splat.rasterize import rasterize
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 from lapgs_wgpu.splat.shape import RasterShape, cpu_shape, gpu_shape
 
-pytestmark = pytest.mark.kernels
+pytestmark = [pytest.mark.kernels, pytest.mark.subgroups]
 
 BACKGROUND = torch.tensor([0.3, 1.0, 0.1])
 

@@ -7,15 +7,15 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
-from scenes import Scene, Step, Weights, front_camera, oblique_camera, random_scene, relative, step
-from stages import watch
+from helpers.scenes import Scene, Step, Weights, front_camera, oblique_camera, random_scene, relative, step
+from helpers.stages import watch
 
 from lapgs_wgpu.gpu import shader
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.splat.rasterize import rasterize, rasterizer_of
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 
-pytestmark = pytest.mark.kernels
+pytestmark = [pytest.mark.kernels, pytest.mark.subgroups]
 
 Use = Callable[[Rasterizer], Rasterizer]
 CAMERA = oblique_camera(101, 61)

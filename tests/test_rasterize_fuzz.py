@@ -8,16 +8,16 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
+from helpers.scenes import Scene, Step, front_camera, oblique_camera, random_scene, reference_step, relative, step
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import Scene, Step, front_camera, oblique_camera, random_scene, reference_step, relative, step
 
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.splat.rasterize import rasterize
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 from lapgs_wgpu.splat.reference import near_discontinuity
 
-pytestmark = pytest.mark.kernels
+pytestmark = [pytest.mark.kernels, pytest.mark.subgroups]
 
 Use = Callable[[Rasterizer], Rasterizer]
 BACKGROUND = torch.tensor([0.2, 0.4, 0.9])

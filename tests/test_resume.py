@@ -16,7 +16,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_train import STEPS, configure
+from helpers.interrupts import interrupt_at
+from helpers.training import STEPS, configure
 
 from lapgs_wgpu import cli
 from lapgs_wgpu.data import Dataset, load_dataset
@@ -26,11 +27,10 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io import atomic
 from lapgs_wgpu.train import run_folder
 from lapgs_wgpu.train.config import Config
-from lapgs_wgpu.train.log import Log
-from lapgs_wgpu.train.loop import resume, train
 from lapgs_wgpu.train.presets import write_toml
+from lapgs_wgpu.train.run import resume, train
 from lapgs_wgpu.train.run_folder import STATE, STATE_BEFORE, load_state, locked_run_folder, save_state
-from lapgs_wgpu.train.training import Training
+from lapgs_wgpu.train.trainer import Trainer
 
 KILLS = int(os.environ.get("LAPGS_SOAK_KILLS", "3"))
 
@@ -51,17 +51,6 @@ def whole(dataset: Dataset, device: Device, tmp_path_factory: pytest.TempPathFac
     out = tmp_path_factory.mktemp("runs") / "whole"
     train(configure(), dataset, out, device=device)
     return out
-
-
-def interrupt_at(at: int, monkeypatch: pytest.MonkeyPatch, number: signal.Signals = signal.SIGINT) -> None:
-    original = Log.step
-
-    def interrupt(self: Log, step: int, *rest: Any) -> None:
-        original(self, step, *rest)
-        if step == at:
-            signal.raise_signal(number)
-
-    monkeypatch.setattr(Log, "step", interrupt)
 
 
 # In the warm-up, after it, at a change of density, at a reset, with an epoch just over, at the last step but one.
@@ -102,7 +91,7 @@ def test_states_are_saved_at_intervals_and_the_last_two_are_kept(
         original(out, state)
         saved.append(int(state["training.done"]))
 
-    monkeypatch.setattr("lapgs_wgpu.train.loop.save_state", note)
+    monkeypatch.setattr("lapgs_wgpu.train.run.save_state", note)
     interrupt_at(28, monkeypatch)
     out = tmp_path / "run"
     with pytest.raises(KeyboardInterrupt):
@@ -149,7 +138,7 @@ def test_a_full_disk_leaves_the_older_state(failing: str, tmp_path: Path, monkey
 
 
 def test_a_state_of_another_configuration_is_refused(dataset: Dataset, device: Device, tmp_path: Path) -> None:
-    save_state(tmp_path, Training(configure(), dataset, device).state())
+    save_state(tmp_path, Trainer(configure(), dataset, device).state())
     others = [configure(field__width="8"), configure(field__dynamics="4"), configure("mlp")]
     for config in others:
         with pytest.raises(InputError, match=r"its state and its config.toml do not belong together"):

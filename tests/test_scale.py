@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from scenes import front_camera, random_scene
-from test_train import configure
+from helpers.scenes import front_camera, random_scene
+from helpers.training import configure
 from torch import Tensor
 
 from lapgs_wgpu.data import Dataset, load_dataset
@@ -29,7 +29,7 @@ from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.rasterize import rasterize, upload_gaussians
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 from lapgs_wgpu.splat.shape import raster_shape
-from lapgs_wgpu.train.loop import train
+from lapgs_wgpu.train.run import train
 
 soak = pytest.mark.skipif(os.environ.get("LAPGS_SOAK") != "1", reason="large: LAPGS_SOAK=1 runs it")
 Use = Callable[[Rasterizer], Rasterizer]
@@ -88,6 +88,7 @@ def check_pile(count: int, device: Device) -> None:
 
 
 @pytest.mark.kernels
+@pytest.mark.subgroups
 def test_lists_beyond_a_round_are_drawn_in_more(device: Device, use: Use) -> None:
     shape = raster_shape(device)
     if not shape.round_splats:
@@ -98,6 +99,7 @@ def test_lists_beyond_a_round_are_drawn_in_more(device: Device, use: Use) -> Non
 
 
 @pytest.mark.kernels
+@pytest.mark.subgroups
 @pytest.mark.parametrize("depth", [False, True])
 def test_rounds_change_no_bit(depth: bool, device: Device, use: Use, monkeypatch: pytest.MonkeyPatch) -> None:
     """Many short rounds, with other tiles that are done long before, in bands and at once."""

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from lapgs_wgpu import cli, command
+from lapgs_wgpu import command, table_cli
 from lapgs_wgpu.data import motion_writer, synthetic
 from lapgs_wgpu.data.motion_scenes import MotionScene
 from lapgs_wgpu.data.synthetic import write_synthetic
@@ -136,7 +136,7 @@ def test_mistakes_end_in_one_sentence_before_any_training(
     assert SPEC.count(before) == 1
     (tmp_path / "spec.toml").write_text(SPEC.replace(before, after))
     arguments = [str(tmp_path / "spec.toml"), "--data", str(data), "--out", str(tmp_path / "out")]
-    assert cli.table_command(arguments) == 2
+    assert table_cli.table_command(arguments) == 2
     out, err = capsys.readouterr()
     assert out == ""
     assert err.count("\n") == 1, err
@@ -163,7 +163,7 @@ def test_mistakes_on_the_command_line(
 ) -> None:
     words, message = COMMAND_MISTAKES[name]
     places = {"SPEC": str(spec_file), "OUT": str(tmp_path / "out"), "DATA": str(data)}
-    assert cli.table_command([places.get(word, word) for word in words]) == 2
+    assert table_cli.table_command([places.get(word, word) for word in words]) == 2
     err = capsys.readouterr().err
     assert err.count("\n") == 1, err
     assert message in err
@@ -226,14 +226,17 @@ def test_results_of_several_machines_are_merged(tmp_path: Path, capsys: pytest.C
         (tmp_path / name).mkdir()
         write_results(tmp_path / name, Results(name, "tiny", results))
     files = [str(tmp_path / name / "results.json") for name in ("a", "b")]
-    assert cli.table_command(["--from", *files, "--out", str(tmp_path / "both")]) == 0
+    assert table_cli.table_command(["--from", *files, "--out", str(tmp_path / "both")]) == 0
     shown = capsys.readouterr().out
     assert "| a | x | 3 | 20.00 | 0.00 |" in shown
     assert (tmp_path / "both" / "table.md").read_text() == shown
     assert len(read_results(tmp_path / "both" / "results.json").runs) == 3
-    assert cli.table_command(["--from", files[0], "--out", str(tmp_path / "both")]) == 2
+    assert table_cli.table_command(["--from", files[0], "--out", str(tmp_path / "both")]) == 2
     assert "results.json would be lost" in capsys.readouterr().err
-    assert cli.table_command(["--from", *files, str(tmp_path / "both" / "results.json"), "--out", str(tmp_path)]) == 0
+    assert (
+        table_cli.table_command(["--from", *files, str(tmp_path / "both" / "results.json"), "--out", str(tmp_path)])
+        == 0
+    )
     with pytest.raises(InputError, match=r"a, x, seed 0: .* two configurations"):
         merge_results([Results("a", "tiny", (result(),)), Results("b", "tiny", (result(fingerprint="g"),))])
 
@@ -262,7 +265,7 @@ def trained(monkeypatch: pytest.MonkeyPatch) -> list[RunKey]:
 
 
 def make(spec_file: Path, data: Path, *more: str) -> int:
-    return cli.table_command([str(spec_file), "--data", str(data), "--out", str(spec_file.parent / "out"), *more])
+    return table_cli.table_command([str(spec_file), "--data", str(data), "--out", str(spec_file.parent / "out"), *more])
 
 
 def test_finished_runs_are_not_trained_again(

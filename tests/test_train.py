@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from helpers.training import STEPS, configure
 from PIL import Image
 
 from lapgs_wgpu.data import Dataset, load_dataset
@@ -24,36 +25,15 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.checkpoint import read_checkpoint
 from lapgs_wgpu.motion.device_decoder import DeviceDecoder
 from lapgs_wgpu.motion.scene import Scene4D, load
-from lapgs_wgpu.train import decoder_choice, loop, training
-from lapgs_wgpu.train.config import Config
+from lapgs_wgpu.train import autotune, trainer
+from lapgs_wgpu.train import run as run_module
+from lapgs_wgpu.train.dataloader import Pictures
 from lapgs_wgpu.train.log import Log
-from lapgs_wgpu.train.loop import train
 from lapgs_wgpu.train.losses import LossWeights
-from lapgs_wgpu.train.pictures import Pictures
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.render_loss import RenderLoss, render_loss
-from lapgs_wgpu.train.training import Training
-
-STEPS = 36
-SMALL: dict[str, str | list[str]] = {
-    "schedule.steps": str(STEPS),
-    "schedule.warm_up": "10",
-    "schedule.sh_interval": "12",
-    "points.count": "300",
-    "field.width": "16",
-    "field.static.levels": "3",
-    "field.static.finest": ["16", "16", "16"],
-    "field.temporal.levels": "2",
-    "density.start": "5",
-    "density.interval": "10",
-    "density.reset_interval": "25",
-    "density.stop": "34",
-}
-
-
-def configure(method: str = "laplacian", **overrides: str) -> Config:
-    given = {name.replace("__", "."): value for name, value in overrides.items()}
-    return load_config("tiny", {**SMALL, **given}, method=method)
+from lapgs_wgpu.train.run import train
+from lapgs_wgpu.train.trainer import Trainer
 
 
 @pytest.fixture(scope="module")
@@ -115,7 +95,7 @@ def test_a_run_is_whole(run: Path, dataset: Dataset) -> None:
 
 def test_the_checkpoint_is_the_last_model(run: Path, dataset: Dataset, device: Device) -> None:
     scene = load(run / "checkpoint.ply", device)
-    metrics = loop.evaluate(scene, dataset.test, "black")
+    metrics = run_module.evaluate(scene, dataset.test, "black")
     stored = json.loads((run / "metrics.json").read_text())
     assert metrics["views"] == stored["views"]
     assert scene.sh_degree == 3
@@ -150,7 +130,7 @@ def test_the_training_never_sees_the_test_views(
         raise SavedError
 
     blind = tuple(dataclasses.replace(view, pixels=refuse, time=0.5) for view in dataset.test[:1])
-    monkeypatch.setattr(loop, "evaluate_run", stop)
+    monkeypatch.setattr(run_module, "evaluate_run", stop)
     with pytest.raises(SavedError):
         train(configure(), dataclasses.replace(dataset, test=blind), tmp_path / "run", device=device)
     assert (tmp_path / "run" / "checkpoint.ply").read_bytes() == (run / "checkpoint.ply").read_bytes()
@@ -213,7 +193,7 @@ def test_a_trial_chooses_where_the_decoder_works(
 ) -> None:
     """On devices that are no CPUs; the choice is written down, so that a resumed run keeps to it."""
     monkeypatch.setattr(device, "is_cpu", False)
-    monkeypatch.setattr(decoder_choice, "_seconds", lambda scene, field, there: seconds[there == "device"])
+    monkeypatch.setattr(autotune, "_seconds", lambda scene, field, there: seconds[there == "device"])
     train(configure(schedule__steps="1"), dataset, tmp_path / "run", device=device)
     assert load_config(str(tmp_path / "run/config.toml")).decoder == place
     assert f"decoder: {place} (a trial took " in capsys.readouterr().out
@@ -237,13 +217,13 @@ def test_a_device_too_small_for_the_decoder_leaves_it_to_torch(
 
 def test_the_trial_leaves_no_trace(dataset: Dataset, device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(device, "is_cpu", False)
-    with closing(Training(configure(), dataset, device)) as trained:
+    with closing(Trainer(configure(), dataset, device)) as trained:
         assert set(trained.decoder.seconds) == {"torch", "device"}
         assert all(0 < seconds < 60 for seconds in trained.decoder.seconds.values())
         scene, random = trained.scene, trained.state()["training.random"]
         assert scene.field is not None
         assert all(p.grad is None for p in (*scene.field.parameters(), *scene.parameters.values()))
-    with closing(Training(configure(decoder="torch"), dataset, device)) as untried:
+    with closing(Trainer(configure(decoder="torch"), dataset, device)) as untried:
         assert not untried.decoder.seconds
         assert untried.decoder.place == "torch"
         assert np.array_equal(untried.state()["training.random"], random)
@@ -256,8 +236,8 @@ def test_nothing_is_tried_where_only_torch_will_do(
     given: dict[str, str], dataset: Dataset, device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(device, "is_cpu", False)
-    with closing(Training(configure(**given), dataset, device)) as trained:
-        assert trained.decoder == decoder_choice.Choice("torch", {})
+    with closing(Trainer(configure(**given), dataset, device)) as trained:
+        assert trained.decoder == autotune.Choice("torch", {})
 
 
 def test_a_processor_without_bfloat16_is_told(
@@ -283,7 +263,7 @@ def test_another_seed_gives_another_model(run: Path, dataset: Dataset, device: D
 def test_nothing_moves_during_the_warm_up(dataset: Dataset, device: Device, tmp_path: Path) -> None:
     config = configure(schedule__steps="4")
     scene = train(config, dataset, tmp_path / "run", device=device)
-    fresh = Scene4D.from_points(*training.initial_points(config.points, dataset, 0), config.field, device=device)
+    fresh = Scene4D.from_points(*trainer.initial_points(config.points, dataset, 0), config.field, device=device)
     assert scene.field is not None
     assert fresh.field is not None
     for ours, initial in zip(scene.field.parameters(), fresh.field.parameters(), strict=True):
@@ -306,7 +286,7 @@ def test_cross_correlation_counts_once_the_warm_up_is_over(
         seen.append((arguments[4], render_loss(*arguments)))
         return seen[-1][1]
 
-    monkeypatch.setattr(training, "render_loss", spy)
+    monkeypatch.setattr(trainer, "render_loss", spy)
     options = {"loss__pyramid": "0.2", "loss__ncc": "0.05", "data__background": "random"}
     config = configure(schedule__steps="4", schedule__warm_up="2", **options)
     train(config, dataset, tmp_path / "run", device=device)

@@ -14,7 +14,7 @@ import pytest
 import torch
 import wgpu
 from conftest import open_test_device
-from test_train import configure
+from helpers.training import configure
 
 from lapgs_wgpu.command import OUT_OF_DEVICE, guarded
 from lapgs_wgpu.data import Dataset, load_dataset
@@ -25,9 +25,9 @@ from lapgs_wgpu.gpu.device import _DEFAULT_LIMITS, _RAISED_LIMITS, Device, Devic
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.trouble import Guard
 from lapgs_wgpu.splat.rasterize import rasterizer_of
+from lapgs_wgpu.train.dataloader import Pictures
 from lapgs_wgpu.train.log import Log
-from lapgs_wgpu.train.loop import resume, train
-from lapgs_wgpu.train.pictures import Pictures
+from lapgs_wgpu.train.run import resume, train
 from lapgs_wgpu.train.run_folder import STATE, load_state
 
 NO_MEMORY = "Validation Error\n\nCaused by:\n  In wgpuDeviceCreateBuffer\n    Not enough memory left.\n"
@@ -110,7 +110,7 @@ def test_an_error_of_another_kind_leaves_a_state_too(
     def fail(*_: Any) -> None:
         raise ZeroDivisionError
 
-    after_step(12, lambda: monkeypatch.setattr("lapgs_wgpu.train.training.draw_nearby", fail), monkeypatch)
+    after_step(12, lambda: monkeypatch.setattr("lapgs_wgpu.train.trainer.draw_nearby", fail), monkeypatch)
     with pytest.raises(ZeroDivisionError):
         train(configure(), dataset, tmp_path, device=device)
     state = load_state(tmp_path)
@@ -124,7 +124,7 @@ def test_a_step_that_broke_off_halfway_is_not_saved(
     def fail(*_: Any, **__: Any) -> None:
         np.empty(1 << 58)
 
-    monkeypatch.setattr("lapgs_wgpu.train.training.densify", fail)
+    monkeypatch.setattr("lapgs_wgpu.train.trainer.densify", fail)
     expected = r"Unable to allocate 2\.00 EiB .*; lapgs-train --resume .* goes on from the state that was saved last\."
     with pytest.raises(MemoryError, match=expected):
         train(configure(schedule__save_interval="4", density__start="9"), dataset, tmp_path, device=device)

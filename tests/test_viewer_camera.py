@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 import pytest
-from lapgs_wgpu.viewer.camera import ViewCamera
 
 from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.viewer.camera import ViewCamera
 
 UP = np.array([0.0, 0.6, 0.8])
 

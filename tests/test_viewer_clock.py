@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+
 from lapgs_wgpu.viewer.clock import Clock
 
 

@@ -8,13 +8,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from lapgs_wgpu.viewer.choices import Mode
-from lapgs_wgpu.viewer.frame import Frame, Painter, Request
-from test_deform import GRID4D, trained
-from test_playback import CAMERA, KINDS, half_still
+from helpers.still_scenes import CAMERA, KINDS, half_still
+from helpers.trained_scenes import GRID4D, trained
 
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.playback import open_playback
+from lapgs_wgpu.viewer.frame import Frame, FrameRenderer, FrameRequest
+from lapgs_wgpu.viewer.render_modes import Mode
 
 pytestmark = pytest.mark.kernels
 
@@ -27,8 +27,8 @@ def planes(frame: Frame) -> np.ndarray:
 @pytest.mark.parametrize("mode", ["motion", "scale"])
 def test_the_first_frame_of_a_mode_is_of_its_own_time(device: Device, tmp_path: Path, mode: Mode) -> None:
     trained(device, GRID4D, 100).save(tmp_path / "scene.ply")
-    painter = Painter(open_playback(tmp_path / "scene.ply", device))
-    first, second = (planes(painter.draw(Request(CAMERA, 0.3, mode, (0, 0, 0)))) for _ in range(2))
+    renderer = FrameRenderer(open_playback(tmp_path / "scene.ply", device))
+    first, second = (planes(renderer.draw(FrameRequest(CAMERA, 0.3, mode, (0, 0, 0)))) for _ in range(2))
     np.testing.assert_array_equal(first, second)
 
 
@@ -37,36 +37,38 @@ def test_the_window_rests_on_the_exact_frame(device: Device, tmp_path: Path, mon
     offscreen = pytest.importorskip("rendercanvas.offscreen")
     pytest.importorskip("imgui_bundle")
     from lapgs_wgpu.viewer import app as app_module
-    from lapgs_wgpu.viewer.opened import open_scene
+    from lapgs_wgpu.viewer import viewport as viewport_module
+    from lapgs_wgpu.viewer.loaded_scene import load_scene
 
     half_still(device, tmp_path)
     now = [50.0]
-    monkeypatch.setattr(app_module, "time", SimpleNamespace(perf_counter=lambda: now[0]))
+    for module in (app_module, viewport_module):
+        monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=lambda: now[0]))
     canvas = offscreen.RenderCanvas(size=(64, 48), pixel_ratio=1)
     loop = SimpleNamespace(call_later=lambda seconds, callback: None)
-    app = app_module.App(canvas, loop, open_scene(tmp_path / "scene.ply", lambda: device))
-    exact = Painter(open_playback(tmp_path / "scene.ply", device))
+    app = app_module.App(canvas, loop, load_scene(tmp_path / "scene.ply", lambda: device))
+    exact = FrameRenderer(open_playback(tmp_path / "scene.ply", device))
     passing = []
     for t in [*((np.arange(16) + 0.5) / 16), 0.3, 0.31]:
         now[0] += 0.1
-        app.clock.seek(float(t))
+        app.state.clock.seek(float(t))
         canvas.draw()
-        assert app.frame is not None
-        passing.append(app.frame.exact)
+        assert app.viewport.frame is not None
+        passing.append(app.viewport.frame.exact)
     assert all(passing[:16])
     assert passing[16:] == 2 * [not device.mappable]
     now[0] += 0.1
     canvas.draw()
-    assert app.frame.exact == (not device.mappable)  # it may move on
+    assert app.viewport.frame.exact == (not device.mappable)  # it may move on
     now[0] += 0.2
     canvas.draw()
-    assert app.frame.exact
-    assert app.scale == 1
-    np.testing.assert_array_equal(planes(app.frame), planes(exact.draw(app.frame.request)))
-    rests = app.frame
+    assert app.viewport.frame.exact
+    assert app.viewport.scale == 1
+    np.testing.assert_array_equal(planes(app.viewport.frame), planes(exact.draw(app.viewport.frame.request)))
+    rests = app.viewport.frame
     now[0] += 5
     canvas.draw()
-    assert app.frame is rests
+    assert app.viewport.frame is rests
 
 
 TROUBLE = {
@@ -85,20 +87,22 @@ def test_a_file_that_cannot_be_shown_leaves_the_scene_as_it_is(
     offscreen = pytest.importorskip("rendercanvas.offscreen")
     pytest.importorskip("imgui_bundle")
     from lapgs_wgpu.viewer import app as app_module
-    from lapgs_wgpu.viewer.opened import open_scene
+    from lapgs_wgpu.viewer import viewport as viewport_module
+    from lapgs_wgpu.viewer.loaded_scene import load_scene
 
     trained(device, GRID4D, 100).save(tmp_path / "small.ply")
     trained(device, KINDS["mlp"], 1000).save(tmp_path / "large.ply")  # whose buffers are made when it is drawn
     now = [50.0]
-    monkeypatch.setattr(app_module, "time", SimpleNamespace(perf_counter=lambda: now[0]))
+    for module in (app_module, viewport_module):
+        monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=lambda: now[0]))
     canvas = offscreen.RenderCanvas(size=(64, 48), pixel_ratio=1)
     loop = SimpleNamespace(call_later=lambda seconds, callback: None)
-    app = app_module.App(canvas, loop, open_scene(tmp_path / "small.ply", lambda: device))
-    app.clock.seek(0.3)
+    app = app_module.App(canvas, loop, load_scene(tmp_path / "small.ply", lambda: device))
+    app.state.clock.seek(0.3)
     canvas.draw()
-    before = vars(app) | {"message": None}
-    assert app.frame is not None
-    shown = planes(app.frame)
+    before = vars(app.state) | vars(app.viewport) | {"message": None}
+    assert app.viewport.frame is not None
+    shown = planes(app.viewport.frame)
 
     def give_out(*_: object) -> None:
         raise MemoryError
@@ -110,19 +114,19 @@ def test_a_file_that_cannot_be_shown_leaves_the_scene_as_it_is(
         elif what == "a binding":
             patched.setitem(device.limits, "max-storage-buffer-binding-size", 8192)
         elif what == "memory":
-            patched.setattr("lapgs_wgpu.viewer.opened.playback_of", give_out)
+            patched.setattr("lapgs_wgpu.viewer.loaded_scene.playback_of", give_out)
         app.open(large)
-    assert app.message is not None
-    assert re.search(TROUBLE[what], app.message)
-    assert str(large) in app.message
-    assert vars(app) | {"message": None} == before
+    assert app.state.message is not None
+    assert re.search(TROUBLE[what], app.state.message)
+    assert str(large) in app.state.message
+    assert vars(app.state) | vars(app.viewport) | {"message": None} == before
     now[0] += 5
     canvas.draw()
-    assert app.frame is before["frame"]
-    np.testing.assert_array_equal(planes(app.frame), shown)
+    assert app.viewport.frame is before["frame"]
+    np.testing.assert_array_equal(planes(app.viewport.frame), shown)
     app.open(tmp_path / "large.ply")
-    assert (app.opened.playback.count, app.clock.time, app.message) == (1000, 0.0, None)
-    opened = app.frame
+    assert (app.state.scene.playback.count, app.state.clock.time, app.state.message) == (1000, 0.0, None)
+    opened = app.viewport.frame
     assert opened is not before["frame"]
     canvas.draw()
-    assert app.frame is opened  # drawn once
+    assert app.viewport.frame is opened  # drawn once

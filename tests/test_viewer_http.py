@@ -18,10 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from browser import CHROMIUM, Browser, wait_for
-from lapgs_wgpu.viewer import cli
-from lapgs_wgpu.viewer.guard import Guard, check_entry, new_token
-from lapgs_wgpu.viewer.remote import open_entry, pages
+from helpers.browser import CHROMIUM, Browser, wait_for
 from numpy.typing import NDArray
 
 from lapgs_wgpu import Scene4D
@@ -31,6 +28,9 @@ from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.motion.field import FieldConfig
 from lapgs_wgpu.motion.hashgrid import HashConfig
 from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.viewer import cli
+from lapgs_wgpu.viewer.auth import AuthMiddleware, check_entry, new_token
+from lapgs_wgpu.viewer.remote import open_entry, pages
 
 TOKEN = "a-token_of-22-letters"
 FRAMES = 31
@@ -66,8 +66,8 @@ async def accept(scope: Any, receive: Any, send: Any) -> None:
     await send({"type": "websocket.accept"})
 
 
-def guarded(**options: Any) -> Guard:
-    return Guard(pages("scene <1>.ply", accept), **options)
+def guarded(**options: Any) -> AuthMiddleware:
+    return AuthMiddleware(pages("scene <1>.ply", accept), **options)
 
 
 @pytest.mark.parametrize("host", ["localhost", "localhost:8080", "127.0.0.1:9000", "[::1]:8080", "LOCALHOST:1"])
@@ -381,13 +381,15 @@ def server(scene: Path) -> Iterator[Server]:
 
 def expected(scene: Path, device: Device, size: tuple[int, int], time: float) -> NDArray[np.int16]:
     """What the painter draws where the viewer begins."""
-    from lapgs_wgpu.viewer.app import MARGIN
-    from lapgs_wgpu.viewer.frame import Painter, Request
-    from lapgs_wgpu.viewer.opened import open_scene
+    from lapgs_wgpu.viewer.frame import FrameRenderer, FrameRequest
+    from lapgs_wgpu.viewer.loaded_scene import load_scene
     from lapgs_wgpu.viewer.present import Offscreen
+    from lapgs_wgpu.viewer.viewport import MARGIN
 
-    opened = open_scene(scene, lambda: device)
-    frame = Painter(opened.playback).draw(Request(opened.camera().camera(*size), time, "rgb", opened.background))
+    opened = load_scene(scene, lambda: device)
+    frame = FrameRenderer(opened.playback).draw(
+        FrameRequest(opened.camera().camera(*size), time, "rgb", opened.background)
+    )
     return Offscreen(device)(size, [frame.placed], MARGIN).astype(np.int16)
 
 
@@ -407,7 +409,7 @@ def connect_with(server: Server, **headers: str) -> None:
 def test_a_foreign_page_cannot_connect(server: Server) -> None:
     from websockets.exceptions import InvalidStatus
 
-    cookie = f"{Guard(accept, token=TOKEN).cookie}={TOKEN}"
+    cookie = f"{AuthMiddleware(accept, token=TOKEN).cookie}={TOKEN}"
     own = f"http://localhost:{server.port}"
     connect_with(server, origin=own, Cookie=cookie)
     for origin, given in (("http://evil.example", cookie), (f"http://localhost:{server.port + 1}", cookie), (own, "")):

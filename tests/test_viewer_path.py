@@ -10,10 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from lapgs_wgpu.viewer.camera import ViewCamera
-from lapgs_wgpu.viewer.path import CameraPath, KeyFrame, Pose
-from lapgs_wgpu.viewer.path_editor import PathEditor, beside
-from lapgs_wgpu.viewer.path_file import PathFile, read_path, write_path
+from helpers.camera_paths import IDENTITY, keys, nerfstudio
 from scipy.spatial.transform import Rotation
 
 from lapgs_wgpu.errors import InputError
@@ -21,16 +18,10 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.field import FieldConfig
 from lapgs_wgpu.motion.hashgrid import HashConfig
 from lapgs_wgpu.motion.scene import Scene4D
-
-
-def keys(seed: int = 0) -> list[KeyFrame]:
-    rng = np.random.default_rng(seed)
-    turns = Rotation.random(4, random_state=seed).as_matrix()
-    moments, times = [0.0, 1.0, 1.5, 4.0], [0.0, 0.2, 0.8, 1.0]
-    return [
-        KeyFrame(second, time, Pose(rng.normal(size=3), turn, float(rng.uniform(0.4, 1.2))))
-        for second, time, turn in zip(moments, times, turns, strict=True)
-    ]
+from lapgs_wgpu.viewer.camera import ViewCamera
+from lapgs_wgpu.viewer.path import CameraPath, KeyFrame, Pose
+from lapgs_wgpu.viewer.path_editor import PathEditor, beside
+from lapgs_wgpu.viewer.path_file import PathFile, read_path, write_path
 
 
 def assert_near(a: Pose, b: Pose, atol: float = 1e-9) -> None:
@@ -161,37 +152,6 @@ def test_what_is_written_is_nerfstudios(tmp_path: Path) -> None:
     np.testing.assert_allclose(key["matrix"], [1, 0, 0, 1, 0, 1, 0, 0, 0, 0, 1, 5, 0, 0, 0, 1], atol=1e-12)
     assert (key["override_transition_enabled"], key["override_transition_sec"]) == (True, 2.0)
     assert (key["override_time_enabled"], key["render_time"]) == (True, 0.75)
-
-
-IDENTITY = np.eye(4).ravel().tolist()
-SHIFTED = [1, 0, 0, 3, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
-
-
-def nerfstudio(**changes: Any) -> dict[str, Any]:
-    """A path as nerfstudio's viewer saves it, without times."""
-    values: dict[str, Any] = {
-        "default_fov": 75.0,
-        "default_transition_sec": 2.0,
-        "keyframes": [
-            {
-                "matrix": matrix,
-                "fov": 60.0,
-                "aspect": 1.78,
-                "override_transition_enabled": i == 2,
-                "override_transition_sec": 0.5 if i == 2 else None,
-            }
-            for i, matrix in enumerate([IDENTITY, SHIFTED, IDENTITY])
-        ],
-        "camera_type": "perspective",
-        "render_height": 1080,
-        "render_width": 1920,
-        "fps": 30.0,
-        "seconds": 2.5,
-        "is_cycle": False,
-        "smoothness_value": 0.0,
-        "camera_path": [{"camera_to_world": m, "fov": 60.0, "aspect": 1.78} for m in (IDENTITY, SHIFTED)],
-    }
-    return values | changes
 
 
 def read(tmp_path: Path, values: Any) -> PathFile:
@@ -396,36 +356,39 @@ def test_the_window_shows_the_path_at_that_moment(
     offscreen = pytest.importorskip("rendercanvas.offscreen")
     pytest.importorskip("imgui_bundle")
     from lapgs_wgpu.viewer import app as app_module
-    from lapgs_wgpu.viewer.opened import open_scene
-    from lapgs_wgpu.viewer.start import Start
+    from lapgs_wgpu.viewer import viewport as viewport_module
+    from lapgs_wgpu.viewer.initial_state import InitialState
+    from lapgs_wgpu.viewer.loaded_scene import load_scene
 
     grid = HashConfig(2, (4, 4, 4), (8, 8, 8), 10)
     config = FieldConfig(static=grid, temporal=grid, width=8)
     scene = Scene4D.from_points(np.eye(3), np.eye(3), np.full(3, 0.2), config, device=device)
     scene.save(tmp_path / "a.ply")
     now = [50.0]
-    monkeypatch.setattr(app_module, "time", SimpleNamespace(perf_counter=lambda: now[0]))
+    for module in (app_module, viewport_module):
+        monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=lambda: now[0]))
     canvas = offscreen.RenderCanvas(size=(64, 48), pixel_ratio=1)
-    app = app_module.App(canvas, offscreen.loop, open_scene(tmp_path / "a.ply", lambda: device))
-    Start(time=0.2, speed=0.5, loop="bounce", mode="depth", fps=12.0, background=(1.0, 1.0, 1.0)).apply(app)
-    assert (app.clock.time, app.clock.speed, app.clock.loop, app.clock.fps) == (0.2, 0.5, "bounce", 12.0)
-    assert (app.mode, app.background, app.clock.playing) == ("depth", (1.0, 1.0, 1.0), False)
+    app = app_module.App(canvas, offscreen.loop, load_scene(tmp_path / "a.ply", lambda: device))
+    state = app.state
+    InitialState(time=0.2, speed=0.5, loop="bounce", mode="depth", fps=12.0, background=(1.0, 1.0, 1.0)).apply(state)
+    assert (state.clock.time, state.clock.speed, state.clock.loop, state.clock.fps) == (0.2, 0.5, "bounce", 12.0)
+    assert (state.mode, state.background, state.clock.playing) == ("depth", (1.0, 1.0, 1.0), False)
     for turn, time in ((0.0, 0.2), (0.7, 0.8)):
-        app.camera.orbit(turn, 0.1)
-        app.clock.seek(time)
-        app.add_key_frame()
-    path = app.path.path
+        state.camera.orbit(turn, 0.1)
+        state.clock.seek(time)
+        state.add_key_frame()
+    path = state.path.path
     assert path is not None
-    app.path.play(now[0])
+    state.path.play(now[0])
     for now[0] in (50.0, 50.4, 51.9, 52.3):  # frames were dropped in between
         canvas.draw()
         pose, time = path.at(now[0] - 50.0)
-        assert app.frame is not None
-        request = app.frame.request
+        assert app.viewport.frame is not None
+        request = app.viewport.frame.request
         assert request.time == pytest.approx(time)
         np.testing.assert_allclose(request.camera.position, pose.position, atol=1e-9)
         np.testing.assert_allclose(request.camera.T_cam_world[:3, :3], pose.rotation, atol=1e-9)
-    assert app.path.started is None
-    app.path.play(now[0])
+    assert state.path.started is None
+    state.path.play(now[0])
     app.controls._on_pointer_down({"x": 5, "y": 5, "button": 1, "modifiers": ()})
-    assert app.path.started is None
+    assert state.path.started is None

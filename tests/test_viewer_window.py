@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from desktop import PATIENCE, Desktop
+from helpers.desktop import PATIENCE, Desktop
+from helpers.scene_files import CONFIG
 from numpy.typing import NDArray
-from test_scene import CONFIG
 
 from lapgs_wgpu.data import Dataset, load_dataset
 from lapgs_wgpu.data.synthetic import write_synthetic

@@ -16,13 +16,13 @@ from lapgs_wgpu.motion.playback import Playback
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.rasterizer import GaussianBuffers, Rasterizer
 
-from .choices import MODES, Mode
 from .present import Placed
+from .render_modes import MODES, Mode
 
 _MOMENTS = 9  # times at which the Gaussians' places are compared
 
 
-class Request(NamedTuple):
+class FrameRequest(NamedTuple):
     """What to draw: equal requests give equal frames."""
 
     camera: Camera
@@ -37,7 +37,7 @@ class Frame:
     splats: how many touched the picture. passes: milliseconds of each pass, where they were asked for. exact: see
     Playback."""
 
-    request: Request
+    request: FrameRequest
     placed: Placed
     seconds: float
     splats: int
@@ -58,7 +58,7 @@ def warm_up(device: Device) -> None:
     rasterizer.grow()
 
 
-class Painter:
+class FrameRenderer:
     """Draws frames of one scene with buffers of its own; a frame is valid until the next one is drawn."""
 
     def __init__(self, playback: Playback) -> None:
@@ -79,7 +79,7 @@ class Painter:
             missing.add("dynamics")
         return [mode for mode in MODES if mode not in missing]
 
-    def draw(self, request: Request, *, passing: bool = False, profile: bool = False) -> Frame:
+    def draw(self, request: FrameRequest, *, passing: bool = False, profile: bool = False) -> Frame:
         """Draw, and wait until it is done. passing: while something moves; Gaussians may then be of other times where
         nobody sees it. profile: take the time of each pass, where the device can."""
         start = time.perf_counter()

@@ -11,7 +11,6 @@ import signal
 import time
 from collections.abc import Iterator
 from types import FrameType
-from typing import Protocol
 
 from rendercanvas.utils.asyncs import sleep
 
@@ -20,7 +19,8 @@ from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.motion.scene_playback import ScenePlayback
 
 from .app import App
-from .opened import Opened
+from .loaded_scene import LoadedScene
+from .training_control import TrainingControl, TrainingStep
 
 SHARE = 0.02  # of the time may go into pictures while nobody moves anything
 _OPENING = 4.0  # seconds after the first step, in which the window draws what it begins with: shaders are compiled
@@ -28,36 +28,14 @@ _ATTENTION = 0.5  # seconds after a move in which the pictures come first
 _PATIENCE = 0.02  # seconds between looks at mouse and keys while the training rests
 
 
-class Progress(Protocol):
-    """What the viewer needs to know of a step that is done: which of how many, and the PSNR in dB of its view."""
-
-    @property
-    def step(self) -> int: ...
-    @property
-    def steps(self) -> int: ...
-    @property
-    def psnr(self) -> float: ...
-
-
-class Training:
-    """What the viewer's panel shows of a training, and where it pauses it.
-
-    last: the last step that was done. single: steps still to be done although it is paused.
-    """
-
-    def __init__(self) -> None:
-        self.last: Progress | None = None
-        self.paused = False
-        self.single = 0
-
-
-def watch(scene: Scene4D, look: InitialView, steps: Iterator[Progress]) -> None:
+def watch(scene: Scene4D, look: InitialView, steps: Iterator[TrainingStep]) -> None:
     """Show the scene in a window and take the training's steps, until the window is closed."""
     from .window import choose_backend, make_canvas
 
     canvas, loop = make_canvas(choose_backend("auto"), "training - lapgs-train", (1280, 720))
-    app = App(canvas, loop, Opened(None, ScenePlayback(scene), look), transport=True)
-    app.training = training = Training()
+    app = App(canvas, loop, LoadedScene(None, ScenePlayback(scene), look), transport=True)
+    state, viewport = app.state, app.viewport
+    state.training = training = TrainingControl()
     interrupt = signal.getsignal(signal.SIGINT)
 
     def on_interrupt(signum: int, frame: FrameType | None) -> None:
@@ -70,7 +48,7 @@ def watch(scene: Scene4D, look: InitialView, steps: Iterator[Progress]) -> None:
         begun: float | None = None
         pictured = spent = 0.0  # when the last picture was asked for, and the time that had gone into drawing then
         while True:
-            moving = not app.clock.playing and time.perf_counter() - app.moved_at < _ATTENTION
+            moving = not state.clock.playing and time.perf_counter() - viewport.moved_at < _ATTENTION
             if moving or (training.paused and not training.single):
                 await sleep(_PATIENCE)
                 continue
@@ -84,8 +62,8 @@ def watch(scene: Scene4D, look: InitialView, steps: Iterator[Progress]) -> None:
             begun = begun or now
             if now - begun < _OPENING:
                 pictured, spent = now, app.drawing_seconds
-            if training.paused or (not app.stale and now - pictured > (app.drawing_seconds - spent) / SHARE):
-                app.refresh()
+            if training.paused or (not viewport.stale and now - pictured > (app.drawing_seconds - spent) / SHARE):
+                viewport.refresh()
                 pictured, spent = now, app.drawing_seconds
             await sleep(0.0)
 

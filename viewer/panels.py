@@ -1,27 +1,29 @@
-"""The GUI over the picture (Dear ImGui): transport, view, overlay, files, help. It reads and sets App's attributes."""
+"""The GUI over the image (Dear ImGui): the view's panel, overlay, message, help."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from imgui_bundle import imgui
 from wgpu.utils.imgui import ImguiRenderer
 
-from .app import COMPARES, App
-from .choices import BACKGROUNDS, MODES
-from .clock import LOOPS, SPEEDS
-from .keys import KEYS, MOUSE
+from .file_browser import FileBrowser
+from .key_bindings import KEYS, MOUSE
 from .path_panel import draw_path
 from .present import HEAT
-
-if TYPE_CHECKING:
-    from .live import Training
+from .render_modes import BACKGROUNDS, COMPARES, MODES
+from .time_slider import draw_time_slider
+from .training_control import TrainingControl
+from .view_state import ViewState
+from .viewport import Viewport
 
 _FIXED = imgui.WindowFlags_.no_move | imgui.WindowFlags_.no_resize | imgui.WindowFlags_.no_saved_settings
 _BAR = _FIXED | imgui.WindowFlags_.no_title_bar | imgui.WindowFlags_.no_scrollbar
 _TEXT = _BAR | imgui.WindowFlags_.no_inputs | imgui.WindowFlags_.always_auto_resize | imgui.WindowFlags_.no_nav
 _GAP = 8.0
+_BAR_HEIGHT = 62.0  # of the time slider
 _SIDE = 230.0  # width of the panel at the left
 _ACCENT = (0.95, 0.60, 0.25, 1.0)
 _COMPARE_NAMES = ("no comparison", "side by side", "split", "error, 4 times")
@@ -38,23 +40,16 @@ class _Renderer(ImguiRenderer):
             event["stop_propagation"] = True
 
 
-def _slider_value() -> float:
-    """0 to 1 where the grab of the last item, a slider, stands in its middle under the mouse."""
-    half_grab = imgui.get_style().grab_min_size / 2 + 2  # imgui's own padding
-    left, right = imgui.get_item_rect_min().x + half_grab, imgui.get_item_rect_max().x - half_grab
-    return float((imgui.get_mouse_pos().x - left) / max(right - left, 1.0))
-
-
 class Panels:
-    """Draws the GUI of an App onto its canvas."""
+    """Draws the GUI of a ViewState onto the viewport's canvas. open_file: shows another file."""
 
-    def __init__(self, app: App) -> None:
-        self.app = app
+    def __init__(self, state: ViewState, viewport: Viewport, open_file: Callable[[Path], None]) -> None:
+        self.state, self.viewport = state, viewport
         self._covered: list[tuple[float, float, float, float]] = []
-        self._renderer = _Renderer(app.device.wgpu_device, app.canvas, app.format)
+        self._renderer = _Renderer(viewport.device.wgpu_device, viewport.canvas, viewport.format)
         self._renderer.set_gui(self._draw)
-        self._folder = app.opened.path.resolve().parent if app.opened.path else Path.cwd()
-        self._browsing = False
+        path = state.scene.path
+        self._files = FileBrowser(path.resolve().parent if path else Path.cwd(), open_file)
         imgui.get_io().set_ini_filename("")
         imgui.get_io().config_flags &= ~imgui.ConfigFlags_.nav_enable_keyboard  # the keys are the viewer's
         _style()
@@ -75,208 +70,137 @@ class Panels:
         imgui.end()
 
     def _draw(self) -> None:
-        app = self.app
+        state = self.state
         self._covered.clear()
-        if app.show_help:
+        if state.show_help:
             self._help()
-        if not app.show_panels:
+        if not state.show_panels:
             return
         self._view()
-        if app.show_overlay:
+        if state.show_overlay:
             self._overlay()
-        if app.show_transport:
-            self._transport()
-        if app.message:
-            self._message(app.message)
-
-    # The time slider -------------------------------------------------------------------------------------------------
-
-    def _transport(self) -> None:
-        app, clock = self.app, self.app.clock
-        width, height = app.canvas.get_logical_size()
-        bar = 62.0
-        imgui.set_next_window_pos((_GAP, height - bar - _GAP))
-        imgui.set_next_window_size((width - 2 * _GAP, bar))
-        imgui.begin("transport", None, _BAR)
-        imgui.begin_disabled(not app.opened.playback.moves)
-        last = clock.frames - 1
-        imgui.set_next_item_width(-1)
-        label = f"{clock.time:.3f}   frame {clock.frame} of {last}"
-        # imgui reads % in a format; the label has none.
-        moved, time = imgui.slider_float("##time", clock.time, 0.0, 1.0, label, imgui.SliderFlags_.no_input)
-        if imgui.is_item_deactivated() and imgui.is_mouse_released(imgui.MouseButton_.left):
-            # imgui leaves out where the mouse went since the last frame, which is far where frames take long.
-            moved, time = True, _slider_value()
-        if moved:
-            clock.playing = False
-            clock.seek(min(max(time, 0.0), 1.0))
-        for text, action in (("|<", app.first_frame), ("<", app.previous_frame)):
-            if imgui.button(text, (32, 0)):
-                action()
-            imgui.same_line()
-        if imgui.button("Pause" if clock.playing else "Play", (64, 0)):
-            app.toggle_playing()
-        imgui.same_line()
-        for text, action in ((">", app.next_frame), (">|", app.last_frame)):
-            if imgui.button(text, (32, 0)):
-                action()
-            imgui.same_line()
-        imgui.set_next_item_width(70)
-        changed, fps = imgui.input_float("fps", clock.fps, 0.0, 0.0, "%.4g")
-        if changed:
-            clock.fps = min(max(fps, 0.1), 1000.0)
-        imgui.same_line()
-        imgui.set_next_item_width(70)
-        speeds = [f"{speed:g}x" for speed in SPEEDS]
-        present = SPEEDS.index(clock.speed) if clock.speed in SPEEDS else SPEEDS.index(1.0)
-        changed, chosen = imgui.combo("speed", present, speeds)
-        if changed:
-            clock.speed = SPEEDS[chosen]
-        imgui.same_line()
-        imgui.set_next_item_width(84)
-        changed, chosen = imgui.combo("##loop", LOOPS.index(clock.loop), list(LOOPS))
-        if changed:
-            clock.loop = LOOPS[chosen]
-        imgui.end_disabled()
-        self._end()
+        if state.show_transport:
+            width, height = self.viewport.canvas.get_logical_size()
+            imgui.set_next_window_pos((_GAP, height - _BAR_HEIGHT - _GAP))
+            imgui.set_next_window_size((width - 2 * _GAP, _BAR_HEIGHT))
+            imgui.begin("transport", None, _BAR)
+            draw_time_slider(state)
+            self._end()
+        if state.message:
+            self._message(state.message)
 
     # The panel at the left -------------------------------------------------------------------------------------------
 
     def _view(self) -> None:
-        app = self.app
+        state = self.state
         imgui.set_next_window_pos((_GAP, _GAP))
         imgui.set_next_window_size((_SIDE, 0))
         imgui.begin("View", None, _FIXED)
-        modes = app.painter.modes()
+        modes = state.renderer.modes()
         imgui.set_next_item_width(-70)
-        changed, chosen = imgui.combo("mode", modes.index(app.mode), list(modes))
+        changed, chosen = imgui.combo("mode", modes.index(state.mode), list(modes))
         if changed:
-            app.mode = modes[chosen]
-        _tip(MODES[app.mode])
-        if app.frame is not None and app.frame.placed.shows in ("depth", "value"):
-            _legend(app.frame.placed.low, app.frame.placed.high)
+            state.mode = modes[chosen]
+        _tip(MODES[state.mode])
+        frame = self.viewport.frame
+        if frame is not None and frame.placed.shows in ("depth", "value"):
+            _legend(frame.placed.low, frame.placed.high)
         names = list(BACKGROUNDS)
         colours = list(BACKGROUNDS.values())
         imgui.set_next_item_width(-70)
-        present = colours.index(app.background) if app.background in colours else 0
+        present = colours.index(state.background) if state.background in colours else 0
         changed, chosen = imgui.combo("ground", present, names)
         if changed:
-            app.background = colours[chosen]
+            state.background = colours[chosen]
         _tip("background")
         for text, action, tip in (
-            ("Reset", app.reset_camera, "camera back to where it started (R)"),
-            ("Open", self._toggle_browsing, "another .ply file; one can also be dropped on the window"),
-            ("Help", app.toggle_help, "keys and mouse (?)"),
+            ("Reset", state.reset_camera, "camera back to where it started (R)"),
+            ("Open", self._files.toggle, "another .ply file; one can also be dropped on the window"),
+            ("Help", state.toggle_help, "keys and mouse (?)"),
         ):
             if imgui.button(text, (66, 0)):
                 action()
             _tip(tip)
             imgui.same_line()
         imgui.new_line()
-        if app.flying:
+        if state.flying:
             imgui.text_colored(_ACCENT, "flying: W A S D Q E, V ends")
-        if app.training is not None:
-            self._training(app.training)
-        if app.capture is not None:
+        if state.training is not None:
+            self._training(state.training)
+        if state.capture is not None:
             self._capture()
-        draw_path(app)
-        if self._browsing:
-            self._files()
+        draw_path(state, self.viewport)
+        self._files.draw()
         self._end()
 
-    def _training(self, training: Training) -> None:
+    def _training(self, training: TrainingControl) -> None:
         imgui.separator_text("Training")
         last = training.last
         if last is not None:
             imgui.progress_bar(last.step / last.steps, (-1, 0), f"step {last.step} of {last.steps}")
-            imgui.text(f"{last.psnr:.2f} dB   {self.app.opened.playback.count:,} Gaussians")
+            imgui.text(f"{last.psnr:.2f} dB   {self.state.scene.playback.count:,} Gaussians")
         if imgui.button("Go on" if training.paused else "Pause", (66, 0)):
-            self.app.toggle_pause()
+            training.toggle_pause()
         imgui.same_line()
         if imgui.button("Step", (66, 0)):
-            self.app.step_training()
+            training.step()
         _tip("one step of the optimiser, then pause")
 
     def _capture(self) -> None:
-        app = self.app
-        assert app.capture is not None
+        state = self.state
+        assert state.capture is not None
         imgui.separator_text("Capture")
-        names = [view.name for view in app.capture.views]
+        names = [view.name for view in state.capture.views]
         imgui.set_next_item_width(-70)
-        changed, chosen = imgui.combo("camera", -1 if app.view is None else app.view, names)
+        changed, chosen = imgui.combo("camera", -1 if state.view is None else state.view, names)
         if changed:
-            app.stand_at(chosen)
+            state.stand_at(chosen)
         imgui.set_next_item_width(-1)
-        changed, chosen = imgui.combo("##compare", COMPARES.index(app.compare), list(_COMPARE_NAMES))
+        changed, chosen = imgui.combo("##compare", COMPARES.index(state.compare), list(_COMPARE_NAMES))
         if changed:
-            app.compare = COMPARES[chosen]
-            if app.view is None:
-                app.stand_at(0)
-        if app.compare != "off" and app.comparing() == "off":
+            state.compare = COMPARES[chosen]
+            if state.view is None:
+                state.stand_at(0)
+        if state.compare != "off" and state.comparing() == "off":
             imgui.text_wrapped("The capture has no picture of this camera and time; N goes to the next that it has.")
-
-    # Files -----------------------------------------------------------------------------------------------------------
-
-    def _toggle_browsing(self) -> None:
-        self._browsing = not self._browsing
-
-    def _files(self) -> None:
-        """A small file dialog: it works the same in a window and in a browser."""
-        imgui.separator_text("Open")
-        imgui.text_wrapped(str(self._folder))
-        imgui.begin_child("files", (0, 180), imgui.ChildFlags_.borders)
-        if imgui.selectable("../", False)[0]:
-            self._folder = self._folder.parent
-        try:
-            entries = sorted(self._folder.iterdir())
-        except OSError as error:
-            entries = []
-            imgui.text_wrapped(str(error))
-        for entry in entries:
-            if entry.name.startswith("."):
-                continue
-            if entry.is_dir() and imgui.selectable(f"{entry.name}/", False)[0]:
-                self._folder = entry
-            elif entry.suffix.lower() == ".ply" and imgui.selectable(entry.name, False)[0]:
-                self._browsing = False
-                self.app.open(entry)
-        imgui.end_child()
 
     # Texts over the picture ------------------------------------------------------------------------------------------
 
     def _overlay(self) -> None:
-        app = self.app
-        if app.frame is None:
+        state, viewport = self.state, self.viewport
+        if viewport.frame is None:
             return
-        width, _ = app.canvas.get_logical_size()
+        width, _ = viewport.canvas.get_logical_size()
         imgui.set_next_window_pos((width - _GAP, _GAP), imgui.Cond_.always, (1.0, 0.0))
         imgui.set_next_window_bg_alpha(0.6)
         # Not without inputs: its one check box must be reached.
         imgui.begin("overlay", None, _BAR | imgui.WindowFlags_.always_auto_resize | imgui.WindowFlags_.no_nav)
-        frame, camera = app.frame, app.frame.request.camera
-        rate = f"{app.fps:.0f} fps" if app.fps else "at rest"
+        frame, camera = viewport.frame, viewport.frame.request.camera
+        rate = f"{viewport.fps:.0f} fps" if viewport.fps else "at rest"
         imgui.text(f"{rate}   {1000 * frame.seconds:.1f} ms a frame")
-        imgui.text(f"{frame.splats:,} of {app.opened.playback.count:,} splats")
-        imgui.text(f"{camera.width}x{camera.height}" + (f" ({100 * app.scale:.0f} %)" if app.scale < 1 else ""))
-        imgui.text(app.device.info.name[:34])
-        _, app.profiling = imgui.checkbox("passes", app.profiling)
+        imgui.text(f"{frame.splats:,} of {state.scene.playback.count:,} splats")
+        imgui.text(
+            f"{camera.width}x{camera.height}" + (f" ({100 * viewport.scale:.0f} %)" if viewport.scale < 1 else "")
+        )
+        imgui.text(viewport.device.info.name[:34])
+        _, state.profiling = imgui.checkbox("passes", state.profiling)
         for name, milliseconds in sorted(frame.passes.items(), key=lambda entry: -entry[1]):
             imgui.text(f"{milliseconds:7.2f} ms {name}")
         self._end()
 
     def _message(self, message: str) -> None:
-        app = self.app
-        width, _ = app.canvas.get_logical_size()
+        state = self.state
+        width, _ = self.viewport.canvas.get_logical_size()
         imgui.set_next_window_pos((0.5 * width, _GAP), imgui.Cond_.always, (0.5, 0.0))
         imgui.set_next_window_size((min(420.0, width - 2 * _GAP), 0))
         imgui.begin("message", None, _BAR)
         imgui.text_wrapped(message)
         if imgui.button("OK"):
-            app.message = None
+            state.message = None
         self._end()
 
     def _help(self) -> None:
-        width, height = self.app.canvas.get_logical_size()
+        width, height = self.viewport.canvas.get_logical_size()
         imgui.set_next_window_pos((0.5 * width, 0.5 * height), imgui.Cond_.always, (0.5, 0.5))
         _, stays = imgui.begin("Keys and mouse", True, _FIXED | imgui.WindowFlags_.always_auto_resize)
         if imgui.begin_table("keys", 2):
@@ -288,7 +212,7 @@ class Panels:
                 imgui.text(text)
             imgui.end_table()
         self._end()
-        self.app.show_help = bool(stays)
+        self.state.show_help = bool(stays)
 
 
 def _tip(text: str) -> None:

@@ -62,7 +62,7 @@ class PathEditor:
         self.keys = list(CameraPath(self.keys).keys) if self.keys else []
 
     def play(self, now: float) -> None:
-        """Start the preview, or end it."""
+        """InitialState the preview, or end it."""
         self.started = None if self.started is not None or len(self.keys) < 2 else now
 
     def preview(self, now: float) -> tuple[Pose, float] | None:

@@ -1,39 +1,37 @@
-"""The part of the GUI that makes camera paths."""
+"""The panel's section for camera paths."""
 
 from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from imgui_bundle import imgui
 
 from lapgs_wgpu.errors import InputError
 
 from .path_editor import beside
+from .view_state import ViewState
+from .viewport import Viewport
 
-if TYPE_CHECKING:
-    from .app import App
 
-
-def draw_path(app: App) -> None:
-    """A section of the panel at the left: the key-frames, and what can be done with them."""
-    editor = app.path
-    if app.show_path:
+def draw_path(state: ViewState, viewport: Viewport) -> None:
+    """Draw the key-frames and their buttons into the present imgui window."""
+    editor = state.path
+    if state.show_path:
         imgui.set_next_item_open(True)
-        app.show_path = False
+        state.show_path = False
     if not imgui.collapsing_header("Camera path"):
         return
     if imgui.button("Add (K)", (66, 0)):
-        app.add_key_frame()
+        state.add_key_frame()
     imgui.same_line()
     imgui.begin_disabled(len(editor.keys) < 2)
     if imgui.button("Play" if editor.started is None else "Stop", (66, 0)):
         editor.play(time.perf_counter())
     imgui.end_disabled()
-    file = beside(app.opened.path or Path("training.ply"))
+    file = beside(state.scene.path or Path("training.ply"))
     for text, action, possible in (
-        ("Save", lambda: editor.save(file, app.canvas.get_physical_size(), app.clock.fps), bool(editor.keys)),
+        ("Save", lambda: editor.save(file, viewport.canvas.get_physical_size(), state.clock.fps), bool(editor.keys)),
         ("Load", lambda: editor.load(file), file.is_file()),
     ):
         if text == "Load":
@@ -42,9 +40,9 @@ def draw_path(app: App) -> None:
         if imgui.button(text, (66, 0)):
             try:
                 action()
-                app.message = f"{'saved' if text == 'Save' else 'loaded'} {file}"
+                state.message = f"{'saved' if text == 'Save' else 'loaded'} {file}"
             except InputError as error:
-                app.message = str(error)
+                state.message = str(error)
         imgui.end_disabled()
         if imgui.is_item_hovered():
             imgui.set_tooltip(str(file))
@@ -55,7 +53,7 @@ def draw_path(app: App) -> None:
         label = f"{number + 1}:  {key.second:.2f} s   time {key.time:.3f}##{number}"
         if imgui.selectable(label, editor.chosen == number)[0]:
             editor.chosen, editor.started = number, None
-            app.stand_on(key.pose, key.time)
+            state.stand_on(key.pose, key.time)
     imgui.end_child()
     if editor.chosen is not None:
         imgui.set_next_item_width(100)
@@ -66,7 +64,7 @@ def draw_path(app: App) -> None:
         if changed:
             editor.move(min(max(second, -3600.0), 86400.0))
         if imgui.button("Replace", (66, 0)):
-            editor.replace(app.camera, app.clock.time)
+            editor.replace(state.camera, state.clock.time)
         if imgui.is_item_hovered():
             imgui.set_tooltip("by the present camera and time")
         imgui.same_line()

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 
 from lapgs_wgpu.errors import InputError
 
-from .guard import LOCAL, Application, Guard, Receive, Scope, Send, answer, check_entry
-from .start import Start
+from .auth import LOCAL, Application, AuthMiddleware, Receive, Scope, Send, answer, check_entry
+from .initial_state import InitialState
 
 DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 8080
 _EVERYWHERE = ("0.0.0.0", "::")
@@ -74,7 +74,7 @@ def open_entry(host: str, port: int, token: str | None) -> Entry:
         raise InputError(f"--host {host} --port {port} cannot be listened on: {error.strerror}.") from None
 
 
-def run_remote(opened: Any, entry: Entry, *, transport: bool | None, start: Start) -> None:
+def run_remote(scene: Any, entry: Entry, *, transport: bool | None, start: InitialState) -> None:
     """Show it to browsers until Ctrl-C, which raises KeyboardInterrupt. transport, start: as for run_window."""
     import uvicorn
     from rendercanvas.http import asgi, loop
@@ -84,13 +84,13 @@ def run_remote(opened: Any, entry: Entry, *, transport: bool | None, start: Star
 
     # rendercanvas takes Ctrl-C from uvicorn when its loop starts, closes the canvas and leaves the server running.
     loop._BaseLoop__setup_interrupt_hooks = dict
-    name = opened.path.name if opened.path else "lapgs-view"
-    canvas = RemoteCanvas(opened.playback.device, title=name, update_mode="ondemand", max_fps=60)
-    viewer = App(canvas, loop, opened, transport=transport)
-    start.apply(viewer)
+    name = scene.path.name if scene.path else "lapgs-view"
+    canvas = RemoteCanvas(scene.playback.device, title=name, update_mode="ondemand", max_fps=60)
+    viewer = App(canvas, loop, scene, transport=transport)
+    start.apply(viewer.state)
     everywhere = entry.host in _EVERYWHERE
     names = [entry.host, entry.listening.getsockname()[0], *([socket.gethostname()] if everywhere else [])]
-    guard = Guard(pages(name, asgi), names=names, any_address=everywhere, token=entry.token)
+    guard = AuthMiddleware(pages(name, asgi), names=names, any_address=everywhere, token=entry.token)
     config = uvicorn.Config(
         guard,
         log_level="warning",
@@ -104,7 +104,7 @@ def run_remote(opened: Any, entry: Entry, *, transport: bool | None, start: Star
         ws_ping_timeout=30,
         timeout_graceful_shutdown=2,
     )
-    print(entry.welcome(str(opened.path or name)), file=sys.stderr, flush=True)
+    print(entry.welcome(str(scene.path or name)), file=sys.stderr, flush=True)
     asyncio.run(uvicorn.Server(config).serve(sockets=[entry.listening]))
     del viewer
     raise KeyboardInterrupt  # nothing else ends the server, but on a busy machine it may come to end without a word

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.atomic import atomic_write
+from lapgs_wgpu.progress import Progress
 from lapgs_wgpu.splat.camera import Camera
 
 from .camera import ViewCamera
 from .path import CameraPath
-from .progress import Progress
 
 Shot = tuple[Camera, float]  # a camera and a time in the clip
 PATHS = ("time", "view", "both")

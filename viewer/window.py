@@ -13,8 +13,8 @@ from typing import Any
 from lapgs_wgpu.errors import InputError
 
 from .app import App
-from .opened import Opened
-from .start import Start
+from .initial_state import InitialState
+from .loaded_scene import LoadedScene
 
 _OTHERWISE = "take --backend http to look in a browser (also from another machine), or --screenshot FILE.png"
 
@@ -37,7 +37,9 @@ def choose_backend(wanted: str) -> str:
     raise InputError(f"no window can be opened here ({reasons['glfw']}): {_OTHERWISE}.")
 
 
-def run_window(opened: Opened, *, backend: str, size: tuple[int, int], transport: bool | None, start: Start) -> None:
+def run_window(
+    scene: LoadedScene, *, backend: str, size: tuple[int, int], transport: bool | None, start: InitialState
+) -> None:
     """Show it until the window is closed. backend: what choose_backend returned. size: of the picture, logical pixels.
     transport: whether the time slider is shown; where the scene moves, by default. start: what else the window begins
     with. Raises InputError where the scene has no such thing."""
@@ -45,9 +47,9 @@ def run_window(opened: Opened, *, backend: str, size: tuple[int, int], transport
     def drop(path: Path) -> None:
         app.open(path)
 
-    canvas, loop = make_canvas(backend, f"{opened.path} - lapgs-view", size, drop)
-    app = App(canvas, loop, opened, transport=transport)
-    start.apply(app)
+    canvas, loop = make_canvas(backend, f"{scene.path} - lapgs-view", size, drop)
+    app = App(canvas, loop, scene, transport=transport)
+    start.apply(app.state)
     loop.run()
 
 

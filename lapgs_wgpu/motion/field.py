@@ -8,7 +8,7 @@ and "mlp".
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from .hashgrid import TIME, GridShape, HashConfig, option
@@ -34,10 +34,10 @@ MAX_WIDTH, MAX_DEPTH, MAX_COMPONENTS, MAX_DYNAMICS = 4096, 16, 256, 256
 class PlaneConfig:
     """The planes of the field hexplane."""
 
-    features: int = option(32, "features of a plane")
-    space: int = option(64, "entries along a spatial axis of the coarsest planes")
-    time: int = option(75, "entries along the time axis")
-    levels: int = option(2, "sets of planes, each of twice the spatial resolution of the one before")
+    features: int = option(32, "number of features per plane")
+    space: int = option(64, "resolution of the coarsest planes along each spatial axis")
+    time: int = option(75, "resolution along the time axis")
+    levels: int = option(2, "number of resolution levels; each doubles the spatial resolution of the level before")
 
     def __post_init__(self) -> None:
         if not (1 <= self.features <= 256 and 2 <= self.space <= 4096 and 2 <= self.time <= 4096):
@@ -55,31 +55,34 @@ class FieldConfig:
 
     kind: FieldKind = option(
         "laplacian",
-        "static (nothing moves), mlp (deformable 3DGS), hexplane (4D-GS), grid4d (Grid4D) or laplacian (the paper's); "
-        "this key changes the field alone, --field also leaves out what belongs to the paper's method only",
+        "deformation field: static (no motion), mlp (deformable 3DGS), hexplane (4D-GS), grid4d (Grid4D) or "
+        "laplacian (the paper's); changes the field only, whereas --field also turns off the paper's other "
+        "parts for the other methods",
     )
     bound: float = option(
-        1.6, "half side of the box that the encoder covers, world units; outside it features are zero"
+        1.6, "half side length of the cube that the encoder covers, world units; outside it the features are zero"
     )
-    static: HashConfig = field(default_factory=lambda: HashConfig(16, (16, 16, 16), (2048, 2048, 2048)))
-    temporal: HashConfig = field(default_factory=lambda: HashConfig(32, (8, 8, 8), (32, 32, 16)))
-    planes: PlaneConfig = field(default_factory=PlaneConfig)
-    width: int = option(256, "of the decoder")
-    depth: int = option(0, "hidden layers between the fused features and the heads")
-    time_scale: float = option(0.9, "share of the temporal grids' time axis that the clip fills")
-    temporal_hash: bool = option(True, "whether grid4d and laplacian have the three temporal grids")
+    static: HashConfig = option(HashConfig(16, (16, 16, 16), (2048, 2048, 2048)), "spatial hash grid (x, y, z)")
+    temporal: HashConfig = option(HashConfig(32, (8, 8, 8), (32, 32, 16)), "space-time hash grids (two axes and time)")
+    planes: PlaneConfig = option(PlaneConfig(), "planes of the field hexplane")
+    width: int = option(256, "width of the decoder's layers")
+    depth: int = option(0, "number of hidden layers between the fused features and the output heads")
+    time_scale: float = option(0.9, "fraction of the temporal grids' time axis that the clip occupies")
+    temporal_hash: bool = option(True, "grid4d and laplacian: use the three space-time hash grids")
     motion: Motion = option(
-        "laplacian", "of the field laplacian: laplacian (a spectrum), or mlp, a decoder of features and time instead"
+        "laplacian",
+        "field laplacian: how motion is decoded; laplacian: as a sum of sinusoids (the motion spectrum); mlp: "
+        "by an MLP of features and time instead",
     )
-    components: int = option(16, "frequencies of the spectrum")
+    components: int = option(16, "number of frequencies in the motion spectrum")
     frequency_step: float = option(
-        1.0, "from one frequency to the next at the start, which is at 0; cycles over the clip"
+        1.0, "initial spacing of the spectrum's frequencies, which start at 0; cycles per clip"
     )
-    amplitude: float = option(0.3, "standard deviation of the spectrum's sum at the start; 0.03 to 1 are reasonable")
-    dynamics: int = option(16, "length of each Gaussian's dynamics attribute with the field laplacian; 0 for none")
-    appearance: Appearance = option(
-        "color", "what the field laplacian changes besides the geometry: none, color, or color+opacity"
+    amplitude: float = option(
+        0.3, "initial standard deviation of the sum of the spectrum's components; useful values are 0.03 to 1"
     )
+    dynamics: int = option(16, "field laplacian: length of the dynamics attribute of each Gaussian; 0: none")
+    appearance: Appearance = option("color", "field laplacian: what the field changes over time besides geometry")
 
     def __post_init__(self) -> None:
         if not (0 < self.bound < 1e6 and 0 < self.time_scale <= 1):

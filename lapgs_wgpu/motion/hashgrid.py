@@ -19,10 +19,10 @@ def option(default: Any, help_text: str) -> Any:
 class HashConfig:
     """The shape of a grid."""
 
-    levels: int = option(16, "number of levels")
-    base: tuple[int, int, int] = option((16, 16, 16), "entries along each axis of the coarsest level")
-    finest: tuple[int, int, int] = option((2048, 2048, 2048), "entries along each axis of the finest level")
-    table_log2: int = option(19, "a level has at most 2^this entries, beyond which it is hashed")
+    levels: int = option(16, "number of resolution levels")
+    base: tuple[int, int, int] = option((16, 16, 16), "resolution of the coarsest level along each axis")
+    finest: tuple[int, int, int] = option((2048, 2048, 2048), "resolution of the finest level along each axis")
+    table_log2: int = option(19, "log2 of the largest number of entries per level; larger levels are hashed")
 
     def __post_init__(self) -> None:
         if not (1 <= self.levels <= 64 and 1 <= self.table_log2 <= 24):

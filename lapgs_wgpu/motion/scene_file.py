@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
-import typing
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..io.checkpoint import read_checkpoint
+from ..io.dataclass_table import build_dataclass
 from ..io.safe_json_toml import parse_json
-from .field import FieldConfig, PlaneConfig, plane_shapes, static_grid, temporal_grids
-from .hashgrid import HashConfig
+from .field import FieldConfig, plane_shapes, static_grid, temporal_grids
 
 _MAX_DEGREE = 3
 _SHAPES = {
@@ -79,13 +77,8 @@ def row_shapes(config: FieldConfig) -> dict[str, tuple[int, ...]]:
 
 def _read_header(metadata: Mapping[str, str], path: str | os.PathLike[str]) -> tuple[FieldConfig, int]:
     try:
-        values: dict[str, Any] = parse_json(metadata["field"], "its text")
-        for name in ("static", "temporal"):
-            grid: dict[str, Any] = values[name]
-            values[name] = HashConfig(grid["levels"], tuple(grid["base"]), tuple(grid["finest"]), grid["table_log2"])
-        values["planes"] = PlaneConfig(**values["planes"])
-        config, degree = FieldConfig(**values), int(metadata["sh_degree"])
-        _check_types(config, FieldConfig())
+        config = build_dataclass(FieldConfig, parse_json(metadata["field"], "its text"), "field")
+        degree = int(metadata["sh_degree"])
         if not 0 <= degree <= _MAX_DEGREE:
             raise ValueError(f"sh_degree {degree} is outside 0 to {_MAX_DEGREE}")
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
@@ -95,22 +88,6 @@ def _read_header(metadata: Mapping[str, str], path: str | os.PathLike[str]) -> t
             "it was damaged, or written by another version of lapgs_wgpu"
         ) from error
     return config, degree
-
-
-def _check_types(found: Any, like: Any) -> None:
-    """That a description has the types of another one: JSON may hold anything."""
-    if dataclasses.is_dataclass(like):
-        kinds = typing.get_type_hints(type(like))
-        for field in dataclasses.fields(like):
-            value, choices = getattr(found, field.name), typing.get_args(kinds[field.name])
-            if typing.get_origin(kinds[field.name]) is Literal and value not in choices:
-                raise ValueError(f"{field.name} is {value!r}")
-            _check_types(value, getattr(like, field.name))
-    elif isinstance(like, tuple):
-        for value, entry in zip(found, like, strict=True):
-            _check_types(value, entry)
-    elif type(found) is not type(like) and not (type(like) is float and type(found) is int):
-        raise TypeError(f"{found!r} has the wrong type")
 
 
 def _check_sizes(config: FieldConfig, tensors: Mapping[str, NDArray[Any]], path: str | os.PathLike[str]) -> None:

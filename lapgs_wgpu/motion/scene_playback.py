@@ -43,7 +43,7 @@ class ScenePlayback:
     """A Scene4D as it is at each call: parameters, their number and sh_degree may change in between. See Playback.
 
     It is evaluated only where the time, the degree or a parameter has changed, by torch's count of what was written to
-    it. Fused optimisers do not count by themselves (train/optimise).
+    it. Fused optimisers do not count by themselves (train/optimizer).
     """
 
     def __init__(self, scene: Scene4D) -> None:

@@ -29,31 +29,35 @@ def described(text: str, default: Any = dataclasses.MISSING) -> Any:
 
 @dataclass(frozen=True)
 class DataConfig:
-    """What is trained on."""
+    """The capture."""
 
-    size: int = described("longer side in pixels to which larger pictures are shrunk; 0 keeps them as they are")
+    size: int = described("longer side of the images, pixels; larger images are downscaled; 0 keeps the original size")
     background: Background = described(
-        "what transparent pictures are laid on; random is another colour at each step, and black when measuring"
+        "background behind transparent images; random: a new color in each step, black during evaluation"
     )
     cache_gb: float = described(
-        "bound on decoded pictures kept in memory, and on those on the device, in gigabytes; on both together where "
-        "the device shares the memory"
+        "memory limit for decoded images, gigabytes: one limit for host memory and one for device memory; a "
+        "single limit for both where the device shares host memory"
     )
     path: str = described(
-        'folder of the scene, or a built-in scene, "synthetic" or "motion:path=4,cycles=2", written beside the run', ""
+        'folder of the capture, or a built-in scene: "synthetic", or "motion:path=4,cycles=2"; a built-in '
+        "scene is generated next to the run folder",
+        "",
     )
 
 
 @dataclass(frozen=True)
 class PointsConfig:
-    """The Gaussians at the start."""
+    """The initial Gaussians."""
 
-    count: int = described("how many; of a cloud that the capture brings, at most")
-    box: float = described(
-        "half side of the cube around the origin in which they lie at random, world units, where the capture brings "
-        "neither a cloud nor the depths that its cameras see"
+    count: int = described(
+        "number of initial Gaussians; if the capture has a point cloud, the maximum number taken from it"
     )
-    opacity: float = described("of each, between 0 and 1")
+    box: float = described(
+        "half side length of the cube around the origin in which initial Gaussians are placed at random, "
+        "world units; used only if the capture has neither a point cloud nor depth maps"
+    )
+    opacity: float = described("initial opacity of each Gaussian, between 0 and 1")
 
     def __post_init__(self) -> None:
         if self.count < 1 or self.box <= 0 or not 0 < self.opacity < 1:
@@ -65,13 +69,18 @@ class PointsConfig:
 
 @dataclass(frozen=True)
 class ScheduleConfig:
-    """When things happen."""
+    """Lengths and intervals, in steps."""
 
-    steps: int = described("length of the training")
-    batch: int = described("pictures a step, whose gradients are averaged")
-    warm_up: int = described("steps at the start during which nothing moves")
-    sh_interval: int = described("steps after which the degree of the spherical harmonics grows by one, up to 3")
-    save_interval: int = described("steps from one saved state, from which --resume goes on, to the next; 0 for none")
+    steps: int = described("number of training steps")
+    batch: int = described("images per step; their gradients are averaged")
+    warm_up: int = described(
+        "number of initial steps without motion: the deformation field is off, and only the static Gaussians "
+        "are trained"
+    )
+    sh_interval: int = described(
+        "the degree of the spherical harmonics starts at 0 and increases by one every this many steps, up to 3"
+    )
+    save_interval: int = described("save the training state every this many steps, for --resume; 0: never")
 
     def __post_init__(self) -> None:
         if min(self.steps, self.batch, self.sh_interval) < 1:
@@ -83,9 +92,9 @@ class ScheduleConfig:
 class Rate:
     """A learning rate that goes from start to end exponentially and then stays there."""
 
-    start: float = described("at the beginning")
-    end: float = described("at the end")
-    steps: int = described("steps from start to end, counted from the beginning of the training")
+    start: float = described("initial value")
+    end: float = described("final value")
+    steps: int = described("steps of the exponential decay from the initial to the final value; constant afterwards")
 
     def __post_init__(self) -> None:
         if not (0 < self.start < math.inf and 0 < self.end < math.inf and self.steps >= 1):
@@ -104,16 +113,16 @@ class Rate:
 class RatesConfig:
     """Adam's learning rates, for each parameter of the Gaussians and for the field's hash tables and its MLP."""
 
-    means: Rate = described("learning rate of the positions, world units a step")
-    log_scales: float = described("learning rate of the logarithms of the scales")
-    quats: float = described("learning rate of the quaternions")
-    opacity_logits: float = described("learning rate of the opacities' logits")
-    sh_dc: float = described("learning rate of the colours' constant part")
-    sh_rest: float = described("learning rate of the colours' other spherical harmonics")
-    dynamics: float = described("learning rate of the dynamics attributes")
-    hash: Rate = described("learning rate of the field's hash tables, or planes")
-    mlp: Rate = described("learning rate of the field's other weights")
-    frequencies: Rate = described("learning rate of the spectrum's frequencies, cycles over the clip a step")
+    means: Rate = described("learning rate of the means, world units per step")
+    log_scales: float = described("learning rate of the log-scales")
+    quats: float = described("learning rate of the rotations (quaternions)")
+    opacity_logits: float = described("learning rate of the opacities (logits)")
+    sh_dc: float = described("learning rate of the base colors (spherical harmonics of degree 0)")
+    sh_rest: float = described("learning rate of the view-dependent colors (spherical harmonics of degree 1 to 3)")
+    dynamics: float = described("learning rate of the per-Gaussian dynamics attributes")
+    hash: Rate = described("learning rate of the field's hash tables or feature planes")
+    mlp: Rate = described("learning rate of the field's MLP weights")
+    frequencies: Rate = described("learning rate of the motion spectrum's frequencies, cycles per clip per step")
 
     def __post_init__(self) -> None:
         self.schedules()
@@ -126,42 +135,47 @@ class RatesConfig:
 
 @dataclass(frozen=True)
 class DensityConfig:
-    """When and how the number of Gaussians changes."""
+    """Densification and pruning."""
 
-    start: int = described("step after which it changes")
-    stop: int = described("step from which on it stays, and opacities are not reset any more")
-    interval: int = described("steps from one change to the next")
+    start: int = described("densify and prune only after this step")
+    stop: int = described("densify, prune and reset opacities only before this step")
+    interval: int = described("densify and prune every this many steps")
     gradient: float = described(
-        "mean length of the loss's gradient by the place on the image from which on a Gaussian is cloned or split; "
-        "in normalised device coordinates, in which an image is 2 wide and 2 high"
+        "densify (clone or split) Gaussians whose mean gradient norm of the 2-D mean exceeds this value; "
+        "normalized device coordinates, where the image is 2 units wide"
     )
     split_size: float = described(
-        "largest standard deviation up to which a Gaussian is cloned, beyond which split; in extents of the cameras"
+        "largest standard deviation of a Gaussian that is cloned; larger ones are split; relative to the "
+        "extent of the cameras"
     )
     split: Split = described(
-        "which of the large Gaussians of a large gradient are split: plain, all of them; adaptive, those that differ "
-        "most from their neighbours in shape and dynamics"
+        "which large Gaussians above the gradient threshold are split; plain: all; adaptive (the paper's): "
+        "those that differ most from their neighbors in shape and dynamics"
     )
-    neighbours: int = described("how many nearest Gaussians the adaptive split compares one with")
+    neighbours: int = described("adaptive split: number of nearest neighbors that each Gaussian is compared with")
     divergence_weight: float = described(
-        "weight of the differences in dynamics against those in shape in the score of the adaptive split"
+        "adaptive split: weight of the difference in dynamics relative to the difference in shape"
     )
     split_quantile: float = described(
-        "share of these Gaussians, those of the lowest scores, that the adaptive split leaves as they are, unless "
-        "their dynamics stand out"
+        "adaptive split: fraction of the candidates, those with the lowest scores, that are not split unless "
+        "their dynamics differ strongly"
     )
-    min_opacity: float = described("Gaussians below it are removed, but for the 256 most opaque ones")
+    min_opacity: float = described(
+        "prune Gaussians with an opacity below this value; the 256 most opaque ones always stay"
+    )
     max_screen_radius: float = described(
-        "Gaussians that were larger on an image are removed, in pixels, from the first reset on; 0 for no bound"
+        "prune Gaussians that had a larger radius in a rendered image, pixels; applies after the first "
+        "opacity reset; 0: no limit"
     )
     max_world_size: float = described(
-        "Gaussians of a larger standard deviation are removed, in extents of the cameras, from the first reset on; "
-        "0 for no bound"
+        "prune Gaussians with a larger standard deviation, relative to the extent of the cameras; applies "
+        "after the first opacity reset; 0: no limit"
     )
-    reset_interval: int = described("steps from one reset of the opacities to the next")
-    reset_opacity: float = described("what opacities are lowered to")
+    reset_interval: int = described("reset the opacities every this many steps")
+    reset_opacity: float = described("an opacity reset lowers all larger opacities to this value")
     limit: int = described(
-        "no more Gaussians than this: those of the largest gradients are cloned or split first; 0 for no bound", 0
+        "maximum number of Gaussians; at the limit, those with the largest gradients are densified first; 0: no limit",
+        0,
     )
 
     def __post_init__(self) -> None:
@@ -203,15 +217,20 @@ class LossWeights(NamedTuple):
 
 @dataclass(frozen=True)
 class LossConfig:
-    """What is minimised."""
+    """The training loss."""
 
-    ssim: float = described("share w of the structural similarity in (1 - w) L1 + w (1 - SSIM)")
-    pyramid: float = described("weight of the Laplacian pyramids' difference, which is added; 0 leaves it out")
-    ncc: float = described("weight of 1 - local cross-correlation, added once the warm-up is over; 0 leaves it out")
-    dynamics: float = described("weight of the regularisation of the dynamics attributes (paper eq. 12)")
+    ssim: float = described("weight w of the structural similarity; the image loss is (1 - w) L1 + w (1 - SSIM)")
+    pyramid: float = described(
+        "weight of the Laplacian pyramid loss (L1 between the pyramids of the two images), added to the image "
+        "loss; 0: off"
+    )
+    ncc: float = described(
+        "weight of 1 - local normalized cross-correlation, added to the image loss after the warm-up; 0: off"
+    )
+    dynamics: float = described("weight of the regularization of the dynamics attributes (paper eq. 12)")
     dynamics_mode: DynamicsMode = described(
-        "what it does to outliers: literal (pulls them in, as the paper's equation), promote (pushes them out, as its "
-        "text) or off"
+        "sign of the dynamics regularization; literal: pulls outliers towards the mean, as in the paper's "
+        "equation; promote: pushes outliers away, as in the paper's text; off: no regularization"
     )
 
     def __post_init__(self) -> None:
@@ -225,13 +244,15 @@ class LossConfig:
 
 @dataclass(frozen=True)
 class SmoothnessConfig:
-    """The loss that keeps the field smooth: squared differences of its features at near places (Grid4D)."""
+    """The smoothness loss: squared differences of the field's features at nearby points (Grid4D)."""
 
-    static: float = described("weight for features of place")
-    temporal: float = described("weight for features of place and time")
-    share: float = described("of the Gaussians that are compared in a step, between 0 and 1; 0 leaves the loss out")
-    reach: float = described("how far away the other place is at most along each axis, world units")
-    time_reach: float = described("how far away the other time is at most, in clips")
+    static: float = described("weight of the smoothness loss on the features of the spatial grid")
+    temporal: float = described("weight of the smoothness loss on the features of the space-time grids")
+    share: float = described(
+        "fraction of the Gaussians that the smoothness loss samples in each step, between 0 and 1; 0: off"
+    )
+    reach: float = described("largest offset between the two sampled positions along each axis, world units")
+    time_reach: float = described("largest offset between the two sampled times, as a fraction of the clip")
 
     def __post_init__(self) -> None:
         if self.share > 1:
@@ -240,18 +261,20 @@ class SmoothnessConfig:
 
 @dataclass(frozen=True)
 class DiscoveryConfig:
-    """Search for what moves before the training (train/discovery). With defaults: older runs lack it."""
+    """Motion discovery before the training (train/discovery). Has defaults, since older config.toml files lack it."""
 
     enabled: bool = described(
-        "whether things that move far are searched for before the first step, and start with Gaussians of their own; "
-        "left out by the field static and by trainings that are no longer than discovery.steps",
+        "before training, search for objects that move far, and initialize Gaussians on them; skipped for the "
+        "field static and if schedule.steps is at most discovery.steps",
         False,
     )
-    steps: int = described("steps of the static fit that shows what stands still", 800)
-    size: int = described("longer side in pixels of the images that the static fit and the search see", 100)
-    field_steps: int = described("steps in which the field learns the motion that was found", 500)
+    steps: int = described("training steps of the static model that separates what moves from what does not", 800)
+    size: int = described("longer side of the images for this search, pixels", 100)
+    field_steps: int = described("steps that fit the deformation field to the motion that was found", 500)
     least: float = described(
-        "share of the moving surface points that the static fit must lack, below which nothing is added", 0.05
+        "minimum fraction of the moving surface points that the static model must miss; below it, no "
+        "Gaussians are added",
+        0.05,
     )
 
     def __post_init__(self) -> None:
@@ -264,21 +287,21 @@ class DiscoveryConfig:
 
 @dataclass(frozen=True)
 class ExposureConfig:
-    """Colours of cameras that do not keep their exposure or their white balance. With defaults: older runs lack it."""
+    """Per-image color correction. Has defaults, since older config.toml files lack it."""
 
     enabled: bool = described(
-        "whether each training picture has an affine correction of its colours, which is learnt; a correction is never "
-        "applied to the pictures that are measured",
+        "learn an affine color correction for each training image, for cameras with varying exposure or white "
+        "balance; never applied in evaluation",
         False,
     )
     rate: Rate = dataclasses.field(
-        default=Rate(2e-2, 2e-3, 20_000), metadata={"help": "learning rate of a picture's correction"}
+        default=Rate(2e-2, 2e-3, 20_000), metadata={"help": "learning rate of the color corrections"}
     )
 
 
 @dataclass(frozen=True)
 class Config:
-    """All that a training depends on, besides the pictures."""
+    """The configuration of a training."""
 
     data: DataConfig
     points: PointsConfig
@@ -288,18 +311,18 @@ class Config:
     density: DensityConfig
     loss: LossConfig
     smoothness: SmoothnessConfig
-    seed: int = described("of every random draw")
+    seed: int = described("seed of all random numbers")
     exposure: ExposureConfig = dataclasses.field(default=ExposureConfig())
     discovery: DiscoveryConfig = dataclasses.field(default=DiscoveryConfig())
     precision: Precision = described(
-        "of the field's features, and of its decoder's products and their gradients; bfloat16 is faster on processors "
-        "that have instructions for it; parameters, sums, images and everything after the training are float32",
+        "data type of the field's features and of its decoder's matrix products and their gradients; bfloat16 "
+        "is faster on processors with bfloat16 instructions; everything else is float32",
         "float32",
     )
     decoder: DecoderPlace = described(
-        "where the decoder of the fields grid4d and laplacian works while training: torch, device (by kernels, which "
-        "changes the last bits), or auto: on the device where it is no CPU and a trial at the start finds it faster; "
-        "config.toml then says which it was",
+        "where the decoder of the fields grid4d and laplacian runs during training; torch: on the CPU; "
+        "device: as kernels on the device, which changes the last bits; auto: torch on CPU devices, otherwise "
+        "the faster of the two in a trial at the start, recorded in config.toml",
         "torch",
     )
 

@@ -6,7 +6,6 @@ import json
 import math
 import platform
 import subprocess
-import sys
 import time
 from collections import deque
 from contextlib import suppress
@@ -19,11 +18,10 @@ from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.motion.laplacian import LaplacianMotion
+from lapgs_wgpu.progress import Progress, duration
 
 INTERVAL = 50  # steps from one line of log.jsonl to the next, over which loss and PSNR are averaged
-TERMINAL_SECONDS = 0.25  # from one redraw of the progress line to the next
 _MOST_SECONDS = 1e9  # that a training takes
-FILE_SECONDS = 15.0  # the same where stderr is no terminal, and each is a line of its own
 
 
 class Log:
@@ -37,13 +35,13 @@ class Log:
 
     def __init__(self, path: Path, steps: int, *, done: int = 0, terminal: TextIO | None = None) -> None:
         self._steps = steps
-        self._terminal = terminal or sys.stderr
+        self._progress = Progress(steps, "steps", terminal)
         self._path = path
         self._file, before = _continued(path, done)
         self._recent: deque[tuple[float, float]] = deque(maxlen=INTERVAL)
-        self._shown = time.perf_counter()
-        self._start = self._shown - before
-        self._times: deque[float] = deque([self._shown], maxlen=INTERVAL + 1)
+        now = time.perf_counter()
+        self._start = now - before
+        self._times: deque[float] = deque([now], maxlen=INTERVAL + 1)
 
     def __enter__(self) -> Log:
         return self
@@ -51,8 +49,7 @@ class Log:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        if self._terminal.isatty():
-            self._tell("\n")
+        self._progress.__exit__(kind, error, traceback)
         self._file.close()
 
     @property
@@ -71,8 +68,7 @@ class Log:
         if not self._recent:
             return
         rate = (len(self._times) - 1) / max(now - self._times[0], 1e-9)
-        last = step == self._steps
-        if step % INTERVAL == 0 or last:
+        if step % INTERVAL == 0 or step == self._steps:
             mean_loss, mean_psnr = (sum(values) / len(self._recent) for values in zip(*self._recent, strict=True))
             line = {
                 "step": step,
@@ -83,16 +79,15 @@ class Log:
                 "timing": {"seconds": round(now - self._start, 3), "steps_per_second": round(rate, 3)},
             }
             self._write(json.dumps(line) + "\n")
-        on_terminal = self._terminal.isatty()
-        if last or now - self._shown >= (TERMINAL_SECONDS if on_terminal else FILE_SECONDS):
-            self._shown = now
+
+        def text() -> str:
             smooth = sum(psnr for _, psnr in self._recent) / len(self._recent)
-            left = (self._steps - step) / rate
-            text = (
-                f"step {step}/{self._steps}  {smooth:5.2f} dB  {gaussians} Gaussians  "
-                f"{rate:.1f} steps/s  {_clock(left)} left"
+            left = duration((self._steps - step) / rate)
+            return (
+                f"step {step}/{self._steps}  {smooth:5.2f} dB  {gaussians} Gaussians  {rate:.1f} steps/s  {left} left"
             )
-            self._tell(f"\r\x1b[2K{text}" if on_terminal else f"{text}\n")
+
+        self._progress.at(step, text)
 
     def _write(self, line: str) -> None:
         try:
@@ -103,15 +98,9 @@ class Log:
                 f"lapgs-train --resume {self._path.parent} goes on from the last saved state"
             ) from error
 
-    def _tell(self, text: str) -> None:
-        with suppress(OSError):  # nobody reads it any more, or it goes into a file on a full disk: no reason to stop
-            self._terminal.write(text)
-            self._terminal.flush()
-
     def tell(self, text: str) -> None:
         """A line of its own on the terminal."""
-        self._terminal.write(f"\r\x1b[2K{text}\n" if self._terminal.isatty() else f"{text}\n")
-        self._terminal.flush()
+        self._progress.note(text)
 
 
 def _continued(path: Path, done: int) -> tuple[BinaryIO, float]:
@@ -134,12 +123,6 @@ def _continued(path: Path, done: int) -> tuple[BinaryIO, float]:
 def _spectrum(motion: LaplacianMotion) -> dict[str, list[float]]:
     values = {"frequencies": motion.frequencies.detach(), "amplitudes": motion.amplitudes()}
     return {name: [round(value, 6) for value in tensor.tolist()] for name, tensor in values.items()}
-
-
-def _clock(seconds: float) -> str:
-    minutes, seconds = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes}:{seconds:02d}"
 
 
 def environment(device: Device) -> dict[str, str]:

@@ -6,24 +6,24 @@ A file names every key, or starts from another preset (`base = "dnerf"`) and nam
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import importlib.resources
 import json
 import typing
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 from lapgs_wgpu.errors import InputError, shown
+from lapgs_wgpu.io.dataclass_table import build_dataclass, checked, did_you_mean, field_types
 from lapgs_wgpu.io.safe_json_toml import read_toml
 from lapgs_wgpu.motion.field import FieldKind
 from lapgs_wgpu.train.config import Config
 
 Table = dict[str, Any]
 
-# What only the paper's method has, besides its field: left out with every other one.
+# The paper's parts beside its field: off for every other method.
 PAPER_ONLY = {"loss.pyramid": 0.0, "loss.ncc": 0.0, "density.split": "plain"}
-# The parts of the method that --ablate takes out, and what is set then.
+# The parts of the method that --ablate turns off: the keys that it sets, and its help text.
 ABLATIONS: dict[str, dict[str, Any]] = {
     "laplacian": {"field.motion": "mlp"},
     "dynamics": {"field.dynamics": 0},
@@ -34,8 +34,16 @@ ABLATIONS: dict[str, dict[str, Any]] = {
     "hash": {"field.temporal_hash": False},
     "appearance": {"field.appearance": "none"},
 }
-
-LARGEST_NUMBER = 2**31 - 1  # no key has a use for more
+ABLATION_HELP = {
+    "laplacian": "motion spectrum, replaced by an MLP",
+    "dynamics": "dynamics attributes",
+    "split": "adaptive split",
+    "lap": "Laplacian pyramid loss",
+    "ncc": "cross-correlation loss",
+    "dy": "dynamics regularization",
+    "hash": "space-time hash grids",
+    "appearance": "color changes over time",
+}
 
 
 def preset_names() -> list[str]:
@@ -65,8 +73,8 @@ def load_config(
     for key, text in (overrides or {}).items():
         if key not in known:
             raise InputError(f"there is no option --{key}{did_you_mean(key, known)}.")
-        _set(table, key, _checked(known[key], _from_text(text, known[key]), f"--{key}"))
-    return typing.cast(Config, _build(Config, table, preset, ""))
+        _set(table, key, checked(known[key], _from_text(text, known[key]), f"--{key}"))
+    return build_dataclass(Config, table, preset)
 
 
 def build_config(
@@ -79,14 +87,14 @@ def build_config(
     base = _read(preset)
     for key, value in _shorthands(method, ablate).items():
         _set(base, key, value)
-    return typing.cast(Config, _build(Config, merge(base, table), source, ""))
+    return build_dataclass(Config, merge(base, table), source)
 
 
 def _shorthands(method: str | None, ablate: Iterable[str]) -> dict[str, Any]:
-    """Key -> value of what --field and --ablate stand for."""
+    """ConfigKey -> value of what --field and --ablate stand for."""
     values: dict[str, Any] = {}
     if method is not None:
-        values["field.kind"] = _checked(FieldKind, method, "--field")
+        values["field.kind"] = checked(FieldKind, method, "--field")
         values |= PAPER_ONLY if method != "laplacian" else {}
     for part in ablate:
         if part not in ABLATIONS:
@@ -96,13 +104,7 @@ def _shorthands(method: str | None, ablate: Iterable[str]) -> dict[str, Any]:
     return values
 
 
-def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """ "; did you mean X?" for a name that is close to a known one, else nothing."""
-    close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.6)
-    return f"; did you mean {close[0]}?" if close else ""
-
-
-class Key(NamedTuple):
+class ConfigKey(NamedTuple):
     """A key of the configuration: its dotted name, its type, and what it means."""
 
     name: str
@@ -110,15 +112,15 @@ class Key(NamedTuple):
     help: str
 
 
-def config_keys(cls: type = Config, prefix: str = "", about: str = "") -> Iterator[Key]:
+def config_keys(cls: type = Config, prefix: str = "", about: str = "") -> Iterator[ConfigKey]:
     """Every key of the configuration."""
-    types = _types(cls)
+    types = field_types(cls)
     for field in dataclasses.fields(cls):
-        text = ", ".join(filter(None, (about, field.metadata.get("help", ""))))
+        text = ": ".join(filter(None, (about, field.metadata.get("help", ""))))
         if dataclasses.is_dataclass(types[field.name]):
             yield from config_keys(types[field.name], f"{prefix}{field.name}.", text)
         else:
-            yield Key(prefix + field.name, types[field.name], text)
+            yield ConfigKey(prefix + field.name, types[field.name], text)
 
 
 def write_toml(table: Mapping[str, Any]) -> str:
@@ -167,61 +169,8 @@ def _set(table: Table, key: str, value: Any) -> None:
     table[name] = value
 
 
-def _types(cls: type) -> dict[str, Any]:
-    hints = typing.get_type_hints(cls)
-    return {field.name: hints[field.name] for field in dataclasses.fields(cls)}
-
-
-def _build(cls: type, table: Any, source: str, prefix: str) -> Any:
-    """A dataclass from a table; every key must be known, every value of its type."""
-    if not isinstance(table, dict):
-        raise InputError(f"{source}: {prefix.rstrip('.')} must be a table, got {shown(table)}.")
-    types = _types(cls)
-    for key in table:
-        if key not in types:
-            raise InputError(f"{source}: there is no key {prefix}{key}{did_you_mean(key, types)}.")
-    values = {}
-    for field in dataclasses.fields(cls):
-        name, kind = field.name, types[field.name]
-        if name in table:
-            inner = dataclasses.is_dataclass(kind)
-            values[name] = (
-                _build(typing.cast(type, kind), table[name], source, f"{prefix}{name}.")
-                if inner
-                else _checked(kind, table[name], f"{source}: {prefix}{name}")
-            )
-        elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
-            raise InputError(f'{source} lacks the key {prefix}{name}; add it, or start the file with base = "dnerf".')
-    try:
-        return cls(**values)
-    except ValueError as error:
-        raise InputError(f"{source}: {prefix.rstrip('.')}: {error}.") from None
-
-
-def _checked(kind: Any, value: Any, where: str) -> Any:
-    """A TOML value as a value of this type; numbers must lie between 0 and LARGEST_NUMBER."""
-    parts = typing.get_args(kind)
-    if typing.get_origin(kind) is Literal:
-        if value in parts:
-            return value
-        hint = did_you_mean(value, parts) if isinstance(value, str) else ""
-        raise InputError(f"{where} must be {' or '.join(parts)}, got {shown(value)}{hint}.")
-    if typing.get_origin(kind) is tuple:
-        if not isinstance(value, list | tuple) or len(value) != len(parts):
-            raise InputError(f"{where} must be {len(parts)} numbers, got {shown(value)}.")
-        return tuple(_checked(part, entry, where) for part, entry in zip(parts, value, strict=True))
-    if type(value) is not kind and not (kind is float and type(value) is int):
-        raise InputError(f"{where} must be {_KINDS[kind]}, got {shown(value)}.")
-    if kind in (int, float) and not 0 <= value <= LARGEST_NUMBER:
-        raise InputError(f"{where} must lie between 0 and {LARGEST_NUMBER}, got {shown(value)}.")
-    return float(value) if kind is float else value
-
-
-_KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "a text"}
-
-
 def _from_text(text: str | list[str], kind: Any) -> Any:
-    """Words of the command line as a value of this type; what is no number stays text, for `_checked` to refuse."""
+    """Words of the command line as a value of this type; what is no number stays text, for `checked` to refuse."""
     if isinstance(text, list):
         return [_from_text(entry, part) for entry, part in zip(text, typing.get_args(kind), strict=True)]
     if kind is bool:

@@ -28,9 +28,10 @@ from typing import Any, NamedTuple
 
 from lapgs_wgpu.data.builtin import builtin_folder, is_builtin
 from lapgs_wgpu.errors import InputError, shown
+from lapgs_wgpu.io.dataclass_table import did_you_mean
 from lapgs_wgpu.io.safe_json_toml import read_toml
 from lapgs_wgpu.train.config import Config
-from lapgs_wgpu.train.presets import Table, build_config, did_you_mean, merge
+from lapgs_wgpu.train.presets import Table, build_config, merge
 
 MOST_RUNS = 10_000
 _NAME = re.compile(r"\w[\w .+=-]*", re.ASCII)  # becomes the name of a folder, and a cell of a Markdown table

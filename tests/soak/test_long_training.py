@@ -1,7 +1,7 @@
 """Training for a long time takes no more memory than training for a short one.
 
 LAPGS_SOAK_MINUTES (make soak: 30) says for how long; without it the test is skipped. The same short training, with
-changes of density and resets of the opacities, runs again and again in one process, each time from a new `Training`:
+changes of density and resets of the opacities, runs again and again in one process, each time from a new `Trainer`:
 at the same step of each round the memory must be the same, once caches and allocators have warmed up. The figures go
 into LAPGS_SOAK_OUT (soak.json).
 """
@@ -16,14 +16,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from test_train import configure
+from helpers.training import configure
 
 from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.gpu.buffer import BufferPool
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.train.memory import keep_freed_memory
-from lapgs_wgpu.train.training import Training
+from lapgs_wgpu.train.malloc import keep_freed_memory
+from lapgs_wgpu.train.trainer import Trainer
 
 MINUTES = float(os.environ.get("LAPGS_SOAK_MINUTES", "0"))
 STEPS = 40  # of a round: three changes of density, a reset of the opacities
@@ -86,7 +86,7 @@ def test_memory_is_flat(device: Device, tmp_path: Path) -> None:
     samples: list[dict[str, Any]] = []
     start = time.monotonic()
     while time.monotonic() - start < 60 * MINUTES:
-        training = Training(config, dataset, device)
+        training = Trainer(config, dataset, device)
         counts = {len(training.scene)}
         for _ in range(STEPS):
             training.step()

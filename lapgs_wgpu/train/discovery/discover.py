@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from typing import NamedTuple, TextIO
 
@@ -17,6 +16,7 @@ from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.scene import Scene4D
+from lapgs_wgpu.progress import Progress
 from lapgs_wgpu.splat.constants import CONSTANTS
 from lapgs_wgpu.splat.morton import morton_order
 from lapgs_wgpu.train.config import Config
@@ -53,7 +53,7 @@ def discover(config: Config, dataset: Dataset, device: Device, terminal: TextIO 
     started = time.perf_counter()
     steps = config.discovery.steps
     fit_steps = config.discovery.field_steps
-    meter = _Meter(steps + fit_steps, terminal or sys.stderr)
+    meter = Progress(steps + fit_steps, "steps of motion discovery", terminal)
     static, images = static_fit(config, dataset, device, meter.at)
     background = 1.0 if config.data.background == "white" else 0.0
     if all(float(np.abs(image.image - background).max()) < SHOWN for image in images):
@@ -67,7 +67,7 @@ def discover(config: Config, dataset: Dataset, device: Device, terminal: TextIO 
     tracks = None if tracks is None else lost_tracks(tracks, static)
     share = 0.0 if tracks is None else explained_share(clouds, tracks, half_side)
     if tracks is None or share < config.discovery.least:
-        meter.close()
+        meter.clear()
         return Discovery(None, f"discovery: the static fit loses {share:.1%} of what moves: nothing is added")
     generator = torch.Generator().manual_seed(config.seed)
     scene = scene_with(static, tracks, config, device, generator)
@@ -75,7 +75,7 @@ def discover(config: Config, dataset: Dataset, device: Device, terminal: TextIO 
     order = morton_order(scene.parameters["means"].detach())
     for name, values in scene.parameters.items():
         scene.parameters[name] = torch.nn.Parameter(values.detach()[order])
-    meter.close()
+    meter.clear()
     seconds = time.perf_counter() - started
     return Discovery(
         scene,
@@ -140,28 +140,3 @@ def scene_with(static: Scene4D, tracks: Tracks, config: Config, device: Device, 
     of_part = DYNAMICS * torch.randn(int(tracks.part.max()) + 1, size, generator=generator)
     rows["dynamics"] = torch.cat([torch.zeros(len(static), size), of_part[torch.from_numpy(tracks.part)]])
     return Scene4D(rows, config.field, device, sh_degree=static.sh_degree, seed=config.seed)
-
-
-class _Meter:
-    """The discovery's progress on the terminal."""
-
-    def __init__(self, steps: int, terminal: TextIO) -> None:
-        self._steps, self._terminal = steps, terminal
-        self._start = self._shown = time.perf_counter()
-
-    def at(self, step: int) -> None:
-        """After a step, counted from 1."""
-        now = time.perf_counter()
-        if now - self._shown < (0.25 if self._terminal.isatty() else 15.0):
-            return
-        self._shown = now
-        left = (now - self._start) / step * (self._steps - step)
-        text = f"looking for what moves: step {step}/{self._steps}  {left:.0f} s left"
-        self._terminal.write(f"\r\x1b[2K{text}" if self._terminal.isatty() else f"{text}\n")
-        self._terminal.flush()
-
-    def close(self) -> None:
-        """Remove the progress line."""
-        if self._terminal.isatty():
-            self._terminal.write("\r\x1b[2K")
-            self._terminal.flush()

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lapgs_wgpu.motion.scene import Scene4D, rotate
-from lapgs_wgpu.train.optimise import ADAM_EPS
+from lapgs_wgpu.train.optimizer import ADAM_EPS
 
 from .tracks import Tracks
 

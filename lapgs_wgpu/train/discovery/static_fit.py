@@ -16,7 +16,7 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.config import Config, Rate
 from lapgs_wgpu.train.evaluate import COLOURS
-from lapgs_wgpu.train.training import Training
+from lapgs_wgpu.train.trainer import Trainer
 
 from .residual import Residual
 
@@ -38,7 +38,7 @@ def static_fit(
     views = sorted(dataset.train, key=lambda view: (view.time, view.name))
     chosen = np.linspace(0, len(views) - 1, min(len(views), MOST_VIEWS)).astype(np.int64)
     small = [small_view(views[i], config.discovery.size) for i in dict.fromkeys(chosen.tolist())]
-    training = Training(static_config(config), dataclasses.replace(dataset, train=tuple(small)), device)
+    training = Trainer(static_config(config), dataclasses.replace(dataset, train=tuple(small)), device)
     try:
         for step in range(config.discovery.steps):
             training.step()

@@ -1,0 +1,128 @@
+"""Where a training step's time goes: the real loop with the preset `dnerf`, 50,000 Gaussians, 400x400 pixels."""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+from unittest import mock
+
+from measure import Timing, summary
+
+from lapgs_wgpu.data import load_dataset
+from lapgs_wgpu.data.synthetic import write_synthetic
+from lapgs_wgpu.gpu import buffer as buffer_module
+from lapgs_wgpu.gpu.buffer import Buffer
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.kernel import Commands
+from lapgs_wgpu.gpu.profile import Profile
+from lapgs_wgpu.motion import hash_encoder
+from lapgs_wgpu.splat import objective
+from lapgs_wgpu.train.log import Log
+from lapgs_wgpu.train.optimizer import FrequencyOptimizer, Optimizer
+from lapgs_wgpu.train.presets import load_config
+from lapgs_wgpu.train.run import train
+
+WARM_UP = 2  # steps that are not counted
+RASTER, ENCODER, LOSSES = "rasteriser", "hash encoder", "image losses"
+TRANSFERS, OPTIMISER, REST = "transfers", "optimiser", "torch: decoder, activations, their gradients"
+ORDER = (RASTER, ENCODER, LOSSES, TRANSFERS, OPTIMISER, REST)
+
+
+def bench_shares(device: Device, repeat: int, gaussians: int = 50_000, size: int = 400) -> dict[str, Timing]:
+    """Milliseconds a step of each part, and under "step" of the whole.
+
+    Kernels by the device's timestamps. Transfers are the host's copies, timed when the device has finished, and the
+    device's own between buffers and textures.
+    """
+    steps = WARM_UP + repeat
+    config = load_config(
+        "dnerf", {"schedule.steps": str(steps), "schedule.warm_up": "0", "points.count": str(gaussians)}
+    )
+    clock = _Clock(device)
+    log_step = Log.step
+
+    def end_of_step(self: Log, *values: Any) -> None:
+        log_step(self, *values)
+        clock.end_step()
+
+    with TemporaryDirectory() as folder, clock.running(), mock.patch.object(Log, "step", end_of_step):
+        scene = write_synthetic(Path(folder) / "scene", size=size, train_views=8, test_views=1)
+        train(config, load_dataset(scene), Path(folder) / "run", device=device)
+    counted = clock.steps[WARM_UP:steps]
+    return {name: summary([step[name] for step in counted]) for name in (*ORDER, "step")}
+
+
+class _Clock:
+    """Adds up the times of a step by part."""
+
+    def __init__(self, device: Device) -> None:
+        self._device = device
+        self._profile = Profile(device)
+        self._now: dict[str, float] = defaultdict(float)
+        self._start = time.perf_counter()
+        self.steps: list[dict[str, float]] = []
+
+    def end_step(self) -> None:
+        self._collect()
+        now = time.perf_counter()
+        step = self._now | {"step": 1e3 * (now - self._start)}
+        step[REST] = step["step"] - sum(step.get(name, 0.0) for name in ORDER[:-1])
+        self.steps.append(defaultdict(float, step))
+        self._now, self._start = defaultdict(float), time.perf_counter()
+
+    def _collect(self) -> None:
+        """Wait for the device and take in its kernels; what it did besides are copies from buffers to textures."""
+        start = time.perf_counter()
+        kernels = self._profile.read()
+        for name, milliseconds in kernels:
+            part = ENCODER if name.startswith("hashgrid") else LOSSES if name.startswith("loss_") else RASTER
+            self._now[part] += milliseconds
+        waited = 1e3 * (time.perf_counter() - start) - sum(milliseconds for _, milliseconds in kernels)
+        self._now[TRANSFERS] += max(0.0, waited)
+
+    def _timed(self, part: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        def run(*arguments: Any, **options: Any) -> Any:
+            start = time.perf_counter()
+            result = function(*arguments, **options)
+            self._now[part] += 1e3 * (time.perf_counter() - start)
+            return result
+
+        return run
+
+    @contextmanager
+    def running(self) -> Iterator[None]:
+        prepare, read_all = Commands.__init__, buffer_module.read_all
+
+        def profiled(commands: Commands, device: Device, profile: Profile | None = None) -> None:
+            prepare(commands, device, profile or self._profile)
+
+        copy = self._timed(TRANSFERS, read_all)
+
+        def read_when_done(requests: Any) -> Any:
+            if not any(buffer.label == "timestamps to read" for buffer, *_ in requests):
+                self._collect()
+                return copy(requests)
+            return read_all(requests)
+
+        patches = [
+            mock.patch.object(Commands, "__init__", profiled),
+            mock.patch.object(Buffer, "write", self._timed(TRANSFERS, Buffer.write)),
+            mock.patch.object(Optimizer, "step", self._timed(OPTIMISER, Optimizer.step)),
+            mock.patch.object(FrequencyOptimizer, "step", self._timed(OPTIMISER, FrequencyOptimizer.step)),
+            *(
+                mock.patch.object(module, "read_all", read_when_done)
+                for module in (buffer_module, hash_encoder, objective)
+            ),
+        ]
+        for patch in patches:
+            patch.start()
+        try:
+            yield
+        finally:
+            for patch in patches:
+                patch.stop()

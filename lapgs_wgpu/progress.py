@@ -1,0 +1,69 @@
+"""The progress line of a long job, on stderr."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from types import TracebackType
+from typing import TextIO
+
+TERMINAL_SECONDS = 0.25  # between two updates of the line on a terminal
+FILE_SECONDS = 15.0  # between two lines where stderr is no terminal
+
+
+class Progress:
+    """A context manager. total: number of steps. what: the steps' name, in the plural. stream: stderr where None."""
+
+    def __init__(self, total: int, what: str, stream: TextIO | None = None) -> None:
+        self._total, self._what, self._done = total, what, 0
+        self._stream = stream or sys.stderr
+        self._start = self._shown = time.perf_counter()
+
+    def __enter__(self) -> Progress:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        if self._stream.isatty():
+            self._write("\n")
+
+    def step(self) -> None:
+        """One more step is done."""
+        self.at(self._done + 1)
+
+    def at(self, done: int, text: Callable[[], str] | None = None) -> None:
+        """`done` steps are done. text: makes the line, by default the count and the time left at the mean rate."""
+        self._done = done
+        now, on_terminal = time.perf_counter(), self._stream.isatty()
+        if done == self._total or now - self._shown >= (TERMINAL_SECONDS if on_terminal else FILE_SECONDS):
+            self._shown = now
+            line = text() if text else self._line(now)
+            self._write(f"\r\x1b[2K{line}" if on_terminal else f"{line}\n")
+
+    def note(self, text: str) -> None:
+        """Print a line of its own."""
+        self._write(f"\r\x1b[2K{text}\n" if self._stream.isatty() else f"{text}\n")
+
+    def clear(self) -> None:
+        """Remove the line from a terminal."""
+        if self._stream.isatty():
+            self._write("\r\x1b[2K")
+
+    def _line(self, now: float) -> str:
+        left = (now - self._start) / self._done * (self._total - self._done)
+        return f"{self._done}/{self._total} {self._what}  {duration(left)} left"
+
+    def _write(self, text: str) -> None:
+        with suppress(OSError):  # a closed pipe or a full disk behind stderr does not stop the job
+            self._stream.write(text)
+            self._stream.flush()
+
+
+def duration(seconds: float) -> str:
+    """m:ss, or h:mm:ss from an hour on."""
+    minutes, seconds = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes}:{seconds:02d}"

@@ -1,0 +1,67 @@
+"""The command lapgs-table."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from lapgs_wgpu.command import DEVICE_HELP, HelpFormatter, Parser, guarded
+from lapgs_wgpu.errors import InputError
+
+DESCRIPTION = """\
+Train all runs of a table (scenes x rows x seeds, defined in SPEC.toml), and write their metrics as a table.
+
+  lapgs-table docs/tables/demo.toml --out runs/demo-table       built-in scene
+  lapgs-table SPEC.toml --data DIR --out OUT                    the same again after an interruption: remaining runs
+  lapgs-table --from A/results.json B/results.json              print a table of finished runs, without training
+
+Each run has its own run folder, OUT/SCENE/ROW/seedN. OUT/results.json and OUT/table.md are updated after each run. A
+run is skipped if its folder, OUT/results.json or a --from file has its results for the same configuration."""
+
+
+def table_command(arguments: Sequence[str] | None = None) -> int:
+    """lapgs-table: returns the exit code, 1 where runs failed."""
+    return guarded("lapgs-table", _table, list(sys.argv[1:] if arguments is None else arguments))
+
+
+def _table(arguments: list[str]) -> int:
+    parser = Parser("lapgs-table", description=DESCRIPTION, formatter_class=HelpFormatter, allow_abbrev=False)
+    parser.add_argument(
+        "spec", nargs="?", metavar="SPEC.toml", help="table definition; docs/tables/demo.toml documents the format"
+    )
+    parser.add_argument("--data", metavar="DIR", default=".", help="folder that contains the scenes' folders [.]")
+    parser.add_argument("--out", metavar="OUT", help="output folder for the runs and the table")
+    parser.add_argument(
+        "--from", metavar="FILE", nargs="+", default=[], dest="known", help="results.json files whose runs are reused"
+    )
+    parser.add_argument("--device", metavar="NAME", help=DEVICE_HELP)
+    parser.add_argument(
+        "--slim", action="store_true", help="delete checkpoint.ply and eval/ of each finished run, to save disk space"
+    )
+    given = parser.parse_args(arguments)
+    if given.spec and not given.out:
+        raise InputError("name a folder for the runs and the table with --out.")
+    if not given.spec and not given.known:
+        raise InputError("name a SPEC.toml, or --from results.json; lapgs-table --help says more.")
+    from lapgs_wgpu.train.table import make_table
+    from lapgs_wgpu.train.table_results import markdown, merge_results, read_results, write_results
+    from lapgs_wgpu.train.table_spec import read_spec
+
+    known = [read_results(Path(file)) for file in given.known]
+    if not given.spec:
+        results = merge_results(known)
+        if given.out:
+            there = Path(given.out, "results.json")
+            if there.exists() and not any(there.samefile(file) for file in given.known):
+                raise InputError(f"{there} would be lost; name it after --from, too, or take another folder.")
+            there.parent.mkdir(parents=True, exist_ok=True)
+            write_results(there.parent, results)
+        print(markdown(results), end="")
+        return 0
+    spec, out = read_spec(Path(given.spec)), Path(given.out)
+    failed = make_table(spec, Path(given.data), out, known=known, device=given.device, slim=given.slim)
+    print(f"{out / 'table.md'}: {len(spec.runs) - len(failed)} of {len(spec.runs)} runs")
+    for key, reason in failed.items():
+        print(f"lapgs-table: {key} failed: {reason}", file=sys.stderr)
+    return 1 if failed else 0

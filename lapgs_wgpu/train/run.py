@@ -1,0 +1,290 @@
+"""A run from start to end: a configuration and a capture become a trained scene in its run folder."""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext, suppress
+from pathlib import Path
+from types import FrameType
+
+import torch
+
+from lapgs_wgpu.data.init import first_points
+from lapgs_wgpu.data.validation import check_in_view, check_times
+from lapgs_wgpu.data.views import Dataset
+from lapgs_wgpu.errors import DeviceError, InputError, NumericalError
+from lapgs_wgpu.gpu.device import Device, open_device
+from lapgs_wgpu.io.initial_view import InitialView
+from lapgs_wgpu.motion.grid_field import GridField
+from lapgs_wgpu.motion.scene import Scene4D
+from lapgs_wgpu.train.autotune import Choice
+from lapgs_wgpu.train.config import Background, Config
+from lapgs_wgpu.train.discovery.discover import discover
+from lapgs_wgpu.train.distributed import SINGLE_PROCESS, Ranks
+from lapgs_wgpu.train.evaluate import evaluate, write_metrics
+from lapgs_wgpu.train.log import Log
+from lapgs_wgpu.train.lpips import Lpips
+from lapgs_wgpu.train.malloc import keep_freed_memory, return_freed_memory
+from lapgs_wgpu.train.run_folder import (
+    STATE,
+    check_run_folder,
+    check_state,
+    drop_states,
+    load_state,
+    locked_run_folder,
+    save_state,
+    start_run_folder,
+)
+from lapgs_wgpu.train.trainer import StepResult, Trainer
+
+PROBES = 2048  # points of the scene that say whether a camera sees it
+OUTSIDE = 0.05  # warn if this share of the Gaussians, or more, is outside the encoder's box
+
+# Takes over a training's steps, such as a viewer does: called with the scene, where to look at it from, and the steps,
+# of which it takes as many as it likes, each one a step of the training. The rest follows when it returns.
+Watch = Callable[[Scene4D, InitialView, Iterator[StepResult]], None]
+
+
+def train(
+    config: Config,
+    dataset: Dataset,
+    out: str | Path,
+    *,
+    device: Device | None = None,
+    overwrite: bool = False,
+    watch: Watch | None = None,
+    ranks: Ranks = SINGLE_PROCESS,
+) -> Scene4D:
+    """Train on a dataset, evaluate on its test views, and leave config.toml, log.jsonl, metrics.json, checkpoint.ply
+    and eval/ in the folder `out`, which must be new or empty, or hold an earlier run when `overwrite` is set.
+
+    device: the default adapter where None. ranks: this process among those that train together; only the first one
+    writes. The same configuration, pictures, adapter and driver give the same
+    checkpoint to the last byte, watched or not, interrupted and resumed or not. Raises InputError before anything is
+    written where the input is not usable, and KeyboardInterrupt after Ctrl-C or SIGTERM, when checkpoint and state of
+    the last whole step have been written. DeviceError, NumericalError and whatever else ends a step go on to the caller
+    when that state has been written.
+    """
+    out = Path(out)
+    found = check_times(dataset, moving=config.field.kind != "static")
+    found += check_in_view(dataset, first_points(dataset, PROBES, config.points.box, config.seed)[0])
+    if ranks.first:
+        check_run_folder(out, overwrite=overwrite)
+        for warning in (*dataset.warnings, *found, *_precision_warnings(config)):
+            print(f"warning: {warning}", file=sys.stderr, flush=True)
+        if dataset.normalization is not None:
+            print(f"placement: {dataset.normalization}", flush=True)
+    keep_freed_memory()
+    device = device or open_device()
+    training = Trainer(config, dataset, device, ranks, _discovered(config, dataset, device, ranks))
+    if not ranks.first:
+        return _assist(training)
+    with locked_run_folder(out):
+        start_run_folder(out, training.config, training.scene.device, dataset)
+        if training.decoder.seconds:
+            print(_told(training.decoder), flush=True)
+        return _run(training, dataset, out, watch)
+
+
+def resume(
+    config: Config,
+    dataset: Dataset,
+    out: str | Path,
+    *,
+    device: Device | None = None,
+    watch: Watch | None = None,
+    ranks: Ranks = SINGLE_PROCESS,
+) -> Scene4D:
+    """Go on with an interrupted training of this configuration and dataset in its run folder, from its last saved
+    state, or from the start where it has none. Otherwise as `train`."""
+    out = Path(out)
+    if (out / "metrics.json").exists():
+        raise InputError(f"{out} is finished: there is nothing to resume.")
+    keep_freed_memory()
+    device = device or open_device()
+    with locked_run_folder(out) if ranks.first else nullcontext():
+        state = load_state(out)
+        scene = _discovered(config, dataset, device, ranks) if state is None else None
+        training = Trainer(config, dataset, device, ranks, scene)
+        if state is not None:
+            try:
+                check_state(state, views=len(dataset.train), steps=config.schedule.steps)
+                training.restore(state)
+            except (IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
+                reason = f"{type(error).__name__}: {error}".splitlines()[0]
+                raise InputError(f"{out}: its state and its config.toml do not belong together ({reason}).") from error
+        return _run(training, dataset, out, watch) if ranks.first else _assist(training)
+
+
+def _discovered(config: Config, dataset: Dataset, device: Device, ranks: Ranks) -> Scene4D | None:
+    """The scene that discovery starts a training with; None where it is off, finds nothing, or is out of proportion."""
+    wanted = config.discovery.enabled and config.field.kind != "static"
+    if not wanted or config.schedule.steps <= config.discovery.steps:
+        return None
+    with open(os.devnull, "w") as nowhere:
+        found = discover(config, dataset, device, None if ranks.first else nowhere)
+    if ranks.first:
+        print(found.summary, flush=True)
+    return found.scene
+
+
+def _precision_warnings(config: Config) -> list[str]:
+    """A sentence where the precision costs time instead of saving it."""
+    features: dict[str, object] = getattr(torch.cpu, "get_capabilities", dict)()  # not in every torch
+    if config.precision == "float32" or not features or any(features[name] for name in features if "bf16" in name):
+        return []
+    return ["this processor has no instructions for bfloat16: the training will be faster with --precision float32."]
+
+
+def _outside(scene: Scene4D) -> str:
+    """A warning where the hash grids do not cover the canonical means of many Gaussians; else nothing."""
+    if not isinstance(scene.field, GridField):
+        return ""
+    bound = scene.field_config.bound
+    count = int((scene.parameters["means"].detach().abs() > bound).any(dim=1).sum())
+    if count < OUTSIDE * len(scene):
+        return ""
+    return (
+        f"warning: {count} of {len(scene)} Gaussians lie outside the field's box of half side {bound:g}, where it "
+        "cannot tell one from another; that is right for a background that stands still, but if something moves there, "
+        "raise field.bound."
+    )
+
+
+def _told(choice: Choice) -> str:
+    """Where the decoder works, and why, after a trial."""
+    torch_time, device_time = (1e3 * choice.seconds[place] for place in ("torch", "device"))
+    there = f"{device_time:.0f} ms on the device" if math.isfinite(device_time) else "more memory than the device has"
+    return f"decoder: {choice.place} (a trial took {torch_time:.0f} ms in torch, {there})"
+
+
+def _assist(training: Trainer) -> Scene4D:
+    """Take the steps of a process that is not the first: nothing is written."""
+    with _interruptible() as interrupted:
+        try:
+            while _goes_on(training, interrupted):
+                training.step()
+        finally:
+            training.close()
+    if training.done < training.config.schedule.steps:
+        raise KeyboardInterrupt(f"stopped after step {training.done}.")
+    return training.scene
+
+
+def _goes_on(training: Trainer, interrupted: threading.Event) -> bool:
+    """Whether a step is left, and no process was interrupted."""
+    return training.done < training.config.schedule.steps and not training.ranks.any(interrupted.is_set())
+
+
+def _run(training: Trainer, dataset: Dataset, out: Path, watch: Watch | None) -> Scene4D:
+    config, scene = training.config, training.scene
+    look = InitialView((dataset.test or dataset.train)[0].camera, dataset.focus, dataset.up, len(dataset.times))
+    with Log(out / "log.jsonl", config.schedule.steps, done=training.done) as log, _interruptible() as interrupted:
+        steps = _steps(training, log, out, interrupted)
+        if watch is not None:
+            watch(scene, look, steps)
+        for _ in steps:
+            pass
+        seconds = log.seconds
+        if training.done == config.schedule.steps and (outside := _outside(scene)):
+            log.tell(outside)
+
+    return_freed_memory()
+    done, all_steps = training.done, config.schedule.steps
+    if done < all_steps or config.schedule.save_interval:
+        save_state(out, training.state())
+    metadata = {"scene": dataset.name, "background": config.data.background, "step": str(done), "view": look.to_json()}
+    if dataset.normalization is not None:
+        metadata["placement"] = dataset.normalization.to_json()
+    scene.save(out / "checkpoint.ply", metadata)
+    if done < all_steps:
+        raise KeyboardInterrupt(
+            f"stopped after step {done} of {all_steps}; {out / 'checkpoint.ply'} holds it, and "
+            f"lapgs-train --resume {out} goes on."
+        )
+    evaluate_run(out, scene, dataset, config.data.background, {"steps": done, "seconds": round(seconds, 3)})
+    drop_states(out)
+    return scene
+
+
+def _steps(training: Trainer, log: Log, out: Path, interrupted: threading.Event) -> Iterator[StepResult]:
+    """The steps that are left, each logged, and the state saved now and then, until `interrupted` is set."""
+    schedule = training.config.schedule
+    try:
+        while _goes_on(training, interrupted):
+            progress = training.step()
+            if progress.skipped is not None:
+                log.tell(str(progress.skipped))
+            log.step(progress.step, progress.loss, progress.psnr, len(training.scene), training.scene.spectrum)
+            yield progress
+            if schedule.save_interval and training.done % schedule.save_interval == 0 < schedule.steps - training.done:
+                save_state(out, training.state())
+    except (DeviceError, NumericalError, MemoryError) as error:
+        kind = MemoryError if not isinstance(error, DeviceError | NumericalError) else type(error)  # numpy has its own
+        raise kind(f"{error}{_saved(training, out)}") from error
+    except Exception:
+        _saved(training, out)
+        raise
+    finally:
+        training.close()
+
+
+def _saved(training: Trainer, out: Path) -> str:
+    """Save the state of a training that cannot go on, if it has one worth saving; what a user should know of it."""
+    if training.whole and training.done:
+        try:
+            save_state(out, training.state())
+        except InputError as error:  # no second trouble instead of the first
+            return f" (and {error})"
+        return f"; stopped after step {training.done}, from which lapgs-train --resume {out} goes on."
+    if (out / STATE).exists():
+        return f"; lapgs-train --resume {out} goes on from the state that was saved last."
+    return "; nothing was saved yet."
+
+
+def evaluate_run(
+    out: Path,
+    scene: Scene4D,
+    dataset: Dataset,
+    background: Background,
+    training: dict[str, float],
+    lpips: Lpips | None = None,
+    static: Scene4D | None = None,
+) -> dict[str, object]:
+    """Evaluate on the test views; write metrics.json, metrics.csv and eval/ of a run folder; returns the metrics.
+
+    lpips, static: as `evaluate` takes them.
+    """
+    for folder in (out / "eval", out / "eval" / "plots"):
+        if folder.is_symlink():
+            raise InputError(f"{folder} is a link, and pictures are written into the run's own folder only; remove it.")
+    (out / "eval").mkdir(exist_ok=True)
+    metrics = evaluate(scene, dataset.test, background, out / "eval", lpips=lpips, static=static)
+    metrics["training"] = training
+    write_metrics(out, metrics)
+    return metrics
+
+
+@contextmanager
+def _interruptible() -> Iterator[threading.Event]:
+    """An event that Ctrl-C and SIGTERM set, instead of an exception in the middle of a step; the second one is one."""
+    interrupted = threading.Event()
+
+    def note(signum: int, frame: FrameType | None) -> None:
+        interrupted.set()
+        signal.signal(signum, signal.default_int_handler)
+
+    before = {}
+    with suppress(ValueError):  # only the main thread may listen to signals
+        for number in (signal.SIGINT, signal.SIGTERM):
+            before[number] = signal.signal(number, note)
+    try:
+        yield interrupted
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,346 @@
+"""The training, step by step, and everything that its next step depends on."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lapgs_wgpu.data.init import first_points, initial_scales, limit_optical_depth
+from lapgs_wgpu.data.views import Dataset, View
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.motion.dynamics import dynamics_loss
+from lapgs_wgpu.motion.field import Nearby
+from lapgs_wgpu.motion.grid_field import GridField
+from lapgs_wgpu.motion.scene import Scene4D
+from lapgs_wgpu.splat.morton import morton_order
+from lapgs_wgpu.train.autotune import choose_decoder
+from lapgs_wgpu.train.config import Config, PointsConfig, SmoothnessConfig
+from lapgs_wgpu.train.dataloader import Pictures
+from lapgs_wgpu.train.densify import Statistics, densify, reset_opacities
+from lapgs_wgpu.train.distributed import SINGLE_PROCESS, Ranks
+from lapgs_wgpu.train.exposure import Exposures
+from lapgs_wgpu.train.nonfinite import Health, Skipped, check_parameters, describe, finite
+from lapgs_wgpu.train.optimizer import FrequencyOptimizer, Optimizer
+from lapgs_wgpu.train.render_loss import RenderLoss, render_loss
+
+MAX_SH_DEGREE = 3
+
+
+class StepResult(NamedTuple):
+    """A step that is done, of how many in all; loss, and PSNR in dB, means over its views. skipped: where its values
+    were not finite, so that it moved nothing."""
+
+    step: int
+    steps: int
+    loss: float
+    psnr: float
+    skipped: Skipped | None = None
+
+
+class _Look(NamedTuple):
+    """A view of a step: on what it lies, and where the field is asked once more."""
+
+    view: View
+    background: Tensor
+    nearby: Nearby | None
+
+
+class Trainer:
+    """A training between two of its steps.
+
+    scene: to start from, as `discover` gives it, and to move from the first step on; made of `initial_points` where
+    None. config: with the decoder's place chosen. done: the steps so far. whole: whether `state` is that of a whole
+    step, which it also is where `step` raised an error before anything that lasts had changed.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        dataset: Dataset,
+        device: Device,
+        ranks: Ranks = SINGLE_PROCESS,
+        scene: Scene4D | None = None,
+    ) -> None:
+        if config.schedule.batch % ranks.count:
+            raise InputError(
+                f"{ranks.count} processes cannot share {config.schedule.batch} views a step evenly; give --batch "
+                f"{ranks.count}, or a multiple of it."
+            )
+        self.ranks = ranks
+        self.done = 0
+        self._generator = torch.Generator().manual_seed(config.seed)
+        # What discovery found moves from the first step on.
+        self._warm_up = config.schedule.warm_up if scene is None else 0
+        self.scene = scene or Scene4D.from_points(
+            *initial_points(config.points, dataset, config.seed),
+            config.field,
+            opacity=config.points.opacity,
+            device=device,
+            seed=config.seed,
+        )
+        self.decoder = choose_decoder(config, self.scene, device, ranks)
+        self.config = dataclasses.replace(config, decoder=self.decoder.place)
+        self._start(dataset)
+        self.whole = True
+
+    def _start(self, dataset: Dataset) -> None:
+        config, scene = self.config, self.scene
+        if isinstance(scene.field, GridField):
+            scene.field.precision = getattr(torch, config.precision)
+            scene.field.on_device = self.decoder.place == "device"
+        groups = scene.field.parameter_groups() if scene.field else {}
+        self._optimizer = Optimizer(scene.parameters, groups, config.rates.schedules())
+        self._frequencies = None
+        if scene.spectrum is not None:
+            limit = len(dataset.times) / 2
+            self._frequencies = FrequencyOptimizer(scene.spectrum, config.rates.frequencies, limit)
+        self._exposures = Exposures(len(dataset.train), config.exposure.rate) if config.exposure.enabled else None
+        self._beside = [each for each in (self._frequencies, self._exposures) if each is not None]
+        self._numbers = {view.name: number for number, view in enumerate(dataset.train)}
+        # Cameras that all stand at one place have no extent; the scene's own size must serve.
+        self._extent = dataset.extent or config.points.box
+        self._statistics = Statistics(len(scene), scene.parameters["means"].device)
+        self._health = Health()
+        data = config.data
+        self._pictures = Pictures(dataset.train, data.background, data.cache_gb, self._generator, scene.device)
+
+    def close(self) -> None:
+        """End what goes on beside the steps."""
+        self._pictures.close()
+
+    def step(self) -> StepResult:
+        """One step of the optimiser, on `schedule.batch` pictures, whose losses count as their mean.
+
+        A step whose loss or gradients are not finite moves nothing: parameters, the optimisers' and the density
+        control's state stay as they were; what the schedule plans for this step is done. Raises NumericalError where
+        too many are skipped, or where a parameter is not finite, and DeviceError.
+        """
+        random, order = self._generator.get_state(), list(self._pictures.order)
+        try:
+            return self._step()
+        except Exception:
+            if self.whole:  # the device gave out: as if the step had not begun
+                self._generator.set_state(random)
+                self._pictures.order = order
+            raise
+
+    def _step(self) -> StepResult:
+        config, scene, ranks = self.config, self.scene, self.ranks
+        step = self.done + 1
+        moving = step > self._warm_up
+        # Every rank draws the numbers of all views, so that their random streams stay the same.
+        chosen = [self._pictures.choose() for _ in range(config.schedule.batch)]
+        drawn = self._generator.get_state()
+        looks = [_Look(*each, self._nearby(each[0]) if moving else None) for each in chosen]
+
+        self._zero_grad()
+        seen = Statistics(len(scene), scene.parameters["means"].device)
+        renderings, totals = [], torch.zeros(2, dtype=torch.float64)
+        for look in looks[ranks.rank :: ranks.count]:
+            loss, rendering = self._loss(look, moving)
+            (loss / len(looks)).backward()
+            seen.add(rendering, look.view.camera, scale=len(looks))
+            renderings.append(rendering)
+            totals += torch.tensor([loss.item(), rendering.psnr], dtype=torch.float64)
+        if ranks.count > 1:
+            self._put_together()
+        loss_sum, psnr_sum = ranks.sums([totals])[0].tolist()
+        value, psnr = loss_sum / len(looks), psnr_sum / len(looks)
+
+        names = ", ".join(look.view.name for look in looks)
+        skipped = self._examine(renderings, value, step, names)
+        self.whole = False
+        if skipped is None:
+            self._optimizer.step(step)
+            for beside in self._beside:
+                beside.step(step)
+            # After the optimiser's step, so that no gradient is lost with the rows that change.
+            if step < config.density.stop:
+                self._statistics.merge(self._seen_by_all(seen))
+        else:
+            self._generator.set_state(drawn)
+            self._zero_grad()
+        self._change_density(step)
+        if step % config.schedule.sh_interval == 0:
+            scene.sh_degree = min(scene.sh_degree + 1, MAX_SH_DEGREE)
+        self.done = step
+        self.whole = True
+        self._health.note(skipped)
+        return StepResult(step, config.schedule.steps, value, psnr, skipped)
+
+    def _nearby(self, view: View) -> Nearby | None:
+        return draw_nearby(self.config.smoothness, len(self.scene), view.time, self._generator)
+
+    def _loss(self, look: _Look, moving: bool) -> tuple[Tensor, RenderLoss]:
+        """The loss of a view, all terms together, and its rendering."""
+        config, scene, view = self.config, self.scene, look.view
+        if moving:
+            gaussians, smoothness = scene.deformed(view.time, look.nearby)
+        else:
+            gaussians, smoothness = scene.canonical(), None
+        weights = config.loss.weights(warm=moving)
+        truth = self._pictures.on_device(view)
+        correction = None if self._exposures is None else self._exposures.values[self._numbers[view.name]]
+        rendering = render_loss(gaussians, view.camera, truth, look.background, weights, scene.device, correction)
+        loss = rendering.loss
+        if smoothness is not None:
+            loss = loss + smoothness
+        if moving and "dynamics" in scene.parameters:
+            spread = dynamics_loss(scene.parameters["dynamics"], config.loss.dynamics_mode)
+            loss = loss + config.loss.dynamics * spread
+        return loss, rendering
+
+    def _gradients(self) -> dict[str, list[Tensor]]:
+        """By group, of all parameters that have one."""
+        gradients = self._optimizer.gradients()
+        for beside in self._beside:
+            gradients |= beside.gradients()
+        return gradients
+
+    def _zero_grad(self) -> None:
+        for each in (self._optimizer, *self._beside):
+            each.zero_grad()
+
+    def _put_together(self) -> None:
+        """Every rank's gradients become the sums over the ranks."""
+        mine = [gradient for group in self._gradients().values() for gradient in group]
+        for gradient, total in zip(mine, self.ranks.sums(mine), strict=True):
+            gradient.copy_(total)
+
+    def _seen_by_all(self, seen: Statistics) -> list[Statistics]:
+        names = list(seen.state())
+        parts = self.ranks.gather(list(seen.state().values()))
+        found = []
+        for values in zip(*parts, strict=True):
+            one = Statistics(0, values[0].device)
+            one.restore(dict(zip(names, values, strict=True)))
+            found.append(one)
+        return found
+
+    def _examine(self, renderings: list[RenderLoss], loss: float, step: int, views: str) -> Skipped | None:
+        """Whether the step of these gradients is to be skipped, and why. Raises NumericalError for a parameter, whose
+        values a step cannot mend."""
+        parameters, gradients = self._optimizer.parameters(), self._gradients()
+        for beside in self._beside:
+            parameters |= beside.parameters()
+        places = [each.means2d.grad for each in renderings if each.means2d.grad is not None]
+        gradients |= {"the places in the image": places} if places else {}
+        if not self.ranks.any(not (math.isfinite(loss) and finite(parameters, gradients))):
+            return None
+        self.whole = False
+        check_parameters(parameters)
+        self.whole = True
+        terms = [
+            f"the loss term {name} is {value}"
+            for each in renderings
+            for name, value in each.terms.items()
+            if value - value != 0
+        ]
+        terms = terms or ([] if math.isfinite(loss) else [f"the loss is {loss}"])
+        what = [*terms, *describe("gradient", gradients)] or ["the gradients together are too large"]
+        return Skipped(step, views, "; ".join(what))
+
+    def _change_density(self, step: int) -> None:
+        density, scene = self.config.density, self.scene
+        if density.changes_at(step):
+            change = densify(
+                scene.parameters,
+                self._statistics,
+                density,
+                self._extent,
+                self._generator,
+                bound_sizes=step > density.reset_interval,
+            )
+            if not change.keep.any() and len(change.added["means"]) == 0:
+                raise InputError(
+                    f"density control leaves no Gaussian at step {step}; raise density.max_world_size or "
+                    "density.max_screen_radius (0 switches these two off)."
+                )
+            self._optimizer.edit_rows(change.keep, change.added)
+            self._optimizer.reorder(morton_order(scene.parameters["means"].detach()))
+            self._statistics = Statistics(len(scene), scene.parameters["means"].device)
+        if density.resets_at(step):
+            logits = reset_opacities(scene.parameters["opacity_logits"], density.reset_opacity)
+            self._optimizer.reset("opacity_logits", logits)
+
+    # The state between two steps -------------------------------------------------------------------------------------
+
+    def state(self) -> dict[str, NDArray[np.generic]]:
+        """Everything that the next step depends on, by name."""
+        scene = self.scene
+        parts: dict[str, Mapping[str, Tensor]] = {
+            "gaussians": scene.parameters,
+            "field": scene.field.state_dict() if scene.field else {},
+            "adam": self._optimizer.state(),
+            "frequencies": self._frequencies.state() if self._frequencies else {},
+            "exposure": self._exposures.state() if self._exposures else {},
+            "statistics": self._statistics.state(),
+            "training": {
+                "done": torch.tensor(self.done),
+                "warm_up": torch.tensor(self._warm_up),
+                "sh_degree": torch.tensor(scene.sh_degree),
+                "random": self._generator.get_state(),
+                "order": torch.tensor(self._pictures.order, dtype=torch.int64),
+            },
+        }
+        return {f"{part}.{name}": t.numpy(force=True) for part, tensors in parts.items() for name, t in tensors.items()}
+
+    def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
+        """Go on from what `state` gave. Raises KeyError, RuntimeError or ValueError where it belongs to a training of
+        another configuration."""
+        parts: dict[str, dict[str, Tensor]] = {}
+        for name, array in state.items():
+            part, _, rest = name.partition(".")
+            parts.setdefault(part, {})[rest] = torch.from_numpy(array)
+        scene = self.scene
+        if parts["gaussians"].keys() != scene.parameters.keys():
+            raise ValueError(f"it has Gaussians with {sorted(parts['gaussians'])}, not {sorted(scene.parameters)}")
+        for name, value in parts["gaussians"].items():
+            if value.shape[1:] != scene.parameters[name].shape[1:]:
+                raise ValueError(f"its {name} have the shape {tuple(value.shape)}")
+            self._optimizer.reset(name, value)
+        if scene.field is not None:
+            scene.field.load_state_dict(parts["field"])
+        self._optimizer.restore(parts.get("adam", {}))
+        if self._frequencies is not None:
+            self._frequencies.restore(parts["frequencies"])
+        if self._exposures is not None:
+            self._exposures.restore(parts["exposure"])
+        self._statistics.restore(parts["statistics"])
+        own = parts["training"]
+        self.done, scene.sh_degree = int(own["done"]), int(own["sh_degree"])
+        self._warm_up = int(own.get("warm_up", self._warm_up))  # older states lack it
+        self._generator.set_state(own["random"])
+        self._pictures.order = own["order"].tolist()
+
+
+def initial_points(
+    config: PointsConfig, dataset: Dataset, seed: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """The first Gaussians (data/init): points (N, 3), colours (N, 3) and scales (N,)."""
+    points, colours = first_points(dataset, config.count, config.box, seed)
+    scales = initial_scales(points)
+    # Published figures of D-NeRF start from a fog, which the empty background there soon lifts.
+    if dataset.cloud is not None or dataset.depths is not None:
+        scales = limit_optical_depth(points, scales, config.opacity, dataset.cameras)
+    order = morton_order(torch.from_numpy(points)).numpy()
+    return points[order], colours[order], scales[order]
+
+
+def draw_nearby(config: SmoothnessConfig, count: int, t: float, generator: torch.Generator) -> Nearby | None:
+    """Where the field of `count` Gaussians is compared with itself in a step at time t; None where it is not."""
+    chosen = round(config.share * count)
+    if chosen == 0 or config.static == config.temporal == 0:
+        return None
+    rows = torch.randint(count, (chosen,), generator=generator)
+    offsets = config.reach * (2 * torch.rand(chosen, 3, generator=generator) - 1)
+    other = t + config.time_reach * (2 * float(torch.rand((), generator=generator)) - 1)
+    return Nearby(rows, offsets, min(max(other, 0.0), 1.0), config.static, config.temporal)

@@ -1,0 +1,96 @@
+"""The options of lapgs-train: a fixed part, and an option for each key of the configuration."""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import typing
+
+from lapgs_wgpu.command import DEVICE_HELP, LIST_DEVICES_HELP, HelpFormatter, Parser
+from lapgs_wgpu.errors import InputError
+
+# Short names for the keys that are given most often.
+SHORTCUTS = {
+    "data.path": "--data",
+    "schedule.steps": "--steps",
+    "schedule.batch": "--batch",
+    "data.cache_gb": "--cache-gb",
+}
+USAGE = "lapgs-train PRESET --data DIR [--out RUN] [--KEY VALUE ...]"
+DESCRIPTION = """\
+Train a 4D Gaussian splatting model of a moving scene on a folder of images. Runs on any Vulkan adapter.
+
+  lapgs-train demo --data synthetic             built-in scene; takes minutes on a CPU
+  lapgs-train tiny --data motion:path=4,cycles=2   built-in scene that measures motion (docs/metrics.md)
+  lapgs-train tiny --data DIR                   D-NeRF scene at 200x200 pixels, with settings for a CPU
+  lapgs-train dnerf --data DIR --out RUN        D-NeRF scene at the paper's resolution and schedule
+  lapgs-train hypernerf --data DIR              Nerfies or HyperNeRF capture; for a CPU: hypernerf-tiny
+  lapgs-train neu3d --data DIR                  several static cameras; for a CPU: neu3d-tiny
+  lapgs-train tiny --data DIR                   your own videos, converted by lapgs-prepare (see its --help)
+  lapgs-train RUN/config.toml --out RUN2        repeat a run
+  lapgs-train --resume RUN                      continue an interrupted training
+  lapgs-train --eval RUN                        evaluate RUN/checkpoint.ply on the test views again
+
+The run folder receives config.toml, log.jsonl, metrics.json, checkpoint.ply (any 3DGS viewer opens it as a static
+scene) and eval/ with images: ground truth | rendering | 4 x error. [Values in brackets] are defaults."""
+
+
+_METAVARS = {int: "INT", float: "FLOAT", str: "TEXT", bool: "true|false"}
+
+
+def parse_options(arguments: list[str]) -> dict[str, typing.Any]:
+    """Option name -> value; configuration keys by their dotted names, only those that were given. Raises InputError."""
+    from lapgs_wgpu.io.dataclass_table import did_you_mean
+    from lapgs_wgpu.train.presets import ABLATION_HELP, config_keys, load_config, preset_names
+
+    shown = next((word for word in arguments if word in preset_names()), "dnerf")
+    preset = load_config(shown)
+    parser = Parser(
+        "lapgs-train", usage=USAGE, description=DESCRIPTION, formatter_class=HelpFormatter, allow_abbrev=False
+    )
+    # fmt: off
+    add = parser.add_argument
+    names, parts = ", ".join(preset_names()), "; ".join(f"{name} ({text})" for name, text in ABLATION_HELP.items())
+    add("preset", nargs="?", metavar="PRESET",
+        help=f"preset configuration: {names}, or the path of a .toml file, such as RUN/config.toml")
+    add("--field", metavar="NAME", help="method: static (3DGS, no motion), mlp (deformable 3DGS), hexplane (4D-GS), "
+        "grid4d (Grid4D) or laplacian (the paper's). All but laplacian also turn off the paper's losses and its "
+        "adaptive split [the preset's]")
+    add("--ablate", metavar="PART[,PART]", help=f"turn off parts of the paper's method, comma-separated: {parts}")
+    add("--out", metavar="RUN", help="run folder for all output; must be new or empty [runs/SCENE-PRESET]")
+    add("--resume", metavar="RUN", help="continue the interrupted training in run folder RUN from its last saved state")
+    add("--overwrite", action="store_true", help="replace an existing run in the run folder")
+    add("--view", action="store_true", help="show the training in a window, with pause and single step (P and S keys)")
+    add("--device", metavar="NAME", help=DEVICE_HELP)
+    add("--list-devices", action="store_true", help=LIST_DEVICES_HELP)
+    add("--eval", metavar="RUN", help="evaluate the finished run in folder RUN again, without training. Can be "
+        "combined with --data, --data.background, --cache-gb, --device, --lpips-weights and --motion-from only")
+    add("--lpips-weights", metavar="FILE", help="with --eval: also compute LPIPS (VGG) with the weights in FILE "
+        "(docs/metrics.md)")
+    add("--motion-from", metavar="RUN", help="with --eval: also compute metrics of the moving pixels, found by "
+        "comparison with RUN, a run on the same capture with --field static (docs/metrics.md)")
+    # fmt: on
+    groups: dict[str, argparse._ArgumentGroup] = {}
+    for name, kind, about in config_keys():
+        section = name.split(".")[0] if "." in name else "general"
+        if section not in groups:
+            groups[section] = parser.add_argument_group(f"{section} [defaults of the preset {shown}]")
+        entries = len(typing.get_args(kind)) if typing.get_origin(kind) is tuple else None
+        value = functools.reduce(getattr, name.split("."), preset)
+        text = " ".join(map(str, value)) if isinstance(value, tuple) else str(value)
+        groups[section].add_argument(
+            *([SHORTCUTS[name]] if name in SHORTCUTS else []),
+            f"--{name}",
+            dest=name,
+            nargs=entries,
+            metavar=_METAVARS.get(kind) or ("INT" if entries else "|".join(typing.get_args(kind))),
+            default=argparse.SUPPRESS,
+            help=f"{about} [{text}]".removesuffix(" []").replace("%", "%%"),
+        )
+    known, unknown = parser.parse_known_args(arguments)
+    if unknown:
+        word = unknown[0].split("=")[0]
+        options = [name for action in parser._actions for name in action.option_strings]
+        what = f"there is no option {word}" if word.startswith("-") else f"{word!r} is one word too many"
+        raise InputError(f"{what}{did_you_mean(word, options) or '; lapgs-train --help lists the options'}.")
+    return vars(known)

@@ -1,0 +1,118 @@
+"""A moving scene and its checkpoint."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.io.checkpoint import read_checkpoint, write_checkpoint
+from lapgs_wgpu.motion.field import FieldConfig
+from lapgs_wgpu.motion.hashgrid import HashConfig
+from lapgs_wgpu.motion.scene import Scene4D
+
+CONFIG = FieldConfig(
+    bound=1.5,
+    static=HashConfig(2, (4, 4, 4), (8, 8, 8)),
+    temporal=HashConfig(2, (4, 4, 4), (8, 8, 6)),
+    width=8,
+)
+
+
+def moving_scene(device: Device, config: FieldConfig = CONFIG, sh_degree: int = 2, count: int = 60) -> Scene4D:
+    """With everything as training might leave it."""
+    generator = torch.Generator().manual_seed(0)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator)
+
+    parameters = {
+        "means": 0.4 * normal(count, 3),
+        "log_scales": normal(count, 3) * 0.5 - 2.5,
+        "quats": 2 * normal(count, 4),
+        "opacity_logits": normal(count),
+        "sh_dc": normal(count, 1, 3),
+        "sh_rest": 0.2 * normal(count, 15, 3),
+        "dynamics": normal(count, config.dynamics_size),
+    }
+    scene = Scene4D(parameters, config, device, sh_degree=sh_degree)
+    if scene.field is not None:
+        with torch.no_grad():
+            for parameter in scene.field.parameters():
+                parameter.copy_(0.3 * normal(*parameter.shape))
+    return scene
+
+
+def rewrite(path: Path, change: Callable[[dict[str, Any], dict[str, str]], object]) -> None:
+    """The file again, with its tensors and metadata changed."""
+    still, tensors, metadata = read_checkpoint(path)
+    change(tensors, metadata)
+    write_checkpoint(path, still, tensors, metadata)
+
+
+def with_field(**changes: object) -> Callable[[dict[str, Any], dict[str, str]], object]:
+    def change(_: dict[str, Any], metadata: dict[str, str]) -> None:
+        metadata["field"] = json.dumps(json.loads(metadata["field"]) | changes)
+
+    return change
+
+
+def with_grid(**changes: object) -> Callable[[dict[str, Any], dict[str, str]], object]:
+    def change(_: dict[str, Any], metadata: dict[str, str]) -> None:
+        values = json.loads(metadata["field"])
+        metadata["field"] = json.dumps(values | {"temporal": values["temporal"] | changes})
+
+    return change
+
+
+DAMAGE: dict[str, tuple[Callable[[dict[str, Any], dict[str, str]], object], str]] = {
+    "no field": (lambda _, m: m.pop("field"), "description of its field"),
+    "no degree": (lambda _, m: m.pop("sh_degree"), "description of its field"),
+    "not JSON": (lambda _, m: m.update(field="{"), "description of its field"),
+    "another type": (lambda _, m: m.update(field="[1, 2]"), "description of its field"),
+    "degree in words": (lambda _, m: m.update(sh_degree="three"), "description of its field"),
+    "degree 4": (lambda _, m: m.update(sh_degree="4"), "sh_degree 4 is outside 0 to 3"),
+    "unknown kind": (with_field(kind="quantum"), "kind must be static or .*, got 'quantum'"),
+    "unknown key": (with_field(colour="red"), "description of its field"),
+    "a grid missing": (with_field(static=None), "description of its field"),
+    "width 0": (with_field(width=0), "width must be 1 to 4096, got 0"),
+    "absurd width": (with_field(width=10**9), "width must be 1 to 4096"),
+    "width in words": (with_field(width="wide"), "description of its field"),
+    "fractional width": (with_field(width=8.5), "description of its field"),
+    "fractional depth": (with_field(depth=0.5), "description of its field"),
+    "true for a width": (with_field(width=True), "description of its field"),
+    "fractional table": (with_grid(table_log2=18.5), "description of its field"),
+    "time in words": (with_field(time_scale="slow"), "description of its field"),
+    "NaN time": (with_field(time_scale=math.nan), "time_scale must lie between 0 and .*, got nan"),
+    "time beyond its axis": (with_field(time_scale=50.0), "got 1.5 and 50"),
+    "bound 0": (with_field(bound=0), "bound must be above 0"),
+    "NaN bound": (with_field(bound=math.nan), "bound must lie between 0 and .*, got nan"),
+    "no levels": (with_grid(levels=0), "levels must be 1 to 64"),
+    "absurd levels": (with_grid(levels=10**6), "levels must be 1 to 64"),
+    "fractional levels": (with_grid(levels=2.5), "description of its field"),
+    "absurd table": (with_grid(table_log2=60), "table_log2 1 to 24, got 2 and 60"),
+    "negative resolution": (with_grid(base=[-4, 4, 4]), "base must lie between 0 and .*, got -4"),
+    "absurd resolution": (with_grid(finest=[10**6, 8, 8]), "2 to 65536 entries, got 1000000"),
+    "two axes": (with_grid(base=[4, 4]), "description of its field"),
+    "absurd planes": (
+        with_field(planes={"features": 10**6, "space": 8, "time": 8, "levels": 1}),
+        "features must be 1 to",
+    ),
+    "no dynamics": (with_field(dynamics=-1), "dynamics must lie between 0 and .*, got -1"),
+    "hash in words": (with_field(temporal_hash="yes"), "temporal_hash must be true or false"),
+    "other levels": (with_grid(levels=3), "has shape"),
+    "other width": (with_field(width=9), "has shape"),
+    "a tensor missing": (lambda t, _: t.pop("gaussians.quats"), "no tensor 'gaussians.quats'"),
+    "a dynamics row missing": (
+        lambda t, _: t.update({"gaussians.dynamics": t["gaussians.dynamics"][1:]}),
+        r"gaussians.dynamics' has shape \(59, 16\)",
+    ),
+    "a weight missing": (lambda t, _: t.pop("field.heads.bias"), "no tensor 'field.heads.bias'"),
+    "a row missing": (lambda t, _: t.update({"gaussians.means": t["gaussians.means"][1:]}), r"has shape \(59, 3\)"),
+}

@@ -1,0 +1,121 @@
+"""Several views a step, and several processes that share them."""
+
+from __future__ import annotations
+
+import dataclasses
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from helpers.training import configure
+
+from lapgs_wgpu.data import Dataset, load_dataset
+from lapgs_wgpu.data.synthetic import write_synthetic
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.motion.scene import load
+from lapgs_wgpu.train import trainer as training_module
+from lapgs_wgpu.train.distributed import Ranks
+from lapgs_wgpu.train.presets import write_toml
+from lapgs_wgpu.train.run import train
+from lapgs_wgpu.train.trainer import Trainer
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_synthetic(tmp_path_factory.mktemp("data") / "scene", size=32, train_views=8, test_views=2)
+
+
+@pytest.fixture(scope="module")
+def dataset(data: Path) -> Dataset:
+    return load_dataset(data)
+
+
+def test_gradients_of_a_step_are_the_mean_over_its_views(
+    dataset: Dataset, device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And the density control's are those of the views, not of their share in the mean."""
+    found: list[tuple[dict[str, list[torch.Tensor]], torch.Tensor]] = []
+    for views in ([0], [1], [0, 1]):
+        config = configure(schedule__batch=str(len(views)), schedule__warm_up="0", smoothness__share="0")
+        training = Trainer(config, dataset, device)
+        training._pictures.order = list(views)
+        monkeypatch.setattr(training._optimizer, "step", lambda step: None)
+        training.step()
+        gradients = {name: [g.clone() for g in group] for name, group in training._gradients().items()}
+        found.append((gradients, training._statistics.gradients.clone()))
+        training.close()
+    (first, seen_first), (second, seen_second), (both, seen_both) = found
+    for name, group in both.items():
+        for mean, a, b in zip(group, first[name], second[name], strict=True):
+            torch.testing.assert_close(mean, (a + b) / 2, rtol=1e-4, atol=1e-8)
+    torch.testing.assert_close(seen_both, seen_first + seen_second, rtol=1e-4, atol=1e-9)
+
+
+def test_a_batch_repeats_to_the_last_bit(dataset: Dataset, device: Device, tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        train(configure(schedule__batch="3", schedule__steps="14"), dataset, tmp_path / name, device=device)
+    assert (tmp_path / "a" / "checkpoint.ply").read_bytes() == (tmp_path / "b" / "checkpoint.ply").read_bytes()
+
+
+def test_processes_share_views_evenly_or_not_at_all(dataset: Dataset, device: Device) -> None:
+    with pytest.raises(InputError, match=r"2 processes cannot share 3 views a step evenly; give --batch 2"):
+        Trainer(configure(schedule__batch="3"), dataset, device, Ranks(0, 2))
+
+
+def test_every_process_draws_the_same_numbers_and_other_views(
+    dataset: Dataset, device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looked: list[str] = []
+    original = training_module.Trainer._loss
+
+    def note(self: Trainer, look: training_module._Look, moving: bool) -> object:
+        looked.append(look.view.name)
+        return original(self, look, moving)
+
+    monkeypatch.setattr(Trainer, "_loss", note)
+    monkeypatch.setattr(Ranks, "gather", lambda self, tensors: [[tensor] * self.count for tensor in tensors])
+    monkeypatch.setattr(Ranks, "any", lambda self, here: here)
+    states, views = [], []
+    for rank in range(2):
+        training = Trainer(configure(schedule__batch="2", schedule__warm_up="0"), dataset, device, Ranks(rank, 2))
+        looked.clear()
+        training.step()
+        states.append(training._generator.get_state())
+        views.append(list(looked))
+        training.close()
+    assert torch.equal(states[0], states[1])
+    assert len(views[0]) == len(views[1]) == 1
+    assert views[0] != views[1]
+
+
+def torchrun(config: Path, out: Path) -> None:
+    command = [
+        sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2", "--master-port", "0",
+        "--rdzv-backend", "c10d", "--rdzv-endpoint", "localhost:0", "-m", "lapgs_wgpu.cli", str(config),
+        "--out", str(out),
+    ]  # fmt: skip
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("dB PSNR") == 1, "more than one process told of the result"
+
+
+def test_two_processes_are_one_with_two_views(dataset: Dataset, data: Path, device: Device, tmp_path: Path) -> None:
+    """The same scene to float tolerance, and the same bits on each repetition."""
+    config = configure(schedule__batch="2", schedule__steps="24", data__path=str(data))
+    file = tmp_path / "small.toml"
+    file.write_text(write_toml(dataclasses.asdict(config)))
+    for name in ("first", "again"):
+        torchrun(file, tmp_path / name)
+    first = (tmp_path / "first" / "checkpoint.ply").read_bytes()
+    assert (tmp_path / "again" / "checkpoint.ply").read_bytes() == first
+    train(config, dataset, tmp_path / "one", device=device)
+    one, two = (load(tmp_path / name / "checkpoint.ply", device) for name in ("one", "first"))
+    assert len(one) == len(two)
+    for name, parameter in one.parameters.items():
+        np.testing.assert_allclose(
+            two.parameters[name].detach().numpy(), parameter.detach().numpy(), rtol=1e-3, atol=1e-4, err_msg=name
+        )

@@ -1,0 +1,270 @@
+"""Values that are not finite: named in the step in which they appear, kept from what lasts, and a reason to stop."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from helpers.training import configure
+
+from lapgs_wgpu import cli
+from lapgs_wgpu.command import NOT_FINITE, guarded
+from lapgs_wgpu.data import Dataset, load_dataset
+from lapgs_wgpu.data.synthetic import write_synthetic
+from lapgs_wgpu.errors import NumericalError
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.train import trainer as training_module
+from lapgs_wgpu.train.adaptive_split import adaptive_split
+from lapgs_wgpu.train.densify import Statistics, densify
+from lapgs_wgpu.train.nonfinite import IN_A_ROW, SHARE, Health, Skipped, describe, finite
+from lapgs_wgpu.train.render_loss import RenderLoss
+from lapgs_wgpu.train.run import resume, train
+from lapgs_wgpu.train.run_folder import STATE, load_state
+from lapgs_wgpu.train.trainer import Trainer
+
+BAD = Skipped(3, "r_003", "1 of 9 values")
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_synthetic(tmp_path_factory.mktemp("data") / "scene", size=32, train_views=8, test_views=2)
+
+
+@pytest.fixture(scope="module")
+def dataset(data: Path) -> Dataset:
+    return load_dataset(data)
+
+
+class Spoiled(torch.autograd.Function):
+    """The identity, whose gradient has one bad value."""
+
+    @staticmethod
+    def forward(ctx: Any, values: torch.Tensor, bad: float) -> torch.Tensor:
+        ctx.bad = bad
+        return values.view_as(values)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Any) -> tuple[torch.Tensor, None]:
+        gradient = gradients[0].clone()
+        gradient.view(-1)[7] = ctx.bad
+        return gradient, None
+
+
+def spoil(monkeypatch: pytest.MonkeyPatch, when: Callable[[int], bool], bad: float) -> None:
+    """Put a bad value into the gradient of the scales at the steps of these numbers, counted from 1."""
+    original, calls = training_module.render_loss, 0
+
+    def render(gaussians: Any, *rest: Any) -> RenderLoss:
+        nonlocal calls
+        calls += 1
+        if when(calls):
+            object.__setattr__(gaussians, "scales", Spoiled.apply(gaussians.scales, bad))
+        return original(gaussians, *rest)
+
+    monkeypatch.setattr(training_module, "render_loss", render)
+
+
+def same(a: dict[str, Any], b: dict[str, Any]) -> set[str]:
+    """The names of what differs."""
+    assert a.keys() == b.keys()
+    return {name for name in a if not np.array_equal(a[name], b[name])}
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e25])
+@pytest.mark.parametrize("at", [5, 16], ids=["warm-up", "moving"])
+def test_a_bad_gradient_skips_the_step_and_leaves_everything_as_it_was(
+    at: int, bad: float, dataset: Dataset, device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spoil(monkeypatch, lambda step: step == at, bad)
+    # Ahead of any change of density, which a skipped step does not put off.
+    training = Trainer(configure(density__start="30", data__background="black"), dataset, device)
+    with closing(training):
+        for _ in range(at - 1):
+            assert training.step().skipped is None
+        before = {name: value.copy() for name, value in training.state().items()}
+        progress = training.step()
+        assert progress.skipped is not None
+        assert progress.skipped.step == at
+        assert progress.skipped.view == dataset.train[before["training.order"][0]].name
+        expected = (
+            "the gradient of log_scales is too large"
+            if bad == 1e25
+            else "1 of 900 values of the gradient of log_scales are not finite"
+        )
+        assert expected in progress.skipped.what
+        after = {name: value.copy() for name, value in training.state().items()}
+        assert same(before, after) == {"training.done", "training.order"}
+        np.testing.assert_array_equal(after["training.order"], before["training.order"][1:])
+        assert training.step().skipped is None
+        assert {"gaussians.means", "adam.means.0.exp_avg", "statistics.views"} <= same(after, training.state())
+
+
+def test_a_bad_loss_is_named_by_its_term(dataset: Dataset, device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    original = training_module.render_loss
+
+    def render(*arguments: Any) -> RenderLoss:
+        done = original(*arguments)
+        return done._replace(loss=done.loss * math.nan, terms={**done.terms, "ssim": math.nan})
+
+    monkeypatch.setattr(training_module, "render_loss", render)
+    with closing(Trainer(configure(), dataset, device)) as training:
+        skipped = training.step().skipped
+    assert skipped is not None
+    assert skipped.what.startswith("the loss term ssim is nan; ")
+
+
+def test_a_training_that_stays_bad_stops_with_its_state(
+    data: Path, dataset: Dataset, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: Any
+) -> None:
+    config = configure(data__path=str(data), density__start="100")
+    with monkeypatch.context() as patched:
+        spoil(patched, lambda step: step > 4, math.nan)
+        code = guarded("lapgs-train", lambda _: train(config, dataset, tmp_path / "run", device=device) and 0, [])
+    assert code == NOT_FINITE == 5
+    error = capfd.readouterr().err
+    assert "step 5 was skipped: on view train_" in error
+    last = error.splitlines()[-1]
+    assert last.startswith(
+        f"lapgs-train: {IN_A_ROW} steps in a row had values that are not finite; the last: step 14 was"
+    )
+    assert last.endswith(f"stopped after step 14, from which lapgs-train --resume {tmp_path / 'run'} goes on.")
+    state = load_state(tmp_path / "run")
+    assert state is not None
+    assert state["training.done"] == 14
+    assert all(np.isfinite(value).all() for value in state.values())
+    resume(config, dataset, tmp_path / "run", device=device)
+    assert (tmp_path / "run" / "metrics.json").exists()
+
+
+def test_one_bad_step_does_not_stop_a_run(
+    dataset: Dataset, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spoil(monkeypatch, lambda step: step == 15, math.nan)
+    train(configure(), dataset, tmp_path / "run", device=device)
+    assert "NaN" not in (tmp_path / "run" / "log.jsonl").read_text()
+    assert (tmp_path / "run" / "metrics.json").exists()
+
+
+def test_a_bad_parameter_stops_the_training_and_leaves_the_older_state(
+    dataset: Dataset, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nobody else would see it: the rasteriser culls such a Gaussian, and it has no gradient."""
+    original, calls = training_module.render_loss, 0
+
+    def render(gaussians: Any, *rest: Any) -> RenderLoss:
+        nonlocal calls
+        calls += 1
+        if calls == 14:
+            # As a fault in memory might: after the step has read it.
+            trainings[0].scene.parameters["means"].data[3, 1] = math.nan
+        return original(gaussians, *rest)
+
+    trainings: list[Trainer] = []
+    start = Trainer._start
+
+    def note(self: Trainer, dataset: Dataset) -> None:
+        trainings.append(self)
+        start(self, dataset)
+
+    monkeypatch.setattr(Trainer, "_start", note)
+    monkeypatch.setattr(training_module, "render_loss", render)
+    out = tmp_path / "run"
+    with pytest.raises(
+        NumericalError, match=r"^1 of \d+ values of the parameters of means are not finite; .* saved last"
+    ):
+        train(configure(schedule__save_interval="10"), dataset, out, device=device)
+    state = load_state(out)
+    assert state is not None
+    assert state["training.done"] == 10
+    assert np.isfinite(state["gaussians.means"]).all()
+    assert (out / STATE).exists()
+
+
+def test_repeated_and_frequent_skips_end_a_training() -> None:
+    health = Health()
+    for _ in range(IN_A_ROW - 1):
+        health.note(BAD)
+    health.note(None)
+    for _ in range(IN_A_ROW - 1):
+        health.note(BAD)
+    with pytest.raises(NumericalError, match=r"10 steps in a row .*; the last: step 3 was skipped: on view r_003"):
+        health.note(BAD)
+    health = Health()
+    for _ in range(SHARE - 1):
+        for each in (BAD, None, None):
+            health.note(each)
+    with pytest.raises(NumericalError, match=f"{SHARE} of the last .* steps had values that are not finite"):
+        health.note(BAD)
+    health = Health()
+    for _ in range(1000):  # one in five
+        for each in (BAD, None, None, None, None):
+            health.note(each)
+
+
+def test_every_bad_value_is_found_wherever_it_is() -> None:
+    for bad in (math.nan, math.inf, -math.inf):
+        for at in (0, 1, 15, 16, 17, 62, 99_999):
+            values = torch.ones(100_000)
+            values[at] = bad
+            assert not finite({"a": [torch.zeros(3)], "b": [torch.zeros(0), values]})
+            assert describe("gradient", {"b": [torch.ones(4), values]}) == [
+                "1 of 100004 values of the gradient of b are not finite"
+            ]
+    assert finite({"a": [torch.full((1000,), 1e15)]}, {})
+    assert finite({})
+
+
+def rows(count: int) -> dict[str, torch.Tensor]:
+    generator = torch.Generator().manual_seed(1)
+    return {
+        "means": torch.randn(count, 3, generator=generator),
+        "log_scales": torch.randn(count, 3, generator=generator) - 1,
+        "quats": torch.randn(count, 4, generator=generator),
+        "opacity_logits": torch.zeros(count),
+        "dynamics": torch.randn(count, 16, generator=generator),
+    }
+
+
+@pytest.mark.parametrize("name", ["means", "log_scales", "quats", "dynamics"])
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_the_adaptive_split_leaves_out_what_is_not_finite(name: str, bad: float) -> None:
+    config = configure().density
+    whole = rows(60)
+    candidates = torch.arange(60) % 2 == 0
+    sound = torch.arange(60) % 4 != 0
+    expected = adaptive_split({k: v[sound] for k, v in whole.items()}, candidates[sound], config)
+    assert expected.any()
+    whole[name][~sound, 0] = bad
+    found = adaptive_split(whole, candidates, config)
+    assert torch.equal(found[sound], expected)
+    assert not found[~sound].any()
+
+
+def test_density_control_gets_over_bad_gaussians_and_statistics() -> None:
+    whole, statistics = rows(60), Statistics(60, torch.device("cpu"))
+    statistics.gradients += 1.0
+    statistics.views += 1.0
+    for i, name in enumerate(("means", "log_scales", "quats", "dynamics")):
+        whole[name][i] = math.nan
+    statistics.gradients[5] = math.nan
+    config = configure().density
+    change = densify(whole, statistics, config, 1.0, torch.Generator().manual_seed(0), bound_sizes=True)
+    assert change.split > 0
+
+
+def test_the_command_names_its_exit_codes() -> None:
+    def fail(error: Exception) -> Callable[[list[str]], int]:
+        def command(_: list[str]) -> int:
+            raise error
+
+        return command
+
+    assert guarded("x", fail(NumericalError("bad")), []) == 5
+    assert guarded("x", fail(MemoryError()), []) == 4
+    assert cli.train_command(["--eval", "nowhere"]) == 2

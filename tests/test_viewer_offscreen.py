@@ -1,0 +1,389 @@
+"""lapgs-view without a screen: pictures equal the evaluator's, videos and stills read back, mistakes are told."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from lapgs_wgpu.data import load_dataset
+from lapgs_wgpu.data.synthetic import write_synthetic
+from lapgs_wgpu.gpu import device as device_module
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.motion.field import FieldConfig
+from lapgs_wgpu.motion.hashgrid import HashConfig
+from lapgs_wgpu.motion.scene import Scene4D, load
+from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.splat.rasterize import rasterize
+from lapgs_wgpu.train.evaluate import to_8_bit
+from lapgs_wgpu.viewer import offscreen as offscreen_module
+from lapgs_wgpu.viewer.cli import view_command
+from lapgs_wgpu.viewer.offscreen import framed
+from lapgs_wgpu.viewer.path import CameraPath, KeyFrame, Pose
+from lapgs_wgpu.viewer.path_file import PathFile, write_path
+
+pytestmark = pytest.mark.triangles
+kernels = pytest.mark.kernels
+COUNT = 60
+
+
+def moving_scene(device: Device) -> Scene4D:
+    """Gaussians that a random field moves by about their own size."""
+    rng = np.random.default_rng(0)
+    grid = HashConfig(2, (4, 4, 4), (8, 8, 8), 10)
+    config = FieldConfig(static=grid, temporal=grid, width=8)
+    points, colours = rng.uniform(-0.8, 0.8, (COUNT, 3)), rng.uniform(0, 1, (COUNT, 3))
+    scene = Scene4D.from_points(points, colours, rng.uniform(0.05, 0.2, COUNT), config, opacity=0.7, device=device)
+    torch.manual_seed(0)
+    with torch.no_grad():
+        scene.parameters["sh_rest"].copy_(0.2 * torch.randn(COUNT, 15, 3))
+        scene.parameters["quats"].copy_(torch.randn(COUNT, 4))
+        scene.parameters["log_scales"].add_(0.5 * torch.randn(COUNT, 3))
+        for value in scene.field.parameters():  # type: ignore[union-attr]
+            value.add_(0.2 * torch.randn_like(value))
+    scene.sh_degree = 3
+    return scene
+
+
+@pytest.fixture(scope="module")
+def run(device: Device, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run folder: a checkpoint, and the config.toml that names its capture."""
+    folder = tmp_path_factory.mktemp("run")
+    data = write_synthetic(folder / "toys", size=24, train_views=3, test_views=2)
+    (folder / "config.toml").write_text(f'[data]\npath = "{data}"\nsize = 0\n')
+    scene = moving_scene(device)
+    scene.save(folder / "checkpoint.ply", {"background": "white"})
+    still = Scene4D.from_points(np.eye(3), np.eye(3), np.full(3, 0.2), FieldConfig(kind="static"), device=device)
+    still.save(folder / "still.ply")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def scene(run: Path, device: Device) -> Scene4D:
+    return load(run / "checkpoint.ply", device)
+
+
+@pytest.fixture(autouse=True)
+def one_device(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(device_module, "open_device", lambda name=None, **_: device)
+
+
+def view(*words: object) -> None:
+    assert view_command([str(word) for word in words]) == 0
+
+
+def picture(file: Path) -> np.ndarray:
+    return np.asarray(Image.open(file)).astype(int)
+
+
+# Pictures
+
+
+def expected_picture(scene: Scene4D, camera: Camera, time: float, colour: float = 1.0) -> np.ndarray:
+    return to_8_bit(scene.render(camera, time, torch.full((3,), colour)).image).astype(int)
+
+
+@kernels
+@pytest.mark.parametrize("number", [0, 1, 4])
+def test_a_screenshot_of_a_view_is_the_evaluators_picture(
+    number: int, run: Path, scene: Scene4D, tmp_path: Path
+) -> None:
+    dataset = load_dataset(run / "toys")
+    wanted = (*dataset.test, *dataset.train)[number]
+    for name in (number, wanted.name):
+        view(run / "checkpoint.ply", "--screenshot", tmp_path / "a.png", "--view", name)
+        got = picture(tmp_path / "a.png")
+        assert got.shape == (24, 24, 3)
+        assert np.abs(got - expected_picture(scene, wanted.camera, wanted.time)).max() <= 1
+
+
+@kernels
+def test_time_background_and_size_of_a_view(run: Path, scene: Scene4D, tmp_path: Path) -> None:
+    wanted = load_dataset(run / "toys").test[0]
+    words = ("--view", 0, "--time", "0.9", "--background", "black", "--size", "60x48")
+    view(run / "checkpoint.ply", "--screenshot", tmp_path / "a.png", *words)
+    camera = framed(wanted.camera, 60, 48)
+    assert (camera.K[0, 0], camera.K[0, 2]) == pytest.approx((2 * wanted.camera.K[0, 0], 30))
+    assert np.abs(picture(tmp_path / "a.png") - expected_picture(scene, camera, 0.9, 0.0)).max() <= 1
+    assert np.abs(expected_picture(scene, camera, 0.9) - expected_picture(scene, camera, 0.1)).max() > 20
+
+
+@kernels
+@pytest.mark.parametrize("mode", ["depth", "alpha", "motion", "dynamics", "scale"])
+def test_every_mode_gives_a_picture(mode: str, run: Path, tmp_path: Path) -> None:
+    view(run / "checkpoint.ply", "--screenshot", tmp_path / "a.png", "--mode", mode, "--size", "40x30")
+    got = picture(tmp_path / "a.png")
+    assert got.shape == (30, 40, 3)
+    assert got.std() > 5
+    assert (got[..., 0] == got[..., 1]).all() == (mode == "alpha")
+
+
+# Videos
+
+
+def frames_of(file: Path) -> np.ndarray:
+    return iio.imread(file, plugin="pyav").astype(int)
+
+
+def distance(a: np.ndarray, b: np.ndarray) -> float:
+    """Mean difference of two pictures (H, W, 3), 2 x 2 pixels at a time: yuv420p keeps no finer colours."""
+    height, width = a.shape[:2]
+    blocks = (a - b).reshape(height // 2, 2, width // 2, 2, 3).mean(axis=(1, 3))
+    return float(np.abs(blocks).mean())
+
+
+@kernels
+def test_a_video_of_the_clip(run: Path, scene: Scene4D, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "a.mp4"
+    view(run / "checkpoint.ply", "--video", file, "--view", 0, "--size", "65x49", "--fps", "12", "--seconds", "0.75")
+    assert "65x49 becomes 64x48" in capsys.readouterr().err
+    got = frames_of(file)
+    assert got.shape == (9, 48, 64, 3)
+    meta = iio.immeta(file, plugin="pyav")
+    assert meta["fps"] == 12
+    assert meta["codec"] == "h264"
+    assert meta["video_format"] == "yuv420p"
+    camera = framed(load_dataset(run / "toys").test[0].camera, 64, 48)
+    for frame, time in zip(got, np.linspace(0, 1, 9), strict=True):
+        assert distance(frame, expected_picture(scene, camera, time)) < 4.5
+    assert distance(got[0], expected_picture(scene, camera, 1.0)) > 10
+    assert [entry.name for entry in tmp_path.iterdir()] == ["a.mp4"]
+
+
+@kernels
+def test_colours_survive_the_video(tmp_path: Path, device: Device) -> None:
+    """Red, green, blue and grey come back: the matrix and the range are those that the file names."""
+    from lapgs_wgpu.viewer.video import write_video
+
+    wanted = np.array([[200, 30, 40], [20, 180, 60], [30, 50, 220], [128, 128, 128]], np.uint8)
+    flat = np.repeat(np.repeat(wanted[None], 32, axis=0), 16, axis=1)
+    camera = Camera(np.eye(3), np.eye(4), 64, 32)
+    write_video(tmp_path / "a.mp4", iter([(camera, 0.0)] * 3), 3, 24.0, lambda camera, time: flat)
+    got = frames_of(tmp_path / "a.mp4")[1, 16, 8::16]
+    assert np.abs(got - wanted.astype(int)).max() <= 6
+
+
+@kernels
+def test_a_turn_goes_around_while_time_stands(run: Path, tmp_path: Path) -> None:
+    words = ("--size", "32x24", "--path", "view", "--time", "0.5", "--seconds", "0.4", "--fps", "10")
+    view(run / "checkpoint.ply", "--video", tmp_path / "a.mp4", *words)
+    view(run / "checkpoint.ply", "--screenshot", tmp_path / "a.png", "--size", "32x24", "--time", "0.5")
+    got = frames_of(tmp_path / "a.mp4")
+    assert len(got) == 4
+    assert distance(got[0], picture(tmp_path / "a.png")) < 4.5
+    assert distance(got[2], got[0]) > 8  # from behind
+
+
+def test_a_turn_is_a_whole_one() -> None:
+    from lapgs_wgpu.viewer.camera import ViewCamera
+    from lapgs_wgpu.viewer.video import turn_shots
+
+    shots = list(turn_shots(ViewCamera([3, 0, 1], [1, 0, 0], [0, 0, 1], 0.7), (8, 6), 4, None))
+    assert [time for _, time in shots] == pytest.approx([0, 1 / 3, 2 / 3, 1])
+    places = np.stack([camera.position for camera, _ in shots])
+    np.testing.assert_allclose(places[[0, 2]], [[3, 0, 1], [-1, 0, 1]], atol=1e-9)
+    np.testing.assert_allclose(np.sort(places[[1, 3], 1]), [-2, 2], atol=1e-9)
+
+
+@kernels
+def test_a_still_scene_is_shown_from_all_around(run: Path, tmp_path: Path) -> None:
+    view(run / "still.ply", "--video", tmp_path / "a.mp4", "--size", "32x24", "--fps", "1")
+    assert len(frames_of(tmp_path / "a.mp4")) == 6
+
+
+@kernels
+def test_a_video_along_a_camera_path(run: Path, scene: Scene4D, tmp_path: Path) -> None:
+    def pose(x: float) -> Pose:
+        camera = Camera.looking_at([x, -3, 1], [0, 0, 0], up=[0, 0, 1], fov_x=0.8, width=4, height=3)
+        return Pose(camera.position, camera.T_cam_world[:3, :3], 0.7)
+
+    path = CameraPath([KeyFrame(0, 0.2, pose(-1)), KeyFrame(0.5, 0.6, pose(1)), KeyFrame(1.0, 0.1, pose(2))])
+    write_path(tmp_path / "p.json", PathFile(path, (48, 36), 4.0))
+    view(run / "checkpoint.ply", "--video", tmp_path / "a.mp4", "--path", tmp_path / "p.json")
+    got = frames_of(tmp_path / "a.mp4")
+    assert got.shape == (4, 36, 48, 3)
+    for frame, second in zip(got, np.linspace(0, 1, 4), strict=True):
+        stand, time = path.at(float(second))
+        assert distance(frame, expected_picture(scene, stand.camera(48, 36), time)) < 4.5
+
+
+def test_ctrl_c_leaves_no_file(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    drawn = offscreen_module.OffscreenRenderer.__call__
+    calls: list[int] = []
+
+    def interrupted(*arguments: object) -> object:
+        calls.append(1)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return drawn(*arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(offscreen_module.OffscreenRenderer, "__call__", interrupted)
+    words = [str(run / "checkpoint.ply"), "--video", str(tmp_path / "a.mp4"), "--size", "32x24"]
+    assert view_command(words) == 130
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "a.mp4").write_bytes(b"older")
+    calls.clear()
+    assert view_command(words) == 130
+    assert (tmp_path / "a.mp4").read_bytes() == b"older"
+    assert "interrupted" in capsys.readouterr().err
+
+
+def test_without_pyav_one_sentence_says_what_to_install(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "av", None)
+    assert view_command([str(run / "checkpoint.ply"), "--video", str(tmp_path / "a.mp4")]) == 2
+    assert capsys.readouterr().err == "lapgs-view: writing mp4 needs PyAV: pip install 'lapgs-wgpu[video]'\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+# Stills
+
+
+def columns(file: Path) -> dict[str, np.ndarray]:
+    """A reader of its own: the float properties of the first element, by name."""
+    header, _, body = file.read_bytes().partition(b"end_header\n")
+    lines = header.decode("ascii").splitlines()
+    assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
+    assert lines[2].startswith("element vertex ")
+    assert all(line.startswith("property float ") for line in lines[3:])
+    names = [line.split()[-1] for line in lines[3:]]
+    rows = np.frombuffer(body, "<f4").reshape(int(lines[2].split()[-1]), len(names))
+    return dict(zip(names, rows.T, strict=True))
+
+
+def assert_still(file: Path, scene: Scene4D, time: float) -> None:
+    """The file holds the Gaussians of the scene at this time, and draws the same picture."""
+    got = columns(file)
+    assert len(got) == 62
+    means, scales, quats = (
+        np.stack([got[name] for name in names], axis=1)
+        for names in (("x", "y", "z"), [f"scale_{i}" for i in range(3)], [f"rot_{i}" for i in range(4)])
+    )
+    # Channel-major: 15 coefficients of red, then of green, then of blue.
+    sh = np.stack(
+        [np.stack([got[f"f_dc_{c}"], *(got[f"f_rest_{15 * c + k}"] for k in range(15))], axis=1) for c in range(3)],
+        axis=2,
+    )
+    opacities = 1 / (1 + np.exp(-got["opacity"]))
+    with torch.no_grad():
+        wanted = scene.at(time)
+    unit = wanted.quats / wanted.quats.norm(dim=1, keepdim=True)
+    np.testing.assert_allclose(means, wanted.means.numpy(), atol=1e-5)
+    np.testing.assert_allclose(np.exp(scales), wanted.scales.numpy(), rtol=1e-4, atol=1e-7)
+    np.testing.assert_allclose(opacities, wanted.opacities.numpy(), atol=1e-5)
+    np.testing.assert_allclose(quats / np.linalg.norm(quats, axis=1, keepdims=True), unit.numpy(), atol=1e-6)
+    np.testing.assert_allclose(sh, wanted.sh.numpy(), atol=1e-6)
+    camera = Camera.looking_at([1, -3, 1], [0, 0, 0], up=[0, 0, 1], fov_x=0.8, width=40, height=30)
+    tensors = (torch.from_numpy(np.ascontiguousarray(a)) for a in (means, quats, np.exp(scales), opacities, sh))
+    image = rasterize(*tensors, camera, sh_degree=3, background=torch.ones(3), device=scene.device).image
+    assert np.abs(to_8_bit(image).astype(int) - expected_picture(scene, camera, time)).max() <= 1
+
+
+@kernels
+def test_an_exported_still(run: Path, scene: Scene4D, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "still.ply"
+    view(run / "checkpoint.ply", "--export", file, "--time", "0.7")
+    assert_still(file, scene, 0.7)
+    assert view_command([str(run / "checkpoint.ply"), "--export", str(file)]) == 2
+    assert "--overwrite" in capsys.readouterr().err
+    assert_still(file, scene, 0.7)
+    view(run / "checkpoint.ply", "--export", file, "--overwrite")
+    assert_still(file, scene, 0.0)
+
+
+@kernels
+def test_an_exported_sequence(run: Path, scene: Scene4D, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "new" / "frames"
+    view(run / "checkpoint.ply", "--export", folder, "--frames", "3")
+    assert sorted(file.name for file in folder.iterdir()) == ["frame_0000.ply", "frame_0001.ply", "frame_0002.ply"]
+    for number, time in enumerate((0.0, 0.5, 1.0)):
+        assert_still(folder / f"frame_{number:04}.ply", scene, time)
+    assert "3/3 frames" in capsys.readouterr().err
+    (folder / "notes.txt").write_text("kept")
+    assert view_command([str(run / "checkpoint.ply"), "--export", str(folder), "--frames", "2"]) == 2
+    assert "is not empty" in capsys.readouterr().err
+    view(run / "checkpoint.ply", "--export", folder, "--frames", "2", "--overwrite")
+    assert sorted(file.name for file in folder.iterdir()) == ["frame_0000.ply", "frame_0001.ply", "notes.txt"]
+    assert_still(folder / "frame_0001.ply", scene, 1.0)
+
+
+def test_the_opened_file_is_never_replaced(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = (run / "checkpoint.ply").read_bytes()
+    assert view_command([str(run / "checkpoint.ply"), "--export", str(run / "checkpoint.ply"), "--overwrite"]) == 2
+    assert "is the opened file" in capsys.readouterr().err
+    assert (run / "checkpoint.ply").read_bytes() == before
+
+
+# Mistakes
+
+MISTAKES = {
+    "frames alone": (["CHECKPOINT", "--frames", "3"], "--frames has no use without --export"),
+    "seconds alone": (["CHECKPOINT", "--seconds", "3"], "--seconds has no use without --video"),
+    "two at once": (["CHECKPOINT", "--screenshot", "a.png", "--video", "a.mp4"], "do not go together"),
+    "speed of a picture": (["CHECKPOINT", "--screenshot", "a.png", "--speed", "2"], "--speed has no use with --scre"),
+    "size of a still": (["CHECKPOINT", "--export", "a.ply", "--size", "8x8"], "--size has no use with --export"),
+    "slider of a video": (["CHECKPOINT", "--video", "a.mp4", "--no-time-slider"], "--time-slider has no use with"),
+    "a list and more": (["--list-devices", "--time", "0"], "--time has no use with --list-devices"),
+    "time of a sequence": (["CHECKPOINT", "--export", "a", "--frames", "3", "--time", "0.5"], "no use with --frames"),
+    "time of a clip": (["CHECKPOINT", "--video", "a.mp4", "--time", "0.5"], "--time has no use with --path time"),
+    "time of a still scene": (["STILL", "--screenshot", "a.png", "--time", "0.5"], "holds no motion"),
+    "frames of a still scene": (["STILL", "--export", "a", "--frames", "3"], "holds no motion"),
+    "clip of a still scene": (["STILL", "--video", "a.mp4", "--path", "both"], "holds no motion"),
+    "motion of a still scene": (["STILL", "--screenshot", "a.png", "--mode", "motion"], "nothing to show in mode"),
+    "no file": (["--screenshot", "a.png"], "name a .ply file"),
+    "a missing file": (["none.ply", "--screenshot", "a.png"], "none.ply"),
+    "time beyond the clip": (["CHECKPOINT", "--screenshot", "a.png", "--time", "1.5"], "from 0 to 1"),
+    "time of NaN": (["CHECKPOINT", "--screenshot", "a.png", "--time", "nan"], "from 0 to 1"),
+    "no size": (["CHECKPOINT", "--screenshot", "a.png", "--size", "8"], "WIDTHxHEIGHT"),
+    "a jpeg": (["CHECKPOINT", "--screenshot", "a.jpg"], "ends with .png"),
+    "an avi": (["CHECKPOINT", "--video", "a.avi"], "ends with .mp4"),
+    "a folder without frames": (["CHECKPOINT", "--export", "a"], "needs --frames"),
+    "a file with frames": (["CHECKPOINT", "--export", "a.ply", "--frames", "2"], "name of a folder"),
+    "an unknown path": (["CHECKPOINT", "--video", "a.mp4", "--path", "spiral"], "expected time, view, both"),
+    "a missing path": (["CHECKPOINT", "--video", "a.mp4", "--path", "none.json"], "none.json: cannot be read"),
+    "an unknown view": (["CHECKPOINT", "--screenshot", "a.png", "--view", "99"], "has views 0 to 4"),
+    "an unknown mode": (["CHECKPOINT", "--screenshot", "a.png", "--mode", "x"], "invalid choice"),
+    "too long": (["CHECKPOINT", "--video", "a.mp4", "--fps", "1000", "--seconds", "86400"], "are 86400000 frames"),
+    "a missing folder": (["CHECKPOINT", "--screenshot", "no/a.png", "--size", "8x8"], "no/a.png: not written"),
+    "a video in a missing folder": (["CHECKPOINT", "--video", "no/a.mp4", "--size", "8x8"], "no/a.mp4: not written"),
+    "frames in a file": (["CHECKPOINT", "--export", "used", "--frames", "2"], "cannot be used as a folder"),
+    "an unknown option": (["CHECKPOINT", "--screenshoot", "a.png"], "--help lists the options"),
+}
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_mistakes_end_in_one_sentence(
+    name: str, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "used").write_text("")
+    words, message = MISTAKES[name]
+    places = {"CHECKPOINT": str(run / "checkpoint.ply"), "STILL": str(run / "still.ply")}
+    assert view_command([places.get(word, word) for word in words]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.count("\n") == 1, err
+    assert err.startswith("lapgs-view: ")
+    assert message in err
+    assert [file.name for file in tmp_path.iterdir()] == ["used"]
+
+
+def test_a_view_without_a_capture(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "a.ply").write_bytes((run / "checkpoint.ply").read_bytes())
+    assert view_command([str(tmp_path / "a.ply"), "--screenshot", str(tmp_path / "a.png"), "--view", "0"]) == 2
+    assert "names a capture which is here" in capsys.readouterr().err
+
+
+def test_help_shows_examples(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="0"):
+        view_command(["--help"])
+    out = capsys.readouterr().out
+    for word in ("--screenshot a.png", "--path CAMERAS.json", "--frames 60"):
+        assert word in out

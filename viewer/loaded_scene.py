@@ -1,0 +1,76 @@
+"""An opened file: its scene, ready to be shown, and where a viewer begins."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.io.initial_view import InitialView
+from lapgs_wgpu.motion.playback import Playback, playback_of
+from lapgs_wgpu.motion.scene_file import read_scene
+from lapgs_wgpu.splat.camera import Camera
+
+from .camera import ViewCamera
+from .clock import Clock
+from .render_modes import BACKGROUNDS
+
+_ELEVATION = math.radians(35)  # of the guessed camera above the middle
+_FLAT = 0.5  # of the extents along x and y: what is lower lies on the ground
+_FRAMES = 150  # of a clip whose file does not say how many it has
+
+
+class LoadedScene(NamedTuple):
+    """path: where it came from, None for a training under way. look: camera, focus, up and frames to begin with."""
+
+    path: Path | None
+    playback: Playback
+    look: InitialView
+
+    def camera(self) -> ViewCamera:
+        """A camera where the viewer begins."""
+        return ViewCamera.of(self.look.camera, self.look.focus, self.look.up)
+
+    def clock(self) -> Clock:
+        """The clip from its start."""
+        return Clock(self.look.frames if self.playback.moves else 1)
+
+    @property
+    def background(self) -> tuple[float, float, float]:
+        """The one it was trained on, black where that is not known."""
+        return BACKGROUNDS.get(self.playback.metadata.get("background", ""), BACKGROUNDS["black"])
+
+
+def load_scene(path: Path, device: Callable[[], Device]) -> LoadedScene:
+    """Open a checkpoint, or any 3DGS .ply. device: is asked for when the file has been read. Raises InputError."""
+    playback = playback_of(read_scene(path), device())
+    look = InitialView.from_json(playback.metadata.get("view", ""))
+    return LoadedScene(path, playback, look or guess_look(playback))
+
+
+def guess_look(playback: Playback) -> InitialView:
+    """For files that say nothing of cameras: the middle of the Gaussians from a distance that shows most of them.
+
+    Up is -y, as in scenes whose poses come from COLMAP; z where the Gaussians lie flat in x and y, or the file is a
+    checkpoint of D-NeRF's scenes.
+    """
+    means = playback.means(0.0).astype(np.float64)
+    if not len(means):
+        means = np.zeros((1, 3))
+    middle = np.median(means, axis=0)
+    radius = max(float(np.quantile(np.linalg.norm(means - middle, axis=1), 0.9)), 1e-3)
+    extent = np.subtract(*np.quantile(means, [0.9, 0.1], axis=0))
+    flat = extent[2] < _FLAT * min(extent[0], extent[1])
+    if playback.metadata:
+        up, ahead = np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0])
+    elif flat:
+        up, ahead = np.array([0.0, 0.0, 1.0]), np.array([0.0, -1.0, 0.0])  # y points down in pictures
+    else:
+        up, ahead = np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, 1.0])
+    away = math.sin(_ELEVATION) * up - math.cos(_ELEVATION) * ahead
+    camera = Camera.looking_at(middle + 3.6 * radius * away, middle, up=up.tolist(), fov_x=0.9, width=640, height=480)
+    return InitialView(camera, middle, up, _FRAMES)

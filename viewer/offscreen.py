@@ -1,0 +1,76 @@
+"""Rendering without a window: screenshots and the frames of videos."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lapgs_wgpu.data import View
+from lapgs_wgpu.data.images import encode_png
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.io.atomic import atomic_write
+from lapgs_wgpu.splat.camera import Camera
+
+from .capture import open_capture
+from .frame import FrameRenderer, FrameRequest
+from .loaded_scene import LoadedScene
+from .present import Offscreen
+from .render_modes import Mode
+
+Colour = tuple[float, float, float]
+
+
+class OffscreenRenderer:
+    """Renders images of a scene. Raises InputError where the scene has nothing to show in this mode."""
+
+    def __init__(self, scene: LoadedScene, mode: Mode = "rgb", background: Colour | None = None) -> None:
+        self._renderer = FrameRenderer(scene.playback)
+        check_mode(scene, self._renderer, mode)
+        self._offscreen = Offscreen(scene.playback.device)
+        self._mode = mode
+        self._background = scene.background if background is None else background
+
+    def __call__(self, camera: Camera, time: float) -> NDArray[np.uint8]:
+        """(height, width, 3) uint8: what the camera sees at a time in [0, 1]."""
+        frame = self._renderer.draw(FrameRequest(camera, time, self._mode, self._background))
+        return self._offscreen((camera.width, camera.height), [frame.placed], self._background)
+
+
+def check_mode(scene: LoadedScene, renderer: FrameRenderer, mode: Mode) -> None:
+    """Raises InputError where the scene has nothing to show in this mode."""
+    if mode not in renderer.modes():
+        raise InputError(f"{scene.path}: has nothing to show in mode {mode}; it has {', '.join(renderer.modes())}.")
+
+
+def find_view(scene: LoadedScene, wanted: str) -> View:
+    """The view of the capture beside the file with this number (the held-out ones come first) or name. Raises
+    InputError."""
+    capture = open_capture(scene.path, scene.playback.metadata) if scene.path else None
+    if capture is None:
+        raise InputError(
+            f"--view {wanted}: {scene.path} stands beside no config.toml that names a capture which is here."
+        )
+    names = [view.name for view in capture.views]
+    if wanted in names:
+        return capture.views[names.index(wanted)]
+    if wanted.isdecimal() and int(wanted[:9]) < len(names):
+        return capture.views[int(wanted[:9])]
+    raise InputError(f"--view {wanted}: the capture has views 0 to {len(names) - 1}, named {names[0]} to {names[-1]}.")
+
+
+def framed(camera: Camera, width: int, height: int) -> Camera:
+    """The same camera on a picture of another size and aspect: its vertical field of view stays, pixels stay square
+    where they were, and what was in the middle stays there."""
+    scale = height / camera.height
+    K = camera.K.copy()
+    K[:2] *= scale
+    K[0, 2] += 0.5 * (width - scale * camera.width)
+    return Camera(K, camera.T_cam_world, width, height)
+
+
+def write_png(file: Path, picture: NDArray[np.uint8]) -> None:
+    """Write (height, width, 3) uint8. Atomic. Raises InputError where it cannot be written."""
+    with atomic_write(file) as target:
+        target.write(encode_png(picture))

@@ -1,0 +1,163 @@
+"""The options of lapgs-view, and which of them go together."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from lapgs_wgpu.command import DEVICE_HELP, LIST_DEVICES_HELP, HelpFormatter, Parser
+from lapgs_wgpu.errors import InputError
+
+from .clock import LOOPS
+from .render_modes import BACKGROUNDS, MODES
+
+DESCRIPTION = """\
+Display a trained scene, or any 3DGS .ply file, at any time and from any viewpoint.
+
+  lapgs-view runs/demo/checkpoint.ply --time-slider
+  lapgs-view runs/demo/checkpoint.ply --play --speed 0.5 --loop bounce
+  lapgs-view runs/demo/checkpoint.ply --backend http                  in a browser, also on another machine
+
+Without a display:
+  lapgs-view CHECKPOINT.ply --screenshot a.png --time 0.5 --size 1920x1080
+  lapgs-view CHECKPOINT.ply --screenshot a.png --view test_000 --mode depth
+  lapgs-view CHECKPOINT.ply --video a.mp4                             the clip once; an orbit if the scene is static
+  lapgs-view CHECKPOINT.ply --video a.mp4 --path both --seconds 10    one orbit while the clip plays
+  lapgs-view CHECKPOINT.ply --video a.mp4 --path CAMERAS.json         along a camera path (nerfstudio's format)
+  lapgs-view CHECKPOINT.ply --export still.ply --time 0.5             static .ply for other splat viewers
+  lapgs-view CHECKPOINT.ply --export frames --frames 60               sequence of static .ply files for SuperSplat
+
+[Values in brackets] are defaults.
+"""
+
+# Job -> the options that it takes; every job but window is chosen by the option of its name.
+_COMMON = {"device"}
+_PICTURE = _COMMON | {"time", "mode", "background", "size", "view"}
+_TAKES = {
+    "list_devices": set[str](),
+    "screenshot": _PICTURE,
+    "video": _PICTURE | {"path", "fps", "seconds"},
+    "export": _COMMON | {"time", "frames", "overwrite"},
+    "window": _PICTURE | {"time_slider", "play", "fps", "speed", "loop", "backend", "host", "port", "token"},
+}
+NEW_TOKEN = ""  # value of --token without a text
+
+
+def parse_options(arguments: Sequence[str]) -> tuple[Any, str]:
+    """The options, None where not given, and the job: one of _TAKES. Raises InputError where options conflict."""
+    given = _parse(arguments)
+    return given, _job(given)
+
+
+def _job(given: Any) -> str:
+    """What is to be done. Raises InputError for options that do not go together: none is silently ignored."""
+    jobs = [name for name in _TAKES if getattr(given, name, None) is not None]
+    if len(jobs) > 1:
+        raise InputError(f"{_option(jobs[0])} and {_option(jobs[1])} do not go together: one at a time.")
+    job = jobs[0] if jobs else "window"
+    for name, value in vars(given).items():
+        if value is None or name in ("file", job) or name in _TAKES[job]:
+            continue
+        needs = [_option(other) for other, takes in _TAKES.items() if name in takes and other != "window"]
+        if job != "window":
+            raise InputError(f"{_option(name)} has no use with {_option(job)}.")
+        raise InputError(f"{_option(name)} has no use without {' or '.join(needs)}.")
+    return job
+
+
+def _option(name: str) -> str:
+    return "--" + name.replace("_", "-")
+
+
+def _parse(arguments: Sequence[str]) -> Any:
+    parser = Parser("lapgs-view", description=DESCRIPTION, formatter_class=HelpFormatter, allow_abbrev=False)
+    # fmt: off
+    add = parser.add_argument
+    # All defaults are None, which tells given options from others.
+    add("file", nargs="?", metavar="FILE.ply", help="checkpoint of lapgs-train, or any 3DGS .ply file")
+    add("--device", metavar="NAME", help=DEVICE_HELP)
+    add("--list-devices", action="store_const", const=True, help=LIST_DEVICES_HELP)
+
+    add = parser.add_argument_group("content of the window, screenshot or video").add_argument
+    add("--time", type=_number(0.0, 1.0), metavar="T", help="time in the clip: 0 is its start, 1 its end [0, or the "
+        "time of --view]")
+    modes = "; ".join(f"{mode}: {about}" for mode, about in MODES.items())
+    add("--mode", choices=list(MODES), help=f"what to render; {modes} [rgb]")
+    add("--background", choices=list(BACKGROUNDS), help="background color [that of the training, otherwise black]")
+    add("--size", type=_size, metavar="WxH", help="width and height of the window, screenshot or video, pixels "
+        "[1280x720, or that of --view or of the camera path]")
+    add("--view", metavar="N|NAME", help="use a camera of the training's capture, by name or by number from 0; test "
+        "views come first [a camera stored in the file, otherwise one chosen to show the whole scene]")
+
+    add = parser.add_argument_group("window").add_argument
+    add("--time-slider", action=argparse.BooleanOptionalAction, help="show or hide the time slider [shown if the "
+        "scene moves]")
+    add("--play", action="store_const", const=True, help="start playing at once [paused]")
+    add("--fps", type=_number(0.1, 1000.0), metavar="F", help="frames per second of the clip at speed 1, and of "
+        "--video [30]")
+    add("--speed", type=_number(0.01, 100.0), metavar="X", help="playback speed, a factor [1]")
+    add("--loop", choices=list(LOOPS), help="at the end of the clip; loop: start again; bounce: play backwards; "
+        "once: stop [loop]")
+    add("--backend", choices=("auto", "glfw", "qt", "http"), help="how to display; glfw or qt: desktop window of "
+        "that library; auto: glfw if it works, otherwise qt; http: web server for a browser [auto]")
+
+    add = parser.add_argument_group("web server (with --backend http)").add_argument
+    add("--host", metavar="ADDRESS", help="network address to listen on; an address that other machines can reach "
+        "requires --token [127.0.0.1: this machine only]")
+    add("--port", type=_port, metavar="N", help="TCP port to listen on; 0: any free port [8080]")
+    add("--token", nargs="?", const=NEW_TOKEN, metavar="TEXT", help="require this token from browsers, 16 or more "
+        "letters, digits, - or _; without TEXT a random token is generated and printed [no token]")
+
+    add = parser.add_argument_group("screenshot and video (no window)").add_argument
+    add("--screenshot", metavar="FILE.png", help="render one image to a PNG file")
+    add("--video", metavar="FILE.mp4", help="render a video to an MP4 file (H.264)")
+    add("--path", metavar="time|view|both|CAMERAS.json", help="camera motion of --video; time: static camera while "
+        "the clip plays; view: one orbit around the focus point at a fixed time; both: one orbit while the clip "
+        "plays; CAMERAS.json: camera path in nerfstudio's format [time, or view if the scene does not move]")
+    add("--seconds", type=_number(0.001, 86400.0), metavar="S", help="length of --video, seconds [length of the clip "
+        "or of the camera path; 6 for view]")
+
+    add = parser.add_argument_group("export (no window)").add_argument
+    add("--export", metavar="FILE.ply|DIR", help="write a static 3DGS .ply file of the Gaussians at --time; with "
+        "--frames: a sequence of such files in the folder DIR")
+    add("--frames", type=_count, metavar="N", help="number of files that --export writes, at equally spaced times "
+        "from 0 to 1")
+    add("--overwrite", action="store_const", const=True, help="allow --export to replace existing files")
+    # fmt: on
+    return parser.parse_args(arguments)
+
+
+def _port(text: str) -> int:
+    if not (text.isascii() and text.isdigit() and int(text) <= 65535):
+        raise argparse.ArgumentTypeError(f"expected a number from 0 to 65535, got {text!r}")
+    return int(text)
+
+
+def _size(text: str) -> tuple[int, int]:
+    found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text)
+    if found is None or not (0 < int(found[1]) <= 16384 and 0 < int(found[2]) <= 16384):
+        raise argparse.ArgumentTypeError(f"expected WIDTHxHEIGHT in pixels, such as 1280x720, got {text!r}")
+    return int(found[1]), int(found[2])
+
+
+def _number(low: float, high: float) -> Callable[[str], float]:
+    def number(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = float("nan")
+        if not low <= value <= high:
+            raise argparse.ArgumentTypeError(f"expected a number from {low:g} to {high:g}, got {text!r}")
+        return value
+
+    return number
+
+
+def _count(text: str) -> int:
+    from .export import MOST_FRAMES
+
+    if re.fullmatch(r"\d{1,9}", text) is None or not 1 <= int(text) <= MOST_FRAMES:
+        raise argparse.ArgumentTypeError(f"expected a whole number from 1 to {MOST_FRAMES}, got {text!r}")
+    return int(text)

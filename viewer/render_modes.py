@@ -1,0 +1,18 @@
+"""Render modes, backgrounds and comparisons: constants that load neither torch nor wgpu."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+Mode = Literal["rgb", "depth", "alpha", "motion", "dynamics", "scale"]
+Compare = Literal["off", "side", "split", "error"]
+COMPARES: tuple[Compare, ...] = ("off", "side", "split", "error")
+MODES: dict[Mode, str] = {
+    "rgb": "colors",
+    "depth": "depth along the camera axis, world units",
+    "alpha": "opacity",
+    "motion": "distance that each Gaussian moves over the clip, world units",
+    "dynamics": "norm of each Gaussian's dynamics attribute",
+    "scale": "largest standard deviation of each Gaussian, world units",
+}
+BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "grey": (0.5, 0.5, 0.5)}

@@ -1,0 +1,60 @@
+"""The time slider with its transport: play, step, frame rate, speed, loop."""
+
+from __future__ import annotations
+
+from imgui_bundle import imgui
+
+from .clock import LOOPS, SPEEDS
+from .view_state import ViewState
+
+
+def draw_time_slider(state: ViewState) -> None:
+    """Fill the present imgui window."""
+    clock = state.clock
+    imgui.begin_disabled(not state.scene.playback.moves)
+    last = clock.frames - 1
+    imgui.set_next_item_width(-1)
+    label = f"{clock.time:.3f}   frame {clock.frame} of {last}"
+    # imgui reads % in a format; the label has none.
+    moved, time = imgui.slider_float("##time", clock.time, 0.0, 1.0, label, imgui.SliderFlags_.no_input)
+    if imgui.is_item_deactivated() and imgui.is_mouse_released(imgui.MouseButton_.left):
+        # imgui leaves out where the mouse went since the last frame, which is far where frames take long.
+        moved, time = True, _slider_value()
+    if moved:
+        clock.playing = False
+        clock.seek(min(max(time, 0.0), 1.0))
+    for text, action in (("|<", state.first_frame), ("<", state.previous_frame)):
+        if imgui.button(text, (32, 0)):
+            action()
+        imgui.same_line()
+    if imgui.button("Pause" if clock.playing else "Play", (64, 0)):
+        state.toggle_playing()
+    imgui.same_line()
+    for text, action in ((">", state.next_frame), (">|", state.last_frame)):
+        if imgui.button(text, (32, 0)):
+            action()
+        imgui.same_line()
+    imgui.set_next_item_width(70)
+    changed, fps = imgui.input_float("fps", clock.fps, 0.0, 0.0, "%.4g")
+    if changed:
+        clock.fps = min(max(fps, 0.1), 1000.0)
+    imgui.same_line()
+    imgui.set_next_item_width(70)
+    speeds = [f"{speed:g}x" for speed in SPEEDS]
+    present = SPEEDS.index(clock.speed) if clock.speed in SPEEDS else SPEEDS.index(1.0)
+    changed, chosen = imgui.combo("speed", present, speeds)
+    if changed:
+        clock.speed = SPEEDS[chosen]
+    imgui.same_line()
+    imgui.set_next_item_width(84)
+    changed, chosen = imgui.combo("##loop", LOOPS.index(clock.loop), list(LOOPS))
+    if changed:
+        clock.loop = LOOPS[chosen]
+    imgui.end_disabled()
+
+
+def _slider_value() -> float:
+    """0 to 1 where the grab of the last item, a slider, stands in its middle under the mouse."""
+    half_grab = imgui.get_style().grab_min_size / 2 + 2  # imgui's own padding
+    left, right = imgui.get_item_rect_min().x + half_grab, imgui.get_item_rect_max().x - half_grab
+    return float((imgui.get_mouse_pos().x - left) / max(right - left, 1.0))
