@@ -226,6 +226,16 @@ def test_two_balls_are_followed_over_the_whole_clip() -> None:
         assert (errors(found.tracks, center) < 0.8).mean() > 0.95
 
 
+def test_a_track_is_not_drawn_to_the_side_that_is_seen() -> None:
+    """Each time shows one side, whose points are half a radius from the center on average."""
+    center = path(np.linspace(0, 1, 80))
+    found = find_tracks(balls(center), BOX)
+    assert found.tracks is not None
+    middle = found.tracks.paths.mean(axis=1) - center
+    wander = np.linalg.norm(middle - np.median(middle, axis=0), axis=1)
+    assert np.median(wander) < 0.2 * RADIUS
+
+
 def test_a_ball_that_is_hidden_for_a_while_is_found_again() -> None:
     center = path(np.linspace(0, 1, 80))
     found = find_tracks(balls(center, gone=range(50, 54)), BOX)

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from .residual import Floats
 from .surface_points import PointClouds, Points, parts_of
-from .trajectories import Trajectory, find_trajectories
+from .trajectories import Trajectory, find_trajectories, time_step
 
 KEY_TIMES = 4  # from which is tracked, at most
 LEAST_REST = 0.05  # share of the points without a track that is worth another key time
@@ -44,6 +44,9 @@ COLOR_SPREAD = 0.3
 NOISE = 0.1  # weight of the hypothesis that a point belongs to no track
 EXPLAINED = 0.3  # weight of points that an earlier key time's tracks explain
 LOST = 0.3  # a part is lost where it explains less than this share of what it usually does
+SMOOTHING = 2.0  # times; standard deviation of the weights by which paths are smoothed
+RIDGE = 1e-2  # of slope and curvature, which few times do not determine
+UNSUPPORTED = 0.1  # weight of a time at which a part is not seen
 SUPPORTED = 0.3  # share of a part's points with surface points within REACH, from which on it is seen
 
 
@@ -82,11 +85,11 @@ def find_tracks(clouds: PointClouds, half_side: float) -> Found:
             points._replace(scores=points.scores * np.where(mask, 1.0, EXPLAINED).astype(np.float32))
             for points, mask in zip(clouds.clouds, free, strict=True)
         ]
-        tracks = _tracks_from(key, _merged(rest, key), clouds.times, weighted, trajectories, half_side)
-        if tracks is None:
+        followed = _tracks_from(key, _merged(rest, key), clouds.times, weighted, trajectories, half_side)
+        if followed is None:
             break
-        found.append(tracks)
-        for mask, points, path in zip(free, clouds.clouds, tracks.paths, strict=True):
+        found.append(followed[0])
+        for mask, points, path in zip(free, clouds.clouds, followed[1], strict=True):
             if len(points.scores):
                 mask &= cKDTree(path).query(points.positions)[0] >= REACH * half_side
     if not found:
@@ -155,25 +158,56 @@ def _tracks_from(
     clouds: list[Points],
     trajectories: list[Trajectory],
     half_side: float,
-) -> Tracks | None:
-    """The points of a key time, followed twice: first those of that time, then with all that belongs to them."""
-    follower = _Follower(_thinned(_voxels(start, VOXEL * half_side, least=1), ROUGH), half_side)
-    if len(follower.positions) == 0:
-        return None
-    paths = follower.follow(key, times, clouds, trajectories)
-    template = _at_key_time(key, paths, clouds, half_side)
-    if len(template.scores) >= LEAST_PART:
-        follower = _Follower(_thinned(template, FINE), half_side)
+) -> tuple[Tracks, Floats] | None:
+    """The points of a key time, followed twice: first those of that time, then with all that belongs to them.
+
+    Returns the tracks, and their paths before these were smoothed, which are nearer to the points of each time.
+    """
+    template = _thinned(_voxels(start, VOXEL * half_side, least=1), ROUGH)
+    found = None
+    for last in (False, True):
+        follower = _Follower(template, half_side)
         if len(follower.positions) == 0:
-            return None
+            break
         paths = follower.follow(key, times, clouds, trajectories)
+        supported = _supported(paths, follower.part, clouds, half_side)
+        smooth = _smoothed(times, paths, supported, follower.part)
+        found = Tracks(follower.positions, follower.colors, follower.part, smooth, supported), paths
+        if not last:
+            template = _thinned(_at_key_time(key, smooth, clouds, half_side), FINE)
+    return found
+
+
+def _supported(paths: Floats, part: NDArray[np.int64], clouds: list[Points], half_side: float) -> NDArray[np.bool_]:
+    """(T, n) whether the surface points of a time agree with a point's part."""
     supported = np.zeros(paths.shape[:2], bool)
     for i, points in enumerate(clouds):
         if len(points.scores):
             near = cKDTree(points.positions).query(paths[i])[0] < REACH * half_side
-            share = np.bincount(follower.part, near) / np.bincount(follower.part)
-            supported[i] = share[follower.part] > SUPPORTED
-    return Tracks(follower.positions, follower.colors, follower.part, paths, supported)
+            supported[i] = (np.bincount(part, near) / np.bincount(part))[part] > SUPPORTED
+    return supported
+
+
+def _smoothed(
+    times: NDArray[np.float64], paths: Floats, supported: NDArray[np.bool_], part: NDArray[np.int64]
+) -> Floats:
+    """Paths (T, n, 3), each a parabola fitted to the times around: the image of a time shows one side of a part, and
+    pulls it towards that side."""
+    clock = times / time_step(times)
+    apart = clock[:, None] - clock
+    falloff = np.exp(-0.5 * (apart / SMOOTHING) ** 2)
+    basis = np.stack([np.ones_like(apart), -apart / SMOOTHING, (apart / SMOOTHING) ** 2], axis=2)
+    ridge = np.diag([0.0, RIDGE, RIDGE])
+    smooth = np.empty_like(paths)
+    for k in range(int(part.max()) + 1):
+        members = part == k
+        weights = falloff * np.where(supported[:, members][:, 0], 1.0, UNSUPPORTED)
+        weighted = np.swapaxes(basis, 1, 2) * weights[:, None]
+        fit = np.linalg.solve(
+            weighted @ basis + ridge, weighted
+        )  # (T, 3, T): coefficients of the parabola at each time
+        smooth[:, members] = np.tensordot(fit[:, 0], paths[:, members], axes=1)
+    return smooth
 
 
 def _at_key_time(key: int, paths: Floats, clouds: list[Points], half_side: float) -> Points:

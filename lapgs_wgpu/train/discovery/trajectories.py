@@ -39,9 +39,13 @@ class Trajectory(NamedTuple):
 
 
 class _Groups(NamedTuple):
-    """The groups of all times. time: (n,) index. centers, colors: (n, 3). worth: (n,) in [0, 1]."""
+    """The groups of all times.
+
+    time: (n,) index. clock: (n,) time in typical time steps. centers, colors: (n, 3). worth: (n,) in [0, 1].
+    """
 
     time: NDArray[np.int64]
+    clock: NDArray[np.float64]
     centers: NDArray[np.float64]
     colors: NDArray[np.float64]
     worth: NDArray[np.float64]
@@ -59,7 +63,7 @@ def find_trajectories(clouds: PointClouds, link: float, half_side: float) -> lis
         if worth < LEAST_WORTH:
             break
         groups.worth[path] *= AGAIN
-        trajectories.append(_smooth(groups, path, len(clouds.times)))
+        trajectories.append(_smooth(groups, path, clouds.times / time_step(clouds.times)))
     return trajectories
 
 
@@ -72,7 +76,8 @@ def _groups(clouds: PointClouds, link: float) -> _Groups:
             center, color = points.positions[members].mean(axis=0), points.colors[members].mean(axis=0)
             rows.append([i, *center, *color, min(1.0, members.sum() / FULL_GROUP)])
     table = np.array(rows, np.float64).reshape(-1, 8)
-    return _Groups(table[:, 0].astype(np.int64), table[:, 1:4], table[:, 4:7], table[:, 7].copy())
+    time = table[:, 0].astype(np.int64)
+    return _Groups(time, clouds.times[time] / time_step(clouds.times), table[:, 1:4], table[:, 4:7], table[:, 7].copy())
 
 
 def _best_path(groups: _Groups, times: int, half_side: float) -> tuple[list[int], float]:
@@ -89,12 +94,12 @@ def _best_path(groups: _Groups, times: int, half_side: float) -> tuple[list[int]
     before: list[NDArray[np.int64]] = []
     for b, (time, center, color) in enumerate(zip(groups.time, groups.centers, groups.colors, strict=True)):
         a = np.arange(first[max(0, time - LEAP)], first[time])
-        lapse = (time - groups.time[a]).astype(np.float64)
+        lapse = groups.clock[b] - groups.clock[a]
         velocity = (center - groups.centers[a]) / lapse[:, None]
         near = np.abs(velocity).max(axis=1, initial=0.0) <= STEP * half_side
         a, lapse, velocity = a[near], lapse[near], velocity[near]
         apart = ((color - groups.colors[a]) ** 2).sum(axis=1) / (2 * COLOR_SPREAD**2)
-        gain = groups.worth[b] - SKIPPED * (lapse - 1) - np.minimum(SHARP, apart)
+        gain = groups.worth[b] - SKIPPED * (time - groups.time[a] - 1) - np.minimum(SHARP, apart)
         worth, origin = groups.worth[a], np.full(len(a), -1)
         for i, group in enumerate(a):
             if len(starts[group]):
@@ -119,17 +124,23 @@ def _best_path(groups: _Groups, times: int, half_side: float) -> tuple[list[int]
     return path[::-1], total
 
 
-def _smooth(groups: _Groups, path: list[int], times: int) -> Trajectory:
-    """The path at every time: a straight line fitted to the groups around it, by weights that fall off in time."""
-    at, centers = groups.time[path].astype(np.float64), groups.centers[path]
-    result = np.zeros((times, 3), np.float32)
-    for i in range(times):
-        nearest = float(np.abs(at - i).min())
-        weight = np.exp(-0.5 * ((at - i) / (WINDOW + nearest)) ** 2)
-        basis = np.stack([np.ones(len(at)), at - i], axis=1)
+def _smooth(groups: _Groups, path: list[int], clock: NDArray[np.float64]) -> Trajectory:
+    """The path at every time (T,): a straight line fitted to the groups around it, by weights that fall off in time."""
+    centers = groups.centers[path]
+    apart = groups.clock[path] - clock[:, None]
+    nearest = np.abs(apart).min(axis=1)[:, None]
+    weights = np.exp(-0.5 * (apart / (WINDOW + nearest)) ** 2)
+    result = np.zeros((len(clock), 3), np.float32)
+    for i, (weight, lapse) in enumerate(zip(weights, apart, strict=True)):
+        basis = np.stack([np.ones_like(lapse), lapse], axis=1)
         product = basis.T * weight
-        ridge = np.diag([0.0, 1e-3 + nearest])  # beyond its ends a path hardly goes on
+        ridge = np.diag([0.0, 1e-3 + nearest[i, 0]])  # beyond its ends a path hardly goes on
         result[i] = np.linalg.solve(product @ basis + ridge, product @ centers)[0]
-    seen = np.zeros(times, bool)
+    seen = np.zeros(len(clock), bool)
     seen[groups.time[path]] = True
     return Trajectory(result, seen)
+
+
+def time_step(times: NDArray[np.float64]) -> float:
+    """The typical difference of ascending times; 1 for a single one."""
+    return float(np.median(np.diff(times))) if len(times) > 1 else 1.0
