@@ -199,15 +199,17 @@ def test_a_comparison_tells_what_is_worse(tmp_path: Path) -> None:
         (tmp_path / name).write_text(json.dumps(content))
         return tmp_path / name
 
-    old = write("old.json", "one", sort=(1, 2, 3), emit=(1.9, 2, 2.1), ranges=(1, 1, 1), gone=(1, 1, 1))
-    new = write("new.json", "two", sort=(2, 3, 4), emit=(3.8, 4, 4.2), ranges=(0.4, 0.5, 0.6))
+    old = write(
+        "old.json", "one", sort=(1, 2, 3), duplicate_with_keys=(1.9, 2, 2.1), tile_ranges=(1, 1, 1), gone=(1, 1, 1)
+    )
+    new = write("new.json", "two", sort=(2, 3, 4), duplicate_with_keys=(3.8, 4, 4.2), tile_ranges=(0.4, 0.5, 0.6))
     lines = bench("--compare", old, new).splitlines()
     assert lines[0] == "adapter: one -> two"
     assert [line.split()[:3] for line in lines[2:5]] == [["raster", "/", "a"]] * 3
     assert [line.split()[4:] for line in lines[2:5]] == [
-        ["emit", "2.00", "4.00", "2.00", "*"],
+        ["duplicate_with_keys", "2.00", "4.00", "2.00", "*"],
         ["sort", "2.00", "3.00", "1.50"],
-        ["ranges", "1.00", "0.50", "0.50", "*"],
+        ["tile_ranges", "1.00", "0.50", "0.50", "*"],
     ]
     assert lines[5] == f"only in {old}: raster / a / gone"
     assert len(lines) == 6

@@ -17,9 +17,10 @@ from wgpu.backends.wgpu_native import GPUBuffer, GPUQueue
 from lapgs_wgpu.gpu.buffer import Buffer
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Kernel
-from lapgs_wgpu.motion.field import FieldConfig, Nearby
-from lapgs_wgpu.motion.grid_field import GridField
-from lapgs_wgpu.motion.hashgrid import HashConfig
+from lapgs_wgpu.motion.fields.config import FieldConfig
+from lapgs_wgpu.motion.fields.deformation import Nearby
+from lapgs_wgpu.motion.fields.grid_field import GridField
+from lapgs_wgpu.motion.fields.hash_grid_config import HashConfig
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterize import rasterizer_of
 from lapgs_wgpu.splat.rasterizer import Rasterizer
@@ -111,7 +112,7 @@ def test_dispatches_a_step(device: Device, scene: Scene, truths: TruthCache, eve
     """By the plan: what a sort needs follows from the width of its digits, all else is counted."""
     step(scene, truths, device)
     names = [event.name for event in events if event.kind == "dispatch"]
-    shape = rasterizer_of(device).shape
+    shape = rasterizer_of(device).config
     tiles = math.ceil(CAMERA.width / shape.tile_width) * math.ceil(CAMERA.height / shape.tile_height)
     widest = 8 if shape.lane_runs else 4
     digits = math.ceil(32 / widest) + math.ceil(tiles.bit_length() / widest)

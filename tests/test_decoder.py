@@ -9,16 +9,17 @@ import pytest
 import torch
 from scenes import relative
 from test_fields import DYNAMICS, NEARBY, OURS, POINTS, grid_field, parts
-from test_matrix import on_device, random, read
+from test_matmul import on_device, random, read
 from torch import Tensor
 
 from lapgs_wgpu.gpu.buffer import Buffer
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
-from lapgs_wgpu.motion.decoder import Decoder
-from lapgs_wgpu.motion.device_decoder import DecoderShape
-from lapgs_wgpu.motion.field import FieldConfig, Nearby
-from lapgs_wgpu.motion.grid_field import GridField
+from lapgs_wgpu.motion.fields.config import FieldConfig
+from lapgs_wgpu.motion.fields.decoder import Decoder
+from lapgs_wgpu.motion.fields.deformation import Nearby
+from lapgs_wgpu.motion.fields.grid_field import GridField
+from lapgs_wgpu.motion.passes.decoder_passes import DecoderShape
 
 pytestmark = pytest.mark.kernels
 

@@ -18,7 +18,7 @@ from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.buffer import Buffer
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.tensors import pack_tensors
-from lapgs_wgpu.motion.field import FieldConfig
+from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.rasterizer import Rasterizer

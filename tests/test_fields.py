@@ -9,15 +9,16 @@ import torch
 from torch import Tensor, nn
 
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.motion import grid_field as grid_field_module
-from lapgs_wgpu.motion.field import PLANES, Deformation, FieldConfig, FieldKind, Nearby, PlaneConfig
-from lapgs_wgpu.motion.grid_field import GridField
-from lapgs_wgpu.motion.hash_encoder import encode_reference
-from lapgs_wgpu.motion.hashgrid import HashConfig
-from lapgs_wgpu.motion.hexplane_field import HexPlaneField
-from lapgs_wgpu.motion.laplacian import LaplacianMotion, TimeMotion
-from lapgs_wgpu.motion.layers import last_product
-from lapgs_wgpu.motion.mlp_field import MlpField, octaves
+from lapgs_wgpu.motion.fields import grid_field as grid_field_module
+from lapgs_wgpu.motion.fields.config import PLANES, FieldConfig, FieldKind, PlaneConfig
+from lapgs_wgpu.motion.fields.deformation import Deformation, Nearby
+from lapgs_wgpu.motion.fields.grid_field import GridField
+from lapgs_wgpu.motion.fields.hash_encoder import encode_reference
+from lapgs_wgpu.motion.fields.hash_grid_config import HashConfig
+from lapgs_wgpu.motion.fields.hexplane_field import HexPlaneField
+from lapgs_wgpu.motion.fields.laplacian import LaplacianMotion, TimeMotion
+from lapgs_wgpu.motion.fields.layers import last_product
+from lapgs_wgpu.motion.fields.mlp_field import MlpField, octaves
 from lapgs_wgpu.motion.scene import Field, make_field
 
 OURS = FieldConfig(

@@ -11,8 +11,8 @@ from scenes import relative
 from torch import Tensor
 
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.motion.hash_encoder import HashEncoder, HashGrid, encode_reference
-from lapgs_wgpu.motion.hashgrid import TIME, HashConfig, make_levels
+from lapgs_wgpu.motion.fields.hash_encoder import HashEncoder, HashGrid, encode_reference
+from lapgs_wgpu.motion.fields.hash_grid_config import TIME, HashConfig, make_levels
 
 pytestmark = pytest.mark.kernels
 

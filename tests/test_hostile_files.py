@@ -40,9 +40,9 @@ from test_viewer_path import nerfstudio
 from lapgs_wgpu.data import Dataset, load_dataset
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.first_look import FirstLook
-from lapgs_wgpu.motion.field import FieldConfig, PlaneConfig
-from lapgs_wgpu.motion.hashgrid import HashConfig
-from lapgs_wgpu.motion.playback import open_playback
+from lapgs_wgpu.motion.fields.config import FieldConfig, PlaneConfig
+from lapgs_wgpu.motion.fields.hash_grid_config import HashConfig
+from lapgs_wgpu.motion.playback.playback import open_playback
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.motion.scene_file import read_scene
 from lapgs_wgpu.train.config import Config

@@ -109,8 +109,12 @@ def test_wgsl_that_does_not_compile_is_named(device: Device, wgsl: dict[str, str
 
 def test_kernels_are_compiled_once(device: Device) -> None:
     assert Kernel.get(device, "compact") is Kernel.get(device, "compact")
-    assert Kernel.get(device, "emit", TILE_W=8, TILE_H=8) is Kernel.get(device, "emit", TILE_H=8, TILE_W=8)
-    assert Kernel.get(device, "emit", TILE_W=8, TILE_H=8) is not Kernel.get(device, "emit", TILE_W=16, TILE_H=8)
+    assert Kernel.get(device, "duplicate_with_keys", TILE_W=8, TILE_H=8) is Kernel.get(
+        device, "duplicate_with_keys", TILE_H=8, TILE_W=8
+    )
+    assert Kernel.get(device, "duplicate_with_keys", TILE_W=8, TILE_H=8) is not Kernel.get(
+        device, "duplicate_with_keys", TILE_W=16, TILE_H=8
+    )
 
 
 def test_a_part_of_a_buffer_can_be_bound(device: Device, wgsl: dict[str, str]) -> None:

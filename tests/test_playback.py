@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from test_deform import CONFIGS, GRID4D, OURS, trained
+from test_grid_field_playback import CONFIGS, GRID4D, OURS, trained
 from test_ply import columns_of, ply_bytes, random_still
 from test_scene import DAMAGE, moving_scene, rewrite
 from test_train import configure
@@ -22,12 +22,12 @@ from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.buffer import BufferPool, read_all
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.ply import StillGaussians, write_ply
-from lapgs_wgpu.motion import scene_playback
-from lapgs_wgpu.motion.field import FieldConfig
-from lapgs_wgpu.motion.playback import DevicePlayback, Playback, open_playback
+from lapgs_wgpu.motion.fields.config import FieldConfig
+from lapgs_wgpu.motion.playback import torch_playback
+from lapgs_wgpu.motion.playback.playback import DevicePlayback, Playback, open_playback
+from lapgs_wgpu.motion.playback.torch_playback import TorchPlayback
 from lapgs_wgpu.motion.scene import Scene4D, load
 from lapgs_wgpu.motion.scene_file import read_scene
-from lapgs_wgpu.motion.scene_playback import ScenePlayback
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.rasterize import rasterizer_of, upload_gaussians
 from lapgs_wgpu.splat.rasterizer import GaussianBuffers, Rasterizer
@@ -66,7 +66,7 @@ def saved(device: Device, folder: Path, config: FieldConfig, count: int = 300) -
 def test_it_shows_the_scene(device: Device, tmp_path: Path, name: str) -> None:
     scene, path = saved(device, tmp_path, KINDS[name])
     playback = open_playback(path, device)
-    assert isinstance(playback, DevicePlayback if name in ON_DEVICE else ScenePlayback)
+    assert isinstance(playback, DevicePlayback if name in ON_DEVICE else TorchPlayback)
     assert (playback.count, playback.sh_degree, playback.moves) == (300, 2, name != "static")
     assert playback.field_config == KINDS[name]
     assert playback.metadata == {"scene": "test"}
@@ -129,7 +129,7 @@ def test_torch_evaluates_what_has_changed_alone(
 ) -> None:
     _, path = saved(device, tmp_path, KINDS[name])
     playback = open_playback(path, device)
-    assert isinstance(playback, ScenePlayback)
+    assert isinstance(playback, TorchPlayback)
     scene, times = playback.scene, []
     at = scene.at
     monkeypatch.setattr(scene, "at", lambda t: (times.append(t), at(t))[1])
@@ -137,7 +137,7 @@ def test_torch_evaluates_what_has_changed_alone(
     def evaluated(t: float = 0.1) -> bool:
         times.clear()
         shown = contents(playback.at(t))
-        for found, expected in zip(shown, contents(ScenePlayback(load(path, device)).at(t)), strict=True):
+        for found, expected in zip(shown, contents(TorchPlayback(load(path, device)).at(t)), strict=True):
             np.testing.assert_array_equal(found, expected)
         return times == [t]
 
@@ -164,7 +164,7 @@ def test_an_upload_that_failed_is_made_again(device: Device, tmp_path: Path, mon
         raise MemoryError
 
     with monkeypatch.context() as patched:
-        patched.setattr(scene_playback, "upload_gaussians", fail)
+        patched.setattr(torch_playback, "upload_gaussians", fail)
         with pytest.raises(MemoryError):
             playback.at(0.2)
     for found, part in zip(contents(playback.at(0.1)), expected, strict=True):
@@ -175,11 +175,11 @@ def test_an_upload_that_failed_is_made_again(device: Device, tmp_path: Path, mon
 def test_each_step_of_a_training_is_shown(device: Device, tmp_path: Path, kind: str) -> None:
     dataset = load_dataset(write_synthetic(tmp_path / "scene", size=16, train_views=4, test_views=1))
     training = Training(configure(method=kind), dataset, device)
-    playback = ScenePlayback(training.scene)
+    playback = TorchPlayback(training.scene)
     with closing(training):
         for _ in range(12):
             training.step()
-            shown, anew = (contents(each.at(0.4)) for each in (playback, ScenePlayback(training.scene)))
+            shown, anew = (contents(each.at(0.4)) for each in (playback, TorchPlayback(training.scene)))
             for found, expected in zip(shown, anew, strict=True):
                 np.testing.assert_array_equal(found, expected)
 
@@ -188,7 +188,7 @@ def test_each_step_of_a_training_is_shown(device: Device, tmp_path: Path, kind: 
 def test_a_training_can_be_watched(device: Device) -> None:
     """Parameters, their number and the degree change between calls, and training's own buffers stay as they are."""
     scene = trained(device, OURS, 50)
-    playback = ScenePlayback(scene)
+    playback = TorchPlayback(scene)
     before = picture(playback, 0.4)
     assert np.abs(before - scene.render(CAMERA, 0.4, torch.tensor([0.1, 0.2, 0.3])).image.numpy()).max() < 1e-6
     assert playback.at(0.4).means is not rasterizer_of(device).pool.get("input means", 0)
@@ -302,7 +302,7 @@ def test_a_passing_picture_is_the_exact_one_for_less(
 SHOW = """
 import sys
 from lapgs_wgpu.gpu.device import open_device
-from lapgs_wgpu.motion.playback import open_playback
+from lapgs_wgpu.motion.playback.playback import open_playback
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 

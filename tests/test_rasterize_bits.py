@@ -261,7 +261,7 @@ def test_tiles_that_were_counted_and_not_found(device: Device, use: Use, monkeyp
     have no record, and take none of an earlier image."""
     text = shader.shader_text
     found, one_fewer = "&& slot < end;", "&& slot + select(0u, 1u, id % 50u == 0u) < end;"
-    assert found in text("emit")
+    assert found in text("duplicate_with_keys")
     monkeypatch.setattr(device, "kernel_cache", {})
     monkeypatch.setattr(shader, "shader_text", lambda name: text(name).replace(found, one_fewer))
     scene, other = random_scene(1500, 1, size=0.08), random_scene(1500, 2, size=0.12)

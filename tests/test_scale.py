@@ -24,11 +24,11 @@ from lapgs_wgpu.data import Dataset, load_dataset
 from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.motion.playback import open_playback
+from lapgs_wgpu.motion.playback.playback import open_playback
 from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.splat.raster_config import raster_config
 from lapgs_wgpu.splat.rasterize import rasterize, upload_gaussians
 from lapgs_wgpu.splat.rasterizer import Rasterizer
-from lapgs_wgpu.splat.shape import raster_shape
 from lapgs_wgpu.train.loop import train
 
 soak = pytest.mark.skipif(os.environ.get("LAPGS_SOAK") != "1", reason="large: LAPGS_SOAK=1 runs it")
@@ -89,7 +89,7 @@ def check_pile(count: int, device: Device) -> None:
 
 @pytest.mark.kernels
 def test_lists_beyond_a_round_are_drawn_in_more(device: Device, use: Use) -> None:
-    shape = raster_shape(device)
+    shape = raster_config(device)
     if not shape.round_splats:
         pytest.skip("this device has no rounds")
     rasterizer = use(Rasterizer(device))
@@ -101,7 +101,7 @@ def test_lists_beyond_a_round_are_drawn_in_more(device: Device, use: Use) -> Non
 @pytest.mark.parametrize("depth", [False, True])
 def test_rounds_change_no_bit(depth: bool, device: Device, use: Use, monkeypatch: pytest.MonkeyPatch) -> None:
     """Many short rounds, with other tiles that are done long before, in bands and at once."""
-    if not raster_shape(device).round_splats:
+    if not raster_config(device).round_splats:
         pytest.skip("this device has no rounds")
     scene, camera = random_scene(400, 3, size=0.3), front_camera(45, 37)
     scene["means"][:, 2] += 4
@@ -109,9 +109,9 @@ def test_rounds_change_no_bit(depth: bool, device: Device, use: Use, monkeypatch
     use(Rasterizer(device))
     background = (0.2, 0.7, 0.4)
     expected = drawn(scene, camera, device, depth=depth, background=background)
-    short = dataclasses.replace(raster_shape(device), round_splats=16)
+    short = dataclasses.replace(raster_config(device), round_splats=16)
     for bands in (1, 2):
-        rasterizer = use(Rasterizer(device, shape=short))
+        rasterizer = use(Rasterizer(device, config=short))
         rasterizer.bands = bands
         found = drawn(scene, camera, device, depth=depth, background=background)
         assert rasterizer.rounds >= 8
@@ -127,7 +127,7 @@ def test_rounds_change_no_bit(depth: bool, device: Device, use: Use, monkeypatch
 def test_large_images_are_cut_so_that_a_splat_has_few_enough_tiles(
     device: Device, use: Use, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    if not raster_shape(device).round_splats:
+    if not raster_config(device).round_splats:
         pytest.skip("this device has no limit")
     scene, camera = random_scene(50, 3), front_camera(64, 64)
     expected = drawn(scene, camera, device)

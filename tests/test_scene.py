@@ -18,9 +18,9 @@ from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.checkpoint import read_checkpoint, write_checkpoint
 from lapgs_wgpu.io.ply import StillGaussians, read_ply, write_ply
-from lapgs_wgpu.motion.field import FieldConfig
-from lapgs_wgpu.motion.hash_encoder import HashGrid
-from lapgs_wgpu.motion.hashgrid import HashConfig
+from lapgs_wgpu.motion.fields.config import FieldConfig
+from lapgs_wgpu.motion.fields.hash_encoder import HashGrid
+from lapgs_wgpu.motion.fields.hash_grid_config import HashConfig
 from lapgs_wgpu.motion.scene import Scene4D, draw, load
 
 CONFIG = FieldConfig(

@@ -22,7 +22,7 @@ from lapgs_wgpu.data.views import Placement
 from lapgs_wgpu.errors import DeviceMemoryError, InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.checkpoint import read_checkpoint
-from lapgs_wgpu.motion.device_decoder import DeviceDecoder
+from lapgs_wgpu.motion.passes.decoder_passes import DecoderPasses
 from lapgs_wgpu.motion.scene import Scene4D, load
 from lapgs_wgpu.train import decoder_choice, loop, training
 from lapgs_wgpu.train.config import Config
@@ -230,7 +230,7 @@ def test_a_device_too_small_for_the_decoder_leaves_it_to_torch(
         raise DeviceMemoryError("buffer 'layers' needs more")
 
     monkeypatch.setattr(device, "is_cpu", False)
-    monkeypatch.setattr(DeviceDecoder, "decode_bwd", too_large)
+    monkeypatch.setattr(DecoderPasses, "decode_bwd", too_large)
     train(configure(schedule__steps="1"), dataset, tmp_path / "run", device=device)
     assert "ms in torch, more memory than the device has)" in capsys.readouterr().out
 

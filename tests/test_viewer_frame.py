@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from lapgs_wgpu.viewer.choices import Mode
 from lapgs_wgpu.viewer.frame import Frame, Painter, Request
-from test_deform import GRID4D, trained
+from test_grid_field_playback import GRID4D, trained
 from test_playback import CAMERA, KINDS, half_still
 
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.motion.playback import open_playback
+from lapgs_wgpu.motion.playback.playback import open_playback
 
 pytestmark = pytest.mark.kernels
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from lapgs_wgpu.gpu.buffer import Buffer, BufferPool, read_all
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.profile import Profile
-from lapgs_wgpu.motion.playback import Playback
+from lapgs_wgpu.motion.playback.playback import Playback
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.rasterizer import GaussianBuffers, Rasterizer
 

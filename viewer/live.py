@@ -16,8 +16,8 @@ from typing import Protocol
 from rendercanvas.utils.asyncs import sleep
 
 from lapgs_wgpu.io.first_look import FirstLook
+from lapgs_wgpu.motion.playback.torch_playback import TorchPlayback
 from lapgs_wgpu.motion.scene import Scene4D
-from lapgs_wgpu.motion.scene_playback import ScenePlayback
 
 from .app import App
 from .opened import Opened
@@ -56,7 +56,7 @@ def watch(scene: Scene4D, look: FirstLook, steps: Iterator[Progress]) -> None:
     from .window import choose_backend, make_canvas
 
     canvas, loop = make_canvas(choose_backend("auto"), "training - lapgs-train", (1280, 720))
-    app = App(canvas, loop, Opened(None, ScenePlayback(scene), look), transport=True)
+    app = App(canvas, loop, Opened(None, TorchPlayback(scene), look), transport=True)
     app.training = training = Training()
     interrupt = signal.getsignal(signal.SIGINT)
 

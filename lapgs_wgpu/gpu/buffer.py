@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..errors import DeviceMemoryError
 from .shader import TABLE_TYPES, TABLE_WIDTH
-from .trouble import Guard
+from .wgpu_errors import Guard
 
 if TYPE_CHECKING:
     from .device import Device

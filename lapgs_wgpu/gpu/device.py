@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ..errors import NoAdapterError
-from .c_types import parse_only_what_is_named
+from .cffi_patch import parse_named_types_only
 
 # Features that the kernels can use. Each is requested only where the adapter has it, and each has a fallback.
 _WANTED_FEATURES = ("subgroup", "mappable-primary-buffers", "timestamp-query")
@@ -48,7 +48,7 @@ def _instance() -> Any:
     from wgpu.backends.wgpu_native import ffi
     from wgpu.backends.wgpu_native.extras import set_instance_extras
 
-    parse_only_what_is_named(ffi)
+    parse_named_types_only(ffi)
     # Not OpenGL: the same hardware again, with less of what the kernels need.
     set_instance_extras(backends=["Vulkan", "Metal", "DX12"], flags=["Empty"])
     return wgpu.gpu

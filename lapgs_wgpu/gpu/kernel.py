@@ -11,7 +11,7 @@ import wgpu
 from ..errors import DeviceMemoryError
 from .buffer import Buffer
 from .shader import Defines, ShaderError, compose, pack, reflect
-from .trouble import Guard, is_lost
+from .wgpu_errors import Guard, is_lost
 
 if TYPE_CHECKING:
     from .device import Device

@@ -19,11 +19,12 @@ from ..io.ply import StillGaussians
 from ..splat.camera import Camera
 from ..splat.gaussians import Gaussians
 from ..splat.rasterize import Rendering, rasterize
-from .field import MIN_SCALE, FieldConfig, Nearby
-from .grid_field import GridField
-from .hexplane_field import HexPlaneField
-from .laplacian import LaplacianMotion
-from .mlp_field import MlpField
+from .fields.config import MIN_SCALE, FieldConfig
+from .fields.deformation import Nearby
+from .fields.grid_field import GridField
+from .fields.hexplane_field import HexPlaneField
+from .fields.laplacian import LaplacianMotion
+from .fields.mlp_field import MlpField
 from .scene_file import SceneFile, read_scene, row_shapes
 
 SH_C0 = 0.28209479177387814

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..io.checkpoint import read_checkpoint
 from ..io.documents import parse_json
-from .field import FieldConfig, PlaneConfig, plane_shapes, static_grid, temporal_grids
-from .hashgrid import HashConfig
+from .fields.config import FieldConfig, PlaneConfig, plane_shapes, static_grid, temporal_grids
+from .fields.hash_grid_config import HashConfig
 
 _MAX_DEGREE = 3
 _SHAPES = {

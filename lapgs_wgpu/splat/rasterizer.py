@@ -1,7 +1,7 @@
 """The passes that draw an image from Gaussians, and those that carry its gradient back, on buffers of a device.
 
 See docs/architecture.md for the order of the passes. Nothing here waits for the device except `Rasterizer.grow` and,
-once a pass, `Rasterizer._torn`.
+once a pass, `Rasterizer._subgroup_mismatch`.
 """
 
 from __future__ import annotations
@@ -16,9 +16,10 @@ from ..errors import DeviceMemoryError
 from ..gpu.buffer import Buffer, BufferPool, Request, read_all
 from ..gpu.device import Device
 from ..gpu.kernel import Commands, Kernel
-from ..gpu.primitives import RadixSort, Scan
+from ..gpu.radix_sort import RadixSort
+from ..gpu.scan import Scan
 from .camera import Camera
-from .shape import MOST_TILES, RasterShape, raster_shape
+from .raster_config import MOST_TILES, RasterConfig, raster_config
 
 SPLAT_FLOATS = 12  # common/splat.wgsl
 _RECORD_BYTES = 32  # rasterize_bwd.wgsl
@@ -64,9 +65,9 @@ class Rasterizer:
     capacity: how many intersections (tile, splat) the buffers hold; it grows by `grow` and never changes a result.
     """
 
-    def __init__(self, device: Device, *, shape: RasterShape | None = None, capacity: int = 1 << 16) -> None:
+    def __init__(self, device: Device, *, config: RasterConfig | None = None, capacity: int = 1 << 16) -> None:
         self.device = device
-        self.shape = shape or raster_shape(device)
+        self.config = config or raster_config(device)
         self.pool = BufferPool(device)
         self.capacity = capacity
         self.bands = 1
@@ -75,8 +76,8 @@ class Rasterizer:
         self._flags_scan = Scan(device, self.pool, "visible", "flags")
         # A number of intersections that no buffer holds must not come back as a small one.
         self._offset_scan = Scan(device, self.pool, "offsets", "gather", saturating=True)
-        self._depth_sort = RadixSort(device, self.pool, "depth sort", lane_runs=self.shape.lane_runs)
-        self._tile_sort = RadixSort(device, self.pool, "tile sort", lane_runs=self.shape.lane_runs)
+        self._depth_sort = RadixSort(device, self.pool, "depth sort", lane_runs=self.config.lane_runs)
+        self._tile_sort = RadixSort(device, self.pool, "tile sort", lane_runs=self.config.lane_runs)
         self._drawn: _Drawn | None = None
         self._trusted: set[tuple[str, bool, bool]] = set()  # passes whose workgroups are known to be subgroups
 
@@ -100,15 +101,15 @@ class Rasterizer:
         if (before.width, before.height) != (camera.width, camera.height):
             self.bands = self.rounds = 1  # what an image of another size needed would slow this one down
         self._drawn = drawn = _Drawn(gaussians, camera, background, depth)
-        if self.shape.round_splats:
-            rows, columns = -(-camera.height // self.shape.tile_height), -(-camera.width // self.shape.tile_width)
+        if self.config.round_splats:
+            rows, columns = -(-camera.height // self.config.tile_height), -(-camera.width // self.config.tile_width)
             self.bands = max(self.bands, -(-rows // max(1, MOST_TILES // columns)))
         planes = 5 if depth else 4
         image = self.pool.get("image", 4 * planes * camera.width * camera.height)
         for band in range(self.bands):
             with Commands(self.device, profile) as commands:
                 self._draw_band(commands, drawn, band)
-        if self._torn("rasterize", drawn):
+        if self._subgroup_mismatch("rasterize", drawn):
             return self.draw(gaussians, camera, background, depth=depth, profile=profile)
         return image
 
@@ -129,12 +130,12 @@ class Rasterizer:
         needed = [int(count[0]) for count in counts]
         most = max(needed)
         if most <= self.capacity:
-            if not self.shape.round_splats or not any(count[2] for count in counts):
+            if not self.config.round_splats or not any(count[2] for count in counts):
                 return False
             self.rounds *= 2
             return True
         if most > self.max_capacity:
-            rows = -(-self._drawn.camera.height // self.shape.tile_height)
+            rows = -(-self._drawn.camera.height // self.config.tile_height)
             if self.bands >= rows:
                 raise DeviceMemoryError(
                     f"one row of tiles holds {most} intersections, but the device's bindings hold {self.max_capacity}"
@@ -147,7 +148,7 @@ class Rasterizer:
         return self.pool.get(f"needed {band}", 16)
 
     def _draw_band(self, commands: Commands, drawn: _Drawn, band: int) -> None:
-        device, pool, shape = self.device, self.pool, self.shape
+        device, pool, config = self.device, self.pool, self.config
         gaussians, n, capacity = drawn.gaussians, drawn.gaussians.count, self.capacity
         frame = self._frame(drawn, band)
         tiles = self._band_tiles(drawn, band)
@@ -155,13 +156,13 @@ class Rasterizer:
         tile_counts = pool.get("tile counts", 4 * n)
         ranges = pool.get("ranges", 16 * tiles + 16)
         visible, needed = pool.get("visible", 4), self._needed(band)
-        if shape.round_splats:
+        if config.round_splats:
             commands.clear(needed)
         length = pool.constant("gaussians", n.to_bytes(4, "little"))
         ids, keys, prefix = (pool.get(name, 4 * n) for name in ("ids", "depth keys", "prefix"))
 
         commands.dispatch(
-            Kernel.get(device, "project", **shape.tile_defines),
+            Kernel.get(device, "project", **config.tile_defines),
             _groups(n),
             frame=frame,
             means=gaussians.means,
@@ -195,7 +196,7 @@ class Rasterizer:
         )
         tile_keys, slot_ids = (pool.get(name, 4 * capacity) for name in ("tile keys", "slot ids"))
         commands.dispatch(
-            Kernel.get(device, "emit", **shape.tile_defines),
+            Kernel.get(device, "duplicate_with_keys", **config.tile_defines),
             _groups(n),
             frame=frame,
             visible=visible,
@@ -212,7 +213,7 @@ class Rasterizer:
         )
         commands.clear(ranges)
         commands.dispatch(
-            Kernel.get(device, "ranges"),
+            Kernel.get(device, "tile_ranges"),
             _groups(-(-capacity // 4)),
             frame=frame,
             needed=needed,
@@ -220,12 +221,12 @@ class Rasterizer:
             ranges=ranges,
         )
         for number in range(self.rounds):
-            rounds = {"CONTINUED": number > 0, "LAST_ROUND": number == self.rounds - 1} if shape.round_splats else {}
+            rounds = {"CONTINUED": number > 0, "LAST_ROUND": number == self.rounds - 1} if config.round_splats else {}
             commands.dispatch(
                 Kernel.get(
                     device,
                     "rasterize",
-                    **shape.raster_defines(depth=drawn.depth),
+                    **config.raster_defines(depth=drawn.depth),
                     **{name: 1 for name, on in rounds.items() if on},
                 ),
                 tiles,
@@ -235,7 +236,7 @@ class Rasterizer:
                 slot_ids=slot_ids,
                 splats=splats,
                 image=pool.get("image", 0),
-                **({"needed": needed} if shape.round_splats else {}),
+                **({"needed": needed} if config.round_splats else {}),
             )
         drawn.sorted_ids, drawn.slots = sorted_ids, slots
 
@@ -258,12 +259,12 @@ class Rasterizer:
         return parts
 
     def _band_rows(self, drawn: _Drawn, band: int) -> tuple[int, int]:
-        rows = -(-drawn.camera.height // self.shape.tile_height)
+        rows = -(-drawn.camera.height // self.config.tile_height)
         return rows * band // self.bands, rows * (band + 1) // self.bands
 
     def _band_tiles(self, drawn: _Drawn, band: int) -> int:
         first, last = self._band_rows(drawn, band)
-        return (last - first) * -(-drawn.camera.width // self.shape.tile_width)
+        return (last - first) * -(-drawn.camera.width // self.config.tile_width)
 
     def _frame(self, drawn: _Drawn, band: int) -> Buffer:
         camera = drawn.camera
@@ -277,24 +278,24 @@ class Rasterizer:
             background=drawn.background,
             capacity=self.capacity,
             size=(camera.width, camera.height),
-            tiles=(-(-camera.width // self.shape.tile_width), -(-camera.height // self.shape.tile_height)),
+            tiles=(-(-camera.width // self.config.tile_width), -(-camera.height // self.config.tile_height)),
             band=self._band_rows(drawn, band),
         )
         return self.pool.constant(f"frame {band}", content)
 
-    def _torn(self, name: str, drawn: _Drawn) -> bool:
+    def _subgroup_mismatch(self, name: str, drawn: _Drawn) -> bool:
         """Whether the driver has cut the workgroups of a pass, which was submitted for the first time, into several
         subgroups. The shape then does without subgroups, and the pass has to be done again. Waits for the device, but
         once a pass."""
         key = (name, drawn.depth, self.rounds > 1)
-        if not self.shape.subgroups or key in self._trusted:
+        if not self.config.subgroups or key in self._trusted:
             return False
         self._trusted.add(key)
         ranges = self.pool.get("ranges", 0)
         last = ranges.read("uint32", (4,), ranges.nbytes - 16)
         if not last[3 if name == "rasterize_bwd" else 2]:
             return False
-        self.shape = replace(self.shape, subgroups=False)
+        self.config = replace(self.config, subgroups=False)
         return True
 
     # Backward --------------------------------------------------------------------------------------------------------
@@ -317,7 +318,7 @@ class Rasterizer:
                 if self.bands > 1:
                     self._draw_band(commands, drawn, band)  # the lists of the other bands are gone
                 self._backward_band(commands, drawn, band, d_image, d_splats)
-        if self._torn("rasterize_bwd", drawn):
+        if self._subgroup_mismatch("rasterize_bwd", drawn):
             return self.backward(d_image, profile=profile)
         d_colors = None
         with Commands(self.device, profile) as commands:
@@ -350,7 +351,7 @@ class Rasterizer:
         kernel = Kernel.get(
             device,
             "rasterize_bwd",
-            **self.shape.raster_defines(depth=drawn.depth),
+            **self.config.raster_defines(depth=drawn.depth),
             **({"ROUNDS": 1} if self.rounds > 1 else {}),
         )
         commands.clear(record_tails, 4 * self.capacity)  # no slot has a record yet

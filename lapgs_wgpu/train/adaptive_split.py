@@ -14,7 +14,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from lapgs_wgpu.motion.dynamics import outliers
+from lapgs_wgpu.motion.fields.dynamics import outliers
 from lapgs_wgpu.splat.reference import rotation
 from lapgs_wgpu.train.config import DensityConfig
 

@@ -16,9 +16,9 @@ from lapgs_wgpu.data.init import first_points, initial_scales, see_through
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.motion.dynamics import dynamics_loss
-from lapgs_wgpu.motion.field import Nearby
-from lapgs_wgpu.motion.grid_field import GridField
+from lapgs_wgpu.motion.fields.deformation import Nearby
+from lapgs_wgpu.motion.fields.dynamics import dynamics_loss
+from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.morton import morton_order
 from lapgs_wgpu.train.config import Config, PointsConfig, SmoothnessConfig

@@ -19,7 +19,7 @@ from lapgs_wgpu.gpu.buffer import Buffer
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.profile import Profile
-from lapgs_wgpu.splat.shape import raster_shape
+from lapgs_wgpu.splat.raster_config import raster_config
 
 COPY, FMA, EXP = KERNELS = ("ceiling_copy", "ceiling_fma", "ceiling_exp")
 COPIED = 64 << 20  # bytes: more than what the caches of processors and GPUs hold
@@ -49,7 +49,7 @@ class CeilingKernels:
 
     def __init__(self, device: Device, shortest: float = LONG) -> None:
         self._device = device
-        shape = raster_shape(device)
+        shape = raster_config(device)
         defines = shape.raster_defines(depth=False) | {"CHAINS": CHAINS, "STEPS": STEPS}
         with mock.patch.object(shader, "shader_text", _shader_text):
             copy = Kernel.get(device, COPY)

@@ -14,9 +14,9 @@ from torch import Tensor
 from work import encoder_work
 
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.motion.field import FieldConfig
-from lapgs_wgpu.motion.grid_field import GridField
-from lapgs_wgpu.motion.hash_encoder import HashEncoder, encode_reference
+from lapgs_wgpu.motion.fields.config import FieldConfig
+from lapgs_wgpu.motion.fields.grid_field import GridField
+from lapgs_wgpu.motion.fields.hash_encoder import HashEncoder, encode_reference
 
 TIME = 0.37
 

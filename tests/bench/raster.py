@@ -88,7 +88,7 @@ def bench_raster(
     torch_whole = timed(torch_forward, repeat), timed(torch_forward_backward, repeat)
     return RasterReport(
         counts,
-        dataclasses.asdict(rasterizer.shape),
+        dataclasses.asdict(rasterizer.config),
         passes,
         forward=whole[0],
         forward_backward=whole[1],

@@ -20,7 +20,7 @@ from lapgs_wgpu.gpu.buffer import Buffer
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands
 from lapgs_wgpu.gpu.profile import Profile
-from lapgs_wgpu.motion import hash_encoder
+from lapgs_wgpu.motion.fields import hash_encoder
 from lapgs_wgpu.splat import objective
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.loop import train

@@ -18,7 +18,7 @@ from scene import SceneSize, make_scene
 
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.first_look import FirstLook
-from lapgs_wgpu.motion.playback import open_playback
+from lapgs_wgpu.motion.playback.playback import open_playback
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.presets import load_config
 

@@ -11,7 +11,7 @@ from typing import Any
 import cffi
 import pytest
 
-from lapgs_wgpu.gpu.c_types import parse_only_what_is_named
+from lapgs_wgpu.gpu.cffi_patch import parse_named_types_only
 
 HEADER = """
 typedef unsigned int Flags;
@@ -32,7 +32,7 @@ def declared(quick: bool) -> Any:
     ffi = cffi.FFI()
     ffi.cdef(HEADER)
     if quick:
-        parse_only_what_is_named(ffi)
+        parse_named_types_only(ffi)
     return ffi
 
 
@@ -82,5 +82,5 @@ def test_only_what_is_named_is_parsed(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_another_cffi_is_left_alone() -> None:
     other = SimpleNamespace(_parser=SimpleNamespace())
-    parse_only_what_is_named(other)
+    parse_named_types_only(other)
     assert vars(other._parser) == {}

@@ -8,7 +8,7 @@ from .buffer import Buffer, BufferPool
 from .device import Device
 from .kernel import Commands, Kernel
 
-_TILE = 64  # product.wgsl
+_TILE = 64  # matmul.wgsl
 _SPLIT = 1 << 11  # inner elements over which a long product is summed at once
 
 
@@ -50,7 +50,7 @@ class Matrix:
         return self.buffer if self.bound is None else (self.buffer, *self.bound)
 
 
-class Product:
+class Matmul:
     """Records products whose sums are in one order, so the same to the last bit on every run. name, in the calls: tells
     apart those that are submitted together."""
 
@@ -67,7 +67,7 @@ class Product:
         size, count = a.rows * b.columns, -(-a.columns // _SPLIT)
         parts = self._pool.get("parts", 4 * size * count)
         self._dispatch(commands, name, a, b, Matrix.whole(parts, a.rows, b.columns), _SPLIT, {})
-        kernel = Kernel.get(self._device, "product_sum", **({"ADD": 1} if add else {}))
+        kernel = Kernel.get(self._device, "matmul_sum", **({"ADD": 1} if add else {}))
         uniform = self._pool.constant(f"sum {name}", kernel.uniform("Sum", count=size, parts=count))
         commands.dispatch(kernel, -(-size // 64), sum=uniform, parts=parts, total=total)
 
@@ -75,9 +75,9 @@ class Product:
         self, commands: Commands, name: str, a: Matrix, b: Matrix, c: Matrix, split: int, options: dict[str, int]
     ) -> None:
         ways = {"A_INNER": not a.transposed, "B_INNER": b.transposed}
-        kernel = Kernel.get(self._device, "product", **options, **{way: 1 for way, on in ways.items() if on})
+        kernel = Kernel.get(self._device, "matmul", **options, **{way: 1 for way, on in ways.items() if on})
         content = kernel.uniform(
-            "Product",
+            "Matmul",
             rows=c.rows,
             columns=c.columns,
             inner=a.columns,

@@ -5,8 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from .field import PLANES, Deformation, FieldConfig, Nearby, plane_shapes
-from .hashgrid import TIME
+from .config import PLANES, FieldConfig, plane_shapes
+from .deformation import Deformation, Nearby
+from .hash_grid_config import TIME
 from .layers import linear, zero_head
 
 # Weights of the smoothness loss that 4D-GS trains with on D-NeRF scenes.
@@ -43,7 +44,7 @@ class HexPlaneField(nn.Module):
     def forward(
         self, means: Tensor, t: float, dynamics: Tensor | None = None, nearby: Nearby | None = None
     ) -> Deformation:
-        """See motion/field.py."""
+        """See motion/fields/deformation.py."""
         unit = torch.cat([means.detach() / self.bound, means.new_full((len(means), 1), 2.0 * t - 1.0)], dim=1)
         levels = [self._features(unit, first) for first in range(0, len(self.planes), len(PLANES))]
         hidden = self.trunk(torch.cat(levels, dim=1))
@@ -73,7 +74,7 @@ class HexPlaneField(nn.Module):
         return total
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        """See motion/field.py."""
+        """See motion/fields/deformation.py."""
         planes = list(self.planes)
         apart = {id(plane) for plane in planes}
         return {"hash": planes, "mlp": [p for p in self.parameters() if id(p) not in apart]}

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lapgs_wgpu.gpu.buffer import Buffer, BufferPool
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands
-from lapgs_wgpu.gpu.primitives import RadixSort
+from lapgs_wgpu.gpu.radix_sort import RadixSort
 
 pytestmark = pytest.mark.kernels
 

@@ -1,5 +1,7 @@
-"""Encoder and decoder of the grid fields as torch sees them where both are on the device (motion/device_encoder,
-motion/device_decoder): features and their gradients stay there, and only outputs and parameters are exchanged."""
+"""Encoder and decoder of the grid fields on the device, as one autograd function.
+
+Features and their gradients stay on the device; only outputs and parameters are exchanged. See motion/passes.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +13,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..gpu.buffer import Buffer, BufferPool, Request, read_all
-from ..gpu.device import Device
-from ..gpu.kernel import Commands, Kernel
-from .device_decoder import DecoderShape, DeviceDecoder
+from ...gpu.buffer import Buffer, BufferPool, Request, read_all
+from ...gpu.device import Device
+from ...gpu.kernel import Commands, Kernel
+from ..passes.decoder_passes import DecoderPasses, DecoderShape
 from .hash_encoder import HashEncoder, Place
 
 
@@ -35,7 +37,7 @@ class Decoder:
     def __init__(self, device: Device, encoder: HashEncoder, shape: DecoderShape, *, block: int | None = None) -> None:
         self.encoder, self.shape = encoder, shape
         self._device = device
-        self._decoder = DeviceDecoder(device, shape, block=block)
+        self._decoder = DecoderPasses(device, shape, block=block)
         self._pool = BufferPool(device)
 
     def __call__(

@@ -8,11 +8,11 @@ import torch
 from scenes import relative
 from torch import Tensor
 
-from lapgs_wgpu.gpu import matrix
+from lapgs_wgpu.gpu import matmul
 from lapgs_wgpu.gpu.buffer import Buffer, BufferPool
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands
-from lapgs_wgpu.gpu.matrix import Matrix, Product
+from lapgs_wgpu.gpu.matmul import Matmul, Matrix
 
 pytestmark = pytest.mark.kernels
 
@@ -50,7 +50,7 @@ def test_product(
     of_a, of_b = stored(device, a, transposed=a_transposed), stored(device, b, transposed=b_transposed)
     start = random(rows, columns, seed=2)
     fresh, added = on_device(device, torch.full_like(start, torch.nan)), on_device(device, start)
-    product = Product(device, BufferPool(device))
+    product = Matmul(device, BufferPool(device))
     with Commands(device) as commands:
         product(commands, "fresh", of_a, of_b, Matrix.whole(fresh, rows, columns))
         product(commands, "added", of_a, of_b, Matrix.whole(added, rows, columns), add=True)
@@ -64,7 +64,7 @@ def test_parts_of_matrices(device: Device) -> None:
     a, b, c = random(150, 40), random(33, 90, seed=1), random(140, 80, seed=2)
     result = on_device(device, c)
     with Commands(device) as commands:
-        Product(device, BufferPool(device))(
+        Matmul(device, BufferPool(device))(
             commands,
             "part",
             Matrix.block(on_device(device, a), 40, 64, 70).from_column(3, 33),
@@ -83,11 +83,11 @@ def test_parts_of_matrices(device: Device) -> None:
 @pytest.mark.parametrize("inner", [1, 99, 100, 101, 350])
 def test_long_products_are_sums_of_parts(device: Device, inner: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """The sum over Gaussians of a gradient: a is transposed, b is not; the same to the last bit each time."""
-    monkeypatch.setattr(matrix, "_SPLIT", 100)
+    monkeypatch.setattr(matmul, "_SPLIT", 100)
     a, b, start = random(inner, 70), random(inner, 9, seed=1), random(70, 9, seed=2)
     fresh, added = on_device(device, torch.full_like(start, torch.nan)), on_device(device, start)
     of_a, of_b = (Matrix.whole(on_device(device, x), *x.shape) for x in (a, b))
-    product = Product(device, BufferPool(device))
+    product = Matmul(device, BufferPool(device))
     runs = []
     for _ in range(2):
         with Commands(device) as commands:
@@ -107,5 +107,5 @@ def test_long_sums_are_accurate(device: Device) -> None:
     total = on_device(device, torch.zeros(1, 1))
     column = Matrix.whole(on_device(device, ones), 20_000, 1)
     with Commands(device) as commands:
-        Product(device, BufferPool(device)).long(commands, "sum", column.transpose, column, total)
+        Matmul(device, BufferPool(device)).long(commands, "sum", column.transpose, column, total)
     assert float(read(total, 1, 1)) == pytest.approx(20_000 * float(np.float32(0.1)) ** 2, rel=2e-5)

@@ -8,10 +8,11 @@ import torch
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
-from ..gpu.device import Device
+from ...gpu.device import Device
+from ..passes.decoder_passes import DecoderShape
+from .config import APPEARANCE_SCALE, GEOMETRY, TEMPORAL_AXES, FieldConfig
 from .decoder import Decoder
-from .device_decoder import DecoderShape
-from .field import APPEARANCE_SCALE, GEOMETRY, TEMPORAL_AXES, Deformation, FieldConfig, Nearby
+from .deformation import Deformation, Nearby
 from .hash_encoder import HashEncoder, HashGrid
 from .laplacian import LaplacianMotion, TimeMotion
 from .layers import last_product, linear, product, zero_head
@@ -87,7 +88,7 @@ class GridField(nn.Module):
     def forward(
         self, means: Tensor, t: float, dynamics: Tensor | None = None, nearby: Nearby | None = None
     ) -> Deformation:
-        """See motion/field.py."""
+        """See motion/fields/deformation.py."""
         evaluate = self._on_device if self.on_device and torch.is_grad_enabled() else self._in_torch
         outputs, apart = evaluate(means, t, dynamics, nearby)
         geometry, look = outputs[:, : sum(GEOMETRY)], outputs[:, sum(GEOMETRY) :] if self.appearance else None
@@ -202,7 +203,7 @@ class GridField(nn.Module):
         return moving
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        """See motion/field.py. The frequencies of the spectrum are in no group: they have an optimiser of their own."""
+        """See motion/fields/deformation.py. The spectrum's frequencies are in no group: they have their own optimiser."""
         tables = [grid.table for grid in self.grids]
         apart = {id(table) for table in tables}
         if isinstance(self.motion, LaplacianMotion):

@@ -1,6 +1,6 @@
 """The passes of the grid fields' decoder for training, without torch: from features to outputs of the heads, and back.
 
-The decoder is that of motion/grid_field without hidden layers, in matrices: layers = beside W_beside^T, to whose
+The decoder is that of motion/fields/grid_field without hidden layers, in matrices: layers = beside W_beside^T, to whose
 channels of place static W_static^T is added, and to the temporal ones temporal W_temporal^T; features = gate(layers);
 outputs = features W_heads^T. The layers' biases are the weights of a column of ones in `beside`.
 """
@@ -10,10 +10,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-from ..gpu.buffer import Buffer, BufferPool
-from ..gpu.device import Device
-from ..gpu.kernel import Commands, Kernel
-from ..gpu.matrix import Matrix, Product
+from ...gpu.buffer import Buffer, BufferPool
+from ...gpu.device import Device
+from ...gpu.kernel import Commands, Kernel
+from ...gpu.matmul import Matmul, Matrix
 
 _BLOCK = 1 << 14  # Gaussians that are decoded at once: layers and features of a block take 80 MB at a width of 256
 
@@ -57,7 +57,7 @@ class DecoderShape:
         return shapes | {"heads": (self.outputs, self.placed)}
 
 
-class DeviceDecoder:
+class DecoderPasses:
     """Records the passes on one device. `inputs` are buffers of (N, columns) float32 by the names of
     `DecoderShape.inputs`, `weights` by those of `DecoderShape.weights`.
 
@@ -67,7 +67,7 @@ class DeviceDecoder:
     def __init__(self, device: Device, shape: DecoderShape, *, block: int | None = None) -> None:
         self.device, self.shape = device, shape
         self.pool = BufferPool(device)
-        self._product = Product(device, self.pool)
+        self._product = Matmul(device, self.pool)
         self._size = block or max(64, min(_BLOCK, device.max_binding // (4 * shape.channels) // 64 * 64))
 
     def decode(

@@ -42,13 +42,13 @@ class Emitted(NamedTuple):
 
 def emit(monkeypatch: pytest.MonkeyPatch, device: Device, scene: Scene, camera: Camera) -> Emitted:
     names = ("tile_keys", "slot_ids", "ids", "offsets", "tile_counts", "splats")
-    copies = capture(monkeypatch, "emit", *names)
+    copies = capture(monkeypatch, "duplicate_with_keys", *names)
     rasterize(**scene, camera=camera, device=device)
     count, copy = len(scene["means"]), copies[-1]  # the last draw is one whose lists fitted
     tile_keys, slot_ids, ids, offsets, counts = (all_of(copy[name]) for name in names[:5])
     counts = counts[:count].astype(np.int64)
     seen, total = int((counts > 0).sum()), int(counts.sum())
-    shape = rasterizer_of(device).shape
+    shape = rasterizer_of(device).config
     size = shape.tile_width, shape.tile_height
     return Emitted(
         tile_keys[:total].astype(np.int64),

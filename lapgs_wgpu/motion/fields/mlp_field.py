@@ -7,7 +7,8 @@ import math
 import torch
 from torch import Tensor, nn
 
-from .field import Deformation, FieldConfig, Nearby
+from .config import FieldConfig
+from .deformation import Deformation, Nearby
 from .layers import linear, zero_head
 
 PLACE_OCTAVES, TIME_OCTAVES = 10, 6
@@ -36,7 +37,7 @@ class MlpField(nn.Module):
     def forward(
         self, means: Tensor, t: float, dynamics: Tensor | None = None, nearby: Nearby | None = None
     ) -> Deformation:
-        """See motion/field.py; this field has no smoothness loss."""
+        """See motion/fields/deformation.py; this field has no smoothness loss."""
         time = self.time(octaves(means.new_tensor([[t]]), TIME_OCTAVES)).expand(len(means), -1)
         inputs = torch.cat([octaves(means.detach() / self.bound, PLACE_OCTAVES), time], dim=1)
         hidden = inputs
@@ -46,7 +47,7 @@ class MlpField(nn.Module):
         return Deformation(None, shift, d_quats, d_scales)
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        """See motion/field.py."""
+        """See motion/fields/deformation.py."""
         return {"mlp": list(self.parameters())}
 
 

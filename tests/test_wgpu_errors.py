@@ -23,7 +23,7 @@ from lapgs_wgpu.errors import DeviceError, DeviceLostError, DeviceMemoryError, N
 from lapgs_wgpu.gpu.buffer import Buffer
 from lapgs_wgpu.gpu.device import _DEFAULT_LIMITS, _RAISED_LIMITS, Device, DeviceInfo
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
-from lapgs_wgpu.gpu.trouble import Guard
+from lapgs_wgpu.gpu.wgpu_errors import Guard
 from lapgs_wgpu.splat.rasterize import rasterizer_of
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.loop import resume, train

@@ -13,7 +13,7 @@ from typing import Any
 _KINDS = ("typedef", "struct", "union", "enum")
 
 
-def parse_only_what_is_named(ffi: Any) -> None:
+def parse_named_types_only(ffi: Any) -> None:
     """Have a cffi.FFI look up the types of its texts quickly."""
     parser: Any = getattr(ffi, "_parser", None)
     if not isinstance(getattr(parser, "_declarations", None), dict) or not hasattr(parser, "parse_type_and_quals"):

@@ -1,10 +1,10 @@
 // A product of matrices, C = A B, or with ADD C += A B; any of them may be part of a larger one, or transposed. A workgroup
 // computes a tile of C and goes through the inner dimension in steps whose parts of A and B it shares.
 // A_INNER, B_INNER: the elements of A's rows, of B's columns lie beside one another in memory; else those of A's columns, of
-// B's rows. The inner dimension may be split; each part then has a C of its own, which product_sum adds up in their order.
+// B's rows. The inner dimension may be split; each part then has a C of its own, which matmul_sum adds up in their order.
 #import common/index
 
-struct Product {
+struct Matmul {
     rows: u32,           // of C
     columns: u32,
     inner: u32,
@@ -21,7 +21,7 @@ const DEPTH = 16u;       // inner elements of a step; a lane loads TILE x DEPTH 
 const LANES = 256u;
 const PITCH = TILE + 4u; // so that the elements that are stored together lie in different banks
 
-@group(0) @binding(0) var<uniform> product: Product;
+@group(0) @binding(0) var<uniform> product: Matmul;
 @group(0) @binding(1) var<storage, read> a: array<f32>;
 @group(0) @binding(2) var<storage, read> b: array<f32>;
 @group(0) @binding(3) var<storage, read_write> c: array<f32>;

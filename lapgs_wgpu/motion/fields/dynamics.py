@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .field import DynamicsMode
+from .config import DynamicsMode
 
 # Distances that are equal but for float32's rounding must not stand out. Where they differ it changes nothing.
 ROUNDING = 1e-6

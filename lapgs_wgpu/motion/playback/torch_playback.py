@@ -10,12 +10,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..gpu.buffer import BufferPool
-from ..io.ply import StillGaussians
-from ..splat.camera import Camera
-from ..splat.rasterize import upload_gaussians
-from ..splat.rasterizer import GaussianBuffers
-from .scene import Scene4D
+from ...gpu.buffer import BufferPool
+from ...io.ply import StillGaussians
+from ...splat.camera import Camera
+from ...splat.rasterize import upload_gaussians
+from ...splat.rasterizer import GaussianBuffers
+from ..scene import Scene4D
 
 
 class _Shown(NamedTuple):
@@ -39,7 +39,7 @@ def _parameters(scene: Scene4D) -> list[Tensor]:
     return [*scene.parameters.values(), *(scene.field.parameters() if scene.field is not None else [])]
 
 
-class ScenePlayback:
+class TorchPlayback:
     """A Scene4D as it is at each call: parameters, their number and sh_degree may change in between. See Playback.
 
     It is evaluated only where the time, the degree or a parameter has changed, by torch's count of what was written to

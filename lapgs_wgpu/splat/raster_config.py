@@ -15,7 +15,7 @@ MOST_TILES = 60_000
 
 
 @dataclass(frozen=True)
-class RasterShape:
+class RasterConfig:
     """A workgroup of `lanes` draws a tile of tile_width x tile_height pixels, each lane `rows` pixels of one column.
 
     subgroups: the lanes lie in one subgroup and exchange values by shuffles instead of workgroup memory.
@@ -48,20 +48,20 @@ class RasterShape:
         return values | {name: 1 for name, on in flags.items() if on}
 
 
-def cpu_shape(subgroup_size: int) -> RasterShape:
+def cpu_config(subgroup_size: int) -> RasterConfig:
     """A workgroup is one vector of the processor, so that nothing has to wait at barriers."""
     lanes = 16 if subgroup_size == 16 else 8
     subgroups = subgroup_size >= lanes
     # Without subgroups the backward pass adds up a splat's ten values by loops over the lanes, 20 turns a splat.
-    return RasterShape(8, 8, lanes, subgroups, lane_runs=True, round_splats=1 << 15 if subgroups else 1 << 11)
+    return RasterConfig(8, 8, lanes, subgroups, lane_runs=True, round_splats=1 << 15 if subgroups else 1 << 11)
 
 
-def gpu_shape(subgroup_size: int) -> RasterShape:
+def gpu_config(subgroup_size: int) -> RasterConfig:
     """Wider tiles, hence fewer intersections to sort, and a subgroup of 16 or 32 lanes a tile."""
     lanes = 16 if subgroup_size == 16 else 32
-    return RasterShape(16, 8, lanes, subgroups=subgroup_size >= lanes, lane_runs=False)
+    return RasterConfig(16, 8, lanes, subgroups=subgroup_size >= lanes, lane_runs=False)
 
 
-def raster_shape(device: Device) -> RasterShape:
+def raster_config(device: Device) -> RasterConfig:
     """The shape for this adapter."""
-    return (cpu_shape if device.is_cpu else gpu_shape)(device.subgroup_size)
+    return (cpu_config if device.is_cpu else gpu_config)(device.subgroup_size)

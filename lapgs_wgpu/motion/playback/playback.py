@@ -12,15 +12,15 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..gpu.buffer import BufferPool, read_all
-from ..gpu.device import Device
-from ..io.ply import StillGaussians
-from ..splat.camera import Camera
-from ..splat.rasterizer import GaussianBuffers
-from .deform import DeviceField, parameter_shapes, runs_on_device
-from .field import MIN_SCALE, FieldConfig
+from ...gpu.buffer import BufferPool, read_all
+from ...gpu.device import Device
+from ...io.ply import StillGaussians
+from ...splat.camera import Camera
+from ...splat.rasterizer import GaussianBuffers
+from ..fields.config import MIN_SCALE, FieldConfig
+from ..scene_file import SceneFile, read_scene
+from .grid_field_playback import GridFieldPlayback, parameter_shapes, runs_on_device
 from .motion_bounds import MotionBounds
-from .scene_file import SceneFile, read_scene
 
 Floats = NDArray[np.float32]
 
@@ -76,16 +76,16 @@ def playback_of(file: SceneFile, device: Device) -> Playback:
     """
     if file.field_config.kind == "static" or runs_on_device(file.field_config):
         return DevicePlayback(file, device)
-    from .scene import scene_of
-    from .scene_playback import ScenePlayback
+    from ..scene import scene_of
+    from .torch_playback import TorchPlayback
 
-    return ScenePlayback(scene_of(file, device))
+    return TorchPlayback(scene_of(file, device))
 
 
 class DevicePlayback:
     """A file whose scene stands still, or moves by a field that the device evaluates. See Playback.
 
-    block: how many Gaussians a dispatch takes, see DeviceField.
+    block: how many Gaussians a dispatch takes, see GridFieldPlayback.
     """
 
     def __init__(self, file: SceneFile, device: Device, *, block: int | None = None) -> None:
@@ -103,14 +103,14 @@ class DevicePlayback:
             count=self.count, sh_degree=self.sh_degree, sh_stored=(self.sh_degree + 1) ** 2, **buffers
         )
         self.exact = True
-        self._field: DeviceField | None = None
+        self._field: GridFieldPlayback | None = None
         if self.moves:
             self._times = np.full(self.count, np.nan)  # of what the buffers hold
             # Features change from entry to entry of the temporal grids' time axis, so little within half of one.
             self._bounds = MotionBounds(self.count, 2 * self.field_config.temporal.finest[2])
             self._bounded = True  # do the bounds hold what is in the buffers?
             parameters = file.field(parameter_shapes(file.field_config))
-            self._field = DeviceField(device, file.field_config, parameters, activated, block=block)
+            self._field = GridFieldPlayback(device, file.field_config, parameters, activated, block=block)
 
     def at(self, t: float, seen_by: Camera | None = None) -> GaussianBuffers:
         """See Playback."""

@@ -1,25 +1,18 @@
-"""What all deformation fields share: their configuration, what they are asked and what they answer.
-
-A field is an nn.Module that is called as field(means, t, dynamics, nearby) -> Deformation, where means are the
-canonical ones (N, 3) in world units, which get no gradient from it; t in [0, 1]; dynamics (N, D) or None; nearby a
-Nearby or None. At first it changes nothing. Its parameter_groups() are by learning rate: "hash" (tables and planes)
-and "mlp".
-"""
+"""The configuration of a deformation field, and the sizes that follow from it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import Literal
 
-from .hashgrid import TIME, GridShape, HashConfig, option
-
-if TYPE_CHECKING:
-    from torch import Tensor
+from .hash_grid_config import TIME, GridShape, HashConfig, option
 
 FieldKind = Literal["static", "mlp", "hexplane", "grid4d", "laplacian"]
 Motion = Literal["laplacian", "mlp"]
 Appearance = Literal["none", "color", "color+opacity"]
-DynamicsMode = Literal["literal", "promote", "off"]  # of the regularisation of the dynamics attribute (motion/dynamics)
+DynamicsMode = Literal[
+    "literal", "promote", "off"
+]  # of the regularisation of the dynamics attribute (motion/fields/dynamics)
 MIN_SCALE = 1e-7  # of a Gaussian, after its deformation; world units
 PLANES = ((0, 1), (0, 2), (1, 2), (0, TIME), (1, TIME), (2, TIME))  # of the field hexplane: pairs of x, y, z, t
 TEMPORAL_AXES = ((0, 1, TIME), (1, 2, TIME), (0, 2, TIME))  # of the temporal hash grids
@@ -138,32 +131,3 @@ def plane_shapes(config: PlaneConfig) -> list[tuple[int, int, int, int]]:
         sizes = [config.space << level] * 3 + [config.time]
         shapes += [(1, config.features, sizes[b], sizes[a]) for a, b in PLANES]
     return shapes
-
-
-class Nearby(NamedTuple):
-    """Where a field is asked once more, to keep it smooth: Gaussians `rows` (M,), at their means + offsets (M, 3),
-    world units, and at another time in [0, 1]. The weights are those of the two parts of the smoothness loss."""
-
-    rows: Tensor
-    offsets: Tensor
-    time: float
-    static_weight: float
-    temporal_weight: float
-
-
-class Deformation(NamedTuple):
-    """What is done to N Gaussians at a time.
-
-    Means are turned by `rotation` (N, 4) wxyz of unit length about the origin and shifted by `translation` (N, 3);
-    d_quats (N, 4) and d_scales (N, 3) are added to unit quaternions and to scales, d_dc (N, 3) to the colours' constant
-    part and d_opacity (N,) to the opacities' logits, None where the field leaves them as they are.
-    smoothness: a scalar, the weighted loss that keeps the field smooth; None where it was not asked for.
-    """
-
-    rotation: Tensor | None
-    translation: Tensor
-    d_quats: Tensor
-    d_scales: Tensor
-    d_dc: Tensor | None = None
-    d_opacity: Tensor | None = None
-    smoothness: Tensor | None = None

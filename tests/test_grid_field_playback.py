@@ -13,12 +13,12 @@ from torch import Tensor, nn
 from lapgs_wgpu.gpu.buffer import BufferPool
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
-from lapgs_wgpu.motion.deform import DeviceField, parameter_shapes, runs_on_device
-from lapgs_wgpu.motion.field import FieldConfig
-from lapgs_wgpu.motion.grid_field import GridField
-from lapgs_wgpu.motion.hash_encoder import encode_reference
-from lapgs_wgpu.motion.hashgrid import HashConfig
-from lapgs_wgpu.motion.playback import activate
+from lapgs_wgpu.motion.fields.config import FieldConfig
+from lapgs_wgpu.motion.fields.grid_field import GridField
+from lapgs_wgpu.motion.fields.hash_encoder import encode_reference
+from lapgs_wgpu.motion.fields.hash_grid_config import HashConfig
+from lapgs_wgpu.motion.playback.grid_field_playback import GridFieldPlayback, parameter_shapes, runs_on_device
+from lapgs_wgpu.motion.playback.playback import activate
 from lapgs_wgpu.motion.scene import Scene4D, rotate
 from lapgs_wgpu.splat.rasterizer import GaussianBuffers
 
@@ -123,7 +123,7 @@ def expected(scene: Scene4D, t: float) -> dict[str, Tensor]:
     }
 
 
-def device_field(scene: Scene4D, block: int | None = None) -> tuple[DeviceField, GaussianBuffers]:
+def device_field(scene: Scene4D, block: int | None = None) -> tuple[GridFieldPlayback, GaussianBuffers]:
     """The scene's field without torch, and buffers for what it moves: colours as they are, rubbish elsewhere."""
     assert scene.field is not None
     parameters = {name: value.numpy(force=True) for name, value in scene.field.state_dict().items()}
@@ -136,7 +136,7 @@ def device_field(scene: Scene4D, block: int | None = None) -> tuple[DeviceField,
     for name, buffer in buffers.items():
         buffer.write(gaussians["colors"] if name == "colors" else np.full(buffer.nbytes // 4, np.nan, np.float32))
     out = GaussianBuffers(count=count, sh_degree=scene.sh_degree, sh_stored=9, **buffers)
-    return DeviceField(scene.device, scene.field_config, parameters, gaussians, block=block), out
+    return GridFieldPlayback(scene.device, scene.field_config, parameters, gaussians, block=block), out
 
 
 def check(scene: Scene4D, times: tuple[float, ...] = (0.37,), block: int | None = None) -> None:

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from ..gpu.buffer import Buffer, BufferPool
-from ..gpu.device import Device
-from ..gpu.kernel import Commands, Kernel
-from .hashgrid import GridShape
+from ...gpu.buffer import Buffer, BufferPool
+from ...gpu.device import Device
+from ...gpu.kernel import Commands, Kernel
+from ..fields.hash_grid_config import GridShape
 
 _LOOP_POINTS = 1 << 15  # with lane_levels: Mesa's software driver ends a shader's loops after 65,535 rounds
 _ALIGNED = 64  # so many rows are a multiple of 256 bytes, at which a binding may begin, whatever the row
@@ -34,7 +34,7 @@ class _Part:
     entries: int  # of all slices together
 
 
-class DeviceEncoder:
+class HashEncoderPasses:
     """Records the passes that encode points with several grids at once. Axes and levels are fixed; tables (entries, 2),
     points (N, 4) and the encoding come with each call, in float32 but for an encoding that is wanted in bfloat16.
 

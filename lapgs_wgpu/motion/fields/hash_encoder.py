@@ -1,5 +1,5 @@
 """The hash encoder as torch sees it: grids whose tables belong to torch, their encoding and its gradient on the device
-(motion/device_encoder), and its plain-torch twin."""
+(motion/passes/hash_encoder_passes), and its plain-torch twin."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ..gpu.buffer import Buffer, BufferPool, Request, read_all
-from ..gpu.device import Device
-from ..gpu.kernel import Commands
-from .device_encoder import DeviceEncoder
-from .hashgrid import TIME, GridShape, HashConfig
+from ...gpu.buffer import Buffer, BufferPool, Request, read_all
+from ...gpu.device import Device
+from ...gpu.kernel import Commands
+from ..passes.hash_encoder_passes import HashEncoderPasses
+from .hash_grid_config import TIME, GridShape, HashConfig
 
 Place = tuple[Tensor, float]  # points (N, 3), world units, and a time in [0, 1]
 _NUMPY = {torch.float32: "float32", torch.bfloat16: "int16"}  # as which numpy, which has no bfloat16, takes them
@@ -45,7 +45,7 @@ class HashEncoder:
         lane_levels: bool | None = None,
     ) -> None:
         self.groups = [list(group) for group in groups]
-        self._encoders = [DeviceEncoder(device, group, bound, lane_levels=lane_levels) for group in self.groups]
+        self._encoders = [HashEncoderPasses(device, group, bound, lane_levels=lane_levels) for group in self.groups]
         self._pool = BufferPool(device)
         self.written: object = None  # another one with each `write`, whose encodings are on the device until the next
 

@@ -12,12 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..gpu.buffer import Buffer, BufferPool
-from ..gpu.device import Device
-from ..gpu.kernel import Commands, Kernel
-from ..splat.rasterizer import GaussianBuffers
-from .device_encoder import DeviceEncoder
-from .field import APPEARANCE_SCALE, GEOMETRY, FieldConfig, static_grid, temporal_grids
+from ...gpu.buffer import Buffer, BufferPool
+from ...gpu.device import Device
+from ...gpu.kernel import Commands, Kernel
+from ...splat.rasterizer import GaussianBuffers
+from ..fields.config import APPEARANCE_SCALE, GEOMETRY, FieldConfig, static_grid, temporal_grids
+from ..passes.hash_encoder_passes import HashEncoderPasses
 
 Floats = NDArray[np.float32]
 
@@ -28,7 +28,7 @@ _BLOCK_BYTES = 128 << 20  # of the features that one dispatch sees: WebGPU's def
 
 
 def runs_on_device(config: FieldConfig) -> bool:
-    """Whether `DeviceField` can show this field."""
+    """Whether `GridFieldPlayback` can show this field."""
     if not config.decodes_on_device:
         return False
     sizes = _Sizes(config)
@@ -79,7 +79,7 @@ class _Block:
     moving: Buffer  # (count, dynamics and temporal features)
 
 
-class DeviceField:
+class GridFieldPlayback:
     """Moves activated Gaussians (`still`, means (N, 3), quats (N, 4) of unit length, ..., with opacity_logits in place
     of opacities) by a field whose parameters have the names and shapes of `parameter_shapes`.
 
@@ -111,7 +111,7 @@ class DeviceField:
         self._size = size = block or _BLOCK_BYTES // (4 * row) // _LANES * _LANES
         self._count = count = len(gaussians["means"])
         self._blocks = [self._block(gaussians, first, min(size, count - first)) for first in range(0, count, size)]
-        self._temporal = DeviceEncoder(
+        self._temporal = HashEncoderPasses(
             device, temporal_grids(config), config.bound, row=4 * sizes.moving_quads, column=sizes.first_temporal
         )
         self._tables = [
@@ -145,7 +145,7 @@ class DeviceField:
     def _encode_static(self, entries: Floats) -> None:
         """H_s, into the rows of what does not change."""
         row = _CANONICAL + 4 * self._sizes.still_quads
-        encoder = DeviceEncoder(
+        encoder = HashEncoderPasses(
             self._device, [static_grid(self._config)], self._config.bound, row=row, column=_CANONICAL
         )
         table = Buffer(self._device, entries.nbytes, "static table")  # not in the pool: it is needed once
