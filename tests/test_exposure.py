@@ -28,10 +28,11 @@ from lapgs_wgpu.splat.rasterize import rasterize
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 from lapgs_wgpu.train.config import Rate
 from lapgs_wgpu.train.exposure import ExposurePasses, Exposures, exposure
+from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
 from lapgs_wgpu.train.loop import resume, train
 from lapgs_wgpu.train.losses import total
-from lapgs_wgpu.train.render_loss import RenderLoss, render_loss, upload_rgba
 from lapgs_wgpu.train.training import Training
+from lapgs_wgpu.train.truth_cache import upload_rgba
 
 CORRECTION = torch.tensor([[0.9, 0.1, -0.05, 0.02], [0.03, 1.2, 0.0, -0.1], [-0.02, 0.05, 0.8, 0.2]])
 IDENTITY = torch.eye(3, 4)

@@ -18,11 +18,11 @@ from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterize import rasterize
 from lapgs_wgpu.splat.rasterizer import Rasterizer
-from lapgs_wgpu.train import losses
-from lapgs_wgpu.train import render_loss as render_loss_module
+from lapgs_wgpu.train import fused_loss, losses, truth_cache
+from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
 from lapgs_wgpu.train.image_loss import TERMS, ImageLoss
 from lapgs_wgpu.train.losses import LossWeights, total
-from lapgs_wgpu.train.render_loss import RenderLoss, TruthCache, render_loss, upload_rgba
+from lapgs_wgpu.train.truth_cache import TruthCache, upload_rgba
 
 pytestmark = pytest.mark.kernels
 
@@ -265,7 +265,7 @@ def test_overflow_and_bands_do_not_show(device: Device, monkeypatch: pytest.Monk
     for capacity, most in ((1 << 16, 1 << 20), (16, 1 << 20), (400, 400)):
         rasterizer = Rasterizer(device, capacity=capacity)
         rasterizer.max_capacity = most
-        monkeypatch.setattr(render_loss_module, "rasterizer_of", lambda device, one=rasterizer: one)
+        monkeypatch.setattr(fused_loss, "rasterizer_of", lambda device, one=rasterizer: one)
         scene = gaussians(400)
         done = step(device, scene)
         done.loss.backward()

@@ -26,12 +26,12 @@ from lapgs_wgpu.motion.passes.decoder_passes import DecoderPasses
 from lapgs_wgpu.motion.scene import Scene4D, load
 from lapgs_wgpu.train import decoder_choice, loop, training
 from lapgs_wgpu.train.config import Config
+from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.loop import train
 from lapgs_wgpu.train.losses import LossWeights
 from lapgs_wgpu.train.pictures import Pictures
 from lapgs_wgpu.train.presets import load_config
-from lapgs_wgpu.train.render_loss import RenderLoss, render_loss
 from lapgs_wgpu.train.training import Training
 
 STEPS = 36

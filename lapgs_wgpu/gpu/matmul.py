@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from .buffer import Buffer, BufferPool
+from .array import DeviceArray
 from .device import Device
 from .kernel import Commands, Kernel
+from .pool import BufferPool
 
 _TILE = 64  # matmul.wgsl
 _SPLIT = 1 << 11  # inner elements over which a long product is summed at once
@@ -14,26 +15,21 @@ _SPLIT = 1 << 11  # inner elements over which a long product is summed at once
 
 @dataclass(frozen=True)
 class Matrix:
-    """float32, in rows of `stride` floats in a buffer, `first` floats after the start of what is bound of it; where it
-    is transposed, in columns."""
+    """float32, in rows of `stride` floats in an array, `first` floats after its start; where it is transposed, in
+    columns."""
 
-    buffer: Buffer
+    array: DeviceArray
     rows: int
     columns: int
     stride: int
     first: int = 0
-    bound: tuple[int, int] | None = None  # offset and size in bytes; all of the buffer by default
     transposed: bool = False
 
     @staticmethod
-    def whole(buffer: Buffer, rows: int, columns: int) -> Matrix:
-        """All of a buffer, or its start."""
-        return Matrix(buffer, rows, columns, columns)
-
-    @staticmethod
-    def block(buffer: Buffer, columns: int, first: int, count: int) -> Matrix:
-        """Some rows of a buffer, from a multiple of 64 on, where a binding may begin."""
-        return Matrix(buffer, count, columns, columns, bound=(4 * first * columns, max(16, 4 * count * columns)))
+    def of(array: DeviceArray) -> Matrix:
+        """All of an array (rows, columns)."""
+        rows, columns = array.shape
+        return Matrix(array, rows, columns, columns)
 
     @property
     def transpose(self) -> Matrix:
@@ -43,11 +39,6 @@ class Matrix:
     def from_column(self, first: int, count: int) -> Matrix:
         """Some columns of one that is not transposed."""
         return replace(self, first=self.first + first, columns=count)
-
-    @property
-    def binding(self) -> Buffer | tuple[Buffer, int, int]:
-        """As `Commands.dispatch` takes it."""
-        return self.buffer if self.bound is None else (self.buffer, *self.bound)
 
 
 class Matmul:
@@ -61,12 +52,14 @@ class Matmul:
         """c = a b, or c += a b; c is not transposed, and neither a nor b."""
         self._dispatch(commands, name, a, b, c, a.columns, {"ADD": 1} if add else {})
 
-    def long(self, commands: Commands, name: str, a: Matrix, b: Matrix, total: Buffer, *, add: bool = False) -> None:
-        """total = a b, or total += a b, for a long inner dimension, which is split so that the device is busy, and into
-        sums of thousands of elements, so that they are accurate."""
+    def long(
+        self, commands: Commands, name: str, a: Matrix, b: Matrix, total: DeviceArray, *, add: bool = False
+    ) -> None:
+        """total = a b, or total += a b, for a long inner dimension, which is split: so that the device is busy, and
+        into sums of thousands of elements, so that they are accurate."""
         size, count = a.rows * b.columns, -(-a.columns // _SPLIT)
-        parts = self._pool.get("parts", 4 * size * count)
-        self._dispatch(commands, name, a, b, Matrix.whole(parts, a.rows, b.columns), _SPLIT, {})
+        parts = self._pool.array("parts", (count, a.rows, b.columns))
+        self._dispatch(commands, name, a, b, Matrix(parts, a.rows, b.columns, b.columns), _SPLIT, {})
         kernel = Kernel.get(self._device, "matmul_sum", **({"ADD": 1} if add else {}))
         uniform = self._pool.constant(f"sum {name}", kernel.uniform("Sum", count=size, parts=count))
         commands.dispatch(kernel, -(-size // 64), sum=uniform, parts=parts, total=total)
@@ -92,7 +85,7 @@ class Matmul:
             kernel,
             -(-c.rows // _TILE) * -(-c.columns // _TILE) * -(-a.columns // split),
             product=self._pool.constant(f"product {name}", content),
-            a=a.binding,
-            b=b.binding,
-            c=c.binding,
+            a=a.array,
+            b=b.array,
+            c=c.array,
         )

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import struct
 
-from .buffer import Buffer, BufferPool
+from .array import DeviceArray
 from .device import Device
 from .kernel import Commands, Kernel
+from .pool import BufferPool
 from .scan import Scan
 
 _SORT_BLOCK_ITEMS = 2048  # common/sort.wgsl: 128 lanes x 16 elements
@@ -27,15 +28,15 @@ class RadixSort:
         self,
         commands: Commands,
         *,
-        length: Buffer,
+        length: DeviceArray,
         capacity: int,
         bits: int,
-        keys: Buffer,
-        payload: Buffer | None,
-    ) -> tuple[Buffer, Buffer]:
+        keys: DeviceArray,
+        payload: DeviceArray | None,
+    ) -> tuple[DeviceArray, DeviceArray]:
         """Sort the first length[0] <= capacity elements by the lowest `bits` bits of their keys.
 
-        payload None stands for 0, 1, 2, ... Returns the buffers that hold the sorted keys and payload; `keys` and
+        payload None stands for 0, 1, 2, ... Returns the arrays of sorted keys and payload; `keys` and
         `payload` are used as scratch and lose their content.
         """
         widest = 8 if self._lane_runs else 4
@@ -46,13 +47,15 @@ class RadixSort:
             owners = 8 * min(128, max(4, capacity // (8 * 4096)))
         else:
             owners = -(-capacity // _SORT_BLOCK_ITEMS)
-        counters = self._pool.get(f"{self._name} counters", 4 * digits * owners)
-        places = self._pool.get(f"{self._name} places", 4 * digits * owners)
+        counters = self._pool.array(f"{self._name} counters", (digits * owners,), "uint32")
+        places = self._pool.array(f"{self._name} places", (digits * owners,), "uint32")
         counter_count = self._pool.constant(f"{self._name} counter count", struct.pack("<I", digits * owners))
-        ignored = self._pool.get(f"{self._name} total", 4)
-        keys_out = self._pool.get(f"{self._name} keys", 4 * capacity)
-        payload_out = self._pool.get(f"{self._name} payload", 4 * capacity)
-        second_payload = payload or self._pool.get(f"{self._name} second payload", 4 * capacity)
+        ignored = self._pool.array(f"{self._name} total", (1,), "uint32")
+        keys_out = self._pool.array(f"{self._name} keys", (capacity,), "uint32")
+        payload_out = self._pool.array(f"{self._name} payload", (capacity,), "uint32")
+        second_payload = payload
+        if second_payload is None:
+            second_payload = self._pool.array(f"{self._name} second payload", (capacity,), "uint32")
         shape = {"LANE_RUNS": 1} if self._lane_runs else {}
         groups = owners // 8 if self._lane_runs else owners
         count_kernel = Kernel.get(self._device, "sort_count", **shape)

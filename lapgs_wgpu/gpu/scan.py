@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from .buffer import Buffer, BufferPool
+from .array import DeviceArray
 from .device import Device
 from .kernel import Commands, Kernel
+from .pool import BufferPool
 
 _BLOCK_ITEMS = 2048  # common/block.wgsl
 
@@ -30,16 +31,16 @@ class Scan:
         self,
         commands: Commands,
         *,
-        length: Buffer,
+        length: DeviceArray,
         capacity: int,
-        values: Buffer,
-        prefix: Buffer,
-        total: Buffer,
-        indices: Buffer | None = None,
+        values: DeviceArray,
+        prefix: DeviceArray,
+        total: DeviceArray,
+        indices: DeviceArray | None = None,
     ) -> None:
         """prefix[i] = sum of the first i elements, total[0] = sum of all; elements = length[0] <= capacity."""
         count = -(-capacity // _BLOCK_ITEMS)
-        sums = self._pool.get(f"{self._name} block sums", 4 * count)
+        sums = self._pool.array(f"{self._name} block sums", (count,), "uint32")
         uniform = self._pool.constant(f"{self._name} blocks", self._blocks.uniform("Blocks", count=count))
         source = {"length": length, "values": values} | ({} if indices is None else {"indices": indices})
         commands.dispatch(self._reduce, count, **source, block_sums=sums)

@@ -1,31 +1,29 @@
-"""What wgpu raises when a device runs out of memory or is lost, as errors with a text for users.
+"""Translates what wgpu raises when a device runs out of memory or is lost into errors with a text for users.
 
 wgpu-py 0.32 reports both at the call: memory as a validation error, a lost device as a validation error or, where a
 buffer is mapped, as an AttributeError of its own. One call cannot be guarded: a submission that the native library
-refuses ends the process. Commands are therefore finished, which a lost device refuses in time, right before they are
-submitted, and sizes are checked before buffers are made.
+refuses ends the process. Commands are therefore finished right before they are submitted, which a lost device refuses
+in time, and sizes are checked before buffers are made.
 """
 
 from __future__ import annotations
 
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import wgpu
 
 from ..errors import DeviceError, DeviceLostError, DeviceMemoryError
-
-if TYPE_CHECKING:
-    from .device import Device
+from .device import Device
 
 _NO_MEMORY = "Not enough memory left"
 _LOST = "device is lost"
 
 
-class Guard:
-    """A context in which a lost device and exhausted memory become DeviceError; all else stays as it is.
+class TranslatedErrors:
+    """A context that turns exhausted memory and a lost device into a DeviceError; other errors pass unchanged.
 
-    what: for which the memory is needed; nbytes: how much, where it is known.
+    what: what the memory is for. nbytes: how much, 0 if unknown.
     """
 
     def __init__(self, device: Device, what: str, nbytes: int = 0) -> None:

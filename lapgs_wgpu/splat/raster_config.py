@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ..gpu.device import Device
+from ..gpu.device import SOFTWARE_LOOP_TURNS, Device
+from ..gpu.probe_subgroup import subgroup_size
 
-# Mesa's software driver ends a shader without a word when all loops of an invocation together have turned 65,535 times.
-# A longer list is drawn in several rounds in any case: all its slots then have no record beforehand, and the backward
-# pass need not turn to say so of the splats that nobody sees.
-LONG_LIST = 1 << 16
-# Of an image, or a band of one: a splat that covers it all is counted, listed and summed up a turn a tile.
-MOST_TILES = 60_000
+# Of an image, or a band of one, where the device limits loops: a splat that covers it all is counted, listed and summed
+# up a turn a tile. Below every device's `max_loop_turns`.
+MAX_BAND_TILES = 60_000
 
 
 @dataclass(frozen=True)
@@ -21,6 +19,8 @@ class RasterConfig:
     subgroups: the lanes lie in one subgroup and exchange values by shuffles instead of workgroup memory.
     lane_runs: the radix sort's shape for CPU devices, which also have no fast exp2.
     round_splats: most splats of a tile's list that a dispatch draws, where the driver ends long loops; else None.
+    long_list: length from which on a list is drawn in several rounds in any case, there. All its slots then have no
+    record beforehand, and the backward pass need not turn to say so of the splats that nobody sees.
     """
 
     tile_width: int
@@ -29,6 +29,7 @@ class RasterConfig:
     subgroups: bool
     lane_runs: bool
     round_splats: int | None = None
+    long_list: int = 1 << 16
 
     @property
     def rows(self) -> int:
@@ -44,16 +45,17 @@ class RasterConfig:
         flags["POLYNOMIAL_EXP2"] = self.lane_runs
         values = self.tile_defines | {"LANES": self.lanes, "ROWS": self.rows}
         if self.round_splats:
-            values |= {"ROUND_SPLATS": self.round_splats, "LONG_LIST": LONG_LIST}
+            values |= {"ROUND_SPLATS": self.round_splats, "LONG_LIST": self.long_list}
         return values | {name: 1 for name, on in flags.items() if on}
 
 
-def cpu_config(subgroup_size: int) -> RasterConfig:
+def cpu_config(subgroup_size: int, max_loop_turns: int = SOFTWARE_LOOP_TURNS) -> RasterConfig:
     """A workgroup is one vector of the processor, so that nothing has to wait at barriers."""
     lanes = 16 if subgroup_size == 16 else 8
     subgroups = subgroup_size >= lanes
     # Without subgroups the backward pass adds up a splat's ten values by loops over the lanes, 20 turns a splat.
-    return RasterConfig(8, 8, lanes, subgroups, lane_runs=True, round_splats=1 << 15 if subgroups else 1 << 11)
+    round_splats = (max_loop_turns + 1) // (2 if subgroups else 32)
+    return RasterConfig(8, 8, lanes, subgroups, True, round_splats, long_list=max_loop_turns + 1)
 
 
 def gpu_config(subgroup_size: int) -> RasterConfig:
@@ -63,5 +65,6 @@ def gpu_config(subgroup_size: int) -> RasterConfig:
 
 
 def raster_config(device: Device) -> RasterConfig:
-    """The shape for this adapter."""
-    return (cpu_config if device.is_cpu else gpu_config)(device.subgroup_size)
+    """The configuration for this adapter."""
+    size = subgroup_size(device)
+    return gpu_config(size) if device.max_loop_turns is None else cpu_config(size, device.max_loop_turns)

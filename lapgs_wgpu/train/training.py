@@ -25,11 +25,11 @@ from lapgs_wgpu.train.config import Config, PointsConfig, SmoothnessConfig
 from lapgs_wgpu.train.decoder_choice import choose_decoder
 from lapgs_wgpu.train.densify import Statistics, densify, reset_opacities
 from lapgs_wgpu.train.exposure import Exposures
+from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
 from lapgs_wgpu.train.health import Health, Skipped, check_parameters, describe, finite
 from lapgs_wgpu.train.optimise import FrequencyOptimiser, Optimiser
 from lapgs_wgpu.train.pictures import Pictures
 from lapgs_wgpu.train.ranks import ALONE, Ranks
-from lapgs_wgpu.train.render_loss import RenderLoss, render_loss
 
 MAX_SH_DEGREE = 3
 

@@ -15,7 +15,7 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands
 from lapgs_wgpu.train.image_loss import TERMS, ImageLoss
 from lapgs_wgpu.train.losses import LossWeights, total
-from lapgs_wgpu.train.render_loss import upload_rgba
+from lapgs_wgpu.train.truth_cache import upload_rgba
 
 WEIGHTS = LossWeights(0.8, 0.2, pyramid=0.2, ncc=0.05)  # the paper's
 

@@ -17,6 +17,10 @@ MIN_SCALE = 1e-7  # of a Gaussian, after its deformation; world units
 PLANES = ((0, 1), (0, 2), (1, 2), (0, TIME), (1, TIME), (2, TIME))  # of the field hexplane: pairs of x, y, z, t
 TEMPORAL_AXES = ((0, 1, TIME), (1, 2, TIME), (0, 2, TIME))  # of the temporal hash grids
 GEOMETRY = (4, 3, 4, 3)  # outputs of the grid fields' geometry heads: turn, shift, quaternion, scale
+HEXPLANE_HEADS = (3, 4, 3)  # outputs of the field hexplane's heads: shift, quaternion, scale
+# Of the field mlp: octaves of its inputs; features of the time; layers, before the one of which the inputs come in once
+# more; outputs: shift, quaternion, scale.
+PLACE_OCTAVES, TIME_OCTAVES, TIME_FEATURES, MLP_LAYERS, MLP_SKIP, MLP_OUTPUTS = 10, 6, 30, 8, 4, (3, 4, 3)
 # Times the appearance head's outputs: it then learns about as fast as the colours themselves; at full speed it explains
 # what is motion by changes of colour.
 APPEARANCE_SCALE = 0.1

@@ -10,14 +10,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from ...gpu.buffer import Buffer, BufferPool, Request, read_all
+from ...gpu.array import DeviceArray, read_all
 from ...gpu.device import Device
 from ...gpu.kernel import Commands, Kernel
+from ...gpu.pool import BufferPool
 from ..passes.decoder_passes import DecoderPasses, DecoderShape
-from .hash_encoder import HashEncoder, Place
+from .hash_encoder import Encoded, HashEncoder, Place
 
 
 class Decoded(NamedTuple):
@@ -37,7 +37,7 @@ class Decoder:
     def __init__(self, device: Device, encoder: HashEncoder, shape: DecoderShape, *, block: int | None = None) -> None:
         self.encoder, self.shape = encoder, shape
         self._device = device
-        self._decoder = DecoderPasses(device, shape, block=block)
+        self._passes = DecoderPasses(device, shape, block=block)
         self._pool = BufferPool(device)
 
     def __call__(
@@ -61,23 +61,24 @@ class Decoder:
 
     def write(
         self, places: Sequence[Place], beside: Tensor, weights: Sequence[Tensor], tables: Sequence[Tensor]
-    ) -> None:
+    ) -> _Written:
         """Bring all that the forward pass reads to the device."""
-        self.encoder.write(places, tables)
-        self._upload("beside", beside)
-        for name, weight in zip(self.shape.weights, weights, strict=True):
-            self._upload(f"weights {name}", weight)
+        encoded = self.encoder.write(places, tables)
+        arrays = {"beside": self._upload("beside", beside)}
+        inputs = dict(zip(self.shape.inputs, [arrays["beside"], *encoded.encodings[0]], strict=True))
+        named = zip(self.shape.weights, weights, strict=True)
+        return _Written(encoded, inputs, {name: self._upload(f"weights {name}", weight) for name, weight in named})
 
-    def record(self, commands: Commands, places: Sequence[Place]) -> list[Request]:
-        """The forward pass: what to read to have the outputs and, for each group of grids, the sums of each pair."""
-        self.encoder.record(commands, places)
-        n = len(places[0][0])
-        outputs = self._pool.get("outputs", 4 * n * self.shape.outputs)
-        self._decoder.decode(commands, n, self._inputs(), self._weights(), outputs)
-        requests: list[Request] = [(outputs, "float32", (n, self.shape.outputs), 0)]
-        for group, (here, there) in enumerate(self._compared(places)):
-            pairs = len(places[1][0])
-            sums = self._pool.get(f"sums {group}", 4 * pairs)
+    def record(self, commands: Commands, written: _Written) -> list[DeviceArray]:
+        """The forward pass: the outputs and, for each group of grids, the sums of each pair."""
+        encoded = written.encoded
+        self.encoder.record(commands, encoded)
+        outputs = self._pool.array("outputs", (encoded.counts[0], self.shape.outputs))
+        self._passes.decode(commands, written.inputs, written.weights, outputs)
+        results = [outputs]
+        for group, (here, there) in enumerate(written.compared):
+            pairs = here.shape[0]
+            sums = self._pool.array(f"sums {group}", (pairs,))
             commands.dispatch(
                 Kernel.get(self._device, "smoothness"),
                 -(-pairs // 64),
@@ -86,15 +87,16 @@ class Decoder:
                 there=there,
                 sums=sums,
             )
-            requests.append((sums, "float32", (pairs,), 0))
-        return requests
+            results.append(sums)
+        return results
 
-    def record_bwd(self, commands: Commands, places: Sequence[Place], d_apart: Sequence[float]) -> list[Request]:
-        """The backward pass, from the gradient of the outputs in its buffer: what to read to have the gradients of
-        `beside`, of the weights and of the tables. Features and tables on the device become their gradients."""
-        n, shape = len(places[0][0]), self.shape
-        for group, (here, there) in enumerate(self._compared(places)):
-            pairs = len(places[1][0])
+    def record_bwd(
+        self, commands: Commands, written: _Written, d_outputs: DeviceArray, d_apart: Sequence[float]
+    ) -> list[DeviceArray]:
+        """The backward pass, from the gradient of the outputs: the gradients of `beside`, of the weights and of the
+        tables. Features and tables on the device become their gradients."""
+        for group, (here, there) in enumerate(written.compared):
+            pairs = here.shape[0]
             commands.dispatch(
                 Kernel.get(self._device, "smoothness_bwd"),
                 -(-pairs * self.encoder.features[group] // 64),
@@ -102,36 +104,32 @@ class Decoder:
                 here=here,
                 there=there,
             )
-        d_weights = {
-            name: self._pool.get(f"d weights {name}", 4 * rows * columns)
-            for name, (rows, columns) in shape.weights.items()
-        }
-        d_outputs = self._pool.get("d outputs", 0)
-        self._decoder.decode_bwd(commands, n, self._inputs(), self._weights(), d_outputs, d_weights)
-        requests: list[Request] = [(self._pool.get("beside", 0), "float32", (n, shape.beside), 0)]
-        requests += [(d_weights[name], "float32", size, 0) for name, size in shape.weights.items()]
-        return requests + self.encoder.record_gradient(commands, places)
+        d_weights = {name: self._pool.array(f"d weights {name}", size) for name, size in self.shape.weights.items()}
+        self._passes.decode_bwd(commands, written.inputs, written.weights, d_outputs, d_weights)
+        d_tables = self.encoder.record_gradient(commands, written.encoded)
+        return [written.inputs["beside"], *d_weights.values(), *d_tables]
 
-    def _inputs(self) -> dict[str, Buffer]:
-        return dict(zip(self.shape.inputs, [self._pool.get("beside", 0), *self.encoder.encodings(0)], strict=True))
-
-    def _weights(self) -> dict[str, Buffer]:
-        return {name: self._pool.get(f"weights {name}", 0) for name in self.shape.weights}
-
-    def _compared(self, places: Sequence[Place]) -> list[tuple[Buffer, Buffer]]:
-        """For each group of grids, the encodings of the two sets of places that are compared."""
-        if len(places) == 1:
-            return []
-        return list(zip(self.encoder.encodings(1), self.encoder.encodings(2), strict=True))
-
-    def _smoothness(self, group: int, pairs: int, scale: float) -> Buffer:
+    def _smoothness(self, group: int, pairs: int, scale: float) -> DeviceArray:
         kernel = Kernel.get(self._device, "smoothness")
         content = kernel.uniform("Smoothness", pairs=pairs, features=self.encoder.features[group], scale=scale)
         return self._pool.constant(f"smoothness {group} {'back' if scale else 'forth'}", content)
 
-    def _upload(self, name: str, tensor: Tensor) -> None:
-        array = tensor.detach().to("cpu", torch.float32).contiguous().numpy()
-        self._pool.get(name, array.nbytes).write(array)
+    def _upload(self, name: str, tensor: Tensor) -> DeviceArray:
+        return self._pool.upload(name, tensor.detach().to("cpu", torch.float32).contiguous().numpy())
+
+
+class _Written(NamedTuple):
+    """What a forward pass reads: its encodings, and the decoder's inputs and weights by the names of DecoderShape."""
+
+    encoded: Encoded
+    inputs: dict[str, DeviceArray]
+    weights: dict[str, DeviceArray]
+
+    @property
+    def compared(self) -> list[tuple[DeviceArray, DeviceArray]]:
+        """For each group of grids, the encodings of the two sets of places that are compared."""
+        here, there = self.encoded.encodings[1:] or ([], [])
+        return list(zip(here, there, strict=True))
 
 
 class _Decode(torch.autograd.Function):
@@ -141,11 +139,10 @@ class _Decode(torch.autograd.Function):
         points = [points.detach() for points, _ in places]
         ctx.decoder, ctx.count, ctx.times = decoder, count, [time for _, time in places]
         ctx.save_for_backward(*points, beside, *tensors)
-        decoder.write(places, beside, tensors[:count], tensors[count:])
+        ctx.written = decoder.write(places, beside, tensors[:count], tensors[count:])
         with Commands(decoder._device) as commands:
-            requests = decoder.record(commands, places)
-        ctx.written = decoder.encoder.written
-        outputs, *sums = read_all(requests)
+            results = decoder.record(commands, ctx.written)
+        outputs, *sums = read_all(results)
         apart = np.array([each.sum(dtype=np.float64) for each in sums], np.float32)
         return torch.from_numpy(outputs).to(beside.device), torch.from_numpy(apart).to(beside.device)
 
@@ -156,15 +153,13 @@ class _Decode(torch.autograd.Function):
         sets = len(ctx.times)
         places = list(zip(ctx.saved_tensors[:sets], ctx.times, strict=True))
         beside, *tensors = ctx.saved_tensors[sets:]
-        lost = decoder.encoder.written is not ctx.written  # something else was encoded in between
+        lost = not decoder.encoder.holds(ctx.written.encoded)  # something else was encoded in between
         if lost:
-            decoder.write(places, beside, tensors[: ctx.count], tensors[ctx.count :])
-        decoder._upload("d outputs", d_outputs)
-        decoder.encoder.written = None  # features become gradients
+            ctx.written = decoder.write(places, beside, tensors[: ctx.count], tensors[ctx.count :])
+        upstream = decoder._upload("d outputs", d_outputs)
         with Commands(decoder._device) as commands:
             if lost:
-                decoder.record(commands, places)
-            requests = decoder.record_bwd(commands, places, d_apart.tolist())
-        found: list[NDArray[np.float32]] = read_all(requests)
-        d_beside, *d_tensors = (torch.from_numpy(array).to(beside.device) for array in found)
+                decoder.record(commands, ctx.written)
+            gradients = decoder.record_bwd(commands, ctx.written, upstream, d_apart.tolist())
+        d_beside, *d_tensors = (torch.from_numpy(array).to(beside.device) for array in read_all(gradients))
         return (None, None, d_beside, None, *d_tensors)

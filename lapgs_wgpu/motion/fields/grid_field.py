@@ -9,13 +9,14 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from ...gpu.device import Device
-from ..passes.decoder_passes import DecoderShape
+from ..passes.decoder_passes import decoder_shape
 from .config import APPEARANCE_SCALE, GEOMETRY, TEMPORAL_AXES, FieldConfig
 from .decoder import Decoder
 from .deformation import Deformation, Nearby
 from .hash_encoder import HashEncoder, HashGrid
 from .laplacian import LaplacianMotion, TimeMotion
 from .layers import last_product, linear, product, zero_head
+from .parameter_shapes import parameter_shapes
 
 _BLOCK = 1 << 13  # Gaussians that are decoded at once
 _KEPT = 1 << 16  # of all, up to which a step keeps the decoder's activations instead of computing them once more
@@ -46,12 +47,13 @@ class GridField(nn.Module):
         self.temporal_grids = nn.ModuleList(HashGrid(config.temporal, three, generator) for three in axes)
         groups = [[self.static_grid], self.grids[1:]] if axes else [[self.static_grid]]
         self._encoder = HashEncoder(device, groups, config.bound)
-        static, temporal = self.static_grid.features, sum(grid.features for grid in self.grids[1:])
-        self.spatial = linear(static, width, generator)
-        self.temporal = linear(max(1, config.dynamics_size + temporal), width, generator)
-        hidden = [layer for _ in range(config.depth) for layer in (linear(width, width, generator), nn.ReLU())]
-        self.hidden = nn.Sequential(*hidden)
-        self.heads = zero_head(width, sum(GEOMETRY))
+        static = self.static_grid.features
+        shapes = parameter_shapes(config)
+        self.spatial = linear(shapes["spatial.weight"], generator)
+        self.temporal = linear(shapes["temporal.weight"], generator)
+        hidden = [(linear(shapes[f"hidden.{2 * i}.weight"], generator), nn.ReLU()) for i in range(config.depth)]
+        self.hidden = nn.Sequential(*(layer for pair in hidden for layer in pair))
+        self.heads = zero_head(shapes["heads.weight"])
         self.motion: LaplacianMotion | TimeMotion | None = None
         if ours and config.motion == "laplacian":
             self.motion = LaplacianMotion(
@@ -64,21 +66,9 @@ class GridField(nn.Module):
             )
         elif ours:
             self.motion = TimeMotion(static, width, generator)
-        changes = config.appearance_size
-        self.appearance = zero_head(width, changes) if changes else None
+        self.appearance = zero_head(shapes["appearance.weight"]) if config.appearance_size else None
         self.on_device = False
-        self._decoder = Decoder(
-            device,
-            self._encoder,
-            DecoderShape(
-                width=width,
-                beside=config.dynamics_size + 1,
-                static=static,
-                temporal=temporal,
-                outputs=sum(GEOMETRY) + changes,
-                motion=ours,
-            ),
-        )
+        self._decoder = Decoder(device, self._encoder, decoder_shape(config))
 
     @property
     def grids(self) -> list[HashGrid]:
@@ -203,7 +193,7 @@ class GridField(nn.Module):
         return moving
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        """See motion/fields/deformation.py. The spectrum's frequencies are in no group: they have their own optimiser."""
+        """See motion/fields/deformation.py. The spectrum's frequencies, in no group, have their own optimiser."""
         tables = [grid.table for grid in self.grids]
         apart = {id(table) for table in tables}
         if isinstance(self.motion, LaplacianMotion):

@@ -1,23 +1,39 @@
 """The hash encoder as torch sees it: grids whose tables belong to torch, their encoding and its gradient on the device
-(motion/passes/hash_encoder_passes), and its plain-torch twin."""
+(motion/passes/hash_encoder_passes), and its plain-torch reference."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from ...gpu.buffer import Buffer, BufferPool, Request, read_all
+from ...gpu.array import DeviceArray, read_all
 from ...gpu.device import Device
 from ...gpu.kernel import Commands
+from ...gpu.pool import BufferPool
 from ..passes.hash_encoder_passes import HashEncoderPasses
 from .hash_grid_config import TIME, GridShape, HashConfig
 
 Place = tuple[Tensor, float]  # points (N, 3), world units, and a time in [0, 1]
-_NUMPY = {torch.float32: "float32", torch.bfloat16: "int16"}  # as which numpy, which has no bfloat16, takes them
+_NUMPY = {torch.float32: "float32", torch.bfloat16: "int16"}  # the dtype of arrays, which have no bfloat16
+
+
+class Encoded(NamedTuple):
+    """Several sets of points and their encodings on the device. Valid until the encoder writes other points.
+
+    counts, times: of each set. points: (N, 4) of each. tables: (entries, 2) of each grid, group by group. encodings:
+    (N, features) of each set and group; where gradients are recorded, they and the tables become their gradients.
+    """
+
+    counts: list[int]
+    times: list[float]
+    points: list[DeviceArray]
+    tables: list[list[DeviceArray]]
+    encodings: list[list[DeviceArray]]
 
 
 class HashGrid(GridShape, nn.Module):
@@ -45,9 +61,10 @@ class HashEncoder:
         lane_levels: bool | None = None,
     ) -> None:
         self.groups = [list(group) for group in groups]
-        self._encoders = [HashEncoderPasses(device, group, bound, lane_levels=lane_levels) for group in self.groups]
+        self._passes = [HashEncoderPasses(device, group, bound, lane_levels=lane_levels) for group in self.groups]
         self._pool = BufferPool(device)
-        self.written: object = None  # another one with each `write`, whose encodings are on the device until the next
+        self._device = device
+        self._held: Encoded | None = None  # what the buffers hold
 
     @property
     def grids(self) -> list[HashGrid]:
@@ -75,92 +92,93 @@ class HashEncoder:
         count = len(self.groups)
         return [list(outputs[i : i + count]) for i in range(0, len(outputs), count)]
 
-    def encode(self, places: Sequence[Place], dtype: torch.dtype, tables: Sequence[Tensor]) -> list[Tensor]:
+    def encode(
+        self, places: Sequence[Place], dtype: torch.dtype, tables: Sequence[Tensor]
+    ) -> tuple[Encoded, list[Tensor]]:
         """The forward pass without autograd: the encodings of the first place, group by group, then of the second."""
-        self.write(places, tables)
-        with Commands(self._pool.device) as commands:
-            self.record(commands, places, dtype)
-        requests: list[Request] = [
-            (buffer, _NUMPY[dtype], (len(points), size), 0)
-            for number, (points, _) in enumerate(places)
-            for buffer, size in zip(self.encodings(number), self.features, strict=True)
-        ]
+        encoded = self.write(places, tables, dtype)
+        with Commands(self._device) as commands:
+            self.record(commands, encoded)
         device = places[0][0].device
-        return [torch.from_numpy(array).view(dtype).to(device) for array in read_all(requests)]
+        arrays = read_all(list(itertools.chain(*encoded.encodings)))
+        return encoded, [torch.from_numpy(array).view(dtype).to(device) for array in arrays]
 
-    def backward(self, places: Sequence[Place], d_encodings: Sequence[Tensor], written: object = None) -> list[Tensor]:
-        """The gradients of the tables, from those of the encodings in the order of `encode`. written: what that left in
-        `self.written`; while it is there, so are the points."""
-        if written is None or written is not self.written:
-            self.write(places)
-        self.written = None  # encodings and tables become gradients
-        for i, d_encoding in enumerate(d_encodings):
-            number, group = divmod(i, len(self.groups))
-            self._upload(f"encoding {number} {group}", d_encoding)
-        with Commands(self._pool.device) as commands:
-            requests = self.record_gradient(commands, places, d_encodings[0].dtype)
-        return [torch.from_numpy(array).to(places[0][0].device) for array in read_all(requests)]
+    def backward(
+        self, places: Sequence[Place], d_encodings: Sequence[Tensor], encoded: Encoded | None = None
+    ) -> list[Tensor]:
+        """The gradients of the tables, from those of the encodings in the order of `encode`. encoded: its result, whose
+        points need not be written again while the encoder holds them."""
+        if encoded is None or not self.holds(encoded):
+            encoded = self.write(places, (), d_encodings[0].dtype)
+        for array, d_encoding in zip(itertools.chain(*encoded.encodings), d_encodings, strict=True):
+            array.write(_host(d_encoding))
+        with Commands(self._device) as commands:
+            gradients = self.record_gradient(commands, encoded)
+        return [torch.from_numpy(array).to(places[0][0].device) for array in read_all(gradients)]
 
     # What `encode` and `backward` consist of, without waiting for the device. Everything is written before anything is
     # submitted: a buffer can only be mapped while the device rests.
 
-    def write(self, places: Sequence[Place], tables: Sequence[Tensor] = ()) -> None:
-        """Bring points, and tables, to the device."""
-        self.written = object()
-        for i, table in enumerate(tables):
-            self._upload(f"table {i}", table)
-        for number, (points, _) in enumerate(places):
-            self._upload(f"points {number}", torch.nn.functional.pad(points.detach().float(), (0, 1)))
-
-    def encodings(self, number: int) -> list[Buffer]:
-        """Those of a set of points, group by group; with `record_gradient` what holds their gradients."""
-        return [self._pool.get(f"encoding {number} {i}", 0) for i in range(len(self.groups))]
-
-    def record(self, commands: Commands, places: Sequence[Place], dtype: torch.dtype = torch.float32) -> None:
-        """The passes that encode what was written."""
-        tables = self._tables()
-        for number, (points, time) in enumerate(places):
-            for i, (encoder, size) in enumerate(zip(self._encoders, self.features, strict=True)):
-                encoding = self._pool.get(f"encoding {number} {i}", dtype.itemsize * len(points) * size)
-                if len(points):
-                    mine = self._pool.get(f"points {number}", 0), len(points), time, tables[i], encoding
-                    encoder.encode(commands, number, *mine, bfloat16=dtype == torch.bfloat16)
-
-    def record_gradient(
-        self, commands: Commands, places: Sequence[Place], dtype: torch.dtype = torch.float32
-    ) -> list[Request]:
-        """The passes that make the gradients of the tables, in the tables' buffers, of those of the encodings, in the
-        encodings' buffers; what to read to have them."""
-        tables = self._tables()
-        for buffer in itertools.chain(*tables):
-            commands.clear(buffer)
-        for number, (points, time) in enumerate(places):
-            for i, encoder in enumerate(self._encoders):
-                if len(points):
-                    mine = (
-                        self._pool.get(f"points {number}", 0),
-                        len(points),
-                        time,
-                        self.encodings(number)[i],
-                        tables[i],
-                    )
-                    encoder.add_gradient(commands, number, *mine, bfloat16=dtype == torch.bfloat16)
-        shapes = [tuple(grid.table.shape) for grid in self.grids]
-        return [(b, "float32", shape, 0) for b, shape in zip(itertools.chain(*tables), shapes, strict=True)]
-
-    def _tables(self) -> list[list[Buffer]]:
-        """The tables' buffers, group by group."""
+    def write(
+        self, places: Sequence[Place], tables: Sequence[Tensor] = (), dtype: torch.dtype = torch.float32
+    ) -> Encoded:
+        """Bring points, and tables where they are given, to the device. dtype: of the encodings."""
+        for number, table in enumerate(tables):
+            self._pool.upload(f"table {number}", _host(table))
         numbers = itertools.count()
-        return [
-            [self._pool.get(f"table {next(numbers)}", 8 * len(grid.table)) for grid in group] for group in self.groups
+        points = [
+            self._pool.upload(f"points {number}", _host(torch.nn.functional.pad(points.detach().float(), (0, 1))))
+            for number, (points, _) in enumerate(places)
         ]
+        self._held = Encoded(
+            [len(points) for points, _ in places],
+            [time for _, time in places],
+            points,
+            [
+                [self._pool.array(f"table {next(numbers)}", tuple(grid.table.shape)) for grid in group]
+                for group in self.groups
+            ],
+            [
+                [
+                    self._pool.array(f"encoding {number} {group}", (len(points), size), _NUMPY[dtype])
+                    for group, size in enumerate(self.features)
+                ]
+                for number, (points, _) in enumerate(places)
+            ],
+        )
+        return self._held
 
-    def _upload(self, name: str, tensor: Tensor) -> Buffer:
-        words = tensor.detach().to("cpu").contiguous()
-        array = words.view(torch.int16).numpy() if words.dtype == torch.bfloat16 else words.float().numpy()
-        buffer = self._pool.get(name, array.nbytes)
-        buffer.write(array)
-        return buffer
+    def holds(self, encoded: Encoded) -> bool:
+        """Whether the device still has these encodings: nothing else was written, and they are no gradients yet."""
+        return encoded is self._held
+
+    def record(self, commands: Commands, encoded: Encoded) -> None:
+        """The passes that encode what was written."""
+        for number, count in enumerate(encoded.counts):
+            for passes, tables, encoding in zip(self._passes, encoded.tables, encoded.encodings[number], strict=True):
+                if count:
+                    passes.encode(
+                        commands, number, encoded.points[number], count, encoded.times[number], tables, encoding
+                    )
+
+    def record_gradient(self, commands: Commands, encoded: Encoded) -> list[DeviceArray]:
+        """The passes from the encodings' gradients, in the arrays of the encodings, to those of the tables, in the
+        arrays of the tables, which are returned."""
+        self._held = None
+        for table in itertools.chain(*encoded.tables):
+            commands.clear(table)
+        for number, count in enumerate(encoded.counts):
+            for passes, tables, encoding in zip(self._passes, encoded.tables, encoded.encodings[number], strict=True):
+                if count:
+                    passes.add_gradient(
+                        commands, number, encoded.points[number], count, encoded.times[number], encoding, tables
+                    )
+        return list(itertools.chain(*encoded.tables))
+
+
+def _host(tensor: Tensor) -> NDArray[Any]:
+    words = tensor.detach().to("cpu").contiguous()
+    return words.view(torch.int16).numpy() if words.dtype == torch.bfloat16 else words.float().numpy()
 
 
 class _Encode(torch.autograd.Function):
@@ -170,18 +188,17 @@ class _Encode(torch.autograd.Function):
     ) -> tuple[Tensor, ...]:
         ctx.encoder, ctx.times = encoder, [time for _, time in places]
         ctx.save_for_backward(*[points for points, _ in places])
-        encodings = encoder.encode(places, dtype, tables)
-        ctx.written = encoder.written
+        ctx.encoded, encodings = encoder.encode(places, dtype, tables)
         return tuple(encodings)
 
     @staticmethod
     def backward(ctx: Any, *d_encodings: Tensor) -> tuple[Tensor | None, ...]:
         places = list(zip(ctx.saved_tensors, ctx.times, strict=True))
-        return (None, None, None, *ctx.encoder.backward(places, d_encodings, ctx.written))
+        return (None, None, None, *ctx.encoder.backward(places, d_encodings, ctx.encoded))
 
 
 def encode_reference(grid: HashGrid, table: Tensor, points: Tensor, time: float, bound: float) -> Tensor:
-    """The plain-torch twin: (N, 2 x levels) in the table's precision; cells are found in float32 as on the device."""
+    """The reference in torch: (N, 2 x levels) in the table's precision; cells are found in float32, as on the device."""
     columns = [(points[:, axis] + bound) / (2 * bound) if axis != TIME else None for axis in grid.axes]
     unit = torch.stack([torch.full_like(points[:, 0], time) if c is None else c for c in columns], dim=1)
     inside = ((unit >= 0) & (unit <= 1)).all(dim=1)

@@ -5,10 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from .config import PLANES, FieldConfig, plane_shapes
+from .config import HEXPLANE_HEADS, PLANES, FieldConfig
 from .deformation import Deformation, Nearby
 from .hash_grid_config import TIME
 from .layers import linear, zero_head
+from .parameter_shapes import parameter_shapes
 
 # Weights of the smoothness loss that 4D-GS trains with on D-NeRF scenes.
 SPACE_SMOOTHNESS, TIME_SMOOTHNESS, TIME_SPARSITY = 1e-4, 1e-2, 1e-4
@@ -23,22 +24,26 @@ class HexPlaneField(nn.Module):
     def __init__(self, config: FieldConfig, seed: int) -> None:
         super().__init__()
         generator = torch.Generator().manual_seed(seed)
-        self.bound, width = config.bound, config.width
+        self.bound, shapes = config.bound, parameter_shapes(config)
         self.planes = nn.ParameterList()
-        for number, shape in enumerate(plane_shapes(config.planes)):
+        for number in range(len(PLANES) * config.planes.levels):
             # Time planes start at one, and thus without motion.
-            plane = torch.ones(shape)
+            plane = torch.ones(shapes[f"planes.{number}"])
             if PLANES[number % len(PLANES)][1] != TIME:
                 plane.uniform_(0.1, 0.5, generator=generator)
             self.planes.append(nn.Parameter(plane))
-        inputs = config.planes.features * config.planes.levels
-        layers: list[nn.Module] = [linear(inputs, width, generator)]
-        for _ in range(config.depth):
-            layers += [nn.ReLU(), linear(width, width, generator)]
+        layers: list[nn.Module] = [linear(shapes["trunk.0.weight"], generator)]
+        for i in range(config.depth):
+            layers += [nn.ReLU(), linear(shapes[f"trunk.{2 * i + 2}.weight"], generator)]
         self.trunk = nn.Sequential(*layers)
         self.heads = nn.ModuleList(
-            nn.Sequential(nn.ReLU(), linear(width, width, generator), nn.ReLU(), zero_head(width, size))
-            for size in (3, 4, 3)
+            nn.Sequential(
+                nn.ReLU(),
+                linear(shapes[f"heads.{i}.1.weight"], generator),
+                nn.ReLU(),
+                zero_head(shapes[f"heads.{i}.3.weight"]),
+            )
+            for i in range(len(HEXPLANE_HEADS))
         )
 
     def forward(

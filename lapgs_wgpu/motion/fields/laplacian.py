@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from .layers import last_product, linear, product
+from .parameter_shapes import laplacian_motion, time_motion
 
 VARIANCE_FLOOR = 1e-4
 VARIANCE_SPREAD = (
@@ -54,13 +55,14 @@ class LaplacianMotion(nn.Module):
         super().__init__()
         # Faint, and fainter at higher frequencies, as smooth motions are: so that the heads do not learn to explain
         # single pictures by a flicker. Not zero: with both factors at zero the product would have no gradient.
+        shapes = laplacian_motion(inputs, width, components)
         fall = 1.0 / torch.arange(components).clamp(min=1)[:, None]
         size = amplitude * fall / fall.square().sum().sqrt()
-        self.alpha = nn.Parameter(torch.randn(components, width, generator=generator) * size)
-        self.beta = nn.Parameter(torch.randn(components, width, generator=generator) * size)
+        self.alpha = nn.Parameter(torch.randn(shapes["alpha"], generator=generator) * size)
+        self.beta = nn.Parameter(torch.randn(shapes["beta"], generator=generator) * size)
         self.frequencies = nn.Parameter(frequency_step * torch.arange(components, dtype=torch.float32))
-        self.first = linear(inputs, width, generator)
-        self.second = linear(width, width, generator)
+        self.first = linear(shapes["first.weight"], generator)
+        self.second = linear(shapes["second.weight"], generator)
 
     def series(self, t: float) -> Tensor:
         """L(t), (W,), at a time in [0, 1]."""
@@ -103,8 +105,9 @@ class TimeMotion(nn.Module):
 
     def __init__(self, inputs: int, width: int, generator: torch.Generator) -> None:
         super().__init__()
-        self.first = linear(inputs + 1, width, generator)
-        self.second = linear(width, width, generator)
+        shapes = time_motion(inputs, width)
+        self.first = linear(shapes["first.weight"], generator)
+        self.second = linear(shapes["second.weight"], generator)
 
     def forward(self, static: Tensor, t: float) -> Factors:
         """The features of Gaussians with the static features H_s (N, inputs)."""

@@ -8,8 +8,9 @@ import torch
 from torch import Tensor, nn
 
 
-def linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:
-    """A linear layer with torch's own initial distribution."""
+def linear(shape: tuple[int, ...], generator: torch.Generator) -> nn.Linear:
+    """A linear layer with a weight of this shape (outputs, inputs) and torch's own initial distribution."""
+    outputs, inputs = shape
     layer = nn.Linear(inputs, outputs)
     reach = inputs**-0.5
     with torch.no_grad():
@@ -18,8 +19,9 @@ def linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:
     return layer
 
 
-def zero_head(inputs: int, outputs: int) -> nn.Linear:
-    """A linear layer of zeros, so that what it changes starts unchanged."""
+def zero_head(shape: tuple[int, ...]) -> nn.Linear:
+    """A linear layer with a weight of this shape (outputs, inputs), of zeros: what it changes starts unchanged."""
+    outputs, inputs = shape
     layer = nn.Linear(inputs, outputs)
     nn.init.zeros_(layer.weight)
     nn.init.zeros_(layer.bias)

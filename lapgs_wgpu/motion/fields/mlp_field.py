@@ -7,14 +7,10 @@ import math
 import torch
 from torch import Tensor, nn
 
-from .config import FieldConfig
+from .config import MLP_LAYERS, MLP_OUTPUTS, MLP_SKIP, PLACE_OCTAVES, TIME_OCTAVES, FieldConfig
 from .deformation import Deformation, Nearby
 from .layers import linear, zero_head
-
-PLACE_OCTAVES, TIME_OCTAVES = 10, 6
-TIME_FEATURES = 30
-LAYERS = 8
-SKIP = 4  # before this layer the inputs come in once more
+from .parameter_shapes import parameter_shapes
 
 
 class MlpField(nn.Module):
@@ -23,16 +19,13 @@ class MlpField(nn.Module):
     def __init__(self, config: FieldConfig, seed: int) -> None:
         super().__init__()
         generator = torch.Generator().manual_seed(seed)
-        width = config.width
+        shapes = parameter_shapes(config)
         self.bound = config.bound
         self.time = nn.Sequential(
-            linear(1 + 2 * TIME_OCTAVES, width, generator), nn.ReLU(), linear(width, TIME_FEATURES, generator)
+            linear(shapes["time.0.weight"], generator), nn.ReLU(), linear(shapes["time.2.weight"], generator)
         )
-        inputs = 3 + 6 * PLACE_OCTAVES + TIME_FEATURES
-        sizes = [inputs, *[width] * (LAYERS - 1)]
-        sizes[SKIP] += inputs
-        self.layers = nn.ModuleList(linear(size, width, generator) for size in sizes)
-        self.heads = zero_head(width, 10)
+        self.layers = nn.ModuleList(linear(shapes[f"layers.{i}.weight"], generator) for i in range(MLP_LAYERS))
+        self.heads = zero_head(shapes["heads.weight"])
 
     def forward(
         self, means: Tensor, t: float, dynamics: Tensor | None = None, nearby: Nearby | None = None
@@ -42,8 +35,8 @@ class MlpField(nn.Module):
         inputs = torch.cat([octaves(means.detach() / self.bound, PLACE_OCTAVES), time], dim=1)
         hidden = inputs
         for number, layer in enumerate(self.layers):
-            hidden = torch.relu(layer(torch.cat([inputs, hidden], dim=1) if number == SKIP else hidden))
-        shift, d_quats, d_scales = self.heads(hidden).split((3, 4, 3), dim=1)
+            hidden = torch.relu(layer(torch.cat([inputs, hidden], dim=1) if number == MLP_SKIP else hidden))
+        shift, d_quats, d_scales = self.heads(hidden).split(MLP_OUTPUTS, dim=1)
         return Deformation(None, shift, d_quats, d_scales)
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:

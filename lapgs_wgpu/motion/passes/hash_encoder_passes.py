@@ -8,16 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from ...gpu.buffer import Buffer, BufferPool
-from ...gpu.device import Device
+from ...gpu.array import DeviceArray
+from ...gpu.device import SOFTWARE_LOOP_TURNS, Device
 from ...gpu.kernel import Commands, Kernel
+from ...gpu.pool import BufferPool
 from ..fields.hash_grid_config import GridShape
 
-_LOOP_POINTS = 1 << 15  # with lane_levels: Mesa's software driver ends a shader's loops after 65,535 rounds
 _ALIGNED = 64  # so many rows are a multiple of 256 bytes, at which a binding may begin, whatever the row
 _LEVEL_WORDS = 12  # common/hashgrid.wgsl: struct Level
 
@@ -29,7 +28,7 @@ class _Part:
     grid: int
     sliced: bool
     count: int
-    levels: Buffer
+    levels: DeviceArray
     cells: int  # of the largest plane
     entries: int  # of all slices together
 
@@ -56,6 +55,9 @@ class HashEncoderPasses:
         self.device, self.grids, self.bound = device, list(grids), bound
         self.pool = BufferPool(device)
         self.lane_levels = device.is_cpu if lane_levels is None else lane_levels
+        # Where a lane takes all points: no more than half of the turns that the driver lets a loop have.
+        turns = SOFTWARE_LOOP_TURNS if self.lane_levels else None
+        self._most_points = None if turns is None else (turns + 1) // 2
         self._row = sum(grid.features for grid in grids) if row is None else row
         self._parts: list[_Part] = []
         for number, grid in enumerate(grids):
@@ -78,11 +80,10 @@ class HashEncoderPasses:
             cells = level.resolution[0] * level.resolution[1]
             largest = max(largest, cells)
             slices += cells
-        buffer = Buffer(self.device, words.nbytes, f"levels {number} {'sliced' if sliced else 'direct'}")
-        buffer.write(words)
-        return _Part(number, sliced, len(chosen), buffer, largest, slices if sliced else 0)
+        array = DeviceArray.upload(self.device, f"levels {number} {'sliced' if sliced else 'direct'}", words)
+        return _Part(number, sliced, len(chosen), array, largest, slices if sliced else 0)
 
-    def _uniform(self, part: _Part, place: str, points: int, all_points: int, time: float) -> Buffer:
+    def _uniform(self, part: _Part, place: str, points: int, all_points: int, time: float) -> DeviceArray:
         """What the kernels are told of a block of points; all blocks of all places are submitted at once."""
         content = Kernel.get(self.device, "hashgrid_slice", SLICED=1, CORNERS=4).uniform(
             "Grid",
@@ -100,9 +101,10 @@ class HashEncoderPasses:
     def _defines(part: _Part) -> dict[str, int]:
         return {"SLICED": 1, "CORNERS": 4} if part.sliced else {"CORNERS": 8}
 
-    def _blocks(self, n: int, row: int, most: int | None = None) -> Iterator[tuple[int, int]]:
-        """First and number of the points that a dispatch takes, at most so many, whose rows of so many bytes fit into a
-        binding."""
+    def _blocks(self, n: int, encoding: DeviceArray, most: int | None = None) -> Iterator[tuple[int, int]]:
+        """First and number of the points that a dispatch takes, at most so many, whose rows of the
+        encoding fit into a binding."""
+        row = encoding.nbytes // max(n, 1)
         size = self.device.max_binding // max(row, 1) // _ALIGNED * _ALIGNED
         size = size if most is None else min(size, most)
         return ((first, min(size, n - first)) for first in range(0, n, size))
@@ -111,25 +113,25 @@ class HashEncoderPasses:
         self,
         commands: Commands,
         number: int,
-        points: Buffer,
+        points: DeviceArray,
         n: int,
         time: float,
-        tables: list[Buffer],
-        encoding: Buffer,
+        tables: list[DeviceArray],
+        encoding: DeviceArray,
         *,
-        bfloat16: bool = False,
-        rows: Buffer | None = None,
+        rows: DeviceArray | None = None,
     ) -> None:
-        """Encode n points at a time in [0, 1]; outside the box [-bound, bound]^3 features are zero.
+        """Encode n points (N, 4) at a time in [0, 1]; outside the box [-bound, bound]^3 features are zero.
 
-        number: tells apart the calls that are submitted together. bfloat16: of the encoding, instead of float32.
-        rows: (n,) uint32, which of the points; the encoding, which must fit into a binding, then keeps its other rows.
+        number: tells apart the calls that are submitted together. tables: (entries, 2) of each grid. encoding:
+        (N, row), float32, or int16, which stands for bfloat16. rows: uint32, its first n say which of the points; the
+        encoding, which must fit into a binding, then keeps its other rows. Without, n is N.
         """
         sources = []
         for part in self._parts:
             source = tables[part.grid]
             if part.sliced:
-                slices = self.pool.get(f"slices {part.grid}", 8 * part.entries)
+                slices = self.pool.array(f"slices {part.grid}", (part.entries, 2))
                 commands.dispatch_grid(
                     Kernel.get(self.device, "hashgrid_slice", **self._defines(part)),
                     (-(-part.cells // 64), part.count),
@@ -140,22 +142,16 @@ class HashEncoderPasses:
                 )
                 source = slices
             sources.append(source)
-        row = self._row * (2 if bfloat16 else 4)
-        options = _precision(bfloat16)
-        blocks: list[tuple[int, int, dict[str, Any]]]
+        options = _precision(encoding)
         if rows is None:
             blocks = [
-                (
-                    first,
-                    count,
-                    {"points": _block(points, 16, first, count), "encoding": _block(encoding, row, first, count)},
-                )
-                for first, count in self._blocks(n, row)
+                (first, count, {"points": points.rows(first, count), "encoding": encoding.rows(first, count)})
+                for first, count in self._blocks(n, encoding)
             ]
         else:
             options |= {"ROWS": 1}
             blocks = [(0, n, {"points": points, "encoding": encoding, "rows": rows})]
-        for first, count, buffers in blocks:
+        for first, count, arrays in blocks:
             for part, source in zip(self._parts, sources, strict=True):
                 commands.dispatch(
                     Kernel.get(self.device, "hashgrid", **self._defines(part), **options),
@@ -163,50 +159,44 @@ class HashEncoderPasses:
                     grid=self._uniform(part, f"{number} from {first}", count, n, time),
                     levels=part.levels,
                     features=source,
-                    **buffers,
+                    **arrays,
                 )
 
     def add_gradient(
         self,
         commands: Commands,
         number: int,
-        points: Buffer,
+        points: DeviceArray,
         n: int,
         time: float,
-        d_encoding: Buffer,
-        d_tables: list[Buffer],
-        *,
-        bfloat16: bool = False,
+        d_encoding: DeviceArray,
+        d_tables: list[DeviceArray],
     ) -> None:
-        """Add the gradient of the tables, from that of the encoding, whose rows must hold nothing else.
-
-        bfloat16: of `d_encoding`, instead of float32.
-        """
+        """Add the gradient of the tables, from that of the encoding, whose rows must hold nothing else."""
         targets, sums = [], []
         for part in self._parts:
             target = d_tables[part.grid]
             if part.sliced:
-                target = self.pool.get(f"d_slices {part.grid}", 8 * part.entries)
+                target = self.pool.array(f"d_slices {part.grid}", (part.entries, 2))
                 commands.clear(target)
             targets.append(target)
             if not self.lane_levels:
-                target = self.pool.get(f"d_fixed {part.grid} {part.sliced}", 2 * target.nbytes)
+                target = self.pool.array(f"d_fixed {part.grid} {part.sliced}", (2 * target.size,), "uint32")
                 commands.clear(target)
             sums.append(target)
 
-        options = _precision(bfloat16)
-        row = self._row * (2 if bfloat16 else 4)
+        options = _precision(d_encoding)
         largest = {} if self.lane_levels else {"largest": self._largest(commands, number, n, time, d_encoding, options)}
         options |= {"LANE_LEVELS": 1} if self.lane_levels else {}
-        for first, count in self._blocks(n, row, _LOOP_POINTS if self.lane_levels else None):
+        for first, count in self._blocks(n, d_encoding, self._most_points):
             for part, target in zip(self._parts, sums, strict=True):
                 commands.dispatch(
                     Kernel.get(self.device, "hashgrid_bwd", **self._defines(part), **options),
                     -(-part.count // 8) if self.lane_levels else -(-count // 64) * part.count,
                     grid=self._uniform(part, f"{number} from {first}", count, n, time),
                     levels=part.levels,
-                    points=_block(points, 16, first, count),
-                    d_encoding=_block(d_encoding, row, first, count),
+                    points=points.rows(first, count),
+                    d_encoding=d_encoding.rows(first, count),
                     **{"d_features" if self.lane_levels else "d_fixed": target},
                     **largest,
                 )
@@ -216,7 +206,7 @@ class HashEncoderPasses:
             if not self.lane_levels:
                 unfix = Kernel.get(self.device, "hashgrid_unfix", **self._defines(part))
                 commands.dispatch(
-                    unfix, -(-target.nbytes // 256), grid=uniform, d_fixed=fixed, d_features=target, **largest
+                    unfix, -(-target.size // 64), grid=uniform, d_fixed=fixed, d_features=target, **largest
                 )
             if part.sliced:
                 commands.dispatch_grid(
@@ -229,28 +219,22 @@ class HashEncoderPasses:
                 )
 
     def _largest(
-        self, commands: Commands, number: int, n: int, time: float, d_encoding: Buffer, options: dict[str, int]
-    ) -> Buffer:
+        self, commands: Commands, number: int, n: int, time: float, d_encoding: DeviceArray, options: dict[str, int]
+    ) -> DeviceArray:
         """The largest absolute value of a gradient, by which sums in fixed point are scaled."""
-        largest = self.pool.get(f"largest {number}", 4)
+        largest = self.pool.array(f"largest {number}", (1,), "uint32")
         commands.clear(largest)
         kernel = Kernel.get(self.device, "hashgrid_largest", CORNERS=4, **options)
-        row = self._row * (2 if "BFLOAT16" in options else 4)
-        for first, count in self._blocks(n, row):
+        for first, count in self._blocks(n, d_encoding):
             commands.dispatch(
                 kernel,
                 -(-count * self._row // 4096),
                 grid=self._uniform(self._parts[0], f"{number} largest from {first}", count, n, time),
-                d_encoding=_block(d_encoding, row, first, count),
+                d_encoding=d_encoding.rows(first, count),
                 largest=largest,
             )
         return largest
 
 
-def _block(buffer: Buffer, row: int, first: int, count: int) -> tuple[Buffer, int, int]:
-    """Part of a buffer with rows of so many bytes; no binding may be smaller than 16 bytes."""
-    return buffer, first * row, max(16, count * row)
-
-
-def _precision(bfloat16: bool) -> dict[str, int]:
-    return {"BFLOAT16": 1} if bfloat16 else {}
+def _precision(encoding: DeviceArray) -> dict[str, int]:
+    return {"BFLOAT16": 1} if encoding.dtype == "int16" else {}

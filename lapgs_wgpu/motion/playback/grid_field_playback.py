@@ -12,10 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...gpu.buffer import Buffer, BufferPool
+from ...gpu.array import DeviceArray
 from ...gpu.device import Device
 from ...gpu.kernel import Commands, Kernel
-from ...splat.rasterizer import GaussianBuffers
+from ...gpu.pool import BufferPool
+from ...splat.gaussians import Gaussians
 from ..fields.config import APPEARANCE_SCALE, GEOMETRY, FieldConfig, static_grid, temporal_grids
 from ..passes.hash_encoder_passes import HashEncoderPasses
 
@@ -23,17 +24,16 @@ Floats = NDArray[np.float32]
 
 _LANES = 64  # deform.wgsl
 _CANONICAL = 16  # deform.wgsl: floats of a Gaussian before its still features
-_MAX_ROUNDS = 65_535  # after which Mesa's software driver ends a shader's loops
 _BLOCK_BYTES = 128 << 20  # of the features that one dispatch sees: WebGPU's default limit of a binding
 
 
-def runs_on_device(config: FieldConfig) -> bool:
-    """Whether `GridFieldPlayback` can show this field."""
-    if not config.decodes_on_device:
-        return False
+def runs_on_device(config: FieldConfig, device: Device) -> bool:
+    """Whether `GridFieldPlayback` can show this field on the device."""
+    if not config.decodes_on_device or device.max_loop_turns is None:
+        return config.decodes_on_device
     sizes = _Sizes(config)
     # Of 8 channels (on CPU devices), with the loops over channels and the round itself.
-    return (sizes.width // 8 + 1) * (sizes.still_quads + sizes.moving_quads + 11) < _MAX_ROUNDS
+    return (sizes.width // 8 + 1) * (sizes.still_quads + sizes.moving_quads + 11) < device.max_loop_turns
 
 
 class _Sizes:
@@ -49,39 +49,21 @@ class _Sizes:
         self.moving_quads = -(-(self.first_temporal + self.temporal) // 4)
 
 
-def parameter_shapes(config: FieldConfig) -> dict[str, tuple[int, ...]]:
-    """The parameters of the field's module that playback needs, all of them where there are no hidden layers."""
-    sizes = _Sizes(config)
-    width, static = sizes.width, sizes.static
-    layers = {"spatial": (width, static), "temporal": (width, max(1, sizes.dynamics + sizes.temporal))}
-    layers["heads"] = (sum(GEOMETRY), width)
-    shapes: dict[str, tuple[int, ...]] = {"static_grid.table": (static_grid(config).entries, 2)}
-    shapes |= {f"temporal_grids.{i}.table": (grid.entries, 2) for i, grid in enumerate(temporal_grids(config))}
-    if config.kind == "laplacian":
-        layers |= {"motion.first": (width, static), "motion.second": (width, width)}
-        shapes |= {"motion.alpha": (config.components, width), "motion.beta": (config.components, width)}
-        shapes["motion.frequencies"] = (config.components,)
-    if config.appearance_size:
-        layers["appearance"] = (config.appearance_size, width)
-    for name, shape in layers.items():
-        shapes |= {f"{name}.weight": shape, f"{name}.bias": shape[:1]}
-    return shapes
-
-
 @dataclass(frozen=True)
 class _Block:
     """Gaussians that one dispatch takes: a range of all, with what is read of them."""
 
     first: int
     count: int
-    points: Buffer  # (count, 4)
-    still: Buffer  # (count, 16 + still features)
-    moving: Buffer  # (count, dynamics and temporal features)
+    points: DeviceArray  # (count, 4)
+    still: DeviceArray  # (count, 16 + still features)
+    moving: DeviceArray  # (count, dynamics and temporal features)
+    rows: DeviceArray  # (count,) uint32, of which the first say what a dispatch takes
 
 
 class GridFieldPlayback:
     """Moves activated Gaussians (`still`, means (N, 3), quats (N, 4) of unit length, ..., with opacity_logits in place
-    of opacities) by a field whose parameters have the names and shapes of `parameter_shapes`.
+    of opacities) by a field whose parameters have the names and shapes of fields/parameter_shapes.
 
     block: how many Gaussians a dispatch takes, a multiple of 64; by default what fits into 128 MiB.
     """
@@ -115,19 +97,15 @@ class GridFieldPlayback:
             device, temporal_grids(config), config.bound, row=4 * sizes.moving_quads, column=sizes.first_temporal
         )
         self._tables = [
-            self._filled(f"table {i}", parameters[f"temporal_grids.{i}.table"])
+            self._pool.upload(f"table {i}", parameters[f"temporal_grids.{i}.table"])
             for i in range(len(self._temporal.grids))
         ]
         self._encode_static(parameters["static_grid.table"])
         heads, stream = self._heads(0.0), self._stream()
         self._stream_at, self._rows_at = len(heads), len(heads) + len(stream)
-        self._weights = self._pool.get("weights", 16 * self._rows_at + 4 * count)
-        self._weights.write(np.concatenate([heads, stream]))
-
-    def _filled(self, name: str, array: Floats) -> Buffer:
-        buffer = self._pool.get(name, array.nbytes)
-        buffer.write(array)
-        return buffer
+        # Vectors of four floats: heads, stream, and the numbers of the rows that are moved.
+        self._weights = self._pool.array("weights", (self._rows_at + -(-count // 4), 4))
+        self._weights.rows(0, self._rows_at).write(np.concatenate([heads, stream]))
 
     def _block(self, gaussians: Mapping[str, Floats], first: int, count: int) -> _Block:
         g = {name: array[first : first + count] for name, array in gaussians.items()}
@@ -139,8 +117,8 @@ class GridFieldPlayback:
         moving = np.zeros((count, max(4, 4 * self._sizes.moving_quads)), np.float32)
         if self._sizes.dynamics:
             moving[:, : self._sizes.dynamics] = g["dynamics"]
-        named = {"points": points, "still": still, "moving": moving}
-        return _Block(first, count, **{name: self._filled(f"{name} from {first}", a) for name, a in named.items()})
+        named = {"points": points, "still": still, "moving": moving, "rows": np.zeros(count, np.uint32)}
+        return _Block(first, count, **{name: self._pool.upload(f"{name} from {first}", a) for name, a in named.items()})
 
     def _encode_static(self, entries: Floats) -> None:
         """H_s, into the rows of what does not change."""
@@ -148,8 +126,7 @@ class GridFieldPlayback:
         encoder = HashEncoderPasses(
             self._device, [static_grid(self._config)], self._config.bound, row=row, column=_CANONICAL
         )
-        table = Buffer(self._device, entries.nbytes, "static table")  # not in the pool: it is needed once
-        table.write(entries)
+        table = DeviceArray.upload(self._device, "static table", entries)  # not in the pool: it is needed once
         with Commands(self._device) as commands:
             for number, block in enumerate(self._blocks):
                 encoder.encode(commands, number, block.points, block.count, 0.0, [table], block.still)
@@ -201,7 +178,7 @@ class GridFieldPlayback:
 
     # A time ----------------------------------------------------------------------------------------------------------
 
-    def move(self, t: float, out: GaussianBuffers, rows: NDArray[np.integer] | None = None) -> None:
+    def move(self, t: float, out: Gaussians[DeviceArray], rows: NDArray[np.integer] | None = None) -> None:
         """Submit the passes that write the Gaussians at a time in [0, 1]: all of `out` but the colours above their
         constant part, which stay, and the constant part, too, where the field changes no colours.
 
@@ -210,16 +187,18 @@ class GridFieldPlayback:
         kernel = Kernel.get(self._device, "deform", **self._defines)
         rows = np.arange(self._count) if rows is None else rows
         of_block = rows % self._size
-        self._weights.write(self._heads(t))
-        self._weights.write(of_block.astype(np.float32), 16 * self._rows_at)
-        points, stored = self._defines["POINTS"], out.sh_stored
+        heads = self._heads(t)
+        self._weights.rows(0, len(heads)).write(heads)
+        listed = np.zeros((-(-len(rows) // 4), 4), np.float32)
+        listed.reshape(-1)[: len(rows)] = of_block
+        self._weights.rows(self._rows_at, len(listed)).write(listed)
+        points = self._defines["POINTS"]
         with Commands(self._device) as commands:
             for number, block in enumerate(self._blocks):
                 start, end = np.searchsorted(rows, (block.first, block.first + block.count)).tolist()
                 if start == end:
                     continue
-                chosen = self._pool.get(f"rows from {block.first}", 4 * block.count)
-                chosen.write(of_block[start:end].astype(np.uint32))
+                block.rows.rows(0, end - start).write(of_block[start:end].astype(np.uint32))
                 self._temporal.encode(
                     commands,
                     number,
@@ -228,7 +207,7 @@ class GridFieldPlayback:
                     self._config.grid_time(t),
                     self._tables,
                     block.moving,
-                    rows=chosen,
+                    rows=block.rows,
                 )
                 uniform = self._pool.constant(
                     f"deform {number}",
@@ -241,16 +220,12 @@ class GridFieldPlayback:
                         still_quads=self._sizes.still_quads,
                         moving_quads=self._sizes.moving_quads,
                         stream=self._stream_at,
-                        sh_stored=stored,
+                        sh_stored=out.sh.shape[1],
                     ),
                 )
-                strides = {"means": 12, "quats": 16, "scales": 12, "opacities": 4, "colors": 12 * stored}
-                if "COLOR" not in self._defines:
-                    del strides["colors"]
-                outputs = {
-                    name: (getattr(out, name), block.first * stride, max(16, block.count * stride))
-                    for name, stride in strides.items()
-                }
+                names = {"means": "means", "quats": "quats", "scales": "scales", "opacities": "opacities"}
+                names |= {"colors": "sh"} if "COLOR" in self._defines else {}
+                outputs = {name: getattr(out, of).rows(block.first, block.count) for name, of in names.items()}
                 commands.dispatch(
                     kernel,
                     -(-(end - start) // (_LANES * points)),

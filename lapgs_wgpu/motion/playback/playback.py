@@ -12,14 +12,15 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ...gpu.buffer import BufferPool, read_all
+from ...gpu.array import DeviceArray, read_all
 from ...gpu.device import Device
+from ...gpu.pool import BufferPool
 from ...io.ply import StillGaussians
 from ...splat.camera import Camera
-from ...splat.rasterizer import GaussianBuffers
+from ...splat.gaussians import Gaussians
 from ..fields.config import MIN_SCALE, FieldConfig
 from ..scene_file import SceneFile, read_scene
-from .grid_field_playback import GridFieldPlayback, parameter_shapes, runs_on_device
+from .grid_field_playback import GridFieldPlayback, runs_on_device
 from .motion_bounds import MotionBounds
 
 Floats = NDArray[np.float32]
@@ -45,7 +46,7 @@ class Playback(Protocol):
     def exact(self) -> bool:
         """Whether all that `at` gave last was of the time that was asked for."""
 
-    def at(self, t: float, seen_by: Camera | None = None) -> GaussianBuffers:
+    def at(self, t: float, seen_by: Camera | None = None) -> Gaussians[DeviceArray]:
         """The activated Gaussians at a time, on the device: submitted, not waited for. Valid until the next call.
 
         seen_by: the only camera that draws them, for a picture that passes; Gaussians that hardly move, or that it does
@@ -74,7 +75,7 @@ def playback_of(file: SceneFile, device: Device) -> Playback:
     Raises MemoryError where a buffer of all Gaussians is beyond the device's limits: colours are the largest,
     1.4 million Gaussians of degree 3 at WebGPU's default limits.
     """
-    if file.field_config.kind == "static" or runs_on_device(file.field_config):
+    if file.field_config.kind == "static" or runs_on_device(file.field_config, device):
         return DevicePlayback(file, device)
     from ..scene import scene_of
     from .torch_playback import TorchPlayback
@@ -95,13 +96,8 @@ class DevicePlayback:
         self._stored = file.gaussians
         activated = activate(file.gaussians, file.sh_degree)
         pool = BufferPool(device)
-        buffers = {}
-        for name in ("means", "quats", "scales", "opacities", "colors"):
-            buffers[name] = pool.get(name, activated[name].nbytes)
-            buffers[name].write(activated[name])
-        self._buffers = GaussianBuffers(
-            count=self.count, sh_degree=self.sh_degree, sh_stored=(self.sh_degree + 1) ** 2, **buffers
-        )
+        names = {"means": "means", "quats": "quats", "scales": "scales", "opacities": "opacities", "sh": "colors"}
+        self._now = Gaussians(**{name: pool.upload(name, activated[of]) for name, of in names.items()})
         self.exact = True
         self._field: GridFieldPlayback | None = None
         if self.moves:
@@ -109,13 +105,12 @@ class DevicePlayback:
             # Features change from entry to entry of the temporal grids' time axis, so little within half of one.
             self._bounds = MotionBounds(self.count, 2 * self.field_config.temporal.finest[2])
             self._bounded = True  # do the bounds hold what is in the buffers?
-            parameters = file.field(parameter_shapes(file.field_config))
-            self._field = GridFieldPlayback(device, file.field_config, parameters, activated, block=block)
+            self._field = GridFieldPlayback(device, file.field_config, file.field, activated, block=block)
 
-    def at(self, t: float, seen_by: Camera | None = None) -> GaussianBuffers:
+    def at(self, t: float, seen_by: Camera | None = None) -> Gaussians[DeviceArray]:
         """See Playback."""
         if self._field is None:
-            return self._buffers
+            return self._now
         old = self._times != t
         moved = old
         # The choice needs the values on the host each time: not where they lie in memory of the device's own.
@@ -124,34 +119,26 @@ class DevicePlayback:
             moved = old & self._bounds.needed(t, seen_by)
         self.exact = bool((moved == old).all())
         if moved.any():
-            self._field.move(t, self._buffers, np.flatnonzero(moved))
+            self._field.move(t, self._now, np.flatnonzero(moved))
             self._times[moved] = t
             self._bounded = False
-        return self._buffers
+        return self._now
 
     def _bound(self) -> None:
         """Widen the bounds by what the buffers hold. Done before each choice, it leaves no Gaussian outside of its own
         bounds, whatever time it is of."""
         if self._bounded:
             return
-        now, n = self._buffers, self.count
-        values = read_all(
-            [
-                (now.means, "float32", (n, 3), 0),
-                (now.quats, "float32", (n, 4), 0),
-                (now.scales, "float32", (n, 3), 0),
-                (now.opacities, "float32", (n, 1), 0),
-                (now.colors, "float32", (n, 3 * now.sh_stored), 0),
-            ]
-        )
-        values[-1] = values[-1][:, :3]
+        now = self._now
+        means, quats, scales, opacities, sh = read_all([now.means, now.quats, now.scales, now.opacities, now.sh])
+        values = [means, quats, scales, opacities[:, None], sh[:, 0]]
         whole = bool((self._times == self._times[0]).all())
         self._bounds.add(np.concatenate(values, axis=1), float(self._times[0]) if whole else None)
         self._bounded = True
 
     def means(self, t: float) -> Floats:
         """See Playback."""
-        return self.at(t).means.read("float32", (self.count, 3)) if self.moves else self._stored["means"]
+        return self.at(t).means.read() if self.moves else self._stored["means"]
 
     def dynamics(self) -> Floats | None:
         """See Playback."""
@@ -159,16 +146,8 @@ class DevicePlayback:
 
     def still(self, t: float) -> StillGaussians:
         """See Playback."""
-        now, n = self.at(t), self.count
-        means, quats, scales, opacities, colors = read_all(
-            [
-                (now.means, "float32", (n, 3), 0),
-                (now.quats, "float32", (n, 4), 0),
-                (now.scales, "float32", (n, 3), 0),
-                (now.opacities, "float32", (n,), 0),
-                (now.colors, "float32", (n, now.sh_stored, 3), 0),
-            ]
-        )
+        now = self.at(t)
+        means, quats, scales, opacities, colors = read_all([now.means, now.quats, now.scales, now.opacities, now.sh])
         logits = self._stored["opacity_logits"]
         if self.field_config.appearance_size == 4:
             inside = np.clip(opacities.astype(np.float64), 1e-7, 1 - 1e-7)

@@ -10,18 +10,19 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ...gpu.buffer import BufferPool
+from ...gpu.array import DeviceArray
+from ...gpu.pool import BufferPool
 from ...io.ply import StillGaussians
 from ...splat.camera import Camera
+from ...splat.gaussians import Gaussians
 from ...splat.rasterize import upload_gaussians
-from ...splat.rasterizer import GaussianBuffers
 from ..scene import Scene4D
 
 
 class _Shown(NamedTuple):
     """What was uploaded last, and of which time, degree and parameters, each with torch's count of what was written."""
 
-    buffers: GaussianBuffers
+    gaussians: Gaussians[DeviceArray]
     t: float
     sh_degree: int
     parameters: list[tuple[weakref.ref[Tensor], int]]  # weak: a training replaces large ones, and drops them
@@ -68,7 +69,7 @@ class TorchPlayback:
         """See Playback."""
         return self.scene.field is not None
 
-    def at(self, t: float, seen_by: Camera | None = None) -> GaussianBuffers:
+    def at(self, t: float, seen_by: Camera | None = None) -> Gaussians[DeviceArray]:
         """See Playback."""
         scene = self.scene
         if self._shown is None or not self._shown.is_of(scene, t):
@@ -76,10 +77,8 @@ class TorchPlayback:
             known = [(weakref.ref(parameter), parameter._version) for parameter in _parameters(scene)]
             with torch.no_grad():
                 now = scene.at(t)
-            tensors = [now.means, now.quats, now.scales, now.opacities, now.sh]
-            buffers = upload_gaussians(self._pool, tensors, now.sh_degree)
-            self._shown = _Shown(buffers, t, scene.sh_degree, known)
-        return self._shown.buffers
+            self._shown = _Shown(upload_gaussians(self._pool, now), t, scene.sh_degree, known)
+        return self._shown.gaussians
 
     def means(self, t: float) -> NDArray[np.float32]:
         """See Playback."""
