@@ -14,6 +14,7 @@ from scenes import step as torch_step
 from stages import watch
 from wgpu.backends.wgpu_native import GPUBuffer, GPUQueue
 
+from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.buffer import Buffer
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Kernel
@@ -182,14 +183,13 @@ def test_no_buffer_is_made_for_nothing(
     """A pass works with each buffer that the rasteriser holds."""
     rasterizer = use(Rasterizer(device))
     bound: set[Buffer] = set()
-    parts = Kernel.parts
+    check = Kernel.check
 
-    def spy(self: Kernel, buffers: dict[str, Any]) -> dict[str, tuple[Buffer, int, int]]:
-        found = parts(self, buffers)
-        bound.update(buffer for buffer, _, _ in found.values())
-        return found
+    def spy(self: Kernel, arrays: dict[str, DeviceArray]) -> None:
+        bound.update(array.buffer for array in arrays.values())
+        check(self, arrays)
 
-    monkeypatch.setattr(Kernel, "parts", spy)
+    monkeypatch.setattr(Kernel, "check", spy)
     torch_step(scene, oblique_camera(200, 120), device, sh_degree=DEGREE)  # of so many tiles that no sort has one pass
     assert [name for name, buffer in rasterizer.pool._buffers.items() if buffer not in bound] == []
 

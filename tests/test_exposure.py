@@ -21,7 +21,7 @@ from test_train import configure
 from lapgs_wgpu.data import Dataset, load_dataset
 from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.data.views import View, composite
-from lapgs_wgpu.gpu.buffer import Buffer
+from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands
 from lapgs_wgpu.splat.rasterize import rasterize
@@ -55,12 +55,10 @@ def test_exposure(device: Device, size: tuple[int, int]) -> None:
     rng = np.random.default_rng(size[0])
     image, d_exposed = (rng.random((4, *size), np.float32) for _ in range(2))
     passes = ExposurePasses(device)
-    drawn, d = Buffer(device, image.nbytes, "image"), Buffer(device, image.nbytes, "d_exposed")
-    drawn.write(image)
-    d.write(d_exposed)
+    drawn, d = DeviceArray.upload(device, "image", image), DeviceArray.upload(device, "d_exposed", d_exposed)
     with Commands(device) as commands:
-        exposed = passes.record(commands, drawn, size, CORRECTION)
-        back = passes.record_bwd(commands, drawn, d, size, CORRECTION)
+        exposed = passes.record(commands, drawn, CORRECTION)
+        back = passes.record_bwd(commands, drawn, d, CORRECTION)
 
     def tensor(planes: NDArray[np.float32]) -> torch.Tensor:
         return torch.from_numpy(planes[:3]).permute(1, 2, 0).double()
@@ -70,12 +68,12 @@ def test_exposure(device: Device, size: tuple[int, int]) -> None:
     expected.backward(tensor(d_exposed))
     assert leaves[0].grad is not None
     assert leaves[1].grad is not None
-    found = tensor(exposed.read("float32", (4, *size)))
+    found = tensor(exposed.read())
     torch.testing.assert_close(found, expected.detach(), rtol=0, atol=1e-6)
-    d_image = back.d_image.read("float32", (4, *size))
+    d_image = back.d_image.read()
     assert relative(tensor(d_image), leaves[0].grad) < 1e-6
     assert (d_image[3] == 0).all()
-    d_rows = back.d_rows.read("float32", (size[0], 3, 4)).astype(np.float64)
+    d_rows = back.d_rows.read().astype(np.float64)
     assert relative(torch.from_numpy(d_rows.sum(axis=0)), leaves[1].grad) < 1e-5
 
 

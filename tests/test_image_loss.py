@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 from scenes import oblique_camera, random_scene, relative
 
 from lapgs_wgpu.data.views import composite
-from lapgs_wgpu.gpu.buffer import Buffer
+from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterize import rasterize
 from lapgs_wgpu.splat.rasterizer import Rasterizer
-from lapgs_wgpu.train import fused_loss, losses, truth_cache
+from lapgs_wgpu.train import fused_loss, losses
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
-from lapgs_wgpu.train.image_loss import TERMS, ImageLoss
+from lapgs_wgpu.train.image_loss import ImageLoss
 from lapgs_wgpu.train.losses import LossWeights, total
 from lapgs_wgpu.train.truth_cache import TruthCache, upload_rgba
 
@@ -69,15 +69,15 @@ def record(
 ) -> tuple[NDArray[np.float32], Picture]:
     """Terms (5,) and gradient (H, W, 3)."""
     height, width = pair.image.shape[:2]
-    image = Buffer(losses.device, 16 * height * width, "image")
-    image.write(np.concatenate([pair.image.transpose(2, 0, 1), np.full((1, height, width), np.nan, np.float32)]))
+    planes = np.concatenate([pair.image.transpose(2, 0, 1), np.full((1, height, width), np.nan, np.float32)])
+    image = DeviceArray.upload(losses.device, "image", planes)
     truth = upload_rgba(losses.device, pair.truth)
     with Commands(losses.device) as commands:
-        done = losses.record(commands, image, truth, (height, width), background, weights, gradient=True)
+        done = losses.record(commands, image, truth, background, weights, gradient=True)
     assert done.d_image is not None
-    planes = done.d_image.read("float32", (4, height, width))
+    planes = done.d_image.read()
     assert (planes[3] == 0).all()
-    return done.terms.read("float32", (TERMS,)), planes[:3].transpose(1, 2, 0)
+    return done.terms.read(), planes[:3].transpose(1, 2, 0)
 
 
 def smooth_pair(height: int, width: int) -> Pair:
@@ -167,7 +167,8 @@ def test_transparent_pictures_are_laid_on_the_background(
     pair = Pair(np.zeros((64, 80, 3), np.float32), rgba)
     terms, _ = record(image_loss, pair, WEIGHTS["l1"], background)
     assert terms[0] == pytest.approx(composite(rgba, background).mean(dtype=float) / 255, rel=1e-6)
-    pixels = image_loss.pool.get("pixels", 0).read("uint8", (10, 64, 8, 16))  # in strips of 8 columns
+    words = image_loss.pool.array("pixels", (10, 64, 8, 4), "uint32").read()  # in strips of 8 columns
+    pixels = words.view(np.uint8)
     laid = pixels[..., 12:15].transpose(1, 0, 2, 3).reshape(64, 80, 3)
     assert (laid == composite(rgba, background)).all()
 
@@ -269,7 +270,7 @@ def test_overflow_and_bands_do_not_show(device: Device, monkeypatch: pytest.Monk
         scene = gaussians(400)
         done = step(device, scene)
         done.loss.backward()
-        results.append((rasterizer.bands, done.loss.item(), gradients(scene, done)))
+        results.append((rasterizer.plan.bands, done.loss.item(), gradients(scene, done)))
     bands, values, found = zip(*results, strict=True)
     assert bands[:2] == (1, 1)
     assert bands[2] > 1
@@ -313,7 +314,7 @@ def test_drawing_in_between_does_no_harm(device: Device) -> None:
 def test_pictures_are_uploaded_once(device: Device) -> None:
     cache, loads = TruthCache(device, 10_000), list[str]()
 
-    def get(name: str, side: int = 20) -> Buffer:
+    def get(name: str, side: int = 20) -> DeviceArray:
         def load() -> NDArray[np.uint8]:
             loads.append(name)
             return np.full((side, side, 3), len(name), np.uint8)
@@ -321,7 +322,7 @@ def test_pictures_are_uploaded_once(device: Device) -> None:
         return cache.get(name, load)
 
     assert get("a") is get("a")
-    assert (get("a").read("uint8", (20, 20, 4)) == [1, 1, 1, 255]).all()
+    assert (get("a").read() == 0xFF010101).all()
     for name in "bcdef":  # 1600 bytes each: six fit
         get(name)
     assert loads == list("abcdef")

@@ -9,10 +9,11 @@ from scenes import relative
 from torch import Tensor
 
 from lapgs_wgpu.gpu import matmul
-from lapgs_wgpu.gpu.buffer import Buffer, BufferPool
+from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands
 from lapgs_wgpu.gpu.matmul import Matmul, Matrix
+from lapgs_wgpu.gpu.pool import BufferPool
 
 pytestmark = pytest.mark.kernels
 
@@ -21,20 +22,18 @@ def random(*shape: int, seed: int = 0) -> Tensor:
     return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
 
 
-def on_device(device: Device, tensor: Tensor) -> Buffer:
-    buffer = Buffer(device, 4 * tensor.numel(), "matrix")
-    buffer.write(tensor.numpy())
-    return buffer
+def on_device(device: Device, tensor: Tensor) -> DeviceArray:
+    return DeviceArray.upload(device, "matrix", tensor.contiguous().numpy())
 
 
 def stored(device: Device, tensor: Tensor, *, transposed: bool) -> Matrix:
     if transposed:
-        return Matrix.whole(on_device(device, tensor.T.contiguous()), *tensor.T.shape).transpose
-    return Matrix.whole(on_device(device, tensor), *tensor.shape)
+        return Matrix.of(on_device(device, tensor.T)).transpose
+    return Matrix.of(on_device(device, tensor))
 
 
-def read(buffer: Buffer, *shape: int) -> Tensor:
-    return torch.from_numpy(buffer.read("float32", shape))
+def read(array: DeviceArray) -> Tensor:
+    return torch.from_numpy(array.read())
 
 
 @pytest.mark.parametrize("a_transposed", [False, True])
@@ -52,11 +51,11 @@ def test_product(
     fresh, added = on_device(device, torch.full_like(start, torch.nan)), on_device(device, start)
     product = Matmul(device, BufferPool(device))
     with Commands(device) as commands:
-        product(commands, "fresh", of_a, of_b, Matrix.whole(fresh, rows, columns))
-        product(commands, "added", of_a, of_b, Matrix.whole(added, rows, columns), add=True)
+        product(commands, "fresh", of_a, of_b, Matrix.of(fresh))
+        product(commands, "added", of_a, of_b, Matrix.of(added), add=True)
     exact = a.double() @ b.double()
-    assert relative(read(fresh, rows, columns), exact) < 1e-6
-    assert relative(read(added, rows, columns), start.double() + exact) < 1e-6
+    assert relative(read(fresh), exact) < 1e-6
+    assert relative(read(added), start.double() + exact) < 1e-6
 
 
 def test_parts_of_matrices(device: Device) -> None:
@@ -67,13 +66,13 @@ def test_parts_of_matrices(device: Device) -> None:
         Matmul(device, BufferPool(device))(
             commands,
             "part",
-            Matrix.block(on_device(device, a), 40, 64, 70).from_column(3, 33),
-            Matrix.whole(on_device(device, b), 33, 90).from_column(20, 65),
-            Matrix.block(result, 80, 64, 70).from_column(11, 65),
+            Matrix.of(on_device(device, a).rows(64, 70)).from_column(3, 33),
+            Matrix.of(on_device(device, b)).from_column(20, 65),
+            Matrix.of(result.rows(64, 70)).from_column(11, 65),
         )
     expected = c.double()
     expected[64:134, 11:76] = a[64:134, 3:36].double() @ b[:, 20:85].double()
-    found = read(result, 140, 80)
+    found = read(result)
     assert relative(found, expected) < 1e-6
     untouched = torch.ones_like(c, dtype=torch.bool)
     untouched[64:134, 11:76] = False
@@ -86,26 +85,26 @@ def test_long_products_are_sums_of_parts(device: Device, inner: int, monkeypatch
     monkeypatch.setattr(matmul, "_SPLIT", 100)
     a, b, start = random(inner, 70), random(inner, 9, seed=1), random(70, 9, seed=2)
     fresh, added = on_device(device, torch.full_like(start, torch.nan)), on_device(device, start)
-    of_a, of_b = (Matrix.whole(on_device(device, x), *x.shape) for x in (a, b))
+    of_a, of_b = (Matrix.of(on_device(device, x)) for x in (a, b))
     product = Matmul(device, BufferPool(device))
     runs = []
     for _ in range(2):
         with Commands(device) as commands:
             product.long(commands, "fresh", of_a.transpose, of_b, fresh)
-        runs.append(read(fresh, 70, 9))
+        runs.append(read(fresh))
     with Commands(device) as commands:
         product.long(commands, "added", of_a.transpose, of_b, added, add=True)
     exact = a.double().T @ b.double()
     assert torch.equal(*runs)
     assert relative(runs[0], exact) < 1e-6
-    assert relative(read(added, 70, 9), start.double() + exact) < 1e-6
+    assert relative(read(added), start.double() + exact) < 1e-6
 
 
 def test_long_sums_are_accurate(device: Device) -> None:
     """Of 20,000 like numbers, which one float32 after the other would sum up with an error of 1e-4."""
     ones = torch.full((20_000, 1), 0.1)
     total = on_device(device, torch.zeros(1, 1))
-    column = Matrix.whole(on_device(device, ones), 20_000, 1)
+    column = Matrix.of(on_device(device, ones))
     with Commands(device) as commands:
         Matmul(device, BufferPool(device)).long(commands, "sum", column.transpose, column, total)
-    assert float(read(total, 1, 1)) == pytest.approx(20_000 * float(np.float32(0.1)) ** 2, rel=2e-5)
+    assert float(read(total)) == pytest.approx(20_000 * float(np.float32(0.1)) ** 2, rel=2e-5)

@@ -19,8 +19,9 @@ from test_train import configure
 from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.errors import InputError
-from lapgs_wgpu.gpu.buffer import BufferPool, read_all
+from lapgs_wgpu.gpu.array import DeviceArray, read_all
 from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.io.ply import StillGaussians, write_ply
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.playback import torch_playback
@@ -29,8 +30,9 @@ from lapgs_wgpu.motion.playback.torch_playback import TorchPlayback
 from lapgs_wgpu.motion.scene import Scene4D, load
 from lapgs_wgpu.motion.scene_file import read_scene
 from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterize import rasterizer_of, upload_gaussians
-from lapgs_wgpu.splat.rasterizer import GaussianBuffers, Rasterizer
+from lapgs_wgpu.splat.rasterizer import Rasterizer
 from lapgs_wgpu.train.training import Training
 
 TIMES = (0.0, 0.37, 1.0)
@@ -50,9 +52,9 @@ def picture(playback: Playback, t: float, camera: Camera = CAMERA, *, passing: b
     rasterizer = Rasterizer(playback.device)
     while True:
         now = playback.at(t, camera if passing else None)
-        planes = rasterizer.draw(now, camera, (0.1, 0.2, 0.3))
-        if not rasterizer.grow():
-            return planes.read("float32", (4, camera.height, camera.width))[:3].transpose(1, 2, 0)
+        drawing = rasterizer.draw(now, camera, (0.1, 0.2, 0.3))
+        if not rasterizer.grow_on_overflow(drawing):
+            return drawing.image.read()[:3].transpose(1, 2, 0)
 
 
 def saved(device: Device, folder: Path, config: FieldConfig, count: int = 300) -> tuple[Scene4D, Path]:
@@ -159,8 +161,8 @@ def test_an_upload_that_failed_is_made_again(device: Device, tmp_path: Path, mon
     playback = open_playback(path, device)
     expected = contents(playback.at(0.1))
 
-    def fail(pool: BufferPool, tensors: list[torch.Tensor], sh_degree: int) -> None:
-        upload_gaussians(pool, [0 * tensor for tensor in tensors], sh_degree)
+    def fail(pool: BufferPool, now: Gaussians[torch.Tensor]) -> None:
+        upload_gaussians(pool, Gaussians(*(0 * tensor for tensor in vars(now).values())))
         raise MemoryError
 
     with monkeypatch.context() as patched:
@@ -191,7 +193,7 @@ def test_a_training_can_be_watched(device: Device) -> None:
     playback = TorchPlayback(scene)
     before = picture(playback, 0.4)
     assert np.abs(before - scene.render(CAMERA, 0.4, torch.tensor([0.1, 0.2, 0.3])).image.numpy()).max() < 1e-6
-    assert playback.at(0.4).means is not rasterizer_of(device).pool.get("input means", 0)
+    assert playback.at(0.4).means.buffer is not rasterizer_of(device).pool.array("input means", (50, 3)).buffer
     with torch.no_grad():
         scene.parameters["sh_dc"] += 0.5
     assert np.abs(picture(playback, 0.4) - before).max() > 0.05
@@ -199,7 +201,7 @@ def test_a_training_can_be_watched(device: Device) -> None:
         scene.parameters[name] = torch.nn.Parameter(parameter.detach()[:20].clone())
     scene.sh_degree = 3
     now = playback.at(0.4)
-    assert (playback.count, now.count, playback.sh_degree, now.sh_degree, now.sh_stored) == (20, 20, 3, 3, 16)
+    assert (playback.count, len(now), playback.sh_degree, now.sh_degree) == (20, 20, 3, 3)
 
 
 @pytest.mark.kernels
@@ -234,10 +236,7 @@ def test_blocks_make_no_difference(device: Device, tmp_path: Path) -> None:
     _, path = saved(device, tmp_path, OURS)
     whole, parts = (DevicePlayback(read_scene(path), device, block=block) for block in (None, 128))
     for t in TIMES:
-        a, b = (
-            read_all([(p.at(t).colors, "uint32", (300, 27), 0), (p.at(t).quats, "uint32", (300, 4), 0)])
-            for p in (whole, parts)
-        )
+        a, b = (read_all([p.at(t).sh, p.at(t).quats]) for p in (whole, parts))
         for x, y in zip(a, b, strict=True):
             np.testing.assert_array_equal(x, y)
 
@@ -257,9 +256,9 @@ def half_still(device: Device, folder: Path) -> DevicePlayback:
     return playback
 
 
-def contents(now: GaussianBuffers) -> list[np.ndarray]:
-    shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "colors": (now.sh_stored, 3)}
-    return read_all([(getattr(now, name), "uint32", (now.count, *shape), 0) for name, shape in shapes.items()])
+def contents(now: Gaussians[DeviceArray]) -> list[np.ndarray]:
+    """As words, so that equal means equal bits."""
+    return [values.view(np.uint32) for values in read_all(list(vars(now).values()))]
 
 
 @pytest.mark.kernels
@@ -311,10 +310,10 @@ playback = open_playback(sys.argv[1], device)
 rasterizer = Rasterizer(device)
 camera = Camera.looking_at([0, -4, 0], [0, 0, 0], up=[0, 0, 1], fov_x=0.8, width=32, height=32)
 while True:
-    image = rasterizer.draw(playback.at(0.3), camera)
-    if not rasterizer.grow():
+    drawing = rasterizer.draw(playback.at(0.3), camera)
+    if not rasterizer.grow_on_overflow(drawing):
         break
-assert image.read("float32", (4, 32, 32))[3].min() < 0.99
+assert drawing.image.read()[3].min() < 0.99
 playback.means(0.5), playback.dynamics(), playback.still(0.2)
 print("torch" in sys.modules)
 """

@@ -8,9 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from lapgs_wgpu.gpu.buffer import Buffer, BufferPool
+from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands
+from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.gpu.radix_sort import RadixSort
 
 pytestmark = pytest.mark.kernels
@@ -41,8 +42,7 @@ def sort(
     held = {}
     for name, words in (("keys", keys), ("payload", payload), ("length", np.array([length], np.uint32))):
         if words is not None:
-            held[name] = Buffer(device, words.nbytes, name)
-            held[name].write(words)
+            held[name] = DeviceArray.upload(device, name, words)
     with Commands(device) as commands:
         sorted_keys, carried = RadixSort(device, pool or BufferPool(device), "test", lane_runs=lane_runs)(
             commands,
@@ -53,7 +53,7 @@ def sort(
             payload=held.get("payload"),
         )
     count = min(length, len(keys))
-    return sorted_keys.read("uint32", (count,)), carried.read("uint32", (count,))
+    return sorted_keys.read()[:count], carried.read()[:count]
 
 
 def check(

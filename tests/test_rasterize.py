@@ -23,6 +23,7 @@ from scenes import (
 from torch import Tensor
 
 from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.probe_subgroup import subgroup_size
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.raster_config import RasterConfig, cpu_config, gpu_config
 from lapgs_wgpu.splat.rasterize import rasterize
@@ -160,8 +161,8 @@ def test_a_loss_on_one_output(device: Device, output: str) -> None:
 def shapes(device: Device) -> list[RasterConfig]:
     """All that this device can run, the simplest first."""
     found = [cpu_config(0), RasterConfig(16, 16, 32, subgroups=False, lane_runs=False), gpu_config(0)]
-    if device.subgroup_size:
-        found += [cpu_config(device.subgroup_size), gpu_config(device.subgroup_size)]
+    if subgroup_size(device):
+        found += [cpu_config(subgroup_size(device)), gpu_config(subgroup_size(device))]
     return list(dict.fromkeys(found))
 
 
@@ -185,7 +186,7 @@ def test_all_shapes_draw_the_same(device: Device, use: Callable[[Rasterizer], An
 
 def test_workgroups_that_are_cut_into_subgroups_are_noticed(device: Device, use: Callable[[Rasterizer], Any]) -> None:
     """As a driver may do for one pass and not for another: both do without shuffles then."""
-    if not 0 < device.subgroup_size < 32:
+    if not 0 < subgroup_size(device) < 32:
         pytest.skip("this device has no subgroups, or none of fewer than 32 lanes")
     scene, camera = random_scene(500, 8, size=0.08), oblique_camera(101, 61)
     whole, cut = gpu_config(0), replace(gpu_config(32), subgroups=True)
@@ -205,7 +206,7 @@ def test_workgroups_that_are_cut_into_subgroups_are_noticed(device: Device, use:
 def test_only_the_backward_pass_is_cut(
     device: Device, use: Callable[[Rasterizer], Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    if not 0 < device.subgroup_size < 32:
+    if not 0 < subgroup_size(device) < 32:
         pytest.skip("this device has no subgroups, or none of fewer than 32 lanes")
     scene, camera = random_scene(500, 8, size=0.08), oblique_camera(101, 61)
     use(Rasterizer(device, config=gpu_config(0)))

@@ -15,7 +15,6 @@ from torch import Tensor
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.rasterize import Rendering
-from lapgs_wgpu.splat.rotation import rotation_matrices
 from lapgs_wgpu.splat.reference import (
     ALPHA_MAX,
     ALPHA_MIN,
@@ -29,6 +28,7 @@ from lapgs_wgpu.splat.reference import (
     rasterize_reference,
     sh_basis,
 )
+from lapgs_wgpu.splat.rotation import rotation_matrices
 
 Scene = dict[str, Tensor]
 IDENTITY = [1.0, 0.0, 0.0, 0.0]

@@ -20,10 +20,11 @@ from lapgs_wgpu.command import OUT_OF_DEVICE, guarded
 from lapgs_wgpu.data import Dataset, load_dataset
 from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.errors import DeviceError, DeviceLostError, DeviceMemoryError, NoAdapterError
+from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.buffer import Buffer
 from lapgs_wgpu.gpu.device import _DEFAULT_LIMITS, _RAISED_LIMITS, Device, DeviceInfo
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
-from lapgs_wgpu.gpu.wgpu_errors import Guard
+from lapgs_wgpu.gpu.wgpu_errors import TranslatedErrors
 from lapgs_wgpu.splat.rasterize import rasterizer_of
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.loop import resume, train
@@ -150,13 +151,13 @@ def test_nothing_is_saved_before_the_first_step(
 
 @pytest.mark.kernels
 def test_a_lost_device_is_named_wherever_it_is_used(doomed: Device) -> None:
-    buffer, large = Buffer(doomed, 64, "small"), Buffer(doomed, 1 << 20, "large")
+    small, large = (DeviceArray.empty(doomed, "words", (count,), "uint32") for count in (16, 1 << 18))
     kernel = Kernel.get(doomed, "scan_blocks", SCAN_LANES=8)
     doomed.wgpu_device.destroy()
 
     def dispatch() -> None:
         with Commands(doomed) as commands:
-            commands.dispatch(kernel, 1, blocks=buffer, block_sums=large, total=buffer)
+            commands.dispatch(kernel, 1, blocks=small, block_sums=large, total=small)
 
     def clear() -> None:
         with Commands(doomed) as commands:
@@ -164,7 +165,7 @@ def test_a_lost_device_is_named_wherever_it_is_used(doomed: Device) -> None:
 
     def texture() -> None:
         with Commands(doomed) as commands:
-            buffer.texture(commands._encoder, "r32float", 0, 64)
+            small.buffer.texture(commands._encoder, "r32float", 0, 64)
 
     uses: list[Callable[[], Any]] = [
         dispatch,
@@ -172,9 +173,9 @@ def test_a_lost_device_is_named_wherever_it_is_used(doomed: Device) -> None:
         texture,
         lambda: Buffer(doomed, 64, "new"),
         lambda: Kernel.get(doomed, "compact"),
-        lambda: buffer.write(np.zeros(4, np.float32)),
-        lambda: large.write(np.zeros(1 << 18, np.float32)),
-        lambda: buffer.read("float32", (4,)),
+        lambda: small.write(np.zeros(16, np.uint32)),
+        lambda: large.write(np.zeros(1 << 18, np.uint32)),
+        small.read,
     ]
     for use in uses:
         with pytest.raises(DeviceLostError, match="was lost, because its driver gave up or it was removed"):
@@ -182,13 +183,13 @@ def test_a_lost_device_is_named_wherever_it_is_used(doomed: Device) -> None:
 
 
 def test_other_errors_stay_what_they_are(device: Device) -> None:
-    with pytest.raises(wgpu.GPUValidationError), Guard(device, "a test"):
+    with pytest.raises(wgpu.GPUValidationError), TranslatedErrors(device, "a test"):
         device.wgpu_device.create_buffer(size=1 << 60, usage=wgpu.BufferUsage.STORAGE)
-    with pytest.raises(AttributeError), Guard(device, "a test"):
+    with pytest.raises(AttributeError), TranslatedErrors(device, "a test"):
         raise AttributeError
     with (
         pytest.raises(DeviceMemoryError, match=r"no memory left for a test of 5 MB, fewer"),
-        Guard(device, "a test", 5_000_000),
+        TranslatedErrors(device, "a test", 5_000_000),
     ):
         raise wgpu.GPUOutOfMemoryError("out of memory")
     assert issubclass(DeviceMemoryError, MemoryError)

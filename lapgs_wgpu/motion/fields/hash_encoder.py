@@ -198,7 +198,7 @@ class _Encode(torch.autograd.Function):
 
 
 def encode_reference(grid: HashGrid, table: Tensor, points: Tensor, time: float, bound: float) -> Tensor:
-    """The reference in torch: (N, 2 x levels) in the table's precision; cells are found in float32, as on the device."""
+    """The reference: (N, 2 x levels) in the table's precision; cells are found in float32, as on the device."""
     columns = [(points[:, axis] + bound) / (2 * bound) if axis != TIME else None for axis in grid.axes]
     unit = torch.stack([torch.full_like(points[:, 0], time) if c is None else c for c in columns], dim=1)
     inside = ((unit >= 0) & (unit <= 1)).all(dim=1)
