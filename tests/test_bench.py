@@ -31,9 +31,9 @@ def results(file: Path) -> dict:
         "rasterize_bwd",
         "forward + backward",
         "0 of them before the sort",
-        "times as fast as the twin;",
+        "times as fast as the reference;",
         "times as fast on the device;",
-        "as fast as the twins",
+        "as fast as the references",
         "at the ceiling",
     ):
         assert words in table
@@ -66,7 +66,7 @@ def test_bytes_of_a_step_are_those_of_its_tensors(results: dict) -> None:
     assert splats + gradients + planes <= step["downloaded_bytes"] <= splats + gradients + planes + constants
 
 
-def test_the_encoder_agrees_with_its_twin_at_the_sizes_that_are_timed(results: dict) -> None:
+def test_the_encoder_agrees_with_its_reference_at_the_sizes_that_are_timed(results: dict) -> None:
     assert results["encoder"]["largest_difference"] < 1e-5
 
 
@@ -74,7 +74,7 @@ def test_the_decoders_agree(results: dict) -> None:
     assert results["decoder"]["largest_difference"] < 1e-4
 
 
-def test_the_losses_agree_with_their_twins(results: dict) -> None:
+def test_the_losses_agree_with_their_references(results: dict) -> None:
     assert results["losses"]["size"] == 40
     assert results["losses"]["difference"] < 1e-4
 

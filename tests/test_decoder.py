@@ -18,6 +18,7 @@ from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.fields.decoder import Decoder
 from lapgs_wgpu.motion.fields.deformation import Nearby
+from lapgs_wgpu.motion.fields.gate import gated
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.passes.decoder_passes import DecoderShape
 
@@ -36,8 +37,8 @@ FIELDS = {
 
 def gate_reference(layers: Tensor, *, motion: bool) -> Tensor:
     """(N, layers, width) -> (N, features, width)."""
-    gated = torch.relu(layers[:, -1]) * torch.tanh(layers[:, 0])
-    return torch.stack([gated, torch.relu(layers[:, 1])], dim=1) if motion else gated[:, None]
+    features = gated(layers[:, -1], layers[:, 0])
+    return torch.stack([features, torch.relu(layers[:, 1])], dim=1) if motion else features[:, None]
 
 
 @pytest.mark.parametrize("motion", [False, True])

@@ -1,4 +1,4 @@
-"""Exposure: the passes against their twin, the corrections, and what they are for."""
+"""Exposure: the passes against their reference, the corrections, and what they are for."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 @pytest.mark.kernels
 @pytest.mark.parametrize("size", [(1, 1), (3, 5), (12, 30), (37, 61), (64, 200)])
 def test_exposure(device: Device, size: tuple[int, int]) -> None:
-    """The image, and its gradient to the image and to the correction, are the twin's in float64."""
+    """The image, and its gradient to the image and to the correction, are the reference's in float64."""
     rng = np.random.default_rng(size[0])
     image, d_exposed = (rng.random((4, *size), np.float32) for _ in range(2))
     passes = ExposurePasses(device)
@@ -78,7 +78,7 @@ def test_exposure(device: Device, size: tuple[int, int]) -> None:
 
 
 @pytest.mark.kernels
-def test_a_step_is_that_of_the_rasteriser_and_the_twins(device: Device) -> None:
+def test_a_step_is_that_of_the_rasteriser_and_the_references(device: Device) -> None:
     scene, other = gaussians(), gaussians()
     mine, theirs = (CORRECTION.clone().requires_grad_() for _ in range(2))
     done = render_loss(scene, CAMERA, upload_rgba(device, TRUTH), BACKGROUND, WEIGHTS["all"], device, mine)

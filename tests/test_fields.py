@@ -290,7 +290,7 @@ def test_smoothness_of_grids_written_out(device: Device) -> None:
     assert torch.equal(without.translation, field(POINTS, 0.3, DYNAMICS, NEARBY).translation)
     found.backward()
     gradients = [grid.table.grad for grid in field.grids]
-    # A place that is asked for twice: its gradient by the twin.
+    # A place that is asked for twice: its gradient by the reference.
     tables = [grid.table.detach().clone().requires_grad_() for grid in field.grids]
     total = torch.zeros(())
     for number, (grid, table) in enumerate(zip(field.grids, tables, strict=True)):

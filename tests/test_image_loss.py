@@ -1,4 +1,4 @@
-"""The kernels of the image losses against their twins in float64, and a step in which nothing but losses comes back."""
+"""The kernels of the image losses against their references in float64, and a step that reads back losses alone."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def loss_of(terms: NDArray[np.float32], weights: LossWeights) -> float:
     return float(np.dot(terms.astype(float), [weights.l1, 0, weights.ssim, weights.pyramid, weights.ncc]))
 
 
-def twin(pair: Pair, weights: LossWeights) -> tuple[float, torch.Tensor]:
+def reference(pair: Pair, weights: LossWeights) -> tuple[float, torch.Tensor]:
     image = torch.from_numpy(pair.image).double().requires_grad_()
     loss = total(image, torch.from_numpy(pair.truth.astype(np.float32) / np.float32(255)).double(), weights)
     loss.backward()
@@ -99,7 +99,7 @@ def twin(pair: Pair, weights: LossWeights) -> tuple[float, torch.Tensor]:
 
 def check(losses: ImageLoss, pair: Pair, weights: LossWeights) -> None:
     terms, gradient = record(losses, pair, weights)
-    expected, expected_gradient = twin(pair, weights)
+    expected, expected_gradient = reference(pair, weights)
     assert loss_of(terms, weights) == pytest.approx(expected, rel=1e-5, abs=1e-6)
     assert relative(torch.from_numpy(gradient.copy()), expected_gradient) < 1e-4
 
@@ -109,7 +109,7 @@ def image_loss(device: Device) -> ImageLoss:
     return ImageLoss(device)
 
 
-# Against the twins
+# Against the references
 
 
 @pytest.mark.parametrize("name", WEIGHTS)
@@ -143,7 +143,7 @@ def test_mean_squared_error(image_loss: ImageLoss) -> None:
     assert terms[1] == pytest.approx(np.square(pair.image - pair.truth.astype(float) / 255).mean(), rel=1e-5)
 
 
-def test_constants_are_those_of_the_twins(device: Device) -> None:
+def test_constants_are_those_of_the_references(device: Device) -> None:
     source = Kernel.get(device, "loss_ssim_across", LANES=8).source
     numbers = source.split("array<f32, 11>(")[1].split(")")[0].split(",")
     torch.testing.assert_close(
@@ -212,7 +212,7 @@ def gradients(scene: Gaussians, done: RenderLoss) -> dict[str, torch.Tensor]:
     return {name: t.grad for name, t in (tensors | {"means2d": done.means2d}).items()}
 
 
-def test_a_step_is_that_of_the_rasteriser_and_the_twins(device: Device) -> None:
+def test_a_step_is_that_of_the_rasteriser_and_the_references(device: Device) -> None:
     scene, other = gaussians(), gaussians()
     done = step(device, scene)
     done.loss.backward()

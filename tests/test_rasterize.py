@@ -1,4 +1,4 @@
-"""The whole rasteriser, forward and backward, against its float64 twin."""
+"""The whole rasteriser, forward and backward, against its float64 reference."""
 
 from __future__ import annotations
 

@@ -122,7 +122,7 @@ def test_only_invisible_gaussians(device: Device) -> None:
     ids=lambda value: value if isinstance(value, str) else "",
 )
 def test_extremes_are_finite_and_as_in_float64(device: Device, name: str, changes: dict[str, float]) -> None:
-    """Gradients are held to the twin's only where float32 can hold them."""
+    """Gradients are held to the reference's only where float32 can hold them."""
     scene, camera = in_front(12, 4), front_camera(33, 25)
     for group, value in changes.items():
         scene[group][::3] = value

@@ -12,9 +12,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from math import sqrt
 
-from lapgs_wgpu.gpu.buffer import read_all
+from lapgs_wgpu.gpu.array import read_all
 from lapgs_wgpu.gpu.kernel import Commands
 from lapgs_wgpu.motion.fields.hash_grid_config import GridShape
+from lapgs_wgpu.splat.drawing import Drawing
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 
 SPLAT = 48  # bytes; common/splat.wgsl
@@ -50,29 +51,21 @@ class SceneCounts:
     bands: int
 
 
-def count_scene(rasterizer: Rasterizer) -> SceneCounts:
+def count_scene(rasterizer: Rasterizer, drawing: Drawing) -> SceneCounts:
     """Of the image that was drawn last, whose bands are drawn once more."""
-    last = rasterizer._drawn
-    assert last is not None
-    pool, shape, camera = rasterizer.pool, rasterizer.config, last.camera
+    config, camera = rasterizer.config, drawing.camera
     visible = intersections = drawn = tiles = 0
-    for band in range(rasterizer.bands):
+    for band in range(drawing.plan.bands):
         with Commands(rasterizer.device) as commands:
-            rasterizer._draw_band(commands, last, band)
-        here = rasterizer._band_tiles(last, band)
-        seen, needed, ranges = read_all(
-            [
-                (pool.get("visible", 4), "uint32", (1,), 0),
-                rasterizer.needed_requests()[band],
-                (pool.get("ranges", 0), "uint32", (here, 4), 0),
-            ]
-        )
+            lists = rasterizer._draw_band(commands, drawing, band)
+        here = rasterizer._band_tiles(drawing, band)
+        seen, needed, ranges = read_all([lists.visible, drawing.needed[band], lists.ranges.rows(0, here)])
         visible, intersections, tiles = visible + int(seen[0]), intersections + int(needed[0]), tiles + here
         listed = ranges[ranges[:, 1] > 0]
         drawn += int((listed[:, 2] - listed[:, 0]).sum())
-    pairs = drawn * shape.tile_width * shape.tile_height
+    pairs = drawn * config.tile_width * config.tile_height
     pixels = camera.width * camera.height
-    return SceneCounts(last.gaussians.count, visible, intersections, drawn, pairs, tiles, pixels, rasterizer.bands)
+    return SceneCounts(len(drawing.gaussians), visible, intersections, drawn, pairs, tiles, pixels, drawing.plan.bands)
 
 
 def raster_work(scene: SceneCounts, rasterizer: Rasterizer) -> dict[str, Work]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+from ...splat.constants import CONSTANTS
 from .hash_grid_config import TIME, GridShape, HashConfig, option
 
 FieldKind = Literal["static", "mlp", "hexplane", "grid4d", "laplacian"]
@@ -13,7 +14,7 @@ Appearance = Literal["none", "color", "color+opacity"]
 DynamicsMode = Literal[
     "literal", "promote", "off"
 ]  # of the regularisation of the dynamics attribute (motion/fields/dynamics)
-MIN_SCALE = 1e-7  # of a Gaussian, after its deformation; world units
+MIN_SCALE = CONSTANTS["MIN_SCALE"]
 PLANES = ((0, 1), (0, 2), (1, 2), (0, TIME), (1, TIME), (2, TIME))  # of the field hexplane: pairs of x, y, z, t
 TEMPORAL_AXES = ((0, 1, TIME), (1, 2, TIME), (0, 2, TIME))  # of the temporal hash grids
 GEOMETRY = (4, 3, 4, 3)  # outputs of the grid fields' geometry heads: turn, shift, quaternion, scale

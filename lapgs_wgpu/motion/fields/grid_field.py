@@ -13,6 +13,7 @@ from ..passes.decoder_passes import decoder_shape
 from .config import APPEARANCE_SCALE, GEOMETRY, TEMPORAL_AXES, FieldConfig
 from .decoder import Decoder
 from .deformation import Deformation, Nearby
+from .gate import gated
 from .hash_encoder import HashEncoder, HashGrid
 from .laplacian import LaplacianMotion, TimeMotion
 from .layers import last_product, linear, product, zero_head
@@ -126,8 +127,7 @@ class GridField(nn.Module):
             beside = torch.cat([means.new_zeros(len(means), size) if dynamics is None else dynamics, ones], dim=1)
         else:
             beside = ones
-        # The gate's weights are halved: 2 sigmoid(x) - 1 = tanh(x / 2).
-        placed = [(0.5 * self.spatial.weight, 0.5 * self.spatial.bias)]
+        placed = [self._gate_weights()]
         heads, bias = self._heads()
         if isinstance(self.motion, LaplacianMotion):
             placed.append((self.motion.first.weight, self.motion.first.bias))
@@ -144,6 +144,10 @@ class GridField(nn.Module):
         }
         outputs, apart = self._decoder((means, time), beside, weights, compared)
         return outputs + bias, apart
+
+    def _gate_weights(self) -> tuple[Tensor, Tensor]:
+        """Weight and bias of the spatial layer as `gated` reads it."""
+        return 0.5 * self.spatial.weight, 0.5 * self.spatial.bias
 
     def _heads(self) -> tuple[Tensor, Tensor]:
         """Weight and bias of all heads, as one matrix: they read the same features, whose gradient goes through
@@ -164,16 +168,16 @@ class GridField(nn.Module):
 
     def _decode(self, t: float, dynamics: Tensor | None, static: Tensor, *temporal: Tensor) -> Tensor:
         """Outputs of the geometry heads (N, 14) and, beside them, of the appearance head."""
-        gate = torch.tanh(product(static, 0.5 * self.spatial.weight, 0.5 * self.spatial.bias))  # 2 sigmoid(x) - 1
-        gated = torch.relu(self._moving(dynamics, static, *temporal)) * gate
+        half = product(static, *self._gate_weights())
+        open_features = gated(self._moving(dynamics, static, *temporal), half)
         motion = self.motion(static, t) if self.motion is not None else None
         if len(self.hidden):
-            fused = gated if motion is None else gated + motion.features()
+            fused = open_features if motion is None else open_features + motion.features()
             outputs = self.heads(self.hidden(fused.float()))
             if self.appearance is None:
                 return outputs
-            return torch.cat([outputs, APPEARANCE_SCALE * self.appearance(gated.float())], dim=1)
-        outputs = last_product(gated, *self._heads())
+            return torch.cat([outputs, APPEARANCE_SCALE * self.appearance(open_features.float())], dim=1)
+        outputs = last_product(open_features, *self._heads())
         if motion is not None:
             moved = motion.through(self.heads.weight)
             outputs = outputs + nn.functional.pad(moved, (0, outputs.shape[1] - moved.shape[1]))

@@ -142,6 +142,7 @@ class GridFieldPlayback:
     def _stream(self) -> Floats:
         """(vectors, 4): biases and layers of the decoder, in the order in which the pass reads them."""
         p, sizes, rounds = self._parameters, self._sizes, self._rounds
+        p = p | {name: np.float32(0.5) * p[name] for name in ("spatial.weight", "spatial.bias")}  # see common/gate.wgsl
         moving = np.zeros((sizes.width, sizes.first_temporal + sizes.temporal), np.float32)
         moving[:, : sizes.dynamics] = p["temporal.weight"][:, : sizes.dynamics]
         moving[:, sizes.first_temporal :] = p["temporal.weight"][:, sizes.dynamics : sizes.dynamics + sizes.temporal]
