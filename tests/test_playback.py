@@ -22,7 +22,7 @@ from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.array import DeviceArray, read_all
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.pool import BufferPool
-from lapgs_wgpu.io.ply import StillGaussians, write_ply
+from lapgs_wgpu.io.ply import GaussianSnapshot, write_ply
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.playback import torch_playback
 from lapgs_wgpu.motion.playback.playback import DevicePlayback, Playback, open_playback
@@ -214,7 +214,7 @@ def test_a_foreign_ply_stands_still(device: Device, tmp_path: Path, degree: int)
     assert (playback.moves, playback.count, playback.sh_degree, playback.metadata) == (False, 40, degree, {})
     drawn = load(tmp_path / "foreign.ply", device).render(CAMERA, 0.0, torch.tensor([0.1, 0.2, 0.3])).image.numpy()
     assert np.abs(picture(playback, 0.7) - drawn).max() < 1e-4
-    found: StillGaussians = playback.still(0.3)
+    found: GaussianSnapshot = playback.still(0.3)
     np.testing.assert_array_equal(found.means, still.means)
     np.testing.assert_array_equal(found.sh[:, : still.sh.shape[1]], still.sh)
     np.testing.assert_array_equal(found.opacity_logits, still.opacity_logits)

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.atomic import atomic_write
-from lapgs_wgpu.io.ply import StillGaussians, read_ply, write_ply
+from lapgs_wgpu.io.ply import GaussianSnapshot, read_ply, write_ply
 
 REAL_FILES = Path(__file__).parents[2] / "shared" / "data" / "ply"
 FIELDS = ["means", "sh", "opacity_logits", "log_scales", "quats"]
@@ -32,16 +32,16 @@ INRIA = (
 ).split()
 
 
-def random_still(n: int = 5, degree: int = 3, seed: int = 0) -> StillGaussians:
+def random_still(n: int = 5, degree: int = 3, seed: int = 0) -> GaussianSnapshot:
     rng = np.random.default_rng(seed)
 
     def floats(*shape: int) -> np.ndarray:
         return rng.standard_normal(shape, np.float32)
 
-    return StillGaussians(floats(n, 3), floats(n, (degree + 1) ** 2, 3), floats(n), floats(n, 3), floats(n, 4))
+    return GaussianSnapshot(floats(n, 3), floats(n, (degree + 1) ** 2, 3), floats(n), floats(n, 3), floats(n, 4))
 
 
-def assert_same(a: StillGaussians, b: StillGaussians) -> None:
+def assert_same(a: GaussianSnapshot, b: GaussianSnapshot) -> None:
     for name in FIELDS:
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
 
@@ -56,7 +56,7 @@ def ply_bytes(columns: Mapping[str, tuple[str, Sequence[float] | np.ndarray]]) -
     return head.encode() + b"".join(row.pack(*(v[i] for _, v in columns.values())) for i in range(n))
 
 
-def columns_of(still: StillGaussians) -> dict[str, tuple[str, np.ndarray]]:
+def columns_of(still: GaussianSnapshot) -> dict[str, tuple[str, np.ndarray]]:
     """The columns of `still` in Inria's order, without normals."""
     values = dict(zip(["x", "y", "z"], still.means.T, strict=True))
     values |= {f"f_dc_{c}": still.sh[:, 0, c] for c in range(3)}
@@ -99,7 +99,7 @@ def test_round_trip_pads_sh_to_degree_3(tmp_path: Path, degree: int, n: int) -> 
     k = still.sh.shape[1]
     padded = np.zeros((n, 16, 3), np.float32)
     padded[:, :k] = still.sh
-    assert_same(back, StillGaussians(still.means, padded, still.opacity_logits, still.log_scales, still.quats))
+    assert_same(back, GaussianSnapshot(still.means, padded, still.opacity_logits, still.log_scales, still.quats))
     assert back.sh_degree == 3
     assert len(back) == n
     assert all(getattr(back, name).flags.c_contiguous for name in FIELDS)
@@ -296,11 +296,11 @@ def test_values_that_could_not_be_read_back_are_not_written(tmp_path: Path) -> N
 def test_arrays_of_wrong_shape_or_type_are_refused() -> None:
     a = random_still(3)
     with pytest.raises(ValueError, match="quats is float32"):
-        StillGaussians(a.means, a.sh, a.opacity_logits, a.log_scales, a.quats[:2])
+        GaussianSnapshot(a.means, a.sh, a.opacity_logits, a.log_scales, a.quats[:2])
     with pytest.raises(ValueError, match="means is float64"):
-        StillGaussians(a.means.astype(float), a.sh, a.opacity_logits, a.log_scales, a.quats)
+        GaussianSnapshot(a.means.astype(float), a.sh, a.opacity_logits, a.log_scales, a.quats)
     with pytest.raises(ValueError, match="K of 1, 4, 9 or 16"):
-        StillGaussians(a.means, a.sh[:, :5], a.opacity_logits, a.log_scales, a.quats)
+        GaussianSnapshot(a.means, a.sh[:, :5], a.opacity_logits, a.log_scales, a.quats)
 
 
 # Atomic writing: each fault is injected at one step, and the old file must be whole and alone in its folder.

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from ..gpu.device import Device, open_device
 from ..io.checkpoint import write_checkpoint
-from ..io.ply import StillGaussians
+from ..io.ply import GaussianSnapshot
 from ..splat.camera import Camera
 from ..splat.constants import CONSTANTS
 from ..splat.gaussians import Gaussians
@@ -153,7 +153,7 @@ class Scene4D:
         with torch.no_grad():
             return draw(self.at(t), camera, background, self.device, depth=depth)
 
-    def still(self, t: float) -> StillGaussians:
+    def still(self, t: float) -> GaussianSnapshot:
         """The Gaussians at time t in [0, 1] before their activations, as 3DGS viewers read them."""
         with torch.no_grad():
             still = self.at(t)
@@ -161,7 +161,7 @@ class Scene4D:
             logits = self.parameters["opacity_logits"].detach()
             if not torch.equal(still.opacities, logits.sigmoid()):
                 logits = still.opacities.logit(eps=1e-7)
-        return StillGaussians(
+        return GaussianSnapshot(
             means=still.means.numpy(force=True),
             sh=sh.numpy(force=True),
             opacity_logits=logits.numpy(force=True),

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ...gpu.array import DeviceArray, read_all
 from ...gpu.device import Device
 from ...gpu.pool import BufferPool
-from ...io.ply import StillGaussians
+from ...io.ply import GaussianSnapshot
 from ...splat.camera import Camera
 from ...splat.gaussians import Gaussians
 from ..fields.config import MIN_SCALE, FieldConfig
@@ -59,7 +59,7 @@ class Playback(Protocol):
     def dynamics(self) -> Floats | None:
         """(count, D) the dynamics attributes; None where the field has none."""
 
-    def still(self, t: float) -> StillGaussians:
+    def still(self, t: float) -> GaussianSnapshot:
         """All Gaussians at a time, as 3DGS viewers read them; what `Scene4D.save` writes for time 0."""
 
 
@@ -144,7 +144,7 @@ class DevicePlayback:
         """See Playback."""
         return self._stored.get("dynamics")
 
-    def still(self, t: float) -> StillGaussians:
+    def still(self, t: float) -> GaussianSnapshot:
         """See Playback."""
         now = self.at(t)
         means, quats, scales, opacities, colors = read_all([now.means, now.quats, now.scales, now.opacities, now.sh])
@@ -153,7 +153,7 @@ class DevicePlayback:
             inside = np.clip(opacities.astype(np.float64), 1e-7, 1 - 1e-7)
             logits = np.log(inside / (1 - inside)).astype(np.float32)
         sh = np.concatenate([colors[:, :1], self._stored["sh_rest"]], axis=1)
-        return StillGaussians(means, sh, logits, np.log(scales), quats)
+        return GaussianSnapshot(means, sh, logits, np.log(scales), quats)
 
 
 def activate(stored: dict[str, Floats], sh_degree: int) -> dict[str, Floats]:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ...gpu.array import DeviceArray
 from ...gpu.pool import BufferPool
-from ...io.ply import StillGaussians
+from ...io.ply import GaussianSnapshot
 from ...splat.camera import Camera
 from ...splat.gaussians import Gaussians
 from ...splat.rasterize import upload_gaussians
@@ -90,6 +90,6 @@ class TorchPlayback:
         d = self.scene.parameters.get("dynamics")
         return None if d is None else np.array(d.numpy(force=True))
 
-    def still(self, t: float) -> StillGaussians:
+    def still(self, t: float) -> GaussianSnapshot:
         """See Playback."""
         return self.scene.still(t)
