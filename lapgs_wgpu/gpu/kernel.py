@@ -172,6 +172,8 @@ class Commands:
 
     def clear(self, array: DeviceArray) -> None:
         """Set an array, rounded up to 4 bytes, to zero."""
+        if array.nbytes == 0:
+            return
         self._end_pass()
         array.buffer.version += 1
         self._encoder.clear_buffer(array.buffer.wgpu_buffer, array.offset, (array.nbytes + 3) & ~3)
