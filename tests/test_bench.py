@@ -166,10 +166,10 @@ device = open_device()
 kernels = CeilingKernels(device, shortest=0.0)
 with Commands(device) as commands:
     kernels._dispatches[{name!r}](commands)
-got = kernels._target.read("float32", (64,))
+got = kernels._target.read()[:64]
 chains = np.arange(CHAINS, dtype=np.float32)[None]
 if {name!r} == "ceiling_copy":
-    expected = kernels._source.read("float32", (64,))
+    expected = kernels._source.read()[:64]
 else:
     x = np.arange(64, dtype=np.float32)[:, None] + chains
     x = x if {name!r} == "ceiling_fma" else -x

@@ -247,7 +247,7 @@ def test_buffers_poisoned_between_the_bands(device: Device, use: Use, pattern: s
     rasterizer = use(Rasterizer(device, capacity=256))
     rasterizer.max_capacity = 640
     expected = drawn(scene, device)
-    assert rasterizer.bands > 1
+    assert rasterizer.plan.bands > 1
     poison(rasterizer, PATTERNS[pattern])
     assert drawn(scene, device).bits == expected.bits
 
@@ -257,10 +257,10 @@ def test_buffers_poisoned_before_an_overflow(device: Device, use: Use) -> None:
     expected = drawn(scene, device)
     rasterizer = use(Rasterizer(device, capacity=64))
     drawn(in_front(1, 10), device)
-    assert rasterizer.capacity == 64
+    assert rasterizer.plan.capacity == 64
     poison(rasterizer, PATTERNS["all bits"])
     assert drawn(scene, device).bits == expected.bits
-    assert rasterizer.capacity > 64
+    assert rasterizer.plan.capacity > 64
 
 
 def test_a_picture_without_gradients_leaves_none(device: Device) -> None:

@@ -399,7 +399,7 @@ def test_pictures_lie_on_their_background(background: str, dataset: Dataset, dev
     with closing(Pictures(dataset.train, background, 1.0, generator, device)) as pictures:  # type: ignore[arg-type]
         drawn = [(view, pictures.on_device(view), colour) for view, colour in (pictures.choose() for _ in range(4))]
     for view, truth, colour in drawn:
-        picture = truth.read("uint8", (32, 32, 4))
+        picture = truth.read().view(np.uint8).reshape(32, 32, 4)
         if background == "random":
             assert (picture == view.load()).all()
         else:

@@ -75,7 +75,10 @@ def raster_work(scene: SceneCounts, rasterizer: Rasterizer) -> dict[str, Work]:
     rows = sqrt(v * i)  # of tiles, over all splats, as if each touched as many rows as columns
     depth, tile = (
         _sort_counters(rasterizer, capacity, bits)
-        for capacity, bits in ((scene.gaussians, 32), (rasterizer.capacity, (scene.tiles // scene.bands).bit_length()))
+        for capacity, bits in (
+            (scene.gaussians, 32),
+            (rasterizer.plan.capacity, (scene.tiles // scene.bands).bit_length()),
+        )
     )
     keys = depth.passes * v + tile.passes * i
     counters = scene.bands * (depth.passes * depth.counters + tile.passes * tile.counters)
