@@ -29,6 +29,7 @@ from shares import bench_shares
 from step import StepReport, bench_step
 
 from lapgs_wgpu.gpu.device import Device, open_device
+from lapgs_wgpu.gpu.probe_subgroup import subgroup_size
 from lapgs_wgpu.train.presets import load_config
 from viewer import bench_viewer, print_viewer
 
@@ -135,7 +136,7 @@ def describe_machine(device: Device) -> dict[str, str | int]:
         "kind": device.info.kind,
         "backend": device.info.backend,
         "driver": device.info.driver,
-        "subgroup size": device.subgroup_size,
+        "subgroup size": subgroup_size(device),
         "tables": "textures" if device.textures else "buffers",
         "processors": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 0,
         "torch threads": torch.get_num_threads(),
@@ -205,10 +206,10 @@ def print_encoder(report: EncoderReport) -> None:
     print_passes(report.passes)
     print_row("forward", report.forward)
     print_row("forward + backward", report.forward_backward)
-    print_row("torch twin: forward", report.twin_forward)
-    print_row("torch twin: both", report.twin_forward_backward)
-    ratio = report.twin_forward_backward.median / report.forward_backward.median
-    print(f"  {ratio:.1f} times as fast as the twin; gradients differ by {report.largest_difference:.1e} at most")
+    print_row("torch reference: forward", report.reference_forward)
+    print_row("torch reference: both", report.reference_forward_backward)
+    ratio = report.reference_forward_backward.median / report.forward_backward.median
+    print(f"  {ratio:.1f} times as fast as the reference; gradients differ by {report.largest_difference:.1e} at most")
 
 
 def print_decoder(report: DecoderReport) -> None:
@@ -223,9 +224,9 @@ def print_losses(report: LossReport) -> None:
     print_header(f"image losses, forward + backward: L1, SSIM, pyramid and NCC, {report.size}x{report.size}")
     print_passes(report.passes)
     print_row("kernels", report.kernels)
-    print_row("torch twins", report.twins)
-    ratio = report.twins.median / report.kernels.median
-    print(f"  {ratio:.1f} times as fast as the twins; gradients differ by {report.difference:.1e}")
+    print_row("torch references", report.references)
+    ratio = report.references.median / report.kernels.median
+    print(f"  {ratio:.1f} times as fast as the references; gradients differ by {report.difference:.1e}")
 
 
 def print_shares(shares: dict[str, Timing], scene: SceneSize) -> None:

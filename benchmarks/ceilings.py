@@ -15,11 +15,11 @@ from measure import Timing
 from work import Work
 
 from lapgs_wgpu.gpu import shader
-from lapgs_wgpu.gpu.buffer import Buffer
+from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.profile import Profile
-from lapgs_wgpu.splat.shape import raster_shape
+from lapgs_wgpu.splat.raster_config import raster_config
 
 COPY, FMA, EXP = KERNELS = ("ceiling_copy", "ceiling_fma", "ceiling_exp")
 COPIED = 64 << 20  # bytes: more than what the caches of processors and GPUs hold
@@ -49,16 +49,16 @@ class CeilingKernels:
 
     def __init__(self, device: Device, shortest: float = LONG) -> None:
         self._device = device
-        shape = raster_shape(device)
+        shape = raster_config(device)
         defines = shape.raster_defines(depth=False) | {"CHAINS": CHAINS, "STEPS": STEPS}
         with mock.patch.object(shader, "shader_text", _shader_text):
             copy = Kernel.get(device, COPY)
             computing = {name: Kernel.get(device, name, **defines) for name in (FMA, EXP)}
-        self._source, self._target = (Buffer(device, COPIED, name) for name in ("copied from", "copied to"))
-        self._source.write(np.random.default_rng(0).random(COPIED // 4, np.float32))
-        factors = Buffer(device, 16, "factors")
+        self._target = DeviceArray.empty(device, "copied to", (COPIED // 4,))
+        values = np.random.default_rng(0).random(COPIED // 4, np.float32)
+        self._source = DeviceArray.upload(device, "copied from", values)
         content = computing[FMA].uniform("Factors", multiply=0.999, add=0.001, turns=TURNS)
-        factors.write(np.frombuffer(content, np.uint8))
+        factors = DeviceArray.upload(device, "factors", np.frombuffer(content, np.uint8))
         self._dispatches: dict[str, Callable[[Commands], None]] = {
             COPY: lambda commands: commands.dispatch(
                 copy, COPIED // (16 * 64), source=self._source, copied=self._target
@@ -92,7 +92,7 @@ class CeilingKernels:
         return Ceilings(*rates, together=self._device.is_cpu)
 
 
-def _compute(kernel: Kernel, groups: int, factors: Buffer, sums: Buffer) -> Callable[[Commands], None]:
+def _compute(kernel: Kernel, groups: int, factors: DeviceArray, sums: DeviceArray) -> Callable[[Commands], None]:
     return lambda commands: commands.dispatch(kernel, groups, factors=factors, sums=sums)
 
 

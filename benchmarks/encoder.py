@@ -1,4 +1,4 @@
-"""The hash encoder at the `dnerf` preset's sizes, against its plain-torch twin in the same run."""
+"""The hash encoder at the `dnerf` preset's sizes, against its torch reference in the same run."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from torch import Tensor
 from work import encoder_work
 
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.motion.field import FieldConfig
-from lapgs_wgpu.motion.grid_field import GridField
-from lapgs_wgpu.motion.hash_encoder import HashEncoder, encode_reference
+from lapgs_wgpu.motion.fields.config import FieldConfig
+from lapgs_wgpu.motion.fields.grid_field import GridField
+from lapgs_wgpu.motion.fields.hash_encoder import HashEncoder, encode_reference
 
 TIME = 0.37
 
 
 @dataclass(frozen=True)
 class EncoderReport:
-    """forward, forward_backward: our kernels through autograd. twin_...: the same in torch alone, in float32."""
+    """forward, forward_backward: our kernels through autograd. reference_...: the same in torch alone, in float32."""
 
     points: int
     levels: int
     entries: int
     forward: Timing
     forward_backward: Timing
-    twin_forward: Timing
-    twin_forward_backward: Timing
+    reference_forward: Timing
+    reference_forward_backward: Timing
     passes: PassTimes | None
     largest_difference: float  # of the gradients, relative to the largest gradient of a grid's table
 
@@ -50,7 +50,7 @@ def bench_encoder(
     def kernels() -> list[Tensor]:
         return encoder(points, TIME)
 
-    def twin() -> list[Tensor]:
+    def reference() -> list[Tensor]:
         return [encode_reference(grid, grid.table, points, TIME, config.bound) for grid in grids]
 
     def gradients(encode: Callable[[], list[Tensor]]) -> list[Tensor]:
@@ -59,18 +59,18 @@ def bench_encoder(
     def forward(encode: Callable[[], list[Tensor]]) -> Callable[[], object]:
         return torch.no_grad()(encode)
 
-    pairs = zip(gradients(kernels), gradients(twin), strict=True)
+    pairs = zip(gradients(kernels), gradients(reference), strict=True)
     differences = [float((ours - theirs).abs().max() / theirs.abs().max()) for ours, theirs in pairs]
     work = encoder_work(grids, len(points), lane_levels=device.is_cpu)
-    twin_repeat = max(1, repeat // 3)  # it takes seconds, and has run once to be compared
+    reference_repeat = max(1, repeat // 3)  # it takes seconds, and has run once to be compared
     return EncoderReport(
         points=len(points),
         levels=sum(len(grid.levels) for grid in grids),
         entries=sum(len(table) for table in tables),
         forward=timed(forward(kernels), repeat),
         forward_backward=timed(lambda: gradients(kernels), repeat),
-        twin_forward=timed(forward(twin), twin_repeat, warm_up=0),
-        twin_forward_backward=timed(lambda: gradients(twin), twin_repeat, warm_up=0),
+        reference_forward=timed(forward(reference), reference_repeat, warm_up=0),
+        reference_forward_backward=timed(lambda: gradients(reference), reference_repeat, warm_up=0),
         passes=meter(lambda: gradients(kernels), work, repeat) if meter else None,
         largest_difference=max(differences),
     )

@@ -9,14 +9,13 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
-from typing import Any
 from unittest import mock
 
 from ceilings import KERNELS, CeilingKernels, Ceilings
 from measure import Timing, summary
 from work import Work
 
-from lapgs_wgpu.gpu.buffer import Buffer
+from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.profile import Profile
@@ -69,7 +68,7 @@ def by_processor_time(device: Device) -> Iterator[Times]:
     """The same of a CPU device by processor time over the number of processors, which other work on the machine hardly
     changes. Each dispatch is submitted and waited for alone, and so are the copies of its tables to textures (COPIES).
     """
-    times, done = Times(), Buffer(device, 16, "done")
+    times, done = Times(), DeviceArray.empty(device, "done", (4,), "uint32")
     processors = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     dispatch_grid = Commands.dispatch_grid
 
@@ -79,19 +78,18 @@ def by_processor_time(device: Device) -> Iterator[Times]:
         commands._encoder = device.wgpu_device.create_command_encoder()
         start = time.process_time()
         device.queue.submit([recorded])
-        done.read("uint32", (4,))
+        done.read()
         return 1e3 * (time.process_time() - start) / processors
 
     empty = statistics.median(submit(Commands(device)) for _ in range(9))  # what asking for nothing takes
 
-    def alone(commands: Commands, kernel: Kernel, groups: tuple[int, int], **buffers: Any) -> None:
+    def alone(commands: Commands, kernel: Kernel, groups: tuple[int, int], **arrays: DeviceArray) -> None:
         if min(groups) > 0:
-            parts = kernel.parts(buffers)
             for name, binding in kernel.bindings.items():
                 if binding.kind == "texture":
-                    commands._texture(parts[name], binding.type)
+                    commands._texture(arrays[name], binding.type)
             times.append((COPIES, max(0.0, submit(commands) - empty)))
-            dispatch_grid(commands, kernel, groups, **buffers)
+            dispatch_grid(commands, kernel, groups, **arrays)
             times.append((kernel.name, max(0.0, submit(commands) - empty)))
 
     with mock.patch.object(Commands, "dispatch_grid", alone):

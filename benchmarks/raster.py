@@ -13,9 +13,11 @@ from passes import Meter, PassTimes
 from work import SceneCounts, count_scene, raster_work
 
 from lapgs_wgpu import Camera, rasterize
-from lapgs_wgpu.gpu.buffer import Buffer
+from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.splat.rasterizer import GaussianBuffers, Rasterizer
+from lapgs_wgpu.splat.drawing import Drawing
+from lapgs_wgpu.splat.gaussians import Gaussians
+from lapgs_wgpu.splat.rasterizer import Rasterizer
 
 NAMES = ("means", "quats", "scales", "opacities", "colors")
 
@@ -44,30 +46,28 @@ def bench_raster(
 ) -> RasterReport:
     """Time the scene on the device. The gradient of the image is random, of unit variance."""
     rasterizer = Rasterizer(device)
-    means, quats, scales, opacities, colors = (_buffer(device, name, arrays[name]) for name in NAMES)
-    gaussians = GaussianBuffers(len(arrays["means"]), means, quats, scales, opacities, colors, None, 1)
+    gaussians = Gaussians(*(DeviceArray.upload(device, name, arrays[name]) for name in NAMES))
     rng = np.random.default_rng(1)
     gradient = rng.standard_normal((4, camera.height, camera.width), np.float32)
-    d_image = _buffer(device, "d_image", gradient)
+    d_image = DeviceArray.upload(device, "d_image", gradient)
 
-    def forward() -> None:
+    def forward() -> Drawing:
         while True:
-            rasterizer.draw(gaussians, camera)
-            if not rasterizer.grow():  # which waits
-                return
+            drawing = rasterizer.draw(gaussians, camera)
+            if not rasterizer.grow_on_overflow(drawing):  # which waits
+                return drawing
 
     def forward_backward() -> None:
-        rasterizer.draw(gaussians, camera)
-        rasterizer.backward(d_image)
-        rasterizer.grow()
+        drawing = rasterizer.draw(gaussians, camera)
+        rasterizer.backward(drawing, d_image)
+        rasterizer.grow_on_overflow(drawing)
 
     forward()
     whole = timed(forward, repeat), timed(forward_backward, repeat)
-    counts = count_scene(rasterizer)
+    counts = count_scene(rasterizer, forward())
 
     def submit() -> None:
-        rasterizer.draw(gaussians, camera)
-        rasterizer.backward(d_image)
+        rasterizer.backward(rasterizer.draw(gaussians, camera), d_image)
 
     passes = meter(submit, raster_work(counts, rasterizer), repeat) if meter else None
 
@@ -88,7 +88,7 @@ def bench_raster(
     torch_whole = timed(torch_forward, repeat), timed(torch_forward_backward, repeat)
     return RasterReport(
         counts,
-        dataclasses.asdict(rasterizer.shape),
+        dataclasses.asdict(rasterizer.config),
         passes,
         forward=whole[0],
         forward_backward=whole[1],
@@ -96,9 +96,3 @@ def bench_raster(
         torch_forward_backward=torch_whole[1],
         torch_traffic=traffic(torch_forward_backward),
     )
-
-
-def _buffer(device: Device, name: str, array: NDArray[np.float32]) -> Buffer:
-    buffer = Buffer(device, array.nbytes, name)
-    buffer.write(array)
-    return buffer

@@ -15,13 +15,13 @@ from measure import Timing, summary
 
 from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.data.synthetic import write_synthetic
-from lapgs_wgpu.gpu import buffer as buffer_module
+from lapgs_wgpu.gpu import array as array_module
 from lapgs_wgpu.gpu.buffer import Buffer
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands
 from lapgs_wgpu.gpu.profile import Profile
-from lapgs_wgpu.motion import hash_encoder
-from lapgs_wgpu.splat import objective
+from lapgs_wgpu.motion.fields import hash_encoder
+from lapgs_wgpu.train import fused_loss
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.optimizer import FrequencyOptimizer, Optimizer
 from lapgs_wgpu.train.presets import load_config
@@ -96,18 +96,18 @@ class _Clock:
 
     @contextmanager
     def running(self) -> Iterator[None]:
-        prepare, read_all = Commands.__init__, buffer_module.read_all
+        prepare, read_all = Commands.__init__, array_module.read_all
 
         def profiled(commands: Commands, device: Device, profile: Profile | None = None) -> None:
             prepare(commands, device, profile or self._profile)
 
         copy = self._timed(TRANSFERS, read_all)
 
-        def read_when_done(requests: Any) -> Any:
-            if not any(buffer.label == "timestamps to read" for buffer, *_ in requests):
+        def read_when_done(arrays: Any) -> Any:
+            if not any(array.buffer.label == "timestamps to read" for array in arrays):
                 self._collect()
-                return copy(requests)
-            return read_all(requests)
+                return copy(arrays)
+            return read_all(arrays)
 
         patches = [
             mock.patch.object(Commands, "__init__", profiled),
@@ -116,7 +116,7 @@ class _Clock:
             mock.patch.object(FrequencyOptimizer, "step", self._timed(OPTIMISER, FrequencyOptimizer.step)),
             *(
                 mock.patch.object(module, "read_all", read_when_done)
-                for module in (buffer_module, hash_encoder, objective)
+                for module in (array_module, hash_encoder, fused_loss)
             ),
         ]
         for patch in patches:

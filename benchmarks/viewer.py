@@ -17,7 +17,7 @@ from scene import SceneSize, make_scene
 
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.initial_view import InitialView
-from lapgs_wgpu.motion.playback import open_playback
+from lapgs_wgpu.motion.playback.playback import open_playback
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.viewer.frame import FrameRenderer, FrameRequest

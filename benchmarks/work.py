@@ -12,9 +12,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from math import sqrt
 
-from lapgs_wgpu.gpu.buffer import read_all
+from lapgs_wgpu.gpu.array import read_all
 from lapgs_wgpu.gpu.kernel import Commands
-from lapgs_wgpu.motion.hashgrid import GridShape
+from lapgs_wgpu.motion.fields.hash_grid_config import GridShape
+from lapgs_wgpu.splat.drawing import Drawing
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 
 SPLAT = 48  # bytes; common/splat.wgsl
@@ -50,39 +51,34 @@ class SceneCounts:
     bands: int
 
 
-def count_scene(rasterizer: Rasterizer) -> SceneCounts:
+def count_scene(rasterizer: Rasterizer, drawing: Drawing) -> SceneCounts:
     """Of the image that was drawn last, whose bands are drawn once more."""
-    last = rasterizer._drawn
-    assert last is not None
-    pool, shape, camera = rasterizer.pool, rasterizer.shape, last.camera
+    config, camera = rasterizer.config, drawing.camera
     visible = intersections = drawn = tiles = 0
-    for band in range(rasterizer.bands):
+    for band in range(drawing.plan.bands):
         with Commands(rasterizer.device) as commands:
-            rasterizer._draw_band(commands, last, band)
-        here = rasterizer._band_tiles(last, band)
-        seen, needed, ranges = read_all(
-            [
-                (pool.get("visible", 4), "uint32", (1,), 0),
-                rasterizer.needed_requests()[band],
-                (pool.get("ranges", 0), "uint32", (here, 4), 0),
-            ]
-        )
+            lists = rasterizer._draw_band(commands, drawing, band)
+        here = rasterizer._band_tiles(drawing, band)
+        seen, needed, ranges = read_all([lists.visible, drawing.needed[band], lists.ranges.rows(0, here)])
         visible, intersections, tiles = visible + int(seen[0]), intersections + int(needed[0]), tiles + here
         listed = ranges[ranges[:, 1] > 0]
         drawn += int((listed[:, 2] - listed[:, 0]).sum())
-    pairs = drawn * shape.tile_width * shape.tile_height
+    pairs = drawn * config.tile_width * config.tile_height
     pixels = camera.width * camera.height
-    return SceneCounts(last.gaussians.count, visible, intersections, drawn, pairs, tiles, pixels, rasterizer.bands)
+    return SceneCounts(len(drawing.gaussians), visible, intersections, drawn, pairs, tiles, pixels, drawing.plan.bands)
 
 
 def raster_work(scene: SceneCounts, rasterizer: Rasterizer) -> dict[str, Work]:
     """Shader -> all its dispatches in a forward and backward pass, for given colours, without depth."""
     n, v, i = scene.gaussians * scene.bands, scene.visible, scene.intersections
-    lanes = scene.drawn * rasterizer.shape.lanes  # a lane does this much for its column of each drawn splat
+    lanes = scene.drawn * rasterizer.config.lanes  # a lane does this much for its column of each drawn splat
     rows = sqrt(v * i)  # of tiles, over all splats, as if each touched as many rows as columns
     depth, tile = (
         _sort_counters(rasterizer, capacity, bits)
-        for capacity, bits in ((scene.gaussians, 32), (rasterizer.capacity, (scene.tiles // scene.bands).bit_length()))
+        for capacity, bits in (
+            (scene.gaussians, 32),
+            (rasterizer.plan.capacity, (scene.tiles // scene.bands).bit_length()),
+        )
     )
     keys = depth.passes * v + tile.passes * i
     counters = scene.bands * (depth.passes * depth.counters + tile.passes * tile.counters)
@@ -95,8 +91,8 @@ def raster_work(scene: SceneCounts, rasterizer: Rasterizer) -> dict[str, Work]:
         "compact": Work(4 * n + 28 * v),
         "sort_count": Work(4 * keys + 4 * counters, 4 * keys),
         "sort_scatter": Work(16 * keys - 4 * i + 4 * counters, 5 * keys),  # the first tile digit has no payload to read
-        "emit": Work((12 + SPLAT) * v + 8 * i, 20 * v + 55 * rows + 3 * i),
-        "ranges": Work(6 * i + 16 * scene.tiles, 6 * i),
+        "duplicate_with_keys": Work((12 + SPLAT) * v + 8 * i, 20 * v + 55 * rows + 3 * i),
+        "tile_ranges": Work(6 * i + 16 * scene.tiles, 6 * i),
         "rasterize": Work(
             BATCH_BYTES * scene.drawn + 16 * scene.pixels + 20 * scene.tiles, 16 * scene.pairs + 14 * lanes, scene.pairs
         ),
@@ -121,9 +117,9 @@ class _Sort:
 
 
 def _sort_counters(rasterizer: Rasterizer, capacity: int, bits: int) -> _Sort:
-    """As gpu/primitives.RadixSort divides the keys."""
+    """As gpu/radix_sort.RadixSort divides the keys."""
     bits = max(1, bits)
-    if rasterizer.shape.lane_runs:
+    if rasterizer.config.lane_runs:
         passes = -(-bits // 8)
         return _Sort(passes, (1 << -(-bits // passes)) * 8 * min(128, max(4, capacity // (8 * 4096))))
     return _Sort(-(-bits // 4), 16 * -(-capacity // 2048))

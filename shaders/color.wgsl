@@ -38,7 +38,7 @@ fn main(
     var color = vec3(SH_OFFSET);
 #unroll c $SH_COUNT
     {
-        let at = 3u * (k * u32($SH_STORED) + $(c)u);
+        let at = 3u * (k * u32(SH_COUNT) + $(c)u);
         color += basis[$c] * vec3(colors_at(at), colors_at(at + 1u), colors_at(at + 2u));
     }
 #end

@@ -31,7 +31,7 @@ fn main(
     let d1 = d_splats_at(i * SPLAT_STRIDE + 1u);
     let d2 = d_splats_at(i * SPLAT_STRIDE + 2u);
     if (d2.z == 0.0) {
-        for (var at = 3u * k * u32($SH_STORED); at < 3u * (k + 1u) * u32($SH_STORED); at++) {
+        for (var at = 3u * k * u32(SH_COUNT); at < 3u * (k + 1u) * u32(SH_COUNT); at++) {
             d_colors[at] = 0.0;
         }
         return;
@@ -45,7 +45,7 @@ fn main(
     var color = vec3(SH_OFFSET);
 #unroll c $SH_COUNT
     {
-        let at = 3u * (k * u32($SH_STORED) + $(c)u);
+        let at = 3u * (k * u32(SH_COUNT) + $(c)u);
         coefficients[$c] = vec3(colors_at(at), colors_at(at + 1u), colors_at(at + 2u));
         color += basis[$c] * coefficients[$c];
     }
@@ -54,16 +54,13 @@ fn main(
     var weights: array<f32, SH_COUNT>;
 #unroll c $SH_COUNT
     {
-        let at = 3u * (k * u32($SH_STORED) + $(c)u);
+        let at = 3u * (k * u32(SH_COUNT) + $(c)u);
         weights[$c] = dot(d_color, coefficients[$c]);
         d_colors[at] = basis[$c] * d_color.x;
         d_colors[at + 1u] = basis[$c] * d_color.y;
         d_colors[at + 2u] = basis[$c] * d_color.z;
     }
 #end
-    for (var at = 3u * (k * u32($SH_STORED) + u32(SH_COUNT)); at < 3u * (k + 1u) * u32($SH_STORED); at++) {
-        d_colors[at] = 0.0;   // degrees that were not used
-    }
     let d_direction = sh_basis_gradient(direction, weights);
     let d_mean = (d_direction - direction * dot(direction, d_direction)) / distance;
     d_means[3u * i] += d_mean.x;

@@ -2,6 +2,8 @@
 // opacities and colours. A lane holds POINTS Gaussians and goes through the decoder's channels, QUADS quads of them a round,
 // so that a weight that is read serves several Gaussians and a feature several channels.
 // MOTION: with the Laplacian motion, whose second layer and spectrum are folded into the heads. COLOR: colours change, too.
+#import common/constants
+#import common/gate
 #import common/index
 
 struct Deform {
@@ -19,7 +21,6 @@ const POINTS: u32 = $POINTS;
 const HEADS: u32 = $HEADS;   // quads of outputs: turn; quaternion; shift, opacity; scales; and with COLOR colour
 const CANONICAL = 4u;        // quads of a Gaussian before its still features
 const LANES = 64u;
-const MIN_SCALE = 1e-7;
 
 @group(0) @binding(0) var<uniform> deform: Deform;
 // rows of: mean, opacity logit; quaternion; scales, -; colour, -; then the features that do not depend on time
@@ -144,7 +145,7 @@ fn main(
 #unroll c $QUADS
         {
 #unroll p $POINTS
-            var gated$p = max(hidden[$p * $QUADS + $c], vec4(0.0)) * (2.0 / (1.0 + exp(-gate[$p * $QUADS + $c])) - 1.0);
+            var gated$p = gated(hidden[$p * $QUADS + $c], gate[$p * $QUADS + $c]);
 #ifdef MOTION
             var motion$p = max(inner[$p * $QUADS + $c], vec4(0.0));
 #endif

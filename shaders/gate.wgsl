@@ -1,5 +1,5 @@
 // From the layers' outputs to what the heads read.
-#import common/gate
+#import common/gate_layers
 
 @group(0) @binding(1) var<storage, read> layers: array<f32>;            // (N, LAYERS, width)
 @group(0) @binding(2) var<storage, read_write> features: array<f32>;    // (N, FEATURES, width)
@@ -17,7 +17,7 @@ fn main(
     let channel = number % gate.width;
     let layer = number / gate.width * LAYERS * gate.width + channel;
     let feature = number / gate.width * FEATURES * gate.width + channel;
-    features[feature] = max(layers[layer + (LAYERS - 1u) * gate.width], 0.0) * safe_tanh(layers[layer]);
+    features[feature] = gated(layers[layer + (LAYERS - 1u) * gate.width], layers[layer]);
 #ifdef MOTION
     features[feature + gate.width] = max(layers[layer + gate.width], 0.0);
 #endif

@@ -1,5 +1,5 @@
 // The gradient of the layers' outputs, from that of what the heads read.
-#import common/gate
+#import common/gate_layers
 
 @group(0) @binding(1) var<storage, read> d_features: array<f32>;       // (N, FEATURES, width)
 @group(0) @binding(2) var<storage, read_write> layers: array<f32>;     // (N, LAYERS, width), which becomes its gradient
@@ -18,7 +18,7 @@ fn main(
     let layer = number / gate.width * LAYERS * gate.width + channel;
     let feature = number / gate.width * FEATURES * gate.width + channel;
     let temporal = layer + (LAYERS - 1u) * gate.width;
-    let open = safe_tanh(layers[layer]);
+    let open = opening(layers[layer]);
     let d_gated = d_features[feature];
     layers[layer] = d_gated * max(layers[temporal], 0.0) * (1.0 - open * open);
     layers[temporal] = select(0.0, d_gated * open, layers[temporal] > 0.0);

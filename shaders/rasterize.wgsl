@@ -94,7 +94,7 @@ fn main(
 #endif
         for (var j = 0u; j < count; j++) {
 #ifdef SUBGROUPS
-            let s = hand_round(mine, j);
+            let s = broadcast(mine, j);
 #else
             let s = batch[j];
 #endif

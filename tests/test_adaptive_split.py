@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from lapgs_wgpu.splat.reference import rotation
+from lapgs_wgpu.splat.rotation import rotation_matrices
 from lapgs_wgpu.train import adaptive_split as module
 from lapgs_wgpu.train.adaptive_split import (
     adaptive_split,
@@ -136,7 +136,7 @@ def test_rotating_the_world_changes_no_score() -> None:
     w, axis = turn[:1] / turn.norm(), turn[1:] / turn.norm()
     real, imaginary = rows["quats"][:, :1], rows["quats"][:, 1:]
     turned = rows | {
-        "means": rows["means"] @ rotation(turn[None])[0].T,
+        "means": rows["means"] @ rotation_matrices(turn[None])[0].T,
         "quats": torch.cat(  # the quaternions' product, turn first
             [
                 w * real - imaginary @ axis[:, None],

@@ -135,12 +135,12 @@ def test_bytes_are_equal_in_every_process(tmp_path: Path) -> None:
 import sys
 import numpy as np
 from lapgs_wgpu.io.checkpoint import write_checkpoint
-from lapgs_wgpu.io.ply import StillGaussians
+from lapgs_wgpu.io.ply import GaussianSnapshot
 names = set("abcdefghijkl")  # a set: its order differs between processes
 x = np.arange(48, dtype=np.float32)
 write_checkpoint(
     sys.argv[1],
-    StillGaussians(x[:9].reshape(3, 3), x[:9].reshape(3, 1, 3), x[:3], x[:9].reshape(3, 3), x[:12].reshape(3, 4)),
+    GaussianSnapshot(x[:9].reshape(3, 3), x[:9].reshape(3, 1, 3), x[:3], x[:9].reshape(3, 3), x[:12].reshape(3, 4)),
     {name: np.full(3, ord(name), np.float32) for name in names},
     {name: name.upper() for name in names},
 )

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from lapgs_wgpu.errors import InputError
-from lapgs_wgpu.motion.field import FieldConfig
+from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.train.config import Config, DiscoveryConfig, ExposureConfig, Rate
 from lapgs_wgpu.train.presets import ABLATIONS, config_keys, load_config, preset_names, write_toml
 

@@ -14,17 +14,20 @@ from helpers.scenes import step as torch_step
 from helpers.stages import watch
 from wgpu.backends.wgpu_native import GPUBuffer, GPUQueue
 
+from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.buffer import Buffer
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Kernel
-from lapgs_wgpu.motion.field import FieldConfig, Nearby
-from lapgs_wgpu.motion.grid_field import GridField
-from lapgs_wgpu.motion.hashgrid import HashConfig
+from lapgs_wgpu.motion.fields.config import FieldConfig
+from lapgs_wgpu.motion.fields.deformation import Nearby
+from lapgs_wgpu.motion.fields.grid_field import GridField
+from lapgs_wgpu.motion.fields.hash_grid_config import HashConfig
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterize import rasterizer_of
 from lapgs_wgpu.splat.rasterizer import Rasterizer
+from lapgs_wgpu.train.fused_loss import image_loss_of, render_loss
 from lapgs_wgpu.train.losses import LossWeights
-from lapgs_wgpu.train.render_loss import TruthCache, image_loss_of, render_loss
+from lapgs_wgpu.train.truth_cache import TruthCache
 
 pytestmark = pytest.mark.kernels
 
@@ -111,7 +114,7 @@ def test_dispatches_a_step(device: Device, scene: Scene, truths: TruthCache, eve
     """By the plan: what a sort needs follows from the width of its digits, all else is counted."""
     step(scene, truths, device)
     names = [event.name for event in events if event.kind == "dispatch"]
-    shape = rasterizer_of(device).shape
+    shape = rasterizer_of(device).config
     tiles = math.ceil(CAMERA.width / shape.tile_width) * math.ceil(CAMERA.height / shape.tile_height)
     widest = 8 if shape.lane_runs else 4
     digits = math.ceil(32 / widest) + math.ceil(tiles.bit_length() / widest)
@@ -180,14 +183,13 @@ def test_no_buffer_is_made_for_nothing(
     """A pass works with each buffer that the rasteriser holds."""
     rasterizer = use(Rasterizer(device))
     bound: set[Buffer] = set()
-    parts = Kernel.parts
+    check = Kernel.check
 
-    def spy(self: Kernel, buffers: dict[str, Any]) -> dict[str, tuple[Buffer, int, int]]:
-        found = parts(self, buffers)
-        bound.update(buffer for buffer, _, _ in found.values())
-        return found
+    def spy(self: Kernel, arrays: dict[str, DeviceArray]) -> None:
+        bound.update(array.buffer for array in arrays.values())
+        check(self, arrays)
 
-    monkeypatch.setattr(Kernel, "parts", spy)
+    monkeypatch.setattr(Kernel, "check", spy)
     torch_step(scene, oblique_camera(200, 120), device, sh_degree=DEGREE)  # of so many tiles that no sort has one pass
     assert [name for name, buffer in rasterizer.pool._buffers.items() if buffer not in bound] == []
 

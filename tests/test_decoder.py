@@ -12,13 +12,15 @@ from helpers.matrices import on_device, random, read
 from helpers.scenes import relative
 from torch import Tensor
 
-from lapgs_wgpu.gpu.buffer import Buffer
+from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
-from lapgs_wgpu.motion.decoder import Decoder
-from lapgs_wgpu.motion.device_decoder import DecoderShape
-from lapgs_wgpu.motion.field import FieldConfig, Nearby
-from lapgs_wgpu.motion.grid_field import GridField
+from lapgs_wgpu.motion.fields.config import FieldConfig
+from lapgs_wgpu.motion.fields.decoder import Decoder
+from lapgs_wgpu.motion.fields.deformation import Nearby
+from lapgs_wgpu.motion.fields.gate import gated
+from lapgs_wgpu.motion.fields.grid_field import GridField
+from lapgs_wgpu.motion.passes.decoder_passes import DecoderShape
 
 pytestmark = pytest.mark.kernels
 
@@ -35,8 +37,8 @@ FIELDS = {
 
 def gate_reference(layers: Tensor, *, motion: bool) -> Tensor:
     """(N, layers, width) -> (N, features, width)."""
-    gated = torch.relu(layers[:, -1]) * torch.tanh(layers[:, 0])
-    return torch.stack([gated, torch.relu(layers[:, 1])], dim=1) if motion else gated[:, None]
+    features = gated(layers[:, -1], layers[:, 0])
+    return torch.stack([features, torch.relu(layers[:, 1])], dim=1) if motion else features[:, None]
 
 
 @pytest.mark.parametrize("motion", [False, True])
@@ -46,8 +48,7 @@ def test_gate(device: Device, count: int, width: int, *, motion: bool) -> None:
     layers[0, 0, 0], layers[-1, 0, -1] = 200.0, -200.0  # a quotient of exponentials would overflow
     options = {"MOTION": 1} if motion else {}
     forth, back = Kernel.get(device, "gate", **options), Kernel.get(device, "gate_bwd", **options)
-    uniform = Buffer(device, 16, "gate")
-    uniform.write(torch.tensor([count, width], dtype=torch.int32).numpy())
+    uniform = DeviceArray.upload(device, "gate", np.array([count, width], np.uint32))
     exact = layers.double().requires_grad_()
     expected = gate_reference(exact, motion=motion)
     d_features = random(*expected.shape, seed=1)
@@ -58,17 +59,17 @@ def test_gate(device: Device, count: int, width: int, *, motion: bool) -> None:
         commands.dispatch(forth, groups, gate=uniform, layers=of_layers, features=features)
         d = on_device(device, d_features)
         commands.dispatch(back, groups, gate=uniform, d_features=d, layers=of_layers)
-    torch.testing.assert_close(read(features, *expected.shape).double(), expected.detach(), rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(read(features).double(), expected.detach(), rtol=1e-5, atol=1e-6)
     # 1 - tanh^2 loses what little is left of a gate that is wide open.
-    torch.testing.assert_close(read(of_layers, *layers.shape).double(), d_expected, rtol=1e-5, atol=5e-6)
+    torch.testing.assert_close(read(of_layers).double(), d_expected, rtol=1e-5, atol=5e-6)
 
 
 def test_smoothness(device: Device) -> None:
     """Sums of squared differences, and their gradients in place of the features."""
     here, there, scale = random(70, 6), random(70, 6, seed=1), 2 * 0.7
     forth, back = Kernel.get(device, "smoothness"), Kernel.get(device, "smoothness_bwd")
-    uniform = Buffer(device, 16, "smoothness")
-    uniform.write(np.frombuffer(forth.uniform("Smoothness", pairs=70, features=6, scale=scale), np.uint8))
+    content = np.frombuffer(forth.uniform("Smoothness", pairs=70, features=6, scale=scale), np.uint8)
+    uniform = DeviceArray.upload(device, "smoothness", content)
     a, b, sums = on_device(device, here), on_device(device, there), on_device(device, torch.full((70,), torch.nan))
     with Commands(device) as commands:
         commands.dispatch(forth, 2, smoothness=uniform, here=a, there=b, sums=sums)
@@ -76,9 +77,9 @@ def test_smoothness(device: Device) -> None:
     of_here, of_there = here.double().requires_grad_(), there.double().requires_grad_()
     exact = (of_there - of_here).square().sum(dim=1)
     (0.7 * exact.sum()).backward()
-    assert relative(read(sums, 70), exact.detach()) < 1e-6
-    assert relative(read(a, 70, 6), of_here.grad) < 1e-6
-    assert relative(read(b, 70, 6), of_there.grad) < 1e-6
+    assert relative(read(sums), exact.detach()) < 1e-6
+    assert relative(read(a), of_here.grad) < 1e-6
+    assert relative(read(b), of_there.grad) < 1e-6
 
 
 def values_and_gradients(

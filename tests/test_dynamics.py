@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from lapgs_wgpu.motion.dynamics import DynamicsMode, dynamics_loss, outliers
+from lapgs_wgpu.motion.fields.dynamics import DynamicsMode, dynamics_loss, outliers
 
 
 def column(values: list[float]) -> Tensor:

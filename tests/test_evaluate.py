@@ -15,12 +15,12 @@ from scipy.signal import convolve2d
 
 from lapgs_wgpu.data.views import View
 from lapgs_wgpu.errors import InputError
-from lapgs_wgpu.gpu.buffer import Buffer
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.safetensors_file import pack_tensors
-from lapgs_wgpu.motion.field import FieldConfig
+from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.splat.drawing import Drawing
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 from lapgs_wgpu.train.evaluate import evaluate, side_by_side, to_8_bit, write_metrics
 from lapgs_wgpu.train.losses import MS_SSIM_SMALLEST, masked_ssim, ms_ssim, psnr
@@ -81,7 +81,7 @@ def test_no_depth_is_drawn(scene: Scene4D, monkeypatch: pytest.MonkeyPatch) -> N
     asked = []
     draw = Rasterizer.draw
 
-    def spy(self: Rasterizer, *arguments: Any, depth: bool = False, **options: Any) -> Buffer:
+    def spy(self: Rasterizer, *arguments: Any, depth: bool = False, **options: Any) -> Drawing:
         asked.append(depth)
         return draw(self, *arguments, depth=depth, **options)
 

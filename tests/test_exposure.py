@@ -1,4 +1,4 @@
-"""Exposure: the passes against their twin, the corrections, and what they are for."""
+"""Exposure: the passes against their reference, the corrections, and what they are for."""
 
 from __future__ import annotations
 
@@ -21,17 +21,18 @@ from numpy.typing import NDArray
 from lapgs_wgpu.data import Dataset, load_dataset
 from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.data.views import View, composite
-from lapgs_wgpu.gpu.buffer import Buffer
+from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands
 from lapgs_wgpu.splat.rasterize import rasterize
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 from lapgs_wgpu.train.config import Rate
 from lapgs_wgpu.train.exposure import ExposurePasses, Exposures, exposure
+from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
 from lapgs_wgpu.train.losses import total
-from lapgs_wgpu.train.render_loss import RenderLoss, render_loss, upload_rgba
 from lapgs_wgpu.train.run import resume, train
 from lapgs_wgpu.train.trainer import Trainer
+from lapgs_wgpu.train.truth_cache import upload_rgba
 
 CORRECTION = torch.tensor([[0.9, 0.1, -0.05, 0.02], [0.03, 1.2, 0.0, -0.1], [-0.02, 0.05, 0.8, 0.2]])
 IDENTITY = torch.eye(3, 4)
@@ -50,16 +51,14 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 @pytest.mark.kernels
 @pytest.mark.parametrize("size", [(1, 1), (3, 5), (12, 30), (37, 61), (64, 200)])
 def test_exposure(device: Device, size: tuple[int, int]) -> None:
-    """The image, and its gradient to the image and to the correction, are the twin's in float64."""
+    """The image, and its gradient to the image and to the correction, are the reference's in float64."""
     rng = np.random.default_rng(size[0])
     image, d_exposed = (rng.random((4, *size), np.float32) for _ in range(2))
     passes = ExposurePasses(device)
-    drawn, d = Buffer(device, image.nbytes, "image"), Buffer(device, image.nbytes, "d_exposed")
-    drawn.write(image)
-    d.write(d_exposed)
+    drawn, d = DeviceArray.upload(device, "image", image), DeviceArray.upload(device, "d_exposed", d_exposed)
     with Commands(device) as commands:
-        exposed = passes.record(commands, drawn, size, CORRECTION)
-        back = passes.record_bwd(commands, drawn, d, size, CORRECTION)
+        exposed = passes.record(commands, drawn, CORRECTION)
+        back = passes.record_bwd(commands, drawn, d, CORRECTION)
 
     def tensor(planes: NDArray[np.float32]) -> torch.Tensor:
         return torch.from_numpy(planes[:3]).permute(1, 2, 0).double()
@@ -69,17 +68,17 @@ def test_exposure(device: Device, size: tuple[int, int]) -> None:
     expected.backward(tensor(d_exposed))
     assert leaves[0].grad is not None
     assert leaves[1].grad is not None
-    found = tensor(exposed.read("float32", (4, *size)))
+    found = tensor(exposed.read())
     torch.testing.assert_close(found, expected.detach(), rtol=0, atol=1e-6)
-    d_image = back.d_image.read("float32", (4, *size))
+    d_image = back.d_image.read()
     assert relative(tensor(d_image), leaves[0].grad) < 1e-6
     assert (d_image[3] == 0).all()
-    d_rows = back.d_rows.read("float32", (size[0], 3, 4)).astype(np.float64)
+    d_rows = back.d_rows.read().astype(np.float64)
     assert relative(torch.from_numpy(d_rows.sum(axis=0)), leaves[1].grad) < 1e-5
 
 
 @pytest.mark.kernels
-def test_a_step_is_that_of_the_rasteriser_and_the_twins(device: Device) -> None:
+def test_a_step_is_that_of_the_rasteriser_and_the_references(device: Device) -> None:
     scene, other = gaussians(), gaussians()
     mine, theirs = (CORRECTION.clone().requires_grad_() for _ in range(2))
     done = render_loss(scene, CAMERA, upload_rgba(device, TRUTH), BACKGROUND, WEIGHTS["all"], device, mine)

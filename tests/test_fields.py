@@ -10,13 +10,13 @@ from helpers.fields import COUNT, DYNAMICS, NEARBY, OURS, POINTS, ROWS, grid_fie
 from torch import Tensor, nn
 
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.motion import grid_field as grid_field_module
-from lapgs_wgpu.motion.field import PLANES, FieldKind
-from lapgs_wgpu.motion.hash_encoder import encode_reference
-from lapgs_wgpu.motion.hexplane_field import HexPlaneField
-from lapgs_wgpu.motion.laplacian import LaplacianMotion, TimeMotion
-from lapgs_wgpu.motion.layers import last_product
-from lapgs_wgpu.motion.mlp_field import MlpField, octaves
+from lapgs_wgpu.motion.fields import grid_field as grid_field_module
+from lapgs_wgpu.motion.fields.config import PLANES, FieldKind
+from lapgs_wgpu.motion.fields.hash_encoder import encode_reference
+from lapgs_wgpu.motion.fields.hexplane_field import HexPlaneField
+from lapgs_wgpu.motion.fields.laplacian import LaplacianMotion, TimeMotion
+from lapgs_wgpu.motion.fields.layers import last_product
+from lapgs_wgpu.motion.fields.mlp_field import MlpField, octaves
 from lapgs_wgpu.motion.scene import make_field
 
 KINDS: tuple[FieldKind, ...] = ("mlp", "hexplane", "grid4d", "laplacian")
@@ -247,7 +247,7 @@ def test_smoothness_of_grids_written_out(device: Device) -> None:
     assert torch.equal(without.translation, field(POINTS, 0.3, DYNAMICS, NEARBY).translation)
     found.backward()
     gradients = [grid.table.grad for grid in field.grids]
-    # A place that is asked for twice: its gradient by the twin.
+    # A place that is asked for twice: its gradient by the reference.
     tables = [grid.table.detach().clone().requires_grad_() for grid in field.grids]
     total = torch.zeros(())
     for number, (grid, table) in enumerate(zip(field.grids, tables, strict=True)):

@@ -27,7 +27,7 @@ from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu import device as device_module
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.ply import read_ply
-from lapgs_wgpu.motion.field import FieldConfig
+from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.presets import write_toml

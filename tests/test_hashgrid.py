@@ -1,4 +1,4 @@
-"""The hash encoder's kernels against its plain-torch twin."""
+"""The hash encoder's kernels against its torch reference."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from helpers.scenes import relative
 from torch import Tensor
 
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.motion.hash_encoder import HashEncoder, HashGrid, encode_reference
-from lapgs_wgpu.motion.hashgrid import TIME, HashConfig, make_levels
+from lapgs_wgpu.motion.fields.hash_encoder import HashEncoder, HashGrid, encode_reference
+from lapgs_wgpu.motion.fields.hash_grid_config import TIME, HashConfig, make_levels
 
 pytestmark = pytest.mark.kernels
 
@@ -87,7 +87,7 @@ def check(encoder: HashEncoder, points: Tensor, time: float) -> None:
         assert relative(found, exact) < 2e-6
 
 
-# The twin against a loop over points, levels and corners, in plain numbers
+# The reference against a loop over points, levels and corners, in plain numbers
 
 
 def encode_by_hand(grid: HashGrid, point: list[float], time: float) -> list[float]:
@@ -116,7 +116,7 @@ def encode_by_hand(grid: HashGrid, point: list[float], time: float) -> list[floa
 
 
 @pytest.mark.parametrize("name", GRIDS)
-def test_the_twin_is_the_loop(name: str) -> None:
+def test_the_reference_is_the_loop(name: str) -> None:
     (grid,) = make_grids(name)
     points = random_points(40).double()
     found = encode_reference(grid, grid.table.double(), points, 0.37, BOUND)
@@ -124,7 +124,7 @@ def test_the_twin_is_the_loop(name: str) -> None:
         assert row == pytest.approx(encode_by_hand(grid, point, 0.37), abs=1e-9)
 
 
-# Against the twin
+# Against the reference
 
 
 @both_shapes

@@ -47,7 +47,7 @@ from PIL import Image
 from lapgs_wgpu.data import Dataset, load_dataset
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.initial_view import InitialView
-from lapgs_wgpu.motion.playback import open_playback
+from lapgs_wgpu.motion.playback.playback import open_playback
 from lapgs_wgpu.motion.scene_file import read_scene
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.log import Log

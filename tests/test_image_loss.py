@@ -1,4 +1,4 @@
-"""The kernels of the image losses against their twins in float64, and a step in which nothing but losses comes back."""
+"""The kernels of the image losses against their references in float64, and a step that reads back losses alone."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from helpers.scenes import relative
 from numpy.typing import NDArray
 
 from lapgs_wgpu.data.views import composite
-from lapgs_wgpu.gpu.buffer import Buffer
+from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterize import rasterize
 from lapgs_wgpu.splat.rasterizer import Rasterizer
-from lapgs_wgpu.train import losses
-from lapgs_wgpu.train import render_loss as render_loss_module
-from lapgs_wgpu.train.image_loss import TERMS, ImageLoss
+from lapgs_wgpu.train import fused_loss, losses
+from lapgs_wgpu.train.fused_loss import RenderLoss
+from lapgs_wgpu.train.image_loss import ImageLoss
 from lapgs_wgpu.train.losses import LossWeights, total
-from lapgs_wgpu.train.render_loss import RenderLoss, TruthCache, upload_rgba
+from lapgs_wgpu.train.truth_cache import TruthCache, upload_rgba
 
 pytestmark = pytest.mark.kernels
 
@@ -58,15 +58,15 @@ def record(
 ) -> tuple[NDArray[np.float32], Picture]:
     """Terms (5,) and gradient (H, W, 3)."""
     height, width = pair.image.shape[:2]
-    image = Buffer(losses.device, 16 * height * width, "image")
-    image.write(np.concatenate([pair.image.transpose(2, 0, 1), np.full((1, height, width), np.nan, np.float32)]))
+    planes = np.concatenate([pair.image.transpose(2, 0, 1), np.full((1, height, width), np.nan, np.float32)])
+    image = DeviceArray.upload(losses.device, "image", planes)
     truth = upload_rgba(losses.device, pair.truth)
     with Commands(losses.device) as commands:
-        done = losses.record(commands, image, truth, (height, width), background, weights, gradient=True)
+        done = losses.record(commands, image, truth, background, weights, gradient=True)
     assert done.d_image is not None
-    planes = done.d_image.read("float32", (4, height, width))
+    planes = done.d_image.read()
     assert (planes[3] == 0).all()
-    return done.terms.read("float32", (TERMS,)), planes[:3].transpose(1, 2, 0)
+    return done.terms.read(), planes[:3].transpose(1, 2, 0)
 
 
 def smooth_pair(height: int, width: int) -> Pair:
@@ -78,7 +78,7 @@ def loss_of(terms: NDArray[np.float32], weights: LossWeights) -> float:
     return float(np.dot(terms.astype(float), [weights.l1, 0, weights.ssim, weights.pyramid, weights.ncc]))
 
 
-def twin(pair: Pair, weights: LossWeights) -> tuple[float, torch.Tensor]:
+def reference(pair: Pair, weights: LossWeights) -> tuple[float, torch.Tensor]:
     image = torch.from_numpy(pair.image).double().requires_grad_()
     loss = total(image, torch.from_numpy(pair.truth.astype(np.float32) / np.float32(255)).double(), weights)
     loss.backward()
@@ -88,7 +88,7 @@ def twin(pair: Pair, weights: LossWeights) -> tuple[float, torch.Tensor]:
 
 def check(losses: ImageLoss, pair: Pair, weights: LossWeights) -> None:
     terms, gradient = record(losses, pair, weights)
-    expected, expected_gradient = twin(pair, weights)
+    expected, expected_gradient = reference(pair, weights)
     assert loss_of(terms, weights) == pytest.approx(expected, rel=1e-5, abs=1e-6)
     assert relative(torch.from_numpy(gradient.copy()), expected_gradient) < 1e-4
 
@@ -98,7 +98,7 @@ def image_loss(device: Device) -> ImageLoss:
     return ImageLoss(device)
 
 
-# Against the twins
+# Against the references
 
 
 @pytest.mark.parametrize("name", WEIGHTS)
@@ -132,7 +132,7 @@ def test_mean_squared_error(image_loss: ImageLoss) -> None:
     assert terms[1] == pytest.approx(np.square(pair.image - pair.truth.astype(float) / 255).mean(), rel=1e-5)
 
 
-def test_constants_are_those_of_the_twins(device: Device) -> None:
+def test_constants_are_those_of_the_references(device: Device) -> None:
     source = Kernel.get(device, "loss_ssim_across", LANES=8).source
     numbers = source.split("array<f32, 11>(")[1].split(")")[0].split(",")
     torch.testing.assert_close(
@@ -156,7 +156,8 @@ def test_transparent_pictures_are_laid_on_the_background(
     pair = Pair(np.zeros((64, 80, 3), np.float32), rgba)
     terms, _ = record(image_loss, pair, WEIGHTS["l1"], background)
     assert terms[0] == pytest.approx(composite(rgba, background).mean(dtype=float) / 255, rel=1e-6)
-    pixels = image_loss.pool.get("pixels", 0).read("uint8", (10, 64, 8, 16))  # in strips of 8 columns
+    words = image_loss.pool.array("pixels", (10, 64, 8, 4), "uint32").read()  # in strips of 8 columns
+    pixels = words.view(np.uint8)
     laid = pixels[..., 12:15].transpose(1, 0, 2, 3).reshape(64, 80, 3)
     assert (laid == composite(rgba, background)).all()
 
@@ -181,7 +182,7 @@ def test_a_term_of_weight_0_runs_no_passes(device: Device, monkeypatch: pytest.M
 # With the rasteriser
 
 
-def test_a_step_is_that_of_the_rasteriser_and_the_twins(device: Device) -> None:
+def test_a_step_is_that_of_the_rasteriser_and_the_references(device: Device) -> None:
     scene, other = gaussians(), gaussians()
     done = step(device, scene)
     done.loss.backward()
@@ -235,11 +236,11 @@ def test_overflow_and_bands_do_not_show(device: Device, monkeypatch: pytest.Monk
     for capacity, most in ((1 << 16, 1 << 20), (16, 1 << 20), (400, 400)):
         rasterizer = Rasterizer(device, capacity=capacity)
         rasterizer.max_capacity = most
-        monkeypatch.setattr(render_loss_module, "rasterizer_of", lambda device, one=rasterizer: one)
+        monkeypatch.setattr(fused_loss, "rasterizer_of", lambda device, one=rasterizer: one)
         scene = gaussians(400)
         done = step(device, scene)
         done.loss.backward()
-        results.append((rasterizer.bands, done.loss.item(), gradients(scene, done)))
+        results.append((rasterizer.plan.bands, done.loss.item(), gradients(scene, done)))
     bands, values, found = zip(*results, strict=True)
     assert bands[:2] == (1, 1)
     assert bands[2] > 1
@@ -283,7 +284,7 @@ def test_drawing_in_between_does_no_harm(device: Device) -> None:
 def test_pictures_are_uploaded_once(device: Device) -> None:
     cache, loads = TruthCache(device, 10_000), list[str]()
 
-    def get(name: str, side: int = 20) -> Buffer:
+    def get(name: str, side: int = 20) -> DeviceArray:
         def load() -> NDArray[np.uint8]:
             loads.append(name)
             return np.full((side, side, 3), len(name), np.uint8)
@@ -291,7 +292,7 @@ def test_pictures_are_uploaded_once(device: Device) -> None:
         return cache.get(name, load)
 
     assert get("a") is get("a")
-    assert (get("a").read("uint8", (20, 20, 4)) == [1, 1, 1, 255]).all()
+    assert (get("a").read() == 0xFF010101).all()
     for name in "bcdef":  # 1600 bytes each: six fit
         get(name)
     assert loads == list("abcdef")

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from lapgs_wgpu.motion.laplacian import LaplacianMotion, TimeMotion
+from lapgs_wgpu.motion.fields.laplacian import LaplacianMotion, TimeMotion
 from lapgs_wgpu.train.config import Rate
 from lapgs_wgpu.train.optimizer import FrequencyOptimizer
 

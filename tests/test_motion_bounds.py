@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from lapgs_wgpu.motion.motion_bounds import MotionBounds
+from lapgs_wgpu.motion.playback.motion_bounds import MotionBounds
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.reference import project
 

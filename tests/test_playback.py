@@ -19,18 +19,20 @@ from helpers.training import configure
 from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.errors import InputError
-from lapgs_wgpu.gpu.buffer import BufferPool, read_all
+from lapgs_wgpu.gpu.array import DeviceArray, read_all
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.io.ply import StillGaussians, write_ply
-from lapgs_wgpu.motion import scene_playback
-from lapgs_wgpu.motion.field import FieldConfig
-from lapgs_wgpu.motion.playback import DevicePlayback, Playback, open_playback
+from lapgs_wgpu.gpu.pool import BufferPool
+from lapgs_wgpu.io.ply import GaussianSnapshot, write_ply
+from lapgs_wgpu.motion.fields.config import FieldConfig
+from lapgs_wgpu.motion.playback import torch_playback
+from lapgs_wgpu.motion.playback.playback import DevicePlayback, Playback, open_playback
+from lapgs_wgpu.motion.playback.torch_playback import TorchPlayback
 from lapgs_wgpu.motion.scene import Scene4D, load
 from lapgs_wgpu.motion.scene_file import read_scene
-from lapgs_wgpu.motion.scene_playback import ScenePlayback
 from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterize import rasterizer_of, upload_gaussians
-from lapgs_wgpu.splat.rasterizer import GaussianBuffers, Rasterizer
+from lapgs_wgpu.splat.rasterizer import Rasterizer
 from lapgs_wgpu.train.trainer import Trainer
 
 TIMES = (0.0, 0.37, 1.0)
@@ -42,9 +44,9 @@ def picture(playback: Playback, t: float, camera: Camera = CAMERA, *, passing: b
     rasterizer = Rasterizer(playback.device)
     while True:
         now = playback.at(t, camera if passing else None)
-        planes = rasterizer.draw(now, camera, (0.1, 0.2, 0.3))
-        if not rasterizer.grow():
-            return planes.read("float32", (4, camera.height, camera.width))[:3].transpose(1, 2, 0)
+        drawing = rasterizer.draw(now, camera, (0.1, 0.2, 0.3))
+        if not rasterizer.grow_on_overflow(drawing):
+            return drawing.image.read()[:3].transpose(1, 2, 0)
 
 
 def saved(device: Device, folder: Path, config: FieldConfig, count: int = 300) -> tuple[Scene4D, Path]:
@@ -58,7 +60,7 @@ def saved(device: Device, folder: Path, config: FieldConfig, count: int = 300) -
 def test_it_shows_the_scene(device: Device, tmp_path: Path, name: str) -> None:
     scene, path = saved(device, tmp_path, KINDS[name])
     playback = open_playback(path, device)
-    assert isinstance(playback, DevicePlayback if name in ON_DEVICE else ScenePlayback)
+    assert isinstance(playback, DevicePlayback if name in ON_DEVICE else TorchPlayback)
     assert (playback.count, playback.sh_degree, playback.moves) == (300, 2, name != "static")
     assert playback.field_config == KINDS[name]
     assert playback.metadata == {"scene": "test"}
@@ -121,7 +123,7 @@ def test_torch_evaluates_what_has_changed_alone(
 ) -> None:
     _, path = saved(device, tmp_path, KINDS[name])
     playback = open_playback(path, device)
-    assert isinstance(playback, ScenePlayback)
+    assert isinstance(playback, TorchPlayback)
     scene, times = playback.scene, []
     at = scene.at
     monkeypatch.setattr(scene, "at", lambda t: (times.append(t), at(t))[1])
@@ -129,7 +131,7 @@ def test_torch_evaluates_what_has_changed_alone(
     def evaluated(t: float = 0.1) -> bool:
         times.clear()
         shown = contents(playback.at(t))
-        for found, expected in zip(shown, contents(ScenePlayback(load(path, device)).at(t)), strict=True):
+        for found, expected in zip(shown, contents(TorchPlayback(load(path, device)).at(t)), strict=True):
             np.testing.assert_array_equal(found, expected)
         return times == [t]
 
@@ -151,12 +153,12 @@ def test_an_upload_that_failed_is_made_again(device: Device, tmp_path: Path, mon
     playback = open_playback(path, device)
     expected = contents(playback.at(0.1))
 
-    def fail(pool: BufferPool, tensors: list[torch.Tensor], sh_degree: int) -> None:
-        upload_gaussians(pool, [0 * tensor for tensor in tensors], sh_degree)
+    def fail(pool: BufferPool, now: Gaussians[torch.Tensor]) -> None:
+        upload_gaussians(pool, Gaussians(*(0 * tensor for tensor in vars(now).values())))
         raise MemoryError
 
     with monkeypatch.context() as patched:
-        patched.setattr(scene_playback, "upload_gaussians", fail)
+        patched.setattr(torch_playback, "upload_gaussians", fail)
         with pytest.raises(MemoryError):
             playback.at(0.2)
     for found, part in zip(contents(playback.at(0.1)), expected, strict=True):
@@ -167,11 +169,11 @@ def test_an_upload_that_failed_is_made_again(device: Device, tmp_path: Path, mon
 def test_each_step_of_a_training_is_shown(device: Device, tmp_path: Path, kind: str) -> None:
     dataset = load_dataset(write_synthetic(tmp_path / "scene", size=16, train_views=4, test_views=1))
     training = Trainer(configure(method=kind), dataset, device)
-    playback = ScenePlayback(training.scene)
+    playback = TorchPlayback(training.scene)
     with closing(training):
         for _ in range(12):
             training.step()
-            shown, anew = (contents(each.at(0.4)) for each in (playback, ScenePlayback(training.scene)))
+            shown, anew = (contents(each.at(0.4)) for each in (playback, TorchPlayback(training.scene)))
             for found, expected in zip(shown, anew, strict=True):
                 np.testing.assert_array_equal(found, expected)
 
@@ -180,10 +182,10 @@ def test_each_step_of_a_training_is_shown(device: Device, tmp_path: Path, kind: 
 def test_a_training_can_be_watched(device: Device) -> None:
     """Parameters, their number and the degree change between calls, and training's own buffers stay as they are."""
     scene = trained(device, OURS, 50)
-    playback = ScenePlayback(scene)
+    playback = TorchPlayback(scene)
     before = picture(playback, 0.4)
     assert np.abs(before - scene.render(CAMERA, 0.4, torch.tensor([0.1, 0.2, 0.3])).image.numpy()).max() < 1e-6
-    assert playback.at(0.4).means is not rasterizer_of(device).pool.get("input means", 0)
+    assert playback.at(0.4).means.buffer is not rasterizer_of(device).pool.array("input means", (50, 3)).buffer
     with torch.no_grad():
         scene.parameters["sh_dc"] += 0.5
     assert np.abs(picture(playback, 0.4) - before).max() > 0.05
@@ -191,7 +193,7 @@ def test_a_training_can_be_watched(device: Device) -> None:
         scene.parameters[name] = torch.nn.Parameter(parameter.detach()[:20].clone())
     scene.sh_degree = 3
     now = playback.at(0.4)
-    assert (playback.count, now.count, playback.sh_degree, now.sh_degree, now.sh_stored) == (20, 20, 3, 3, 16)
+    assert (playback.count, len(now), playback.sh_degree, now.sh_degree) == (20, 20, 3, 3)
 
 
 @pytest.mark.kernels
@@ -204,7 +206,7 @@ def test_a_foreign_ply_stands_still(device: Device, tmp_path: Path, degree: int)
     assert (playback.moves, playback.count, playback.sh_degree, playback.metadata) == (False, 40, degree, {})
     drawn = load(tmp_path / "foreign.ply", device).render(CAMERA, 0.0, torch.tensor([0.1, 0.2, 0.3])).image.numpy()
     assert np.abs(picture(playback, 0.7) - drawn).max() < 1e-4
-    found: StillGaussians = playback.still(0.3)
+    found: GaussianSnapshot = playback.still(0.3)
     np.testing.assert_array_equal(found.means, still.means)
     np.testing.assert_array_equal(found.sh[:, : still.sh.shape[1]], still.sh)
     np.testing.assert_array_equal(found.opacity_logits, still.opacity_logits)
@@ -226,17 +228,14 @@ def test_blocks_make_no_difference(device: Device, tmp_path: Path) -> None:
     _, path = saved(device, tmp_path, OURS)
     whole, parts = (DevicePlayback(read_scene(path), device, block=block) for block in (None, 128))
     for t in TIMES:
-        a, b = (
-            read_all([(p.at(t).colors, "uint32", (300, 27), 0), (p.at(t).quats, "uint32", (300, 4), 0)])
-            for p in (whole, parts)
-        )
+        a, b = (read_all([p.at(t).sh, p.at(t).quats]) for p in (whole, parts))
         for x, y in zip(a, b, strict=True):
             np.testing.assert_array_equal(x, y)
 
 
-def contents(now: GaussianBuffers) -> list[np.ndarray]:
-    shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "colors": (now.sh_stored, 3)}
-    return read_all([(getattr(now, name), "uint32", (now.count, *shape), 0) for name, shape in shapes.items()])
+def contents(now: Gaussians[DeviceArray]) -> list[np.ndarray]:
+    """As words, so that equal means equal bits."""
+    return [values.view(np.uint32) for values in read_all(list(vars(now).values()))]
 
 
 @pytest.mark.kernels
@@ -279,7 +278,7 @@ def test_a_passing_picture_is_the_exact_one_for_less(
 SHOW = """
 import sys
 from lapgs_wgpu.gpu.device import open_device
-from lapgs_wgpu.motion.playback import open_playback
+from lapgs_wgpu.motion.playback.playback import open_playback
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 
@@ -288,10 +287,10 @@ playback = open_playback(sys.argv[1], device)
 rasterizer = Rasterizer(device)
 camera = Camera.looking_at([0, -4, 0], [0, 0, 0], up=[0, 0, 1], fov_x=0.8, width=32, height=32)
 while True:
-    image = rasterizer.draw(playback.at(0.3), camera)
-    if not rasterizer.grow():
+    drawing = rasterizer.draw(playback.at(0.3), camera)
+    if not rasterizer.grow_on_overflow(drawing):
         break
-assert image.read("float32", (4, 32, 32))[3].min() < 0.99
+assert drawing.image.read()[3].min() < 0.99
 playback.means(0.5), playback.dynamics(), playback.still(0.2)
 print("torch" in sys.modules)
 """

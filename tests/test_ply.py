@@ -29,7 +29,7 @@ from hypothesis import strategies as st
 
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.atomic import atomic_write
-from lapgs_wgpu.io.ply import StillGaussians, read_ply, write_ply
+from lapgs_wgpu.io.ply import GaussianSnapshot, read_ply, write_ply
 
 REAL_FILES = Path(__file__).parents[2] / "shared" / "data" / "ply"
 
@@ -64,7 +64,7 @@ def test_round_trip_pads_sh_to_degree_3(tmp_path: Path, degree: int, n: int) -> 
     k = still.sh.shape[1]
     padded = np.zeros((n, 16, 3), np.float32)
     padded[:, :k] = still.sh
-    assert_same(back, StillGaussians(still.means, padded, still.opacity_logits, still.log_scales, still.quats))
+    assert_same(back, GaussianSnapshot(still.means, padded, still.opacity_logits, still.log_scales, still.quats))
     assert back.sh_degree == 3
     assert len(back) == n
     assert all(getattr(back, name).flags.c_contiguous for name in FIELDS)
@@ -240,11 +240,11 @@ def test_values_that_could_not_be_read_back_are_not_written(tmp_path: Path) -> N
 def test_arrays_of_wrong_shape_or_type_are_refused() -> None:
     a = random_still(3)
     with pytest.raises(ValueError, match="quats is float32"):
-        StillGaussians(a.means, a.sh, a.opacity_logits, a.log_scales, a.quats[:2])
+        GaussianSnapshot(a.means, a.sh, a.opacity_logits, a.log_scales, a.quats[:2])
     with pytest.raises(ValueError, match="means is float64"):
-        StillGaussians(a.means.astype(float), a.sh, a.opacity_logits, a.log_scales, a.quats)
+        GaussianSnapshot(a.means.astype(float), a.sh, a.opacity_logits, a.log_scales, a.quats)
     with pytest.raises(ValueError, match="K of 1, 4, 9 or 16"):
-        StillGaussians(a.means, a.sh[:, :5], a.opacity_logits, a.log_scales, a.quats)
+        GaussianSnapshot(a.means, a.sh[:, :5], a.opacity_logits, a.log_scales, a.quats)
 
 
 # Atomic writing: each fault is injected at one step, and the old file must be whole and alone in its folder.

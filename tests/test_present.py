@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lapgs_wgpu.gpu.buffer import BufferPool
+from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.viewer.present import HEAT, Offscreen, Placed
 
@@ -44,14 +44,10 @@ def bench(device: Device) -> Bench:
     planes[:3, 0, :3] = planes[4, 0, :3] = 0.0
     planes[4] *= 4 * (1 - planes[3])
     truth = rng.integers(0, 256, (HEIGHT, WIDTH, 4)).astype(np.uint8)
-    pool = BufferPool(device)
-    buffers = []
-    for name, array in (("planes", planes), ("truth", truth)):
-        buffers.append(pool.get(name, array.nbytes))
-        buffers[-1].write(array)
+    arrays = [DeviceArray.upload(device, "planes", planes), DeviceArray.upload(device, "truth", truth.view(np.uint32))]
     size = (WIDTH, HEIGHT)
-    placed = Placed(buffers[0], size, (0, 0), size, BACKGROUND)
-    with_truth = placed._replace(truth=buffers[1], truth_size=size)
+    placed = Placed(arrays[0], size, (0, 0), size, BACKGROUND)
+    with_truth = placed._replace(truth=arrays[1], truth_size=size)
     return Bench(planes.astype(np.float64), placed, truth[..., :3], Offscreen(device), with_truth)
 
 

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import pytest
 
-from lapgs_wgpu.gpu.buffer import Buffer
+from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.profile import Profile
 
 
 def run(device: Device, profile: Profile, groups: list[int]) -> None:
-    buffers = {name: Buffer(device, 256, name) for name in ("length", "values", "block_sums")}
+    names = ("length", "values", "block_sums")
+    arrays = {name: DeviceArray.empty(device, name, (64,), "uint32") for name in names}
     with Commands(device, profile) as commands:
         for count in groups:
-            commands.dispatch(Kernel.get(device, "scan_reduce", SCAN_LANES=64), count, **buffers)
+            commands.dispatch(Kernel.get(device, "scan_reduce", SCAN_LANES=64), count, **arrays)
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""The projection pass against its float64 twin."""
+"""The projection pass against its float64 reference."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The whole rasteriser, forward and backward, against its float64 twin."""
+"""The whole rasteriser, forward and backward, against its float64 reference."""
 
 from __future__ import annotations
 
@@ -23,10 +23,11 @@ from helpers.scenes import (
 from torch import Tensor
 
 from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.probe_subgroup import subgroup_size
 from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.splat.raster_config import RasterConfig, cpu_config, gpu_config
 from lapgs_wgpu.splat.rasterize import rasterize
 from lapgs_wgpu.splat.rasterizer import Rasterizer
-from lapgs_wgpu.splat.shape import RasterShape, cpu_shape, gpu_shape
 
 pytestmark = [pytest.mark.kernels, pytest.mark.subgroups]
 
@@ -157,11 +158,11 @@ def test_a_loss_on_one_output(device: Device, output: str) -> None:
 # Shapes of the kernels
 
 
-def shapes(device: Device) -> list[RasterShape]:
+def shapes(device: Device) -> list[RasterConfig]:
     """All that this device can run, the simplest first."""
-    found = [cpu_shape(0), RasterShape(16, 16, 32, subgroups=False, lane_runs=False), gpu_shape(0)]
-    if device.subgroup_size:
-        found += [cpu_shape(device.subgroup_size), gpu_shape(device.subgroup_size)]
+    found = [cpu_config(0), RasterConfig(16, 16, 32, subgroups=False, lane_runs=False), gpu_config(0)]
+    if subgroup_size(device):
+        found += [cpu_config(subgroup_size(device)), gpu_config(subgroup_size(device))]
     return list(dict.fromkeys(found))
 
 
@@ -171,7 +172,7 @@ def test_all_shapes_draw_the_same(device: Device, use: Callable[[Rasterizer], An
     weights = Weights.random(camera).without(fragile_pixels(scene, camera, sh_degree))
     steps = []
     for shape in shapes(device):
-        use(Rasterizer(device, shape=shape))
+        use(Rasterizer(device, config=shape))
         steps.append(step(scene, camera, device, sh_degree=sh_degree, background=BACKGROUND, weights=weights))
     first = steps[0]
     for other in steps[1:]:
@@ -185,16 +186,16 @@ def test_all_shapes_draw_the_same(device: Device, use: Callable[[Rasterizer], An
 
 def test_workgroups_that_are_cut_into_subgroups_are_noticed(device: Device, use: Callable[[Rasterizer], Any]) -> None:
     """As a driver may do for one pass and not for another: both do without shuffles then."""
-    if not 0 < device.subgroup_size < 32:
+    if not 0 < subgroup_size(device) < 32:
         pytest.skip("this device has no subgroups, or none of fewer than 32 lanes")
     scene, camera = random_scene(500, 8, size=0.08), oblique_camera(101, 61)
-    whole, cut = gpu_shape(0), replace(gpu_shape(32), subgroups=True)
+    whole, cut = gpu_config(0), replace(gpu_config(32), subgroups=True)
     weights = Weights.random(camera)
     steps = []
     for shape in (whole, cut):
-        rasterizer = use(Rasterizer(device, shape=shape))
+        rasterizer = use(Rasterizer(device, config=shape))
         drawn = [step(scene, camera, device, background=BACKGROUND, weights=weights) for _ in range(2)]
-        assert not rasterizer.shape.subgroups
+        assert not rasterizer.config.subgroups
         steps += drawn
     for other in steps[1:]:
         assert torch.equal(other.image, steps[0].image)
@@ -205,25 +206,25 @@ def test_workgroups_that_are_cut_into_subgroups_are_noticed(device: Device, use:
 def test_only_the_backward_pass_is_cut(
     device: Device, use: Callable[[Rasterizer], Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    if not 0 < device.subgroup_size < 32:
+    if not 0 < subgroup_size(device) < 32:
         pytest.skip("this device has no subgroups, or none of fewer than 32 lanes")
     scene, camera = random_scene(500, 8, size=0.08), oblique_camera(101, 61)
-    use(Rasterizer(device, shape=gpu_shape(0)))
+    use(Rasterizer(device, config=gpu_config(0)))
     expected = step(scene, camera, device)
-    defines = RasterShape.raster_defines
-    rasterizer = use(Rasterizer(device, shape=replace(gpu_shape(32), subgroups=True)))
-    torn = rasterizer._torn
+    defines = RasterConfig.raster_defines
+    rasterizer = use(Rasterizer(device, config=replace(gpu_config(32), subgroups=True)))
+    torn = rasterizer._subgroup_mismatch
 
-    def forward_without(self: RasterShape, *, depth: bool) -> dict[str, int]:
+    def forward_without(self: RasterConfig, *, depth: bool) -> dict[str, int]:
         found = defines(self, depth=depth)
         if not rasterizer._trusted:  # the forward pass
             found.pop("SUBGROUPS", None)
         return found
 
-    monkeypatch.setattr(RasterShape, "raster_defines", forward_without)
+    monkeypatch.setattr(RasterConfig, "raster_defines", forward_without)
     asked: list[tuple[str, bool]] = []
     monkeypatch.setattr(
-        rasterizer, "_torn", lambda name, drawn: asked.append((name, torn(name, drawn))) or asked[-1][1]
+        rasterizer, "_subgroup_mismatch", lambda name, drawn: asked.append((name, torn(name, drawn))) or asked[-1][1]
     )
     found = step(scene, camera, device)
     assert asked == [("rasterize", False), ("rasterize_bwd", True), ("rasterize_bwd", False)]

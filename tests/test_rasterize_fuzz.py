@@ -122,7 +122,7 @@ def test_only_invisible_gaussians(device: Device) -> None:
     ids=lambda value: value if isinstance(value, str) else "",
 )
 def test_extremes_are_finite_and_as_in_float64(device: Device, name: str, changes: dict[str, float]) -> None:
-    """Gradients are held to the twin's only where float32 can hold them."""
+    """Gradients are held to the reference's only where float32 can hold them."""
     scene, camera = in_front(12, 4), front_camera(33, 25)
     for group, value in changes.items():
         scene[group][::3] = value
@@ -247,7 +247,7 @@ def test_buffers_poisoned_between_the_bands(device: Device, use: Use, pattern: s
     rasterizer = use(Rasterizer(device, capacity=256))
     rasterizer.max_capacity = 640
     expected = drawn(scene, device)
-    assert rasterizer.bands > 1
+    assert rasterizer.plan.bands > 1
     poison(rasterizer, PATTERNS[pattern])
     assert drawn(scene, device).bits == expected.bits
 
@@ -257,10 +257,10 @@ def test_buffers_poisoned_before_an_overflow(device: Device, use: Use) -> None:
     expected = drawn(scene, device)
     rasterizer = use(Rasterizer(device, capacity=64))
     drawn(in_front(1, 10), device)
-    assert rasterizer.capacity == 64
+    assert rasterizer.plan.capacity == 64
     poison(rasterizer, PATTERNS["all bits"])
     assert drawn(scene, device).bits == expected.bits
-    assert rasterizer.capacity > 64
+    assert rasterizer.plan.capacity > 64
 
 
 def test_a_picture_without_gradients_leaves_none(device: Device) -> None:

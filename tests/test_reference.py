@@ -26,9 +26,9 @@ from lapgs_wgpu.splat.reference import (
     near_discontinuity,
     project,
     rasterize_reference,
-    rotation,
     sh_basis,
 )
+from lapgs_wgpu.splat.rotation import rotation_matrices
 
 Scene = dict[str, Tensor]
 IDENTITY = [1.0, 0.0, 0.0, 0.0]
@@ -137,10 +137,10 @@ def test_jacobian_is_clamped_beyond_the_margin() -> None:
 
 def test_wxyz_rotation() -> None:
     """w first: (w, 0, 0, z) turns about z, by 90 degrees x to y; length does not matter."""
-    about_z = rotation(torch.tensor([[1.0, 0, 0, 1], [5.0, 0, 0, 5]]))
+    about_z = rotation_matrices(torch.tensor([[1.0, 0, 0, 1], [5.0, 0, 0, 5]]))
     expected = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     torch.testing.assert_close(about_z, expected.expand(2, 3, 3))
-    about_x = rotation(torch.tensor([[math.cos(0.3), math.sin(0.3), 0, 0]]))[0]
+    about_x = rotation_matrices(torch.tensor([[math.cos(0.3), math.sin(0.3), 0, 0]]))[0]
     torch.testing.assert_close(about_x @ torch.tensor([0.0, 1, 0]), torch.tensor([0, math.cos(0.6), math.sin(0.6)]))
 
 
@@ -295,7 +295,7 @@ def test_radius_bounds_the_reached_pixels_tightly() -> None:
 def test_image_does_not_depend_on_the_world_frame_or_the_order() -> None:
     camera, scene = oblique_camera(23, 17), random_scene(30, seed=9)
     before = rasterize_reference(**scene, camera=camera)
-    turn, shift = rotation(torch.tensor([[0.3, -0.5, 0.2, 0.9]]))[0], torch.tensor([3.0, -2.0, 5.0])
+    turn, shift = rotation_matrices(torch.tensor([[0.3, -0.5, 0.2, 0.9]]))[0], torch.tensor([3.0, -2.0, 5.0])
     T_world = torch.eye(4)
     T_world[:3, :3], T_world[:3, 3] = turn, shift
     a, b, c, d = torch.tensor([0.3, -0.5, 0.2, 0.9])

@@ -24,11 +24,12 @@ from lapgs_wgpu.data import Dataset, load_dataset
 from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.motion.playback import open_playback
+from lapgs_wgpu.motion.playback.playback import open_playback
 from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.splat.gaussians import Gaussians
+from lapgs_wgpu.splat.raster_config import raster_config
 from lapgs_wgpu.splat.rasterize import rasterize, upload_gaussians
 from lapgs_wgpu.splat.rasterizer import Rasterizer
-from lapgs_wgpu.splat.shape import raster_shape
 from lapgs_wgpu.train.run import train
 
 soak = pytest.mark.skipif(os.environ.get("LAPGS_SOAK") != "1", reason="large: LAPGS_SOAK=1 runs it")
@@ -90,12 +91,12 @@ def check_pile(count: int, device: Device) -> None:
 @pytest.mark.kernels
 @pytest.mark.subgroups
 def test_lists_beyond_a_round_are_drawn_in_more(device: Device, use: Use) -> None:
-    shape = raster_shape(device)
+    shape = raster_config(device)
     if not shape.round_splats:
         pytest.skip("this device has no rounds")
     rasterizer = use(Rasterizer(device))
     check_pile(5000 if shape.round_splats < 5000 else 40_000, device)
-    assert rasterizer.rounds > 1
+    assert rasterizer.plan.rounds > 1
 
 
 @pytest.mark.kernels
@@ -103,7 +104,7 @@ def test_lists_beyond_a_round_are_drawn_in_more(device: Device, use: Use) -> Non
 @pytest.mark.parametrize("depth", [False, True])
 def test_rounds_change_no_bit(depth: bool, device: Device, use: Use, monkeypatch: pytest.MonkeyPatch) -> None:
     """Many short rounds, with other tiles that are done long before, in bands and at once."""
-    if not raster_shape(device).round_splats:
+    if not raster_config(device).round_splats:
         pytest.skip("this device has no rounds")
     scene, camera = random_scene(400, 3, size=0.3), front_camera(45, 37)
     scene["means"][:, 2] += 4
@@ -111,12 +112,12 @@ def test_rounds_change_no_bit(depth: bool, device: Device, use: Use, monkeypatch
     use(Rasterizer(device))
     background = (0.2, 0.7, 0.4)
     expected = drawn(scene, camera, device, depth=depth, background=background)
-    short = dataclasses.replace(raster_shape(device), round_splats=16)
+    short = dataclasses.replace(raster_config(device), round_splats=16)
     for bands in (1, 2):
-        rasterizer = use(Rasterizer(device, shape=short))
-        rasterizer.bands = bands
+        rasterizer = use(Rasterizer(device, config=short))
+        rasterizer.plan = dataclasses.replace(rasterizer.plan, bands=bands)
         found = drawn(scene, camera, device, depth=depth, background=background)
-        assert rasterizer.rounds >= 8
+        assert rasterizer.plan.rounds >= 8
         for name in ("image", "alpha"):
             assert torch.equal(found[name], expected[name]), name
         for name, value in expected.items():
@@ -129,15 +130,16 @@ def test_rounds_change_no_bit(depth: bool, device: Device, use: Use, monkeypatch
 def test_large_images_are_cut_so_that_a_splat_has_few_enough_tiles(
     device: Device, use: Use, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    if not raster_shape(device).round_splats:
+    if not raster_config(device).round_splats:
         pytest.skip("this device has no limit")
     scene, camera = random_scene(50, 3), front_camera(64, 64)
     expected = drawn(scene, camera, device)
-    monkeypatch.setattr("lapgs_wgpu.splat.rasterizer.MOST_TILES", 20)
+    monkeypatch.setattr("lapgs_wgpu.splat.rasterizer.MAX_BAND_TILES", 20)
     rasterizer = use(Rasterizer(device))
     found = drawn(scene, camera, device)
-    assert rasterizer.bands == 4
-    assert max(rasterizer._band_tiles(rasterizer._drawn, band) for band in range(4)) <= 20  # type: ignore[arg-type]
+    assert rasterizer.plan.bands == 4
+    drawing = rasterizer.draw(upload_gaussians(rasterizer.pool, Gaussians(*scene.values())), camera)
+    assert max(rasterizer._band_tiles(drawing, band) for band in range(4)) <= 20
     assert torch.equal(found["image"], expected["image"])
 
 
@@ -185,9 +187,9 @@ def test_a_number_of_intersections_beyond_32_bits_is_not_taken_for_a_small_one(d
     count, rasterizer = 140_000, Rasterizer(device)
     filling = [torch.zeros(count, 3), torch.ones(count, 4), torch.full((count, 3), 50.0), torch.ones(count)]
     filling[0][:, 2] = 2.0
-    gaussians = upload_gaussians(rasterizer.pool, [*filling, torch.ones(count, 3)], None)
-    rasterizer.draw(gaussians, front_camera(2048, 2048, focal=2000.0))
-    assert all(buffer.read(*rest)[0] == 0xFFFFFFFF for buffer, *rest in rasterizer.needed_requests())
+    gaussians = upload_gaussians(rasterizer.pool, Gaussians(*filling, torch.ones(count, 3)))
+    drawing = rasterizer.draw(gaussians, front_camera(2048, 2048, focal=2000.0))
+    assert all(needed.read()[0] == 0xFFFFFFFF for needed in drawing.needed)
 
 
 # What takes long
@@ -201,7 +203,7 @@ def peak_gb() -> float:
 def test_a_hundred_thousand_splats_in_one_tile(device: Device, use: Use) -> None:
     rasterizer = use(Rasterizer(device))
     check_pile(100_000, device)
-    print(f"rounds {rasterizer.rounds}")
+    print(f"rounds {rasterizer.plan.rounds}")
 
 
 @soak
@@ -218,9 +220,9 @@ def test_a_thousand_gaussians_over_the_whole_screen(device: Device, use: Use) ->
     }
     found = drawn(scene, front_camera(800, 800, focal=800.0), device, depth=False)
     transmittance = max((1 - 0.01) ** 1000, 0.0)
-    assert rasterizer.bands > 1
+    assert rasterizer.plan.bands > 1
     assert (found["alpha"] - (1 - transmittance)).abs().max() < 1e-3
-    print(f"{time.perf_counter() - start:.1f} s, bands {rasterizer.bands}, {peak_gb():.2f} GB")
+    print(f"{time.perf_counter() - start:.1f} s, bands {rasterizer.plan.bands}, {peak_gb():.2f} GB")
 
 
 @soak
@@ -233,4 +235,4 @@ def test_two_million_gaussians_on_a_4k_picture(size: tuple[int, int], device: De
     found = drawn(scene, front_camera(*size, focal=3000.0), device, depth=False)
     assert all(value.isfinite().all() for value in found.values())
     assert float(found["alpha"].mean()) > 0.1
-    print(f"{time.perf_counter() - start:.1f} s, bands {rasterizer.bands}, {peak_gb():.2f} GB")
+    print(f"{time.perf_counter() - start:.1f} s, bands {rasterizer.plan.bands}, {peak_gb():.2f} GB")

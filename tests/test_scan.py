@@ -8,22 +8,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from lapgs_wgpu.gpu.buffer import Buffer, BufferPool
+from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands
-from lapgs_wgpu.gpu.primitives import Scan
+from lapgs_wgpu.gpu.pool import BufferPool
+from lapgs_wgpu.gpu.scan import Scan
 
 pytestmark = pytest.mark.kernels
 
 Words = NDArray[np.uint32]
 UNTOUCHED = 0xDEADBEEF
 SOURCES = ["values", "flags", "gather"]
-
-
-def buffer_of(device: Device, words: Words, label: str) -> Buffer:
-    buffer = Buffer(device, words.nbytes, label)
-    buffer.write(words)
-    return buffer
 
 
 def scan(
@@ -39,22 +34,22 @@ def scan(
     """The first `length` sums and the total. Fails where anything else was written."""
     capacity = length if capacity is None else capacity
     pool = BufferPool(device)
-    prefix = buffer_of(device, np.full(capacity + 64, UNTOUCHED, np.uint32), "prefix")
-    total = buffer_of(device, np.full(4, UNTOUCHED, np.uint32), "total")
-    picked = {} if indices is None else {"indices": buffer_of(device, indices, "indices")}
+    prefix = DeviceArray.upload(device, "prefix", np.full(capacity + 64, UNTOUCHED, np.uint32))
+    total = DeviceArray.upload(device, "total", np.full(4, UNTOUCHED, np.uint32))
+    picked = {} if indices is None else {"indices": DeviceArray.upload(device, "indices", indices)}
     with Commands(device) as commands:
         Scan(device, pool, "test", source, saturating=saturating)(
             commands,
-            length=buffer_of(device, np.array([length], np.uint32), "length"),
+            length=DeviceArray.upload(device, "length", np.array([length], np.uint32)),
             capacity=capacity,
-            values=buffer_of(device, values, "values"),
+            values=DeviceArray.upload(device, "values", values),
             prefix=prefix,
             total=total,
             **picked,
         )
-    sums = prefix.read("uint32", (capacity + 64,))
+    sums = prefix.read()
     assert (sums[length:] == UNTOUCHED).all()
-    return sums[:length], int(total.read("uint32", (1,))[0])
+    return sums[:length], int(total.read()[0])
 
 
 def check(

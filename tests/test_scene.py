@@ -14,9 +14,9 @@ from torch import Tensor
 
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.io.ply import StillGaussians, read_ply, write_ply
-from lapgs_wgpu.motion.field import FieldConfig
-from lapgs_wgpu.motion.hash_encoder import HashGrid
+from lapgs_wgpu.io.ply import GaussianSnapshot, read_ply, write_ply
+from lapgs_wgpu.motion.fields.config import FieldConfig
+from lapgs_wgpu.motion.fields.hash_encoder import HashGrid
 from lapgs_wgpu.motion.scene import Scene4D, draw, load
 
 CAMERA = oblique_camera(48, 32)
@@ -160,7 +160,7 @@ def test_a_plain_ply_is_a_static_scene(device: Device, tmp_path: Path) -> None:
     source = moving_scene(device, FieldConfig(kind="static"), sh_degree=1)
     p = {name: value.detach().numpy() for name, value in source.parameters.items()}
     sh = np.concatenate([p["sh_dc"], p["sh_rest"][:, :3]], axis=1)
-    still = StillGaussians(p["means"], sh, p["opacity_logits"], p["log_scales"], p["quats"])
+    still = GaussianSnapshot(p["means"], sh, p["opacity_logits"], p["log_scales"], p["quats"])
     write_ply(tmp_path / "plain.ply", still)
     scene = load(tmp_path / "plain.ply", device)
     assert scene.field is None

@@ -23,15 +23,15 @@ from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.errors import DeviceMemoryError, InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.checkpoint import read_checkpoint
-from lapgs_wgpu.motion.device_decoder import DeviceDecoder
+from lapgs_wgpu.motion.passes.decoder_passes import DecoderPasses
 from lapgs_wgpu.motion.scene import Scene4D, load
 from lapgs_wgpu.train import autotune, trainer
 from lapgs_wgpu.train import run as run_module
 from lapgs_wgpu.train.dataloader import Pictures
+from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.losses import LossWeights
 from lapgs_wgpu.train.presets import load_config
-from lapgs_wgpu.train.render_loss import RenderLoss, render_loss
 from lapgs_wgpu.train.run import train
 from lapgs_wgpu.train.trainer import Trainer
 
@@ -210,7 +210,7 @@ def test_a_device_too_small_for_the_decoder_leaves_it_to_torch(
         raise DeviceMemoryError("buffer 'layers' needs more")
 
     monkeypatch.setattr(device, "is_cpu", False)
-    monkeypatch.setattr(DeviceDecoder, "decode_bwd", too_large)
+    monkeypatch.setattr(DecoderPasses, "decode_bwd", too_large)
     train(configure(schedule__steps="1"), dataset, tmp_path / "run", device=device)
     assert "ms in torch, more memory than the device has)" in capsys.readouterr().out
 
@@ -379,7 +379,7 @@ def test_pictures_lie_on_their_background(background: str, dataset: Dataset, dev
     with closing(Pictures(dataset.train, background, 1.0, generator, device)) as pictures:  # type: ignore[arg-type]
         drawn = [(view, pictures.on_device(view), colour) for view, colour in (pictures.choose() for _ in range(4))]
     for view, truth, colour in drawn:
-        picture = truth.read("uint8", (32, 32, 4))
+        picture = truth.read().view(np.uint8).reshape(32, 32, 4)
         if background == "random":
             assert (picture == view.load()).all()
         else:

@@ -12,7 +12,7 @@ from helpers.still_scenes import CAMERA, KINDS, half_still
 from helpers.trained_scenes import GRID4D, trained
 
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.motion.playback import open_playback
+from lapgs_wgpu.motion.playback.playback import open_playback
 from lapgs_wgpu.viewer.frame import Frame, FrameRenderer, FrameRequest
 from lapgs_wgpu.viewer.render_modes import Mode
 
@@ -20,8 +20,7 @@ pytestmark = pytest.mark.kernels
 
 
 def planes(frame: Frame) -> np.ndarray:
-    width, height = frame.placed.picture
-    return frame.placed.planes.read("uint32", (4, height, width))
+    return frame.placed.planes.read().view(np.uint32)[:4]
 
 
 @pytest.mark.parametrize("mode", ["motion", "scale"])

@@ -25,8 +25,8 @@ from lapgs_wgpu import Scene4D
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.initial_view import InitialView
-from lapgs_wgpu.motion.field import FieldConfig
-from lapgs_wgpu.motion.hashgrid import HashConfig
+from lapgs_wgpu.motion.fields.config import FieldConfig
+from lapgs_wgpu.motion.fields.hash_grid_config import HashConfig
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.viewer import cli
 from lapgs_wgpu.viewer.auth import AuthMiddleware, check_entry, new_token

@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.motion.field import FieldConfig
-from lapgs_wgpu.motion.hashgrid import HashConfig
+from lapgs_wgpu.motion.fields.config import FieldConfig
+from lapgs_wgpu.motion.fields.hash_grid_config import HashConfig
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.viewer.camera import ViewCamera
 from lapgs_wgpu.viewer.path import CameraPath, KeyFrame, Pose

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lapgs_wgpu.gpu.buffer import BufferPool
 from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.io.safe_json_toml import read_toml
 
 if TYPE_CHECKING:
@@ -36,9 +36,8 @@ class Capture:
             packed = np.zeros((*pixels.shape[:2], 4), np.uint8)
             packed[..., :3] = pixels
             self._pool = self._pool or BufferPool(device)
-            buffer = self._pool.get("ground truth", packed.nbytes)
-            buffer.write(packed)
-            self._held = (key, {"truth": buffer, "truth_size": (pixels.shape[1], pixels.shape[0])})
+            truth = self._pool.upload("ground truth", packed.view(np.uint32)[..., 0])
+            self._held = (key, {"truth": truth, "truth_size": (pixels.shape[1], pixels.shape[0])})
         return self._held[1]
 
 

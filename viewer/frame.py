@@ -9,12 +9,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.gpu.buffer import Buffer, BufferPool, read_all
+from lapgs_wgpu.gpu.array import DeviceArray, read_all
 from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.gpu.profile import Profile
-from lapgs_wgpu.motion.playback import Playback
+from lapgs_wgpu.motion.playback.playback import Playback
 from lapgs_wgpu.splat.camera import Camera
-from lapgs_wgpu.splat.rasterizer import GaussianBuffers, Rasterizer
+from lapgs_wgpu.splat.gaussians import Gaussians
+from lapgs_wgpu.splat.rasterizer import Rasterizer
 
 from .present import Placed
 from .render_modes import MODES, Mode
@@ -47,15 +49,11 @@ class Frame:
 
 def warm_up(device: Device) -> None:
     """Have the driver compile the passes of a picture, with harmonics of degree 3, by drawing one Gaussian."""
-    pool = BufferPool(device)
-    names = ("means", "quats", "scales", "opacities", "colors")
-    buffers = {name: pool.get(name, 4 * 3 * 16) for name in names}
-    for buffer in buffers.values():
-        buffer.write(np.ones(buffer.nbytes // 4, np.float32))
+    shapes = ((1, 3), (1, 4), (1, 3), (1,), (1, 16, 3))
+    one = Gaussians(*(DeviceArray.upload(device, "one Gaussian", np.ones(shape, np.float32)) for shape in shapes))
     camera = Camera.looking_at([1, 1, -3], [1, 1, 1], up=[0, -1, 0], fov_x=0.7, width=16, height=16)
     rasterizer = Rasterizer(device)
-    rasterizer.draw(GaussianBuffers(count=1, sh_degree=3, sh_stored=16, **buffers), camera)
-    rasterizer.grow()
+    rasterizer.grow_on_overflow(rasterizer.draw(one, camera))
 
 
 class FrameRenderer:
@@ -66,7 +64,7 @@ class FrameRenderer:
         self._rasterizer = Rasterizer(playback.device)
         self._pool = BufferPool(playback.device)
         self._profile: Profile | None = None
-        self._values: dict[tuple[Mode, float], tuple[Buffer, float, float]] = {}
+        self._values: dict[tuple[Mode, float], tuple[DeviceArray, float, float]] = {}
 
     def forget(self) -> None:
         """The scene has changed: what was measured of it is out of date."""
@@ -91,31 +89,28 @@ class FrameRenderer:
         exact = self.playback.exact
         if value is not None:
             colours, low, high = value
-            gaussians = dataclasses.replace(gaussians, colors=colours, sh_degree=None, sh_stored=1)
+            gaussians = dataclasses.replace(gaussians, sh=colours)
             background = (0.0, 0.0, 0.0)
         taken = self._profiler() if profile else None
         while True:
-            planes = self._rasterizer.draw(gaussians, camera, background, depth=mode == "depth", profile=taken)
-            visible, *needed = read_all(
-                [(self._rasterizer.pool.get("visible", 4), "uint32", (1,), 0), *self._rasterizer.needed_requests()]
-            )
+            drawing = self._rasterizer.draw(gaussians, camera, background, depth=mode == "depth", profile=taken)
+            visible, *needed = read_all([drawing.lists.visible, *drawing.needed])
             passes: dict[str, float] = {}
             for name, milliseconds in taken.read() if taken else []:
                 passes[name] = passes.get(name, 0.0) + milliseconds
-            if not self._rasterizer.fit(needed):
+            if not self._rasterizer.grow_on_overflow(drawing, needed):
                 break
         if mode == "depth":
-            low, high = self._depth_range(planes, camera)
+            low, high = self._depth_range(drawing.image)
         shows = {"rgb": "color", "alpha": "alpha", "depth": "depth"}.get(mode, "value")
         size = (camera.width, camera.height)
-        placed = Placed(planes, size, (0, 0), size, request.background, shows, low, high)
+        placed = Placed(drawing.image, size, (0, 0), size, request.background, shows, low, high)
         return Frame(request, placed, time.perf_counter() - start, int(visible[0]), passes, exact)
 
     def depth_at(self, frame: Frame, column: int, row: int) -> float | None:
         """Depth along the camera's axis of what a pixel shows, world units; None where it shows next to nothing."""
         drawn = self.draw(frame.request._replace(mode="depth"))
-        width, height = drawn.placed.picture
-        planes = drawn.placed.planes.read("float32", (5, height, width))
+        planes = drawn.placed.planes.read()
         alpha = 1.0 - float(planes[3, row, column])
         return float(planes[4, row, column]) / alpha if alpha > 0.1 else None
 
@@ -124,26 +119,25 @@ class FrameRenderer:
             self._profile = Profile(self.playback.device)
         return self._profile
 
-    def _depth_range(self, planes: Buffer, camera: Camera) -> tuple[float, float]:
-        rest, depth = planes.read("float32", (5, camera.height, camera.width))[3:]
+    def _depth_range(self, planes: DeviceArray) -> tuple[float, float]:
+        rest, depth = planes.read()[3:]
         seen = rest < 0.5
         if not seen.any():
             return 0.0, 1.0
         low, high = np.percentile(depth[seen] / (1.0 - rest[seen]), [1, 99])
         return float(low), float(high)
 
-    def _value(self, mode: Mode, t: float) -> tuple[Buffer, float, float]:
+    def _value(self, mode: Mode, t: float) -> tuple[DeviceArray, float, float]:
         """A value of each Gaussian as its colour (N, 3), and the values at the ends of the scale."""
         key = (mode, t if mode == "scale" else 0.0)
         held = self._values.get(key)
         if held is None:
             value = self._measure(mode, t)
-            buffer = self._pool.get(mode, 12 * len(value))
-            buffer.write(np.repeat(value[:, None], 3, axis=1))
+            array = self._pool.upload(mode, np.repeat(value[:, None], 3, axis=1))
             low = float(np.percentile(value, 2)) if mode == "scale" and len(value) else 0.0
             high = float(np.percentile(value, 98)) if len(value) else 1.0
             self._values = {other: entry for other, entry in self._values.items() if other[0] != mode}
-            held = self._values[key] = (buffer, low, max(high, 1e-9))
+            held = self._values[key] = (array, low, max(high, 1e-9))
         return held
 
     def _measure(self, mode: Mode, t: float) -> NDArray[np.float32]:
@@ -152,8 +146,7 @@ class FrameRenderer:
             assert attributes is not None
             return np.linalg.norm(attributes, axis=1).astype(np.float32)
         if mode == "scale":
-            count = self.playback.count
-            scales = self.playback.at(t).scales.read("float32", (count, 3))
+            scales = self.playback.at(t).scales.read()
             return scales.max(axis=1, initial=0.0)
         places = np.stack([self.playback.means(moment) for moment in np.linspace(0, 1, _MOMENTS)])
         return np.linalg.norm(places - places.mean(axis=0), axis=2).max(axis=0).astype(np.float32)

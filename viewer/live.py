@@ -15,8 +15,8 @@ from types import FrameType
 from rendercanvas.utils.asyncs import sleep
 
 from lapgs_wgpu.io.initial_view import InitialView
+from lapgs_wgpu.motion.playback.torch_playback import TorchPlayback
 from lapgs_wgpu.motion.scene import Scene4D
-from lapgs_wgpu.motion.scene_playback import ScenePlayback
 
 from .app import App
 from .loaded_scene import LoadedScene
@@ -33,7 +33,7 @@ def watch(scene: Scene4D, look: InitialView, steps: Iterator[TrainingStep]) -> N
     from .window import choose_backend, make_canvas
 
     canvas, loop = make_canvas(choose_backend("auto"), "training - lapgs-train", (1280, 720))
-    app = App(canvas, loop, LoadedScene(None, ScenePlayback(scene), look), transport=True)
+    app = App(canvas, loop, LoadedScene(None, TorchPlayback(scene), look), transport=True)
     state, viewport = app.state, app.viewport
     state.training = training = TrainingControl()
     interrupt = signal.getsignal(signal.SIGINT)

@@ -8,8 +8,9 @@ import numpy as np
 import wgpu
 from numpy.typing import NDArray
 
-from lapgs_wgpu.gpu.buffer import Buffer, BufferPool
+from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.gpu.shader import compose, pack
 
 # The scale of colours for values, from low to high.
@@ -34,7 +35,7 @@ class Placed(NamedTuple):
     (a share of the width), or, with error_gain, its absolute difference times this.
     """
 
-    planes: Buffer
+    planes: DeviceArray
     picture: tuple[int, int]
     origin: tuple[int, int]
     size: tuple[int, int]
@@ -42,7 +43,7 @@ class Placed(NamedTuple):
     shows: str = "color"
     low: float = 0.0
     high: float = 1.0
-    truth: Buffer | None = None
+    truth: DeviceArray | None = None
     truth_size: tuple[int, int] = (0, 0)
     truth_until: float = 0.0
     error_gain: float = 0.0
@@ -54,6 +55,7 @@ class Presenter:
     def __init__(self, device: Device, target_format: str) -> None:
         self.device = device
         self._pool = BufferPool(device)
+        self._no_truth = self._pool.array("no truth", (1, 4), "uint32")
         self._source = compose("present", {})
         native = device.wgpu_device
         module = native.create_shader_module(label="present", code=self._source)
@@ -81,10 +83,10 @@ class Presenter:
         render = encoder.begin_render_pass(color_attachments=[attachment])
         render.set_pipeline(self._pipeline)
         for uniform, placed in zip(uniforms, pictures, strict=True):
-            bound = (uniform, placed.planes, placed.truth or self._pool.get("no truth", 16))
+            bound = (uniform, placed.planes, placed.truth or self._no_truth)
             entries = [
-                {"binding": i, "resource": {"buffer": buffer.wgpu_buffer, "offset": 0, "size": buffer.nbytes}}
-                for i, buffer in enumerate(bound)
+                {"binding": i, "resource": {"buffer": buffer.wgpu_buffer, "offset": offset, "size": size}}
+                for i, (buffer, offset, size) in enumerate(array.binding for array in bound)
             ]
             render.set_bind_group(0, native.create_bind_group(layout=self._layout, entries=entries))
             render.set_viewport(*placed.origin, *placed.size, 0, 1)
@@ -93,7 +95,7 @@ class Presenter:
         render.end()
         self.device.queue.submit([encoder.finish()])
 
-    def _uniform(self, number: int, placed: Placed) -> Buffer:
+    def _uniform(self, number: int, placed: Placed) -> DeviceArray:
         values: dict[str, object] = {f"heat{i}": (*colour, 1.0) for i, colour in enumerate(HEAT)}
         values |= {
             "background": (*placed.background, 1.0),

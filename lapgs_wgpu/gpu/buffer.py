@@ -1,23 +1,21 @@
-"""Buffers on the device, and the way of arrays to and from them."""
+"""Buffers on the device, how they are written, and the textures made from them."""
 
 from __future__ import annotations
 
 import itertools
 import weakref
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import wgpu
 from numpy.typing import NDArray
 
 from ..errors import DeviceMemoryError
+from .bind_group import BindGroup
+from .device import Device
 from .shader import TABLE_TYPES, TABLE_WIDTH
-from .trouble import Guard
-
-if TYPE_CHECKING:
-    from .device import Device
-    from .kernel import BindGroup
+from .wgpu_errors import TranslatedErrors
 
 _STORAGE = wgpu.BufferUsage.STORAGE | wgpu.BufferUsage.UNIFORM | wgpu.BufferUsage.COPY_SRC | wgpu.BufferUsage.COPY_DST
 _SMALL = 1 << 16  # bytes that go through the queue where buffers cannot be mapped
@@ -66,8 +64,15 @@ class Buffer:
         self._uploaded = False  # has a write gone through staging before?
         self._download: Any = None
 
+    @property
+    def download(self) -> Any:
+        """The staging buffer to read through, where the device cannot map its own memory."""
+        if self._download is None:
+            self._download = self._create(wgpu.BufferUsage.MAP_READ | wgpu.BufferUsage.COPY_DST)
+        return self._download
+
     def _create(self, usage: int) -> Any:
-        with Guard(self.device, f"buffer {self.label!r}", self.nbytes):
+        with TranslatedErrors(self.device, f"buffer {self.label!r}", self.nbytes):
             return self.device.wgpu_device.create_buffer(label=self.label, size=self.nbytes, usage=usage)
 
     def write(self, array: NDArray[Any], offset: int = 0) -> None:
@@ -78,7 +83,7 @@ class Buffer:
         if data.nbytes == 0:
             return
         self.version += 1
-        with Guard(self.device, f"what is written to buffer {self.label!r}", data.nbytes):
+        with TranslatedErrors(self.device, f"what is written to buffer {self.label!r}", data.nbytes):
             if self.device.mappable:
                 self._fill(self.wgpu_buffer, data, offset)
             elif data.nbytes <= _SMALL:
@@ -112,7 +117,7 @@ class Buffer:
         rows = -(-count // TABLE_WIDTH)
         held = self._textures.get(texel_format)
         if held is None or held.rows < rows:
-            with Guard(self.device, f"the texture of buffer {self.label!r}", rows * TABLE_WIDTH * texel):
+            with TranslatedErrors(self.device, f"the texture of buffer {self.label!r}", rows * TABLE_WIDTH * texel):
                 texture = self.device.wgpu_device.create_texture(
                     label=self.label,
                     size=(TABLE_WIDTH, rows, 1),
@@ -137,75 +142,3 @@ class Buffer:
                         (width, height, 1),
                     )
         return held.view
-
-    def read(self, dtype: str, shape: tuple[int, ...], offset: int = 0) -> NDArray[Any]:
-        """A copy of `shape` elements of `dtype` from `offset` bytes (a multiple of 8) on. Waits for the device."""
-        return read_all([(self, dtype, shape, offset)])[0]
-
-
-Request = tuple[Buffer, str, tuple[int, ...], int]  # buffer, dtype, shape, offset in bytes
-
-
-def read_all(requests: list[Request]) -> list[NDArray[Any]]:
-    """Read several buffers with one wait."""
-    sources = []
-    encoder = None
-    for buffer, dtype, shape, offset in requests:
-        nbytes = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
-        size = max(8, (nbytes + 7) & ~7)
-        if offset + size > buffer.nbytes:
-            raise ValueError(f"{buffer.label}: reading {offset + size} bytes of {buffer.nbytes}")
-        if buffer.device.mappable:
-            sources.append((buffer.wgpu_buffer, offset, size, nbytes))
-            continue
-        if buffer._download is None:
-            buffer._download = buffer._create(wgpu.BufferUsage.MAP_READ | wgpu.BufferUsage.COPY_DST)
-        encoder = encoder or buffer.device.wgpu_device.create_command_encoder()
-        encoder.copy_buffer_to_buffer(buffer.wgpu_buffer, offset, buffer._download, offset, size)
-        sources.append((buffer._download, offset, size, nbytes))
-    if encoder is not None:
-        device = requests[0][0].device
-        with Guard(device, "what is read back"):
-            device.queue.submit([encoder.finish()])
-    out = []
-    for (source, offset, size, nbytes), (buffer, dtype, shape, _) in zip(sources, requests, strict=True):
-        with Guard(buffer.device, f"what is read from buffer {buffer.label!r}", nbytes):
-            source.map_sync("READ_NOSYNC", offset, size)
-        view = np.frombuffer(source.read_mapped(offset, size, copy=False), dtype=np.uint8)
-        array = view[:nbytes].copy().view(dtype).reshape(shape)
-        del view
-        source.unmap()
-        out.append(array)
-    return out
-
-
-class BufferPool:
-    """Named buffers that grow and never shrink, so that a training step allocates nothing in steady state."""
-
-    def __init__(self, device: Device) -> None:
-        self.device = device
-        self._buffers: dict[str, Buffer] = {}
-        self._constants: dict[str, bytes] = {}
-
-    def get(self, name: str, nbytes: int) -> Buffer:
-        """The buffer of this name with room for at least `nbytes`; its content is lost when it has to grow."""
-        buffer = self._buffers.get(name)
-        if buffer is None or buffer.nbytes < nbytes:
-            buffer = self._buffers[name] = Buffer(self.device, nbytes, name)
-        return buffer
-
-    def constant(self, name: str, content: bytes) -> Buffer:
-        """A small buffer with this content, written only when the content changes.
-
-        It must not change between the recording of a command that reads it and that command's submission.
-        """
-        buffer = self.get(f"constant {name}", len(content))
-        if self._constants.get(name) != content:
-            buffer.write(np.frombuffer(content, np.uint8))
-            self._constants[name] = content
-        return buffer
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes held by all buffers of the pool."""
-        return sum(buffer.nbytes for buffer in self._buffers.values())

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ..errors import NoAdapterError
-from .c_types import parse_only_what_is_named
+from .cffi_patch import parse_named_types_only
 
 # Features that the kernels can use. Each is requested only where the adapter has it, and each has a fallback.
 _WANTED_FEATURES = ("subgroup", "mappable-primary-buffers", "timestamp-query")
@@ -23,6 +23,9 @@ _DEFAULT_LIMITS = {
     "max-compute-workgroups-per-dimension": 65535,
 }
 _RAISED_LIMITS = ("max-storage-buffer-binding-size", "max-buffer-size", "max-storage-textures-per-shader-stage")
+
+# Mesa's software driver ends an invocation without a word when all its loops together have turned this many times.
+SOFTWARE_LOOP_TURNS = 65_535
 
 INSTALL_HINT = (
     "install a Vulkan driver for your graphics card, or Mesa's software driver: "
@@ -48,7 +51,7 @@ def _instance() -> Any:
     from wgpu.backends.wgpu_native import ffi
     from wgpu.backends.wgpu_native.extras import set_instance_extras
 
-    parse_only_what_is_named(ffi)
+    parse_named_types_only(ffi)
     # Not OpenGL: the same hardware again, with less of what the kernels need.
     set_instance_extras(backends=["Vulkan", "Metal", "DX12"], flags=["Empty"])
     return wgpu.gpu
@@ -74,9 +77,10 @@ def list_devices() -> list[DeviceInfo]:
 class Device:
     """An opened adapter.
 
-    queue and wgpu_device are wgpu's objects. subgroup_size is 0 where subgroups are unavailable.
+    queue and wgpu_device are wgpu's objects.
     textures: tables are read through textures (see gpu/shader), which is far faster on Mesa's software driver.
     mappable: buffers can be mapped where they are (CPU and integrated devices), without a staging copy.
+    max_loop_turns: after so many turns of all loops of an invocation together the driver ends it; None: never.
     """
 
     def __init__(self, adapter: Any, info: DeviceInfo, *, subgroups: bool = True, default_limits: bool = False) -> None:
@@ -104,22 +108,8 @@ class Device:
         self.is_cpu = info.kind == "cpu"
         self.mappable = "mappable-primary-buffers" in features and info.kind in ("cpu", "integrated")
         self.textures = self.is_cpu and limits.get("max-storage-textures-per-shader-stage", 0) >= 8
+        self.max_loop_turns = SOFTWARE_LOOP_TURNS if self.is_cpu else None
         self.kernel_cache: dict[Any, Any] = {}
-
-    @functools.cached_property
-    def subgroup_size(self) -> int:
-        """Lanes of a subgroup, measured by a kernel, since what adapters report of it is unreliable; 0 without."""
-        if "subgroup" not in self.features:
-            return 0
-        from .buffer import Buffer
-        from .kernel import Commands, Kernel
-
-        # A workgroup of 64 lanes, as the rasteriser's GPU shape has it: each lane reports the size it sees.
-        result = Buffer(self, 64 * 4, "subgroup_sizes")
-        with Commands(self) as commands:
-            commands.dispatch(Kernel.get(self, "probe_subgroup"), 1, sizes=result)
-        sizes = set(result.read("uint32", (64,)).tolist())
-        return sizes.pop() if len(sizes) == 1 else 0
 
     @property
     def max_binding(self) -> int:

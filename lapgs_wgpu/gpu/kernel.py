@@ -2,35 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import re
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import wgpu
 
 from ..errors import DeviceMemoryError
+from .array import DeviceArray
+from .bind_group import BindGroup
 from .buffer import Buffer
-from .shader import Defines, ShaderError, compose, pack, reflect
-from .trouble import Guard, is_lost
-
-if TYPE_CHECKING:
-    from .device import Device
+from .device import Device
+from .profile import Profile
+from .shader import Binding, Defines, ShaderError, compose, pack, reflect
+from .wgpu_errors import TranslatedErrors, is_lost
 
 _LAYOUT_TYPE = {"uniform": "uniform", "read": "read-only-storage", "read_write": "storage"}
-
-
-@dataclass(eq=False)
-class BindGroup:
-    """What a kernel is given, in wgpu's form, and the kernel's store of such groups, where it has the key."""
-
-    native: Any
-    textures: dict[str, Any]  # kept, so that an id in the key cannot come to mean another view
-    store: dict[Any, BindGroup]
-    key: Any
-
-    def drop(self) -> None:
-        """A buffer of it is gone."""
-        self.store.pop(self.key, None)
 
 
 class Kernel:
@@ -50,7 +37,7 @@ class Kernel:
             module = native.create_shader_module(label=name, code=self.source)
         except wgpu.GPUError as error:
             if is_lost(native):
-                with Guard(device, "a shader"):
+                with TranslatedErrors(device, "a shader"):
                     raise
             raise ShaderError(f"shaders/{name}.wgsl does not compile:\n{error}") from error
         entries: list[Any] = [
@@ -69,6 +56,7 @@ class Kernel:
             compute={"module": module, "entry_point": "main"},
         )
         self._groups: dict[Any, BindGroup] = {}
+        self._kinds = {name: _scalar(binding) for name, binding in self.bindings.items()}
 
     @staticmethod
     def get(device: Device, name: str, **defines: int) -> Kernel:
@@ -85,28 +73,30 @@ class Kernel:
         """The bytes of one of the shader's structs, by member name."""
         return pack(self.source, struct_name, values)
 
-    def parts(self, buffers: dict[str, Any]) -> dict[str, tuple[Buffer, int, int]]:
-        """Buffers by name as (Buffer, offset, size), checked against what the shader declares."""
-        if buffers.keys() != self.bindings.keys():
-            missing, unknown = self.bindings.keys() - buffers.keys(), buffers.keys() - self.bindings.keys()
+    def check(self, arrays: dict[str, DeviceArray]) -> None:
+        """Raise ShaderError where the arrays are not those that the shader declares, by name and by dtype, and
+        DeviceMemoryError where one is too large for a binding."""
+        if arrays.keys() != self.bindings.keys():
+            missing, unknown = self.bindings.keys() - arrays.keys(), arrays.keys() - self.bindings.keys()
             raise ShaderError(
-                f"shaders/{self.name}.wgsl: missing buffers {sorted(missing)}, unknown buffers {sorted(unknown)}"
+                f"shaders/{self.name}.wgsl: missing arrays {sorted(missing)}, unknown arrays {sorted(unknown)}"
             )
-        parts = {}
-        for name, given in buffers.items():
-            part = given if isinstance(given, tuple) else (given, 0, getattr(given, "nbytes", 0))
-            if not isinstance(part[0], Buffer):
-                raise ShaderError(f"shaders/{self.name}.wgsl: {name} must be a Buffer, got {type(part[0]).__name__}")
-            if part[2] > self.device.max_binding:
+        for name, array in arrays.items():
+            if not isinstance(array, DeviceArray):
+                raise ShaderError(f"shaders/{self.name}.wgsl: {name} must be a DeviceArray, got {type(array).__name__}")
+            declared = self._kinds[name]
+            if declared is not None and (array.dtype == "float32") != (declared == "f32"):
+                raise ShaderError(f"shaders/{self.name}.wgsl: {name} holds {declared}, got {array.dtype}")
+            size = array.binding[2]
+            if size > self.device.max_binding:
                 raise DeviceMemoryError(
-                    f"{name} of the pass {self.name} needs {part[2]} bytes in one binding, "
+                    f"{name} of the pass {self.name} needs {size} bytes in one binding, "
                     f"but {self.device.info.name} allows {self.device.max_binding}"
                 )
-            parts[name] = part
-        return parts
 
-    def bind(self, parts: dict[str, tuple[Buffer, int, int]], textures: dict[str, Any]) -> Any:
-        """wgpu's bind group for parts of buffers, and for the textures that stand for some of them."""
+    def bind(self, arrays: dict[str, DeviceArray], textures: dict[str, Any]) -> Any:
+        """wgpu's bind group for arrays, and for the textures that stand for some of them."""
+        parts = {name: array.binding for name, array in arrays.items()}
         key = tuple((name, part[0].number, id(textures.get(name)), *part[1:]) for name, part in parts.items())
         group = self._groups.get(key)
         if group is None:
@@ -114,7 +104,7 @@ class Kernel:
             for name, (buffer, offset, size) in parts.items():
                 whole = {"buffer": buffer.wgpu_buffer, "offset": offset, "size": size}
                 entries.append({"binding": self.bindings[name].number, "resource": textures.get(name, whole)})
-            if len(self._groups) > 64:  # parts of other sizes leave groups behind
+            if len(self._groups) > 64:  # arrays of other sizes leave groups behind
                 self._groups.clear()
             native = self.device.wgpu_device.create_bind_group(layout=self._layout, entries=entries)
             group = self._groups[key] = BindGroup(native, textures, self._groups, key)
@@ -123,32 +113,42 @@ class Kernel:
         return group.native
 
 
+def _scalar(binding: Binding) -> str | None:
+    """The scalar type of a binding's elements, f32, u32 or i32; None for structs."""
+    if binding.kind == "uniform":
+        return None
+    if binding.kind == "texture":
+        return "f32" if binding.type.endswith("float") else "u32"
+    names = re.findall(r"\w+", binding.type)
+    return names[-1] if names[-1] in ("f32", "u32", "i32") else None
+
+
 class Commands:
     """A list of dispatches, submitted when the `with` block ends without an error.
 
     profile: a Profile that takes the time of each dispatch (each then has a compute pass of its own).
     """
 
-    def __init__(self, device: Device, profile: Any = None) -> None:
+    def __init__(self, device: Device, profile: Profile | None = None) -> None:
         self.device = device
         self._profile = profile
         self._encoder = device.wgpu_device.create_command_encoder()
         self._pass: Any = None
         self._copied: list[Buffer] = []
 
-    def dispatch(self, kernel: Kernel, groups: int, **buffers: Any) -> None:
+    def dispatch(self, kernel: Kernel, groups: int, **arrays: DeviceArray) -> None:
         """Run `groups` workgroups, folded into two dimensions where one does not hold them (see common/index)."""
         limit = self.device.limits["max-compute-workgroups-per-dimension"]
         rows = max(1, -(-groups // limit))
-        self.dispatch_grid(kernel, (-(-groups // rows), rows), **buffers)
+        self.dispatch_grid(kernel, (-(-groups // rows), rows), **arrays)
 
-    def dispatch_grid(self, kernel: Kernel, groups: tuple[int, int], **buffers: Any) -> None:
-        """Run columns x rows workgroups."""
+    def dispatch_grid(self, kernel: Kernel, groups: tuple[int, int], **arrays: DeviceArray) -> None:
+        """Run columns x rows workgroups on arrays by the names of the shader's bindings."""
         if min(groups) <= 0:
             return
-        parts = kernel.parts(buffers)
+        kernel.check(arrays)
         textures = {
-            name: self._texture(parts[name], binding.type)
+            name: self._texture(arrays[name], binding.type)
             for name, binding in kernel.bindings.items()
             if binding.kind == "texture"
         }
@@ -158,28 +158,35 @@ class Commands:
         elif self._pass is None:
             self._pass = self._encoder.begin_compute_pass()
         self._pass.set_pipeline(kernel._pipeline)
-        self._pass.set_bind_group(0, kernel.bind(parts, textures))
+        self._pass.set_bind_group(0, kernel.bind(arrays, textures))
         self._pass.dispatch_workgroups(*groups, 1)
-        for name, (buffer, _, _) in parts.items():
+        for name, array in arrays.items():
             if kernel.bindings[name].kind == "read_write":
-                buffer.version += 1
+                array.buffer.version += 1
 
-    def _texture(self, part: tuple[Buffer, int, int], texel_format: str) -> Any:
+    def _texture(self, array: DeviceArray, texel_format: str) -> Any:
         self._end_pass()  # for the copy
-        self._copied.append(part[0])
-        return part[0].texture(self._encoder, texel_format, *part[1:])
+        buffer, offset, size = array.binding
+        self._copied.append(buffer)
+        return buffer.texture(self._encoder, texel_format, offset, size)
 
-    def clear(self, buffer: Buffer, nbytes: int | None = None) -> None:
-        """Set the first `nbytes` (a multiple of 4; all by default) to zero."""
+    def clear(self, array: DeviceArray) -> None:
+        """Set an array, rounded up to 4 bytes, to zero."""
+        if array.nbytes == 0:
+            return
         self._end_pass()
-        buffer.version += 1
-        self._encoder.clear_buffer(buffer.wgpu_buffer, 0, buffer.nbytes if nbytes is None else nbytes)
+        array.buffer.version += 1
+        self._encoder.clear_buffer(array.buffer.wgpu_buffer, array.offset, (array.nbytes + 3) & ~3)
 
-    def copy(self, source: Buffer, target: Buffer, nbytes: int) -> None:
-        """Copy the first `nbytes` (a multiple of 4) of one buffer to the start of another."""
+    def copy(self, source: DeviceArray, target: DeviceArray) -> None:
+        """Copy all of one array to another of the same size in bytes."""
         self._end_pass()
-        target.version += 1
-        self._encoder.copy_buffer_to_buffer(source.wgpu_buffer, 0, target.wgpu_buffer, 0, nbytes)
+        if source.nbytes != target.nbytes:
+            raise ValueError(f"{target.buffer.label}: {source.nbytes} bytes are copied to {target.nbytes}")
+        target.buffer.version += 1
+        self._encoder.copy_buffer_to_buffer(
+            source.buffer.wgpu_buffer, source.offset, target.buffer.wgpu_buffer, target.offset, source.nbytes
+        )
 
     def _end_pass(self) -> None:
         if self._pass is not None:
@@ -194,9 +201,9 @@ class Commands:
         if kind is None:
             if self._profile is not None:
                 self._profile.resolve(self._encoder)
-            with Guard(self.device, "commands"):
+            with TranslatedErrors(self.device, "commands"):
                 self.device.queue.submit([self._encoder.finish()])
         else:
             for buffer in self._copied:  # the copies are never made
                 buffer.version += 1
-            Guard(self.device, "commands").__exit__(kind, error, at)
+            TranslatedErrors(self.device, "commands").__exit__(kind, error, at)

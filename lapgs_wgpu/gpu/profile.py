@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import wgpu
 
-from .buffer import Buffer
+from .array import DeviceArray
 from .device import Device
 
 
@@ -27,7 +27,7 @@ class Profile:
         self._queries = device.wgpu_device.create_query_set(type="timestamp", count=2 * capacity)
         resolve = wgpu.BufferUsage.QUERY_RESOLVE | wgpu.BufferUsage.COPY_SRC
         self._resolved = device.wgpu_device.create_buffer(label="timestamps", size=16 * capacity, usage=resolve)
-        self._ticks = Buffer(device, 16 * capacity, "timestamps to read")
+        self._ticks = DeviceArray.empty(device, "timestamps to read", (capacity, 2), "uint64")
         self._tick_nanoseconds = _timestamp_period(device)
 
     def record(self, name: str) -> dict[str, Any]:
@@ -47,13 +47,13 @@ class Profile:
         count = 2 * len(self._names)
         if count:
             encoder.resolve_query_set(self._queries, 0, count, self._resolved, 0)
-            encoder.copy_buffer_to_buffer(self._resolved, 0, self._ticks.wgpu_buffer, 0, 8 * count)
+            encoder.copy_buffer_to_buffer(self._resolved, 0, self._ticks.buffer.wgpu_buffer, 0, 8 * count)
 
     def read(self) -> list[tuple[str, float]]:
         """Each dispatch's name and milliseconds, in order. Waits for the device; the profile is empty afterwards."""
         if not self._names:
             return []
-        ticks = self._ticks.read("uint64", (len(self._names), 2))
+        ticks = self._ticks.rows(0, len(self._names)).read()
         # Differences first: the clock itself has more digits than a float holds.
         milliseconds = (ticks[:, 1] - ticks[:, 0]).astype(np.float64) * self._tick_nanoseconds * 1e-6
         names, self._names = self._names, []

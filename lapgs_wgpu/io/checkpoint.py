@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.atomic import atomic_write
-from lapgs_wgpu.io.ply import StillGaussians, ply_header, read_vertices, vertex_rows
+from lapgs_wgpu.io.ply import GaussianSnapshot, ply_header, read_vertices, vertex_rows
 from lapgs_wgpu.io.ply_header import Element, PathLike, open_ply
 from lapgs_wgpu.io.safetensors_file import pack_tensors, unpack_tensors
 
@@ -26,13 +26,13 @@ _ELEMENT = "lapgs4d"
 class Checkpoint(NamedTuple):
     """still: the Gaussians at the reference time. tensors and metadata: the motion, both empty for a static scene."""
 
-    still: StillGaussians
+    still: GaussianSnapshot
     tensors: dict[str, NDArray[Any]]
     metadata: dict[str, str]
 
 
 def write_checkpoint(
-    path: PathLike, still: StillGaussians, tensors: Mapping[str, NDArray[Any]], metadata: Mapping[str, str]
+    path: PathLike, still: GaussianSnapshot, tensors: Mapping[str, NDArray[Any]], metadata: Mapping[str, str]
 ) -> None:
     """Write a checkpoint. Atomic; equal arguments give equal bytes, on every machine.
 

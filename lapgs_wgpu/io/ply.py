@@ -23,7 +23,7 @@ _BLOCK_BYTES = 1 << 20  # rows are converted in blocks that stay in the cache
 
 
 @dataclass(frozen=True, eq=False)
-class StillGaussians:
+class GaussianSnapshot:
     """N Gaussians at one moment, as stored: before the activations. Everything is float32.
 
     means: (N, 3) world units. sh: (N, K, 3) spherical harmonics, K = (degree + 1)^2 coefficients, degree 0 to 3.
@@ -66,7 +66,7 @@ def _names(rest: int) -> list[str]:
 _WRITTEN_NAMES = [*_names(0)[:3], "nx", "ny", "nz", *_names(45)[3:]]
 
 
-def read_ply(path: PathLike) -> StillGaussians:
+def read_ply(path: PathLike) -> GaussianSnapshot:
     """The Gaussians of any 3DGS .ply: properties in any order, SH degree 0 to 3, further scalar properties skipped.
 
     Raises InputError when the file is not such a file, is damaged, or holds a value that cannot be rendered. Needs
@@ -76,7 +76,7 @@ def read_ply(path: PathLike) -> StillGaussians:
         return read_vertices(file, elements, path)
 
 
-def write_ply(path: PathLike, still: StillGaussians) -> None:
+def write_ply(path: PathLike, still: GaussianSnapshot) -> None:
     """Write Gaussians with exactly the 62 properties of 3DGS, SH padded with zeros to degree 3. Atomic.
 
     Raises InputError when the file cannot be written or a value could not be read back.
@@ -94,7 +94,7 @@ def ply_header(count: int, trailer: str = "") -> bytes:
     return f"ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{properties}{trailer}end_header\n".encode()
 
 
-def vertex_rows(still: StillGaussians, path: PathLike) -> Floats:
+def vertex_rows(still: GaussianSnapshot, path: PathLike) -> Floats:
     """(N, 62) little-endian rows as 3DGS stores them. Raises InputError where `path` could not be read back."""
     if len(still) == 0:
         raise InputError(f"{path}: not written, because it would hold 0 Gaussians; at least 1 is needed")
@@ -111,7 +111,7 @@ def vertex_rows(still: StillGaussians, path: PathLike) -> Floats:
     return rows
 
 
-def read_vertices(file: BinaryIO, elements: dict[str, Element], path: PathLike) -> StillGaussians:
+def read_vertices(file: BinaryIO, elements: dict[str, Element], path: PathLike) -> GaussianSnapshot:
     """The Gaussians of an opened file: see read_ply."""
     if "vertex" not in elements:
         raise InputError(f"{path}: has no element vertex, so it holds no Gaussians; give a 3DGS .ply file")
@@ -125,7 +125,7 @@ def read_vertices(file: BinaryIO, elements: dict[str, Element], path: PathLike) 
     sh[:, 0] = values[:, 3:6]
     for channel in range(3):  # channel-major: all of red, then green, then blue
         sh[:, 1:, channel] = values[:, 6 + channel * rest // 3 : 6 + (channel + 1) * rest // 3]
-    return StillGaussians(
+    return GaussianSnapshot(
         means=values[:, 0:3].copy(),
         sh=sh,
         opacity_logits=values[:, end].copy(),

@@ -15,18 +15,19 @@ from torch import Tensor, nn
 
 from ..gpu.device import Device, open_device
 from ..io.checkpoint import write_checkpoint
-from ..io.ply import StillGaussians
+from ..io.ply import GaussianSnapshot
 from ..splat.camera import Camera
+from ..splat.constants import CONSTANTS
 from ..splat.gaussians import Gaussians
 from ..splat.rasterize import Rendering, rasterize
-from .field import MIN_SCALE, FieldConfig, Nearby
-from .grid_field import GridField
-from .hexplane_field import HexPlaneField
-from .laplacian import LaplacianMotion
-from .mlp_field import MlpField
+from ..splat.rotation import rotate
+from .fields.config import MIN_SCALE, FieldConfig
+from .fields.deformation import Nearby
+from .fields.grid_field import GridField
+from .fields.hexplane_field import HexPlaneField
+from .fields.laplacian import LaplacianMotion
+from .fields.mlp_field import MlpField
 from .scene_file import SceneFile, read_scene, row_shapes
-
-SH_C0 = 0.28209479177387814
 
 Field = GridField | MlpField | HexPlaneField
 
@@ -87,7 +88,7 @@ class Scene4D:
             "log_scales": torch.as_tensor(np.log(np.asarray(scales, np.float32)))[:, None].repeat(1, 3),
             "quats": torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
             "opacity_logits": torch.full((n,), float(np.log(opacity / (1 - opacity)))),
-            "sh_dc": (torch.as_tensor(np.asarray(colors, np.float32)) - 0.5)[:, None] / SH_C0,
+            "sh_dc": (torch.as_tensor(np.asarray(colors, np.float32)) - 0.5)[:, None] / CONSTANTS["SH_C0"],
             "sh_rest": torch.zeros(n, 15, 3),
             "dynamics": torch.zeros(n, field_config.dynamics_size),
         }
@@ -152,7 +153,7 @@ class Scene4D:
         with torch.no_grad():
             return draw(self.at(t), camera, background, self.device, depth=depth)
 
-    def still(self, t: float) -> StillGaussians:
+    def still(self, t: float) -> GaussianSnapshot:
         """The Gaussians at time t in [0, 1] before their activations, as 3DGS viewers read them."""
         with torch.no_grad():
             still = self.at(t)
@@ -160,7 +161,7 @@ class Scene4D:
             logits = self.parameters["opacity_logits"].detach()
             if not torch.equal(still.opacities, logits.sigmoid()):
                 logits = still.opacities.logit(eps=1e-7)
-        return StillGaussians(
+        return GaussianSnapshot(
             means=still.means.numpy(force=True),
             sh=sh.numpy(force=True),
             opacity_logits=logits.numpy(force=True),
@@ -209,15 +210,7 @@ def scene_of(file: SceneFile, device: Device | None = None) -> Scene4D:
     parameters = {name: torch.from_numpy(array.copy()) for name, array in file.gaussians.items()}
     scene = Scene4D(parameters, file.field_config, device or open_device(), sh_degree=file.sh_degree)
     if scene.field is not None:
-        shapes = {name: tuple(value.shape) for name, value in scene.field.state_dict().items()}
         # Copied into the module by load_state_dict, so that they may be views of the file's bytes.
-        scene.field.load_state_dict({name: torch.from_numpy(array) for name, array in file.field(shapes).items()})
+        scene.field.load_state_dict({name: torch.from_numpy(array) for name, array in file.field.items()})
     scene.metadata = file.metadata
     return scene
-
-
-def rotate(q: Tensor, v: Tensor) -> Tensor:
-    """Vectors (N, 3) turned by unit quaternions (N, 4) wxyz."""
-    w, axis = q[:, :1], q[:, 1:]
-    twice = 2.0 * torch.linalg.cross(axis, v)
-    return v + w * twice + torch.linalg.cross(axis, twice)

@@ -14,7 +14,8 @@ from ..errors import InputError
 from ..io.checkpoint import read_checkpoint
 from ..io.dataclass_table import build_dataclass
 from ..io.safe_json_toml import parse_json
-from .field import FieldConfig, plane_shapes, static_grid, temporal_grids
+from .fields.config import FieldConfig
+from .fields.parameter_shapes import parameter_shapes
 
 _MAX_DEGREE = 3
 _SHAPES = {
@@ -29,18 +30,15 @@ _SHAPES = {
 
 @dataclass(frozen=True, eq=False)
 class SceneFile:
-    """gaussians: the canonical ones by name, float32, in the shapes of `row_shapes`. metadata: the file's own texts."""
+    """gaussians: the canonical ones by name, float32, in the shapes of `row_shapes`. field: the field's parameters by
+    name, in the shapes of `parameter_shapes`. metadata: the file's own texts."""
 
     path: str | os.PathLike[str]
     field_config: FieldConfig
     sh_degree: int
     gaussians: dict[str, NDArray[np.float32]]
+    field: dict[str, NDArray[np.float32]]
     metadata: dict[str, str]
-    tensors: Mapping[str, NDArray[Any]]
-
-    def field(self, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, NDArray[np.float32]]:
-        """The field's parameters of these names and shapes. Raises InputError where the file has others."""
-        return {name: _tensor(self.tensors, f"field.{name}", shape, self.path) for name, shape in shapes.items()}
 
 
 def read_scene(path: str | os.PathLike[str]) -> SceneFile:
@@ -64,9 +62,10 @@ def read_scene(path: str | os.PathLike[str]) -> SceneFile:
     gaussians = {
         name: _tensor(tensors, f"gaussians.{name}", (count, *shape), path) for name, shape in row_shapes(config).items()
     }
-    _check_sizes(config, tensors, path)
     texts = {key: value for key, value in metadata.items() if key not in ("field", "sh_degree")}
-    return SceneFile(path, config, degree, gaussians, texts, tensors)
+    # Here, since the description may ask for more memory than there is: no module is made of it before.
+    field = {name: _tensor(tensors, f"field.{name}", shape, path) for name, shape in parameter_shapes(config).items()}
+    return SceneFile(path, config, degree, gaussians, field, texts)
 
 
 def row_shapes(config: FieldConfig) -> dict[str, tuple[int, ...]]:
@@ -88,25 +87,6 @@ def _read_header(metadata: Mapping[str, str], path: str | os.PathLike[str]) -> t
             "it was damaged, or written by another version of lapgs_wgpu"
         ) from error
     return config, degree
-
-
-def _check_sizes(config: FieldConfig, tensors: Mapping[str, NDArray[Any]], path: str | os.PathLike[str]) -> None:
-    """That the large tensors in the file have the sizes that the description asks for, before memory is taken."""
-    shapes: dict[str, tuple[int, ...]] = {}
-    square = (config.width, config.width)
-    if config.kind in ("grid4d", "laplacian"):
-        shapes["static_grid.table"] = (static_grid(config).entries, 2)
-        shapes |= {f"temporal_grids.{i}.table": (grid.entries, 2) for i, grid in enumerate(temporal_grids(config))}
-        shapes |= {f"hidden.{2 * i}.weight": square for i in range(config.depth)}
-    elif config.kind == "hexplane":
-        shapes |= {f"planes.{i}": shape for i, shape in enumerate(plane_shapes(config.planes))}
-        shapes |= {f"trunk.{2 * i}.weight": square for i in range(1, config.depth + 1)} | {"heads.0.1.weight": square}
-    elif config.kind == "mlp":
-        shapes["layers.1.weight"] = square  # there are a few more of this size
-    if config.kind == "laplacian":
-        shapes["motion.second.weight"] = square
-    for name, shape in shapes.items():
-        _tensor(tensors, f"field.{name}", shape, path)
 
 
 def _tensor(

@@ -1,1 +1,1 @@
-"""Rasterising 3D Gaussians: the camera, the passes, their float64 twin."""
+"""Rasterising 3D Gaussians: the camera, the passes, their float64 reference."""

@@ -3,27 +3,35 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
 
-from torch import Tensor
+Array = TypeVar("Array")
 
 
 @dataclass(frozen=True, eq=False)
-class Gaussians:
-    """N Gaussians with their activations applied.
+class Gaussians(Generic[Array]):
+    """N Gaussians with their activations applied, float32: torch tensors, numpy arrays or DeviceArrays.
 
     means: (N, 3) world units. quats: (N, 4) wxyz, any non-zero length. scales: (N, 3) standard deviations, world units.
-    opacities: (N,) in [0, 1]. sh: (N, K, 3) spherical harmonics, K = (degree + 1)^2 coefficients, degree 0 to 3.
+    opacities: (N,) in [0, 1]. sh: (N, K, 3) spherical harmonics, K = (degree + 1)^2 coefficients, degree 0 to 3; or
+    colours (N, 3), which do not depend on the view.
     """
 
-    means: Tensor
-    quats: Tensor
-    scales: Tensor
-    opacities: Tensor
-    sh: Tensor
+    means: Array
+    quats: Array
+    scales: Array
+    opacities: Array
+    sh: Array
 
     def __len__(self) -> int:
-        return self.means.shape[0]
+        return int(_shape(self.means)[0])
 
     @property
-    def sh_degree(self) -> int:
-        return int(self.sh.shape[1] ** 0.5) - 1
+    def sh_degree(self) -> int | None:
+        """Degree of the harmonics; None where `sh` holds colours."""
+        shape = _shape(self.sh)
+        return None if len(shape) == 2 else int(shape[1] ** 0.5) - 1
+
+
+def _shape(array: Any) -> tuple[int, ...]:
+    return tuple(array.shape)

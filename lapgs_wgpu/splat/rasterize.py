@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from ..gpu.buffer import Buffer, BufferPool, Request, read_all
+from ..gpu.array import DeviceArray, read_all
 from ..gpu.device import Device, open_device
+from ..gpu.pool import BufferPool
 from .camera import Camera
-from .rasterizer import SPLAT_FLOATS, GaussianBuffers, GradientBuffers, Rasterizer
+from .drawing import Drawing
+from .gaussians import Gaussians
+from .rasterizer import Rasterizer
+from .splat_layout import COLOR, MEAN, OPACITY, RADIUS
 
 
 class Rendering(NamedTuple):
@@ -85,9 +91,10 @@ def rasterize(
         background = means.new_zeros(3)
     elif tuple(background.shape) != (3,):
         raise ValueError(f"rasterize: background must have shape (3,), got {tuple(background.shape)}")
+    sh = colors if sh_degree is None else colors[:, : (sh_degree + 1) ** 2]
     probe = means.new_zeros((n, 2)).requires_grad_(torch.is_grad_enabled())
     image, alpha, z, radii, centres = _Rasterize.apply(
-        means, quats, scales, opacities, colors, background, probe, camera, sh_degree, depth, device or open_device()
+        means, quats, scales, opacities, sh, background, probe, camera, depth, device or open_device()
     )
     with torch.no_grad():
         probe.copy_(centres)
@@ -97,104 +104,75 @@ def rasterize(
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
-        *tensors, probe, camera, sh_degree, depth, device = arguments
+        *tensors, background, probe, camera, depth, device = arguments
         rasterizer = rasterizer_of(device)
-        n, height, width = len(probe), camera.height, camera.width
-        ctx.camera, ctx.sh_degree, ctx.depth, ctx.rasterizer = camera, sh_degree, depth, rasterizer
-        if n == 0:
-            background = tensors[5]
-            ctx.save_for_backward(*tensors, background.new_ones((height, width)))
+        height, width = camera.height, camera.width
+        ctx.camera, ctx.depth, ctx.rasterizer = camera, depth, rasterizer
+        if len(probe) == 0:
+            ctx.save_for_backward(*tensors, background, background.new_ones((height, width)))
             ctx.drawing = None
             image = background.expand(height, width, 3).clone()
             empty = image.new_zeros((height, width))
             radii = torch.zeros(0, dtype=torch.int32, device=image.device)
             ctx.mark_non_differentiable(radii)
             return image, empty, empty.clone(), radii, probe.detach().clone()
-        planes, splats = _draw(rasterizer, tensors, camera, sh_degree, depth)
-        ctx.drawing = rasterizer._drawn
+        ctx.drawing, planes, splats = _draw(rasterizer, Gaussians(*tensors), background, camera, depth)
         out = torch.from_numpy(planes).to(probe.device)
-        projected = torch.from_numpy(splats).to(probe.device)
-        ctx.save_for_backward(*tensors, out[3])
+        ctx.save_for_backward(*tensors, background, out[3])
         z = out[4].clone() if depth else torch.zeros_like(out[3])
-        radii = projected[:, 10].to(torch.int32)
-        ctx.mark_non_differentiable(radii)
-        centres = projected[:, :2].contiguous()
-        ctx.mark_non_differentiable(centres)
+        radii, centres = radii_and_centres(splats, probe.device)
+        ctx.mark_non_differentiable(radii, centres)
         return out[:3].permute(1, 2, 0).contiguous(), 1.0 - out[3], z, radii, centres
 
     @staticmethod
     def backward(ctx: Any, *d_outputs: Any) -> tuple[Tensor | None, ...]:
         d_image, d_alpha, d_depth = d_outputs[:3]
-        *tensors, transmittance = ctx.saved_tensors
-        background = tensors[5]
+        *tensors, background, transmittance = ctx.saved_tensors
         d_background = (d_image * transmittance[..., None]).sum((0, 1)) if ctx.needs_input_grad[5] else None
         if ctx.drawing is None:
-            empty = [torch.zeros_like(t) for t in tensors[:5]]
-            return (*empty, d_background, background.new_zeros((0, 2)), *[None] * 4)
+            empty = [torch.zeros_like(t) for t in tensors]
+            return (*empty, d_background, background.new_zeros((0, 2)), *[None] * 3)
         rasterizer: Rasterizer = ctx.rasterizer
-        if rasterizer._drawn is not ctx.drawing:  # another image was drawn in between: its buffers are not ours
-            _draw(rasterizer, tensors, ctx.camera, ctx.sh_degree, ctx.depth)
-            ctx.drawing = rasterizer._drawn
+        if not rasterizer.holds(ctx.drawing):  # another image was drawn in between
+            ctx.drawing, _, _ = _draw(rasterizer, Gaussians(*tensors), background, ctx.camera, ctx.depth)
         planes = torch.cat([d_image.permute(2, 0, 1), d_alpha[None], *([d_depth[None]] if ctx.depth else [])])
-        d_planes = _upload(rasterizer.pool, "d_image", planes)
-        gradients = rasterizer.backward(d_planes)
-        n = len(tensors[0])
-        requests = read_requests(gradients, n, tuple(tensors[4].shape))
-        d_splats, d_means, d_quats, d_scales, *d_sh = (
-            torch.from_numpy(array).to(background.device) for array in read_all(requests)
-        )
-        d_colors = d_sh[0] if d_sh else d_splats[:, 6:9]
-        return (
-            d_means, d_quats, d_scales, d_splats[:, 5], d_colors, d_background, d_splats[:, :2], *[None] * 4
-        )  # fmt: skip
+        gradients = rasterizer.backward(ctx.drawing, _upload(rasterizer.pool, "d_image", planes))
+        by_gaussians, d_means2d = gradient_tensors(read_all(gradients.arrays()), background.device)
+        return (*by_gaussians, d_background, d_means2d, *[None] * 3)
 
 
 def _draw(
-    rasterizer: Rasterizer, tensors: list[Tensor], camera: Camera, sh_degree: int | None, depth: bool
-) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
-    """Upload, draw until the buffers are large enough, read back: planes (4 or 5, H, W) and splats (N, 12)."""
-    *shapes, background = tensors
-    n = len(shapes[0])
-    gaussians = upload_gaussians(rasterizer.pool, shapes, sh_degree)
+    rasterizer: Rasterizer, gaussians: Gaussians[Tensor], background: Tensor, camera: Camera, depth: bool
+) -> tuple[Drawing, NDArray[np.float32], NDArray[np.float32]]:
+    """Upload, draw until the buffers are large enough, read back: planes (4 or 5, H, W) and splats."""
+    arrays = upload_gaussians(rasterizer.pool, gaussians)
     red, green, blue = background.tolist()
     while True:
-        image = rasterizer.draw(gaussians, camera, (red, green, blue), depth=depth)
-        splats = rasterizer.pool.get("splats", 0)
-        planes, projected, *needed = read_all(
-            [
-                (image, "float32", (5 if depth else 4, camera.height, camera.width), 0),
-                (splats, "float32", (n, SPLAT_FLOATS), 0),
-                *rasterizer.needed_requests(),
-            ]
-        )
-        if not rasterizer.fit(needed):
-            return planes, projected
+        drawing = rasterizer.draw(arrays, camera, (red, green, blue), depth=depth)
+        planes, splats, *needed = read_all([drawing.image, drawing.splats, *drawing.needed])
+        if not rasterizer.grow_on_overflow(drawing, needed):
+            return drawing, planes, splats
 
 
-def upload_gaussians(pool: BufferPool, tensors: list[Tensor], sh_degree: int | None) -> GaussianBuffers:
-    """The tensors means, quats, scales, opacities and colors, in buffers of a pool."""
-    names = ("means", "quats", "scales", "opacities", "colors")
-    buffers = {name: _upload(pool, name, tensor) for name, tensor in zip(names, tensors, strict=True)}
-    stored = 1 if sh_degree is None else tensors[4].shape[1]
-    return GaussianBuffers(count=len(tensors[0]), sh_degree=sh_degree, sh_stored=stored, **buffers)
+def upload_gaussians(pool: BufferPool, gaussians: Gaussians[Tensor]) -> Gaussians[DeviceArray]:
+    """The Gaussians in buffers of a pool."""
+    names = [field.name for field in dataclasses.fields(gaussians)]
+    return Gaussians(*(_upload(pool, name, getattr(gaussians, name)) for name in names))
 
 
-def read_requests(gradients: GradientBuffers, n: int, colors: tuple[int, ...]) -> list[Request]:
-    """What to read (with `read_all`) to have gradients: splats, means, quats, scales, and colours where they are
-    spherical harmonics, which have this shape."""
-    requests: list[Request] = [
-        (gradients.splats, "float32", (n, SPLAT_FLOATS), 0),
-        (gradients.means, "float32", (n, 3), 0),
-        (gradients.quats, "float32", (n, 4), 0),
-        (gradients.scales, "float32", (n, 3), 0),
-    ]
-    if gradients.colors is not None:
-        requests.append((gradients.colors, "float32", colors, 0))
-    return requests
+def radii_and_centres(splats: NDArray[np.float32], device: torch.device) -> tuple[Tensor, Tensor]:
+    """`radii` and `means2d` of a Rendering, from splats that were read back."""
+    projected = torch.from_numpy(splats).to(device)
+    return projected[:, RADIUS].to(torch.int32), projected[:, MEAN].contiguous()
 
 
-def _upload(pool: BufferPool, name: str, tensor: Tensor) -> Buffer:
-    array = tensor.detach().to("cpu", torch.float32).contiguous().numpy()
-    buffer = pool.get(f"input {name}", array.nbytes)
-    buffer.write(array)
-    return buffer
+def gradient_tensors(arrays: list[NDArray[np.float32]], device: torch.device) -> tuple[tuple[Tensor, ...], Tensor]:
+    """The gradients by means, quats, scales, opacities and sh, and by means2d, from those of GaussianGradients that
+    were read back."""
+    d_splats, d_means, d_quats, d_scales, *d_sh = (torch.from_numpy(array).to(device) for array in arrays)
+    d_colors = d_sh[0] if d_sh else d_splats[:, COLOR]
+    return (d_means, d_quats, d_scales, d_splats[:, OPACITY], d_colors), d_splats[:, MEAN]
+
+
+def _upload(pool: BufferPool, name: str, tensor: Tensor) -> DeviceArray:
+    return pool.upload(f"input {name}", tensor.detach().to("cpu", torch.float32).contiguous().numpy())

@@ -16,6 +16,7 @@ from ..errors import InputError
 from .camera import Camera
 from .constants import CONSTANTS
 from .rasterize import Rendering
+from .rotation import rotation_matrices
 
 DILATION, NEAR, FRUSTUM_MARGIN, ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN = (
     CONSTANTS[name] for name in ("DILATION", "NEAR", "FRUSTUM_MARGIN", "ALPHA_MAX", "ALPHA_MIN", "TRANSMITTANCE_MIN")
@@ -45,17 +46,6 @@ class Projection(NamedTuple):
         return rows[torch.argsort(self.depths[rows].detach(), stable=True)]
 
 
-def rotation(quats: Tensor) -> Tensor:
-    """(N, 3, 3) rotation matrices of (N, 4) quaternions wxyz of any non-zero length."""
-    w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
-
-
 def _camera_points(means: Tensor, camera: Camera) -> Tensor:
     T = torch.as_tensor(camera.T_cam_world, dtype=means.dtype, device=means.device)
     return means @ T[:3, :3].T + T[:3, 3]
@@ -82,7 +72,9 @@ def _project(
     means2d = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=-1)
 
     R_cam = torch.as_tensor(camera.T_cam_world[:3, :3], dtype=means.dtype, device=means.device)
-    axes = R_cam @ (rotation(quats) * scales[:, None, :])  # (N, 3, 3): the covariance in camera space is axes axes^T
+    axes = R_cam @ (
+        rotation_matrices(quats) * scales[:, None, :]
+    )  # (N, 3, 3): the covariance in camera space is axes axes^T
     # Beyond its limits x/z is a constant for the Jacobian, so no gradient flows to it from there (as in gsplat).
     (x_low, x_high), (y_low, y_high) = _frustum_limits(camera)
     row_x = (fx / z)[:, None] * (axes[:, 0] - (x / z).clamp(x_low, x_high)[:, None] * axes[:, 2])

@@ -14,8 +14,8 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from lapgs_wgpu.motion.dynamics import outliers
-from lapgs_wgpu.splat.reference import rotation
+from lapgs_wgpu.motion.fields.dynamics import outliers
+from lapgs_wgpu.splat.rotation import rotation_matrices
 from lapgs_wgpu.train.config import DensityConfig
 
 LEAST_SHARE = 1e-2  # added to each neighbour's weight, in mean weights, so that none has the probability zero
@@ -79,7 +79,7 @@ def nearest(means: Tensor, of: Tensor, count: int) -> Tensor:
 
 def covariances(log_scales: Tensor, quats: Tensor) -> Tensor:
     """(N, 3, 3) covariances R diag(s^2) R^T of Gaussians, squared world units."""
-    axes = rotation(quats) * log_scales.exp()[:, None, :]
+    axes = rotation_matrices(quats) * log_scales.exp()[:, None, :]
     return axes @ axes.mT
 
 

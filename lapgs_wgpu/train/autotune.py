@@ -11,7 +11,7 @@ import torch
 
 from lapgs_wgpu.errors import DeviceMemoryError
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.motion.grid_field import GridField
+from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.distributed import Ranks

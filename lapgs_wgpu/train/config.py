@@ -13,8 +13,8 @@ import math
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
-from lapgs_wgpu.motion.field import DynamicsMode, FieldConfig
-from lapgs_wgpu.motion.hashgrid import option
+from lapgs_wgpu.motion.fields.config import DynamicsMode, FieldConfig
+from lapgs_wgpu.motion.fields.hash_grid_config import option
 
 Background = Literal["black", "white", "random"]
 Split = Literal["plain", "adaptive"]

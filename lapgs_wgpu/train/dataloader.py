@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lapgs_wgpu.data.views import ImageCache, View, composite
-from lapgs_wgpu.gpu.buffer import Buffer
+from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.train.config import Background
 from lapgs_wgpu.train.evaluate import COLOURS
-from lapgs_wgpu.train.render_loss import TruthCache
+from lapgs_wgpu.train.truth_cache import TruthCache
 
 AHEAD = 8  # pictures that are decoded before they are needed
 DECODERS = min(4, os.cpu_count() or 1)  # threads that decode them
@@ -65,7 +65,7 @@ class Pictures:
         self._cache.prefetch(each for each in coming if each not in self._truths)
         return view, torch.rand(3, generator=self._generator) if self._colour is None else self._colour
 
-    def on_device(self, view: View) -> Buffer:
+    def on_device(self, view: View) -> DeviceArray:
         """The picture of a view that `choose` gave, for `render_loss`."""
         return self._truths.get(view, partial(self._cache.get, view))
 

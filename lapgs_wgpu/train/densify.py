@@ -15,7 +15,7 @@ from torch import Tensor
 
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.rasterize import Seen
-from lapgs_wgpu.splat.reference import rotation
+from lapgs_wgpu.splat.rotation import rotation_matrices
 from lapgs_wgpu.train.adaptive_split import adaptive_split
 from lapgs_wgpu.train.config import DensityConfig
 
@@ -132,7 +132,7 @@ def split_rows(parents: Rows, generator: torch.Generator) -> dict[str, Tensor]:
     """Two children (2 N, ...) for each of N parents: drawn from the parent as a distribution, and 1.6 times smaller."""
     rows = {name: row.repeat(CHILDREN, *[1] * (row.ndim - 1)) for name, row in parents.items()}
     normal = torch.randn(rows["means"].shape, generator=generator).to(rows["means"].device)
-    offset = rotation(rows["quats"]) @ (normal * rows["log_scales"].exp())[:, :, None]
+    offset = rotation_matrices(rows["quats"]) @ (normal * rows["log_scales"].exp())[:, :, None]
     rows["means"] = rows["means"] + offset[:, :, 0]
     rows["log_scales"] = rows["log_scales"] - math.log(SHRINK)
     return rows

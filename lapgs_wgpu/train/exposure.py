@@ -12,9 +12,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ..gpu.buffer import Buffer, BufferPool
+from ..gpu.array import DeviceArray
 from ..gpu.device import Device
 from ..gpu.kernel import Commands, Kernel
+from ..gpu.pool import BufferPool
 from .config import Rate
 
 MEAN_DECAY, SQUARE_DECAY = 0.9, 0.999  # Adam's
@@ -22,7 +23,7 @@ TINY = 1e-15  # keeps 0 / 0 away
 
 
 def exposure(image: Tensor, correction: Tensor) -> Tensor:
-    """The image (H, W, 3) after a correction (3, 4): the twin of the passes."""
+    """The image (H, W, 3) after a correction (3, 4): the reference of the passes."""
     return image @ correction[:, :3].mT + correction[:, 3]
 
 
@@ -30,8 +31,8 @@ class Exposed(NamedTuple):
     """An image (4, H, W) whose gradient was carried back: d_image, by the rendered image's planes; and d_rows
     (H, 3, 4), whose sum is the gradient by the correction."""
 
-    d_image: Buffer
-    d_rows: Buffer
+    d_image: DeviceArray
+    d_rows: DeviceArray
 
 
 class ExposurePasses:
@@ -42,35 +43,27 @@ class ExposurePasses:
         self.pool = BufferPool(device)
         self._lanes = 8 if device.is_cpu else 64
 
-    def record(self, commands: Commands, image: Buffer, size: tuple[int, int], correction: Tensor) -> Buffer:
-        """The corrected image. image: planes (4, H, W) of float32, the first three red, green, blue. size: (H, W)."""
-        height, width = size
-        exposed = self.pool.get("exposed", 16 * height * width)
-        self._dispatch(commands, "exposure", size, correction, image=(image, 0, 16 * height * width), exposed=exposed)
+    def record(self, commands: Commands, image: DeviceArray, correction: Tensor) -> DeviceArray:
+        """The corrected image. image: planes (4, H, W) of float32, the first three red, green, blue."""
+        exposed = self.pool.array("exposed", image.shape)
+        self._dispatch(commands, "exposure", correction, image=image, exposed=exposed)
         return exposed
 
-    def record_bwd(
-        self, commands: Commands, image: Buffer, d_exposed: Buffer, size: tuple[int, int], correction: Tensor
-    ) -> Exposed:
+    def record_bwd(self, commands: Commands, image: DeviceArray, d_exposed: DeviceArray, correction: Tensor) -> Exposed:
         """d_exposed: the gradient by the corrected image; its fourth plane counts as zeros."""
-        height, width = size
-        done = Exposed(self.pool.get("d_image", 16 * height * width), self.pool.get("d_rows", 48 * height))
-        tables = {name: (part, 0, 16 * height * width) for name, part in (("image", image), ("d_exposed", d_exposed))}
-        self._dispatch(commands, "exposure_bwd", size, correction, **tables, **done._asdict())
+        height = image.shape[1]
+        done = Exposed(self.pool.array("d_image", image.shape), self.pool.array("d_rows", (height, 3, 4)))
+        self._dispatch(commands, "exposure_bwd", correction, image=image, d_exposed=d_exposed, **done._asdict())
         return done
 
     def _dispatch(
-        self,
-        commands: Commands,
-        name: str,
-        size: tuple[int, int],
-        correction: Tensor,
-        **buffers: Buffer | tuple[Buffer, int, int],
+        self, commands: Commands, name: str, correction: Tensor, *, image: DeviceArray, **arrays: DeviceArray
     ) -> None:
+        _, height, width = image.shape
         kernel = Kernel.get(self.device, name, LANES=self._lanes)
         rows = dict(zip(("red", "green", "blue"), correction.tolist(), strict=True))
-        uniform = self.pool.constant("exposure", kernel.uniform("Exposure", size=(size[1], size[0]), **rows))
-        commands.dispatch_grid(kernel, (1, size[0]), exposure=uniform, **buffers)
+        uniform = self.pool.constant("exposure", kernel.uniform("Exposure", size=(width, height), **rows))
+        commands.dispatch_grid(kernel, (1, height), exposure=uniform, image=image, **arrays)
 
 
 class Exposures:

@@ -6,26 +6,27 @@ device.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from ..gpu.buffer import Buffer, BufferPool
+from ..gpu.array import DeviceArray
 from ..gpu.device import Device
 from ..gpu.kernel import Commands, Kernel
+from ..gpu.pool import BufferPool
 from .losses import NCC_WINDOW, LossWeights, pyramid_sizes, pyramid_weights
 
 TERMS = 5  # in the buffer that `record` leaves
 _WHOLE = 1 << 14  # longer than any side of an image: a lane takes a whole row or column
 
 
-class LossBuffers(NamedTuple):
+class LossArrays(NamedTuple):
     """terms (5,) float32: L1, mean squared error, 1 - SSIM, pyramid, NCC; the last three 0 where their weight is 0.
     d_image (4, H, W) float32: the weighted loss's gradient by red, green, blue, and zeros; None where none was asked.
     """
 
-    terms: Buffer
-    d_image: Buffer | None
+    terms: DeviceArray
+    d_image: DeviceArray | None
 
 
 class ImageLoss:
@@ -44,21 +45,20 @@ class ImageLoss:
     def record(
         self,
         commands: Commands,
-        image: Buffer,
-        truth: Buffer,
-        size: tuple[int, int],
+        image: DeviceArray,
+        truth: DeviceArray,
         background: tuple[float, float, float],
         weights: LossWeights,
         *,
         gradient: bool,
-    ) -> LossBuffers:
+    ) -> LossArrays:
         """Compare an image with its ground truth.
 
-        image: planes (4, H, W) of float32, the first three red, green, blue. truth: (H, W) u32, straight RGBA of 8
-        bits, red lowest. size: (height, width). background: in [0, 1], under the ground truth, which is rounded to 8
-        bits, as data/views.composite does. weights: of the terms. gradient: whether to leave it, too.
+        image: planes (4, H, W) of float32, the first three red, green, blue. truth: (H, W) uint32, straight RGBA of 8
+        bits, red lowest. background: in [0, 1], under the ground truth, which is rounded to 8 bits, as
+        data/views.composite does. weights: of the terms. gradient: whether to leave it, too.
         """
-        height, width = size
+        height, width = truth.shape
         frame = _Frame(self, commands, height, width, background, weights)
         pixels = frame.pixels(image, truth)
         extra = {}
@@ -68,16 +68,16 @@ class ImageLoss:
         levels = frame.pyramid_forward(pixels)
         terms = frame.sum_up()
         if not gradient:
-            return LossBuffers(terms, None)
+            return LossArrays(terms, None)
         if correlated:
             extra["ncc"] = frame.ncc_backward(pixels, *correlated)
         if levels:
             extra["pyramid"] = frame.pyramid_backward(levels)
-        d_image = self.pool.get("d_image", 16 * width * height)
+        d_image = self.pool.array("d_image", (4, height, width))
         kernel = self.kernel("loss_gradient", **{name.upper(): 1 for name in extra})
         grid = frame.grid(width, height, channels=3)
         commands.dispatch_grid(kernel, grid, picture=frame.picture, pixels=pixels, d_image=d_image, **extra)
-        return LossBuffers(terms, d_image)
+        return LossArrays(terms, d_image)
 
     def kernel(self, name: str, **defines: int) -> Kernel:
         return Kernel.get(self.device, name, LANES=self._lanes, **defines)
@@ -86,9 +86,9 @@ class ImageLoss:
 class _Level(NamedTuple):
     """Two neighbouring levels of the pyramid: their uniform, the coarse one's values, the fine band's signs."""
 
-    uniform: Buffer
-    coarse: Buffer
-    signs: Buffer
+    uniform: DeviceArray
+    coarse: DeviceArray
+    signs: DeviceArray
 
 
 class _Frame:
@@ -122,7 +122,7 @@ class _Frame:
         self.pyramid_counts = [self.runs(h) * w for h, w in self.sizes[1:]]
         counts += [sum(self.pyramid_counts), self.runs(width) * (height - margin) if self.ncc_windows else 0]
         self.ends = np.cumsum(counts).tolist()
-        self.sums = owner.pool.get("sums", 4 * self.ends[-1])
+        self.sums = owner.pool.array("sums", (self.ends[-1],))
 
         pixel = 1.0 / (3 * height * width)
         window = 1.0 / max(1, self.ncc_windows)
@@ -148,40 +148,40 @@ class _Frame:
         """Workgroups for so many lanes, each of which takes a run of the length."""
         return -(-lanes // self.owner._lanes), channels * self.runs(length)
 
-    def pixels(self, image: Buffer, truth: Buffer) -> Buffer:
-        pool, count = self.owner.pool, self.height * self.width
+    def pixels(self, image: DeviceArray, truth: DeviceArray) -> DeviceArray:
+        pool = self.owner.pool
         # A copy, so that all pictures of a training go through one buffer (and one texture, and one bind group).
-        held = pool.get("truth", 4 * count)
-        self.commands.copy(truth, held, 4 * count)
-        pixels = pool.get("pixels", 16 * self.places)
+        held = pool.array("truth", truth.shape, "uint32")
+        self.commands.copy(truth, held)
+        pixels = pool.array("pixels", (self.places, 4), "uint32")
         self.commands.dispatch_grid(
             self.owner.kernel("loss_pixels"),
             (1, self.height),
             picture=self.picture,
-            image=(image, 0, 16 * count),
-            rgba=(held, 0, max(16, 4 * count)),
+            image=image,
+            rgba=held,
             pixels=pixels,
             sums=self.sums,
         )
         return pixels
 
-    def ssim(self, pixels: Buffer) -> Buffer:
+    def ssim(self, pixels: DeviceArray) -> DeviceArray:
         """The derivatives, blurred along the rows."""
-        moments = self.owner.pool.get("ssim moments", 48 * self.places_across)
-        slopes = self.owner.pool.get("ssim slopes", 48 * self.places)
+        moments = self.owner.pool.array("ssim moments", (3, self.places_across, 4))
+        slopes = self.owner.pool.array("ssim slopes", (3, self.places, 4))
         down, across = self.owner.kernel("loss_ssim_down"), self.owner.kernel("loss_ssim_across")
         grid = self.grid(self.width, self.height, channels=3)
         self.commands.dispatch_grid(down, grid, picture=self.picture, pixels=pixels, moments=moments)
         grid = self.grid(self.height, self.width, channels=3)
-        buffers = {"moments": moments, "slopes": slopes, "sums": self.sums}
-        self.commands.dispatch_grid(across, grid, picture=self.picture, **buffers)
+        arrays = {"moments": moments, "slopes": slopes, "sums": self.sums}
+        self.commands.dispatch_grid(across, grid, picture=self.picture, **arrays)
         return slopes
 
-    def ncc_forward(self, pixels: Buffer) -> tuple[Buffer, Buffer]:
+    def ncc_forward(self, pixels: DeviceArray) -> tuple[DeviceArray, DeviceArray]:
         """Moments of pixels below each other, and the derivatives, summed over the windows along the rows."""
         pool, count = self.owner.pool, self.places
-        moments, slopes = (pool.get(f"ncc {name}", 16 * count) for name in ("moments", "slopes"))
-        halves = {"moments": moments, "truth_variances": pool.get("ncc truth variances", 4 * count)}
+        moments, slopes = (pool.array(f"ncc {name}", (count, 4)) for name in ("moments", "slopes"))
+        halves = {"moments": moments, "truth_variances": pool.array("ncc truth variances", (count,))}
         down, across = self.owner.kernel("loss_ncc_down"), self.owner.kernel("loss_ncc_across")
         rows = self.height - NCC_WINDOW + 1
         grid = self.grid(self.width, rows)
@@ -190,15 +190,15 @@ class _Frame:
         self.commands.dispatch_grid(across, grid, picture=self.picture, slopes=slopes, sums=self.sums, **halves)
         return moments, slopes
 
-    def ncc_backward(self, pixels: Buffer, moments: Buffer, slopes: Buffer) -> Buffer:
+    def ncc_backward(self, pixels: DeviceArray, moments: DeviceArray, slopes: DeviceArray) -> DeviceArray:
         """The gradient by the luminance."""
-        d_luminance = self.owner.pool.get("d_luminance", 4 * self.places)
+        d_luminance = self.owner.pool.array("d_luminance", (self.places,))
         up, grid = self.owner.kernel("loss_ncc_up"), self.grid(self.width, self.height)
-        buffers = {"pixels": pixels, "moments": moments, "slopes": slopes, "d_luminance": d_luminance}
-        self.commands.dispatch_grid(up, grid, picture=self.picture, **buffers)
+        arrays = {"pixels": pixels, "moments": moments, "slopes": slopes, "d_luminance": d_luminance}
+        self.commands.dispatch_grid(up, grid, picture=self.picture, **arrays)
         return d_luminance
 
-    def pyramid_forward(self, pixels: Buffer) -> list[_Level]:
+    def pyramid_forward(self, pixels: DeviceArray) -> list[_Level]:
         """The levels, from the finest on; none where the pyramid is not used, or nothing but a residual."""
         owner, levels = self.owner, list[_Level]()
         shares = [
@@ -227,35 +227,35 @@ class _Frame:
                     coarse_slope=shares[k + 1] * self.weights.pyramid,
                 ),
             )
-            coarse = owner.pool.get(f"level {k + 1}", 16 * height * width)
-            signs = owner.pool.get(f"signs {k}", 4 * fine_height * fine_width)
+            coarse = owner.pool.array(f"level {k + 1}", (height, width, 4))
+            signs = owner.pool.array(f"signs {k}", (fine_height, fine_width), "uint32")
             columns = -(-width // owner._lanes)
             self.commands.dispatch_grid(reduce, (columns, height), level=uniform, fine=fine, coarse=coarse)
             grid = self.grid(width, height)
-            buffers: dict[str, Any] = {"fine": fine, "coarse": coarse, "signs": signs, "sums": self.sums}
-            self.commands.dispatch_grid(band, grid, level=uniform, **buffers)
+            arrays: dict[str, DeviceArray] = {"fine": fine, "coarse": coarse, "signs": signs, "sums": self.sums}
+            self.commands.dispatch_grid(band, grid, level=uniform, **arrays)
             levels.append(_Level(uniform, coarse, signs))
             first += self.pyramid_counts[k]
             fine = coarse
         return levels
 
-    def pyramid_backward(self, levels: list[_Level]) -> Buffer:
+    def pyramid_backward(self, levels: list[_Level]) -> DeviceArray:
         """The gradient by the difference, from the residual up."""
         owner = self.owner
         d_level = levels[-1].coarse  # until there is a gradient
         for k in range(len(levels), 0, -1):
             defines = dict[str, int]()
-            buffers: dict[str, Any] = {"above": levels[k - 1].uniform, "fine_signs": levels[k - 1].signs}
+            arrays: dict[str, DeviceArray] = {"above": levels[k - 1].uniform, "fine_signs": levels[k - 1].signs}
             if k == len(levels):
                 defines["RESIDUAL"] = 1
-                buffers["difference"] = levels[-1].coarse
+                arrays["difference"] = levels[-1].coarse
             else:
-                buffers |= {"below": levels[k].uniform, "signs": levels[k].signs, "d_coarse": d_level}
+                arrays |= {"below": levels[k].uniform, "signs": levels[k].signs, "d_coarse": d_level}
             height, width = self.sizes[k]
-            d_level = owner.pool.get(f"d_level {k}", 16 * height * width)
+            d_level = owner.pool.array(f"d_level {k}", (height, width, 4))
             kernel = owner.kernel("loss_pyramid_bwd", **defines)
-            self.commands.dispatch_grid(kernel, (-(-width // owner._lanes), height), d_level=d_level, **buffers)
-        difference = owner.pool.get("d_difference", 16 * self.places)
+            self.commands.dispatch_grid(kernel, (-(-width // owner._lanes), height), d_level=d_level, **arrays)
+        difference = owner.pool.array("d_difference", (self.places, 4))
         (height, width), level = self.sizes[1], levels[0]
         self.commands.dispatch_grid(
             owner.kernel("loss_pyramid_finest", FINEST=1),
@@ -267,8 +267,8 @@ class _Frame:
         )
         return difference
 
-    def sum_up(self) -> Buffer:
-        terms = self.owner.pool.get("terms", 4 * TERMS)
+    def sum_up(self) -> DeviceArray:
+        terms = self.owner.pool.array("terms", (TERMS,))
         kernel = self.owner.kernel("loss_sums")
         names = ("l1", "squared", "ssim", "pyramid", "ncc")
         parts = dict(zip(names, zip([0, *self.ends], self.ends, strict=False), strict=True))

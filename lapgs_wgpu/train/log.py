@@ -17,7 +17,7 @@ from typing import BinaryIO, TextIO
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.atomic import atomic_write
-from lapgs_wgpu.motion.laplacian import LaplacianMotion
+from lapgs_wgpu.motion.fields.laplacian import LaplacianMotion
 from lapgs_wgpu.progress import Progress, duration
 
 INTERVAL = 50  # steps from one line of log.jsonl to the next, over which loss and PSNR are averaged

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
-from lapgs_wgpu.motion.laplacian import LaplacianMotion
+from lapgs_wgpu.motion.fields.laplacian import LaplacianMotion
 from lapgs_wgpu.train.config import Rate
 
 ADAM_EPS = 1e-15  # 3DGS's: gradients of single Gaussians are tiny

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 from lapgs_wgpu.errors import InputError, shown
 from lapgs_wgpu.io.dataclass_table import build_dataclass, checked, did_you_mean, field_types
 from lapgs_wgpu.io.safe_json_toml import read_toml
-from lapgs_wgpu.motion.field import FieldKind
+from lapgs_wgpu.motion.fields.config import FieldKind
 from lapgs_wgpu.train.config import Config
 
 Table = dict[str, Any]

@@ -20,7 +20,7 @@ from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.errors import DeviceError, InputError, NumericalError
 from lapgs_wgpu.gpu.device import Device, open_device
 from lapgs_wgpu.io.initial_view import InitialView
-from lapgs_wgpu.motion.grid_field import GridField
+from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.autotune import Choice
 from lapgs_wgpu.train.config import Background, Config

@@ -16,9 +16,9 @@ from lapgs_wgpu.data.init import first_points, initial_scales, limit_optical_dep
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.motion.dynamics import dynamics_loss
-from lapgs_wgpu.motion.field import Nearby
-from lapgs_wgpu.motion.grid_field import GridField
+from lapgs_wgpu.motion.fields.deformation import Nearby
+from lapgs_wgpu.motion.fields.dynamics import dynamics_loss
+from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.morton import morton_order
 from lapgs_wgpu.train.autotune import choose_decoder
@@ -27,9 +27,9 @@ from lapgs_wgpu.train.dataloader import Pictures
 from lapgs_wgpu.train.densify import Statistics, densify, reset_opacities
 from lapgs_wgpu.train.distributed import SINGLE_PROCESS, Ranks
 from lapgs_wgpu.train.exposure import Exposures
+from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
 from lapgs_wgpu.train.nonfinite import Health, Skipped, check_parameters, describe, finite
 from lapgs_wgpu.train.optimizer import FrequencyOptimizer, Optimizer
-from lapgs_wgpu.train.render_loss import RenderLoss, render_loss
 
 MAX_SH_DEGREE = 3
 

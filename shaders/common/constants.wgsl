@@ -3,6 +3,7 @@
 const DILATION: f32 = 0.3;                      // px^2, added to both variances of a splat: none falls between pixels
 const NEAR: f32 = 0.01;                         // world units; a Gaussian at or before this camera depth is culled
 const FRUSTUM_MARGIN: f32 = 0.3;                // the Jacobian's x/z, y/z end this many half-images beyond the borders
+const MIN_SCALE: f32 = 1e-7;                     // world units; no scale is below it, at rest or deformed
 const ALPHA_MAX: f32 = 0.99;                    // one splat never hides all that is behind it
 const ALPHA_MIN: f32 = 0.00392156862745098;     // 1/255: a fainter contribution is skipped
 const TRANSMITTANCE_MIN: f32 = 1e-4;            // a pixel stops before its transmittance falls to this

@@ -1,23 +1,16 @@
-// The activations between the decoder's layers and its heads: temporal channels, gated by those of place; MOTION: and
-// beside them the inner channels of the Laplacian motion.
-#import common/index
-
-struct Gate {
-    gaussians: u32,
-    width: u32,   // channels of each layer
-}
-
-#ifdef MOTION
-const LAYERS = 3u;     // gate, inner, temporal, side by side
-const FEATURES = 2u;   // gated, inner
+// The gate between the decoder's layers and its heads: the temporal channels, rectified, times 2 sigmoid(x) - 1 of the
+// spatial ones, whose layer has half its weights, so that this is tanh. QUADS: on four channels at once.
+#ifdef QUADS
+alias Channels = vec4<f32>;
 #else
-const LAYERS = 2u;
-const FEATURES = 1u;
+alias Channels = f32;
 #endif
 
-@group(0) @binding(0) var<uniform> gate: Gate;
+// Not the built-in tanh, which some drivers compute as a quotient that overflows.
+fn opening(half: Channels) -> Channels {
+    return 2.0 / (1.0 + exp(-2.0 * half)) - 1.0;
+}
 
-// Not the built-in function, which some drivers compute as a quotient that overflows.
-fn safe_tanh(x: f32) -> f32 {
-    return 2.0 / (1.0 + exp(-2.0 * x)) - 1.0;
+fn gated(temporal: Channels, half: Channels) -> Channels {
+    return max(temporal, Channels(0.0)) * opening(half);
 }

@@ -68,7 +68,7 @@ fn empty() -> Loaded {
 }
 
 #ifdef SUBGROUPS
-fn hand_round(s: Loaded, from_lane: u32) -> Loaded {
+fn broadcast(s: Loaded, from_lane: u32) -> Loaded {
     var r: Loaded;
     r.mean = vec2(subgroupShuffle(s.mean.x, from_lane), subgroupShuffle(s.mean.y, from_lane));
     r.a = subgroupShuffle(s.a, from_lane);

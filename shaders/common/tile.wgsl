@@ -1,5 +1,5 @@
 // Which tiles a splat touches: exactly those that hold a pixel centre inside the ellipse where its alpha reaches 1/255.
-// `project` counts with these functions and `emit` writes with them, so the two cannot disagree.
+// `project` counts with these functions and `duplicate_with_keys` writes with them, so the two cannot disagree.
 #import common/constants
 
 // Pixels added around the ellipse, against rounding. A tile too many costs a little time, a tile too few a hole.

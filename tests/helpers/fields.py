@@ -6,9 +6,10 @@ import torch
 from torch import Tensor, nn
 
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.motion.field import Deformation, FieldConfig, Nearby, PlaneConfig
-from lapgs_wgpu.motion.grid_field import GridField
-from lapgs_wgpu.motion.hashgrid import HashConfig
+from lapgs_wgpu.motion.fields.config import FieldConfig, PlaneConfig
+from lapgs_wgpu.motion.fields.deformation import Deformation, Nearby
+from lapgs_wgpu.motion.fields.grid_field import GridField
+from lapgs_wgpu.motion.fields.hash_grid_config import HashConfig
 from lapgs_wgpu.motion.scene import Field, make_field
 
 OURS = FieldConfig(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from lapgs_wgpu.gpu.buffer import Buffer
+from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 
 
@@ -13,11 +13,9 @@ def random(*shape: int, seed: int = 0) -> Tensor:
     return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
 
 
-def on_device(device: Device, tensor: Tensor) -> Buffer:
-    buffer = Buffer(device, 4 * tensor.numel(), "matrix")
-    buffer.write(tensor.numpy())
-    return buffer
+def on_device(device: Device, tensor: Tensor) -> DeviceArray:
+    return DeviceArray.upload(device, "matrix", tensor.contiguous().numpy())
 
 
-def read(buffer: Buffer, *shape: int) -> Tensor:
-    return torch.from_numpy(buffer.read("float32", shape))
+def read(array: DeviceArray) -> Tensor:
+    return torch.from_numpy(array.read())

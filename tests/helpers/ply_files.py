@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from hypothesis import strategies as st
 
-from lapgs_wgpu.io.ply import StillGaussians
+from lapgs_wgpu.io.ply import GaussianSnapshot
 
 FIELDS = ["means", "sh", "opacity_logits", "log_scales", "quats"]
 # Written out by hand, so that it checks the code's own lists.
@@ -19,16 +19,16 @@ INRIA = (
 ).split()
 
 
-def random_still(n: int = 5, degree: int = 3, seed: int = 0) -> StillGaussians:
+def random_still(n: int = 5, degree: int = 3, seed: int = 0) -> GaussianSnapshot:
     rng = np.random.default_rng(seed)
 
     def floats(*shape: int) -> np.ndarray:
         return rng.standard_normal(shape, np.float32)
 
-    return StillGaussians(floats(n, 3), floats(n, (degree + 1) ** 2, 3), floats(n), floats(n, 3), floats(n, 4))
+    return GaussianSnapshot(floats(n, 3), floats(n, (degree + 1) ** 2, 3), floats(n), floats(n, 3), floats(n, 4))
 
 
-def assert_same(a: StillGaussians, b: StillGaussians) -> None:
+def assert_same(a: GaussianSnapshot, b: GaussianSnapshot) -> None:
     for name in FIELDS:
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
 
@@ -43,7 +43,7 @@ def ply_bytes(columns: Mapping[str, tuple[str, Sequence[float] | np.ndarray]]) -
     return head.encode() + b"".join(row.pack(*(v[i] for _, v in columns.values())) for i in range(n))
 
 
-def columns_of(still: StillGaussians) -> dict[str, tuple[str, np.ndarray]]:
+def columns_of(still: GaussianSnapshot) -> dict[str, tuple[str, np.ndarray]]:
     """The columns of `still` in Inria's order, without normals."""
     values = dict(zip(["x", "y", "z"], still.means.T, strict=True))
     values |= {f"f_dc_{c}": still.sh[:, 0, c] for c in range(3)}

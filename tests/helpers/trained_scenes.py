@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.motion.field import FieldConfig
-from lapgs_wgpu.motion.hashgrid import HashConfig
+from lapgs_wgpu.motion.fields.config import FieldConfig
+from lapgs_wgpu.motion.fields.hash_grid_config import HashConfig
 from lapgs_wgpu.motion.scene import Scene4D
 
 GRID4D = FieldConfig(

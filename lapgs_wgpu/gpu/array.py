@@ -1,0 +1,107 @@
+"""Arrays on the device: a part of a buffer with a dtype and a shape."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .buffer import Buffer
+from .device import Device
+from .wgpu_errors import TranslatedErrors
+
+_ITEM_BYTES = {"float32": 4, "uint32": 4, "int16": 2, "uint8": 1, "uint64": 8}
+
+
+@dataclass(frozen=True, eq=False)
+class DeviceArray:
+    """A contiguous array in a buffer.
+
+    dtype: float32, uint32, int16 (pairs of bfloat16), uint8 or uint64. offset: in bytes, from the buffer's start.
+    """
+
+    buffer: Buffer
+    shape: tuple[int, ...]
+    dtype: str = "float32"
+    offset: int = 0
+
+    @staticmethod
+    def empty(device: Device, label: str, shape: tuple[int, ...], dtype: str = "float32") -> DeviceArray:
+        """An array of zeros in a buffer of its own."""
+        return DeviceArray(Buffer(device, math.prod(shape) * _ITEM_BYTES[dtype], label), shape, dtype)
+
+    @staticmethod
+    def upload(device: Device, label: str, values: NDArray[Any]) -> DeviceArray:
+        """A copy of `values`, with their shape and dtype, in a buffer of its own."""
+        array = DeviceArray.empty(device, label, values.shape, values.dtype.name)
+        array.write(values)
+        return array
+
+    @property
+    def size(self) -> int:
+        """Number of elements."""
+        return math.prod(self.shape)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the elements."""
+        return math.prod(self.shape) * _ITEM_BYTES[self.dtype]
+
+    @property
+    def binding(self) -> tuple[Buffer, int, int]:
+        """Buffer, offset and size in bytes of what a kernel sees: the array, rounded up to 16 bytes."""
+        return self.buffer, self.offset, max(16, (self.nbytes + 15) & ~15)
+
+    def rows(self, first: int, count: int) -> DeviceArray:
+        """Rows first to first + count; to be bound, they must begin at a multiple of 256 bytes."""
+        row = math.prod(self.shape[1:])
+        return DeviceArray(
+            self.buffer, (count, *self.shape[1:]), self.dtype, self.offset + first * row * _ITEM_BYTES[self.dtype]
+        )
+
+    def write(self, values: NDArray[Any]) -> None:
+        """Copy values of the array's dtype and shape to the device. Raises ValueError for others."""
+        if values.dtype.name != self.dtype or values.shape != self.shape:
+            raise ValueError(
+                f"{self.buffer.label}: {values.dtype} of shape {values.shape} is not {self.dtype} of {self.shape}"
+            )
+        self.buffer.write(values, self.offset)
+
+    def read(self) -> NDArray[Any]:
+        """A copy of the array on the host. Waits for the device."""
+        return read_all([self])[0]
+
+
+def read_all(arrays: Sequence[DeviceArray]) -> list[NDArray[Any]]:
+    """Read several arrays with one wait. Their offsets must be multiples of 8 bytes."""
+    sources = []
+    encoder = None
+    for array in arrays:
+        buffer, offset, nbytes = array.buffer, array.offset, array.nbytes
+        size = max(8, (nbytes + 7) & ~7)
+        if offset + size > buffer.nbytes:
+            raise ValueError(f"{buffer.label}: reading {offset + size} bytes of {buffer.nbytes}")
+        if buffer.device.mappable:
+            sources.append((buffer.wgpu_buffer, offset, size, nbytes))
+            continue
+        encoder = encoder or buffer.device.wgpu_device.create_command_encoder()
+        encoder.copy_buffer_to_buffer(buffer.wgpu_buffer, offset, buffer.download, offset, size)
+        sources.append((buffer.download, offset, size, nbytes))
+    if encoder is not None:
+        device = arrays[0].buffer.device
+        with TranslatedErrors(device, "what is read back"):
+            device.queue.submit([encoder.finish()])
+    out = []
+    for (source, offset, size, nbytes), array in zip(sources, arrays, strict=True):
+        with TranslatedErrors(array.buffer.device, f"what is read from buffer {array.buffer.label!r}", nbytes):
+            source.map_sync("READ_NOSYNC", offset, size)
+        view = np.frombuffer(source.read_mapped(offset, size, copy=False), dtype=np.uint8)
+        values = view[:nbytes].copy().view(array.dtype).reshape(array.shape)
+        del view
+        source.unmap()
+        out.append(values)
+    return out

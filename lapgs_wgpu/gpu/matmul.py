@@ -1,0 +1,91 @@
+"""Products of matrices on the device."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from .array import DeviceArray
+from .device import Device
+from .kernel import Commands, Kernel
+from .pool import BufferPool
+
+_TILE = 64  # matmul.wgsl
+_SPLIT = 1 << 11  # inner elements over which a long product is summed at once
+
+
+@dataclass(frozen=True)
+class Matrix:
+    """float32, in rows of `stride` floats in an array, `first` floats after its start; where it is transposed, in
+    columns."""
+
+    array: DeviceArray
+    rows: int
+    columns: int
+    stride: int
+    first: int = 0
+    transposed: bool = False
+
+    @staticmethod
+    def of(array: DeviceArray) -> Matrix:
+        """All of an array (rows, columns)."""
+        rows, columns = array.shape
+        return Matrix(array, rows, columns, columns)
+
+    @property
+    def transpose(self) -> Matrix:
+        """The same memory with rows and columns exchanged."""
+        return replace(self, rows=self.columns, columns=self.rows, transposed=not self.transposed)
+
+    def from_column(self, first: int, count: int) -> Matrix:
+        """Some columns of one that is not transposed."""
+        return replace(self, first=self.first + first, columns=count)
+
+
+class Matmul:
+    """Records products whose sums are in one order, so the same to the last bit on every run. name, in the calls: tells
+    apart those that are submitted together."""
+
+    def __init__(self, device: Device, pool: BufferPool) -> None:
+        self._device, self._pool = device, pool
+
+    def __call__(self, commands: Commands, name: str, a: Matrix, b: Matrix, c: Matrix, *, add: bool = False) -> None:
+        """c = a b, or c += a b; c is not transposed, and neither a nor b."""
+        self._dispatch(commands, name, a, b, c, a.columns, {"ADD": 1} if add else {})
+
+    def long(
+        self, commands: Commands, name: str, a: Matrix, b: Matrix, total: DeviceArray, *, add: bool = False
+    ) -> None:
+        """total = a b, or total += a b, for a long inner dimension, which is split: so that the device is busy, and
+        into sums of thousands of elements, so that they are accurate."""
+        size, count = a.rows * b.columns, -(-a.columns // _SPLIT)
+        parts = self._pool.array("parts", (count, a.rows, b.columns))
+        self._dispatch(commands, name, a, b, Matrix(parts, a.rows, b.columns, b.columns), _SPLIT, {})
+        kernel = Kernel.get(self._device, "matmul_sum", **({"ADD": 1} if add else {}))
+        uniform = self._pool.constant(f"sum {name}", kernel.uniform("Sum", count=size, parts=count))
+        commands.dispatch(kernel, -(-size // 64), sum=uniform, parts=parts, total=total)
+
+    def _dispatch(
+        self, commands: Commands, name: str, a: Matrix, b: Matrix, c: Matrix, split: int, options: dict[str, int]
+    ) -> None:
+        ways = {"A_INNER": not a.transposed, "B_INNER": b.transposed}
+        kernel = Kernel.get(self._device, "matmul", **options, **{way: 1 for way, on in ways.items() if on})
+        content = kernel.uniform(
+            "Matmul",
+            rows=c.rows,
+            columns=c.columns,
+            inner=a.columns,
+            split=split,
+            a_stride=a.stride,
+            b_stride=b.stride,
+            c_stride=c.stride,
+            c_part=c.rows * c.columns,
+            first=(a.first, b.first, c.first, 0),
+        )
+        commands.dispatch(
+            kernel,
+            -(-c.rows // _TILE) * -(-c.columns // _TILE) * -(-a.columns // split),
+            product=self._pool.constant(f"product {name}", content),
+            a=a.array,
+            b=b.array,
+            c=c.array,
+        )

@@ -1,0 +1,23 @@
+"""The subgroup size of a device, measured."""
+
+from __future__ import annotations
+
+import functools
+
+from .array import DeviceArray
+from .device import Device
+from .kernel import Commands, Kernel
+
+_LANES = 64  # of a workgroup, as many as the raster passes have at most
+
+
+@functools.cache
+def subgroup_size(device: Device) -> int:
+    """Lanes of a subgroup, measured by a kernel, since what adapters report is unreliable; 0 without subgroups."""
+    if "subgroup" not in device.features:
+        return 0
+    sizes = DeviceArray.empty(device, "subgroup sizes", (_LANES,), "uint32")
+    with Commands(device) as commands:
+        commands.dispatch(Kernel.get(device, "probe_subgroup"), 1, sizes=sizes)
+    found = set(sizes.read().tolist())
+    return found.pop() if len(found) == 1 else 0

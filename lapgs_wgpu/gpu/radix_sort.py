@@ -1,0 +1,98 @@
+"""Stable radix sort on the device, with a length that only the device knows."""
+
+from __future__ import annotations
+
+import struct
+
+from .array import DeviceArray
+from .device import Device
+from .kernel import Commands, Kernel
+from .pool import BufferPool
+from .scan import Scan
+
+_SORT_BLOCK_ITEMS = 2048  # common/sort.wgsl: 128 lanes x 16 elements
+
+
+class RadixSort:
+    """A stable sort of u32 keys with a u32 payload, least significant digit first.
+
+    lane_runs: the shape for CPU devices (digits of up to 8 bits, a run of elements a lane); otherwise 4-bit digits
+    ranked in workgroups. Both give the same result.
+    """
+
+    def __init__(self, device: Device, pool: BufferPool, name: str, *, lane_runs: bool) -> None:
+        self._device, self._pool, self._name, self._lane_runs = device, pool, name, lane_runs
+        self._scan = Scan(device, pool, name)
+
+    def __call__(
+        self,
+        commands: Commands,
+        *,
+        length: DeviceArray,
+        capacity: int,
+        bits: int,
+        keys: DeviceArray,
+        payload: DeviceArray | None,
+    ) -> tuple[DeviceArray, DeviceArray]:
+        """Sort the first length[0] <= capacity elements by the lowest `bits` bits of their keys.
+
+        payload None stands for 0, 1, 2, ... Returns the arrays of sorted keys and payload; `keys` and
+        `payload` are used as scratch and lose their content.
+        """
+        widest = 8 if self._lane_runs else 4
+        passes = -(-bits // widest)
+        width = -(-bits // passes) if self._lane_runs else widest
+        digits = 1 << width
+        if self._lane_runs:
+            owners = 8 * min(128, max(4, capacity // (8 * 4096)))
+        else:
+            owners = -(-capacity // _SORT_BLOCK_ITEMS)
+        counters = self._pool.array(f"{self._name} counters", (digits * owners,), "uint32")
+        places = self._pool.array(f"{self._name} places", (digits * owners,), "uint32")
+        counter_count = self._pool.constant(f"{self._name} counter count", struct.pack("<I", digits * owners))
+        ignored = self._pool.array(f"{self._name} total", (1,), "uint32")
+        keys_out = self._pool.array(f"{self._name} keys", (capacity,), "uint32")
+        payload_out = self._pool.array(f"{self._name} payload", (capacity,), "uint32")
+        second_payload = payload
+        if second_payload is None:
+            second_payload = self._pool.array(f"{self._name} second payload", (capacity,), "uint32")
+        shape = {"LANE_RUNS": 1} if self._lane_runs else {}
+        groups = owners // 8 if self._lane_runs else owners
+        count_kernel = Kernel.get(self._device, "sort_count", **shape)
+        for step in range(passes):
+            uniform = self._pool.constant(
+                f"{self._name} pass {step}",
+                count_kernel.uniform("Sort", shift=step * width, digits=digits, owners=owners, capacity=capacity),
+            )
+            commands.dispatch(
+                count_kernel,
+                groups,
+                sort=uniform,
+                length=length,
+                keys=keys,
+                counters=counters,
+            )
+            self._scan(
+                commands,
+                length=counter_count,
+                capacity=digits * owners,
+                values=counters,
+                prefix=places,
+                total=ignored,
+            )
+            iota = step == 0 and payload is None
+            source = {} if iota else {"payload": second_payload}
+            commands.dispatch(
+                Kernel.get(self._device, "sort_scatter", **shape, **({"IOTA": 1} if iota else {})),
+                groups,
+                sort=uniform,
+                length=length,
+                keys=keys,
+                counters=places,
+                keys_out=keys_out,
+                payload_out=payload_out,
+                **source,
+            )
+            keys, keys_out = keys_out, keys
+            second_payload, payload_out = payload_out, second_payload
+        return keys, second_payload

@@ -1,0 +1,48 @@
+"""Exclusive scan on the device, with a length that only the device knows."""
+
+from __future__ import annotations
+
+from .array import DeviceArray
+from .device import Device
+from .kernel import Commands, Kernel
+from .pool import BufferPool
+
+_BLOCK_ITEMS = 2048  # common/block.wgsl
+
+
+class Scan:
+    """Exclusive prefix sums of u32.
+
+    source: "values"; "flags" adds 1 for each value that is not zero; "gather" adds values[indices[i]].
+    saturating: sums end at 2^32 - 1 instead of beginning anew, provided that no element reaches 2^21.
+    """
+
+    def __init__(
+        self, device: Device, pool: BufferPool, name: str, source: str = "values", *, saturating: bool = False
+    ) -> None:
+        self._pool, self._name = pool, name
+        defines = {"SCAN_LANES": 8 if device.is_cpu else 256} | ({} if source == "values" else {source.upper(): 1})
+        self._reduce = Kernel.get(device, "scan_reduce", **defines)
+        blocks = {"SCAN_LANES": defines["SCAN_LANES"]} | ({"SATURATING": 1} if saturating else {})
+        self._blocks = Kernel.get(device, "scan_blocks", **blocks)
+        self._apply = Kernel.get(device, "scan_apply", **defines)
+
+    def __call__(
+        self,
+        commands: Commands,
+        *,
+        length: DeviceArray,
+        capacity: int,
+        values: DeviceArray,
+        prefix: DeviceArray,
+        total: DeviceArray,
+        indices: DeviceArray | None = None,
+    ) -> None:
+        """prefix[i] = sum of the first i elements, total[0] = sum of all; elements = length[0] <= capacity."""
+        count = -(-capacity // _BLOCK_ITEMS)
+        sums = self._pool.array(f"{self._name} block sums", (count,), "uint32")
+        uniform = self._pool.constant(f"{self._name} blocks", self._blocks.uniform("Blocks", count=count))
+        source = {"length": length, "values": values} | ({} if indices is None else {"indices": indices})
+        commands.dispatch(self._reduce, count, **source, block_sums=sums)
+        commands.dispatch(self._blocks, 1, blocks=uniform, block_sums=sums, total=total)
+        commands.dispatch(self._apply, count, **source, block_sums=sums, prefix=prefix)

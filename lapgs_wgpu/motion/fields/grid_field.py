@@ -1,0 +1,211 @@
+"""The fields over the four-grid hash encoder: Grid4D's, and the paper's, which adds to it."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import torch
+from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
+
+from ...gpu.device import Device
+from ..passes.decoder_passes import decoder_shape
+from .config import APPEARANCE_SCALE, GEOMETRY, TEMPORAL_AXES, FieldConfig
+from .decoder import Decoder
+from .deformation import Deformation, Nearby
+from .gate import gated
+from .hash_encoder import HashEncoder, HashGrid
+from .laplacian import LaplacianMotion, TimeMotion
+from .layers import last_product, linear, product, zero_head
+from .parameter_shapes import parameter_shapes
+
+_BLOCK = 1 << 13  # Gaussians that are decoded at once
+_KEPT = 1 << 16  # of all, up to which a step keeps the decoder's activations instead of computing them once more
+
+
+class GridField(nn.Module):
+    """grid4d: temporal hash features, gated by spatial ones, then linear heads (Grid4D, Xu et al. 2024; paper eq. 9).
+
+    laplacian: each Gaussian's dynamics attribute stands beside its temporal features (eq. 8), the Laplacian motion is
+    added before the heads (eq. 6), and an appearance head compensates for changes of brightness. Without these, or
+    with all of them at zero, it is grid4d.
+
+    Where gradients are wanted, the decoder works in torch, or by kernels of ours where `on_device` is set, for
+    which the configuration must be one that `decodes_on_device`; without gradients in torch.
+    precision: torch.float32 or torch.bfloat16, of features and of the decoder's products where gradients are wanted, in
+    torch; the parameters, what the heads give and everything without gradients are float32.
+    """
+
+    def __init__(self, config: FieldConfig, device: Device, seed: int) -> None:
+        super().__init__()
+        generator = torch.Generator().manual_seed(seed)
+        ours = config.kind == "laplacian"
+        width = config.width
+        self.config = config
+        self.precision = torch.float32
+        self.static_grid = HashGrid(config.static, (0, 1, 2), generator)
+        axes = TEMPORAL_AXES if config.temporal_hash else ()
+        self.temporal_grids = nn.ModuleList(HashGrid(config.temporal, three, generator) for three in axes)
+        groups = [[self.static_grid], self.grids[1:]] if axes else [[self.static_grid]]
+        self._encoder = HashEncoder(device, groups, config.bound)
+        static = self.static_grid.features
+        shapes = parameter_shapes(config)
+        self.spatial = linear(shapes["spatial.weight"], generator)
+        self.temporal = linear(shapes["temporal.weight"], generator)
+        hidden = [(linear(shapes[f"hidden.{2 * i}.weight"], generator), nn.ReLU()) for i in range(config.depth)]
+        self.hidden = nn.Sequential(*(layer for pair in hidden for layer in pair))
+        self.heads = zero_head(shapes["heads.weight"])
+        self.motion: LaplacianMotion | TimeMotion | None = None
+        if ours and config.motion == "laplacian":
+            self.motion = LaplacianMotion(
+                static,
+                width,
+                config.components,
+                generator,
+                frequency_step=config.frequency_step,
+                amplitude=config.amplitude,
+            )
+        elif ours:
+            self.motion = TimeMotion(static, width, generator)
+        self.appearance = zero_head(shapes["appearance.weight"]) if config.appearance_size else None
+        self.on_device = False
+        self._decoder = Decoder(device, self._encoder, decoder_shape(config))
+
+    @property
+    def grids(self) -> list[HashGrid]:
+        """The static one first."""
+        return [self.static_grid, *(grid for grid in self.temporal_grids if isinstance(grid, HashGrid))]
+
+    def forward(
+        self, means: Tensor, t: float, dynamics: Tensor | None = None, nearby: Nearby | None = None
+    ) -> Deformation:
+        """See motion/fields/deformation.py."""
+        evaluate = self._on_device if self.on_device and torch.is_grad_enabled() else self._in_torch
+        outputs, apart = evaluate(means, t, dynamics, nearby)
+        geometry, look = outputs[:, : sum(GEOMETRY)], outputs[:, sum(GEOMETRY) :] if self.appearance else None
+        turn, shift, d_quats, d_scales = geometry.split(GEOMETRY, dim=1)
+        rotation = nn.functional.normalize(turn + turn.new_tensor([1.0, 0.0, 0.0, 0.0]), dim=1)
+        return Deformation(
+            rotation,
+            shift,
+            d_quats,
+            d_scales,
+            look[:, :3] if look is not None else None,
+            look[:, 3] if look is not None and look.shape[1] > 3 else None,
+            _smoothness(apart, nearby) if nearby is not None else None,
+        )
+
+    def _in_torch(
+        self, means: Tensor, t: float, dynamics: Tensor | None, nearby: Nearby | None
+    ) -> tuple[Tensor, Tensor]:
+        """Outputs of the geometry heads (N, 14) and, beside them, of the appearance head; and, for static and temporal
+        features, the sum of the squared differences between those of near places."""
+        places = [(means, self.config.grid_time(t))]
+        if nearby is not None:
+            places.append((means[nearby.rows] + nearby.offsets, self.config.grid_time(nearby.time)))
+        here, *there = self._encoder.encode_all(places, self.precision if torch.is_grad_enabled() else torch.float32)
+        apart = [
+            (b - a[nearby.rows]).float().square().sum()
+            for far in there
+            for a, b in zip(here, far, strict=True)
+            if nearby is not None
+        ]
+        return self._decode_blocks(t, dynamics, *here), torch.stack(apart) if apart else means.new_zeros(0)
+
+    def _on_device(
+        self, means: Tensor, t: float, dynamics: Tensor | None, nearby: Nearby | None
+    ) -> tuple[Tensor, Tensor]:
+        """The same, without features or their gradients ever coming to the host."""
+        time = self.config.grid_time(t)
+        compared = None
+        if nearby is not None:
+            near = means[nearby.rows]
+            compared = (near, time), (near + nearby.offsets, self.config.grid_time(nearby.time))
+        ones = means.new_ones(len(means), 1)
+        size = self.config.dynamics_size
+        if size:
+            beside = torch.cat([means.new_zeros(len(means), size) if dynamics is None else dynamics, ones], dim=1)
+        else:
+            beside = ones
+        placed = [self._gate_weights()]
+        heads, bias = self._heads()
+        if isinstance(self.motion, LaplacianMotion):
+            placed.append((self.motion.first.weight, self.motion.first.bias))
+            folded, shift = (self.heads.weight @ factor for factor in self.motion.second_factor(t))
+            heads = torch.cat([heads, nn.functional.pad(folded, (0, 0, 0, len(heads) - len(folded)))], dim=1)
+            bias = bias + nn.functional.pad(shift, (0, len(bias) - len(shift)))
+        of_place = [nn.functional.pad(own[:, None], (size, 0)) for _, own in placed]
+        of_time = torch.cat([self.temporal.weight[:, :size], self.temporal.bias[:, None]], dim=1)
+        weights = {
+            "beside": torch.cat([*of_place, of_time]),
+            "static": torch.cat([weight for weight, _ in placed]),
+            "temporal": self.temporal.weight[:, size:],
+            "heads": heads,
+        }
+        outputs, apart = self._decoder((means, time), beside, weights, compared)
+        return outputs + bias, apart
+
+    def _gate_weights(self) -> tuple[Tensor, Tensor]:
+        """Weight and bias of the spatial layer as `gated` reads it."""
+        return 0.5 * self.spatial.weight, 0.5 * self.spatial.bias
+
+    def _heads(self) -> tuple[Tensor, Tensor]:
+        """Weight and bias of all heads, as one matrix: they read the same features, whose gradient goes through
+        (N, width) once then."""
+        looks = [] if self.appearance is None else [self.appearance]
+        weight = torch.cat([self.heads.weight, *(APPEARANCE_SCALE * head.weight for head in looks)])
+        return weight, torch.cat([self.heads.bias, *(APPEARANCE_SCALE * head.bias for head in looks)])
+
+    def _decode_blocks(self, t: float, dynamics: Tensor | None, *features: Tensor) -> Tensor:
+        """`_decode`, block by block, so that no step asks for large pieces of memory. Of many Gaussians it is done
+        anew in the backward pass: the activations would be most of a training's memory, 4 KB each at a width of 256."""
+        decode = self._decode
+        if len(features[0]) > _KEPT:
+            decode = partial(checkpoint, decode, use_reentrant=False, preserve_rng_state=False)
+        blocks = [part.split(_BLOCK) for part in features]
+        of_dynamics = [None] * len(blocks[0]) if dynamics is None else dynamics.split(_BLOCK)
+        return torch.cat([decode(t, *block) for block in zip(of_dynamics, *blocks, strict=True)])
+
+    def _decode(self, t: float, dynamics: Tensor | None, static: Tensor, *temporal: Tensor) -> Tensor:
+        """Outputs of the geometry heads (N, 14) and, beside them, of the appearance head."""
+        half = product(static, *self._gate_weights())
+        open_features = gated(self._moving(dynamics, static, *temporal), half)
+        motion = self.motion(static, t) if self.motion is not None else None
+        if len(self.hidden):
+            fused = open_features if motion is None else open_features + motion.features()
+            outputs = self.heads(self.hidden(fused.float()))
+            if self.appearance is None:
+                return outputs
+            return torch.cat([outputs, APPEARANCE_SCALE * self.appearance(open_features.float())], dim=1)
+        outputs = last_product(open_features, *self._heads())
+        if motion is not None:
+            moved = motion.through(self.heads.weight)
+            outputs = outputs + nn.functional.pad(moved, (0, outputs.shape[1] - moved.shape[1]))
+        return outputs
+
+    def _moving(self, dynamics: Tensor | None, static: Tensor, *temporal: Tensor) -> Tensor:
+        """(N, width) of the dynamics attribute and the temporal features, as far as the field has them, side by side.
+        They are multiplied apart, since putting them together first would copy the largest tensors of all."""
+        size = self.config.dynamics_size
+        bias, weight = self.temporal.bias, self.temporal.weight
+        if size and dynamics is not None:
+            moving = product(dynamics.to(static.dtype), weight[:, :size], bias)
+        else:
+            moving = bias.to(static.dtype).expand(len(static), -1)
+        for features in temporal:
+            moving = torch.addmm(moving, features, weight[:, size:].to(features.dtype).T)
+        return moving
+
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        """See motion/fields/deformation.py. The spectrum's frequencies, in no group, have their own optimiser."""
+        tables = [grid.table for grid in self.grids]
+        apart = {id(table) for table in tables}
+        if isinstance(self.motion, LaplacianMotion):
+            apart.add(id(self.motion.frequencies))
+        return {"hash": tables, "mlp": [p for p in self.parameters() if id(p) not in apart]}
+
+
+def _smoothness(apart: Tensor, nearby: Nearby) -> Tensor:
+    """Grid4D's smoothness loss: the mean squared distance between the features of near places, static and temporal."""
+    weights = apart.new_tensor([nearby.static_weight, nearby.temporal_weight][: len(apart)])
+    return (weights * apart).sum() / max(1, len(nearby.rows))

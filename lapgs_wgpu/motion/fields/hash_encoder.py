@@ -1,0 +1,229 @@
+"""The hash encoder as torch sees it: grids whose tables belong to torch, their encoding and its gradient on the device
+(motion/passes/hash_encoder_passes), and its plain-torch reference."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from ...gpu.array import DeviceArray, read_all
+from ...gpu.device import Device
+from ...gpu.kernel import Commands
+from ...gpu.pool import BufferPool
+from ..passes.hash_encoder_passes import HashEncoderPasses
+from .hash_grid_config import TIME, GridShape, HashConfig
+
+Place = tuple[Tensor, float]  # points (N, 3), world units, and a time in [0, 1]
+_NUMPY = {torch.float32: "float32", torch.bfloat16: "int16"}  # the dtype of arrays, which have no bfloat16
+
+
+class Encoded(NamedTuple):
+    """Several sets of points and their encodings on the device. Valid until the encoder writes other points.
+
+    counts, times: of each set. points: (N, 4) of each. tables: (entries, 2) of each grid, group by group. encodings:
+    (N, features) of each set and group; where gradients are recorded, they and the tables become their gradients.
+    """
+
+    counts: list[int]
+    times: list[float]
+    points: list[DeviceArray]
+    tables: list[list[DeviceArray]]
+    encodings: list[list[DeviceArray]]
+
+
+class HashGrid(GridShape, nn.Module):
+    """A grid with its table: (entries, 2) float32."""
+
+    def __init__(self, config: HashConfig, axes: tuple[int, int, int], generator: torch.Generator) -> None:
+        nn.Module.__init__(self)
+        GridShape.__init__(self, config, axes)
+        self.table = nn.Parameter(torch.empty(self.entries, 2).uniform_(-1e-4, 1e-4, generator=generator))
+
+
+class HashEncoder:
+    """Encodes points with several grids at once on one device. Axes and levels are fixed; tables come with each call.
+
+    groups: of grids whose features lie beside one another in one encoding.
+    lane_levels: the shape of the backward pass for CPU devices; otherwise fixed-point atomics.
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        groups: Sequence[Sequence[HashGrid]],
+        bound: float,
+        *,
+        lane_levels: bool | None = None,
+    ) -> None:
+        self.groups = [list(group) for group in groups]
+        self._passes = [HashEncoderPasses(device, group, bound, lane_levels=lane_levels) for group in self.groups]
+        self._pool = BufferPool(device)
+        self._device = device
+        self._held: Encoded | None = None  # what the buffers hold
+
+    @property
+    def grids(self) -> list[HashGrid]:
+        """Those of all groups."""
+        return [grid for group in self.groups for grid in group]
+
+    @property
+    def features(self) -> list[int]:
+        """Of a point, for each group."""
+        return [sum(grid.features for grid in group) for group in self.groups]
+
+    def __call__(self, points: Tensor, time: float = 0.0, dtype: torch.dtype = torch.float32) -> list[Tensor]:
+        """Encode points (N, 3), world units, at a time in [0, 1]: an (N, features) tensor for each group.
+
+        Differentiable in the tables, not in the points (the encoder sees sg[mean]). A point outside the box
+        [-bound, bound]^3 has zero features. dtype: of the encodings and of their gradients, float32 or bfloat16, to
+        which sums in float32 are rounded; the tables and their gradients are float32.
+        """
+        return self.encode_all([(points, time)], dtype)[0]
+
+    def encode_all(self, places: Sequence[Place], dtype: torch.dtype = torch.float32) -> list[list[Tensor]]:
+        """Encode several sets of points, each at its own time, and exchange the tables with the device only once."""
+        detached = [(points.detach(), time) for points, time in places]
+        outputs = _Encode.apply(self, detached, dtype, *[grid.table for grid in self.grids])
+        count = len(self.groups)
+        return [list(outputs[i : i + count]) for i in range(0, len(outputs), count)]
+
+    def encode(
+        self, places: Sequence[Place], dtype: torch.dtype, tables: Sequence[Tensor]
+    ) -> tuple[Encoded, list[Tensor]]:
+        """The forward pass without autograd: the encodings of the first place, group by group, then of the second."""
+        encoded = self.write(places, tables, dtype)
+        with Commands(self._device) as commands:
+            self.record(commands, encoded)
+        device = places[0][0].device
+        arrays = read_all(list(itertools.chain(*encoded.encodings)))
+        return encoded, [torch.from_numpy(array).view(dtype).to(device) for array in arrays]
+
+    def backward(
+        self, places: Sequence[Place], d_encodings: Sequence[Tensor], encoded: Encoded | None = None
+    ) -> list[Tensor]:
+        """The gradients of the tables, from those of the encodings in the order of `encode`. encoded: its result, whose
+        points need not be written again while the encoder holds them."""
+        if encoded is None or not self.holds(encoded):
+            encoded = self.write(places, (), d_encodings[0].dtype)
+        for array, d_encoding in zip(itertools.chain(*encoded.encodings), d_encodings, strict=True):
+            array.write(_host(d_encoding))
+        with Commands(self._device) as commands:
+            gradients = self.record_gradient(commands, encoded)
+        return [torch.from_numpy(array).to(places[0][0].device) for array in read_all(gradients)]
+
+    # What `encode` and `backward` consist of, without waiting for the device. Everything is written before anything is
+    # submitted: a buffer can only be mapped while the device rests.
+
+    def write(
+        self, places: Sequence[Place], tables: Sequence[Tensor] = (), dtype: torch.dtype = torch.float32
+    ) -> Encoded:
+        """Bring points, and tables where they are given, to the device. dtype: of the encodings."""
+        for number, table in enumerate(tables):
+            self._pool.upload(f"table {number}", _host(table))
+        numbers = itertools.count()
+        points = [
+            self._pool.upload(f"points {number}", _host(torch.nn.functional.pad(points.detach().float(), (0, 1))))
+            for number, (points, _) in enumerate(places)
+        ]
+        self._held = Encoded(
+            [len(points) for points, _ in places],
+            [time for _, time in places],
+            points,
+            [
+                [self._pool.array(f"table {next(numbers)}", tuple(grid.table.shape)) for grid in group]
+                for group in self.groups
+            ],
+            [
+                [
+                    self._pool.array(f"encoding {number} {group}", (len(points), size), _NUMPY[dtype])
+                    for group, size in enumerate(self.features)
+                ]
+                for number, (points, _) in enumerate(places)
+            ],
+        )
+        return self._held
+
+    def holds(self, encoded: Encoded) -> bool:
+        """Whether the device still has these encodings: nothing else was written, and they are no gradients yet."""
+        return encoded is self._held
+
+    def record(self, commands: Commands, encoded: Encoded) -> None:
+        """The passes that encode what was written."""
+        for number, count in enumerate(encoded.counts):
+            for passes, tables, encoding in zip(self._passes, encoded.tables, encoded.encodings[number], strict=True):
+                if count:
+                    passes.encode(
+                        commands, number, encoded.points[number], count, encoded.times[number], tables, encoding
+                    )
+
+    def record_gradient(self, commands: Commands, encoded: Encoded) -> list[DeviceArray]:
+        """The passes from the encodings' gradients, in the arrays of the encodings, to those of the tables, in the
+        arrays of the tables, which are returned."""
+        self._held = None
+        for table in itertools.chain(*encoded.tables):
+            commands.clear(table)
+        for number, count in enumerate(encoded.counts):
+            for passes, tables, encoding in zip(self._passes, encoded.tables, encoded.encodings[number], strict=True):
+                if count:
+                    passes.add_gradient(
+                        commands, number, encoded.points[number], count, encoded.times[number], encoding, tables
+                    )
+        return list(itertools.chain(*encoded.tables))
+
+
+def _host(tensor: Tensor) -> NDArray[Any]:
+    words = tensor.detach().to("cpu").contiguous()
+    return words.view(torch.int16).numpy() if words.dtype == torch.bfloat16 else words.float().numpy()
+
+
+class _Encode(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, encoder: HashEncoder, places: Sequence[Place], dtype: torch.dtype, *tables: Tensor
+    ) -> tuple[Tensor, ...]:
+        ctx.encoder, ctx.times = encoder, [time for _, time in places]
+        ctx.save_for_backward(*[points for points, _ in places])
+        ctx.encoded, encodings = encoder.encode(places, dtype, tables)
+        return tuple(encodings)
+
+    @staticmethod
+    def backward(ctx: Any, *d_encodings: Tensor) -> tuple[Tensor | None, ...]:
+        places = list(zip(ctx.saved_tensors, ctx.times, strict=True))
+        return (None, None, None, *ctx.encoder.backward(places, d_encodings, ctx.encoded))
+
+
+def encode_reference(grid: HashGrid, table: Tensor, points: Tensor, time: float, bound: float) -> Tensor:
+    """The reference: (N, 2 x levels) in the table's precision; cells are found in float32, as on the device."""
+    columns = [(points[:, axis] + bound) / (2 * bound) if axis != TIME else None for axis in grid.axes]
+    unit = torch.stack([torch.full_like(points[:, 0], time) if c is None else c for c in columns], dim=1)
+    inside = ((unit >= 0) & (unit <= 1)).all(dim=1)
+    primes = (1, 2654435761, 805459861)
+    encodings = []
+    for level, rows in zip(grid.levels, table.split([level.entries for level in grid.levels]), strict=True):
+        p = torch.where(inside[:, None], unit * torch.tensor(level.scale, dtype=unit.dtype), 0.0)
+        low = p.floor()
+        fraction = (p - low).to(table.dtype)
+        up = fraction * fraction * (3 - 2 * fraction)
+        base = low.long()
+        total = table.new_zeros((len(points), 2))
+        for corner in range(8):
+            weight = inside.to(table.dtype)
+            at = []
+            for axis in range(3):
+                high = (corner >> axis) & 1
+                weight = weight * (up[:, axis] if high else 1 - up[:, axis])
+                at.append((base[:, axis] + high).clamp(max=level.resolution[axis] - 1))
+            x, y, z = at
+            if level.dense:
+                index = x + level.resolution[0] * (y + level.resolution[1] * z)
+            else:
+                hashed = [((a * prime) & 0xFFFFFFFF) for a, prime in zip(at, primes, strict=True)]
+                index = (hashed[0] ^ hashed[1] ^ hashed[2]) % level.entries
+            total = total + weight[:, None] * rows[index]
+        encodings.append(total)
+    return torch.cat(encodings, dim=1)

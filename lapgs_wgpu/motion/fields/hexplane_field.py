@@ -1,0 +1,85 @@
+"""The field of 4D-GS (Wu et al. 2024), the baseline `hexplane`: features from six planes of space and time."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from .config import HEXPLANE_HEADS, PLANES, FieldConfig
+from .deformation import Deformation, Nearby
+from .hash_grid_config import TIME
+from .layers import linear, zero_head
+from .parameter_shapes import parameter_shapes
+
+# Weights of the smoothness loss that 4D-GS trains with on D-NeRF scenes.
+SPACE_SMOOTHNESS, TIME_SMOOTHNESS, TIME_SPARSITY = 1e-4, 1e-2, 1e-4
+
+
+class HexPlaneField(nn.Module):
+    """Features are products over the six planes, beside each other for each resolution, decoded by small networks.
+
+    Places outside the box take the values of its border.
+    """
+
+    def __init__(self, config: FieldConfig, seed: int) -> None:
+        super().__init__()
+        generator = torch.Generator().manual_seed(seed)
+        self.bound, shapes = config.bound, parameter_shapes(config)
+        self.planes = nn.ParameterList()
+        for number in range(len(PLANES) * config.planes.levels):
+            # Time planes start at one, and thus without motion.
+            plane = torch.ones(shapes[f"planes.{number}"])
+            if PLANES[number % len(PLANES)][1] != TIME:
+                plane.uniform_(0.1, 0.5, generator=generator)
+            self.planes.append(nn.Parameter(plane))
+        layers: list[nn.Module] = [linear(shapes["trunk.0.weight"], generator)]
+        for i in range(config.depth):
+            layers += [nn.ReLU(), linear(shapes[f"trunk.{2 * i + 2}.weight"], generator)]
+        self.trunk = nn.Sequential(*layers)
+        self.heads = nn.ModuleList(
+            nn.Sequential(
+                nn.ReLU(),
+                linear(shapes[f"heads.{i}.1.weight"], generator),
+                nn.ReLU(),
+                zero_head(shapes[f"heads.{i}.3.weight"]),
+            )
+            for i in range(len(HEXPLANE_HEADS))
+        )
+
+    def forward(
+        self, means: Tensor, t: float, dynamics: Tensor | None = None, nearby: Nearby | None = None
+    ) -> Deformation:
+        """See motion/fields/deformation.py."""
+        unit = torch.cat([means.detach() / self.bound, means.new_full((len(means), 1), 2.0 * t - 1.0)], dim=1)
+        levels = [self._features(unit, first) for first in range(0, len(self.planes), len(PLANES))]
+        hidden = self.trunk(torch.cat(levels, dim=1))
+        shift, d_quats, d_scales = (head(hidden) for head in self.heads)
+        smoothness = self._smoothness() if nearby is not None else None
+        return Deformation(None, shift, d_quats, d_scales, smoothness=smoothness)
+
+    def _features(self, unit: Tensor, first: int) -> Tensor:
+        """(N, F) at places and a time (N, 4) in [-1, 1] from the six planes from number `first` on."""
+        product: Tensor | None = None
+        for plane, pair in zip(list(self.planes)[first : first + len(PLANES)], PLANES, strict=True):
+            at = unit[None, None, :, list(pair)]
+            values = nn.functional.grid_sample(plane, at, align_corners=True, padding_mode="border")[0, :, 0].T
+            product = values if product is None else product * values
+        assert product is not None
+        return product
+
+    def _smoothness(self) -> Tensor:
+        """4D-GS's: squared second differences along the second axis of each plane, and time planes close to one."""
+        total = self.planes[0].new_zeros(())
+        for number, plane in enumerate(self.planes):
+            bend = plane[:, :, 2:] - 2 * plane[:, :, 1:-1] + plane[:, :, :-2]
+            if PLANES[number % len(PLANES)][1] == TIME:
+                total = total + TIME_SMOOTHNESS * bend.square().mean() + TIME_SPARSITY * (1 - plane).abs().mean()
+            else:
+                total = total + SPACE_SMOOTHNESS * bend.square().mean()
+        return total
+
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        """See motion/fields/deformation.py."""
+        planes = list(self.planes)
+        apart = {id(plane) for plane in planes}
+        return {"hash": planes, "mlp": [p for p in self.parameters() if id(p) not in apart]}

@@ -1,0 +1,50 @@
+"""The field of deformable 3DGS (Yang et al. 2024), the baseline `mlp`: one network of place and time, without grids."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from .config import MLP_LAYERS, MLP_OUTPUTS, MLP_SKIP, PLACE_OCTAVES, TIME_OCTAVES, FieldConfig
+from .deformation import Deformation, Nearby
+from .layers import linear, zero_head
+from .parameter_shapes import parameter_shapes
+
+
+class MlpField(nn.Module):
+    """Eight layers over sines of the place and of the time; its outputs are added to mean, quaternion and scale."""
+
+    def __init__(self, config: FieldConfig, seed: int) -> None:
+        super().__init__()
+        generator = torch.Generator().manual_seed(seed)
+        shapes = parameter_shapes(config)
+        self.bound = config.bound
+        self.time = nn.Sequential(
+            linear(shapes["time.0.weight"], generator), nn.ReLU(), linear(shapes["time.2.weight"], generator)
+        )
+        self.layers = nn.ModuleList(linear(shapes[f"layers.{i}.weight"], generator) for i in range(MLP_LAYERS))
+        self.heads = zero_head(shapes["heads.weight"])
+
+    def forward(
+        self, means: Tensor, t: float, dynamics: Tensor | None = None, nearby: Nearby | None = None
+    ) -> Deformation:
+        """See motion/fields/deformation.py; this field has no smoothness loss."""
+        time = self.time(octaves(means.new_tensor([[t]]), TIME_OCTAVES)).expand(len(means), -1)
+        inputs = torch.cat([octaves(means.detach() / self.bound, PLACE_OCTAVES), time], dim=1)
+        hidden = inputs
+        for number, layer in enumerate(self.layers):
+            hidden = torch.relu(layer(torch.cat([inputs, hidden], dim=1) if number == MLP_SKIP else hidden))
+        shift, d_quats, d_scales = self.heads(hidden).split(MLP_OUTPUTS, dim=1)
+        return Deformation(None, shift, d_quats, d_scales)
+
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        """See motion/fields/deformation.py."""
+        return {"mlp": list(self.parameters())}
+
+
+def octaves(values: Tensor, count: int) -> Tensor:
+    """(N, D (1 + 2 count)): the values (N, D) beside their sines and cosines at 1, 2, 4, ... radians a unit."""
+    angles = [values * (math.pi * 2.0**k) for k in range(count)]
+    return torch.cat([values, *(f(angle) for angle in angles for f in (torch.sin, torch.cos))], dim=1)

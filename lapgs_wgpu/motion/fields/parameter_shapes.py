@@ -1,0 +1,83 @@
+"""The names and shapes of a field's parameters, in the order of its module's state_dict; without torch."""
+
+from __future__ import annotations
+
+from .config import (
+    GEOMETRY,
+    HEXPLANE_HEADS,
+    MLP_LAYERS,
+    MLP_OUTPUTS,
+    MLP_SKIP,
+    PLACE_OCTAVES,
+    TIME_FEATURES,
+    TIME_OCTAVES,
+    FieldConfig,
+    plane_shapes,
+    static_grid,
+    temporal_grids,
+)
+
+Shapes = dict[str, tuple[int, ...]]
+
+
+def parameter_shapes(config: FieldConfig) -> Shapes:
+    """All parameters of the field of this configuration; none where nothing moves."""
+    if config.kind == "mlp":
+        return _mlp(config)
+    if config.kind == "hexplane":
+        return _hexplane(config)
+    return _grid(config) if config.kind in ("grid4d", "laplacian") else {}
+
+
+def laplacian_motion(inputs: int, width: int, components: int) -> Shapes:
+    """Those of LaplacianMotion."""
+    series: Shapes = {"alpha": (components, width), "beta": (components, width), "frequencies": (components,)}
+    return series | _layer("first", width, inputs) | _layer("second", width, width)
+
+
+def time_motion(inputs: int, width: int) -> Shapes:
+    """Those of TimeMotion."""
+    return _layer("first", width, inputs + 1) | _layer("second", width, width)
+
+
+def _layer(name: str, outputs: int, inputs: int) -> Shapes:
+    return {f"{name}.weight": (outputs, inputs), f"{name}.bias": (outputs,)}
+
+
+def _grid(config: FieldConfig) -> Shapes:
+    static, grids, width = static_grid(config), temporal_grids(config), config.width
+    shapes: Shapes = {"static_grid.table": (static.entries, 2)}
+    shapes |= {f"temporal_grids.{i}.table": (grid.entries, 2) for i, grid in enumerate(grids)}
+    shapes |= _layer("spatial", width, static.features)
+    shapes |= _layer("temporal", width, max(1, config.dynamics_size + sum(grid.features for grid in grids)))
+    for i in range(config.depth):
+        shapes |= _layer(f"hidden.{2 * i}", width, width)
+    shapes |= _layer("heads", sum(GEOMETRY), width)
+    if config.kind == "laplacian":
+        spectrum = config.motion == "laplacian"
+        motion = laplacian_motion(static.features, width, config.components)
+        motion = motion if spectrum else time_motion(static.features, width)
+        shapes |= {f"motion.{name}": shape for name, shape in motion.items()}
+    if config.appearance_size:
+        shapes |= _layer("appearance", config.appearance_size, width)
+    return shapes
+
+
+def _hexplane(config: FieldConfig) -> Shapes:
+    width = config.width
+    shapes: Shapes = {f"planes.{i}": shape for i, shape in enumerate(plane_shapes(config.planes))}
+    shapes |= _layer("trunk.0", width, config.planes.features * config.planes.levels)
+    for i in range(config.depth):
+        shapes |= _layer(f"trunk.{2 * i + 2}", width, width)
+    for i, outputs in enumerate(HEXPLANE_HEADS):
+        shapes |= _layer(f"heads.{i}.1", width, width) | _layer(f"heads.{i}.3", outputs, width)
+    return shapes
+
+
+def _mlp(config: FieldConfig) -> Shapes:
+    width = config.width
+    shapes = _layer("time.0", width, 1 + 2 * TIME_OCTAVES) | _layer("time.2", TIME_FEATURES, width)
+    inputs = 3 + 6 * PLACE_OCTAVES + TIME_FEATURES
+    for i in range(MLP_LAYERS):
+        shapes |= _layer(f"layers.{i}", width, inputs if i == 0 else width + inputs if i == MLP_SKIP else width)
+    return shapes | _layer("heads", sum(MLP_OUTPUTS), width)

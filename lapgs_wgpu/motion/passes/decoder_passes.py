@@ -1,0 +1,149 @@
+"""The passes of the grid fields' decoder for training, without torch: from features to outputs of the heads, and back.
+
+The decoder is that of motion/fields/grid_field without hidden layers, in matrices: layers = beside W_beside^T, to whose
+channels of place static W_static^T is added, and to the temporal ones temporal W_temporal^T; features = gate(layers);
+outputs = features W_heads^T. The layers' biases are the weights of a column of ones in `beside`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+from ...gpu.array import DeviceArray
+from ...gpu.device import Device
+from ...gpu.kernel import Commands, Kernel
+from ...gpu.matmul import Matmul, Matrix
+from ...gpu.pool import BufferPool
+from ..fields.config import GEOMETRY, FieldConfig, static_grid, temporal_grids
+
+_BLOCK = 1 << 14  # Gaussians that are decoded at once: layers and features of a block take 80 MB at a width of 256
+
+
+@dataclass(frozen=True)
+class DecoderShape:
+    """width: channels of a layer. beside, static, temporal: columns of the inputs; temporal may be 0. motion: whether
+    the inner layer of the Laplacian motion stands between the gate and the temporal layer."""
+
+    width: int
+    beside: int
+    static: int
+    temporal: int
+    outputs: int
+    motion: bool
+
+    @property
+    def placed(self) -> int:
+        """Channels that depend on the static features; as many are read by the heads."""
+        return self.width * (2 if self.motion else 1)
+
+    @property
+    def channels(self) -> int:
+        """Of all layers."""
+        return self.placed + self.width
+
+    @property
+    def inputs(self) -> dict[str, tuple[int, int, int]]:
+        """Columns of each input, and the first and the number of the channels that depend on it."""
+        inputs = {
+            "beside": (self.beside, 0, self.channels),
+            "static": (self.static, 0, self.placed),
+            "temporal": (self.temporal, self.placed, self.width),
+        }
+        return {name: sizes for name, sizes in inputs.items() if sizes[0]}
+
+    @property
+    def weights(self) -> dict[str, tuple[int, int]]:
+        """Shapes of the layers' weights, by input, and of the heads'."""
+        shapes = {name: (channels, columns) for name, (columns, _, channels) in self.inputs.items()}
+        return shapes | {"heads": (self.outputs, self.placed)}
+
+
+def decoder_shape(config: FieldConfig) -> DecoderShape:
+    """Of a field that `decodes_on_device`."""
+    return DecoderShape(
+        width=config.width,
+        beside=config.dynamics_size + 1,
+        static=static_grid(config).features,
+        temporal=sum(grid.features for grid in temporal_grids(config)),
+        outputs=sum(GEOMETRY) + config.appearance_size,
+        motion=config.kind == "laplacian",
+    )
+
+
+class DecoderPasses:
+    """Records the passes on one device. `inputs` are arrays (N, columns) float32 by the names of `DecoderShape.inputs`,
+    `weights` by those and in the shapes of `DecoderShape.weights`.
+
+    block: how many Gaussians are decoded at once, a multiple of 64.
+    """
+
+    def __init__(self, device: Device, shape: DecoderShape, *, block: int | None = None) -> None:
+        self.device, self.shape = device, shape
+        self.pool = BufferPool(device)
+        self._product = Matmul(device, self.pool)
+        self._size = block or max(64, min(_BLOCK, device.max_binding // (4 * shape.channels) // 64 * 64))
+
+    def decode(
+        self,
+        commands: Commands,
+        inputs: Mapping[str, DeviceArray],
+        weights: Mapping[str, DeviceArray],
+        outputs: DeviceArray,
+    ) -> None:
+        """outputs: (N, outputs) float32."""
+        for first, count in self._blocks(outputs):
+            _, features = self._activate(commands, first, count, inputs, weights)
+            target = Matrix.of(outputs.rows(first, count))
+            self._product(commands, f"outputs {first}", features, Matrix.of(weights["heads"]).transpose, target)
+
+    def decode_bwd(
+        self,
+        commands: Commands,
+        inputs: Mapping[str, DeviceArray],
+        weights: Mapping[str, DeviceArray],
+        d_outputs: DeviceArray,
+        d_weights: Mapping[str, DeviceArray],
+    ) -> None:
+        """Carry the gradient of the outputs back to the weights, and to the inputs, which become their gradients."""
+        for first, count in self._blocks(d_outputs):
+            layers, features = self._activate(commands, first, count, inputs, weights)
+            d = Matrix.of(d_outputs.rows(first, count))
+            self._product.long(commands, f"d heads {first}", d.transpose, features, d_weights["heads"], add=first > 0)
+            self._product(commands, f"d features {first}", d, Matrix.of(weights["heads"]), features)
+            self._gate("gate_bwd", commands, first, count, d_features=features.array, layers=layers.array)
+            for name, (_, channel, channels) in self.shape.inputs.items():
+                given, own = Matrix.of(inputs[name].rows(first, count)), layers.from_column(channel, channels)
+                self._product.long(
+                    commands, f"d weights {name} {first}", own.transpose, given, d_weights[name], add=first > 0
+                )
+                self._product(commands, f"d {name} {first}", own, Matrix.of(weights[name]), given)
+
+    def _blocks(self, outputs: DeviceArray) -> Iterator[tuple[int, int]]:
+        n = outputs.shape[0]
+        return ((first, min(self._size, n - first)) for first in range(0, n, self._size))
+
+    def _activate(
+        self,
+        commands: Commands,
+        first: int,
+        count: int,
+        inputs: Mapping[str, DeviceArray],
+        weights: Mapping[str, DeviceArray],
+    ) -> tuple[Matrix, Matrix]:
+        """What the layers give for a block, and what the heads read."""
+        shape = self.shape
+        layers = Matrix.of(self.pool.array("layers", (count, shape.channels)))
+        features = Matrix.of(self.pool.array("features", (count, shape.placed)))
+        for number, (name, (_, channel, channels)) in enumerate(shape.inputs.items()):
+            given, own = Matrix.of(inputs[name].rows(first, count)), layers.from_column(channel, channels)
+            # The first input, beside the features, goes into all channels.
+            self._product(commands, f"{name} {first}", given, Matrix.of(weights[name]).transpose, own, add=number > 0)
+        self._gate("gate", commands, first, count, layers=layers.array, features=features.array)
+        return layers, features
+
+    def _gate(self, name: str, commands: Commands, first: int, count: int, **arrays: DeviceArray) -> None:
+        kernel = Kernel.get(self.device, name, **({"MOTION": 1} if self.shape.motion else {}))
+        content = kernel.uniform("Gate", gaussians=count, width=self.shape.width)
+        uniform = self.pool.constant(f"gate {first}", content)
+        commands.dispatch(kernel, -(-count * self.shape.width // 64), gate=uniform, **arrays)

@@ -1,0 +1,240 @@
+"""The passes of the hash encoder, without torch: points through several hash grids, and the gradient of their tables.
+
+All points share one time, so a grid with a time axis is first cut at that time wherever that is cheaper than looking up
+the planes around it for each point.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...gpu.array import DeviceArray
+from ...gpu.device import SOFTWARE_LOOP_TURNS, Device
+from ...gpu.kernel import Commands, Kernel
+from ...gpu.pool import BufferPool
+from ..fields.hash_grid_config import GridShape
+
+_ALIGNED = 64  # so many rows are a multiple of 256 bytes, at which a binding may begin, whatever the row
+_LEVEL_WORDS = 12  # common/hashgrid.wgsl: struct Level
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Some levels of a grid that are handled alike."""
+
+    grid: int
+    sliced: bool
+    count: int
+    levels: DeviceArray
+    cells: int  # of the largest plane
+    entries: int  # of all slices together
+
+
+class HashEncoderPasses:
+    """Records the passes that encode points with several grids at once. Axes and levels are fixed; tables (entries, 2),
+    points (N, 4) and the encoding come with each call, in float32 but for an encoding that is wanted in bfloat16.
+
+    lane_levels: the shape of the backward pass for CPU devices; otherwise fixed-point atomics.
+    row, column: the encoding's rows have `row` floats, in which the features of one grid lie behind those of the other
+    from `column` on; both even. By default the rows hold just these.
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        grids: Sequence[GridShape],
+        bound: float,
+        *,
+        lane_levels: bool | None = None,
+        row: int | None = None,
+        column: int = 0,
+    ) -> None:
+        self.device, self.grids, self.bound = device, list(grids), bound
+        self.pool = BufferPool(device)
+        self.lane_levels = device.is_cpu if lane_levels is None else lane_levels
+        # Where a lane takes all points: no more than half of the turns that the driver lets a loop have.
+        turns = SOFTWARE_LOOP_TURNS if self.lane_levels else None
+        self._most_points = None if turns is None else (turns + 1) // 2
+        self._row = sum(grid.features for grid in grids) if row is None else row
+        self._parts: list[_Part] = []
+        for number, grid in enumerate(grids):
+            sliced = grid.sliced
+            direct = [i for i in range(len(grid.levels)) if i not in sliced]
+            for chosen, cut in ((sliced, True), (direct, False)):
+                if chosen:
+                    self._parts.append(self._part(number, chosen, cut, column // 2))
+            column += grid.features
+
+    def _part(self, number: int, chosen: list[int], sliced: bool, first_pair: int) -> _Part:
+        levels = self.grids[number].levels
+        words = np.zeros((len(chosen), _LEVEL_WORDS), np.uint32)
+        slices = largest = 0
+        for row, i in zip(words, chosen, strict=True):
+            level = levels[i]
+            row[:3] = np.asarray(level.scale, np.float32).view(np.uint32)
+            row[4:8] = (*level.resolution, level.entries)
+            row[8:12] = (level.first, slices, first_pair + i, level.dense)
+            cells = level.resolution[0] * level.resolution[1]
+            largest = max(largest, cells)
+            slices += cells
+        array = DeviceArray.upload(self.device, f"levels {number} {'sliced' if sliced else 'direct'}", words)
+        return _Part(number, sliced, len(chosen), array, largest, slices if sliced else 0)
+
+    def _uniform(self, part: _Part, place: str, points: int, all_points: int, time: float) -> DeviceArray:
+        """What the kernels are told of a block of points; all blocks of all places are submitted at once."""
+        content = Kernel.get(self.device, "hashgrid_slice", SLICED=1, CORNERS=4).uniform(
+            "Grid",
+            points=points,
+            all_points=all_points,
+            levels=part.count,
+            all_levels=self._row // 2,
+            axes=(*self.grids[part.grid].axes, 0),
+            time=time,
+            bound=self.bound,
+        )
+        return self.pool.constant(f"grid {part.grid} {part.sliced} place {place}", content)
+
+    @staticmethod
+    def _defines(part: _Part) -> dict[str, int]:
+        return {"SLICED": 1, "CORNERS": 4} if part.sliced else {"CORNERS": 8}
+
+    def _blocks(self, n: int, encoding: DeviceArray, most: int | None = None) -> Iterator[tuple[int, int]]:
+        """First and number of the points that a dispatch takes, at most so many, whose rows of the
+        encoding fit into a binding."""
+        row = encoding.nbytes // max(n, 1)
+        size = self.device.max_binding // max(row, 1) // _ALIGNED * _ALIGNED
+        size = size if most is None else min(size, most)
+        return ((first, min(size, n - first)) for first in range(0, n, size))
+
+    def encode(
+        self,
+        commands: Commands,
+        number: int,
+        points: DeviceArray,
+        n: int,
+        time: float,
+        tables: list[DeviceArray],
+        encoding: DeviceArray,
+        *,
+        rows: DeviceArray | None = None,
+    ) -> None:
+        """Encode n points (N, 4) at a time in [0, 1]; outside the box [-bound, bound]^3 features are zero.
+
+        number: tells apart the calls that are submitted together. tables: (entries, 2) of each grid. encoding:
+        (N, row), float32, or int16, which stands for bfloat16. rows: uint32, its first n say which of the points; the
+        encoding, which must fit into a binding, then keeps its other rows. Without, n is N.
+        """
+        sources = []
+        for part in self._parts:
+            source = tables[part.grid]
+            if part.sliced:
+                slices = self.pool.array(f"slices {part.grid}", (part.entries, 2))
+                commands.dispatch_grid(
+                    Kernel.get(self.device, "hashgrid_slice", **self._defines(part)),
+                    (-(-part.cells // 64), part.count),
+                    grid=self._uniform(part, f"{number}", n, n, time),
+                    levels=part.levels,
+                    features=source,
+                    slices=slices,
+                )
+                source = slices
+            sources.append(source)
+        options = _precision(encoding)
+        if rows is None:
+            blocks = [
+                (first, count, {"points": points.rows(first, count), "encoding": encoding.rows(first, count)})
+                for first, count in self._blocks(n, encoding)
+            ]
+        else:
+            options |= {"ROWS": 1}
+            blocks = [(0, n, {"points": points, "encoding": encoding, "rows": rows})]
+        for first, count, arrays in blocks:
+            for part, source in zip(self._parts, sources, strict=True):
+                commands.dispatch(
+                    Kernel.get(self.device, "hashgrid", **self._defines(part), **options),
+                    -(-count // 512) * part.count,
+                    grid=self._uniform(part, f"{number} from {first}", count, n, time),
+                    levels=part.levels,
+                    features=source,
+                    **arrays,
+                )
+
+    def add_gradient(
+        self,
+        commands: Commands,
+        number: int,
+        points: DeviceArray,
+        n: int,
+        time: float,
+        d_encoding: DeviceArray,
+        d_tables: list[DeviceArray],
+    ) -> None:
+        """Add the gradient of the tables, from that of the encoding, whose rows must hold nothing else."""
+        targets, sums = [], []
+        for part in self._parts:
+            target = d_tables[part.grid]
+            if part.sliced:
+                target = self.pool.array(f"d_slices {part.grid}", (part.entries, 2))
+                commands.clear(target)
+            targets.append(target)
+            if not self.lane_levels:
+                target = self.pool.array(f"d_fixed {part.grid} {part.sliced}", (2 * target.size,), "uint32")
+                commands.clear(target)
+            sums.append(target)
+
+        options = _precision(d_encoding)
+        largest = {} if self.lane_levels else {"largest": self._largest(commands, number, n, time, d_encoding, options)}
+        options |= {"LANE_LEVELS": 1} if self.lane_levels else {}
+        for first, count in self._blocks(n, d_encoding, self._most_points):
+            for part, target in zip(self._parts, sums, strict=True):
+                commands.dispatch(
+                    Kernel.get(self.device, "hashgrid_bwd", **self._defines(part), **options),
+                    -(-part.count // 8) if self.lane_levels else -(-count // 64) * part.count,
+                    grid=self._uniform(part, f"{number} from {first}", count, n, time),
+                    levels=part.levels,
+                    points=points.rows(first, count),
+                    d_encoding=d_encoding.rows(first, count),
+                    **{"d_features" if self.lane_levels else "d_fixed": target},
+                    **largest,
+                )
+
+        for part, target, fixed in zip(self._parts, targets, sums, strict=True):
+            uniform = self._uniform(part, f"{number}", n, n, time)
+            if not self.lane_levels:
+                unfix = Kernel.get(self.device, "hashgrid_unfix", **self._defines(part))
+                commands.dispatch(
+                    unfix, -(-target.size // 64), grid=uniform, d_fixed=fixed, d_features=target, **largest
+                )
+            if part.sliced:
+                commands.dispatch_grid(
+                    Kernel.get(self.device, "hashgrid_slice_bwd", **self._defines(part)),
+                    (-(-part.cells // 64), part.count),
+                    grid=uniform,
+                    levels=part.levels,
+                    d_slices=target,
+                    d_features=d_tables[part.grid],
+                )
+
+    def _largest(
+        self, commands: Commands, number: int, n: int, time: float, d_encoding: DeviceArray, options: dict[str, int]
+    ) -> DeviceArray:
+        """The largest absolute value of a gradient, by which sums in fixed point are scaled."""
+        largest = self.pool.array(f"largest {number}", (1,), "uint32")
+        commands.clear(largest)
+        kernel = Kernel.get(self.device, "hashgrid_largest", CORNERS=4, **options)
+        for first, count in self._blocks(n, d_encoding):
+            commands.dispatch(
+                kernel,
+                -(-count * self._row // 4096),
+                grid=self._uniform(self._parts[0], f"{number} largest from {first}", count, n, time),
+                d_encoding=d_encoding.rows(first, count),
+                largest=largest,
+            )
+        return largest
+
+
+def _precision(encoding: DeviceArray) -> dict[str, int]:
+    return {"BFLOAT16": 1} if encoding.dtype == "int16" else {}

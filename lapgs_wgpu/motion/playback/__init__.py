@@ -1,0 +1,1 @@
+"""Showing a scene at any time, where possible without torch."""

@@ -1,0 +1,244 @@
+"""Grid fields on the device, without torch: the Gaussians of a grid4d or laplacian scene at a time, for playback.
+
+What needs no time is computed once. Then a time costs the temporal encoding and one pass, `deform`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...gpu.array import DeviceArray
+from ...gpu.device import Device
+from ...gpu.kernel import Commands, Kernel
+from ...gpu.pool import BufferPool
+from ...splat.gaussians import Gaussians
+from ..fields.config import APPEARANCE_SCALE, GEOMETRY, FieldConfig, static_grid, temporal_grids
+from ..passes.hash_encoder_passes import HashEncoderPasses
+
+Floats = NDArray[np.float32]
+
+_LANES = 64  # deform.wgsl
+_CANONICAL = 16  # deform.wgsl: floats of a Gaussian before its still features
+_BLOCK_BYTES = 128 << 20  # of the features that one dispatch sees: WebGPU's default limit of a binding
+
+
+def runs_on_device(config: FieldConfig, device: Device) -> bool:
+    """Whether `GridFieldPlayback` can show this field on the device."""
+    if not config.decodes_on_device or device.max_loop_turns is None:
+        return config.decodes_on_device
+    sizes = _Sizes(config)
+    # Of 8 channels (on CPU devices), with the loops over channels and the round itself.
+    return (sizes.width // 8 + 1) * (sizes.still_quads + sizes.moving_quads + 11) < device.max_loop_turns
+
+
+class _Sizes:
+    """Lengths of the rows that the pass reads, in floats and in quads of them."""
+
+    def __init__(self, config: FieldConfig) -> None:
+        self.width = config.width
+        self.static = static_grid(config).features
+        self.dynamics = config.dynamics_size
+        self.temporal = sum(grid.features for grid in temporal_grids(config))
+        self.first_temporal = self.dynamics + self.dynamics % 2  # features come in pairs
+        self.still_quads = -(-self.static // 4)
+        self.moving_quads = -(-(self.first_temporal + self.temporal) // 4)
+
+
+@dataclass(frozen=True)
+class _Block:
+    """Gaussians that one dispatch takes: a range of all, with what is read of them."""
+
+    first: int
+    count: int
+    points: DeviceArray  # (count, 4)
+    still: DeviceArray  # (count, 16 + still features)
+    moving: DeviceArray  # (count, dynamics and temporal features)
+    rows: DeviceArray  # (count,) uint32, of which the first say what a dispatch takes
+
+
+class GridFieldPlayback:
+    """Moves activated Gaussians (`still`, means (N, 3), quats (N, 4) of unit length, ..., with opacity_logits in place
+    of opacities) by a field whose parameters have the names and shapes of fields/parameter_shapes.
+
+    block: how many Gaussians a dispatch takes, a multiple of 64; by default what fits into 128 MiB.
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        config: FieldConfig,
+        parameters: Mapping[str, Floats],
+        gaussians: Mapping[str, Floats],
+        *,
+        block: int | None = None,
+    ) -> None:
+        self._device, self._config = device, config
+        self._parameters = {name: array for name, array in parameters.items() if not name.endswith(".table")}
+        self._pool = BufferPool(device)
+        self._sizes = sizes = _Sizes(config)
+        self._defines = {"POINTS": 4, "QUADS": 2} if device.is_cpu else {"POINTS": 2, "QUADS": 1}
+        self._defines["HEADS"] = 5 if config.appearance_size else 4
+        if config.kind == "laplacian":
+            self._defines["MOTION"] = 1
+        if config.appearance_size:
+            self._defines["COLOR"] = 1
+        self._channels = 4 * self._defines["QUADS"]  # a round
+        self._rounds = -(-config.width // self._channels)
+        row = max(_CANONICAL + 4 * sizes.still_quads, 4 * sizes.moving_quads)
+        self._size = size = block or _BLOCK_BYTES // (4 * row) // _LANES * _LANES
+        self._count = count = len(gaussians["means"])
+        self._blocks = [self._block(gaussians, first, min(size, count - first)) for first in range(0, count, size)]
+        self._temporal = HashEncoderPasses(
+            device, temporal_grids(config), config.bound, row=4 * sizes.moving_quads, column=sizes.first_temporal
+        )
+        self._tables = [
+            self._pool.upload(f"table {i}", parameters[f"temporal_grids.{i}.table"])
+            for i in range(len(self._temporal.grids))
+        ]
+        self._encode_static(parameters["static_grid.table"])
+        heads, stream = self._heads(0.0), self._stream()
+        self._stream_at, self._rows_at = len(heads), len(heads) + len(stream)
+        # Vectors of four floats: heads, stream, and the numbers of the rows that are moved.
+        self._weights = self._pool.array("weights", (self._rows_at + -(-count // 4), 4))
+        self._weights.rows(0, self._rows_at).write(np.concatenate([heads, stream]))
+
+    def _block(self, gaussians: Mapping[str, Floats], first: int, count: int) -> _Block:
+        g = {name: array[first : first + count] for name, array in gaussians.items()}
+        points = np.zeros((count, 4), np.float32)
+        points[:, :3] = g["means"]
+        still = np.zeros((count, _CANONICAL + 4 * self._sizes.still_quads), np.float32)
+        still[:, :3], still[:, 3], still[:, 4:8] = g["means"], g["opacity_logits"], g["quats"]
+        still[:, 8:11], still[:, 12:15] = g["scales"], g["colors"][:, 0]
+        moving = np.zeros((count, max(4, 4 * self._sizes.moving_quads)), np.float32)
+        if self._sizes.dynamics:
+            moving[:, : self._sizes.dynamics] = g["dynamics"]
+        named = {"points": points, "still": still, "moving": moving, "rows": np.zeros(count, np.uint32)}
+        return _Block(first, count, **{name: self._pool.upload(f"{name} from {first}", a) for name, a in named.items()})
+
+    def _encode_static(self, entries: Floats) -> None:
+        """H_s, into the rows of what does not change."""
+        row = _CANONICAL + 4 * self._sizes.still_quads
+        encoder = HashEncoderPasses(
+            self._device, [static_grid(self._config)], self._config.bound, row=row, column=_CANONICAL
+        )
+        table = DeviceArray.upload(self._device, "static table", entries)  # not in the pool: it is needed once
+        with Commands(self._device) as commands:
+            for number, block in enumerate(self._blocks):
+                encoder.encode(commands, number, block.points, block.count, 0.0, [table], block.still)
+
+    # Weights ---------------------------------------------------------------------------------------------------------
+
+    def _columns(self, weight: Floats, quads: int) -> Floats:
+        """(rounds, input quads, output quads of a round, 4 inputs, 4 outputs) of a layer's weight (width, inputs)."""
+        padded = np.zeros((self._rounds * self._channels, 4 * quads), np.float32)
+        padded[: weight.shape[0], : weight.shape[1]] = weight
+        return padded.reshape(self._rounds, self._channels // 4, 4, quads, 4).transpose(0, 3, 1, 4, 2)
+
+    def _stream(self) -> Floats:
+        """(vectors, 4): biases and layers of the decoder, in the order in which the pass reads them."""
+        p, sizes, rounds = self._parameters, self._sizes, self._rounds
+        p = p | {name: np.float32(0.5) * p[name] for name in ("spatial.weight", "spatial.bias")}  # see common/gate.wgsl
+        moving = np.zeros((sizes.width, sizes.first_temporal + sizes.temporal), np.float32)
+        moving[:, : sizes.dynamics] = p["temporal.weight"][:, : sizes.dynamics]
+        moving[:, sizes.first_temporal :] = p["temporal.weight"][:, sizes.dynamics : sizes.dynamics + sizes.temporal]
+        still, biases = ["spatial"], ["spatial", "temporal"]
+        if self._config.kind == "laplacian":
+            still, biases = [*still, "motion.first"], [*biases, "motion.first"]
+        starts = np.concatenate([self._columns(p[f"{name}.bias"][:, None], 1)[:, 0, :, :1] for name in biases], axis=2)
+        layers = [self._columns(p[f"{name}.weight"], sizes.still_quads) for name in still]
+        parts = [starts, np.stack(layers, axis=4), self._columns(moving, sizes.moving_quads)]
+        return np.concatenate([part.reshape(rounds, -1, 4) for part in parts], axis=1).reshape(-1, 4)
+
+    def _heads(self, t: float) -> Floats:
+        """(vectors, 4): biases and, by channel, weights of the heads; with the Laplacian motion at a time folded in."""
+        p, width = self._parameters, self._sizes.width
+        weight = p["heads.weight"]
+        heads, channels = self._defines["HEADS"], self._rounds * self._channels
+        columns = np.zeros((channels, heads + 4 if "MOTION" in self._defines else heads, 4), np.float32)
+        start = np.zeros((heads, 4), np.float32)
+        _fill_geometry(columns[:width], weight.T)
+        _fill_geometry(start[None], p["heads.bias"][None])
+        if self._config.kind == "laplacian":
+            phase = 2 * math.pi * t * p["motion.frequencies"].astype(np.float64)
+            series = np.cos(phase) @ p["motion.alpha"] + np.sin(phase) @ p["motion.beta"]
+            # Factors.through: A_L goes into nothing but these heads.
+            _fill_geometry(columns[:width, heads:], (weight @ (series[:, None] * p["motion.second.weight"])).T)
+            bias = p["heads.bias"] + weight @ (series * p["motion.second.bias"])
+            _fill_geometry(start[None], bias[None])
+        if self._config.appearance_size:
+            look = APPEARANCE_SCALE * p["appearance.weight"], APPEARANCE_SCALE * p["appearance.bias"]
+            columns[:width, 4, :3], start[4, :3] = look[0][:3].T, look[1][:3]
+            if self._config.appearance_size == 4:
+                columns[:width, 2, 3], start[2, 3] = look[0][3], look[1][3]
+        return np.concatenate([start, columns.reshape(-1, 4)])
+
+    # A time ----------------------------------------------------------------------------------------------------------
+
+    def move(self, t: float, out: Gaussians[DeviceArray], rows: NDArray[np.integer] | None = None) -> None:
+        """Submit the passes that write the Gaussians at a time in [0, 1]: all of `out` but the colours above their
+        constant part, which stay, and the constant part, too, where the field changes no colours.
+
+        rows: (M,) ascending, the Gaussians to be moved, None for all; the others stay as they are in `out`.
+        """
+        kernel = Kernel.get(self._device, "deform", **self._defines)
+        rows = np.arange(self._count) if rows is None else rows
+        of_block = rows % self._size
+        heads = self._heads(t)
+        self._weights.rows(0, len(heads)).write(heads)
+        listed = np.zeros((-(-len(rows) // 4), 4), np.float32)
+        listed.reshape(-1)[: len(rows)] = of_block
+        self._weights.rows(self._rows_at, len(listed)).write(listed)
+        points = self._defines["POINTS"]
+        with Commands(self._device) as commands:
+            for number, block in enumerate(self._blocks):
+                start, end = np.searchsorted(rows, (block.first, block.first + block.count)).tolist()
+                if start == end:
+                    continue
+                block.rows.rows(0, end - start).write(of_block[start:end].astype(np.uint32))
+                self._temporal.encode(
+                    commands,
+                    number,
+                    block.points,
+                    end - start,
+                    self._config.grid_time(t),
+                    self._tables,
+                    block.moving,
+                    rows=block.rows,
+                )
+                uniform = self._pool.constant(
+                    f"deform {number}",
+                    kernel.uniform(
+                        "Deform",
+                        gaussians=end - start,
+                        first=start,
+                        rows=self._rows_at,
+                        rounds=self._rounds,
+                        still_quads=self._sizes.still_quads,
+                        moving_quads=self._sizes.moving_quads,
+                        stream=self._stream_at,
+                        sh_stored=out.sh.shape[1],
+                    ),
+                )
+                names = {"means": "means", "quats": "quats", "scales": "scales", "opacities": "opacities"}
+                names |= {"colors": "sh"} if "COLOR" in self._defines else {}
+                outputs = {name: getattr(out, of).rows(block.first, block.count) for name, of in names.items()}
+                commands.dispatch(
+                    kernel,
+                    -(-(end - start) // (_LANES * points)),
+                    deform=uniform,
+                    still=block.still,
+                    moving=block.moving,
+                    weights=self._weights,
+                    **outputs,
+                )
+
+
+def _fill_geometry(quads: NDArray[np.float32], outputs: NDArray[np.floating]) -> None:
+    """Lay the geometry heads' 14 outputs (rows, 14) out as deform.wgsl has them, in quads (rows, 4 or more, 4)."""
+    turn, shift, quaternion, scale = np.split(outputs, np.cumsum(GEOMETRY)[:-1], axis=1)
+    quads[:, 0], quads[:, 1], quads[:, 2, :3], quads[:, 3, :3] = turn, quaternion, shift, scale

@@ -1,0 +1,83 @@
+"""What playback has seen of each Gaussian's motion, and so which of them a picture cannot do without.
+
+On the host: a hundred operations for each Gaussian, where the field takes a hundred thousand.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...splat.camera import Camera
+from ...splat.constants import CONSTANTS
+
+Floats = NDArray[np.float32]
+
+_FEW = 8  # parts of the clip that must have been seen before any Gaussian is taken to stand still
+_STILL_PIXELS = 0.25  # it does where what lies a standard deviation from its mean, on the steepest slope, moves less
+_STILL_SHADE = 1 / 64  # and its opacity and colours, of range 1, change less
+_BEYOND = 1.5  # times the box of the means: between the times seen a path may leave it
+_RIM = math.sqrt(-2 * math.log(CONSTANTS["ALPHA_MIN"]))  # standard deviations to where even an opaque Gaussian ends
+_DILATED = _RIM * math.sqrt(CONSTANTS["DILATION"])  # pixels that the low-pass adds to a rim, at most
+
+
+class MotionBounds:
+    """Boxes of the values that `count` Gaussians have had so far.
+
+    parts: of the clip, so short that next to nothing happens within one.
+    """
+
+    def __init__(self, count: int, parts: int) -> None:
+        self._parts = parts
+        self._seen: set[int] = set()
+        self._low = np.full((14, count), np.inf, np.float32)
+        self._high = -self._low
+
+    def add(self, values: Floats, t: float | None) -> None:
+        """Widen the boxes by values (count, 14): mean, quaternion, scales, opacity, constant part of the colour.
+
+        t: the time in [0, 1] of all of them; None where they are of several times.
+        """
+        np.minimum(self._low, values.T, out=self._low)
+        np.maximum(self._high, values.T, out=self._high)
+        if t is not None:
+            self._seen.add(self._part(t))
+
+    def _part(self, t: float) -> int:
+        return min(int(t * self._parts), self._parts - 1)
+
+    @np.errstate(invalid="ignore", over="ignore")  # what is not finite is needed
+    def needed(self, t: float, camera: Camera) -> NDArray[np.bool_]:
+        """(count,) whether a picture of a time in [0, 1] needs the Gaussian as it is at that very time.
+
+        Not where its box is so small that any values in it will do, nor where the box lies beside the picture: values
+        of another time that were added lie beside it, too. At times of which too little was seen all are needed.
+        """
+        low, high = self._low, self._high
+        if len(self._seen) < min(_FEW, self._parts) or self._part(t) not in self._seen:
+            return np.ones(low.shape[1], bool)
+        size = high - low
+        path, turn, growth = (np.sqrt((size[part] ** 2).sum(axis=0)) for part in (slice(3), slice(3, 7), slice(7, 10)))
+        shade = np.maximum(size[10], CONSTANTS["SH_C0"] * size[11:].max(axis=0))
+        widest = high[7:10].max(axis=0)
+        spread = 0.5 * _BEYOND * path
+
+        focal, centre, pixels = camera.K[[0, 1], [0, 1]], camera.K[:2, 2], np.array([camera.width, camera.height])
+        # The half axes in the image of a unit ball at depth 1 are at most this long (`project`).
+        tangent = np.maximum(centre, pixels - centre) / focal + CONSTANTS["FRUSTUM_MARGIN"] * 0.5 * pixels / focal
+        stretch = focal * np.sqrt(1 + tangent**2)
+        T = camera.T_cam_world.astype(np.float32)
+        place = T[:3, :3] @ (0.5 * (low[:3] + high[:3])) + T[:3, 3:]
+        depth = place[2]
+        beside = depth + spread < CONSTANTS["NEAR"]
+        for axis in (0, 1):  # pixels times depth
+            at = focal[axis] * place[axis] + centre[axis] * depth
+            reach = stretch[axis] * (spread + _RIM * widest) + _DILATED * np.maximum(depth, 0)
+            beside |= (at + reach < 0) | (at - reach > pixels[axis] * depth)
+
+        moved = path + growth + 2 * turn * widest  # a quaternion turns by twice its own angle
+        nearest = np.maximum(depth - spread, CONSTANTS["NEAR"])
+        still = (stretch.max() * moved < _STILL_PIXELS * nearest) & (shade < _STILL_SHADE)
+        return ~(still | beside)

@@ -1,0 +1,169 @@
+"""Showing a trained scene at any time: what a viewer needs of it, and opening a file for that.
+
+Where a scene stands still or the device evaluates its field (motion/deform), torch is not imported, which alone would
+take longer than all the rest.
+"""
+
+from __future__ import annotations
+
+import os
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...gpu.array import DeviceArray, read_all
+from ...gpu.device import Device
+from ...gpu.pool import BufferPool
+from ...io.ply import GaussianSnapshot
+from ...splat.camera import Camera
+from ...splat.gaussians import Gaussians
+from ..fields.config import MIN_SCALE, FieldConfig
+from ..scene_file import SceneFile, read_scene
+from .grid_field_playback import GridFieldPlayback, runs_on_device
+from .motion_bounds import MotionBounds
+
+Floats = NDArray[np.float32]
+
+
+class Playback(Protocol):
+    """A scene that can be shown: `count` Gaussians of `sh_degree`, which stand still unless it `moves`.
+
+    metadata: what the checkpoint says of itself. Times are in [0, 1].
+    """
+
+    device: Device
+    field_config: FieldConfig
+    metadata: dict[str, str]
+
+    @property
+    def count(self) -> int: ...
+    @property
+    def sh_degree(self) -> int: ...
+    @property
+    def moves(self) -> bool: ...
+    @property
+    def exact(self) -> bool:
+        """Whether all that `at` gave last was of the time that was asked for."""
+
+    def at(self, t: float, seen_by: Camera | None = None) -> Gaussians[DeviceArray]:
+        """The activated Gaussians at a time, on the device: submitted, not waited for. Valid until the next call.
+
+        seen_by: the only camera that draws them, for a picture that passes; Gaussians that hardly move, or that it does
+        not see, may be of other times.
+        """
+
+    def means(self, t: float) -> Floats:
+        """(count, 3), world units, at a time."""
+
+    def dynamics(self) -> Floats | None:
+        """(count, D) the dynamics attributes; None where the field has none."""
+
+    def still(self, t: float) -> GaussianSnapshot:
+        """All Gaussians at a time, as 3DGS viewers read them; what `Scene4D.save` writes for time 0."""
+
+
+def open_playback(path: str | os.PathLike[str], device: Device) -> Playback:
+    """Open a checkpoint, or any 3DGS .ply, which becomes a static scene. Raises as `read_scene` and `playback_of`."""
+    return playback_of(read_scene(path), device)
+
+
+def playback_of(file: SceneFile, device: Device) -> Playback:
+    """Show a file that was read.
+
+    torch is imported for the fields mlp and hexplane, for hidden layers, and for the ablated motion alone.
+    Raises MemoryError where a buffer of all Gaussians is beyond the device's limits: colours are the largest,
+    1.4 million Gaussians of degree 3 at WebGPU's default limits.
+    """
+    if file.field_config.kind == "static" or runs_on_device(file.field_config, device):
+        return DevicePlayback(file, device)
+    from ..scene import scene_of
+    from .torch_playback import TorchPlayback
+
+    return TorchPlayback(scene_of(file, device))
+
+
+class DevicePlayback:
+    """A file whose scene stands still, or moves by a field that the device evaluates. See Playback.
+
+    block: how many Gaussians a dispatch takes, see GridFieldPlayback.
+    """
+
+    def __init__(self, file: SceneFile, device: Device, *, block: int | None = None) -> None:
+        self.device, self.field_config, self.metadata = device, file.field_config, file.metadata
+        self.count, self.sh_degree = len(file.gaussians["means"]), file.sh_degree
+        self.moves = file.field_config.kind != "static"
+        self._stored = file.gaussians
+        activated = activate(file.gaussians, file.sh_degree)
+        pool = BufferPool(device)
+        names = {"means": "means", "quats": "quats", "scales": "scales", "opacities": "opacities", "sh": "colors"}
+        self._now = Gaussians(**{name: pool.upload(name, activated[of]) for name, of in names.items()})
+        self.exact = True
+        self._field: GridFieldPlayback | None = None
+        if self.moves:
+            self._times = np.full(self.count, np.nan)  # of what the buffers hold
+            # Features change from entry to entry of the temporal grids' time axis, so little within half of one.
+            self._bounds = MotionBounds(self.count, 2 * self.field_config.temporal.finest[2])
+            self._bounded = True  # do the bounds hold what is in the buffers?
+            self._field = GridFieldPlayback(device, file.field_config, file.field, activated, block=block)
+
+    def at(self, t: float, seen_by: Camera | None = None) -> Gaussians[DeviceArray]:
+        """See Playback."""
+        if self._field is None:
+            return self._now
+        old = self._times != t
+        moved = old
+        # The choice needs the values on the host each time: not where they lie in memory of the device's own.
+        if seen_by is not None and self.device.mappable and old.any():
+            self._bound()
+            moved = old & self._bounds.needed(t, seen_by)
+        self.exact = bool((moved == old).all())
+        if moved.any():
+            self._field.move(t, self._now, np.flatnonzero(moved))
+            self._times[moved] = t
+            self._bounded = False
+        return self._now
+
+    def _bound(self) -> None:
+        """Widen the bounds by what the buffers hold. Done before each choice, it leaves no Gaussian outside of its own
+        bounds, whatever time it is of."""
+        if self._bounded:
+            return
+        now = self._now
+        means, quats, scales, opacities, sh = read_all([now.means, now.quats, now.scales, now.opacities, now.sh])
+        values = [means, quats, scales, opacities[:, None], sh[:, 0]]
+        whole = bool((self._times == self._times[0]).all())
+        self._bounds.add(np.concatenate(values, axis=1), float(self._times[0]) if whole else None)
+        self._bounded = True
+
+    def means(self, t: float) -> Floats:
+        """See Playback."""
+        return self.at(t).means.read() if self.moves else self._stored["means"]
+
+    def dynamics(self) -> Floats | None:
+        """See Playback."""
+        return self._stored.get("dynamics")
+
+    def still(self, t: float) -> GaussianSnapshot:
+        """See Playback."""
+        now = self.at(t)
+        means, quats, scales, opacities, colors = read_all([now.means, now.quats, now.scales, now.opacities, now.sh])
+        logits = self._stored["opacity_logits"]
+        if self.field_config.appearance_size == 4:
+            inside = np.clip(opacities.astype(np.float64), 1e-7, 1 - 1e-7)
+            logits = np.log(inside / (1 - inside)).astype(np.float32)
+        sh = np.concatenate([colors[:, :1], self._stored["sh_rest"]], axis=1)
+        return GaussianSnapshot(means, sh, logits, np.log(scales), quats)
+
+
+def activate(stored: dict[str, Floats], sh_degree: int) -> dict[str, Floats]:
+    """What is stored, and beside it the Gaussians after their activations, as Scene4D.canonical has them."""
+    quats, used = stored["quats"], (sh_degree + 1) ** 2 - 1
+    with np.errstate(over="ignore"):
+        scales = np.maximum(np.exp(stored["log_scales"]), np.float32(MIN_SCALE))
+    return stored | {
+        "quats": quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-12),
+        "scales": scales,
+        "opacities": 0.5 + 0.5 * np.tanh(0.5 * stored["opacity_logits"]),
+        "colors": np.concatenate([stored["sh_dc"], stored["sh_rest"][:, :used]], axis=1),
+    }

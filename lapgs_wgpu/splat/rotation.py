@@ -1,0 +1,24 @@
+"""Quaternions as rotations, differentiable."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def rotation_matrices(quats: Tensor) -> Tensor:
+    """(N, 3, 3) rotation matrices of (N, 4) quaternions wxyz of any non-zero length."""
+    w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+
+
+def rotate(quats: Tensor, vectors: Tensor) -> Tensor:
+    """Vectors (N, 3) turned by unit quaternions (N, 4) wxyz."""
+    w, axis = quats[:, :1], quats[:, 1:]
+    twice = 2.0 * torch.linalg.cross(axis, vectors)
+    return vectors + w * twice + torch.linalg.cross(axis, twice)

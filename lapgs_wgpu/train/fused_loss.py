@@ -1,0 +1,126 @@
+"""A training step's image and loss without either leaving the device, as one autograd function."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..gpu.array import DeviceArray, read_all
+from ..gpu.device import Device
+from ..gpu.kernel import Commands
+from ..splat.camera import Camera
+from ..splat.gaussians import Gaussians
+from ..splat.rasterize import gradient_tensors, radii_and_centres, rasterizer_of, upload_gaussians
+from .exposure import ExposurePasses
+from .image_loss import ImageLoss
+from .losses import LEAST_ERROR, LossWeights
+
+
+class RenderLoss(NamedTuple):
+    """loss: a scalar, differentiable in the Gaussians' tensors and in the correction. terms: l1, mse (mean squared
+    error), ssim, pyramid and ncc (losses), as far as they were computed. radii (N,) and means2d (N, 2): as those of
+    splat.rasterize.Rendering."""
+
+    loss: Tensor
+    terms: dict[str, float]
+    radii: Tensor
+    means2d: Tensor
+
+    @property
+    def psnr(self) -> float:
+        """In dB over all pixels and channels, at most 100 dB."""
+        return -10.0 * float(np.log10(max(self.terms["mse"], LEAST_ERROR)))
+
+
+@functools.cache
+def image_loss_of(device: Device) -> ImageLoss:
+    """The losses that `render_loss` uses on this device; their buffers serve all calls."""
+    return ImageLoss(device)
+
+
+@functools.cache
+def exposure_of(device: Device) -> ExposurePasses:
+    """The passes of `render_loss`'s correction on this device."""
+    return ExposurePasses(device)
+
+
+def render_loss(
+    gaussians: Gaussians[Tensor],
+    camera: Camera,
+    truth: DeviceArray,
+    background: Tensor,
+    weights: LossWeights,
+    device: Device,
+    correction: Tensor | None = None,
+) -> RenderLoss:
+    """The loss of the Gaussians' image (train/losses.total), computed on the device from end to end.
+
+    gaussians: activated, float32, with harmonics. truth: (H, W) as `upload_rgba` leaves it, of the camera's size.
+    background: (3,) in [0, 1], under both; not differentiable. weights: of the terms. correction: (3, 4), of the
+    image's colours before they are compared (train/exposure); none where None.
+    The same bits on every run of one adapter and driver. Under torch.no_grad(), or where no tensor wants a gradient,
+    none is computed.
+    """
+    tensors = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh, correction)
+    wanted = torch.is_grad_enabled() and any(tensor is not None and tensor.requires_grad for tensor in tensors)
+    probe = gaussians.means.new_zeros((len(gaussians), 2)).requires_grad_(wanted)
+    red, green, blue = background.tolist()
+    loss, computed, radii, centres = _FusedLoss.apply(
+        *tensors, probe, camera, truth, (red, green, blue), weights, device, wanted
+    )
+    with torch.no_grad():
+        probe.copy_(centres)
+    names = ("l1", "mse", "ssim", "pyramid", "ncc")
+    used = (True, True, weights.ssim, weights.pyramid, weights.ncc)
+    terms = {name: value for name, value, use in zip(names, computed.tolist(), used, strict=True) if use}
+    if "ssim" in terms:
+        terms["ssim"] = 1.0 - terms["ssim"]
+    return RenderLoss(loss, terms, radii, probe)
+
+
+class _FusedLoss(torch.autograd.Function):
+    """forward: all passes, those of the gradient included, are submitted at once, and one read-back brings what the
+    host needs. backward: multiplies the gradients that are then already there."""
+
+    @staticmethod
+    def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
+        *tensors, correction, probe, camera, truth, background, weights, device, wanted = arguments
+        rasterizer, losses, exposing = rasterizer_of(device), image_loss_of(device), exposure_of(device)
+        gaussians = upload_gaussians(rasterizer.pool, Gaussians(*tensors))
+        while True:
+            drawing = rasterizer.draw(gaussians, camera, background)
+            d_rows, d_gaussians = [], []
+            with Commands(device) as commands:
+                image = drawing.image if correction is None else exposing.record(commands, drawing.image, correction)
+                terms, d_image = losses.record(commands, image, truth, background, weights, gradient=wanted)
+                if d_image is not None and correction is not None:
+                    d_image, d_correction = exposing.record_bwd(commands, drawing.image, d_image, correction)
+                    d_rows = [d_correction]
+            if d_image is not None:
+                d_gaussians = rasterizer.backward(drawing, d_image).arrays()
+            found = iter(read_all([terms, drawing.splats, *d_gaussians, *d_rows, *drawing.needed]))
+            values, splats, gradients, rows = next(found), next(found), [next(found) for _ in d_gaussians], None
+            if d_rows:
+                rows = next(found)
+            # Where the intersections did not fit, none of this is right, and all of it is done again.
+            if not rasterizer.grow_on_overflow(drawing, list(found)):
+                break
+        ctx.gradients = None
+        if gradients:
+            by_gaussians, d_means2d = gradient_tensors(gradients, probe.device)
+            own = None if rows is None else correction.new_tensor(rows.sum(axis=0, dtype=np.float64))
+            ctx.gradients = (*by_gaussians, own, d_means2d)
+        computed = torch.from_numpy(values)
+        radii, centres = radii_and_centres(splats, probe.device)
+        ctx.mark_non_differentiable(computed, radii, centres)
+        factors = [weights.l1, 0, weights.ssim, weights.pyramid, weights.ncc]
+        return probe.new_tensor(float(np.dot(values.astype(np.float64), factors))), computed, radii, centres
+
+    @staticmethod
+    def backward(ctx: Any, *d_outputs: Any) -> tuple[Tensor | None, ...]:
+        scaled = (None if gradient is None else d_outputs[0] * gradient for gradient in ctx.gradients)
+        return (*scaled, *[None] * 6)

@@ -1,0 +1,170 @@
+"""Which tiles each splat is listed in: every one with a pixel that it reaches, hardly any other, as many as counted."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+import torch
+from helpers.scenes import Scene, front_camera, needles, oblique_camera, random_scene
+from helpers.stages import all_of, capture
+from numpy.typing import NDArray
+
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.splat.rasterize import rasterize, rasterizer_of
+from lapgs_wgpu.splat.reference import ALPHA_MIN
+
+pytestmark = pytest.mark.kernels
+
+
+class Emitted(NamedTuple):
+    """Slots in order. splats: (N, 12) of common/splat.wgsl; counts: (N,) tiles that the projection counted."""
+
+    tile: NDArray[Any]
+    splat: NDArray[Any]
+    ids: NDArray[Any]  # of the visible splats, in depth order
+    offsets: NDArray[Any]  # of their first slots
+    counts: NDArray[Any]
+    splats: NDArray[Any]
+    tiles: tuple[int, int]  # columns, rows
+    tile_size: tuple[int, int]  # pixels
+
+    @property
+    def touched(self) -> NDArray[np.bool_]:
+        """(N, rows, columns) whether the splat is listed in the tile."""
+        columns, rows = self.tiles
+        listed = np.zeros((len(self.counts), rows * columns), bool)
+        listed[self.splat, self.tile] = True
+        return listed.reshape(-1, rows, columns)
+
+
+def duplicated(monkeypatch: pytest.MonkeyPatch, device: Device, scene: Scene, camera: Camera) -> Emitted:
+    names = ("tile_keys", "slot_ids", "ids", "offsets", "tile_counts", "splats")
+    copies = capture(monkeypatch, "duplicate_with_keys", *names)
+    rasterize(**scene, camera=camera, device=device)
+    count, copy = len(scene["means"]), copies[-1]  # the last draw is one whose lists fitted
+    tile_keys, slot_ids, ids, offsets, counts = (all_of(copy[name]) for name in names[:5])
+    counts = counts[:count].astype(np.int64)
+    seen, total = int((counts > 0).sum()), int(counts.sum())
+    shape = rasterizer_of(device).config
+    size = shape.tile_width, shape.tile_height
+    return Emitted(
+        tile_keys[:total].astype(np.int64),
+        slot_ids[:total].astype(np.int64),
+        ids[:seen],
+        offsets[:seen],
+        counts,
+        copy["splats"].read(),
+        (-(-camera.width // size[0]), -(-camera.height // size[1])),
+        size,
+    )
+
+
+def log_alphas(splats: NDArray[Any], camera: Camera, dtype: type) -> NDArray[Any]:
+    """(N, height, width) log2 of opacity exp(-q) at each pixel's centre, before the cuts."""
+    x = np.arange(camera.width, dtype=dtype) + dtype(0.5)
+    y = np.arange(camera.height, dtype=dtype) + dtype(0.5)
+    s = splats.astype(dtype)[:, :, None, None]
+    dx, dy = x[None, None, :] - s[:, 0], y[None, :, None] - s[:, 1]
+    half = dtype(0.5 * np.log2(np.e))
+    return s[:, 5] - half * (s[:, 2] * dx * dx + s[:, 4] * dy * dy) - 2 * half * s[:, 3] * dx * dy
+
+
+def by_tile(pixels: NDArray[np.bool_], emitted: Emitted) -> NDArray[np.bool_]:
+    """(N, rows, columns): whether any pixel of the tile is set."""
+    (columns, rows), (width, height) = emitted.tiles, emitted.tile_size
+    padded = np.zeros((len(pixels), rows * height, columns * width), bool)
+    padded[:, : pixels.shape[1], : pixels.shape[2]] = pixels
+    return padded.reshape(len(pixels), rows, height, columns, width).any(axis=(2, 4))
+
+
+def thresholds() -> Scene:
+    """Splats so faint that their ellipses are smaller than a pixel, everywhere between pixel centres."""
+    count = 300
+    generator = torch.Generator().manual_seed(5)
+    scene = random_scene(count, 5, size=1e-3)
+    scene["opacities"] = ALPHA_MIN * (1 + torch.rand(count, generator=generator) ** 2)
+    return scene
+
+
+SCENES = {
+    "small": (random_scene(400, 1, size=0.03), oblique_camera(101, 61)),
+    "large": (random_scene(150, 2, size=0.4), oblique_camera(101, 61)),
+    "needles": (needles(80, 3, front_camera(320, 200)), front_camera(320, 200)),
+    "long needles": (needles(60, 4, front_camera(320, 200), length=3000.0), front_camera(320, 200)),
+    "faint": (thresholds(), oblique_camera(101, 61)),
+    "one pixel": (random_scene(100, 6, size=0.5), oblique_camera(1, 1)),
+    "one row": (random_scene(100, 7, size=0.2), oblique_camera(130, 3)),
+}
+all_scenes = pytest.mark.parametrize("name", SCENES)
+
+
+@all_scenes
+def test_no_contributing_pixel_is_missed(monkeypatch: pytest.MonkeyPatch, device: Device, name: str) -> None:
+    scene, camera = SCENES[name]
+    emitted = duplicated(monkeypatch, device, scene, camera)
+    seen = emitted.splats[:, 10] > 0
+    assert seen.sum() > 20
+    for dtype in (np.float64, np.float32):  # exactly, and about as the rasteriser rounds
+        reached = log_alphas(emitted.splats, camera, dtype) >= np.log2(ALPHA_MIN)
+        missed = by_tile(reached & seen[:, None, None], emitted) & ~emitted.touched
+        assert not missed.any(), f"splats {np.unique(missed.nonzero()[0])} miss tiles in {dtype.__name__}"
+
+
+@all_scenes
+def test_few_tiles_are_listed_in_vain(monkeypatch: pytest.MonkeyPatch, device: Device, name: str) -> None:
+    """None whose rectangle of pixel centres, a little larger than the padding makes it, the ellipse does not meet."""
+    scene, camera = SCENES[name]
+    emitted = duplicated(monkeypatch, device, scene, camera)
+    vain = emitted.touched & (least_distance(emitted, grown=0.03) > 2 * np.log(2) * log_reach(emitted)[:, None, None])
+    assert not vain.any(), f"splats {np.unique(vain.nonzero()[0])} are listed in tiles that they do not reach"
+
+
+def log_reach(emitted: Emitted) -> NDArray[Any]:
+    """(N,) log2 of opacity over ALPHA_MIN."""
+    return emitted.splats[:, 5].astype(np.float64) - np.log2(ALPHA_MIN)
+
+
+def least_distance(emitted: Emitted, grown: float) -> NDArray[Any]:
+    """(N, rows, columns) the least a x^2 + 2 b x y + c y^2 over the rectangle of the tile's pixel centres."""
+    (columns, rows), (width, height) = emitted.tiles, emitted.tile_size
+    s = emitted.splats.astype(np.float64)[:, :, None, None]
+    a, b, c = s[:, 2], s[:, 3], s[:, 4]
+    left = np.arange(columns)[None, None, :] * width + 0.5 - grown - s[:, 0]
+    top = np.arange(rows)[None, :, None] * height + 0.5 - grown - s[:, 1]
+    right, bottom = left + width - 1 + 2 * grown, top + height - 1 + 2 * grown
+    inside = (left <= 0) & (right >= 0) & (top <= 0) & (bottom >= 0)
+    least = np.where(inside, 0.0, np.inf)
+    # Elsewhere it lies on an edge: along each the form is a parabola, lowest at its vertex or at the edge's nearer end.
+    for x in (left, right):
+        y = np.clip(-b / np.where(c > 0, c, 1) * x, top, bottom)
+        least = np.minimum(least, a * x * x + 2 * b * x * y + c * y * y)
+    for y in (top, bottom):
+        x = np.clip(-b / np.where(a > 0, a, 1) * y, left, right)
+        least = np.minimum(least, a * x * x + 2 * b * x * y + c * y * y)
+    return least
+
+
+@all_scenes
+def test_as_many_tiles_are_written_as_were_counted(monkeypatch: pytest.MonkeyPatch, device: Device, name: str) -> None:
+    """No pad, no tile twice; each splat's slots side by side, splats from front to back."""
+    scene, camera = SCENES[name]
+    emitted = duplicated(monkeypatch, device, scene, camera)
+    columns, rows = emitted.tiles
+    assert emitted.tile.max(initial=0) < rows * columns, "a pad: the two passes disagree"
+    assert np.array_equal(np.bincount(emitted.splat, minlength=len(emitted.counts)), emitted.counts)
+    assert len(np.unique(emitted.splat * rows * columns + emitted.tile)) == len(emitted.tile)
+    assert np.array_equal(emitted.splat, np.repeat(emitted.ids, emitted.counts[emitted.ids]))
+    assert np.array_equal(emitted.offsets, np.cumsum(emitted.counts[emitted.ids]) - emitted.counts[emitted.ids])
+    depths = emitted.splats[emitted.ids, 9]
+    assert (np.diff(depths) >= 0).all()
+
+
+def test_equal_depths_go_by_index(monkeypatch: pytest.MonkeyPatch, device: Device) -> None:
+    scene, camera = random_scene(500, 8), front_camera(101, 61)
+    scene["means"][:, 2] = 2.0 + 0.5 * (torch.arange(500) % 3)
+    emitted = duplicated(monkeypatch, device, scene, camera)
+    expected = sorted(emitted.ids.tolist(), key=lambda i: (i % 3, i))
+    assert emitted.ids.tolist() == expected

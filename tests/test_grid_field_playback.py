@@ -1,0 +1,196 @@
+"""Grid fields on the device against the formula of Scene4D in float64 torch."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from helpers.trained_scenes import CONFIGS, GRID4D, OURS, trained
+from torch import Tensor, nn
+
+from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.kernel import Commands, Kernel
+from lapgs_wgpu.motion.fields.config import FieldConfig
+from lapgs_wgpu.motion.fields.grid_field import GridField
+from lapgs_wgpu.motion.fields.hash_encoder import encode_reference
+from lapgs_wgpu.motion.fields.parameter_shapes import parameter_shapes
+from lapgs_wgpu.motion.playback.grid_field_playback import (
+    GridFieldPlayback,
+    runs_on_device,
+)
+from lapgs_wgpu.motion.playback.playback import activate
+from lapgs_wgpu.motion.scene import Scene4D, rotate
+from lapgs_wgpu.splat.gaussians import Gaussians
+
+pytestmark = pytest.mark.kernels
+
+
+def expected(scene: Scene4D, t: float) -> dict[str, Tensor]:
+    """The formulas of docs/method.md, in float64."""
+    field, config = scene.field, scene.field_config
+    assert isinstance(field, GridField)
+    p = {name: value.detach().double() for name, value in scene.parameters.items()}
+    w = {name: value.detach().double() for name, value in field.named_parameters()}
+    time = 0.5 * ((2 * t - 1) * config.time_scale + 1)
+    means = scene.parameters["means"].detach()
+    static, *temporal = (encode_reference(g, g.table.detach().double(), means, time, config.bound) for g in field.grids)
+
+    def layer(name: str, x: Tensor) -> Tensor:
+        return x @ w[f"{name}.weight"].T + w[f"{name}.bias"]
+
+    inputs = [p["dynamics"], *temporal] if config.dynamics_size else temporal
+    fused = torch.cat(inputs, dim=1) if inputs else means.new_zeros(len(means), 1).double()
+    hidden = torch.relu(layer("temporal", fused)) * (2 * torch.sigmoid(layer("spatial", static)) - 1)
+    look = 0.1 * layer("appearance", hidden) if config.appearance_size else None
+    if config.kind == "laplacian":
+        phase = 2 * math.pi * t * w["motion.frequencies"]
+        series = phase.cos() @ w["motion.alpha"] + phase.sin() @ w["motion.beta"]
+        hidden = hidden + series * layer("motion.second", torch.relu(layer("motion.first", static)))
+    turn, shift, d_quats, d_scales = layer("heads", hidden).split((4, 3, 4, 3), dim=1)
+    unit = nn.functional.normalize
+    turn = unit(turn + turn.new_tensor([1.0, 0, 0, 0]), dim=1)
+    dc, logits = p["sh_dc"], p["opacity_logits"]
+    if look is not None:
+        dc = dc + look[:, None, :3]
+        logits = logits + look[:, 3] if look.shape[1] == 4 else logits
+    return {
+        "means": rotate(turn, p["means"]) + shift,
+        "quats": unit(unit(p["quats"], dim=1) + d_quats, dim=1),
+        "scales": (p["log_scales"].exp().clamp(min=1e-7) + d_scales).clamp(min=1e-7),
+        "opacities": logits.sigmoid(),
+        "sh": torch.cat([dc, p["sh_rest"][:, :8]], dim=1),
+    }
+
+
+def device_field(scene: Scene4D, block: int | None = None) -> tuple[GridFieldPlayback, Gaussians[DeviceArray]]:
+    """The scene's field without torch, and buffers for what it moves: colours as they are, rubbish elsewhere."""
+    assert scene.field is not None
+    parameters = {name: value.numpy(force=True) for name, value in scene.field.state_dict().items()}
+    stored = {name: value.numpy(force=True) for name, value in scene.parameters.items()}
+    gaussians = activate(stored, scene.sh_degree)
+    rubbish = {name: np.full_like(gaussians[name], np.nan) for name in ("means", "quats", "scales", "opacities")}
+    values = rubbish | {"sh": gaussians["colors"]}
+    out = Gaussians(**{name: DeviceArray.upload(scene.device, name, array) for name, array in values.items()})
+    return GridFieldPlayback(scene.device, scene.field_config, parameters, gaussians, block=block), out
+
+
+def check(scene: Scene4D, times: tuple[float, ...] = (0.37,), block: int | None = None) -> None:
+    field, out = device_field(scene, block)
+    for t in times:
+        field.move(t, out)
+        for name, exact in expected(scene, t).items():
+            found = torch.from_numpy(getattr(out, name).read()).double()
+            size = exact.abs().amax(dim=tuple(range(1, exact.ndim)), keepdim=True).clamp(min=1)
+            assert float(((found - exact).abs() / size).max()) < 1e-4, (name, t)
+        assert out.scales.read().min() >= np.float32(1e-7)
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_every_kind_of_field(device: Device, name: str) -> None:
+    check(trained(device, CONFIGS[name], 100), (0.0, 0.37, 1.0))
+
+
+@pytest.mark.parametrize("count", [1, 7, 64, 255, 257, 1000])
+def test_any_number_of_gaussians(device: Device, count: int) -> None:
+    check(trained(device, OURS, count, seed=count))
+
+
+def test_several_blocks(device: Device) -> None:
+    """As many Gaussians as do not fit into one binding: each dispatch has its own range of the buffers."""
+    check(trained(device, OURS, 1000), (0.2, 0.9, 0.2), block=192)
+
+
+def test_no_gaussians(device: Device) -> None:
+    field, out = device_field(trained(device, OURS, 0))
+    field.move(0.5, out)
+
+
+def test_only_what_changes_is_written(device: Device) -> None:
+    """The colours above their constant part stand in the buffer that is drawn, and stay."""
+    scene = trained(device, replace(OURS, appearance="none"), 50)
+    field, out = device_field(scene)
+    before = out.sh.read()
+    field.move(0.4, out)
+    np.testing.assert_array_equal(out.sh.read(), before)
+
+
+def test_the_same_bits_again(device: Device) -> None:
+    scene = trained(device, OURS, 500)
+    field, out = device_field(scene)
+    found = []
+    for t in (0.3, 0.8, 0.3):
+        field.move(t, out)
+        found.append(out.means.read().tobytes())
+    assert found[0] == found[2] != found[1]
+
+
+CHOSEN = {
+    "none": [],
+    "one": [299],
+    "all": list(range(300)),
+    "those of one block": list(range(70, 120)),
+    "any": np.flatnonzero(np.random.default_rng(0).random(300) < 0.4).tolist(),
+}
+
+
+@pytest.mark.parametrize("block", [None, 64, 192])
+@pytest.mark.parametrize("name", ["grid4d", "laplacian", "color", "dynamics alone"])
+def test_some_are_moved_and_the_others_left(device: Device, name: str, block: int | None) -> None:
+    """To the bit as when all are moved."""
+    scene = trained(device, CONFIGS[name], 300)
+    field, out = device_field(scene, block)
+    field.move(0.7, out)
+    after = contents(out)
+    for rows in (np.array(rows, np.int64) for rows in CHOSEN.values()):
+        field.move(0.2, out)
+        before = contents(out)
+        field.move(0.7, out, rows)
+        for part, found in contents(out).items():
+            expected = before[part].copy()
+            expected[rows] = after[part][rows]
+            np.testing.assert_array_equal(found, expected, err_msg=part)
+
+
+def contents(out: Gaussians[DeviceArray]) -> dict[str, np.ndarray]:
+    """As words, so that equal means equal bits."""
+    return {part: array.read().view(np.uint32) for part, array in vars(out).items()}
+
+
+def test_work_goes_with_the_number_of_those_moved(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    field, out = device_field(trained(device, GRID4D, 5000))
+    groups: dict[str, int] = {}
+
+    def dispatch(self: Commands, kernel: Kernel, number: int, **buffers: object) -> None:
+        groups[kernel.name] = groups.get(kernel.name, 0) + number
+
+    monkeypatch.setattr(Commands, "dispatch", dispatch)
+    field.move(0.5, out)
+    whole = groups.copy()
+    groups.clear()
+    field.move(0.5, out, np.arange(0, 5000, 10))
+    assert groups.keys() == whole.keys() == {"hashgrid", "deform"}
+    for name in groups:
+        assert groups[name] <= 0.11 * whole[name] + 1
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_the_parameters_are_those_of_the_module(device: Device, name: str) -> None:
+    field = GridField(CONFIGS[name], device, seed=0)
+    shapes = {key: tuple(value.shape) for key, value in field.state_dict().items()}
+    assert parameter_shapes(CONFIGS[name]) == shapes
+
+
+def test_what_the_device_does_not_evaluate(device: Device) -> None:
+    assert runs_on_device(OURS, device)
+    assert runs_on_device(GRID4D, device)
+    assert runs_on_device(FieldConfig(), device)
+    assert runs_on_device(replace(GRID4D, motion="mlp"), device)  # which belongs to the field laplacian alone
+    assert not runs_on_device(replace(OURS, motion="mlp"), device)
+    for changes in ({"kind": "static"}, {"kind": "mlp"}, {"kind": "hexplane"}, {"depth": 1}):
+        assert not runs_on_device(replace(OURS, **changes), device)
+    too_long = runs_on_device(replace(FieldConfig(), width=4096, dynamics=256), device)
+    assert too_long == (device.max_loop_turns is None)  # a loop for Mesa's software driver

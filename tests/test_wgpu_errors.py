@@ -1,0 +1,256 @@
+"""A device that runs out of memory or is lost: one sentence, an exit code, and a state from which the run goes on."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import wgpu
+from conftest import open_test_device
+from helpers.training import configure
+
+from lapgs_wgpu.command import OUT_OF_DEVICE, guarded
+from lapgs_wgpu.data import Dataset, load_dataset
+from lapgs_wgpu.data.synthetic import write_synthetic
+from lapgs_wgpu.errors import DeviceError, DeviceLostError, DeviceMemoryError, NoAdapterError
+from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.buffer import Buffer
+from lapgs_wgpu.gpu.device import _DEFAULT_LIMITS, _RAISED_LIMITS, Device, DeviceInfo
+from lapgs_wgpu.gpu.kernel import Commands, Kernel
+from lapgs_wgpu.gpu.wgpu_errors import TranslatedErrors
+from lapgs_wgpu.splat.rasterize import rasterizer_of
+from lapgs_wgpu.train.dataloader import Pictures
+from lapgs_wgpu.train.log import Log
+from lapgs_wgpu.train.run import resume, train
+from lapgs_wgpu.train.run_folder import STATE, load_state
+
+NO_MEMORY = "Validation Error\n\nCaused by:\n  In wgpuDeviceCreateBuffer\n    Not enough memory left.\n"
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    folder = tmp_path_factory.mktemp("data") / "scene"
+    return load_dataset(write_synthetic(folder, size=32, train_views=8, test_views=2))
+
+
+@pytest.fixture(scope="module")
+def whole(dataset: Dataset, device: Device, tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    out = tmp_path_factory.mktemp("runs") / "whole"
+    train(configure(), dataset, out, device=device)
+    return (out / "checkpoint.ply").read_bytes()
+
+
+@pytest.fixture
+def doomed(configuration: str) -> Device:
+    """A device of its own."""
+    return open_test_device(configuration)
+
+
+def after_step(at: int, what: Callable[[], None], monkeypatch: pytest.MonkeyPatch) -> None:
+    original = Log.step
+
+    def step(self: Log, number: int, *rest: Any) -> None:
+        original(self, number, *rest)
+        if number == at:
+            what()
+
+    monkeypatch.setattr(Log, "step", step)
+
+
+def fail_to_allocate(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    def create(**_: Any) -> None:
+        raise wgpu.GPUValidationError(NO_MEMORY)
+
+    monkeypatch.setattr(device.wgpu_device, "create_buffer", create)
+    rasterizer = rasterizer_of(device)  # what was made so far no longer does
+    rasterizer.plan = replace(rasterizer.plan, capacity=4 * rasterizer.plan.capacity)
+
+
+@pytest.mark.parametrize("how", ["lost", "memory"])
+def test_a_training_whose_device_fails_goes_on_later_to_the_same_bytes(
+    how: str,
+    whole: bytes,
+    dataset: Dataset,
+    device: Device,
+    doomed: Device,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    out = tmp_path / "run"
+    with monkeypatch.context() as patched:
+        if how == "lost":
+            after_step(14, doomed.wgpu_device.destroy, patched)
+        else:
+            after_step(14, lambda: fail_to_allocate(doomed, patched), patched)
+        code = guarded("lapgs-train", lambda _: train(configure(), dataset, out, device=doomed) and 0, [])
+    assert code == OUT_OF_DEVICE == 4
+    last = capfd.readouterr().err.splitlines()[-1]
+    what = {
+        "lost": "was lost, because its driver gave up or it was removed",
+        "memory": "has no memory left for buffer '",
+    }[how]
+    assert last.startswith(f"lapgs-train: {doomed.info.name} {what}")
+    assert last.endswith(f"; stopped after step 14, from which lapgs-train --resume {out} goes on.")
+    state = load_state(out)
+    assert state is not None
+    assert state["training.done"] == 14
+    resume(configure(), dataset, out, device=device)
+    assert (out / "checkpoint.ply").read_bytes() == whole
+
+
+def test_an_error_of_another_kind_leaves_a_state_too(
+    dataset: Dataset, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any) -> None:
+        raise ZeroDivisionError
+
+    after_step(12, lambda: monkeypatch.setattr("lapgs_wgpu.train.trainer.draw_nearby", fail), monkeypatch)
+    with pytest.raises(ZeroDivisionError):
+        train(configure(), dataset, tmp_path, device=device)
+    state = load_state(tmp_path)
+    assert state is not None
+    assert state["training.done"] == 12
+
+
+def test_a_step_that_broke_off_halfway_is_not_saved(
+    dataset: Dataset, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any, **__: Any) -> None:
+        np.empty(1 << 58)
+
+    monkeypatch.setattr("lapgs_wgpu.train.trainer.densify", fail)
+    expected = r"Unable to allocate 2\.00 EiB .*; lapgs-train --resume .* goes on from the state that was saved last\."
+    with pytest.raises(MemoryError, match=expected):
+        train(configure(schedule__save_interval="4", density__start="9"), dataset, tmp_path, device=device)
+    state = load_state(tmp_path)
+    assert state is not None
+    assert state["training.done"] == 8
+
+
+def test_nothing_is_saved_before_the_first_step(
+    dataset: Dataset, doomed: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    original = Pictures.choose
+
+    def choose(self: Pictures) -> Any:
+        doomed.wgpu_device.destroy()
+        return original(self)
+
+    monkeypatch.setattr(Pictures, "choose", choose)
+    with pytest.raises(DeviceLostError, match=r"was lost, .*; nothing was saved yet\."):
+        train(configure(), dataset, tmp_path, device=doomed)
+    assert not (tmp_path / STATE).exists()
+
+
+@pytest.mark.kernels
+def test_a_lost_device_is_named_wherever_it_is_used(doomed: Device) -> None:
+    small, large = (DeviceArray.empty(doomed, "words", (count,), "uint32") for count in (16, 1 << 18))
+    kernel = Kernel.get(doomed, "scan_blocks", SCAN_LANES=8)
+    doomed.wgpu_device.destroy()
+
+    def dispatch() -> None:
+        with Commands(doomed) as commands:
+            commands.dispatch(kernel, 1, blocks=small, block_sums=large, total=small)
+
+    def clear() -> None:
+        with Commands(doomed) as commands:
+            commands.clear(large)
+
+    def texture() -> None:
+        with Commands(doomed) as commands:
+            small.buffer.texture(commands._encoder, "r32float", 0, 64)
+
+    uses: list[Callable[[], Any]] = [
+        dispatch,
+        clear,
+        texture,
+        lambda: Buffer(doomed, 64, "new"),
+        lambda: Kernel.get(doomed, "compact"),
+        lambda: small.write(np.zeros(16, np.uint32)),
+        lambda: large.write(np.zeros(1 << 18, np.uint32)),
+        small.read,
+    ]
+    for use in uses:
+        with pytest.raises(DeviceLostError, match="was lost, because its driver gave up or it was removed"):
+            use()
+
+
+def test_other_errors_stay_what_they_are(device: Device) -> None:
+    with pytest.raises(wgpu.GPUValidationError), TranslatedErrors(device, "a test"):
+        device.wgpu_device.create_buffer(size=1 << 60, usage=wgpu.BufferUsage.STORAGE)
+    with pytest.raises(AttributeError), TranslatedErrors(device, "a test"):
+        raise AttributeError
+    with (
+        pytest.raises(DeviceMemoryError, match=r"no memory left for a test of 5 MB, fewer"),
+        TranslatedErrors(device, "a test", 5_000_000),
+    ):
+        raise wgpu.GPUOutOfMemoryError("out of memory")
+    assert issubclass(DeviceMemoryError, MemoryError)
+    assert issubclass(DeviceMemoryError, DeviceError)
+
+
+def test_commands_tell_of_memory_in_a_sentence(capsys: pytest.CaptureFixture[str]) -> None:
+    def allocate_tensor(_: list[str]) -> None:
+        torch.empty(1 << 60)
+
+    def allocate_array(_: list[str]) -> None:
+        np.empty(1 << 58)
+
+    for command in (allocate_tensor, allocate_array):
+        assert guarded("lapgs-view", command, []) == 4
+        error = capsys.readouterr().err
+        assert error.startswith("lapgs-view: ")
+        assert error.count("\n") == 1
+        assert "allocate" in error
+
+    def other(_: list[str]) -> None:
+        raise RuntimeError("a fault of ours")
+
+    with pytest.raises(RuntimeError, match="a fault of ours"):
+        guarded("lapgs-view", other, [])
+
+
+REAL = """
+import resource, sys
+from lapgs_wgpu.command import guarded
+from lapgs_wgpu.gpu.buffer import Buffer
+from lapgs_wgpu.gpu.device import open_device
+
+def fill(_):
+    device = open_device()
+    pages = int(open("/proc/self/statm").read().split()[0])
+    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + (300 << 20),) * 2)
+    kept = [Buffer(device, 100 << 20, f"part {i}") for i in range(9)]
+
+sys.exit(guarded("test", fill, []))
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits the memory of a process")
+def test_memory_that_really_is_used_up() -> None:
+    done = subprocess.run([sys.executable, "-c", REAL], capture_output=True, text=True, timeout=100)
+    if "no memory left" not in done.stderr and done.returncode == 0:
+        pytest.skip("the adapter's memory is not the process's")
+    assert done.returncode == OUT_OF_DEVICE
+    assert "has no memory left for buffer 'part " in done.stderr
+    assert "' of 105 MB, fewer Gaussians or smaller pictures need less" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_an_adapter_that_cannot_be_opened_is_named() -> None:
+    def refuse(**_: Any) -> None:
+        raise RuntimeError("Request device failed (1): Not enough memory left")
+
+    limits = dict.fromkeys((*_DEFAULT_LIMITS, *_RAISED_LIMITS), 1 << 31)
+    adapter = SimpleNamespace(features=(), limits=limits, request_device_sync=refuse)
+    with pytest.raises(NoAdapterError, match=r"the adapter 'Broken' cannot be opened \(Request device failed"):
+        Device(adapter, DeviceInfo("Broken", "discrete", "Vulkan", ""))
