@@ -38,6 +38,11 @@ class Points(NamedTuple):
     colors: Floats
     scores: Floats
 
+    def thinned(self, most: int) -> Points:
+        """At most `most` of the points, evenly chosen."""
+        chosen = np.linspace(0, len(self.scores) - 1, min(most, len(self.scores))).astype(np.int64)
+        return Points(*(values[chosen] for values in self))
+
 
 class PointClouds(NamedTuple):
     """The surface points of all times. times: (T,) ascending. clouds: of each."""
