@@ -13,11 +13,15 @@ import torch
 from helpers.training import configure
 
 from lapgs_wgpu.data import Dataset, load_dataset
+from lapgs_wgpu.data.motion_scenes import MotionScene
+from lapgs_wgpu.data.motion_writer import write_motion
 from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.scene import load
 from lapgs_wgpu.train import trainer as training_module
+from lapgs_wgpu.train.config import Config
+from lapgs_wgpu.train.discovery.discover import discover
 from lapgs_wgpu.train.distributed import Ranks
 from lapgs_wgpu.train.presets import write_toml
 from lapgs_wgpu.train.run import train
@@ -103,19 +107,32 @@ def torchrun(config: Path, out: Path) -> None:
     assert done.stdout.count("dB PSNR") == 1, "more than one process told of the result"
 
 
-def test_two_processes_are_one_with_two_views(dataset: Dataset, data: Path, device: Device, tmp_path: Path) -> None:
-    """The same scene to float tolerance, and the same bits on each repetition."""
-    config = configure(schedule__batch="2", schedule__steps="24", data__path=str(data))
-    file = tmp_path / "small.toml"
+def check_two_processes(config: Config, dataset: Dataset, device: Device, folder: Path) -> None:
+    """Two processes give the scene of one to float tolerance, and the same bits on each repetition."""
+    file = folder / "small.toml"
     file.write_text(write_toml(dataclasses.asdict(config)))
     for name in ("first", "again"):
-        torchrun(file, tmp_path / name)
-    first = (tmp_path / "first" / "checkpoint.ply").read_bytes()
-    assert (tmp_path / "again" / "checkpoint.ply").read_bytes() == first
-    train(config, dataset, tmp_path / "one", device=device)
-    one, two = (load(tmp_path / name / "checkpoint.ply", device) for name in ("one", "first"))
+        torchrun(file, folder / name)
+    first = (folder / "first" / "checkpoint.ply").read_bytes()
+    assert (folder / "again" / "checkpoint.ply").read_bytes() == first
+    train(config, dataset, folder / "one", device=device)
+    one, two = (load(folder / name / "checkpoint.ply", device) for name in ("one", "first"))
     assert len(one) == len(two)
     for name, parameter in one.parameters.items():
         np.testing.assert_allclose(
             two.parameters[name].detach().numpy(), parameter.detach().numpy(), rtol=1e-3, atol=1e-4, err_msg=name
         )
+
+
+def test_two_processes_are_one_with_two_views(dataset: Dataset, data: Path, device: Device, tmp_path: Path) -> None:
+    config = configure(schedule__batch="2", schedule__steps="24", data__path=str(data))
+    check_two_processes(config, dataset, device, tmp_path)
+
+
+def test_two_processes_discover_the_same(device: Device, tmp_path: Path) -> None:
+    data = write_motion(tmp_path / "scene", MotionScene(path=4, cycles=1), size=48, train_times=40, test_views=2)
+    steps = {"schedule__steps": "46", "discovery__steps": "40", "discovery__field_steps": "40"}
+    config = configure(schedule__batch="2", data__path=str(data), density__stop="0", **steps)
+    dataset = load_dataset(data)
+    assert discover(config, dataset, device).scene is not None
+    check_two_processes(config, dataset, device, tmp_path)
