@@ -27,7 +27,7 @@ def projected(
     copies = capture(monkeypatch, "project", "splats", "tile_counts")
     rasterize(**scene, camera=camera, device=device)
     count = len(scene["means"])
-    splats = all_of(copies[0]["splats"], "float32")[: 12 * count].reshape(count, 12)
+    splats = all_of(copies[0]["splats"])[: 12 * count].reshape(count, 12)
     tile_counts = all_of(copies[0]["tile_counts"])[:count].astype(np.int64)
     return torch.from_numpy(splats).double(), torch.from_numpy(tile_counts)
 
