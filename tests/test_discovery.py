@@ -253,6 +253,14 @@ def test_a_ball_that_enters_late_has_a_key_time_of_its_own() -> None:
     assert (errors(found.tracks, late)[42:] < 0.8).all()
 
 
+def test_patches_that_come_and_go_are_not_followed() -> None:
+    """Six places, of which one at a time shows a ball: what a static fit only blurs looks like that."""
+    rng = np.random.default_rng(3)
+    places = rng.uniform(-0.8, 0.8, (6, 3))
+    leaping = places[rng.integers(0, 6, 80)]
+    assert find_tracks(balls(leaping), BOX).tracks is None
+
+
 def test_the_same_points_give_the_same_tracks() -> None:
     clouds = balls(path(np.linspace(0, 1, 30)))
     one, other = find_tracks(clouds, BOX).tracks, find_tracks(clouds, BOX).tracks

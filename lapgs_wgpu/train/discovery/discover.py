@@ -90,11 +90,7 @@ def lost_tracks(tracks: Tracks, static: Scene4D) -> Tracks | None:
     empty = density_at(static, tracks.paths.reshape(-1, 3)).reshape(tracks.supported.shape) < EMPTY
     seen = np.maximum(np.bincount(tracks.part, tracks.supported.sum(axis=0)), 1)
     share = np.bincount(tracks.part, (empty & tracks.supported).sum(axis=0)) / seen
-    kept = (share > 0.5)[tracks.part]
-    if not kept.any():
-        return None
-    part = np.unique(tracks.part[kept], return_inverse=True)[1].ravel()
-    return Tracks(tracks.positions[kept], tracks.colors[kept], part, tracks.paths[:, kept], tracks.supported[:, kept])
+    return tracks.of_parts(share > 0.5)
 
 
 def density_at(static: Scene4D, points: Floats) -> NDArray[np.float64]:

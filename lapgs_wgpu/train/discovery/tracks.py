@@ -24,6 +24,9 @@ PROBES = 300  # points of a time by which parts are counted, at most
 # In half sides of the box, 1.3 in the presets:
 VOXEL = 0.045  # spacing of a track's points
 REACH = 0.07  # distance within which a track explains a point
+CALM = 0.02  # jitter of a part's center that is no leaping
+LEAST_SEEN = 0.2  # share of the times at which a part must be seen
+LEAPS = 1.3  # jitter of a part's center that is leaping, in steps of its smoothed path
 EXPLAINED = 0.3  # weight of points that an earlier key time's tracks explain
 SMOOTHING = 2.0  # times; standard deviation of the weights by which paths are smoothed
 RIDGE = 1e-2  # of slope and curvature, which few times do not determine
@@ -44,6 +47,15 @@ class Tracks(NamedTuple):
     paths: Floats
     supported: NDArray[np.bool_]
 
+    def of_parts(self, kept: NDArray[np.bool_]) -> Tracks | None:
+        """The tracks of the parts (p,) that are set, and numbered anew; None where there are none."""
+        chosen = kept[self.part]
+        if not chosen.any():
+            return None
+        part = np.unique(self.part[chosen], return_inverse=True)[1].ravel()
+        paths, supported = self.paths[:, chosen], self.supported[:, chosen]
+        return Tracks(self.positions[chosen], self.colors[chosen], part, paths, supported)
+
 
 class Found(NamedTuple):
     """tracks: None where nothing can be followed. explained: share of the surface points within reach of a track."""
@@ -57,6 +69,7 @@ def find_tracks(clouds: PointClouds, half_side: float) -> Found:
     free = [np.ones(len(cloud.scores), bool) for cloud in clouds.clouds]
     trajectories = find_trajectories(clouds, LINK * half_side, half_side)
     found: list[Tracks] = []
+    steady: list[NDArray[np.bool_]] = []
     for _ in range(KEY_TIMES):
         rest = [Points(*(values[mask] for values in cloud)) for cloud, mask in zip(clouds.clouds, free, strict=True)]
         key = _key_time(rest, half_side)
@@ -70,6 +83,7 @@ def find_tracks(clouds: PointClouds, half_side: float) -> Found:
         if followed is None:
             break
         found.append(followed[0])
+        steady.append(_steady(*followed, half_side))
         for mask, points, path in zip(free, clouds.clouds, followed[1], strict=True):
             if len(points.scores):
                 mask &= cKDTree(path).query(points.positions)[0] >= REACH * half_side
@@ -83,7 +97,8 @@ def find_tracks(clouds: PointClouds, half_side: float) -> Found:
         np.concatenate([each.paths for each in found], axis=1),
         np.concatenate([each.supported for each in found], axis=1),
     )
-    return Found(tracks, 1.0 - sum(int(mask.sum()) for mask in free) / clouds.total)
+    explained = 1.0 - sum(int(mask.sum()) for mask in free) / clouds.total
+    return Found(tracks.of_parts(np.concatenate(steady)), explained)
 
 
 def _key_time(clouds: list[Points], half_side: float) -> int | None:
@@ -162,6 +177,27 @@ def _supported(paths: Floats, part: NDArray[np.int64], clouds: list[Points], hal
             near = cKDTree(points.positions).query(paths[i])[0] < REACH * half_side
             supported[i] = (np.bincount(part, near) / np.bincount(part))[part] > SUPPORTED
     return supported
+
+
+def _steady(tracks: Tracks, paths: Floats, half_side: float) -> NDArray[np.bool_]:
+    """(p,) whether a part is seen for long enough, and moves more from time to time than it jitters, or not at all.
+
+    Patches of a thing that the static fit only blurs come and go; what is followed there leaps from one to the next.
+    paths: (T, n, 3), before they were smoothed.
+    """
+    steady = np.zeros(int(tracks.part.max()) + 1, bool)
+    for k in range(len(steady)):
+        members = tracks.part == k
+        seen = tracks.supported[:, members][:, 0]
+        if seen.mean() < LEAST_SEEN:
+            continue
+        center = tracks.paths[:, members].mean(axis=1)
+        jitter = np.linalg.norm(paths[:, members].mean(axis=1) - center, axis=1)[seen].mean()
+        step = np.median(np.linalg.norm(np.diff(center, axis=0), axis=1)) if len(center) > 1 else 0.0
+        size = np.ptp(tracks.positions[members], axis=0).max()
+        still = np.ptp(center[seen], axis=0).max() < 0.5 * size
+        steady[k] = still or jitter < max(LEAPS * step, CALM * half_side)
+    return steady
 
 
 def _smoothed(
