@@ -68,7 +68,7 @@ def discover(config: Config, dataset: Dataset, device: Device, terminal: TextIO 
     share = 0.0 if tracks is None else explained_share(clouds, tracks, half_side)
     if tracks is None or share < config.discovery.least:
         meter.clear()
-        return Discovery(None, f"discovery: the static fit loses {share:.1%} of what moves: nothing is added")
+        return Discovery(None, f"discovery: {share:.1%} of what the static fit lacks can be followed: nothing is added")
     generator = torch.Generator().manual_seed(config.seed)
     scene = scene_with(static, tracks, config, device, generator)
     error = fit_field(scene, tracks, clouds.times, len(static), fit_steps, generator, lambda s: meter.at(steps + s))
