@@ -93,7 +93,7 @@ def views_of(points: Array, cameras: Sequence[Camera], near: float = 0.0, far: f
 
 
 def in_view(points: NDArray[np.floating], camera: Camera) -> tuple[NDArray[np.floating], NDArray[np.bool_]]:
-    """Return the depth (N,) of points (N, 3), NaN behind the camera, and whether each lies in its image (N,)."""
+    """Project points (N, 3): their depths (N,), NaN behind the camera, and a mask (N,) of those inside the image."""
     local = points @ camera.T_cam_world[:3, :3].T + camera.T_cam_world[:3, 3]
     depths = np.where(local[:, 2] > 0, local[:, 2], np.nan)
     pixels = (local @ camera.K.T)[:, :2] / depths[:, None]
