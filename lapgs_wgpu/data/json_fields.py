@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lapgs_wgpu.data.images import SUFFIXES
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io import safe_json_toml
 
@@ -66,6 +67,21 @@ def check_inside(name: str, field: str, where: str | Path) -> None:
                 f"{where}: {field} {kind(name)} leads out of the scene's folder; put the file, or a link to it, into "
                 "the folder."
             )
+
+
+def image_path(entry: dict[str, Any], folder: Path, where: str, hint: str, *, suffix: str = "") -> tuple[str, Path]:
+    """The file_path of a frame, and the existing file that it names.
+
+    suffix: appended to a name without an image's suffix. where, hint: for errors, as in `required`.
+    """
+    name = required(entry, "file_path", where, hint)
+    if not isinstance(name, str) or not name:
+        raise InputError(f"{where}: file_path must be the path of an image, got {kind(name)}.")
+    check_inside(name, "file_path", where)
+    file = folder / (name if name.lower().endswith(SUFFIXES) else name + suffix)
+    if not os.path.isfile(file):  # Path.is_file raises for names that are too long
+        raise InputError(f"{file} does not exist, but {where} names it as its file_path.")
+    return name, file
 
 
 def kind(value: Any) -> str:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import os
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +18,8 @@ import numpy as np
 
 from lapgs_wgpu.data.cloud import find_cloud, is_random, read_cloud
 from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
-from lapgs_wgpu.data.images import SUFFIXES, Size, check_image
-from lapgs_wgpu.data.json_fields import check_inside, finite, kind, number, read_json, required
+from lapgs_wgpu.data.images import Size, check_image
+from lapgs_wgpu.data.json_fields import finite, image_path, kind, number, read_json, required
 from lapgs_wgpu.data.objects import read_objects
 from lapgs_wgpu.data.poses import opengl_pose
 from lapgs_wgpu.data.timestamps import ImageName
@@ -72,14 +71,7 @@ def _read_split(folder: Path, split: Split) -> list[Frame]:
         where = f"{path}, frame {index}"
         if not isinstance(entry, dict):
             raise InputError(f"{where} must be a JSON object, got {kind(entry)}.")
-        file_path = required(entry, "file_path", where, NEEDED)
-        if not isinstance(file_path, str) or not file_path:
-            raise InputError(f"{where}: file_path must be the path of an image, got {kind(file_path)}.")
-        suffix = "" if file_path.lower().endswith(SUFFIXES) else ".png"
-        check_inside(file_path, "file_path", where)
-        file = folder / (file_path + suffix)
-        if not os.path.isfile(file):  # Path.is_file raises for names that are too long
-            raise InputError(f"{file} does not exist, but {where} names it as its file_path.")
+        file_path, file = image_path(entry, folder, where, NEEDED, suffix=".png")
         T_cam_world = opengl_pose(required(entry, "transform_matrix", where, NEEDED), where)
         if timed == 0:
             time = index / max(len(entries) - 1, 1)

@@ -16,7 +16,7 @@ import numpy as np
 from lapgs_wgpu.data.cloud import read_cloud
 from lapgs_wgpu.data.frames import Capture, Frame, Reader
 from lapgs_wgpu.data.images import check_image
-from lapgs_wgpu.data.json_fields import check_inside, finite, kind, read_json, required
+from lapgs_wgpu.data.json_fields import check_inside, finite, image_path, kind, read_json, required
 from lapgs_wgpu.data.poses import opengl_pose
 from lapgs_wgpu.data.timestamps import ImageName
 from lapgs_wgpu.data.undistort import Lens
@@ -52,12 +52,7 @@ def _read(folder: Path, image_size: int | None) -> Capture:
         where = f"{path}, frame {index}"
         if not isinstance(entry, dict):
             raise InputError(f"{where} must be a JSON object, got {kind(entry)}.")
-        file = required(entry, "file_path", where, NEEDED)
-        if not isinstance(file, str) or not file:
-            raise InputError(f"{where}: file_path must be the path of an image, got {kind(file)}.")
-        check_inside(file, "file_path", where)
-        if not os.path.isfile(folder / file):  # Path.is_file raises for names that are too long
-            raise InputError(f"{folder / file} does not exist, but {where} names it as its file_path.")
+        name_in_file, file = image_path(entry, folder, where, NEEDED)
         values = _intrinsics(entry, data, where)
         width, height, fx, fy, cx, cy, k1, k2, k3, _, p1, p2 = values
         K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
@@ -68,9 +63,9 @@ def _read(folder: Path, image_size: int | None) -> Capture:
         if timed:
             hint = f"though {timed} of {len(entries)} frames have it; give it for all frames or for none"
             time = finite(required(entry, "time", where, hint), "time", where)
-        normal = PurePosixPath(file)
+        normal = PurePosixPath(name_in_file)
         name = ImageName(str(normal), str(normal.parent))
-        frames.append(Frame(check_image(folder / file), lens, T_cam_world, where, name, time))
+        frames.append(Frame(check_image(file), lens, T_cam_world, where, name, time))
     names = [frame.name.file for frame in frames]
     if len(set(names)) < len(names):
         twice = next(name for i, name in enumerate(names) if name in names[:i])
