@@ -215,10 +215,8 @@ def _smoothed(
         members = part == k
         weights = falloff * np.where(supported[:, members][:, 0], 1.0, UNSUPPORTED)
         weighted = np.swapaxes(basis, 1, 2) * weights[:, None]
-        fit = np.linalg.solve(
-            weighted @ basis + ridge, weighted
-        )  # (T, 3, T): coefficients of the parabola at each time
-        smooth[:, members] = np.tensordot(fit[:, 0], paths[:, members], axes=1)
+        parabolas = np.linalg.solve(weighted @ basis + ridge, weighted)  # (T, 3, T): coefficients at each time
+        smooth[:, members] = np.tensordot(parabolas[:, 0], paths[:, members], axes=1)
     return smooth
 
 

@@ -56,18 +56,19 @@ def find_trajectories(clouds: PointClouds, link: float, half_side: float) -> lis
 
     link: distance of points of one group. half_side: of the box that they lie in. Both in world units.
     """
-    groups = _groups(clouds, link)
+    clock = clouds.times / time_step(clouds.times)
+    groups = _groups(clouds, clock, link)
     trajectories: list[Trajectory] = []
     while len(trajectories) < MOST:
         path, worth = _best_path(groups, len(clouds.times), half_side)
         if worth < LEAST_WORTH:
             break
         groups.worth[path] *= AGAIN
-        trajectories.append(_smooth(groups, path, clouds.times / time_step(clouds.times)))
+        trajectories.append(_smooth(groups, path, clock))
     return trajectories
 
 
-def _groups(clouds: PointClouds, link: float) -> _Groups:
+def _groups(clouds: PointClouds, clock: NDArray[np.float64], link: float) -> _Groups:
     rows = []
     for i, points in enumerate(clouds.clouds):
         part = parts_of(points.positions, link)
@@ -77,7 +78,7 @@ def _groups(clouds: PointClouds, link: float) -> _Groups:
             rows.append([i, *center, *color, min(1.0, members.sum() / FULL_GROUP)])
     table = np.array(rows, np.float64).reshape(-1, 8)
     time = table[:, 0].astype(np.int64)
-    return _Groups(time, clouds.times[time] / time_step(clouds.times), table[:, 1:4], table[:, 4:7], table[:, 7].copy())
+    return _Groups(time, clock[time], table[:, 1:4], table[:, 4:7], table[:, 7].copy())
 
 
 def _best_path(groups: _Groups, times: int, half_side: float) -> tuple[list[int], float]:
