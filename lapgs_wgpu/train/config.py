@@ -177,12 +177,21 @@ class DensityConfig:
         "maximum number of Gaussians; at the limit, those with the largest gradients are densified first; 0: no limit",
         0,
     )
+    min_contribution: float = described(
+        "prune Gaussians whose blending weights sum to less than this in every training image that is tried, pixels; "
+        "at most 50 images are tried, evenly chosen over the clip; 0: no such pruning",
+        0.0,
+    )
+    contribution_interval: int = described("prune by min_contribution every this many steps", 500)
 
     def __post_init__(self) -> None:
-        if self.interval < 1 or self.reset_interval < 1:
+        if min(self.interval, self.reset_interval, self.contribution_interval) < 1:
             raise ValueError(
-                f"interval and reset_interval must be at least 1 step, got {self.interval} and {self.reset_interval}"
+                "interval, reset_interval and contribution_interval must be at least 1 step, got "
+                f"{self.interval}, {self.reset_interval} and {self.contribution_interval}"
             )
+        if self.min_contribution < 0:
+            raise ValueError(f"min_contribution must be at least 0 pixels, got {self.min_contribution:g}")
         if self.split_size <= 0 or not (0 < self.reset_opacity < 1 and 0 <= self.min_opacity < 1):
             raise ValueError(
                 "split_size must be above 0, reset_opacity and min_opacity between 0 and 1, "
@@ -197,6 +206,10 @@ class DensityConfig:
     def changes_at(self, step: int) -> bool:
         """Whether Gaussians are cloned, split and pruned after this step (counted from 1)."""
         return self.start < step < self.stop and step % self.interval == 0
+
+    def prunes_at(self, step: int, last: int) -> bool:
+        """Whether Gaussians that contribute too little are pruned after this step of `last`."""
+        return self.min_contribution > 0 and self.start < step < last and step % self.contribution_interval == 0
 
     def resets_at(self, step: int) -> bool:
         """Whether opacities are lowered after this step."""

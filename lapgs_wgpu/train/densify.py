@@ -66,6 +66,12 @@ class Statistics:
         """Go on from what `state` gave."""
         self.gradients, self.views, self.radii = state["gradients"], state["views"], state["radii"]
 
+    def of(self, keep: Tensor) -> Statistics:
+        """Those of the Gaussians of a mask (N,)."""
+        kept = Statistics(0, keep.device)
+        kept.restore({name: values[keep] for name, values in self.state().items()})
+        return kept
+
     @property
     def mean_gradients(self) -> Tensor:
         """(N,) mean over the views in which a Gaussian was visible; 0 for those never seen."""
