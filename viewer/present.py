@@ -84,10 +84,7 @@ class Presenter:
         render.set_pipeline(self._pipeline)
         for uniform, placed in zip(uniforms, pictures, strict=True):
             bound = (uniform, placed.planes, placed.truth or self._no_truth)
-            entries = [
-                {"binding": i, "resource": {"buffer": buffer.wgpu_buffer, "offset": offset, "size": size}}
-                for i, (buffer, offset, size) in enumerate(array.binding for array in bound)
-            ]
+            entries = [{"binding": i, "resource": array.resource} for i, array in enumerate(bound)]
             render.set_bind_group(0, native.create_bind_group(layout=self._layout, entries=entries))
             render.set_viewport(*placed.origin, *placed.size, 0, 1)
             render.set_scissor_rect(*placed.origin, *placed.size)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
 from typing import Any
 
 from numpy.typing import NDArray
@@ -29,6 +28,13 @@ class DeviceArray:
     shape: tuple[int, ...]
     dtype: str = "float32"
     offset: int = 0
+    nbytes: int = field(init=False)  # of the elements
+    bound_bytes: int = field(init=False)  # what a kernel sees: the array, rounded up to 16 bytes
+
+    def __post_init__(self) -> None:
+        nbytes = math.prod(self.shape) * _ITEM_BYTES[self.dtype]
+        object.__setattr__(self, "nbytes", nbytes)
+        object.__setattr__(self, "bound_bytes", max(16, (nbytes + 15) & ~15))
 
     @staticmethod
     def empty(device: Device, label: str, shape: tuple[int, ...], dtype: str = "float32") -> DeviceArray:
@@ -47,20 +53,15 @@ class DeviceArray:
         """Number of elements."""
         return math.prod(self.shape)
 
-    @cached_property
-    def nbytes(self) -> int:
-        """Bytes of the elements."""
-        return math.prod(self.shape) * _ITEM_BYTES[self.dtype]
-
-    @cached_property
+    @property
     def key(self) -> tuple[int, int, int, str]:
         """Equal for arrays that are the same to a kernel."""
-        return self.buffer.number, *self.binding[1:], self.dtype
+        return self.buffer.number, self.offset, self.bound_bytes, self.dtype
 
-    @cached_property
-    def binding(self) -> tuple[Buffer, int, int]:
-        """Buffer, offset and size in bytes of what a kernel sees: the array, rounded up to 16 bytes."""
-        return self.buffer, self.offset, max(16, (self.nbytes + 15) & ~15)
+    @property
+    def resource(self) -> dict[str, Any]:
+        """What wgpu binds."""
+        return {"buffer": self.buffer.wgpu_buffer, "offset": self.offset, "size": self.bound_bytes}
 
     def rows(self, first: int, count: int) -> DeviceArray:
         """Rows first to first + count; to be bound, they must begin at a multiple of 256 bytes."""

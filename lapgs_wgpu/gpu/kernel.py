@@ -90,10 +90,9 @@ class Kernel:
             declared = self._kinds[name]
             if declared is not None and (array.dtype == "float32") != (declared == "f32"):
                 raise ShaderError(f"shaders/{self.name}.wgsl: {name} holds {declared}, got {array.dtype}")
-            size = array.binding[2]
-            if size > self.device.max_binding:
+            if array.bound_bytes > self.device.max_binding:
                 raise DeviceMemoryError(
-                    f"{name} of the pass {self.name} needs {size} bytes in one binding, "
+                    f"{name} of the pass {self.name} needs {array.bound_bytes} bytes in one binding, "
                     f"but {self.device.info.name} allows {self.device.max_binding}"
                 )
 
@@ -105,9 +104,8 @@ class Kernel:
             self.check(arrays)
             entries = []
             for name, array in arrays.items():
-                buffer, offset, size = array.binding
-                whole = {"buffer": buffer.wgpu_buffer, "offset": offset, "size": size}
-                entries.append({"binding": self.bindings[name].number, "resource": textures.get(name, whole)})
+                resource = textures.get(name, array.resource)
+                entries.append({"binding": self.bindings[name].number, "resource": resource})
             if len(self._groups) > 64:  # arrays of other sizes leave groups behind
                 self._groups.clear()
             native = self.device.wgpu_device.create_bind_group(layout=self._layout, entries=entries)
@@ -162,9 +160,8 @@ class Commands:
             arrays[name].buffer.version += 1
 
     def _texture(self, array: DeviceArray, texel_format: str) -> Any:
-        buffer, offset, size = array.binding
-        self._copied.append(buffer)
-        return buffer.texture(self._encoder, texel_format, offset, size)
+        self._copied.append(array.buffer)
+        return array.buffer.texture(self._encoder, texel_format, array.offset, array.bound_bytes)
 
     def clear(self, array: DeviceArray) -> None:
         """Set an array, rounded up to 4 bytes, to zero."""
