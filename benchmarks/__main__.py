@@ -24,7 +24,7 @@ from losses import LossReport, bench_losses
 from measure import Timing, Traffic
 from passes import Meter, PassTimes, by_processor_time, by_timestamps
 from raster import RasterReport, bench_raster
-from scene import FIXED_SET, SceneSize, make_scene, save_scene
+from scene import FIXED_SET, SceneSize, TrainedScene, parse_scene, save_scene
 from shares import bench_shares
 from step import StepReport, bench_step
 
@@ -40,11 +40,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python benchmarks", description=__doc__)
     parser.add_argument(
         "--scenes",
-        type=SceneSize.parse,
+        type=parse_scene,
         nargs="+",
         default=FIXED_SET,
-        metavar="N@WxH",
-        help="Gaussians and image of what is drawn; the first one's also in encoder, decoder, losses and shares "
+        metavar="SCENE@WxH",
+        help="what is drawn: a ball of so many Gaussians, or the checkpoint.ply of a training, and the size of the "
+        "image; the first one also decides the sizes in encoder, decoder, losses and shares "
         f"[{_names(FIXED_SET)}]",
     )
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS, help=f"what is timed [{' '.join(PARTS)}]")
@@ -69,7 +70,7 @@ def main() -> None:
     if options.compare:
         print(compare(*options.compare))
     elif options.save_scene:
-        save_scene(options.save_scene, *make_scene(options.scenes[0]))
+        save_scene(options.save_scene, *options.scenes[0].make())
     else:
         run(options, parser)
 
@@ -90,15 +91,15 @@ def run(options: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
     if "raster" in options.parts:
         results["raster"] = {}
         for scene in options.scenes:
-            raster = bench_raster(device, *make_scene(scene), meter, repeat)
+            raster = bench_raster(device, *scene.make(), meter, repeat)
             print_raster(str(scene), raster)
             results["raster"][str(scene)] = raster
     if "encoder" in options.parts:
-        means = make_scene(first)[0]["means"]
+        means = first.make()[0]["means"]
         results["encoder"] = bench_encoder(device, load_config("dnerf").field, means, meter, repeat)
         print_encoder(results["encoder"])
     if "decoder" in options.parts:
-        means = make_scene(first)[0]["means"]
+        means = first.make()[0]["means"]
         results["decoder"] = bench_decoder(device, load_config("dnerf").field, means, repeat)
         print_decoder(results["decoder"])
     if "losses" in options.parts:
@@ -229,7 +230,7 @@ def print_losses(report: LossReport) -> None:
     print(f"  {ratio:.1f} times as fast as the references; gradients differ by {report.difference:.1e}")
 
 
-def print_shares(shares: dict[str, Timing], scene: SceneSize) -> None:
+def print_shares(shares: dict[str, Timing], scene: SceneSize | TrainedScene) -> None:
     size = f"{scene.height}x{scene.height}"
     print(f"\ntraining step, preset dnerf: {scene.gaussians:,} Gaussians, {size}, everything moving")
     print(f"  {'':46s}{'median':>8s}  milliseconds")

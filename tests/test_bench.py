@@ -9,13 +9,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.scene_files import moving_scene
+
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.io.initial_view import InitialView
+from lapgs_wgpu.splat.camera import Camera
 
 BENCH = Path(__file__).parents[1] / "benchmarks"
 SCENE = "300@40x40"
 
 
-def bench(*arguments: str | Path) -> str:
-    command = [sys.executable, BENCH, "--scenes", SCENE, "--repeat", "1", *arguments]
+def bench(*arguments: str | Path, scene: str = SCENE) -> str:
+    command = [sys.executable, BENCH, "--scenes", scene, "--repeat", "1", *arguments]
     return subprocess.run(command, check=True, capture_output=True, text=True, timeout=300).stdout
 
 
@@ -219,3 +224,17 @@ def test_scenes_have_names() -> None:
     done = subprocess.run([sys.executable, BENCH, "--scenes", "50k"], capture_output=True, text=True)
     assert done.returncode == 2
     assert "expected GAUSSIANS@WIDTHxHEIGHT, such as 50k@400x400, got '50k'" in done.stderr
+
+
+def test_the_checkpoint_of_a_training_is_a_scene_too(device: Device, tmp_path: Path) -> None:
+    scene = moving_scene(device, count=60)
+    camera = Camera.looking_at([0, 0, -4], [0, 0, 0], up=[0, -1, 0], fov_x=0.6, width=80, height=80)
+    view = InitialView(camera, np.zeros(3), np.array([0.0, -1.0, 0.0]), frames=3)
+    scene.save(tmp_path / "checkpoint.ply", {"view": view.to_json()})
+    name = f"{tmp_path / 'checkpoint.ply'}@40x32"
+    bench("--parts", "raster", "--json", tmp_path / "bench.json", scene=name)
+    counts = json.loads((tmp_path / "bench.json").read_text())["raster"][name]["counts"]
+    assert 0 < counts["visible"] <= 60
+    arrays = bench("--save-scene", tmp_path / "scene.npz", scene=name) or np.load(tmp_path / "scene.npz")
+    assert (int(arrays["width"]), int(arrays["height"]), len(arrays["means"])) == (40, 32, 60)
+    np.testing.assert_allclose(arrays["means"], scene.at(0.5).means.numpy(force=True), atol=1e-6)
