@@ -6,13 +6,13 @@ import math
 
 import pytest
 import torch
+from helpers.reference import color
 from helpers.scenes import Scene, front_camera, random_scene, relative, step
 from torch import Tensor
 
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.splat.rasterize import rasterize
 from lapgs_wgpu.splat.rasterizer import Rasterizer
-from lapgs_wgpu.splat.reference import color
 
 pytestmark = pytest.mark.kernels
 

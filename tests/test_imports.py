@@ -68,11 +68,6 @@ def test_no_modules_import_each_other_in_a_circle(part: str) -> None:
             del graph[name]
 
 
-def test_production_code_needs_no_reference() -> None:
-    """splat/reference is what tests hold the kernels to."""
-    assert [file for file in FILES if any("splat.reference" in name for name in imports(file))] == []
-
-
 def test_every_part_has_a_rule() -> None:
     parts = {part_of(file) for file in FILES} - {"__init__", "__main__"}
     assert {"gpu", "splat", "motion", "data", "io"} <= parts

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
+from helpers.reference import near_discontinuity
 from helpers.scenes import Scene, Step, front_camera, oblique_camera, random_scene, reference_step, relative, step
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -15,7 +16,6 @@ from hypothesis import strategies as st
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.splat.rasterize import rasterize
 from lapgs_wgpu.splat.rasterizer import Rasterizer
-from lapgs_wgpu.splat.reference import near_discontinuity
 
 pytestmark = [pytest.mark.kernels, pytest.mark.subgroups]
 

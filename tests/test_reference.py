@@ -9,13 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from scipy.special import lpmv
-from torch import Tensor
-
-from lapgs_wgpu.errors import InputError
-from lapgs_wgpu.splat.camera import Camera
-from lapgs_wgpu.splat.rasterize import Rendering
-from lapgs_wgpu.splat.reference import (
+from helpers.reference import (
     ALPHA_MAX,
     ALPHA_MIN,
     CONSTANTS,
@@ -28,6 +22,12 @@ from lapgs_wgpu.splat.reference import (
     rasterize_reference,
     sh_basis,
 )
+from scipy.special import lpmv
+from torch import Tensor
+
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.splat.rasterize import Rendering
 from lapgs_wgpu.splat.rotation import rotation_matrices
 
 Scene = dict[str, Tensor]

@@ -6,12 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from helpers.reference import near_discontinuity, rasterize_reference
 from torch import Tensor
 
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.rasterize import rasterize
-from lapgs_wgpu.splat.reference import near_discontinuity, rasterize_reference
 
 Scene = dict[str, Tensor]  # the tensors that `rasterize` takes, by argument name, float32
 

@@ -12,11 +12,11 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from ..errors import InputError
-from .camera import Camera
-from .constants import CONSTANTS
-from .rasterize import Rendering
-from .rotation import rotation_matrices
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.splat.constants import CONSTANTS
+from lapgs_wgpu.splat.rasterize import Rendering
+from lapgs_wgpu.splat.rotation import rotation_matrices
 
 DILATION, NEAR, FRUSTUM_MARGIN, ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN = (
     CONSTANTS[name] for name in ("DILATION", "NEAR", "FRUSTUM_MARGIN", "ALPHA_MAX", "ALPHA_MIN", "TRANSMITTANCE_MIN")
