@@ -184,8 +184,6 @@ def _open_data(
     from lapgs_wgpu.data.builtin import SYNTHETIC, is_builtin, write_builtin
 
     path = config.data.path
-    if not path.isprintable():
-        raise InputError(f"{path!r} holds characters that config.toml cannot record; rename the folder.")
     if not path:
         raise InputError(f"name the folder of the scene with --data DIR, or take --data {SYNTHETIC}.")
     if ranks is not None and not ranks.first:

@@ -20,6 +20,7 @@ from lapgs_wgpu.motion.fields.config import FieldKind
 from lapgs_wgpu.train.config import Config
 
 Table = dict[str, Any]
+ADVICE = '; add it, or start the file with base = "dnerf"'
 
 # The paper's parts beside its field: off for every other method.
 PAPER_ONLY = {"loss.pyramid": 0.0, "loss.ncc": 0.0, "density.split": "plain"}
@@ -74,7 +75,7 @@ def load_config(
         if key not in known:
             raise InputError(f"there is no option --{key}{did_you_mean(key, known)}.")
         _set(table, key, checked(known[key], _from_text(text, known[key]), f"--{key}"))
-    return build_dataclass(Config, table, preset)
+    return build_dataclass(Config, table, preset, advice=ADVICE)
 
 
 def build_config(
@@ -87,7 +88,7 @@ def build_config(
     base = _read(preset)
     for key, value in _shorthands(method, ablate).items():
         _set(base, key, value)
-    return build_dataclass(Config, merge(base, table), source)
+    return build_dataclass(Config, merge(base, table), source, advice=ADVICE)
 
 
 def _shorthands(method: str | None, ablate: Iterable[str]) -> dict[str, Any]:

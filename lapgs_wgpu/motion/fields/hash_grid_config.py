@@ -3,33 +3,28 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
+
+from ...io.dataclass_table import Options, option
 
 _SLICE_CELLS = 1 << 14  # a level with more cells a plane than this is looked up directly, not cut
 TIME = 3  # the axis number of time
 
 
-def option(default: Any, help_text: str) -> Any:
-    """A field of a configuration, with the help that lapgs-train --help shows."""
-    return field(default=default, metadata={"help": help_text})
-
-
 @dataclass(frozen=True)
-class HashConfig:
+class HashConfig(Options):
     """The shape of a grid."""
 
-    levels: int = option(16, "number of resolution levels")
-    base: tuple[int, int, int] = option((16, 16, 16), "resolution of the coarsest level along each axis")
-    finest: tuple[int, int, int] = option((2048, 2048, 2048), "resolution of the finest level along each axis")
-    table_log2: int = option(19, "log2 of the largest number of entries per level; larger levels are hashed")
-
-    def __post_init__(self) -> None:
-        if not (1 <= self.levels <= 64 and 1 <= self.table_log2 <= 24):
-            raise ValueError(f"levels must be 1 to 64 and table_log2 1 to 24, got {self.levels} and {self.table_log2}")
-        for size in (*self.base, *self.finest):
-            if not 2 <= size <= 1 << 16:
-                raise ValueError(f"base and finest must be 2 to {1 << 16} entries, got {size}")
+    levels: int = option("number of resolution levels", 16, at_least=1, at_most=64)
+    base: tuple[int, int, int] = option(
+        "resolution of the coarsest level along each axis", (16, 16, 16), at_least=2, at_most=1 << 16
+    )
+    finest: tuple[int, int, int] = option(
+        "resolution of the finest level along each axis", (2048, 2048, 2048), at_least=2, at_most=1 << 16
+    )
+    table_log2: int = option(
+        "log2 of the largest number of entries per level; larger levels are hashed", 19, at_least=1, at_most=24
+    )
 
 
 @dataclass(frozen=True)
