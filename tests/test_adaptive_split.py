@@ -53,7 +53,7 @@ def everyone(rows: Mapping[str, Tensor]) -> Tensor:
 
 
 def change(rows: Mapping[str, Tensor], gradients: Tensor) -> Change:
-    statistics = Statistics(len(gradients), torch.device("cpu"))
+    statistics = Statistics.zeros(len(gradients), torch.device("cpu"))
     statistics.gradients, statistics.views = gradients, torch.ones_like(gradients)
     return densify(rows, statistics, CONFIG, EXTENT, torch.Generator().manual_seed(0), bound_sizes=False)
 
@@ -274,7 +274,7 @@ def test_candidates_that_are_passed_over_stay() -> None:
 
 
 def test_quantile_zero_is_the_plain_split() -> None:
-    rows, statistics = make_rows(30), Statistics(30, torch.device("cpu"))
+    rows, statistics = make_rows(30), Statistics.zeros(30, torch.device("cpu"))
     statistics.gradients, statistics.views = torch.ones(30), torch.ones(30)
     changes = [
         densify(rows, statistics, config, EXTENT, torch.Generator().manual_seed(0), bound_sizes=False)

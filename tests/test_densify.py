@@ -35,7 +35,7 @@ def make_rows(scales: list[float], opacities: list[float] | None = None) -> dict
 
 
 def make_statistics(gradients: list[float], radii: list[float] | None = None) -> Statistics:
-    statistics = Statistics(len(gradients), torch.device("cpu"))
+    statistics = Statistics.zeros(len(gradients), torch.device("cpu"))
     statistics.gradients = torch.tensor(gradients) * 5
     statistics.views = torch.full((len(gradients),), 5.0)
     statistics.radii = torch.tensor(radii or [1.0] * len(gradients))
@@ -57,7 +57,7 @@ def rendering(radii: list[int], gradient: list[list[float]]) -> Rendering:
 
 def test_statistics_are_means_over_visible_views_in_normalised_device_coordinates() -> None:
     camera = Camera(np.eye(3), np.eye(4), 200, 100)
-    statistics = Statistics(3, torch.device("cpu"))
+    statistics = Statistics.zeros(3, torch.device("cpu"))
     statistics.add(rendering([4, 0, 0], [[0.03, 0.08], [9.0, 9.0], [0.0, 0.0]]), camera)
     statistics.add(rendering([2, 7, 0], [[0.0, 0.0], [0.01, 0.0], [0.0, 0.0]]), camera)
     # Pixel gradients times half the image's width and height; what is not visible does not count.
@@ -69,7 +69,7 @@ def test_statistics_need_a_backward_pass() -> None:
     drawn = rendering([1], [[0.0, 0.0]])
     drawn.means2d.grad = None
     with pytest.raises(ValueError, match="backward"):
-        Statistics(1, torch.device("cpu")).add(drawn, Camera(np.eye(3), np.eye(4), 8, 8))
+        Statistics.zeros(1, torch.device("cpu")).add(drawn, Camera(np.eye(3), np.eye(4), 8, 8))
 
 
 def test_small_ones_are_cloned_and_large_ones_split() -> None:
@@ -157,7 +157,7 @@ def test_reset_lowers_only() -> None:
 
 def test_nothing_is_left_to_change() -> None:
     rows = {name: row[:0] for name, row in make_rows([SMALL]).items()}
-    result = change(rows, Statistics(0, torch.device("cpu")))
+    result = change(rows, Statistics.zeros(0, torch.device("cpu")))
     assert len(result.keep) == 0
     assert all(len(row) == 0 for row in result.added.values())
 

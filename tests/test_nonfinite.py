@@ -247,7 +247,7 @@ def test_the_adaptive_split_leaves_out_what_is_not_finite(name: str, bad: float)
 
 
 def test_density_control_gets_over_bad_gaussians_and_statistics() -> None:
-    whole, statistics = rows(60), Statistics(60, torch.device("cpu"))
+    whole, statistics = rows(60), Statistics.zeros(60, torch.device("cpu"))
     statistics.gradients += 1.0
     statistics.views += 1.0
     for i, name in enumerate(("means", "log_scales", "quats", "dynamics")):

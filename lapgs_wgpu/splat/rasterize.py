@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -31,15 +31,6 @@ class Rendering(NamedTuple):
     depth: Tensor
     radii: Tensor
     means2d: Tensor
-
-
-class Seen(Protocol):
-    """What density control needs of a `Rendering`."""
-
-    @property
-    def radii(self) -> Tensor: ...
-    @property
-    def means2d(self) -> Tensor: ...
 
 
 @functools.cache

@@ -72,8 +72,4 @@ class Pictures:
 
 def _on_background(view: View, colour: NDArray[np.float32]) -> View:
     """The view without transparency, so that it is laid on its background once and not at every step."""
-    return dataclasses.replace(view, pixels=partial(_flat, view, colour))
-
-
-def _flat(view: View, colour: NDArray[np.float32]) -> NDArray[np.uint8]:
-    return composite(view.load(), colour)
+    return dataclasses.replace(view, pixels=lambda: composite(view.load(), colour))

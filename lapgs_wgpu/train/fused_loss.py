@@ -36,16 +36,8 @@ class RenderLoss(NamedTuple):
         return -10.0 * float(np.log10(max(self.terms["mse"], LEAST_ERROR)))
 
 
-@functools.cache
-def image_loss_of(device: Device) -> ImageLoss:
-    """The losses that `render_loss` uses on this device; their buffers serve all calls."""
-    return ImageLoss(device)
-
-
-@functools.cache
-def exposure_of(device: Device) -> ExposurePasses:
-    """The passes of `render_loss`'s correction on this device."""
-    return ExposurePasses(device)
+# The passes of a device, whose buffers serve all calls of `render_loss`.
+image_loss_of, exposure_of = functools.cache(ImageLoss), functools.cache(ExposurePasses)
 
 
 def render_loss(

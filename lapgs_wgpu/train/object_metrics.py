@@ -21,6 +21,7 @@ from statistics import mean, median
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import distance_transform_edt
+from scipy.spatial import cKDTree
 
 from lapgs_wgpu.data.objects import ObjectTruth
 from lapgs_wgpu.data.views import composite
@@ -175,16 +176,11 @@ def _norm(a: Image, b: Image) -> NDArray[np.float64]:
 
 
 def _to_nearest(colours: Image, palette: Image) -> NDArray[np.float64]:
-    """Squared distances (n,) of colours (n, 3) from the nearest of a palette (m, 3), which is rounded to 8 levels."""
+    """Distances (n,) of colours (n, 3) from the nearest of a palette (m, 3), which is rounded to 8 levels."""
     if not len(colours) or not len(palette):
         return np.full(len(colours), np.inf)
-    coarse = np.unique(palette // 8, axis=0).astype(np.float32) * 8 + 3.5
-    distance = np.full(len(colours), np.inf, dtype=np.float32)
-    points = colours.astype(np.float32)
-    for start in range(0, len(coarse), 256):
-        apart = np.square(points[:, None] - coarse[None, start : start + 256]).sum(axis=2)
-        np.minimum(distance, apart.min(axis=1), out=distance)
-    return distance.astype(np.float64)
+    distance, _ = cKDTree(np.unique(palette // 8, axis=0) * 8.0 + 3.5).query(colours)
+    return np.asarray(distance)
 
 
 def _distance_from(mask: Mask) -> NDArray[np.float64]:

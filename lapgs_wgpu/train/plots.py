@@ -26,13 +26,11 @@ if typing.TYPE_CHECKING:
 
 Floats = NDArray[np.floating[Any]]
 
-MOST_TRAJECTORIES = 12
 SAMPLE = 2000  # Gaussians among which those that move most are looked for
 VISIBLE = 0.1  # opacity from which on a Gaussian's trajectory says something about the scene
 TIMES = 64  # points of a trajectory
 # Okabe and Ito's colours, which people with any colour vision tell apart; without their yellow, too faint for lines.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-STYLES = ("-", "--")  # the second round of colours is dashed
 TIME_LABEL = "time t (0 to 1: the clip)"
 FREQUENCY_LABEL = "frequency $f_k$ (cycles per clip)"
 AMPLITUDE_LABEL = "amplitude $|c_k|$ (RMS over channels)"
@@ -177,20 +175,13 @@ def dynamics_histogram(path: Path, dynamics: ArrayLike) -> None:
 
 
 def trajectories(path: Path, times: ArrayLike, places: ArrayLike) -> None:
-    """x, y and z over the times (T,) of places (T, M, 3); M of at most 12."""
+    """x, y and z over the times (T,) of positions (T, M, 3); M is at most len(COLOURS)."""
     places = np.asarray(places)
-    if places.shape[1] > MOST_TRAJECTORIES:
-        raise ValueError(f"at most {MOST_TRAJECTORIES} trajectories can be told apart, got {places.shape[1]}")
     figure = _figure(7, 8)
     panels = figure.subplots(3, 1, sharex=True)
     for axis, axes in enumerate(panels):
-        for i in range(places.shape[1]):
-            axes.plot(
-                times,
-                places[:, i, axis],
-                color=COLOURS[i % len(COLOURS)],
-                linestyle=STYLES[i // len(COLOURS)],
-            )
+        for place, colour in zip(places[:, :, axis].T, COLOURS, strict=False):
+            axes.plot(times, place, color=colour)
         axes.set_ylabel(f"{'xyz'[axis]} (world units)")
     panels[-1].set_xlabel(TIME_LABEL)
     panels[-1].set_xlim(0, 1)

@@ -24,26 +24,16 @@ ADVICE = '; add it, or start the file with base = "dnerf"'
 
 # The paper's parts beside its field: off for every other method.
 PAPER_ONLY = {"loss.pyramid": 0.0, "loss.ncc": 0.0, "density.split": "plain"}
-# The parts of the method that --ablate turns off: the keys that it sets, and its help text.
-ABLATIONS: dict[str, dict[str, Any]] = {
-    "laplacian": {"field.motion": "mlp"},
-    "dynamics": {"field.dynamics": 0},
-    "split": {"density.split": "plain"},
-    "lap": {"loss.pyramid": 0.0},
-    "ncc": {"loss.ncc": 0.0},
-    "dy": {"loss.dynamics_mode": "off"},
-    "hash": {"field.temporal_hash": False},
-    "appearance": {"field.appearance": "none"},
-}
-ABLATION_HELP = {
-    "laplacian": "motion spectrum, replaced by an MLP",
-    "dynamics": "dynamics attributes",
-    "split": "adaptive split",
-    "lap": "Laplacian pyramid loss",
-    "ncc": "cross-correlation loss",
-    "dy": "dynamics regularization",
-    "hash": "space-time hash grids",
-    "appearance": "color changes over time",
+# The parts of the method that --ablate turns off: help text, key, and value of the key without the part.
+ABLATIONS: dict[str, tuple[str, str, Any]] = {
+    "laplacian": ("motion spectrum, replaced by an MLP", "field.motion", "mlp"),
+    "dynamics": ("dynamics attributes", "field.dynamics", 0),
+    "split": ("adaptive split", "density.split", "plain"),
+    "lap": ("Laplacian pyramid loss", "loss.pyramid", 0.0),
+    "ncc": ("cross-correlation loss", "loss.ncc", 0.0),
+    "dy": ("dynamics regularization", "loss.dynamics_mode", "off"),
+    "hash": ("space-time hash grids", "field.temporal_hash", False),
+    "appearance": ("color changes over time", "field.appearance", "none"),
 }
 
 
@@ -67,15 +57,13 @@ def load_config(
     method that are left out (ABLATIONS). Overrides come last.
     Raises InputError where the preset, a key or a value is not valid.
     """
-    table = _read(preset)
     known = {key.name: key.kind for key in config_keys()}
-    for key, value in _shorthands(method, ablate).items():
-        _set(table, key, value)
+    table: Table = {}
     for key, text in (overrides or {}).items():
         if key not in known:
             raise InputError(f"there is no option --{key}{did_you_mean(key, known)}.")
         _set(table, key, checked(known[key], _from_text(text, known[key]), f"--{key}"))
-    return build_dataclass(Config, table, preset, advice=ADVICE)
+    return build_config(preset, table, preset, method=method, ablate=ablate)
 
 
 def build_config(
@@ -101,7 +89,8 @@ def _shorthands(method: str | None, ablate: Iterable[str]) -> dict[str, Any]:
         if part not in ABLATIONS:
             hint = did_you_mean(part, ABLATIONS)
             raise InputError(f"--ablate knows {', '.join(ABLATIONS)}, not {shown(part)}{hint}.")
-        values |= ABLATIONS[part]
+        _, key, value = ABLATIONS[part]
+        values[key] = value
     return values
 
 

@@ -107,7 +107,7 @@ class Trainer:
         self._numbers = {view.name: number for number, view in enumerate(dataset.train)}
         # Cameras that all stand at one place have no extent; the scene's own size must serve.
         self._extent = dataset.extent or config.points.box
-        self._statistics = Statistics(len(scene), scene.parameters["means"].device)
+        self._statistics = Statistics.zeros(len(scene), scene.parameters["means"].device)
         self._health = Health()
         data = config.data
         self._pictures = Pictures(dataset.train, data.background, data.cache_gb, self._generator, scene.device)
@@ -142,7 +142,7 @@ class Trainer:
         looks = [_Look(*each, self._nearby(each[0]) if moving else None) for each in chosen]
 
         self._zero_grad()
-        seen = Statistics(len(scene), scene.parameters["means"].device)
+        seen = Statistics.zeros(len(scene), scene.parameters["means"].device)
         renderings, totals = [], torch.zeros(2, dtype=torch.float64)
         for look in looks[ranks.rank :: ranks.count]:
             loss, rendering = self._loss(look, moving)
@@ -216,14 +216,7 @@ class Trainer:
             gradient.copy_(total)
 
     def _seen_by_all(self, seen: Statistics) -> list[Statistics]:
-        names = list(seen.state())
-        parts = self.ranks.gather(list(seen.state().values()))
-        found = []
-        for values in zip(*parts, strict=True):
-            one = Statistics(0, values[0].device)
-            one.restore(dict(zip(names, values, strict=True)))
-            found.append(one)
-        return found
+        return [Statistics(*values) for values in zip(*self.ranks.gather(list(vars(seen).values())), strict=True)]
 
     def _examine(self, renderings: list[RenderLoss], loss: float, step: int, views: str) -> Skipped | None:
         """Whether the step of these gradients is to be skipped, and why. Raises NumericalError for a parameter, whose
@@ -266,7 +259,7 @@ class Trainer:
                 )
             self._optimizer.edit_rows(change.keep, change.added)
             self._optimizer.reorder(morton_order(scene.parameters["means"].detach()))
-            self._statistics = Statistics(len(scene), scene.parameters["means"].device)
+            self._statistics = Statistics.zeros(len(scene), scene.parameters["means"].device)
         if density.resets_at(step):
             logits = reset_opacities(scene.parameters["opacity_logits"], density.reset_opacity)
             self._optimizer.reset("opacity_logits", logits)
@@ -282,7 +275,7 @@ class Trainer:
             "adam": self._optimizer.state(),
             "frequencies": self._frequencies.state() if self._frequencies else {},
             "exposure": self._exposures.state() if self._exposures else {},
-            "statistics": self._statistics.state(),
+            "statistics": vars(self._statistics),
             "training": {
                 "done": torch.tensor(self.done),
                 "warm_up": torch.tensor(self._warm_up),
@@ -314,7 +307,7 @@ class Trainer:
             self._frequencies.restore(parts["frequencies"])
         if self._exposures is not None:
             self._exposures.restore(parts["exposure"])
-        self._statistics.restore(parts["statistics"])
+        self._statistics = Statistics(**parts["statistics"])
         own = parts["training"]
         self.done, scene.sh_degree = int(own["done"]), int(own["sh_degree"])
         self._warm_up = int(own.get("warm_up", self._warm_up))  # older states lack it
