@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from helpers.encoder_reference import encode_reference
 from helpers.trained_scenes import CONFIGS, GRID4D, OURS, trained
 from torch import Tensor, nn
 
@@ -16,7 +17,6 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.fields.grid_field import GridField
-from lapgs_wgpu.motion.fields.hash_encoder import encode_reference
 from lapgs_wgpu.motion.fields.parameter_shapes import parameter_shapes
 from lapgs_wgpu.motion.playback.grid_field_playback import (
     GridFieldPlayback,

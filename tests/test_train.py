@@ -27,10 +27,10 @@ from lapgs_wgpu.motion.passes.decoder_passes import DecoderPasses
 from lapgs_wgpu.motion.scene import Scene4D, load
 from lapgs_wgpu.train import autotune, trainer
 from lapgs_wgpu.train import run as run_module
+from lapgs_wgpu.train.config import LossWeights
 from lapgs_wgpu.train.dataloader import Pictures
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
 from lapgs_wgpu.train.log import Log
-from lapgs_wgpu.train.losses import LossWeights
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.run import train
 from lapgs_wgpu.train.trainer import Trainer

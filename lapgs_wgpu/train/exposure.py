@@ -73,6 +73,8 @@ class Exposures:
     corrections share belong to the scene, which is measured without any: the mean of all stays the identity.
     """
 
+    name = "exposures"
+
     def __init__(self, count: int, rate: Rate) -> None:
         self._identity = torch.eye(3, 4)
         self._rate = rate
@@ -80,18 +82,6 @@ class Exposures:
         self._mean = torch.zeros(count, 3, 4)
         self._square = torch.zeros(count, 3, 4)
         self._steps = torch.zeros(count, 1, 1)
-
-    def parameters(self) -> dict[str, list[Tensor]]:
-        """The corrections."""
-        return {"exposures": [self.values]}
-
-    def gradients(self) -> dict[str, list[Tensor]]:
-        """Their gradient, if they have one."""
-        return {} if self.values.grad is None else {"exposures": [self.values.grad]}
-
-    def zero_grad(self) -> None:
-        """Forget it."""
-        self.values.grad = None
 
     @torch.no_grad()
     def step(self, step: int) -> None:

@@ -15,9 +15,10 @@ from ..gpu.kernel import Commands
 from ..splat.camera import Camera
 from ..splat.gaussians import Gaussians
 from ..splat.rasterize import gradient_tensors, radii_and_centres, rasterizer_of, upload_gaussians
+from .config import LossWeights
 from .exposure import ExposurePasses
 from .image_loss import ImageLoss
-from .losses import LEAST_ERROR, LossWeights
+from .losses import LEAST_ERROR
 
 
 class RenderLoss(NamedTuple):
@@ -49,7 +50,7 @@ def render_loss(
     device: Device,
     correction: Tensor | None = None,
 ) -> RenderLoss:
-    """The loss of the Gaussians' image (train/losses.total), computed on the device from end to end.
+    """The weighted sum of the image losses of the rendered Gaussians, computed on the device from end to end.
 
     gaussians: activated, float32, with harmonics. truth: (H, W) as `upload_rgba` leaves it, of the camera's size.
     background: (3,) in [0, 1], under both; not differentiable. weights: of the terms. correction: (3, 4), of the

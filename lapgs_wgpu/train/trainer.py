@@ -201,13 +201,12 @@ class Trainer:
     def _gradients(self) -> dict[str, list[Tensor]]:
         """By group, of all parameters that have one."""
         gradients = self._optimizer.gradients()
-        for beside in self._beside:
-            gradients |= beside.gradients()
-        return gradients
+        return gradients | {each.name: [each.values.grad] for each in self._beside if each.values.grad is not None}
 
     def _zero_grad(self) -> None:
-        for each in (self._optimizer, *self._beside):
-            each.zero_grad()
+        self._optimizer.zero_grad()
+        for each in self._beside:
+            each.values.grad = None
 
     def _put_together(self) -> None:
         """Every rank's gradients become the sums over the ranks."""
@@ -222,8 +221,7 @@ class Trainer:
         """Whether the step of these gradients is to be skipped, and why. Raises NumericalError for a parameter, whose
         values a step cannot mend."""
         parameters, gradients = self._optimizer.parameters(), self._gradients()
-        for beside in self._beside:
-            parameters |= beside.parameters()
+        parameters |= {each.name: [each.values] for each in self._beside}
         places = [each.means2d.grad for each in renderings if each.means2d.grad is not None]
         gradients |= {"the places in the image": places} if places else {}
         if not self.ranks.any(not (math.isfinite(loss) and finite(parameters, gradients))):

@@ -1,5 +1,5 @@
-"""The hash encoder as torch sees it: grids whose tables belong to torch, their encoding and its gradient on the device
-(motion/passes/hash_encoder_passes), and its plain-torch reference."""
+"""The hash encoder as torch sees it: grids whose tables belong to torch; encoding and gradient run on the device
+(motion/passes/hash_encoder_passes)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ...gpu.device import Device
 from ...gpu.kernel import Commands
 from ...gpu.pool import BufferPool
 from ..passes.hash_encoder_passes import HashEncoderPasses
-from .hash_grid_config import TIME, GridShape, HashConfig
+from .hash_grid_config import GridShape, HashConfig
 
 Place = tuple[Tensor, float]  # points (N, 3), world units, and a time in [0, 1]
 _NUMPY = {torch.float32: "float32", torch.bfloat16: "int16"}  # the dtype of arrays, which have no bfloat16
@@ -195,35 +195,3 @@ class _Encode(torch.autograd.Function):
     def backward(ctx: Any, *d_encodings: Tensor) -> tuple[Tensor | None, ...]:
         places = list(zip(ctx.saved_tensors, ctx.times, strict=True))
         return (None, None, None, *ctx.encoder.backward(places, d_encodings, ctx.encoded))
-
-
-def encode_reference(grid: HashGrid, table: Tensor, points: Tensor, time: float, bound: float) -> Tensor:
-    """The reference: (N, 2 x levels) in the table's precision; cells are found in float32, as on the device."""
-    columns = [(points[:, axis] + bound) / (2 * bound) if axis != TIME else None for axis in grid.axes]
-    unit = torch.stack([torch.full_like(points[:, 0], time) if c is None else c for c in columns], dim=1)
-    inside = ((unit >= 0) & (unit <= 1)).all(dim=1)
-    primes = (1, 2654435761, 805459861)
-    encodings = []
-    for level, rows in zip(grid.levels, table.split([level.entries for level in grid.levels]), strict=True):
-        p = torch.where(inside[:, None], unit * torch.tensor(level.scale, dtype=unit.dtype), 0.0)
-        low = p.floor()
-        fraction = (p - low).to(table.dtype)
-        up = fraction * fraction * (3 - 2 * fraction)
-        base = low.long()
-        total = table.new_zeros((len(points), 2))
-        for corner in range(8):
-            weight = inside.to(table.dtype)
-            at = []
-            for axis in range(3):
-                high = (corner >> axis) & 1
-                weight = weight * (up[:, axis] if high else 1 - up[:, axis])
-                at.append((base[:, axis] + high).clamp(max=level.resolution[axis] - 1))
-            x, y, z = at
-            if level.dense:
-                index = x + level.resolution[0] * (y + level.resolution[1] * z)
-            else:
-                hashed = [((a * prime) & 0xFFFFFFFF) for a, prime in zip(at, primes, strict=True)]
-                index = (hashed[0] ^ hashed[1] ^ hashed[2]) % level.entries
-            total = total + weight[:, None] * rows[index]
-        encodings.append(total)
-    return torch.cat(encodings, dim=1)

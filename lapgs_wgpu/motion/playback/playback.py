@@ -108,7 +108,6 @@ class DevicePlayback:
             self._field = GridFieldPlayback(device, file.field_config, file.field, activated, block=block)
 
     def at(self, t: float, seen_by: Camera | None = None) -> Gaussians[DeviceArray]:
-        """See Playback."""
         if self._field is None:
             return self._now
         old = self._times != t
@@ -137,15 +136,12 @@ class DevicePlayback:
         self._bounded = True
 
     def means(self, t: float) -> Floats:
-        """See Playback."""
         return self.at(t).means.read() if self.moves else self._stored["means"]
 
     def dynamics(self) -> Floats | None:
-        """See Playback."""
         return self._stored.get("dynamics")
 
     def still(self, t: float) -> GaussianSnapshot:
-        """See Playback."""
         now = self.at(t)
         means, quats, scales, opacities, colors = read_all([now.means, now.quats, now.scales, now.opacities, now.sh])
         logits = self._stored["opacity_logits"]

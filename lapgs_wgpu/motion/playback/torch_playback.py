@@ -56,21 +56,17 @@ class TorchPlayback:
 
     @property
     def count(self) -> int:
-        """See Playback."""
         return len(self.scene)
 
     @property
     def sh_degree(self) -> int:
-        """See Playback."""
         return self.scene.sh_degree
 
     @property
     def moves(self) -> bool:
-        """See Playback."""
         return self.scene.field is not None
 
     def at(self, t: float, seen_by: Camera | None = None) -> Gaussians[DeviceArray]:
-        """See Playback."""
         scene = self.scene
         if self._shown is None or not self._shown.is_of(scene, t):
             self._shown = None  # where it fails halfway, the buffers hold a mixture
@@ -81,15 +77,12 @@ class TorchPlayback:
         return self._shown.gaussians
 
     def means(self, t: float) -> NDArray[np.float32]:
-        """See Playback."""
         with torch.no_grad():
             return np.array(self.scene.at(t).means.numpy(force=True))
 
     def dynamics(self) -> NDArray[np.float32] | None:
-        """See Playback."""
         d = self.scene.parameters.get("dynamics")
         return None if d is None else np.array(d.numpy(force=True))
 
     def still(self, t: float) -> GaussianSnapshot:
-        """See Playback."""
         return self.scene.still(t)
