@@ -92,5 +92,5 @@ def parse_options(arguments: list[str]) -> dict[str, typing.Any]:
         word = unknown[0].split("=")[0]
         options = [name for action in parser._actions for name in action.option_strings]
         what = f"there is no option {word}" if word.startswith("-") else f"{word!r} is one word too many"
-        raise InputError(f"{what}{did_you_mean(word, options) or '; lapgs-train --help lists the options'}.")
+        raise InputError(f"{what}{did_you_mean(word, options, '; lapgs-train --help lists the options.')}")
     return vars(known)

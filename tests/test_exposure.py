@@ -14,7 +14,7 @@ import pytest
 import torch
 from helpers.image_losses import BACKGROUND, CAMERA, TRUTH, WEIGHTS, gaussians, gradients, step
 from helpers.interrupts import interrupt_at
-from helpers.loss_reference import total
+from helpers.loss_reference import exposure, total
 from helpers.scenes import relative
 from helpers.training import configure
 from numpy.typing import NDArray
@@ -28,7 +28,7 @@ from lapgs_wgpu.gpu.kernel import Commands
 from lapgs_wgpu.splat.rasterize import rasterize
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 from lapgs_wgpu.train.config import Rate
-from lapgs_wgpu.train.exposure import ExposurePasses, Exposures, exposure
+from lapgs_wgpu.train.exposure import ExposurePasses, Exposures
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
 from lapgs_wgpu.train.run import resume, train
 from lapgs_wgpu.train.trainer import Trainer

@@ -21,7 +21,7 @@ ALLOWED = {
     "gpu": {"errors"},
     "splat": {"errors", "gpu"},
     "motion": {"errors", "gpu", "splat", "io"},
-    "data": {"errors", "splat.camera", "io.safe_json_toml", "io.ply_points"},
+    "data": {"errors", "splat.camera", "io.safe_json_toml", "io.dataclass_table", "io.ply_points"},
     "io": {"errors", "splat.camera"},
     "train": {"errors", "progress", "gpu", "splat", "motion", "data", "io"},
     "command": {"errors", "gpu"},

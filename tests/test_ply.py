@@ -23,13 +23,14 @@ from helpers.ply_files import (
     mutate,
     ply_bytes,
     random_still,
+    read_ply,
 )
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.atomic import atomic_write
-from lapgs_wgpu.io.ply import GaussianSnapshot, read_ply, write_ply
+from lapgs_wgpu.io.ply import GaussianSnapshot, write_ply
 
 REAL_FILES = Path(__file__).parents[2] / "shared" / "data" / "ply"
 

@@ -8,13 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers.ply_files import read_ply
 from helpers.scene_files import CONFIG, DAMAGE, moving_scene, rewrite, with_grid
 from helpers.scenes import oblique_camera
 from torch import Tensor
 
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.io.ply import GaussianSnapshot, read_ply, write_ply
+from lapgs_wgpu.io.ply import GaussianSnapshot, write_ply
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.fields.hash_encoder import HashGrid
 from lapgs_wgpu.motion.scene import Scene4D, draw, load

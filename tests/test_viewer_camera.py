@@ -9,6 +9,7 @@ import pytest
 
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.viewer.camera import ViewCamera
+from lapgs_wgpu.viewer.path import Pose
 
 UP = np.array([0.0, 0.6, 0.8])
 
@@ -145,7 +146,7 @@ def test_any_move_leaves_the_exact_camera(view: ViewCamera, move: str) -> None:
 def test_standing_on_a_pose(view: ViewCamera) -> None:
     distance = view.distance
     wanted = captured()
-    view.stand(wanted.position, wanted.T_cam_world[:3, :3], 0.5)
+    view.stand(Pose(wanted.position, wanted.T_cam_world[:3, :3], 0.5))
     assert np.allclose(view.camera(60, 40).T_cam_world, wanted.T_cam_world)
     assert view.fov_y == 0.5
     assert view.distance == pytest.approx(distance)

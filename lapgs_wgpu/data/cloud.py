@@ -36,11 +36,7 @@ class Cloud(NamedTuple):
 
 def find_cloud(folder: Path, patterns: Sequence[str]) -> Path | None:
     """Find the last file by name of the first pattern that matches any."""
-    for pattern in patterns:
-        found = sorted(folder.glob(pattern))
-        if found:
-            return found[-1]
-    return None
+    return next((found[-1] for pattern in patterns if (found := sorted(folder.glob(pattern)))), None)
 
 
 def read_cloud(path: Path) -> Cloud:

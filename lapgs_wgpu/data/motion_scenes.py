@@ -11,14 +11,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lapgs_wgpu.data.raytrace import Floats, Hits, Solid, Vector, pixel_rays, plane_hits, rays_around, solid_hits
 from lapgs_wgpu.data.synthetic import camera_at, jumps
-from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.io.dataclass_table import Options, option
 from lapgs_wgpu.splat.camera import Camera
 
 CameraMotion = Literal["jump", "walk", "still"]
@@ -38,37 +38,33 @@ SHORTEST_OCCLUDED_PATH = 3  # leaves space for a column
 
 
 @dataclass(frozen=True)
-class MotionScene:
-    """What moves in a scene, and how it is seen.
+class MotionScene(Options):
+    """What moves in a scene, and how it is seen. Raises ValueError for a path or cycles out of range."""
 
-    path: width of each path in diameters of the object. cycles: how often each path is travelled over the clip.
-    camera: "jump" takes each image from elsewhere, as D-NeRF does; "walk" moves slowly around the scene, as a phone;
-    "still" is six cameras that stand still and see each time together.
-    background: "black" or "white" gives transparent images, to be trained and measured on that colour
-    (data.background); "room" a textured floor and two walls.
-    objects: "two" moving ones; "enter": the box drops into the scene at t = 0.4; "occluded": both circle a column.
-    """
-
-    path: float = 2.0
-    cycles: float = 2.0
-    camera: CameraMotion = "jump"
-    background: Backdrop = "black"
-    objects: ObjectSet = "two"
+    path: float = option("width of each path in diameters of the object", 2.0, above=0, at_most=20)
+    cycles: float = option("how often each path is travelled over the clip", 2.0, above=0, at_most=20)
+    camera: CameraMotion = option(
+        "jump: each image from elsewhere, as in D-NeRF; walk: a slow walk around the scene, as with a phone; still: "
+        "six cameras that stand still and see each time together",
+        "jump",
+    )
+    background: Backdrop = option(
+        "black, white: transparent images, for training and evaluation on that color (data.background); room: a "
+        "textured floor and two walls",
+        "black",
+    )
+    objects: ObjectSet = option(
+        "two: two moving objects; enter: the box drops into the scene at t = 0.4; occluded: both circle a column", "two"
+    )
 
     def __post_init__(self) -> None:
-        for name, most in (("path", 20), ("cycles", 20)):
-            value = float(getattr(self, name))
-            object.__setattr__(self, name, value)  # 4 and 4.0 are written alike
-            if not (math.isfinite(value) and 0 < value <= most):
-                raise InputError(f"a motion scene needs {name} above 0 and up to {most}, got {value:g}.")
-        for name, kind in (("camera", CameraMotion), ("background", Backdrop), ("objects", ObjectSet)):
-            if getattr(self, name) not in get_args(kind):
-                known = ", ".join(get_args(kind))
-                raise InputError(f"a motion scene needs {name} of {known}, got {getattr(self, name)!r}.")
+        super().__post_init__()
+        for name in ("path", "cycles"):
+            object.__setattr__(self, name, float(getattr(self, name)))  # 4 and 4.0 are written alike
         if self.objects == "occluded" and self.path < SHORTEST_OCCLUDED_PATH:
-            raise InputError(
-                f"a motion scene with objects=occluded needs a path of at least {SHORTEST_OCCLUDED_PATH}, which leaves "
-                f"space for the column, got {self.path:g}."
+            raise ValueError(
+                f"path must be at least {SHORTEST_OCCLUDED_PATH} with objects=occluded, which leaves space for the "
+                f"column, got {self.path:g}"
             )
 
 

@@ -7,6 +7,7 @@ import difflib
 import operator
 import typing
 from collections.abc import Iterable
+from contextlib import suppress
 from typing import Any, Literal, TypeVar
 
 from lapgs_wgpu.errors import InputError, shown
@@ -56,7 +57,8 @@ def build_dataclass(cls: type[T], table: Any, source: str, prefix: str = "", *, 
     types = field_types(cls)
     for key in table:
         if key not in types:
-            raise InputError(f"{source}: there is no key {prefix}{key}{did_you_mean(key, types)}.")
+            known = f"; known: {', '.join(types)}."
+            raise InputError(f"{source}: there is no key {prefix}{key}{did_you_mean(key, types, known)}")
     values: dict[str, Any] = {}
     for field in dataclasses.fields(cls):  # type: ignore[arg-type]
         name, kind = field.name, types[field.name]
@@ -85,8 +87,8 @@ def checked(kind: Any, value: Any, where: str, least: float = 0) -> Any:
     if origin is Literal:
         if value in parts:
             return value
-        hint = did_you_mean(value, parts) if isinstance(value, str) else ""
-        raise InputError(f"{where} must be {' or '.join(parts)}, got {shown(value)}{hint}.")
+        hint = did_you_mean(value, parts) if isinstance(value, str) else "."
+        raise InputError(f"{where} must be {' or '.join(parts)}, got {shown(value)}{hint}")
     if origin is tuple:
         if not isinstance(value, list | tuple) or len(value) != len(parts):
             raise InputError(f"{where} must be {len(parts)} numbers, got {shown(value)}.")
@@ -104,6 +106,18 @@ def checked(kind: Any, value: Any, where: str, least: float = 0) -> Any:
     return float(value) if kind is float else value
 
 
+def from_text(text: str | list[str], kind: Any) -> Any:
+    """Text as a value of this type; a list as a tuple's entries. Text that is no number stays as it is."""
+    if isinstance(text, list):
+        return [from_text(entry, part) for entry, part in zip(text, typing.get_args(kind), strict=True)]
+    if kind is bool:
+        return {"true": True, "false": False}.get(text, text)
+    if kind in (int, float):
+        with suppress(ValueError):
+            return kind(text)
+    return text
+
+
 _KIND_NAMES = {int: "a whole number", float: "a number", bool: "true or false", str: "a text"}
 
 
@@ -113,7 +127,7 @@ def field_types(cls: type) -> dict[str, Any]:
     return {field.name: hints[field.name] for field in dataclasses.fields(cls)}
 
 
-def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """ "; did you mean X?" for a name that is close to a known one, else nothing."""
+def did_you_mean(name: str, known: Iterable[str], otherwise: str = ".") -> str:
+    """The end of a sentence about an unknown name: "; did you mean X?" if a known one is close."""
     close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.6)
-    return f"; did you mean {close[0]}?" if close else ""
+    return f"; did you mean {close[0]}?" if close else otherwise

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.atomic import atomic_write
-from lapgs_wgpu.io.ply_header import Element, PathLike, open_ply
+from lapgs_wgpu.io.ply_header import Element, PathLike
 
 Floats = NDArray[np.float32]
 
@@ -66,16 +66,6 @@ def _names(rest: int) -> list[str]:
 _WRITTEN_NAMES = [*_names(0)[:3], "nx", "ny", "nz", *_names(45)[3:]]
 
 
-def read_ply(path: PathLike) -> GaussianSnapshot:
-    """The Gaussians of any 3DGS .ply: properties in any order, SH degree 0 to 3, further scalar properties skipped.
-
-    Raises InputError when the file is not such a file, is damaged, or holds a value that cannot be rendered. Needs
-    memory for about twice the Gaussians.
-    """
-    with open_ply(path) as (file, elements):
-        return read_vertices(file, elements, path)
-
-
 def write_ply(path: PathLike, still: GaussianSnapshot) -> None:
     """Write Gaussians with exactly the 62 properties of 3DGS, SH padded with zeros to degree 3. Atomic.
 
@@ -112,7 +102,11 @@ def vertex_rows(still: GaussianSnapshot, path: PathLike) -> Floats:
 
 
 def read_vertices(file: BinaryIO, elements: dict[str, Element], path: PathLike) -> GaussianSnapshot:
-    """The Gaussians of an opened file: see read_ply."""
+    """The Gaussians of an opened 3DGS .ply: properties in any order, SH degree 0 to 3, further scalar ones skipped.
+
+    Takes memory for about twice the Gaussians. Raises InputError when the file is not such a file, is damaged, or holds
+    a value that cannot be rendered.
+    """
     if "vertex" not in elements:
         raise InputError(f"{path}: has no element vertex, so it holds no Gaussians; give a 3DGS .ply file")
     vertex = elements["vertex"]

@@ -151,7 +151,11 @@ class Scene4D:
         depth: whether to draw it; without, its picture is zero, and a tenth of the time is saved.
         """
         with torch.no_grad():
-            return draw(self.at(t), camera, background, self.device, depth=depth)
+            now = self.at(t)
+            tensors = (now.means, now.quats, now.scales, now.opacities, now.sh)
+            return rasterize(
+                *tensors, camera, sh_degree=now.sh_degree, background=background, depth=depth, device=self.device
+            )
 
     def still(self, t: float) -> GaussianSnapshot:
         """The Gaussians at time t in [0, 1] before their activations, as 3DGS viewers read them."""
@@ -180,24 +184,6 @@ class Scene4D:
             tensors |= {f"field.{name}": value.numpy(force=True) for name, value in self.field.state_dict().items()}
         header = {"field": json.dumps(dataclasses.asdict(self.field_config)), "sh_degree": str(self.sh_degree)}
         write_checkpoint(path, arrays, tensors, {**self.metadata, **(metadata or {}), **header})
-
-
-def draw(
-    gaussians: Gaussians, camera: Camera, background: Tensor | None, device: Device, *, depth: bool = True
-) -> Rendering:
-    """Rasterise activated Gaussians; differentiable. depth: see `rasterize`."""
-    return rasterize(
-        gaussians.means,
-        gaussians.quats,
-        gaussians.scales,
-        gaussians.opacities,
-        gaussians.sh,
-        camera,
-        sh_degree=gaussians.sh_degree,
-        background=background,
-        depth=depth,
-        device=device,
-    )
 
 
 def load(path: str | os.PathLike[str], device: Device | None = None) -> Scene4D:

@@ -127,7 +127,7 @@ class _Rasterize(torch.autograd.Function):
         if not rasterizer.holds(ctx.drawing):  # another image was drawn in between
             ctx.drawing, _, _ = _draw(rasterizer, Gaussians(*tensors), background, ctx.camera, ctx.depth)
         planes = torch.cat([d_image.permute(2, 0, 1), d_alpha[None], *([d_depth[None]] if ctx.depth else [])])
-        gradients = rasterizer.backward(ctx.drawing, _upload(rasterizer.pool, "d_image", planes))
+        gradients = rasterizer.backward(ctx.drawing, upload(rasterizer.pool, "d_image", planes))
         by_gaussians, d_means2d = gradient_tensors(read_all(gradients.arrays()), background.device)
         return (*by_gaussians, d_background, d_means2d, *[None] * 3)
 
@@ -148,7 +148,7 @@ def _draw(
 def upload_gaussians(pool: BufferPool, gaussians: Gaussians[Tensor]) -> Gaussians[DeviceArray]:
     """The Gaussians in buffers of a pool."""
     names = [field.name for field in dataclasses.fields(gaussians)]
-    return Gaussians(*(_upload(pool, name, getattr(gaussians, name)) for name in names))
+    return Gaussians(*(upload(pool, name, getattr(gaussians, name)) for name in names))
 
 
 def radii_and_centres(splats: NDArray[np.float32], device: torch.device) -> tuple[Tensor, Tensor]:
@@ -165,5 +165,6 @@ def gradient_tensors(arrays: list[NDArray[np.float32]], device: torch.device) ->
     return (d_means, d_quats, d_scales, d_splats[:, OPACITY], d_colors), d_splats[:, MEAN]
 
 
-def _upload(pool: BufferPool, name: str, tensor: Tensor) -> DeviceArray:
+def upload(pool: BufferPool, name: str, tensor: Tensor) -> DeviceArray:
+    """A copy of a tensor, as float32, in the buffer `input NAME` of a pool."""
     return pool.upload(f"input {name}", tensor.detach().to("cpu", torch.float32).contiguous().numpy())

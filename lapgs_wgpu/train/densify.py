@@ -72,13 +72,10 @@ class Statistics:
 
 
 class Change(NamedTuple):
-    """keep: (N,) which Gaussians stay. added: rows (M, ...) to append. cloned, split, pruned: how many, for the log."""
+    """keep: (N,) bool, which Gaussians stay. added: rows (M, ...) to append."""
 
     keep: Tensor
     added: dict[str, Tensor]
-    cloned: int
-    split: int
-    pruned: int
 
 
 @torch.no_grad()
@@ -118,13 +115,7 @@ def densify(
     # A Gaussian that was just born has not been seen on any image.
     unseen = torch.zeros_like(born["opacity_logits"])
     stillborn = prunable(born, unseen, config, extent, bound_sizes=bound_sizes)
-    return Change(
-        keep=~(split | prune),
-        added={name: row[~stillborn] for name, row in born.items()},
-        cloned=int(clone.sum()),
-        split=int(split.sum()),
-        pruned=int((prune & ~split).sum()) + int(stillborn.sum()),
-    )
+    return Change(keep=~(split | prune), added={name: row[~stillborn] for name, row in born.items()})
 
 
 def split_rows(parents: Rows, generator: torch.Generator) -> dict[str, Tensor]:

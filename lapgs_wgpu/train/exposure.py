@@ -22,11 +22,6 @@ MEAN_DECAY, SQUARE_DECAY = 0.9, 0.999  # Adam's
 TINY = 1e-15  # keeps 0 / 0 away
 
 
-def exposure(image: Tensor, correction: Tensor) -> Tensor:
-    """The image (H, W, 3) after a correction (3, 4): the reference of the passes."""
-    return image @ correction[:, :3].mT + correction[:, 3]
-
-
 class Exposed(NamedTuple):
     """An image (4, H, W) whose gradient was carried back: d_image, by the rendered image's planes; and d_rows
     (H, 3, 4), whose sum is the gradient by the correction."""

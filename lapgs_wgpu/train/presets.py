@@ -8,13 +8,12 @@ from __future__ import annotations
 import dataclasses
 import importlib.resources
 import json
-import typing
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from lapgs_wgpu.errors import InputError, shown
-from lapgs_wgpu.io.dataclass_table import build_dataclass, checked, did_you_mean, field_types
+from lapgs_wgpu.io.dataclass_table import build_dataclass, checked, did_you_mean, field_types, from_text
 from lapgs_wgpu.io.safe_json_toml import read_toml
 from lapgs_wgpu.motion.fields.config import FieldKind
 from lapgs_wgpu.train.config import Config
@@ -61,8 +60,8 @@ def load_config(
     table: Table = {}
     for key, text in (overrides or {}).items():
         if key not in known:
-            raise InputError(f"there is no option --{key}{did_you_mean(key, known)}.")
-        _set(table, key, checked(known[key], _from_text(text, known[key]), f"--{key}"))
+            raise InputError(f"there is no option --{key}{did_you_mean(key, known)}")
+        _set(table, key, checked(known[key], from_text(text, known[key]), f"--{key}"))
     return build_config(preset, table, preset, method=method, ablate=ablate)
 
 
@@ -88,7 +87,7 @@ def _shorthands(method: str | None, ablate: Iterable[str]) -> dict[str, Any]:
     for part in ablate:
         if part not in ABLATIONS:
             hint = did_you_mean(part, ABLATIONS)
-            raise InputError(f"--ablate knows {', '.join(ABLATIONS)}, not {shown(part)}{hint}.")
+            raise InputError(f"--ablate knows {', '.join(ABLATIONS)}, not {shown(part)}{hint}")
         _, key, value = ABLATIONS[part]
         values[key] = value
     return values
@@ -130,7 +129,7 @@ def _read(preset: str, seen: tuple[str, ...] = ()) -> Table:
         file = Path(str(importlib.resources.files("lapgs_wgpu.configs") / f"{preset}.toml"))
     else:
         names = preset_names()
-        hint = did_you_mean(preset, names) or f"; there are {', '.join(names)}, or give a .toml file."
+        hint = did_you_mean(preset, names, f"; there are {', '.join(names)}, or give a .toml file.")
         raise InputError(f"there is no preset {preset!r}{hint}")
     table = read_toml(file)
     table.pop("record", None)  # what a run noted about itself
@@ -157,20 +156,6 @@ def _set(table: Table, key: str, value: Any) -> None:
         inner = table.get(part)
         table[part] = table = dict(inner) if isinstance(inner, dict) else {}
     table[name] = value
-
-
-def _from_text(text: str | list[str], kind: Any) -> Any:
-    """Words of the command line as a value of this type; what is no number stays text, for `checked` to refuse."""
-    if isinstance(text, list):
-        return [_from_text(entry, part) for entry, part in zip(text, typing.get_args(kind), strict=True)]
-    if kind is bool:
-        return {"true": True, "false": False}.get(text, text)
-    if kind in (int, float):
-        try:
-            return kind(text)
-        except ValueError:
-            return text
-    return text
 
 
 def _toml_lines(table: Mapping[str, Any], prefix: str) -> Iterator[str]:

@@ -18,6 +18,11 @@ NCC_E, NCC_TINY = CONSTANTS["NCC_E"], CONSTANTS["NCC_TINY"]
 LUMINANCE = (0.299, 0.587, 0.114)  # Rec. 601, which is meant for gamma-encoded images such as ours
 
 
+def exposure(image: Tensor, correction: Tensor) -> Tensor:
+    """The image (H, W, 3) after a correction (3, 4)."""
+    return image @ correction[:, :3].mT + correction[:, 3]
+
+
 def total(image: Tensor, target: Tensor, weights: LossWeights) -> Tensor:
     """The weighted sum of all image losses, a scalar; with l1 0.8 and ssim 0.2 that of 3DGS (Kerbl et al. 2023)."""
     loss = weights.l1 * l1(image, target)

@@ -16,6 +16,7 @@ from ...gpu.array import DeviceArray, read_all
 from ...gpu.device import Device
 from ...gpu.kernel import Commands, Kernel
 from ...gpu.pool import BufferPool
+from ...splat.rasterize import upload
 from ..passes.decoder_passes import DecoderPasses, DecoderShape
 from .hash_encoder import Encoded, HashEncoder, Place
 
@@ -64,10 +65,12 @@ class Decoder:
     ) -> _Written:
         """Bring all that the forward pass reads to the device."""
         encoded = self.encoder.write(places, tables)
-        arrays = {"beside": self._upload("beside", beside)}
+        arrays = {"beside": upload(self._pool, "beside", beside)}
         inputs = dict(zip(self.shape.inputs, [arrays["beside"], *encoded.encodings[0]], strict=True))
         named = zip(self.shape.weights, weights, strict=True)
-        return _Written(encoded, inputs, {name: self._upload(f"weights {name}", weight) for name, weight in named})
+        return _Written(
+            encoded, inputs, {name: upload(self._pool, f"weights {name}", weight) for name, weight in named}
+        )
 
     def record(self, commands: Commands, written: _Written) -> list[DeviceArray]:
         """The forward pass: the outputs and, for each group of grids, the sums of each pair."""
@@ -114,9 +117,6 @@ class Decoder:
         content = kernel.uniform("Smoothness", pairs=pairs, features=self.encoder.features[group], scale=scale)
         return self._pool.constant(f"smoothness {group} {'back' if scale else 'forth'}", content)
 
-    def _upload(self, name: str, tensor: Tensor) -> DeviceArray:
-        return self._pool.upload(name, tensor.detach().to("cpu", torch.float32).contiguous().numpy())
-
 
 class _Written(NamedTuple):
     """What a forward pass reads: its encodings, and the decoder's inputs and weights by the names of DecoderShape."""
@@ -156,7 +156,7 @@ class _Decode(torch.autograd.Function):
         lost = not decoder.encoder.holds(ctx.written.encoded)  # something else was encoded in between
         if lost:
             ctx.written = decoder.write(places, beside, tensors[: ctx.count], tensors[ctx.count :])
-        upstream = decoder._upload("d outputs", d_outputs)
+        upstream = upload(decoder._pool, "d outputs", d_outputs)
         with Commands(decoder._device) as commands:
             if lost:
                 decoder.record(commands, ctx.written)
