@@ -122,7 +122,7 @@ def test_without_a_gradient_no_backward_pass_runs(device: Device, monkeypatch: p
 # The corrections
 
 
-def test_corrections_move_against_their_gradient_and_leave_the_scene_its_colours() -> None:
+def test_corrections_move_against_their_gradient_and_leave_the_scene_its_colors() -> None:
     exposures = Exposures(4, RATE)
     exposures.step(1)  # without a gradient
     assert torch.equal(exposures.values, IDENTITY.expand(4, 3, 4))
@@ -193,8 +193,8 @@ def flickering(dataset: Dataset) -> Dataset:
     offsets = np.stack([rng.permutation(np.linspace(-0.1, 0.1, count)) for _ in range(3)], axis=1)
 
     def pixels(view: View, gain: NDArray[np.float64], offset: NDArray[np.float64]) -> NDArray[np.uint8]:
-        colours = 0.2 + 0.5 * composite(view.load(), np.zeros(3)) / 255
-        return (255 * (gain * colours + offset)).clip(0, 255).round().astype(np.uint8)
+        colors = 0.2 + 0.5 * composite(view.load(), np.zeros(3)) / 255
+        return (255 * (gain * colors + offset)).clip(0, 255).round().astype(np.uint8)
 
     def changed(views: tuple[View, ...], gains: NDArray[np.float64], offsets: NDArray[np.float64]) -> tuple[View, ...]:
         return tuple(

@@ -67,7 +67,7 @@ def expected(scene: Scene4D, t: float) -> dict[str, Tensor]:
 
 
 def device_field(scene: Scene4D, block: int | None = None) -> tuple[GridFieldPlayback, Gaussians[DeviceArray]]:
-    """The scene's field without torch, and buffers for what it moves: colours as they are, rubbish elsewhere."""
+    """The scene's field without torch, and buffers for what it moves: colors as they are, rubbish elsewhere."""
     assert scene.field is not None
     parameters = {name: value.numpy(force=True) for name, value in scene.field.state_dict().items()}
     stored = {name: value.numpy(force=True) for name, value in scene.parameters.items()}
@@ -110,7 +110,7 @@ def test_no_gaussians(device: Device) -> None:
 
 
 def test_only_what_changes_is_written(device: Device) -> None:
-    """The colours above their constant part stand in the buffer that is drawn, and stay."""
+    """The colors above their constant part stand in the buffer that is drawn, and stay."""
     scene = trained(device, replace(OURS, appearance="none"), 50)
     field, out = device_field(scene)
     before = out.sh.read()

@@ -63,7 +63,7 @@ def lines_of(axes: Any) -> list[list[float]]:
 
 
 def is_a_picture(file: Path) -> bool:
-    """Readable, large enough, and not of one colour."""
+    """Readable, large enough, and not of one color."""
     with Image.open(file) as image:
         return image.width >= 600 and image.height >= 300 and np.asarray(image.convert("L")).std() > 5
 

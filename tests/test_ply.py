@@ -109,7 +109,7 @@ def with_value(name: str, value: float, rows: tuple[int, ...] = (2,)) -> bytes:
     return ply_bytes(columns)
 
 
-ROW = 4 * 23  # x y z, 3 + 9 colours, opacity, 3 scales, 4 of rotation
+ROW = 4 * 23  # x y z, 3 + 9 colors, opacity, 3 scales, 4 of rotation
 BAD = {
     "empty": (b"", ["empty", "0 bytes"]),
     "not a PLY": (b"\x89PNG\r\n\x1a\n" + bytes(100), ["begins with", "PNG"]),

@@ -83,7 +83,7 @@ def test_an_invisible_gaussian_disturbs_nobody(device: Device, name: str) -> Non
 
 
 @pytest.mark.parametrize("sh_degree", [None, 1])
-def test_bad_colours_of_invisible_gaussians_do_no_harm(device: Device, sh_degree: int | None) -> None:
+def test_bad_colors_of_invisible_gaussians_do_no_harm(device: Device, sh_degree: int | None) -> None:
     good = in_front(40, 2, sh=sh_degree and 4)
     rows = torch.arange(40) % 7 == 3
     for value in (NAN, INF):

@@ -377,13 +377,13 @@ def test_pictures_lie_on_their_background(background: str, dataset: Dataset, dev
     """On a fixed background they lie before they are uploaded, on a random one in the loss's first pass."""
     generator = torch.Generator().manual_seed(3)
     with closing(Pictures(dataset.train, background, 1.0, generator, device)) as pictures:  # type: ignore[arg-type]
-        drawn = [(view, pictures.on_device(view), colour) for view, colour in (pictures.choose() for _ in range(4))]
-    for view, truth, colour in drawn:
+        drawn = [(view, pictures.on_device(view), color) for view, color in (pictures.choose() for _ in range(4))]
+    for view, truth, color in drawn:
         picture = truth.read().view(np.uint8).reshape(32, 32, 4)
         if background == "random":
             assert (picture == view.load()).all()
         else:
-            assert colour.tolist() == [float(background == "white")] * 3
+            assert color.tolist() == [float(background == "white")] * 3
             assert (picture[..., 3] == 255).all()
             assert (picture[0, 0, :3] == 255 * int(background == "white")).all()
     if background == "random":

@@ -104,8 +104,8 @@ def _write_image(folder: Path, name: str, scene: MotionScene, camera: Camera, ti
     count = camera.width * camera.height * SAMPLES**2
 
     def image(hits: list[Hits]) -> bytes:
-        colour, owner = combine(hits, count)
-        return encode_png(to_pixels(colour, owner >= 0, camera))
+        color, owner = combine(hits, count)
+        return encode_png(to_pixels(color, owner >= 0, camera))
 
     (folder / f"{name}.png").write_bytes(image(surfaces))
     if not truth:

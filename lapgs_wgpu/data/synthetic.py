@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from lapgs_wgpu.data.dnerf_writer import already_holds, frame_name, new_folder, split_times, write_transforms
 from lapgs_wgpu.data.images import encode_png
 from lapgs_wgpu.data.raytrace import (
-    Colour,
+    Color,
     Floats,
     Solid,
     Vector,
@@ -48,7 +48,7 @@ class Toy:
     """A moving thing. Its centre is at `centre + cosine cos(2 pi f t) + sine sin(2 pi f t)`.
 
     radius: of the ball; half the edge of the box. turns: whether it also turns about z, f turns over the clip.
-    colours: the two between which its pattern alternates. All in world units, RGB in [0, 1].
+    colors: the two between which its pattern alternates. All in world units, RGB in [0, 1].
     """
 
     name: str
@@ -57,12 +57,12 @@ class Toy:
     centre: Vector
     cosine: Vector
     sine: Vector
-    colours: tuple[Colour, Colour]
+    colors: tuple[Color, Color]
     turns: bool = False
 
     @property
     def solid(self) -> Solid:
-        return Solid(self.shape, (self.radius,) * 3, self.colours)
+        return Solid(self.shape, (self.radius,) * 3, self.colors)
 
 
 # Each moves by about its own radius, so that the mean over time still shows it: a model that first fits a still scene
@@ -99,8 +99,8 @@ def render(camera: Camera, time: float, frequencies: Sequence[float] = FREQUENCI
         angle = 2 * np.pi * f * time if toy.turns else 0.0
         surfaces.append(solid_hits(toy.solid, centres[toy.name][0], camera.position, rays, angle=angle))
     surfaces.append(plane_hits(2, TABLE_HEIGHT, 1, _table, camera.position, rays))
-    colour, owner = combine(surfaces, rays.shape[1])
-    return to_pixels(colour, owner >= 0, camera)
+    color, owner = combine(surfaces, rays.shape[1])
+    return to_pixels(color, owner >= 0, camera)
 
 
 def _table(x: Floats, y: Floats) -> tuple[NDArray[np.bool_], Floats]:

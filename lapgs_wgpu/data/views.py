@@ -143,7 +143,7 @@ def focus_of(cameras: Sequence[Camera]) -> NDArray[np.float64]:
 
 
 def composite(image: NDArray[np.uint8], background: ArrayLike) -> NDArray[np.uint8]:
-    """Lay straight RGBA over a background colour, rounded to the nearest 8-bit value (truncating would darken by 0.5).
+    """Lay straight RGBA over a background color, rounded to the nearest 8-bit value (truncating would darken by 0.5).
 
     image: (H, W, 4) uint8, or (H, W, 3), which has no transparency and is returned as it is.
     background: (3,) in [0, 1]. Returns (H, W, 3) uint8.

@@ -114,7 +114,7 @@ def read_vertices(file: BinaryIO, elements: dict[str, Element], path: PathLike) 
     names = _names(rest)
     values = read_columns(file, vertex, names, path)
     _check_values(values, names, f"{path}:")
-    end = 6 + rest  # of the colours
+    end = 6 + rest  # of the colors
     sh = np.empty((len(values), 1 + rest // 3, 3), np.float32)
     sh[:, 0] = values[:, 3:6]
     for channel in range(3):  # channel-major: all of red, then green, then blue

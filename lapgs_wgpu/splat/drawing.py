@@ -67,7 +67,7 @@ class Drawing:
 
 class GaussianGradients(NamedTuple):
     """Gradients by the projected splats (N, SPLAT_FLOATS), see splat_layout, by means (N, 3), quats (N, 4), scales
-    (N, 3) and sh (N, K, 3), which is None where the Gaussians have colours: these are the splats'."""
+    (N, 3) and sh (N, K, 3), which is None where the Gaussians have colors: these are the splats'."""
 
     splats: DeviceArray
     means: DeviceArray

@@ -14,7 +14,7 @@ class Gaussians(Generic[Array]):
 
     means: (N, 3) world units. quats: (N, 4) wxyz, any non-zero length. scales: (N, 3) standard deviations, world units.
     opacities: (N,) in [0, 1]. sh: (N, K, 3) spherical harmonics, K = (degree + 1)^2 coefficients, degree 0 to 3; or
-    colours (N, 3), which do not depend on the view.
+    colors (N, 3), which do not depend on the view.
     """
 
     means: Array
@@ -28,7 +28,7 @@ class Gaussians(Generic[Array]):
 
     @property
     def sh_degree(self) -> int | None:
-        """Degree of the harmonics; None where `sh` holds colours."""
+        """Degree of the harmonics; None where `sh` holds colors."""
         shape = _shape(self.sh)
         return None if len(shape) == 2 else int(shape[1] ** 0.5) - 1
 

@@ -225,7 +225,7 @@ class Rasterizer:
             commands.dispatch(kernel, _groups(colors.shape[0]), frame=frame, part=part, **arrays)
 
     def _color_parts(self, kernel: Kernel, colors: DeviceArray) -> list[tuple[DeviceArray, DeviceArray]]:
-        """The kernel's uniform and rows of the colours, for ranges of Gaussians whose rows fit into one binding."""
+        """The kernel's uniform and rows of the colors, for ranges of Gaussians whose rows fit into one binding."""
         count = colors.shape[0]
         most = self.device.max_binding // (4 * math.prod(colors.shape[1:])) // 64 * 64  # parts begin at 256 bytes
         parts = []

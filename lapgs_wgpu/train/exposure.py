@@ -1,6 +1,6 @@
-"""Exposure: an affine correction of the colours for each training picture of a camera that does not keep its own.
+"""Exposure: an affine correction of the colors for each training picture of a camera that does not keep its own.
 
-A correction is a matrix (3, 4): corrected colour = its first three columns times the colour, plus its last one. It is
+A correction is a matrix (3, 4): corrected color = its first three columns times the color, plus its last one. It is
 applied to the rendered image before the losses, and never to a view that is measured.
 """
 
@@ -64,7 +64,7 @@ class ExposurePasses:
 class Exposures:
     """The corrections of all training pictures, (V, 3, 4), the identity at first, and how they learn.
 
-    Adam, but a picture's moments and step count stand still while other pictures are trained on. Colours that all
+    Adam, but a picture's moments and step count stand still while other pictures are trained on. Colors that all
     corrections share belong to the scene, which is measured without any: the mean of all stays the identity.
     """
 

@@ -54,7 +54,7 @@ def render_loss(
 
     gaussians: activated, float32, with harmonics. truth: (H, W) as `upload_rgba` leaves it, of the camera's size.
     background: (3,) in [0, 1], under both; not differentiable. weights: of the terms. correction: (3, 4), of the
-    image's colours before they are compared (train/exposure); none where None.
+    image's colors before they are compared (train/exposure); none where None.
     The same bits on every run of one adapter and driver. Under torch.no_grad(), or where no tensor wants a gradient,
     none is computed.
     """

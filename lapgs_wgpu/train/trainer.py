@@ -316,14 +316,14 @@ class Trainer:
 def initial_points(
     config: PointsConfig, dataset: Dataset, seed: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """The first Gaussians (data/init): points (N, 3), colours (N, 3) and scales (N,)."""
-    points, colours = first_points(dataset, config.count, config.box, seed)
+    """The first Gaussians (data/init): points (N, 3), colors (N, 3) and scales (N,)."""
+    points, colors = first_points(dataset, config.count, config.box, seed)
     scales = initial_scales(points)
     # Published figures of D-NeRF start from a fog, which the empty background there soon lifts.
     if dataset.cloud is not None or dataset.depths is not None:
         scales = limit_optical_depth(points, scales, config.opacity, dataset.cameras)
     order = morton_order(torch.from_numpy(points)).numpy()
-    return points[order], colours[order], scales[order]
+    return points[order], colors[order], scales[order]
 
 
 def draw_nearby(config: SmoothnessConfig, count: int, t: float, generator: torch.Generator) -> Nearby | None:

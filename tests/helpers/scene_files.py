@@ -79,7 +79,7 @@ DAMAGE: dict[str, tuple[Callable[[dict[str, Any], dict[str, str]], object], str]
     "degree in words": (lambda _, m: m.update(sh_degree="three"), "description of its field"),
     "degree 4": (lambda _, m: m.update(sh_degree="4"), "sh_degree 4 is outside 0 to 3"),
     "unknown kind": (with_field(kind="quantum"), "kind must be static or .*, got 'quantum'"),
-    "unknown key": (with_field(colour="red"), "description of its field"),
+    "unknown key": (with_field(color="red"), "description of its field"),
     "a grid missing": (with_field(static=None), "description of its field"),
     "width 0": (with_field(width=0), "width must be at least 1 and at most 4096, got 0"),
     "absurd width": (with_field(width=10**9), "width must be at least 1 and at most 4096"),

@@ -30,7 +30,7 @@ def oblique_camera(width: int, height: int) -> Camera:
 def random_scene(count: int, seed: int, *, sh: int | None = None, size: float = 0.05, spread: float = 0.8) -> Scene:
     """Gaussians around the origin, every tenth far away (beside the image, or behind the oblique camera).
 
-    sh: coefficients of spherical harmonics a channel; plain colours where None.
+    sh: coefficients of spherical harmonics a channel; plain colors where None.
     """
     generator = torch.Generator().manual_seed(seed)
 

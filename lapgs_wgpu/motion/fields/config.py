@@ -23,8 +23,8 @@ HEXPLANE_HEADS = (3, 4, 3)  # outputs of the field hexplane's heads: shift, quat
 # Of the field mlp: octaves of its inputs; features of the time; layers, before the one of which the inputs come in once
 # more; outputs: shift, quaternion, scale.
 PLACE_OCTAVES, TIME_OCTAVES, TIME_FEATURES, MLP_LAYERS, MLP_SKIP, MLP_OUTPUTS = 10, 6, 30, 8, 4, (3, 4, 3)
-# Times the appearance head's outputs: it then learns about as fast as the colours themselves; at full speed it explains
-# what is motion by changes of colour.
+# Times the appearance head's outputs: it then learns about as fast as the colors themselves; at full speed it explains
+# what is motion by changes of color.
 APPEARANCE_SCALE = 0.1
 
 

@@ -28,7 +28,7 @@ class Deformation(NamedTuple):
     """What is done to N Gaussians at a time.
 
     Means are turned by `rotation` (N, 4) wxyz of unit length about the origin and shifted by `translation` (N, 3);
-    d_quats (N, 4) and d_scales (N, 3) are added to unit quaternions and to scales, d_dc (N, 3) to the colours' constant
+    d_quats (N, 4) and d_scales (N, 3) are added to unit quaternions and to scales, d_dc (N, 3) to the colors' constant
     part and d_opacity (N,) to the opacities' logits, None where the field leaves them as they are.
     smoothness: a scalar, the weighted loss that keeps the field smooth; None where it was not asked for.
     """

@@ -180,8 +180,8 @@ class GridFieldPlayback:
     # A time ----------------------------------------------------------------------------------------------------------
 
     def move(self, t: float, out: Gaussians[DeviceArray], rows: NDArray[np.integer] | None = None) -> None:
-        """Submit the passes that write the Gaussians at a time in [0, 1]: all of `out` but the colours above their
-        constant part, which stay, and the constant part, too, where the field changes no colours.
+        """Submit the passes that write the Gaussians at a time in [0, 1]: all of `out` but the colors above their
+        constant part, which stay, and the constant part, too, where the field changes no colors.
 
         rows: (M,) ascending, the Gaussians to be moved, None for all; the others stay as they are in `out`.
         """

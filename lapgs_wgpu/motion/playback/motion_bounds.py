@@ -17,7 +17,7 @@ Floats = NDArray[np.float32]
 
 _FEW = 8  # parts of the clip that must have been seen before any Gaussian is taken to stand still
 _STILL_PIXELS = 0.25  # it does where what lies a standard deviation from its mean, on the steepest slope, moves less
-_STILL_SHADE = 1 / 64  # and its opacity and colours, of range 1, change less
+_STILL_SHADE = 1 / 64  # and its opacity and colors, of range 1, change less
 _BEYOND = 1.5  # times the box of the means: between the times seen a path may leave it
 _RIM = math.sqrt(-2 * math.log(CONSTANTS["ALPHA_MIN"]))  # standard deviations to where even an opaque Gaussian ends
 _DILATED = _RIM * math.sqrt(CONSTANTS["DILATION"])  # pixels that the low-pass adds to a rim, at most
@@ -36,7 +36,7 @@ class MotionBounds:
         self._high = -self._low
 
     def add(self, values: Floats, t: float | None) -> None:
-        """Widen the boxes by values (count, 14): mean, quaternion, scales, opacity, constant part of the colour.
+        """Widen the boxes by values (count, 14): mean, quaternion, scales, opacity, constant part of the color.
 
         t: the time in [0, 1] of all of them; None where they are of several times.
         """

@@ -72,7 +72,7 @@ def playback_of(file: SceneFile, device: Device) -> Playback:
     """Show a file that was read.
 
     torch is imported for the fields mlp and hexplane, for hidden layers, and for the ablated motion alone.
-    Raises MemoryError where a buffer of all Gaussians is beyond the device's limits: colours are the largest,
+    Raises MemoryError where a buffer of all Gaussians is beyond the device's limits: colors are the largest,
     1.4 million Gaussians of degree 3 at WebGPU's default limits.
     """
     if file.field_config.kind == "static" or runs_on_device(file.field_config, device):
