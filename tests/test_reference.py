@@ -244,9 +244,7 @@ def literal(scene: Scene, camera: Camera, background: np.ndarray) -> tuple[np.nd
         tx, ty = z * min(max(x / z, u_min), u_max), z * min(max(y / z, v_min), v_max)
         J = np.array([[fx / z, 0, -fx * tx / z**2], [0, fy / z, -fy * ty / z**2]])
         cov = J @ W @ R @ np.diag(np.square(scale)) @ R.T @ W.T @ J.T + 0.3 * np.eye(2)
-        gaussians.append(
-            (z, np.array([fx * x / z + cx, fy * y / z + cy]), np.linalg.inv(cov), opacity, np.array(rgb))
-        )
+        gaussians.append((z, np.array([fx * x / z + cx, fy * y / z + cy]), np.linalg.inv(cov), opacity, np.array(rgb)))
     gaussians.sort(key=lambda gaussian: gaussian[0])
     for row in range(camera.height):
         for column in range(camera.width):
