@@ -21,7 +21,6 @@ from .viewport import Viewport
 
 _FIXED = imgui.WindowFlags_.no_move | imgui.WindowFlags_.no_resize | imgui.WindowFlags_.no_saved_settings
 _BAR = _FIXED | imgui.WindowFlags_.no_title_bar | imgui.WindowFlags_.no_scrollbar
-_TEXT = _BAR | imgui.WindowFlags_.no_inputs | imgui.WindowFlags_.always_auto_resize | imgui.WindowFlags_.no_nav
 _GAP = 8.0
 _BAR_HEIGHT = 62.0  # of the time slider
 _SIDE = 230.0  # width of the panel at the left

@@ -7,7 +7,6 @@ frame to frame.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,8 +16,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lapgs_wgpu.data.dnerf_writer import already_holds, frame_name, new_folder, split_times, write_transforms
-from lapgs_wgpu.data.images import encode_png
+from lapgs_wgpu.data.dnerf_writer import split_times, write_image, write_scene
 from lapgs_wgpu.data.raytrace import (
     Color,
     Floats,
@@ -161,7 +159,6 @@ def write_synthetic(
         )
     if not 1 <= len(frequencies) <= len(TOYS) or not all(math.isfinite(f) and f >= 0 for f in frequencies):
         raise InputError(f"the built-in scene needs 1 to {len(TOYS)} frequencies from 0 up, got {list(frequencies)}.")
-    folder = Path(folder)
     parameters = {
         "version": VERSION,
         "size": size,
@@ -170,17 +167,13 @@ def write_synthetic(
         "seed": seed,
         "frequencies": [float(f) for f in frequencies],
     }
-    if already_holds(folder, RECORD, parameters):
-        return folder
-
     train, test = split_times(train_views, test_views)
-    with new_folder(folder) as unfinished:
-        for index, (split, times) in enumerate((("train", train), ("val", test), ("test", test))):
-            (unfinished / split).mkdir()
-            taken = cameras(len(times), 3 * seed + index, size=size)
-            for i, (camera, time) in enumerate(zip(taken, times, strict=True)):
-                image = encode_png(render(camera, time, frequencies))
-                (unfinished / f"{frame_name(split, i)}.png").write_bytes(image)
-            write_transforms(unfinished, split, taken, times, CAMERA_ANGLE_X)
-        (unfinished / RECORD).write_text(json.dumps(parameters, indent=1) + "\n")
-    return folder
+    splits = {
+        split: (cameras(len(times), 3 * seed + index, size=size), times)
+        for index, (split, times) in enumerate((("train", train), ("val", test), ("test", test)))
+    }
+
+    def write_frame(unfinished: Path, split: str, name: str, camera: Camera, time: float) -> None:
+        write_image(unfinished / split / f"{name}.png", render(camera, time, frequencies))
+
+    return write_scene(Path(folder), RECORD, parameters, splits, CAMERA_ANGLE_X, write_frame)

@@ -161,7 +161,8 @@ def composite(image: NDArray[np.uint8], background: ArrayLike) -> NDArray[np.uin
 class ImageCache:
     """Decoded views, the most recently used first to stay, within a bound in bytes. Safe to use from many threads.
 
-    max_bytes: bound on the pixels that are kept; a picture larger than this is handed out and not kept.
+    max_bytes: bound on the pixels that are kept; an image larger than this is returned and not kept.
+    used_bytes: of the pixels kept at present.
     workers: threads that decode what `prefetch` names. Each can hold one picture beyond the bound while it decodes.
     """
 
@@ -169,13 +170,8 @@ class ImageCache:
         self.max_bytes = max_bytes
         self._lock = Lock()
         self._entries: OrderedDict[View, Future[NDArray[np.uint8]]] = OrderedDict()
-        self._bytes = 0
+        self.used_bytes = 0
         self._pool = ThreadPoolExecutor(workers, thread_name_prefix="decode")
-
-    @property
-    def used_bytes(self) -> int:
-        """Bytes of pixels kept at present."""
-        return self._bytes
 
     def get(self, view: View) -> NDArray[np.uint8]:
         """The view's pixels as `View.load` gives them. A view asked for by several threads is decoded once."""
@@ -196,7 +192,7 @@ class ImageCache:
             raise
         mine.set_result(image)
         with self._lock:
-            self._bytes += image.nbytes
+            self.used_bytes += image.nbytes
             self._evict()
         return image
 
@@ -211,8 +207,8 @@ class ImageCache:
 
     def _evict(self) -> None:
         for view, entry in list(self._entries.items()):
-            if self._bytes <= self.max_bytes:
+            if self.used_bytes <= self.max_bytes:
                 return
             if entry.done():
-                self._bytes -= entry.result().nbytes
+                self.used_bytes -= entry.result().nbytes
                 del self._entries[view]

@@ -60,13 +60,14 @@ class Kernel:
 
     @staticmethod
     def get(device: Device, name: str, **defines: int) -> Kernel:
-        """The kernel of this name and defines; compiled once a device."""
+        """The kernel with these defines, compiled once per device. False stands for a define that is absent."""
+        defines = {define: int(value) for define, value in defines.items() if value is not False}
         if device.textures:
             defines["TEXTURES"] = 1
         key = (name, tuple(sorted(defines.items())))
-        kernel = device.kernel_cache.get(key)
-        if kernel is None:
-            kernel = device.kernel_cache[key] = Kernel(device, name, defines)
+        if key not in device.kernel_cache:
+            device.kernel_cache[key] = Kernel(device, name, defines)
+        kernel: Kernel = device.kernel_cache[key]
         return kernel
 
     def uniform(self, struct_name: str, **values: object) -> bytes:

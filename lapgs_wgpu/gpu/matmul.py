@@ -50,7 +50,7 @@ class Matmul:
 
     def __call__(self, commands: Commands, name: str, a: Matrix, b: Matrix, c: Matrix, *, add: bool = False) -> None:
         """c = a b, or c += a b; c is not transposed, and neither a nor b."""
-        self._dispatch(commands, name, a, b, c, a.columns, {"ADD": 1} if add else {})
+        self._dispatch(commands, name, a, b, c, a.columns, add=add)
 
     def long(
         self, commands: Commands, name: str, a: Matrix, b: Matrix, total: DeviceArray, *, add: bool = False
@@ -59,16 +59,15 @@ class Matmul:
         into sums of thousands of elements, so that they are accurate."""
         size, count = a.rows * b.columns, -(-a.columns // _SPLIT)
         parts = self._pool.array("parts", (count, a.rows, b.columns))
-        self._dispatch(commands, name, a, b, Matrix(parts, a.rows, b.columns, b.columns), _SPLIT, {})
-        kernel = Kernel.get(self._device, "matmul_sum", **({"ADD": 1} if add else {}))
+        self._dispatch(commands, name, a, b, Matrix(parts, a.rows, b.columns, b.columns), _SPLIT)
+        kernel = Kernel.get(self._device, "matmul_sum", ADD=add)
         uniform = self._pool.constant(f"sum {name}", kernel.uniform("Sum", count=size, parts=count))
         commands.dispatch(kernel, -(-size // 64), sum=uniform, parts=parts, total=total)
 
     def _dispatch(
-        self, commands: Commands, name: str, a: Matrix, b: Matrix, c: Matrix, split: int, options: dict[str, int]
+        self, commands: Commands, name: str, a: Matrix, b: Matrix, c: Matrix, split: int, *, add: bool = False
     ) -> None:
-        ways = {"A_INNER": not a.transposed, "B_INNER": b.transposed}
-        kernel = Kernel.get(self._device, "matmul", **options, **{way: 1 for way, on in ways.items() if on})
+        kernel = Kernel.get(self._device, "matmul", ADD=add, A_INNER=not a.transposed, B_INNER=b.transposed)
         content = kernel.uniform(
             "Matmul",
             rows=c.rows,

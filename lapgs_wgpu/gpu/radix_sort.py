@@ -56,9 +56,8 @@ class RadixSort:
         second_payload = payload
         if second_payload is None:
             second_payload = self._pool.array(f"{self._name} second payload", (capacity,), "uint32")
-        shape = {"LANE_RUNS": 1} if self._lane_runs else {}
         groups = owners // 8 if self._lane_runs else owners
-        count_kernel = Kernel.get(self._device, "sort_count", **shape)
+        count_kernel = Kernel.get(self._device, "sort_count", LANE_RUNS=self._lane_runs)
         for step in range(passes):
             uniform = self._pool.constant(
                 f"{self._name} pass {step}",
@@ -83,7 +82,7 @@ class RadixSort:
             iota = step == 0 and payload is None
             source = {} if iota else {"payload": second_payload}
             commands.dispatch(
-                Kernel.get(self._device, "sort_scatter", **shape, **({"IOTA": 1} if iota else {})),
+                Kernel.get(self._device, "sort_scatter", LANE_RUNS=self._lane_runs, IOTA=iota),
                 groups,
                 sort=uniform,
                 length=length,

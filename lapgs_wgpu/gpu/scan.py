@@ -21,10 +21,10 @@ class Scan:
         self, device: Device, pool: BufferPool, name: str, source: str = "values", *, saturating: bool = False
     ) -> None:
         self._pool, self._name = pool, name
-        defines = {"SCAN_LANES": 8 if device.is_cpu else 256} | ({} if source == "values" else {source.upper(): 1})
+        lanes = 8 if device.is_cpu else 256
+        defines = {"SCAN_LANES": lanes, "FLAGS": source == "flags", "GATHER": source == "gather"}
         self._reduce = Kernel.get(device, "scan_reduce", **defines)
-        blocks = {"SCAN_LANES": defines["SCAN_LANES"]} | ({"SATURATING": 1} if saturating else {})
-        self._blocks = Kernel.get(device, "scan_blocks", **blocks)
+        self._blocks = Kernel.get(device, "scan_blocks", SCAN_LANES=lanes, SATURATING=saturating)
         self._apply = Kernel.get(device, "scan_apply", **defines)
 
     def __call__(

@@ -42,11 +42,10 @@ class RasterConfig:
     def raster_defines(self, *, depth: bool) -> dict[str, int]:
         """Defines of rasterize and rasterize_bwd."""
         flags = {"SUBGROUPS": self.subgroups, "DEPTH": depth, "LANES_16": self.lanes > 8, "LANES_32": self.lanes > 16}
-        flags["POLYNOMIAL_EXP2"] = self.lane_runs
-        values = self.tile_defines | {"LANES": self.lanes, "ROWS": self.rows}
+        values = {"LANES": self.lanes, "ROWS": self.rows, "POLYNOMIAL_EXP2": self.lane_runs}
         if self.round_splats:
             values |= {"ROUND_SPLATS": self.round_splats, "LONG_LIST": self.long_list}
-        return values | {name: 1 for name, on in flags.items() if on}
+        return self.tile_defines | values | flags
 
 
 def cpu_config(subgroup_size: int, max_loop_turns: int = SOFTWARE_LOOP_TURNS) -> RasterConfig:

@@ -197,15 +197,11 @@ class Rasterizer:
             ranges=ranges,
         )
         for number in range(drawing.plan.rounds):
-            last = number == drawing.plan.rounds - 1
-            rounds = {"CONTINUED": number > 0, "LAST_ROUND": last} if config.round_splats else {}
+            defines = config.raster_defines(depth=drawing.depth)
+            if config.round_splats:
+                defines |= {"CONTINUED": number > 0, "LAST_ROUND": number == drawing.plan.rounds - 1}
             commands.dispatch(
-                Kernel.get(
-                    device,
-                    "rasterize",
-                    **config.raster_defines(depth=drawing.depth),
-                    **{name: 1 for name, on in rounds.items() if on},
-                ),
+                Kernel.get(device, "rasterize", **defines),
                 tiles,
                 frame=frame,
                 ranges=ranges,
@@ -333,7 +329,7 @@ class Rasterizer:
             self.device,
             "rasterize_bwd",
             **self.config.raster_defines(depth=drawing.depth),
-            **({"ROUNDS": 1} if plan.rounds > 1 else {}),
+            ROUNDS=plan.rounds > 1,
         )
         commands.clear(record_tails.rows(0, plan.capacity))  # no slot has a record yet
         for number in range(plan.rounds):
@@ -355,7 +351,7 @@ class Rasterizer:
                 record_tails=record_tails,
                 **piece,
             )
-        gather = Kernel.get(self.device, "gather_gradients", **({"DEPTH": 1} if drawing.depth else {}))
+        gather = Kernel.get(self.device, "gather_gradients", DEPTH=drawing.depth)
         commands.dispatch(
             gather,
             _groups(len(drawing.gaussians)),

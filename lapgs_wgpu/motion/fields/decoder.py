@@ -76,7 +76,7 @@ class Decoder:
         """The forward pass: the outputs and, for each group of grids, the sums of each pair."""
         encoded = written.encoded
         self.encoder.record(commands, encoded)
-        outputs = self._pool.array("outputs", (encoded.counts[0], self.shape.outputs))
+        outputs = self._pool.array("outputs", (encoded.points[0].count, self.shape.outputs))
         self._passes.decode(commands, written.inputs, written.weights, outputs)
         results = [outputs]
         for group, (here, there) in enumerate(written.compared):

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -15,7 +15,7 @@ from ...gpu.array import DeviceArray, read_all
 from ...gpu.device import Device
 from ...gpu.kernel import Commands
 from ...gpu.pool import BufferPool
-from ..passes.hash_encoder_passes import HashEncoderPasses
+from ..passes.hash_encoder_passes import HashEncoderPasses, PointSet
 from .hash_grid_config import GridShape, HashConfig
 
 Place = tuple[Tensor, float]  # points (N, 3), world units, and a time in [0, 1]
@@ -25,13 +25,11 @@ _NUMPY = {torch.float32: "float32", torch.bfloat16: "int16"}  # the dtype of arr
 class Encoded(NamedTuple):
     """Several sets of points and their encodings on the device. Valid until the encoder writes other points.
 
-    counts, times: of each set. points: (N, 4) of each. tables: (entries, 2) of each grid, group by group. encodings:
-    (N, features) of each set and group; where gradients are recorded, they and the tables become their gradients.
+    tables: (entries, 2) of each grid, group by group. encodings: (N, features) of each set and group; where gradients
+    are recorded, they and the tables become their gradients.
     """
 
-    counts: list[int]
-    times: list[float]
-    points: list[DeviceArray]
+    points: list[PointSet]
     tables: list[list[DeviceArray]]
     encodings: list[list[DeviceArray]]
 
@@ -126,14 +124,12 @@ class HashEncoder:
         for number, table in enumerate(tables):
             self._pool.upload(f"table {number}", _host(table))
         numbers = itertools.count()
-        points = [
-            self._pool.upload(f"points {number}", _host(torch.nn.functional.pad(points.detach().float(), (0, 1))))
-            for number, (points, _) in enumerate(places)
-        ]
+        sets = []
+        for number, (points, time) in enumerate(places):
+            padded = _host(torch.nn.functional.pad(points.detach().float(), (0, 1)))
+            sets.append(PointSet(number, self._pool.upload(f"points {number}", padded), len(points), time))
         self._held = Encoded(
-            [len(points) for points, _ in places],
-            [time for _, time in places],
-            points,
+            sets,
             [
                 [self._pool.array(f"table {next(numbers)}", tuple(grid.table.shape)) for grid in group]
                 for group in self.groups
@@ -154,12 +150,8 @@ class HashEncoder:
 
     def record(self, commands: Commands, encoded: Encoded) -> None:
         """The passes that encode what was written."""
-        for number, count in enumerate(encoded.counts):
-            for passes, tables, encoding in zip(self._passes, encoded.tables, encoded.encodings[number], strict=True):
-                if count:
-                    passes.encode(
-                        commands, number, encoded.points[number], count, encoded.times[number], tables, encoding
-                    )
+        for points, passes, tables, encoding in self._calls(encoded):
+            passes.encode(commands, points, tables, encoding)
 
     def record_gradient(self, commands: Commands, encoded: Encoded) -> list[DeviceArray]:
         """The passes from the encodings' gradients, in the arrays of the encodings, to those of the tables, in the
@@ -167,13 +159,15 @@ class HashEncoder:
         self._held = None
         for table in itertools.chain(*encoded.tables):
             commands.clear(table)
-        for number, count in enumerate(encoded.counts):
-            for passes, tables, encoding in zip(self._passes, encoded.tables, encoded.encodings[number], strict=True):
-                if count:
-                    passes.add_gradient(
-                        commands, number, encoded.points[number], count, encoded.times[number], encoding, tables
-                    )
+        for points, passes, tables, encoding in self._calls(encoded):
+            passes.add_gradient(commands, points, encoding, tables)
         return list(itertools.chain(*encoded.tables))
+
+    def _calls(self, encoded: Encoded) -> Iterator[tuple[PointSet, HashEncoderPasses, list[DeviceArray], DeviceArray]]:
+        for points, encodings in zip(encoded.points, encoded.encodings, strict=True):
+            for passes, tables, encoding in zip(self._passes, encoded.tables, encodings, strict=True):
+                if points.count:
+                    yield points, passes, tables, encoding
 
 
 def _host(tensor: Tensor) -> NDArray[Any]:

@@ -143,7 +143,7 @@ class DecoderPasses:
         return layers, features
 
     def _gate(self, name: str, commands: Commands, first: int, count: int, **arrays: DeviceArray) -> None:
-        kernel = Kernel.get(self.device, name, **({"MOTION": 1} if self.shape.motion else {}))
+        kernel = Kernel.get(self.device, name, MOTION=self.shape.motion)
         content = kernel.uniform("Gate", gaussians=count, width=self.shape.width)
         uniform = self.pool.constant(f"gate {first}", content)
         commands.dispatch(kernel, -(-count * self.shape.width // 64), gate=uniform, **arrays)

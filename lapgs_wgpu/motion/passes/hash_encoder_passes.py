@@ -22,6 +22,20 @@ _LEVEL_WORDS = 12  # common/hashgrid.wgsl: struct Level
 
 
 @dataclass(frozen=True)
+class PointSet:
+    """Points at one time.
+
+    number: distinguishes the sets that are submitted together. array: (N, 4) world units. count: number of points to
+    encode. time: in [0, 1].
+    """
+
+    number: int
+    array: DeviceArray
+    count: int
+    time: float
+
+
+@dataclass(frozen=True)
 class _Part:
     """Some levels of a grid that are handled alike."""
 
@@ -112,21 +126,19 @@ class HashEncoderPasses:
     def encode(
         self,
         commands: Commands,
-        number: int,
-        points: DeviceArray,
-        n: int,
-        time: float,
+        points: PointSet,
         tables: list[DeviceArray],
         encoding: DeviceArray,
         *,
         rows: DeviceArray | None = None,
     ) -> None:
-        """Encode n points (N, 4) at a time in [0, 1]; outside the box [-bound, bound]^3 features are zero.
+        """Encode points; outside the box [-bound, bound]^3 features are zero.
 
-        number: tells apart the calls that are submitted together. tables: (entries, 2) of each grid. encoding:
-        (N, row), float32, or int16, which stands for bfloat16. rows: uint32, its first n say which of the points; the
-        encoding, which must fit into a binding, then keeps its other rows. Without, n is N.
+        tables: (entries, 2) of each grid. encoding: (N, row), float32, or int16, which stands for bfloat16. rows:
+        uint32, the first `points.count` select the points; the encoding, which must then fit into a binding, keeps its
+        other rows.
         """
+        number, n = points.number, points.count
         sources = []
         for part in self._parts:
             source = tables[part.grid]
@@ -135,7 +147,7 @@ class HashEncoderPasses:
                 commands.dispatch_grid(
                     Kernel.get(self.device, "hashgrid_slice", **self._defines(part)),
                     (-(-part.cells // 64), part.count),
-                    grid=self._uniform(part, f"{number}", n, n, time),
+                    grid=self._uniform(part, f"{number}", n, n, points.time),
                     levels=part.levels,
                     features=source,
                     slices=slices,
@@ -145,34 +157,28 @@ class HashEncoderPasses:
         options = _precision(encoding)
         if rows is None:
             blocks = [
-                (first, count, {"points": points.rows(first, count), "encoding": encoding.rows(first, count)})
+                (first, count, {"points": points.array.rows(first, count), "encoding": encoding.rows(first, count)})
                 for first, count in self._blocks(n, encoding)
             ]
         else:
             options |= {"ROWS": 1}
-            blocks = [(0, n, {"points": points, "encoding": encoding, "rows": rows})]
+            blocks = [(0, n, {"points": points.array, "encoding": encoding, "rows": rows})]
         for first, count, arrays in blocks:
             for part, source in zip(self._parts, sources, strict=True):
                 commands.dispatch(
                     Kernel.get(self.device, "hashgrid", **self._defines(part), **options),
                     -(-count // 512) * part.count,
-                    grid=self._uniform(part, f"{number} from {first}", count, n, time),
+                    grid=self._uniform(part, f"{number} from {first}", count, n, points.time),
                     levels=part.levels,
                     features=source,
                     **arrays,
                 )
 
     def add_gradient(
-        self,
-        commands: Commands,
-        number: int,
-        points: DeviceArray,
-        n: int,
-        time: float,
-        d_encoding: DeviceArray,
-        d_tables: list[DeviceArray],
+        self, commands: Commands, points: PointSet, d_encoding: DeviceArray, d_tables: list[DeviceArray]
     ) -> None:
         """Add the gradient of the tables, from that of the encoding, whose rows must hold nothing else."""
+        number, n = points.number, points.count
         targets, sums = [], []
         for part in self._parts:
             target = d_tables[part.grid]
@@ -186,23 +192,23 @@ class HashEncoderPasses:
             sums.append(target)
 
         options = _precision(d_encoding)
-        largest = {} if self.lane_levels else {"largest": self._largest(commands, number, n, time, d_encoding, options)}
+        largest = {} if self.lane_levels else {"largest": self._largest(commands, points, d_encoding, options)}
         options |= {"LANE_LEVELS": 1} if self.lane_levels else {}
         for first, count in self._blocks(n, d_encoding, self._most_points):
             for part, target in zip(self._parts, sums, strict=True):
                 commands.dispatch(
                     Kernel.get(self.device, "hashgrid_bwd", **self._defines(part), **options),
                     -(-part.count // 8) if self.lane_levels else -(-count // 64) * part.count,
-                    grid=self._uniform(part, f"{number} from {first}", count, n, time),
+                    grid=self._uniform(part, f"{number} from {first}", count, n, points.time),
                     levels=part.levels,
-                    points=points.rows(first, count),
+                    points=points.array.rows(first, count),
                     d_encoding=d_encoding.rows(first, count),
                     **{"d_features" if self.lane_levels else "d_fixed": target},
                     **largest,
                 )
 
         for part, target, fixed in zip(self._parts, targets, sums, strict=True):
-            uniform = self._uniform(part, f"{number}", n, n, time)
+            uniform = self._uniform(part, f"{number}", n, n, points.time)
             if not self.lane_levels:
                 unfix = Kernel.get(self.device, "hashgrid_unfix", **self._defines(part))
                 commands.dispatch(
@@ -219,9 +225,10 @@ class HashEncoderPasses:
                 )
 
     def _largest(
-        self, commands: Commands, number: int, n: int, time: float, d_encoding: DeviceArray, options: dict[str, int]
+        self, commands: Commands, points: PointSet, d_encoding: DeviceArray, options: dict[str, int]
     ) -> DeviceArray:
         """The largest absolute value of a gradient, by which sums in fixed point are scaled."""
+        number, n = points.number, points.count
         largest = self.pool.array(f"largest {number}", (1,), "uint32")
         commands.clear(largest)
         kernel = Kernel.get(self.device, "hashgrid_largest", CORNERS=4, **options)
@@ -229,7 +236,7 @@ class HashEncoderPasses:
             commands.dispatch(
                 kernel,
                 -(-count * self._row // 4096),
-                grid=self._uniform(self._parts[0], f"{number} largest from {first}", count, n, time),
+                grid=self._uniform(self._parts[0], f"{number} largest from {first}", count, n, points.time),
                 d_encoding=d_encoding.rows(first, count),
                 largest=largest,
             )

@@ -18,7 +18,7 @@ from ...gpu.kernel import Commands, Kernel
 from ...gpu.pool import BufferPool
 from ...splat.gaussians import Gaussians
 from ..fields.config import APPEARANCE_SCALE, GEOMETRY, FieldConfig, static_grid, temporal_grids
-from ..passes.hash_encoder_passes import HashEncoderPasses
+from ..passes.hash_encoder_passes import HashEncoderPasses, PointSet
 
 Floats = NDArray[np.float32]
 
@@ -129,7 +129,7 @@ class GridFieldPlayback:
         table = DeviceArray.upload(self._device, "static table", entries)  # not in the pool: it is needed once
         with Commands(self._device) as commands:
             for number, block in enumerate(self._blocks):
-                encoder.encode(commands, number, block.points, block.count, 0.0, [table], block.still)
+                encoder.encode(commands, PointSet(number, block.points, block.count, 0.0), [table], block.still)
 
     # Weights ---------------------------------------------------------------------------------------------------------
 
@@ -193,23 +193,15 @@ class GridFieldPlayback:
         listed = np.zeros((-(-len(rows) // 4), 4), np.float32)
         listed.reshape(-1)[: len(rows)] = of_block
         self._weights.rows(self._rows_at, len(listed)).write(listed)
-        points = self._defines["POINTS"]
+        lanes = _LANES * self._defines["POINTS"]  # Gaussians of a workgroup
         with Commands(self._device) as commands:
             for number, block in enumerate(self._blocks):
                 start, end = np.searchsorted(rows, (block.first, block.first + block.count)).tolist()
                 if start == end:
                     continue
                 block.rows.rows(0, end - start).write(of_block[start:end].astype(np.uint32))
-                self._temporal.encode(
-                    commands,
-                    number,
-                    block.points,
-                    end - start,
-                    self._config.grid_time(t),
-                    self._tables,
-                    block.moving,
-                    rows=block.rows,
-                )
+                points = PointSet(number, block.points, end - start, self._config.grid_time(t))
+                self._temporal.encode(commands, points, self._tables, block.moving, rows=block.rows)
                 uniform = self._pool.constant(
                     f"deform {number}",
                     kernel.uniform(
@@ -229,7 +221,7 @@ class GridFieldPlayback:
                 outputs = {name: getattr(out, of).rows(block.first, block.count) for name, of in names.items()}
                 commands.dispatch(
                     kernel,
-                    -(-(end - start) // (_LANES * points)),
+                    -(-(end - start) // lanes),
                     deform=uniform,
                     still=block.still,
                     moving=block.moving,
