@@ -180,11 +180,11 @@ def test_a_turn_goes_around_while_time_stands(run: Path, tmp_path: Path) -> None
 
 def test_a_turn_is_a_whole_one() -> None:
     from lapgs_wgpu.viewer.camera import ViewCamera
-    from lapgs_wgpu.viewer.video import turn_shots
+    from lapgs_wgpu.viewer.video import orbit_views
 
-    shots = list(turn_shots(ViewCamera([3, 0, 1], [1, 0, 0], [0, 0, 1], 0.7), (8, 6), 4, None))
-    assert [time for _, time in shots] == pytest.approx([0, 1 / 3, 2 / 3, 1])
-    places = np.stack([camera.position for camera, _ in shots])
+    views = list(orbit_views(ViewCamera([3, 0, 1], [1, 0, 0], [0, 0, 1], 0.7), (8, 6), 4, None))
+    assert [time for _, time in views] == pytest.approx([0, 1 / 3, 2 / 3, 1])
+    places = np.stack([camera.position for camera, _ in views])
     np.testing.assert_allclose(places[[0, 2]], [[3, 0, 1], [-1, 0, 1]], atol=1e-9)
     np.testing.assert_allclose(np.sort(places[[1, 3], 1]), [-2, 2], atol=1e-9)
 

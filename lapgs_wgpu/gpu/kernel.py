@@ -1,4 +1,4 @@
-"""Compute kernels whose buffers are bound by name, and the command list that runs them."""
+"""Compute kernels, whose arrays are bound by name, and lists of commands that run them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _LAYOUT_TYPE = {"uniform": "uniform", "read": "read-only-storage", "read_write":
 
 
 class Kernel:
-    """shaders/<name>.wgsl under some defines, compiled for a device."""
+    """shaders/<name>.wgsl with some defines, compiled for a device."""
 
     def __init__(self, device: Device, name: str, defines: Defines) -> None:
         self.device = device
@@ -75,8 +75,8 @@ class Kernel:
         return pack(self.source, struct_name, values)
 
     def check(self, arrays: dict[str, DeviceArray]) -> None:
-        """Raise ShaderError where the arrays are not those that the shader declares, by name and by dtype, and
-        DeviceMemoryError where one is too large for a binding."""
+        """Raise ShaderError unless names and dtypes of the arrays match the shader's bindings, and DeviceMemoryError
+        if an array is too large for a binding."""
         if arrays.keys() != self.bindings.keys():
             missing, unknown = self.bindings.keys() - arrays.keys(), arrays.keys() - self.bindings.keys()
             raise ShaderError(
@@ -96,7 +96,7 @@ class Kernel:
                 )
 
     def bind(self, arrays: dict[str, DeviceArray], textures: dict[str, Any]) -> Any:
-        """wgpu's bind group for arrays, and for the textures that stand for some of them."""
+        """wgpu's bind group for arrays; `textures` replace some of them."""
         parts = {name: array.binding for name, array in arrays.items()}
         key = tuple((name, part[0].number, id(textures.get(name)), *part[1:]) for name, part in parts.items())
         group = self._groups.get(key)
@@ -105,7 +105,7 @@ class Kernel:
             for name, (buffer, offset, size) in parts.items():
                 whole = {"buffer": buffer.wgpu_buffer, "offset": offset, "size": size}
                 entries.append({"binding": self.bindings[name].number, "resource": textures.get(name, whole)})
-            if len(self._groups) > 64:  # arrays of other sizes leave groups behind
+            if len(self._groups) > 64:  # groups of earlier array sizes accumulate
                 self._groups.clear()
             native = self.device.wgpu_device.create_bind_group(layout=self._layout, entries=entries)
             group = self._groups[key] = BindGroup(native, textures, self._groups, key)
@@ -127,7 +127,7 @@ def _scalar(binding: Binding) -> str | None:
 class Commands:
     """A list of dispatches, submitted when the `with` block ends without an error.
 
-    profile: a Profile that takes the time of each dispatch (each then has a compute pass of its own).
+    profile: measures the time of each dispatch, which then gets a compute pass of its own.
     """
 
     def __init__(self, device: Device, profile: Profile | None = None) -> None:
@@ -138,13 +138,13 @@ class Commands:
         self._copied: list[Buffer] = []
 
     def dispatch(self, kernel: Kernel, groups: int, **arrays: DeviceArray) -> None:
-        """Run `groups` workgroups, folded into two dimensions where one does not hold them (see common/index)."""
+        """Run `groups` workgroups, in two dimensions if there are too many for one (common/index.wgsl)."""
         limit = self.device.limits["max-compute-workgroups-per-dimension"]
         rows = max(1, -(-groups // limit))
         self.dispatch_grid(kernel, (-(-groups // rows), rows), **arrays)
 
     def dispatch_grid(self, kernel: Kernel, groups: tuple[int, int], **arrays: DeviceArray) -> None:
-        """Run columns x rows workgroups on arrays by the names of the shader's bindings."""
+        """Run columns x rows workgroups on arrays, given by the names of the shader's bindings."""
         if min(groups) <= 0:
             return
         kernel.check(arrays)
@@ -180,7 +180,7 @@ class Commands:
         self._encoder.clear_buffer(array.buffer.wgpu_buffer, array.offset, (array.nbytes + 3) & ~3)
 
     def copy(self, source: DeviceArray, target: DeviceArray) -> None:
-        """Copy all of one array to another of the same size in bytes."""
+        """Copy an array to another of the same size in bytes."""
         self._end_pass()
         if source.nbytes != target.nbytes:
             raise ValueError(f"{target.buffer.label}: {source.nbytes} bytes are copied to {target.nbytes}")

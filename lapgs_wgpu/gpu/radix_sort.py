@@ -1,4 +1,4 @@
-"""Stable radix sort on the device, with a length that only the device knows."""
+"""Stable radix sort on the device. The number of elements is read on the device."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _SORT_BLOCK_ITEMS = 2048  # common/sort.wgsl: 128 lanes x 16 elements
 class RadixSort:
     """A stable sort of u32 keys with a u32 payload, least significant digit first.
 
-    lane_runs: the shape for CPU devices (digits of up to 8 bits, a run of elements a lane); otherwise 4-bit digits
+    lane_runs: variant for CPU devices: digits of up to 8 bits, a run of elements per lane. Otherwise 4-bit digits are
     ranked in workgroups. Both give the same result.
     """
 
@@ -36,8 +36,7 @@ class RadixSort:
     ) -> tuple[DeviceArray, DeviceArray]:
         """Sort the first length[0] <= capacity elements by the lowest `bits` bits of their keys.
 
-        payload None stands for 0, 1, 2, ... Returns the arrays of sorted keys and payload; `keys` and
-        `payload` are used as scratch and lose their content.
+        payload: None stands for 0, 1, 2, ... `keys` and `payload` are overwritten. Returns sorted keys and payload.
         """
         widest = 8 if self._lane_runs else 4
         passes = -(-bits // widest)

@@ -1,4 +1,4 @@
-"""Exclusive scan on the device, with a length that only the device knows."""
+"""Exclusive scan on the device. The number of elements is read on the device."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ _BLOCK_ITEMS = 2048  # common/block.wgsl
 class Scan:
     """Exclusive prefix sums of u32.
 
-    source: "values"; "flags" adds 1 for each value that is not zero; "gather" adds values[indices[i]].
-    saturating: sums end at 2^32 - 1 instead of beginning anew, provided that no element reaches 2^21.
+    source: of element i; "values": values[i]; "flags": 1 if values[i] is not zero; "gather": values[indices[i]].
+    saturating: sums stop at 2^32 - 1 instead of wrapping around; each element must be below 2^21.
     """
 
     def __init__(

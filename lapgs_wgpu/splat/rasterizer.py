@@ -1,7 +1,6 @@
-"""The passes that draw an image from Gaussians, and those that carry its gradient back, on arrays of a device.
+"""The rasterizer's forward and backward passes on arrays of a device (docs/architecture.md lists them in order).
 
-See docs/architecture.md for the order of the passes. Nothing here waits for the device except `grow_on_overflow` and,
-once a pass, `Rasterizer._subgroup_mismatch`.
+Only `grow_on_overflow` and, once per pass, `Rasterizer._subgroup_mismatch` wait for the device.
 """
 
 from __future__ import annotations
@@ -36,9 +35,9 @@ def _groups(count: int) -> int:
 
 
 class Rasterizer:
-    """Draws images on one device; keeps its buffers, and the plan that they follow, from image to image.
+    """Draws images on one device. Buffers and plan are reused from image to image.
 
-    capacity: of the first image's plan, see Plan.
+    capacity: of the plan of the first image, see Plan.
     """
 
     def __init__(self, device: Device, *, config: RasterConfig | None = None, capacity: int = 1 << 16) -> None:
@@ -48,13 +47,13 @@ class Rasterizer:
         self.plan = Plan(capacity)
         self.max_capacity = device.max_binding // (4 * _RECORD_FLOATS)
         self._flags_scan = Scan(device, self.pool, "visible", "flags")
-        # A number of intersections that no buffer holds must not come back as a small one.
+        # Saturating: a number of intersections beyond 2^32 must not wrap around to a small one.
         self._offset_scan = Scan(device, self.pool, "offsets", "gather", saturating=True)
         self._depth_sort = RadixSort(device, self.pool, "depth sort", lane_runs=self.config.lane_runs)
         self._tile_sort = RadixSort(device, self.pool, "tile sort", lane_runs=self.config.lane_runs)
-        self._size: tuple[int, int] | None = None  # of the image for which the plan was made
+        self._size: tuple[int, int] | None = None  # of the image that the plan was made for
         self._drawings = 0
-        self._trusted: set[tuple[str, bool, bool]] = set()  # passes whose workgroups are known to be subgroups
+        self._trusted: set[tuple[str, bool, bool]] = set()  # passes whose subgroups were checked
 
     # Forward ---------------------------------------------------------------------------------------------------------
 
@@ -67,9 +66,9 @@ class Rasterizer:
         depth: bool = False,
         profile: Profile | None = None,
     ) -> Drawing:
-        """Submit the passes that draw an image. It is valid once `grow_on_overflow` has returned False."""
+        """Submit the passes that draw an image, which is valid once `grow_on_overflow` has returned False."""
         if self._size not in (None, (camera.width, camera.height)):
-            self.plan = Plan(self.plan.capacity)  # what an image of another size needed would slow this one down
+            self.plan = Plan(self.plan.capacity)  # bands and rounds of another size would be slower
         self._size = (camera.width, camera.height)
         if self.config.round_splats:
             rows, columns = self._tiles(camera)
@@ -95,15 +94,15 @@ class Rasterizer:
         return drawing
 
     def holds(self, drawing: Drawing) -> bool:
-        """Whether the drawing's arrays are still its own: no other image was drawn since."""
+        """Whether the arrays still hold this drawing: no other image was drawn since."""
         return drawing.number == self._drawings
 
     def grow_on_overflow(self, drawing: Drawing, needed: list[NDArray[np.uint32]] | None = None) -> bool:
-        """Whether the drawing's intersections did not fit. Then it is invalid and has to be drawn again: the plan now
-        has larger buffers, more bands of tile rows, or more rounds.
+        """Whether the intersections overflowed the plan. The drawing is then invalid and has to be drawn again, with a
+        plan that now has larger buffers, more bands or more rounds.
 
-        needed: the content of `drawing.needed` where it was read already; without, this waits for the device.
-        Raises DeviceMemoryError where a row of tiles does not fit into the largest buffers.
+        needed: content of `drawing.needed`; None reads it and waits for the device.
+        Raises DeviceMemoryError if a row of tiles does not fit into the largest buffers.
         """
         counts = read_all(drawing.needed) if needed is None else needed
         totals, plan = [int(count[0]) for count in counts], drawing.plan
@@ -221,7 +220,7 @@ class Rasterizer:
             commands.dispatch(kernel, _groups(colors.shape[0]), frame=frame, part=part, **arrays)
 
     def _color_parts(self, kernel: Kernel, colors: DeviceArray) -> list[tuple[DeviceArray, DeviceArray]]:
-        """The kernel's uniform and rows of the colors, for ranges of Gaussians whose rows fit into one binding."""
+        """The kernel's uniform and the rows of colors for each range of Gaussians that fits into one binding."""
         count = colors.shape[0]
         most = self.device.max_binding // (4 * math.prod(colors.shape[1:])) // 64 * 64  # parts begin at 256 bytes
         parts = []
@@ -232,7 +231,7 @@ class Rasterizer:
         return parts
 
     def _tiles(self, camera: Camera) -> tuple[int, int]:
-        """Rows and columns of tiles."""
+        """Number of rows and columns of tiles."""
         return -(-camera.height // self.config.tile_height), -(-camera.width // self.config.tile_width)
 
     def _band_rows(self, drawing: Drawing, band: int) -> tuple[int, int]:
@@ -262,9 +261,11 @@ class Rasterizer:
         return self.pool.constant(f"frame {band}", content)
 
     def _subgroup_mismatch(self, name: str, drawing: Drawing) -> bool:
-        """Whether the driver has cut the workgroups of a pass, which was submitted for the first time, into several
-        subgroups. The config then does without subgroups, and the pass has to be done again. Waits for the device, but
-        once a pass."""
+        """Whether the driver has split the workgroups of a pass into several subgroups, checked after its first run.
+
+        If so, the config no longer uses subgroups, and the pass has to be run again. Waits for the device, once per
+        pass.
+        """
         key = (name, drawing.depth, drawing.plan.rounds > 1)
         if not self.config.subgroups or key in self._trusted:
             return False
@@ -278,10 +279,10 @@ class Rasterizer:
     # Backward --------------------------------------------------------------------------------------------------------
 
     def backward(self, drawing: Drawing, d_image: DeviceArray, *, profile: Profile | None = None) -> GaussianGradients:
-        """Submit the passes that carry the gradient of a drawing back to its Gaussians.
+        """Submit the backward passes of a drawing.
 
-        d_image: planes as those of the image, with the gradient by alpha in place of the transmittance.
-        Raises RuntimeError where another image was drawn since: the drawing's arrays hold that one's values.
+        d_image: gradient of the image's planes, with that of alpha instead of the transmittance.
+        Raises RuntimeError if another image was drawn since, which has overwritten the drawing's arrays.
         """
         if not self.holds(drawing):
             raise RuntimeError("backward needs the drawing that was drawn last; its buffers now hold another image")

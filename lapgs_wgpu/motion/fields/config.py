@@ -1,4 +1,4 @@
-"""The configuration of a deformation field, and the sizes that follow from it."""
+"""Configuration of deformation fields, and derived sizes."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ Motion = Literal["laplacian", "mlp"]
 Appearance = Literal["none", "color", "color+opacity"]
 DynamicsMode = Literal[
     "literal", "promote", "off"
-]  # of the regularisation of the dynamics attribute (motion/fields/dynamics)
+]  # of the regularization of the dynamics attributes (motion/fields/dynamics)
 MIN_SCALE = CONSTANTS["MIN_SCALE"]
 PLANES = ((0, 1), (0, 2), (1, 2), (0, TIME), (1, TIME), (2, TIME))  # of the field hexplane: pairs of x, y, z, t
 TEMPORAL_AXES = ((0, 1, TIME), (1, 2, TIME), (0, 2, TIME))  # of the temporal hash grids
 GEOMETRY = (4, 3, 4, 3)  # outputs of the grid fields' geometry heads: turn, shift, quaternion, scale
 HEXPLANE_HEADS = (3, 4, 3)  # outputs of the field hexplane's heads: shift, quaternion, scale
-# Of the field mlp: octaves of its inputs; features of the time; layers, before the one of which the inputs come in once
-# more; outputs: shift, quaternion, scale.
+# Of the field mlp: octaves of its inputs; features of the time; number of layers, and of the one that also takes the
+# inputs (skip connection); outputs: shift, quaternion, scale.
 PLACE_OCTAVES, TIME_OCTAVES, TIME_FEATURES, MLP_LAYERS, MLP_SKIP, MLP_OUTPUTS = 10, 6, 30, 8, 4, (3, 4, 3)
-# Times the appearance head's outputs: it then learns about as fast as the colors themselves; at full speed it explains
-# what is motion by changes of color.
+# Factor of the appearance head's outputs. The head then learns about as fast as the colors; faster, it would explain
+# motion by changes of color.
 APPEARANCE_SCALE = 0.1
 
 
@@ -89,32 +89,32 @@ class FieldConfig(Options):
 
     @property
     def dynamics_size(self) -> int:
-        """Length of a Gaussian's dynamics attribute; 0 where the field has no use for it."""
+        """Length of a Gaussian's dynamics attribute; 0 for fields without it."""
         return self.dynamics if self.kind == "laplacian" else 0
 
     @property
     def appearance_size(self) -> int:
-        """Outputs of the appearance head of a grid field; 0 where it has none."""
+        """Number of outputs of the appearance head; 0 for fields without it."""
         return {"none": 0, "color": 3, "color+opacity": 4}[self.appearance] if self.kind == "laplacian" else 0
 
     @property
     def decodes_on_device(self) -> bool:
-        """Whether our kernels have the field's decoder: that of grid4d and laplacian without hidden layers, and without
-        the decoder that stands in for the spectrum."""
+        """Whether kernels for the field's decoder exist: for grid4d and laplacian without hidden layers, except for the
+        ablation that replaces the spectrum by an MLP."""
         return not self.depth and (self.kind == "grid4d" or (self.kind == "laplacian" and self.motion == "laplacian"))
 
     def grid_time(self, t: float) -> float:
-        """A time in [0, 1] as the place on the temporal grids' time axis."""
+        """Position on the temporal grids' time axis, in [0, 1], of a time in [0, 1]."""
         return 0.5 * ((2.0 * t - 1.0) * self.time_scale + 1.0)
 
 
 def static_grid(config: FieldConfig) -> GridShape:
-    """The hash grid of the grid fields over space."""
+    """The spatial hash grid of the grid fields."""
     return GridShape(config.static, (0, 1, 2))
 
 
 def temporal_grids(config: FieldConfig) -> list[GridShape]:
-    """Those over time, too."""
+    """The space-time hash grids of the grid fields."""
     return [GridShape(config.temporal, axes) for axes in (TEMPORAL_AXES if config.temporal_hash else ())]
 
 

@@ -1,4 +1,4 @@
-"""Shapes of multi-resolution hash grids (Instant-NGP's, with the resolutions of Grid4D; paper eq. 1), without torch."""
+"""Shapes of multi-resolution hash grids (Instant-NGP, with the resolutions of Grid4D; paper eq. 1). Without torch."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from ...io.dataclass_table import Options, option
 
-_SLICE_CELLS = 1 << 14  # a level with more cells a plane than this is looked up directly, not cut
+_SLICE_CELLS = 1 << 14  # a level with more cells per plane is not sliced
 TIME = 3  # the axis number of time
 
 
@@ -29,7 +29,7 @@ class HashConfig(Options):
 
 @dataclass(frozen=True)
 class Level:
-    """scale: cells along each axis, a real number; resolution: entries along each axis; first: its first entry."""
+    """A level. scale: cells along each axis, a real number. resolution: entries along each axis. first: first entry."""
 
     scale: tuple[float, float, float]
     resolution: tuple[int, int, int]
@@ -42,7 +42,7 @@ class Level:
 
 
 def make_levels(config: HashConfig) -> list[Level]:
-    """The levels of a grid: the resolution grows geometrically along each axis."""
+    """Levels of a grid, whose resolution grows geometrically along each axis."""
     levels, first = [], 0
     for number in range(config.levels):
         share = number / max(1, config.levels - 1)
@@ -56,7 +56,7 @@ def make_levels(config: HashConfig) -> list[Level]:
 
 
 class GridShape:
-    """A grid without its table: over three of the axes x, y, z (0 to 2) and t (3, only as the last)."""
+    """A grid without its table. axes: three of x, y, z (0 to 2) and t (3, only as the last one)."""
 
     def __init__(self, config: HashConfig, axes: tuple[int, int, int]) -> None:
         self.axes = axes
@@ -64,7 +64,7 @@ class GridShape:
 
     @property
     def entries(self) -> int:
-        """Rows of the table, of two features each."""
+        """Number of rows of the table, which hold two features each."""
         return self.levels[-1].first + self.levels[-1].entries
 
     @property
@@ -74,7 +74,7 @@ class GridShape:
 
     @property
     def sliced(self) -> list[int]:
-        """The levels that are cut at the time of the step."""
+        """Levels that are sliced at the time of the points before the lookup."""
         if self.axes[2] != TIME:
             return []
         cells = [level.resolution[0] * level.resolution[1] for level in self.levels]

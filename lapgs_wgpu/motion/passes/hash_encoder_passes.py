@@ -1,7 +1,7 @@
-"""The passes of the hash encoder, without torch: points through several hash grids, and the gradient of their tables.
+"""Device passes of the hash encoder, without torch: lookup of points in several hash grids, and gradients of tables.
 
-All points share one time, so a grid with a time axis is first cut at that time wherever that is cheaper than looking up
-the planes around it for each point.
+All points share one time. Levels of a grid with a time axis are first sliced at that time, if that is cheaper than
+looking up two planes for each point.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from ...gpu.kernel import Commands, Kernel
 from ...gpu.pool import BufferPool
 from ..fields.hash_grid_config import GridShape
 
-_ALIGNED = 64  # so many rows are a multiple of 256 bytes, at which a binding may begin, whatever the row
+_ALIGNED = 64  # rows; a multiple of 256 bytes for every row size, at which a binding may begin
 _LEVEL_WORDS = 12  # common/hashgrid.wgsl: struct Level
 
 
@@ -37,7 +37,7 @@ class PointSet:
 
 @dataclass(frozen=True)
 class _Part:
-    """Some levels of a grid that are handled alike."""
+    """The levels of a grid that are sliced, or those that are not."""
 
     grid: int
     sliced: bool
@@ -48,12 +48,11 @@ class _Part:
 
 
 class HashEncoderPasses:
-    """Records the passes that encode points with several grids at once. Axes and levels are fixed; tables (entries, 2),
-    points (N, 4) and the encoding come with each call, in float32 but for an encoding that is wanted in bfloat16.
+    """Records the passes that encode points with several grids. Axes and levels are fixed.
 
-    lane_levels: the shape of the backward pass for CPU devices; otherwise fixed-point atomics.
-    row, column: the encoding's rows have `row` floats, in which the features of one grid lie behind those of the other
-    from `column` on; both even. By default the rows hold just these.
+    lane_levels: use the backward pass for CPU devices; otherwise fixed-point atomics.
+    row, column: the encoding's rows have `row` floats; the grids' features are written one after another from `column`
+    on. Both are even. By default the rows hold the features only.
     """
 
     def __init__(
@@ -69,7 +68,7 @@ class HashEncoderPasses:
         self.device, self.grids, self.bound = device, list(grids), bound
         self.pool = BufferPool(device)
         self.lane_levels = device.is_cpu if lane_levels is None else lane_levels
-        # Where a lane takes all points: no more than half of the turns that the driver lets a loop have.
+        # If a lane loops over all points: at most half of the iterations that the driver allows.
         turns = SOFTWARE_LOOP_TURNS if self.lane_levels else None
         self._most_points = None if turns is None else (turns + 1) // 2
         self._row = sum(grid.features for grid in grids) if row is None else row
@@ -98,7 +97,7 @@ class HashEncoderPasses:
         return _Part(number, sliced, len(chosen), array, largest, slices if sliced else 0)
 
     def _uniform(self, part: _Part, place: str, points: int, all_points: int, time: float) -> DeviceArray:
-        """What the kernels are told of a block of points; all blocks of all places are submitted at once."""
+        """The uniform of a block of points. All blocks of all sets are submitted together, so each has its own."""
         content = Kernel.get(self.device, "hashgrid_slice", SLICED=1, CORNERS=4).uniform(
             "Grid",
             points=points,
@@ -116,8 +115,7 @@ class HashEncoderPasses:
         return {"SLICED": 1, "CORNERS": 4} if part.sliced else {"CORNERS": 8}
 
     def _blocks(self, n: int, encoding: DeviceArray, most: int | None = None) -> Iterator[tuple[int, int]]:
-        """First and number of the points that a dispatch takes, at most so many, whose rows of the
-        encoding fit into a binding."""
+        """First point and number of points of each dispatch: at most `most`, with rows that fit into a binding."""
         row = encoding.nbytes // max(n, 1)
         size = self.device.max_binding // max(row, 1) // _ALIGNED * _ALIGNED
         size = size if most is None else min(size, most)
@@ -227,7 +225,7 @@ class HashEncoderPasses:
     def _largest(
         self, commands: Commands, points: PointSet, d_encoding: DeviceArray, options: dict[str, int]
     ) -> DeviceArray:
-        """The largest absolute value of a gradient, by which sums in fixed point are scaled."""
+        """The largest absolute value of a gradient, which scales fixed-point sums."""
         number, n = points.number, points.count
         largest = self.pool.array(f"largest {number}", (1,), "uint32")
         commands.clear(largest)
