@@ -1,7 +1,6 @@
-"""Names of the built-in scenes on the command line and in tables: `synthetic` and `motion:KEY=VALUE,...`.
+"""Names of the built-in scenes on the command line and in tables: `synthetic`, `motion`, `motion:KEY=VALUE,...`.
 
-motion:path=4,cycles=2,camera=walk,background=room,objects=two has the keys of MotionScene; those left out have its
-defaults, so `motion` alone is a scene, too.
+The keys are those of MotionScene, with its defaults: motion:path=4,cycles=2,camera=walk,background=room,objects=two.
 """
 
 from __future__ import annotations
@@ -18,14 +17,12 @@ SYNTHETIC, MOTION = "synthetic", "motion"
 
 
 def is_builtin(name: str) -> bool:
-    """Whether a name on the command line is that of a built-in scene rather than a folder."""
+    """Whether a name is that of a built-in scene, rather than a folder."""
     return name in (SYNTHETIC, MOTION) or name.startswith(f"{MOTION}:")
 
 
 def builtin_folder(name: str) -> str:
-    """Name of the folder that a built-in scene is written to, such as motion-path4-cycles2-jump-black-two.
-
-    Raises InputError where the name has an unknown key or value."""
+    """Name of the folder of a built-in scene, such as motion-path4-cycles2-jump-black-two. Raises InputError."""
     if name == SYNTHETIC:
         return SYNTHETIC
     scene = parse_motion(name)
@@ -33,7 +30,7 @@ def builtin_folder(name: str) -> str:
 
 
 def write_builtin(name: str, parent: Path) -> Path:
-    """Write a built-in scene into its folder in `parent`, unless it is there. Returns the folder. Raises InputError."""
+    """Write a built-in scene to its folder in `parent`, unless it exists. Returns the folder. Raises InputError."""
     folder = parent / builtin_folder(name)
     if name == SYNTHETIC:
         return synthetic.write_synthetic(folder)

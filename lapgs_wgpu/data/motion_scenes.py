@@ -1,9 +1,9 @@
-"""Built-in scenes that measure motion: two objects travel a known path, seen by cameras of a known kind.
+"""Built-in scenes for measuring motion: two objects travel along known paths.
 
-A ball runs along a circle and a box along a line, both `path` of their diameters wide and `cycles` times over the clip;
-a small ball below them stands still. z is up. All objects stay within [-1.3, 1.3]^3 and within the view of all cameras
-except where the scene says otherwise, so the objects' size follows from the path. `write_motion` writes a scene in
-the D-NeRF layout with its true trajectories, masks and clean plates (`objects.json`, docs/metrics.md).
+A ball moves along a circle and a box along a line. Both paths are `path` diameters wide and travelled `cycles` times
+over the clip. A small ball below them is static. z is up. All objects stay within [-1.3, 1.3]^3 and within the view of
+all cameras, unless `objects` says otherwise, so their size depends on the path. `write_motion` writes a scene in the
+D-NeRF layout with true trajectories, masks and clean plates (`objects.json`, docs/metrics.md).
 """
 
 from __future__ import annotations
@@ -70,10 +70,10 @@ class MotionScene(Options):
 
 @dataclass(frozen=True)
 class MovingObject:
-    """A solid whose centre is at `centre + cosine cos(2 pi f t) + sine sin(2 pi f t)`, f = `cycles`, world units.
+    """A solid with center `centre + cosine cos(2 pi f t) + sine sin(2 pi f t)`, f = `cycles`, world units.
 
-    diameter: of the ball, or of the ball of the same volume as the box. drop: height from which it enters.
-    A still object has `cycles` 0 and no mask is asked of it.
+    diameter: of the ball, or of a ball with the volume of the box. drop: height from which it enters. A static object
+    has 0 cycles; no masks are written for it.
     """
 
     name: str
@@ -91,11 +91,11 @@ class MovingObject:
 
     @property
     def reach(self) -> float:
-        """Radius of the smallest ball around the centre that holds the object."""
+        """Radius of the bounding sphere around the center."""
         return math.hypot(*self.solid.half) if self.solid.shape == "box" else self.solid.half[0]
 
     def positions(self, times: ArrayLike) -> Floats:
-        """Centre of the object at times (T,): (T, 3) world units."""
+        """Centers at times (T,): (T, 3) world units."""
         time = np.asarray(times, dtype=np.float64)[:, None]
         phase = 2 * np.pi * self.cycles * time
         path = np.array(self.centre) + np.cos(phase) * self.cosine + np.sin(phase) * self.sine
@@ -105,7 +105,7 @@ class MovingObject:
 
 
 def moving_objects(scene: MotionScene) -> tuple[MovingObject, ...]:
-    """All objects of a scene, those that move first."""
+    """All objects of a scene, the moving ones first."""
     diameter = min(0.55, 2.1 / (scene.path + 1))
     edge = 0.806 * diameter  # of the box that has the ball's volume
     radius = scene.path * diameter / 2  # of the circle, and half the length of the line
@@ -146,7 +146,7 @@ def moving_objects(scene: MotionScene) -> tuple[MovingObject, ...]:
 
 
 def trace(scene: MotionScene, camera: Camera, time: float) -> list[Hits]:
-    """Hits of every surface: first those of `moving_objects`, in their order, then those of the room."""
+    """Hits of all surfaces: first those of `moving_objects`, in that order, then those of the room."""
     rays = pixel_rays(camera)
     eye = camera.position
     surfaces = []
@@ -162,7 +162,7 @@ def trace(scene: MotionScene, camera: Camera, time: float) -> list[Hits]:
 
 
 def _floor(x: Floats, y: Floats) -> tuple[NDArray[np.bool_], Floats]:
-    """Tiles of two greys, each third one warmer."""
+    """Tiles in two shades of gray, every third one warmer."""
     inside = (np.abs(x) <= WALL) & (np.abs(y) <= WALL)
     column, row = np.floor(x[inside] / 0.29), np.floor(y[inside] / 0.29)
     light = (column + row) % 2 == 0
@@ -195,8 +195,10 @@ def fov_x(scene: MotionScene) -> float:
 
 
 def scene_cameras(scene: MotionScene, split: str, times: ArrayLike, seed: int, *, size: int) -> list[Camera]:
-    """The cameras of the images of a split taken at `times` (T,): for training cameras that stand still T is a
-    multiple of STILL_CAMERAS, image by image camera 0 to 5. seed: of the jumps."""
+    """Cameras of the images of a split, at `times` (T,). seed: of the jumps.
+
+    For training images of static cameras, T is a multiple of STILL_CAMERAS, and the cameras 0 to 5 alternate.
+    """
     time = np.asarray(times, dtype=np.float64)
     room = scene.background == "room"
     places: Sequence[tuple[float, float]]

@@ -1,8 +1,8 @@
-"""Writes a motion scene in the D-NeRF layout, with the truth about its objects beside the images.
+"""Writes a motion scene in the D-NeRF layout, with the ground truth of its objects.
 
-objects.json: parameters of the scene; of every object its size, and its positions at the times of each split's images.
-masks/SPLIT/VIEW_OBJECT.png: which pixels of a held-out image show a moving object, 8-bit grey, antialiased.
-clean/SPLIT/VIEW_OBJECT.png: the same image without that object, RGBA.
+objects.json: parameters of the scene; size of each object, and its positions at the times of each split's images.
+masks/SPLIT/VIEW_OBJECT.png: pixels of a test image that show a moving object, 8-bit gray, antialiased.
+clean/SPLIT/VIEW_OBJECT.png: the image without that object, RGBA.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from lapgs_wgpu.data.raytrace import SAMPLES, Hits, combine, pixel_means, to_byt
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
 
-VERSION = 2  # of the scenes' looks: raise it with every change of what is rendered
+VERSION = 2  # of the rendered images: increase it with every change of them
 
 
 def write_motion(
@@ -33,17 +33,17 @@ def write_motion(
     test_views: int = 20,
     seed: int = 0,
 ) -> Path:
-    """Write a scene: training images evenly spread over the clip, and test and validation images halfway between them.
+    """Write a scene: training images at equally spaced times, test and validation images halfway between them.
 
-    The same arguments give the same bytes. A folder that already holds this very scene is left as it is.
+    Equal arguments give equal bytes. A folder that already holds the scene is not changed.
 
     Args:
-        folder: to write; it appears only when it is whole.
+        folder: appears only when it is complete.
         size: of the square images, pixels.
-        train_times: training times; cameras that stand still take STILL_CAMERAS images of each, others one.
-            None for 120, or 40 where the cameras stand still.
-        test_views: of each of the splits test and val.
-        seed: of the cameras that jump.
+        train_times: number of training times, with one image each, or STILL_CAMERAS images from static cameras. None
+            for 120, or 40 with static cameras.
+        test_views: number of images of each of the splits test and val.
+        seed: of the jumping cameras.
 
     Returns:
         The folder.
@@ -87,7 +87,7 @@ def write_motion(
 
 
 def _write_frame(scene: MotionScene, folder: Path, split: str, name: str, camera: Camera, time: float) -> None:
-    """Write one image and, where it is held out, the mask and the clean plate of each moving object."""
+    """Write an image; for test and validation also the mask and the clean plate of each moving object."""
     surfaces = trace(scene, camera, time)
     count = camera.width * camera.height * SAMPLES**2
 

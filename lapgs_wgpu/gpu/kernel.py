@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from types import TracebackType
 from typing import Any
 
@@ -142,6 +143,10 @@ class Commands:
         limit = self.device.limits["max-compute-workgroups-per-dimension"]
         rows = max(1, -(-groups // limit))
         self.dispatch_grid(kernel, (-(-groups // rows), rows), **arrays)
+
+    def run(self, kernel: Kernel, groups: int, arrays: Mapping[str, DeviceArray]) -> None:
+        """`dispatch` with those of the arrays that the shader binds."""
+        self.dispatch(kernel, groups, **{name: arrays[name] for name in kernel.bindings})
 
     def dispatch_grid(self, kernel: Kernel, groups: tuple[int, int], **arrays: DeviceArray) -> None:
         """Run columns x rows workgroups on arrays, given by the names of the shader's bindings."""

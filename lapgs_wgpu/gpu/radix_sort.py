@@ -62,35 +62,15 @@ class RadixSort:
                 f"{self._name} pass {step}",
                 count_kernel.uniform("Sort", shift=step * width, digits=digits, owners=owners, capacity=capacity),
             )
-            commands.dispatch(
-                count_kernel,
-                groups,
-                sort=uniform,
-                length=length,
-                keys=keys,
-                counters=counters,
+            arrays = {"sort": uniform, "length": length, "keys": keys}
+            commands.dispatch(count_kernel, groups, counters=counters, **arrays)
+            scanned = {"values": counters, "prefix": places, "total": ignored}
+            self._scan(commands, length=counter_count, capacity=digits * owners, **scanned)
+            scatter = Kernel.get(
+                self._device, "sort_scatter", LANE_RUNS=self._lane_runs, IOTA=step == 0 and payload is None
             )
-            self._scan(
-                commands,
-                length=counter_count,
-                capacity=digits * owners,
-                values=counters,
-                prefix=places,
-                total=ignored,
-            )
-            iota = step == 0 and payload is None
-            source = {} if iota else {"payload": second_payload}
-            commands.dispatch(
-                Kernel.get(self._device, "sort_scatter", LANE_RUNS=self._lane_runs, IOTA=iota),
-                groups,
-                sort=uniform,
-                length=length,
-                keys=keys,
-                counters=places,
-                keys_out=keys_out,
-                payload_out=payload_out,
-                **source,
-            )
+            arrays |= {"counters": places, "keys_out": keys_out, "payload_out": payload_out, "payload": second_payload}
+            commands.run(scatter, groups, arrays)
             keys, keys_out = keys_out, keys
             second_payload, payload_out = payload_out, second_payload
         return keys, second_payload

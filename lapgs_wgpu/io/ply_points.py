@@ -1,4 +1,4 @@
-"""A colored cloud of points in a .ply file, as structure from motion leaves it (COLMAP, and what is made of it)."""
+"""Point clouds with colors in .ply files, as written by COLMAP and nerfstudio."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ COLORS = ["red", "green", "blue"]
 
 
 def read_points(path: PathLike) -> tuple[Floats, Floats | None]:
-    """Positions (N, 3), and colors (N, 3) in [0, 1] where the properties red, green and blue are bytes, else None.
+    """Read positions (N, 3), and colors (N, 3) in [0, 1], None unless red, green and blue are byte properties.
 
-    Values may be NaN or infinite. Raises InputError where the file is no cloud.
+    Values may be NaN or infinite. Raises InputError if the file is not a point cloud.
     """
     if _is_text(path):
         return _read_text(path)
@@ -36,7 +36,7 @@ def _is_text(path: PathLike) -> bool:
 
 
 def _read_text(path: PathLike) -> tuple[Floats, Floats | None]:
-    """A cloud written as text, which is how nerfstudio leaves it. Its vertices come first, a line each."""
+    """Read an ASCII file, as nerfstudio writes it. The vertices are the first element, one per line."""
     lines = Path(path).read_text(encoding="utf-8", errors="replace").splitlines()
     end = next((i for i, line in enumerate(lines) if line.strip() == "end_header"), None)
     if end is None:

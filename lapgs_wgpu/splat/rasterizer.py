@@ -125,99 +125,53 @@ class Rasterizer:
         return True
 
     def _draw_band(self, commands: Commands, drawing: Drawing, band: int) -> TileLists:
-        device, pool, config, splats = self.device, self.pool, self.config, drawing.splats
-        gaussians, n, capacity = drawing.gaussians, len(drawing.gaussians), drawing.plan.capacity
-        frame, tiles, needed = self._frame(drawing, band), self._band_tiles(drawing, band), drawing.needed[band]
+        device, pool, config, gaussians = self.device, self.pool, self.config, drawing.gaussians
+        n, capacity, tiles = len(gaussians), drawing.plan.capacity, self._band_tiles(drawing, band)
+        frame, needed, visible = self._frame(drawing, band), drawing.needed[band], pool.array("visible", (1,), "uint32")
         tile_counts, ids, keys, offsets = (
             pool.array(name, (n,), "uint32") for name in ("tile counts", "ids", "depth keys", "offsets")
         )
-        visible = pool.array("visible", (1,), "uint32")
+        tile_keys, slot_ids = (pool.array(name, (capacity,), "uint32") for name in ("tile keys", "slot ids"))
         ranges = pool.array("ranges", (tiles + 1, 4), "uint32")
+        length = pool.constant("gaussians", n.to_bytes(4, "little"))
+        arrays = vars(gaussians) | {"frame": frame, "splats": drawing.splats, "image": drawing.image, "needed": needed}
+        arrays |= {"tile_counts": tile_counts, "ids": ids, "keys": keys, "prefix": offsets, "visible": visible}
+        arrays |= {"offsets": offsets, "tile_keys": tile_keys, "slot_ids": slot_ids, "ranges": ranges}
         if config.round_splats:
             commands.clear(needed)
-        length = pool.constant("gaussians", n.to_bytes(4, "little"))
-        commands.dispatch(
-            Kernel.get(device, "project", **config.tile_defines),
-            _groups(n),
-            frame=frame,
-            means=gaussians.means,
-            quats=gaussians.quats,
-            scales=gaussians.scales,
-            opacities=gaussians.opacities,
-            splats=splats,
-            tile_counts=tile_counts,
-        )
+        commands.run(Kernel.get(device, "project", **config.tile_defines), _groups(n), arrays)
         self._color(commands, drawing, frame, tile_counts)
         self._flags_scan(commands, length=length, capacity=n, values=tile_counts, prefix=offsets, total=visible)
-        commands.dispatch(
-            Kernel.get(device, "compact"),
-            _groups(n),
-            frame=frame,
-            splats=splats,
-            tile_counts=tile_counts,
-            prefix=offsets,
-            keys=keys,
-            ids=ids,
+        commands.run(Kernel.get(device, "compact"), _groups(n), arrays)
+        _, arrays["ids"] = self._depth_sort(
+            commands, length=visible, capacity=n, bits=_DEPTH_BITS, keys=keys, payload=ids
         )
-        _, sorted_ids = self._depth_sort(commands, length=visible, capacity=n, bits=_DEPTH_BITS, keys=keys, payload=ids)
-        self._offset_scan(
-            commands,
-            length=visible,
-            capacity=n,
-            values=tile_counts,
-            indices=sorted_ids,
-            prefix=offsets,
-            total=needed,
-        )
-        tile_keys, slot_ids = (pool.array(name, (capacity,), "uint32") for name in ("tile keys", "slot ids"))
-        commands.dispatch(
-            Kernel.get(device, "duplicate_with_keys", **config.tile_defines),
-            _groups(n),
-            frame=frame,
-            visible=visible,
-            splats=splats,
-            ids=sorted_ids,
-            tile_counts=tile_counts,
-            offsets=offsets,
-            tile_keys=tile_keys,
-            slot_ids=slot_ids,
-        )
+        scanned = {"values": tile_counts, "indices": arrays["ids"], "prefix": offsets, "total": needed}
+        self._offset_scan(commands, length=visible, capacity=n, **scanned)
+        commands.run(Kernel.get(device, "duplicate_with_keys", **config.tile_defines), _groups(n), arrays)
         bits = max(1, tiles.bit_length())  # one key more than there are tiles, for pads
-        sorted_keys, slots = self._tile_sort(
+        arrays["tile_keys"], arrays["slots"] = self._tile_sort(
             commands, length=needed, capacity=capacity, bits=bits, keys=tile_keys, payload=None
         )
         commands.clear(ranges)
-        commands.dispatch(
-            Kernel.get(device, "tile_ranges"),
-            _groups(-(-capacity // 4)),
-            frame=frame,
-            needed=needed,
-            tile_keys=sorted_keys,
-            ranges=ranges,
-        )
+        commands.run(Kernel.get(device, "tile_ranges"), _groups(-(-capacity // 4)), arrays)
         for number in range(drawing.plan.rounds):
             defines = config.raster_defines(depth=drawing.depth)
             if config.round_splats:
                 defines |= {"CONTINUED": number > 0, "LAST_ROUND": number == drawing.plan.rounds - 1}
-            commands.dispatch(
-                Kernel.get(device, "rasterize", **defines),
-                tiles,
-                frame=frame,
-                ranges=ranges,
-                slots=slots,
-                slot_ids=slot_ids,
-                splats=splats,
-                image=drawing.image,
-                **({"needed": needed} if config.round_splats else {}),
-            )
-        return TileLists(tile_counts, visible, sorted_ids, offsets, slot_ids, slots, ranges)
+            commands.run(Kernel.get(device, "rasterize", **defines), tiles, arrays)
+        return TileLists(tile_counts, visible, arrays["ids"], offsets, slot_ids, arrays["slots"], ranges)
 
     def _color(self, commands: Commands, drawing: Drawing, frame: DeviceArray, tile_counts: DeviceArray) -> None:
         kernel = Kernel.get(self.device, "color", **drawing.sh_defines)
-        means = {} if drawing.gaussians.sh_degree is None else {"means": drawing.gaussians.means}
+        arrays = {
+            "frame": frame,
+            "means": drawing.gaussians.means,
+            "tile_counts": tile_counts,
+            "splats": drawing.splats,
+        }
         for part, colors in self._color_parts(kernel, drawing.gaussians.sh):
-            arrays = {"colors": colors, "tile_counts": tile_counts, "splats": drawing.splats} | means
-            commands.dispatch(kernel, _groups(colors.shape[0]), frame=frame, part=part, **arrays)
+            commands.run(kernel, _groups(colors.shape[0]), arrays | {"part": part, "colors": colors})
 
     def _color_parts(self, kernel: Kernel, colors: DeviceArray) -> list[tuple[DeviceArray, DeviceArray]]:
         """The kernel's uniform and the rows of colors for each range of Gaussians that fits into one binding."""
@@ -300,19 +254,10 @@ class Rasterizer:
         if self._subgroup_mismatch("rasterize_bwd", drawing):
             return self.backward(drawing, d_image, profile=profile)
         d_sh = None
+        arrays = vars(gaussians) | {"frame": self._frame(drawing, 0), "d_splats": d_splats}
+        arrays |= {"d_means": d_means, "d_quats": d_quats, "d_scales": d_scales}
         with Commands(self.device, profile) as commands:
-            commands.dispatch(
-                Kernel.get(self.device, "project_bwd"),
-                _groups(n),
-                frame=self._frame(drawing, 0),
-                means=gaussians.means,
-                quats=gaussians.quats,
-                scales=gaussians.scales,
-                d_splats=d_splats,
-                d_means=d_means,
-                d_quats=d_quats,
-                d_scales=d_scales,
-            )
+            commands.run(Kernel.get(self.device, "project_bwd"), _groups(n), arrays)
             if gaussians.sh_degree is not None:
                 d_sh = self.pool.array("d_sh", gaussians.sh.shape)
                 self._color_bwd(commands, drawing, d_splats, d_means, d_sh)
@@ -321,66 +266,33 @@ class Rasterizer:
     def _backward_band(
         self, commands: Commands, drawing: Drawing, band: int, d_image: DeviceArray, d_splats: DeviceArray
     ) -> None:
-        lists, plan, splats = drawing.lists, drawing.plan, drawing.splats
+        lists, plan = drawing.lists, drawing.plan
         records = self.pool.array("records", (plan.capacity, _RECORD_FLOATS))
         tails = (3 if drawing.depth else 2) * plan.capacity
         states = 2 * drawing.camera.width * drawing.camera.height if plan.rounds > 1 else 0
         record_tails = self.pool.array("record tails", (tails + states,), "uint32")
-        kernel = Kernel.get(
-            self.device,
-            "rasterize_bwd",
-            **self.config.raster_defines(depth=drawing.depth),
-            ROUNDS=plan.rounds > 1,
-        )
+        defines = self.config.raster_defines(depth=drawing.depth)
+        kernel = Kernel.get(self.device, "rasterize_bwd", ROUNDS=plan.rounds > 1, **defines)
+        gather = Kernel.get(self.device, "gather_gradients", DEPTH=drawing.depth)
+        arrays = lists._asdict() | {"ids": lists.sorted_ids, "frame": self._frame(drawing, band)}
+        arrays |= {"splats": drawing.splats, "image": drawing.image, "d_image": d_image, "d_splats": d_splats}
+        arrays |= {"records": records, "record_tails": record_tails}
+        arrays["tails"] = self.pool.constant("tails", gather.uniform("Tails", capacity=plan.capacity))
         commands.clear(record_tails.rows(0, plan.capacity))  # no slot has a record yet
         for number in range(plan.rounds):
-            piece = {}
             if plan.rounds > 1:
                 uniform = kernel.uniform("Piece", number=number, state=tails)
-                piece["piece"] = self.pool.constant(f"piece {number}", uniform)
-            commands.dispatch(
-                kernel,
-                self._band_tiles(drawing, band),
-                frame=self._frame(drawing, band),
-                ranges=lists.ranges,
-                slots=lists.slots,
-                slot_ids=lists.slot_ids,
-                splats=splats,
-                image=drawing.image,
-                d_image=d_image,
-                records=records,
-                record_tails=record_tails,
-                **piece,
-            )
-        gather = Kernel.get(self.device, "gather_gradients", DEPTH=drawing.depth)
-        commands.dispatch(
-            gather,
-            _groups(len(drawing.gaussians)),
-            visible=lists.visible,
-            ids=lists.sorted_ids,
-            tile_counts=lists.tile_counts,
-            offsets=lists.offsets,
-            splats=splats,
-            records=records,
-            record_tails=record_tails,
-            d_splats=d_splats,
-            tails=self.pool.constant("tails", gather.uniform("Tails", capacity=plan.capacity)),
-        )
+                arrays["piece"] = self.pool.constant(f"piece {number}", uniform)
+            commands.run(kernel, self._band_tiles(drawing, band), arrays)
+        commands.run(gather, _groups(len(drawing.gaussians)), arrays)
 
     def _color_bwd(
         self, commands: Commands, drawing: Drawing, d_splats: DeviceArray, d_means: DeviceArray, d_sh: DeviceArray
     ) -> None:
         kernel = Kernel.get(self.device, "color_bwd", **drawing.sh_defines)
         inputs, outputs = self._color_parts(kernel, drawing.gaussians.sh), self._color_parts(kernel, d_sh)
+        arrays = {"frame": self._frame(drawing, 0), "means": drawing.gaussians.means}
+        arrays |= {"d_splats": d_splats, "d_means": d_means}
         for (part, colors), (_, d_colors) in zip(inputs, outputs, strict=True):
-            commands.dispatch(
-                kernel,
-                _groups(colors.shape[0]),
-                frame=self._frame(drawing, 0),
-                part=part,
-                colors=colors,
-                means=drawing.gaussians.means,
-                d_splats=d_splats,
-                d_colors=d_colors,
-                d_means=d_means,
-            )
+            arrays |= {"part": part, "colors": colors, "d_colors": d_colors}
+            commands.run(kernel, _groups(colors.shape[0]), arrays)

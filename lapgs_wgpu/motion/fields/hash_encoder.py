@@ -92,7 +92,7 @@ class HashEncoder:
     def encode(
         self, places: Sequence[Place], dtype: torch.dtype, tables: Sequence[Tensor]
     ) -> tuple[Encoded, list[Tensor]]:
-        """The forward pass without autograd. Returns the encodings, group by group, of the first place, then the next."""
+        """The forward pass without autograd. Returns the encodings by place, then by group."""
         encoded = self.write(places, tables, dtype)
         with Commands(self._device) as commands:
             self.record(commands, encoded)

@@ -142,14 +142,10 @@ class HashEncoderPasses:
             source = tables[part.grid]
             if part.sliced:
                 slices = self.pool.array(f"slices {part.grid}", (part.entries, 2))
-                commands.dispatch_grid(
-                    Kernel.get(self.device, "hashgrid_slice", **self._defines(part)),
-                    (-(-part.cells // 64), part.count),
-                    grid=self._uniform(part, f"{number}", n, n, points.time),
-                    levels=part.levels,
-                    features=source,
-                    slices=slices,
-                )
+                kernel = Kernel.get(self.device, "hashgrid_slice", **self._defines(part))
+                grid = self._uniform(part, f"{number}", n, n, points.time)
+                arrays = {"grid": grid, "levels": part.levels, "features": source, "slices": slices}
+                commands.dispatch_grid(kernel, (-(-part.cells // 64), part.count), **arrays)
                 source = slices
             sources.append(source)
         options = _precision(encoding)
@@ -161,16 +157,12 @@ class HashEncoderPasses:
         else:
             options |= {"ROWS": 1}
             blocks = [(0, n, {"points": points.array, "encoding": encoding, "rows": rows})]
-        for first, count, arrays in blocks:
+        for first, count, of_points in blocks:
             for part, source in zip(self._parts, sources, strict=True):
-                commands.dispatch(
-                    Kernel.get(self.device, "hashgrid", **self._defines(part), **options),
-                    -(-count // 512) * part.count,
-                    grid=self._uniform(part, f"{number} from {first}", count, n, points.time),
-                    levels=part.levels,
-                    features=source,
-                    **arrays,
-                )
+                kernel = Kernel.get(self.device, "hashgrid", **self._defines(part), **options)
+                grid = self._uniform(part, f"{number} from {first}", count, n, points.time)
+                arrays = {"grid": grid, "levels": part.levels, "features": source}
+                commands.dispatch(kernel, -(-count // 512) * part.count, **arrays, **of_points)
 
     def add_gradient(
         self, commands: Commands, points: PointSet, d_encoding: DeviceArray, d_tables: list[DeviceArray]
@@ -194,16 +186,12 @@ class HashEncoderPasses:
         options |= {"LANE_LEVELS": 1} if self.lane_levels else {}
         for first, count in self._blocks(n, d_encoding, self._most_points):
             for part, target in zip(self._parts, sums, strict=True):
-                commands.dispatch(
-                    Kernel.get(self.device, "hashgrid_bwd", **self._defines(part), **options),
-                    -(-part.count // 8) if self.lane_levels else -(-count // 64) * part.count,
-                    grid=self._uniform(part, f"{number} from {first}", count, n, points.time),
-                    levels=part.levels,
-                    points=points.array.rows(first, count),
-                    d_encoding=d_encoding.rows(first, count),
-                    **{"d_features" if self.lane_levels else "d_fixed": target},
-                    **largest,
-                )
+                kernel = Kernel.get(self.device, "hashgrid_bwd", **self._defines(part), **options)
+                groups = -(-part.count // 8) if self.lane_levels else -(-count // 64) * part.count
+                arrays = {"points": points.array.rows(first, count), "d_encoding": d_encoding.rows(first, count)}
+                arrays |= {"levels": part.levels, "d_features": target, "d_fixed": target, **largest}
+                arrays["grid"] = self._uniform(part, f"{number} from {first}", count, n, points.time)
+                commands.run(kernel, groups, arrays)
 
         for part, target, fixed in zip(self._parts, targets, sums, strict=True):
             uniform = self._uniform(part, f"{number}", n, n, points.time)
@@ -213,14 +201,9 @@ class HashEncoderPasses:
                     unfix, -(-target.size // 64), grid=uniform, d_fixed=fixed, d_features=target, **largest
                 )
             if part.sliced:
-                commands.dispatch_grid(
-                    Kernel.get(self.device, "hashgrid_slice_bwd", **self._defines(part)),
-                    (-(-part.cells // 64), part.count),
-                    grid=uniform,
-                    levels=part.levels,
-                    d_slices=target,
-                    d_features=d_tables[part.grid],
-                )
+                kernel = Kernel.get(self.device, "hashgrid_slice_bwd", **self._defines(part))
+                arrays = {"levels": part.levels, "d_slices": target, "d_features": d_tables[part.grid]}
+                commands.dispatch_grid(kernel, (-(-part.cells // 64), part.count), grid=uniform, **arrays)
 
     def _largest(
         self, commands: Commands, points: PointSet, d_encoding: DeviceArray, options: dict[str, int]
@@ -231,13 +214,9 @@ class HashEncoderPasses:
         commands.clear(largest)
         kernel = Kernel.get(self.device, "hashgrid_largest", CORNERS=4, **options)
         for first, count in self._blocks(n, d_encoding):
-            commands.dispatch(
-                kernel,
-                -(-count * self._row // 4096),
-                grid=self._uniform(self._parts[0], f"{number} largest from {first}", count, n, points.time),
-                d_encoding=d_encoding.rows(first, count),
-                largest=largest,
-            )
+            grid = self._uniform(self._parts[0], f"{number} largest from {first}", count, n, points.time)
+            gradient = d_encoding.rows(first, count)
+            commands.dispatch(kernel, -(-count * self._row // 4096), grid=grid, d_encoding=gradient, largest=largest)
         return largest
 
 
