@@ -23,7 +23,8 @@ ffmpeg and colmap must be installed.
   lapgs-prepare walk.mp4 --out DIR              one moving camera: a pose for each image
   lapgs-prepare a.mp4 b.mp4 c.mp4 --out DIR     several static cameras: a pose for each video; all videos must start at
                                                 the same moment
-"""
+
+Then train: lapgs-train hypernerf-tiny --data DIR (one camera) or neu3d-tiny (several). See docs/own-data.md."""
 FRAMES_PER_SECOND = 10.0
 NEIGHBOURS = 20  # a moving camera: match each image with so many before and after
 FEWEST = 0.5  # of the images need a pose

@@ -48,7 +48,7 @@ class PointsConfig(Options):
     )
     box: float = option(
         "half side length of the cube around the origin in which initial Gaussians are placed at random, "
-        "world units; used only if the capture has neither a point cloud nor depth maps",
+        "world units; used only if the capture has neither a point cloud nor depth bounds",
         above=0,
     )
     opacity: float = option("initial opacity of each Gaussian, between 0 and 1", above=0, below=1)
@@ -123,7 +123,7 @@ class DensityConfig(Options):
     )
     split_size: float = option(
         "largest standard deviation of a Gaussian that is cloned; larger ones are split; relative to the "
-        "extent of the cameras",
+        "extent of the cameras (1.1 times the largest distance of a training camera from their mean)",
         above=0,
     )
     split: Split = option(
@@ -212,8 +212,10 @@ class LossConfig(Options):
 class SmoothnessConfig(Options):
     """The smoothness loss: squared differences of the field's features at nearby points (Grid4D)."""
 
-    static: float = option("weight of the smoothness loss on the features of the spatial grid")
-    temporal: float = option("weight of the smoothness loss on the features of the space-time grids")
+    static: float = option(
+        "weight of the smoothness loss (squared differences between features at nearby points), spatial grid"
+    )
+    temporal: float = option("weight of the smoothness loss, space-time grids")
     share: float = option(
         "fraction of the Gaussians that the smoothness loss samples in each step, between 0 and 1; 0: off", at_most=1
     )

@@ -60,9 +60,7 @@ class FieldConfig(Options):
     temporal: HashConfig = option("space-time hash grids (two axes and time)", HashConfig(32, (8, 8, 8), (32, 32, 16)))
     planes: PlaneConfig = option("planes of the field hexplane", PlaneConfig())
     width: int = option("width of the decoder's layers", 256, at_least=1, at_most=4096)
-    depth: int = option(
-        "number of hidden layers between the fused features and the output heads", 0, at_least=0, at_most=16
-    )
+    depth: int = option("number of hidden layers of the decoder before its output heads", 0, at_least=0, at_most=16)
     time_scale: float = option(
         "fraction of the temporal grids' time axis that the clip occupies", 0.9, above=0, at_most=1
     )
