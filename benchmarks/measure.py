@@ -11,8 +11,8 @@ from typing import Any
 from unittest import mock
 
 import numpy as np
-from wgpu.backends.wgpu_native import GPUBuffer
 
+from lapgs_wgpu.gpu import array, native
 from lapgs_wgpu.gpu.buffer import Buffer
 from lapgs_wgpu.gpu.kernel import Commands
 
@@ -88,7 +88,7 @@ def count(events: list[Event]) -> Traffic:
 def recording() -> Iterator[list[Event]]:
     """A list of events, in order: ("dispatch", shader), ("submit", None), ("write", bytes), ("read", bytes)."""
     events: list[Event] = []
-    dispatch_grid, leave, write, map_sync = Commands.dispatch_grid, Commands.__exit__, Buffer.write, GPUBuffer.map_sync
+    dispatch_grid, leave, write = Commands.dispatch_grid, Commands.__exit__, Buffer.write
 
     def counted_dispatch(self: Commands, kernel: Any, groups: tuple[int, int], **buffers: Any) -> None:
         if min(groups) > 0:
@@ -99,19 +99,18 @@ def recording() -> Iterator[list[Event]]:
         events.append(("submit", None))
         leave(self, *error)
 
-    def counted_write(self: Buffer, array: Any, offset: int = 0) -> None:
-        events.append(("write", array.nbytes))
-        write(self, array, offset)
+    def counted_write(self: Buffer, values: Any, offset: int = 0) -> None:
+        events.append(("write", values.nbytes))
+        write(self, values, offset)
 
-    def counted_map(self: Any, mode: str, offset: int = 0, size: int | None = None) -> None:
-        if mode.startswith("READ"):
-            events.append(("read", self.size if size is None else size))
-        map_sync(self, mode, offset, size)
+    def counted_mapping(device: Any, buffer: Any, mode: int, offset: int, nbytes: int) -> Any:
+        events.append(("read", nbytes))  # `array` maps for nothing else
+        return native.mapping(device, buffer, mode, offset, nbytes)
 
     with (
         mock.patch.object(Commands, "dispatch_grid", counted_dispatch),
         mock.patch.object(Commands, "__exit__", counted_leave),
         mock.patch.object(Buffer, "write", counted_write),
-        mock.patch.object(GPUBuffer, "map_sync", counted_map),
+        mock.patch.object(array, "mapping", counted_mapping),
     ):
         yield events

@@ -18,6 +18,7 @@ from work import Work
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
+from lapgs_wgpu.gpu.native import Encoder
 from lapgs_wgpu.gpu.profile import Profile
 
 COPIES = "copies to textures"
@@ -74,8 +75,9 @@ def by_processor_time(device: Device) -> Iterator[Times]:
 
     def submit(commands: Commands) -> float:
         commands.clear(done)
-        recorded = commands._encoder.finish()
-        commands._encoder = device.wgpu_device.create_command_encoder()
+        encoder, commands._encoder = commands._encoder, Encoder(device.wgpu_device)
+        encoder.end_pass()
+        recorded = encoder.wgpu_encoder.finish()
         start = time.process_time()
         device.queue.submit([recorded])
         done.read()
@@ -85,9 +87,8 @@ def by_processor_time(device: Device) -> Iterator[Times]:
 
     def alone(commands: Commands, kernel: Kernel, groups: tuple[int, int], **arrays: DeviceArray) -> None:
         if min(groups) > 0:
-            for name, binding in kernel.bindings.items():
-                if binding.kind == "texture":
-                    commands._texture(arrays[name], binding.type)
+            for name, texels in kernel.textures.items():
+                commands._texture(arrays[name], texels)
             times.append((COPIES, max(0.0, submit(commands) - empty)))
             dispatch_grid(commands, kernel, groups, **arrays)
             times.append((kernel.name, max(0.0, submit(commands) - empty)))

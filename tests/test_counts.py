@@ -14,6 +14,9 @@ from helpers.scenes import step as torch_step
 from helpers.stages import watch
 from wgpu.backends.wgpu_native import GPUBuffer, GPUQueue
 
+from lapgs_wgpu.gpu import array as array_module
+from lapgs_wgpu.gpu import buffer as buffer_module
+from lapgs_wgpu.gpu import native
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.buffer import Buffer
 from lapgs_wgpu.gpu.device import Device
@@ -49,11 +52,11 @@ def events(monkeypatch: pytest.MonkeyPatch) -> list[Event]:
     """All that happens from now on, seen where wgpu is called, so that no way around is missed."""
     seen: list[Event] = []
     watch(monkeypatch, lambda name: seen.append(Event("dispatch", name, 0)))
-    map_sync, write_buffer, read_buffer = GPUBuffer.map_sync, GPUQueue.write_buffer, GPUQueue.read_buffer
+    write_buffer, read_buffer = GPUQueue.write_buffer, GPUQueue.read_buffer
 
-    def mapping(self: GPUBuffer, mode: Any, offset: int = 0, size: int | None = None) -> Any:
-        seen.append(Event("read" if "READ" in str(mode) else "write", self.label, size or self.size - offset))
-        return map_sync(self, mode, offset, size)
+    def mapping(device: Any, buffer: GPUBuffer, mode: int, offset: int, nbytes: int) -> Any:
+        seen.append(Event("read" if mode == native.READ else "write", buffer.label, nbytes))
+        return native.mapping(device, buffer, mode, offset, nbytes)
 
     def writing(self: GPUQueue, buffer: GPUBuffer, offset: int, data: Any, *rest: Any) -> Any:
         seen.append(Event("write", buffer.label, memoryview(data).nbytes))
@@ -62,7 +65,8 @@ def events(monkeypatch: pytest.MonkeyPatch) -> list[Event]:
     def reading(self: GPUQueue, *arguments: Any) -> Any:
         raise AssertionError("queue.read_buffer is a hundred times slower than mapping")
 
-    monkeypatch.setattr(GPUBuffer, "map_sync", mapping)
+    monkeypatch.setattr(array_module, "mapping", mapping)
+    monkeypatch.setattr(buffer_module, "mapping", mapping)
     monkeypatch.setattr(GPUQueue, "write_buffer", writing)
     monkeypatch.setattr(GPUQueue, "read_buffer", reading)
     assert read_buffer is not GPUQueue.read_buffer

@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from .buffer import Buffer
 from .device import Device
+from .native import READ, mapping
 from .wgpu_errors import TranslatedErrors
 
 _ITEM_BYTES = {"float32": 4, "uint32": 4, "int16": 2, "uint8": 1, "uint64": 8}
@@ -46,12 +47,17 @@ class DeviceArray:
         """Number of elements."""
         return math.prod(self.shape)
 
-    @property
+    @cached_property
     def nbytes(self) -> int:
         """Bytes of the elements."""
         return math.prod(self.shape) * _ITEM_BYTES[self.dtype]
 
-    @property
+    @cached_property
+    def key(self) -> tuple[int, int, int, str]:
+        """Equal for arrays that are the same to a kernel."""
+        return self.buffer.number, *self.binding[1:], self.dtype
+
+    @cached_property
     def binding(self) -> tuple[Buffer, int, int]:
         """Buffer, offset and size in bytes of what a kernel sees: the array, rounded up to 16 bytes."""
         return self.buffer, self.offset, max(16, (self.nbytes + 15) & ~15)
@@ -97,11 +103,10 @@ def read_all(arrays: Sequence[DeviceArray]) -> list[NDArray[Any]]:
             device.queue.submit([encoder.finish()])
     out = []
     for (source, offset, size, nbytes), array in zip(sources, arrays, strict=True):
-        with TranslatedErrors(array.buffer.device, f"what is read from buffer {array.buffer.label!r}", nbytes):
-            source.map_sync("READ_NOSYNC", offset, size)
-        view = np.frombuffer(source.read_mapped(offset, size, copy=False), dtype=np.uint8)
-        values = view[:nbytes].copy().view(array.dtype).reshape(array.shape)
-        del view
-        source.unmap()
-        out.append(values)
+        device = array.buffer.device
+        with (
+            TranslatedErrors(device, f"what is read from buffer {array.buffer.label!r}", nbytes),
+            mapping(device.wgpu_device, source, READ, offset, size) as content,
+        ):
+            out.append(content[:nbytes].copy().view(array.dtype).reshape(array.shape))
     return out

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ..errors import DeviceMemoryError
 from .bind_group import BindGroup
 from .device import Device
+from .native import WRITE, Encoder, TextureCopies, mapping
 from .shader import TABLE_TYPES, TABLE_WIDTH
 from .wgpu_errors import TranslatedErrors
 
@@ -33,7 +34,9 @@ class _Texture:
     texture: Any
     view: Any
     rows: int
-    state: tuple[int, int, int] = (-1, 0, 0)  # version, offset and size of what was copied
+    place: tuple[int, int] = (0, 0)  # offset and size of what is copied
+    copies: TextureCopies | None = None
+    version: int = -1  # of what was copied
 
 
 class Buffer:
@@ -101,16 +104,14 @@ class Buffer:
                     self._upload = staging
                 self._uploaded = True
 
-    @staticmethod
-    def _fill(target: Any, data: NDArray[np.uint8], offset: int) -> None:
-        target.map_sync("WRITE", offset, (data.nbytes + 7) & ~7)
-        target.write_mapped(data, offset)
-        target.unmap()
+    def _fill(self, target: Any, data: NDArray[np.uint8], offset: int) -> None:
+        with mapping(self.device.wgpu_device, target, WRITE, offset, (data.nbytes + 7) & ~7) as content:
+            content[: data.nbytes] = data
 
-    def texture(self, encoder: Any, texel_format: str, offset: int, size: int) -> Any:
+    def texture(self, encoder: Encoder, texel_format: str, offset: int, size: int) -> Any:
         """A view of a texture that holds `size` bytes from `offset` on, in rows of TABLE_WIDTH texels.
 
-        If the buffer has changed, a copy is recorded in `encoder`, which must not have an open pass.
+        If the buffer has changed, a copy is recorded in `encoder`.
         """
         texel = next(nbytes for name, nbytes, _ in TABLE_TYPES.values() if name == texel_format)
         count = size // texel
@@ -125,20 +126,11 @@ class Buffer:
                     usage=wgpu.TextureUsage.STORAGE_BINDING | wgpu.TextureUsage.COPY_DST,
                 )
             held = self._textures[texel_format] = _Texture(texture, texture.create_view(), rows)
-        if held.state != (self.version, offset, size):
-            held.state = (self.version, offset, size)
-            pitch = TABLE_WIDTH * texel
-            full, rest = divmod(count, TABLE_WIDTH)
-            for row, width, height in ((0, TABLE_WIDTH, full), (full, rest, 1)):
-                if width and height:
-                    encoder.copy_buffer_to_texture(
-                        {
-                            "buffer": self.wgpu_buffer,
-                            "offset": offset + row * pitch,
-                            "bytes_per_row": pitch,
-                            "rows_per_image": height,
-                        },
-                        {"texture": held.texture, "origin": (0, row, 0)},
-                        (width, height, 1),
-                    )
+        if held.copies is None or held.place != (offset, size):
+            held.place = (offset, size)
+            held.copies = TextureCopies(self.wgpu_buffer, offset, held.texture, TABLE_WIDTH, texel, count)
+            held.version = -1
+        if held.version != self.version:
+            held.version = self.version
+            encoder.copy_to_texture(held.copies)
         return held.view

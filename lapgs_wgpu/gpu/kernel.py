@@ -14,6 +14,7 @@ from .array import DeviceArray
 from .bind_group import BindGroup
 from .buffer import Buffer
 from .device import Device
+from .native import Encoder, raising
 from .profile import Profile
 from .shader import Binding, Defines, ShaderError, compose, pack, reflect
 from .wgpu_errors import TranslatedErrors, is_lost
@@ -51,12 +52,14 @@ class Kernel:
             for b in self.bindings.values()
         ]
         self._layout = native.create_bind_group_layout(entries=entries)
-        self._pipeline = native.create_compute_pipeline(
+        self.pipeline = native.create_compute_pipeline(
             label=name,
             layout=native.create_pipeline_layout(bind_group_layouts=[self._layout]),
             compute={"module": module, "entry_point": "main"},
         )
         self._groups: dict[Any, BindGroup] = {}
+        self.textures = {name: binding.type for name, binding in self.bindings.items() if binding.kind == "texture"}
+        self.written = [name for name, binding in self.bindings.items() if binding.kind == "read_write"]
         self._kinds = {name: _scalar(binding) for name, binding in self.bindings.items()}
 
     @staticmethod
@@ -97,21 +100,22 @@ class Kernel:
                 )
 
     def bind(self, arrays: dict[str, DeviceArray], textures: dict[str, Any]) -> Any:
-        """wgpu's bind group for arrays; `textures` replace some of them."""
-        parts = {name: array.binding for name, array in arrays.items()}
-        key = tuple((name, part[0].number, id(textures.get(name)), *part[1:]) for name, part in parts.items())
+        """wgpu's bind group for arrays; `textures` replace some of them. Raises as `check` does."""
+        key = tuple((name, array.key, id(textures.get(name))) for name, array in arrays.items())
         group = self._groups.get(key)
         if group is None:
+            self.check(arrays)
             entries = []
-            for name, (buffer, offset, size) in parts.items():
+            for name, array in arrays.items():
+                buffer, offset, size = array.binding
                 whole = {"buffer": buffer.wgpu_buffer, "offset": offset, "size": size}
                 entries.append({"binding": self.bindings[name].number, "resource": textures.get(name, whole)})
             if len(self._groups) > 64:  # groups of earlier array sizes accumulate
                 self._groups.clear()
             native = self.device.wgpu_device.create_bind_group(layout=self._layout, entries=entries)
             group = self._groups[key] = BindGroup(native, textures, self._groups, key)
-            for buffer, _, _ in parts.values():
-                buffer.bound.add(group)
+            for array in arrays.values():
+                array.buffer.bound.add(group)
         return group.native
 
 
@@ -134,8 +138,8 @@ class Commands:
     def __init__(self, device: Device, profile: Profile | None = None) -> None:
         self.device = device
         self._profile = profile
-        self._encoder = device.wgpu_device.create_command_encoder()
-        self._pass: Any = None
+        self._encoder = Encoder(device.wgpu_device)
+        self._raising = raising("commands")
         self._copied: list[Buffer] = []
 
     def dispatch(self, kernel: Kernel, groups: int, **arrays: DeviceArray) -> None:
@@ -152,26 +156,18 @@ class Commands:
         """Run columns x rows workgroups on arrays, given by the names of the shader's bindings."""
         if min(groups) <= 0:
             return
-        kernel.check(arrays)
-        textures = {
-            name: self._texture(arrays[name], binding.type)
-            for name, binding in kernel.bindings.items()
-            if binding.kind == "texture"
-        }
-        if self._profile is not None:
-            self._end_pass()
-            self._pass = self._encoder.begin_compute_pass(timestamp_writes=self._profile.record(kernel.name))
-        elif self._pass is None:
-            self._pass = self._encoder.begin_compute_pass()
-        self._pass.set_pipeline(kernel._pipeline)
-        self._pass.set_bind_group(0, kernel.bind(arrays, textures))
-        self._pass.dispatch_workgroups(*groups, 1)
-        for name, array in arrays.items():
-            if kernel.bindings[name].kind == "read_write":
-                array.buffer.version += 1
+        if arrays.keys() != kernel.bindings.keys() or not all(
+            isinstance(array, DeviceArray) for array in arrays.values()
+        ):
+            kernel.check(arrays)
+        textures = {name: self._texture(arrays[name], texels) for name, texels in kernel.textures.items()}
+        group = kernel.bind(arrays, textures)
+        self._encoder.begin_pass(None if self._profile is None else self._profile.record(kernel.name))
+        self._encoder.dispatch(kernel.pipeline, group, *groups)
+        for name in kernel.written:
+            arrays[name].buffer.version += 1
 
     def _texture(self, array: DeviceArray, texel_format: str) -> Any:
-        self._end_pass()  # for the copy
         buffer, offset, size = array.binding
         self._copied.append(buffer)
         return buffer.texture(self._encoder, texel_format, offset, size)
@@ -180,36 +176,34 @@ class Commands:
         """Set an array, rounded up to 4 bytes, to zero."""
         if array.nbytes == 0:
             return
-        self._end_pass()
         array.buffer.version += 1
-        self._encoder.clear_buffer(array.buffer.wgpu_buffer, array.offset, (array.nbytes + 3) & ~3)
+        self._encoder.clear(array.buffer.wgpu_buffer, array.offset, (array.nbytes + 3) & ~3)
 
     def copy(self, source: DeviceArray, target: DeviceArray) -> None:
         """Copy an array to another of the same size in bytes."""
-        self._end_pass()
         if source.nbytes != target.nbytes:
             raise ValueError(f"{target.buffer.label}: {source.nbytes} bytes are copied to {target.nbytes}")
         target.buffer.version += 1
-        self._encoder.copy_buffer_to_buffer(
+        self._encoder.copy(
             source.buffer.wgpu_buffer, source.offset, target.buffer.wgpu_buffer, target.offset, source.nbytes
         )
 
-    def _end_pass(self) -> None:
-        if self._pass is not None:
-            self._pass.end()
-            self._pass = None
-
     def __enter__(self) -> Commands:
+        self._raising.__enter__()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self._end_pass()
-        if kind is None:
-            if self._profile is not None:
-                self._profile.resolve(self._encoder)
-            with TranslatedErrors(self.device, "commands"):
-                self.device.queue.submit([self._encoder.finish()])
-        else:
+        translated = TranslatedErrors(self.device, "commands")
+        if kind is not None:
             for buffer in self._copied:  # the copies are never made
                 buffer.version += 1
-            TranslatedErrors(self.device, "commands").__exit__(kind, error, at)
+            self._encoder.end_pass()
+            self._raising.__exit__(kind, error, at)
+            translated.__exit__(kind, error, at)
+            return
+        with translated:
+            self._encoder.end_pass()
+            if self._profile is not None:
+                self._profile.resolve(self._encoder.wgpu_encoder)
+            self._raising.__exit__(None, None, None)
+            self._encoder.submit(self.device.queue)

@@ -161,10 +161,21 @@ class DensityConfig(Options):
         "maximum number of Gaussians; at the limit, those with the largest gradients are densified first; 0: no limit",
         0,
     )
+    min_contribution: float = option(
+        "prune Gaussians whose blending weights sum to less than this in every training image that is tried, pixels; "
+        "at most 50 images are tried, evenly chosen over the clip; 0: no such pruning",
+        0.0,
+        at_least=0,
+    )
+    contribution_interval: int = option("prune by min_contribution every this many steps", 500, at_least=1)
 
     def changes_at(self, step: int) -> bool:
         """Whether Gaussians are cloned, split and pruned after this step (counted from 1)."""
         return self.start < step < self.stop and step % self.interval == 0
+
+    def prunes_at(self, step: int, last: int) -> bool:
+        """Whether Gaussians that contribute too little are pruned after this step of `last`."""
+        return self.min_contribution > 0 and self.start < step < last and step % self.contribution_interval == 0
 
     def resets_at(self, step: int) -> bool:
         """Whether opacities are lowered after this step."""

@@ -65,6 +65,10 @@ class Statistics:
             self.views += other.views
             self.radii = torch.maximum(self.radii, other.radii)
 
+    def of(self, keep: Tensor) -> Statistics:
+        """The statistics of the Gaussians of a mask (N,)."""
+        return Statistics(*(values[keep] for values in vars(self).values()))
+
     @property
     def mean_gradients(self) -> Tensor:
         """(N,) mean over the views in which a Gaussian was visible; 0 for those never seen."""

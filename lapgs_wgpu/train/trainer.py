@@ -23,8 +23,9 @@ from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.morton import morton_order
 from lapgs_wgpu.train.autotune import choose_decoder
 from lapgs_wgpu.train.config import Config, PointsConfig, SmoothnessConfig
+from lapgs_wgpu.train.contribution import contributions, spread_over_time
 from lapgs_wgpu.train.dataloader import Pictures
-from lapgs_wgpu.train.densify import Statistics, densify, reset_opacities
+from lapgs_wgpu.train.densify import LEAST_KEPT, Statistics, densify, largest, reset_opacities
 from lapgs_wgpu.train.distributed import SINGLE_PROCESS, Ranks
 from lapgs_wgpu.train.exposure import Exposures
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
@@ -104,6 +105,7 @@ class Trainer:
             self._frequencies = FrequencyOptimizer(scene.spectrum, config.rates.frequencies, limit)
         self._exposures = Exposures(len(dataset.train), config.exposure.rate) if config.exposure.enabled else None
         self._beside = [each for each in (self._frequencies, self._exposures) if each is not None]
+        self._scored = spread_over_time(dataset.train)
         self._numbers = {view.name: number for number, view in enumerate(dataset.train)}
         # Cameras that all stand at one place have no extent; the scene's own size must serve.
         self._extent = dataset.extent or config.points.box
@@ -241,6 +243,8 @@ class Trainer:
 
     def _change_density(self, step: int) -> None:
         density, scene = self.config.density, self.scene
+        if density.prunes_at(step, self.config.schedule.steps):
+            self._prune_hidden(step)
         if density.changes_at(step):
             change = densify(
                 scene.parameters,
@@ -261,6 +265,15 @@ class Trainer:
         if density.resets_at(step):
             logits = reset_opacities(scene.parameters["opacity_logits"], density.reset_opacity)
             self._optimizer.reset("opacity_logits", logits)
+
+    def _prune_hidden(self, step: int) -> None:
+        """Prune the Gaussians that contribute too little to all images."""
+        scene = self.scene
+        most = contributions(scene, self._scored, moving=step > self._warm_up)
+        keep = (most >= self.config.density.min_contribution) | largest(most, LEAST_KEPT)
+        if not keep.all():
+            self._optimizer.edit_rows(keep, {name: row[:0] for name, row in scene.parameters.items()})
+            self._statistics = self._statistics.of(keep)
 
     # The state between two steps -------------------------------------------------------------------------------------
 

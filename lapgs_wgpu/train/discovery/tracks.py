@@ -26,7 +26,7 @@ VOXEL = 0.045  # spacing of a track's points
 REACH = 0.07  # distance within which a track explains a point
 CALM = 0.02  # jitter of a part's center that is no leaping
 LEAST_SEEN = 0.2  # share of the times at which a part must be seen
-LEAPS = 1.3  # jitter of a part's center that is leaping, in steps of its smoothed path
+LEAPS = 1.7  # jitter of a part's center that is leaping, in steps of its smoothed path
 EXPLAINED = 0.3  # weight of points that an earlier key time's tracks explain
 SMOOTHING = 2.0  # times; standard deviation of the weights by which paths are smoothed
 RIDGE = 1e-2  # of slope and curvature, which few times do not determine
@@ -193,7 +193,8 @@ def _steady(tracks: Tracks, paths: Floats, half_side: float) -> NDArray[np.bool_
             continue
         center = tracks.paths[:, members].mean(axis=1)
         jitter = np.linalg.norm(paths[:, members].mean(axis=1) - center, axis=1)[seen].mean()
-        step = np.median(np.linalg.norm(np.diff(center, axis=0), axis=1)) if len(center) > 1 else 0.0
+        steps = np.linalg.norm(np.diff(center, axis=0), axis=1)[seen[1:] & seen[:-1]]
+        step = np.median(steps) if len(steps) else 0.0
         size = np.ptp(tracks.positions[members], axis=0).max()
         still = np.ptp(center[seen], axis=0).max() < 0.5 * size
         steady[k] = still or jitter < max(LEAPS * step, CALM * half_side)

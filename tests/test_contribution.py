@@ -1,0 +1,86 @@
+"""What Gaussians contribute to images, and that those are pruned which nobody would miss."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from helpers.captures import cameras
+from helpers.scene_files import moving_scene
+
+from lapgs_wgpu.data.views import Dataset, View
+from lapgs_wgpu.gpu.device import Device
+from helpers.reference import rasterize_reference
+from lapgs_wgpu.train import trainer
+from lapgs_wgpu.train.config import Config
+from lapgs_wgpu.train.contribution import MOST_VIEWS, contributions, spread_over_time
+from lapgs_wgpu.train.presets import load_config
+
+
+def views(count: int) -> list[View]:
+    return [
+        View(f"train_{i:03d}", camera, i / max(count - 1, 1), "made up", lambda: np.zeros((48, 64, 3), np.uint8))
+        for i, camera in enumerate(cameras(count, 64, 48))
+    ]
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_contributions_are_the_largest_sums_of_blending_weights(device: Device, *, moving: bool) -> None:
+    scene, shown = moving_scene(device), views(3)
+    expected = torch.zeros(len(scene), dtype=torch.float64)
+    for view in shown:
+        gaussians = scene.at(view.time) if moving else scene.canonical()
+        shape = [getattr(gaussians, name).detach().double() for name in ("means", "quats", "scales", "opacities")]
+        for k in range(0, len(scene), 3):  # three Gaussians at a time, in a channel each
+            colors = torch.zeros(len(scene), 3, dtype=torch.float64)
+            colors[range(k, k + 3), range(3)] = 1.0
+            image = rasterize_reference(*shape, colors, view.camera).image
+            expected[k : k + 3] = torch.maximum(expected[k : k + 3], image.sum((0, 1)))
+    assert expected.max() > 10
+    assert (expected < 1).any()
+    torch.testing.assert_close(contributions(scene, shown, moving=moving).double(), expected, rtol=1e-3, atol=1e-2)
+
+
+def test_views_are_spread_over_the_clip() -> None:
+    shown = views(3)
+    assert [view.name for view in spread_over_time(shown[::-1])] == [view.name for view in shown]
+    many = [dataclasses.replace(shown[0], name=f"{i}", time=(i * 37 % 400) / 400) for i in range(400)]
+    times = [view.time for view in spread_over_time(many)]
+    assert len(times) == MOST_VIEWS
+    assert np.allclose(np.diff(times), 1 / MOST_VIEWS)
+    assert times[0] < 1 / MOST_VIEWS
+
+
+def pruning_config(**changes: float) -> Config:
+    config = load_config("demo", {"schedule.steps": "20"})
+    density = dataclasses.replace(config.density, start=2, stop=3, contribution_interval=4, **changes)
+    return dataclasses.replace(config, density=density)
+
+
+def test_training_prunes_what_hardly_shows(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(trainer, "LEAST_KEPT", 1)
+    found: list[torch.Tensor] = []
+
+    def noted(*arguments: Any, **options: Any) -> torch.Tensor:
+        found.append(contributions(*arguments, **options))
+        return found[-1]
+
+    monkeypatch.setattr(trainer, "contributions", noted)
+    dataset = Dataset("made up", tuple(views(4)), ())
+
+    def trained(least: float) -> int:
+        config = pruning_config(min_contribution=least)
+        training = trainer.Trainer(config, dataset, device, scene=moving_scene(device, config.field))
+        for _ in range(6):
+            training.step()
+        training.close()
+        return len(training.scene)
+
+    everything = trained(0.0)
+    assert not found, "without a threshold nothing is looked at"
+    remaining = trained(0.5)
+    assert len(found) == 1, "at step 4, after density.start"
+    assert remaining == int((found[0] >= 0.5).sum()) < len(found[0]) == everything
