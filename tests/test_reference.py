@@ -87,6 +87,11 @@ def random_scene(count: int, seed: int, sh_degree: int | None = None, spread: fl
 # One Gaussian, by hand
 
 
+def test_the_logarithm_of_the_smallest_alpha() -> None:
+    """A constant of its own, since WGSL cannot be relied on to compute it when compiled."""
+    assert CONSTANTS["LOG2_ALPHA_MIN"] == pytest.approx(math.log2(ALPHA_MIN), rel=1e-15)
+
+
 def test_single_gaussian_pixels_by_hand() -> None:
     scene = splats(([0, 0, 2], 0.3, 0.8, [0.2, 0.5, 0.9]))
     background = torch.tensor([1.0, 0.0, 0.5])
