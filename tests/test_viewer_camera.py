@@ -136,7 +136,7 @@ def test_snapping_is_exact(view: ViewCamera) -> None:
 @pytest.mark.parametrize("move", ["orbit", "look", "pan", "zoom", "fly", "focus_on", "stand", "reset"])
 def test_any_move_leaves_the_exact_camera(view: ViewCamera, move: str) -> None:
     arguments = {"zoom": (0.9,), "fly": (0, 0, 1), "focus_on": ([0, 0, 0],), "reset": ()}
-    arguments["stand"] = (view.position, view.rotation, 0.5)
+    arguments["stand"] = (view.pose,)
     view.snap(captured())
     getattr(view, move)(*arguments.get(move, (0.1, 0.1)))
     assert view.exact is None
