@@ -6,13 +6,18 @@ from __future__ import annotations
 import lapgs_wgpu  # noqa: F401
 
 # isort: split
+import sys
+from pathlib import Path
+
+sys.path.append(str(Path(__file__).parents[1] / "tests"))  # helpers: the references in torch
+
+# isort: split
 import argparse
 import dataclasses
 import json
 import os
 import platform
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
 import torch

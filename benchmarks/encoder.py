@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from helpers.encoder_reference import encode_reference
 from measure import Timing, timed
 from numpy.typing import NDArray
 from passes import Meter, PassTimes
@@ -16,7 +17,7 @@ from work import encoder_work
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.fields.grid_field import GridField
-from lapgs_wgpu.motion.fields.hash_encoder import HashEncoder, encode_reference
+from lapgs_wgpu.motion.fields.hash_encoder import HashEncoder
 
 TIME = 0.37
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from helpers.loss_reference import total
 from measure import Timing, timed
 from numpy.typing import NDArray
 from passes import Meter, PassTimes
@@ -13,8 +14,8 @@ from passes import Meter, PassTimes
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands
+from lapgs_wgpu.train.config import LossWeights
 from lapgs_wgpu.train.image_loss import ImageLoss
-from lapgs_wgpu.train.losses import LossWeights, total
 from lapgs_wgpu.train.truth_cache import upload_rgba
 
 WEIGHTS = LossWeights(0.8, 0.2, pyramid=0.2, ncc=0.05)  # the paper's

@@ -69,7 +69,7 @@ def count_scene(rasterizer: Rasterizer, drawing: Drawing) -> SceneCounts:
 
 
 def raster_work(scene: SceneCounts, rasterizer: Rasterizer) -> dict[str, Work]:
-    """Shader -> all its dispatches in a forward and backward pass, for given colours, without depth."""
+    """Shader -> all its dispatches in a forward and backward pass, for given colors, without depth."""
     n, v, i = scene.gaussians * scene.bands, scene.visible, scene.intersections
     lanes = scene.drawn * rasterizer.config.lanes  # a lane does this much for its column of each drawn splat
     rows = sqrt(v * i)  # of tiles, over all splats, as if each touched as many rows as columns

@@ -45,10 +45,9 @@ def _train(arguments: list[str]) -> None:
     if given["eval"]:
         _evaluate(Path(given["eval"]), given, overrides)
         return
-    if given["lpips_weights"]:
-        raise InputError("--lpips-weights goes with --eval RUN, after the training.")
-    if given["motion_from"]:
-        raise InputError("--motion-from goes with --eval RUN, after the training.")
+    for name in ("lpips_weights", "motion_from"):
+        if given[name]:
+            raise InputError(f"--{name.replace('_', '-')} goes with --eval RUN, after the training.")
     watch = None
     if given["view"]:
         from lapgs_wgpu.viewer import live
@@ -83,8 +82,7 @@ def _resume(
     others = _others(given, ("preset", "field", "ablate", "out", "overwrite"), overrides)
     if others:
         raise InputError(f"--resume goes on as the run began, so {others[0]} cannot be given.")
-    if not (run / "config.toml").is_file():
-        raise InputError(f"{run / 'config.toml'} does not exist; --resume needs the folder of a run.")
+    _check_files("--resume", "a run", run / "config.toml")
     config = load_config(str(run / "config.toml"))
     device = open_device(given["device"], number=ranks.on_machine)
     config, dataset = _open_data(config, run.parent, ranks)
@@ -106,6 +104,7 @@ def _evaluate(run: Path, given: dict[str, typing.Any], overrides: dict[str, str 
     from lapgs_wgpu.io.safe_json_toml import read_json
     from lapgs_wgpu.motion.scene import load
     from lapgs_wgpu.train import plots
+    from lapgs_wgpu.train.distributed import SINGLE_PROCESS
     from lapgs_wgpu.train.lpips import Lpips
     from lapgs_wgpu.train.presets import load_config
     from lapgs_wgpu.train.run import evaluate_run
@@ -115,9 +114,7 @@ def _evaluate(run: Path, given: dict[str, typing.Any], overrides: dict[str, str 
     if others:
         raise InputError(f"--eval measures a run as it is, so {others[0]} cannot be given.")
     lpips = Lpips(Path(given["lpips_weights"])) if given["lpips_weights"] else None
-    for name in ("config.toml", "checkpoint.ply"):
-        if not (run / name).is_file():
-            raise InputError(f"{run / name} does not exist; --eval needs the folder of a finished run.")
+    _check_files("--eval", "a finished run", run / "config.toml", run / "checkpoint.ply")
     size = load_config(str(run / "config.toml")).data.size
     config = load_config(str(run / "config.toml"), overrides)
     if config.data.size != size:
@@ -127,7 +124,7 @@ def _evaluate(run: Path, given: dict[str, typing.Any], overrides: dict[str, str 
         )
     device = open_device(given["device"])
     scene = load(run / "checkpoint.ply", device)
-    config, dataset = _open_data(config, run.parent, normalize="placement" in scene.metadata)
+    config, dataset = _open_data(config, run.parent, SINGLE_PROCESS, normalize="placement" in scene.metadata)
     try:
         training = read_json(run / "metrics.json")["training"]
     except (InputError, KeyError, TypeError):
@@ -146,14 +143,19 @@ def _static_fit(run: Path, device: Device) -> Scene4D:
     """The scene of a run that was trained without motion."""
     from lapgs_wgpu.motion.scene import load
 
-    if not (run / "checkpoint.ply").is_file():
-        raise InputError(f"{run / 'checkpoint.ply'} does not exist; --motion-from needs the folder of a finished run.")
+    _check_files("--motion-from", "a finished run", run / "checkpoint.ply")
     scene = load(run / "checkpoint.ply", device)
     if scene.field_config.kind != "static":
         raise InputError(
             f"{run} has the field {scene.field_config.kind}; --motion-from needs a run trained with --field static."
         )
     return scene
+
+
+def _check_files(option: str, what: str, *files: Path) -> None:
+    for file in files:
+        if not file.is_file():
+            raise InputError(f"{file} does not exist; {option} needs the folder of {what}.")
 
 
 def _report(run: Path) -> None:
@@ -173,9 +175,7 @@ def _scene_name(config: Config) -> str:
     return Path(config.data.path).resolve().name or "scene"
 
 
-def _open_data(
-    config: Config, parent: Path, ranks: Ranks | None = None, *, normalize: bool = True
-) -> tuple[Config, Dataset]:
+def _open_data(config: Config, parent: Path, ranks: Ranks, *, normalize: bool = True) -> tuple[Config, Dataset]:
     """The dataset, and the configuration with its folder. parent: folder for built-in scenes, which the first of
     several processes writes. normalize: of `load_dataset`."""
     import dataclasses
@@ -184,14 +184,12 @@ def _open_data(
     from lapgs_wgpu.data.builtin import SYNTHETIC, is_builtin, write_builtin
 
     path = config.data.path
-    if not path.isprintable():
-        raise InputError(f"{path!r} holds characters that config.toml cannot record; rename the folder.")
     if not path:
         raise InputError(f"name the folder of the scene with --data DIR, or take --data {SYNTHETIC}.")
-    if ranks is not None and not ranks.first:
-        ranks.any(False)  # waits until the first has done so
+    if not ranks.first:
+        ranks.any(False)  # waits for the first process, which writes the scene
     folder = write_builtin(path, parent) if is_builtin(path) else Path(path)
-    if ranks is not None and ranks.first:
+    if ranks.first:
         ranks.any(False)
     dataset = load_dataset(folder, image_size=config.data.size or None, normalize=normalize)
     data = dataclasses.replace(config.data, path=str(folder.resolve()))

@@ -26,32 +26,27 @@ def guarded(name: str, command: Callable[[list[str]], int | None], arguments: li
     """Run a command; what its user should know goes to stderr in one sentence. Returns the exit code."""
     try:
         code = command(arguments)
-    except NoAdapterError as error:
-        print(f"{name}: {error}", file=sys.stderr)
-        return 2 if list_devices() else 3  # an adapter that is not there, or none at all
+        return code or 0
+    except NoAdapterError as error:  # either no adapter at all, or none of the wanted name
+        text, code = str(error), 2 if list_devices() else 3
     except InputError as error:
-        print(f"{name}: {error}", file=sys.stderr)
-        return 2
+        text, code = str(error), 2
     except (DeviceError, MemoryError) as error:
-        print(f"{name}: {str(error) or 'out of memory.'}", file=sys.stderr)
-        return OUT_OF_DEVICE
-    except RuntimeError as error:  # how torch says that memory gave out
-        if "allocate" not in str(error):
+        text, code = str(error) or "out of memory.", OUT_OF_DEVICE
+    except RuntimeError as error:
+        if "allocate" not in str(error):  # torch's error for exhausted memory
             raise
-        print(f"{name}: out of memory ({str(error).splitlines()[0]})", file=sys.stderr)
-        return OUT_OF_DEVICE
+        text, code = f"out of memory ({str(error).splitlines()[0]})", OUT_OF_DEVICE
     except NumericalError as error:
-        print(f"{name}: {error}", file=sys.stderr)
-        return NOT_FINITE
-    except OSError as error:  # a full disk, a folder that may not be written to
+        text, code = str(error), NOT_FINITE
+    except OSError as error:  # such as a full disk, or missing permissions
         where = f"{error.filename}: " if error.filename is not None else ""
-        reason = InputError(f"{where}{error.strerror or error}; check the disk's free space, the path and your rights")
-        print(f"{name}: {reason}.", file=sys.stderr)
-        return 2
+        text = f"{InputError(f'{where}{error.strerror or error}; check the free space, the path and the permissions')}."
+        code = 2
     except KeyboardInterrupt as error:
-        print(f"{name}: {str(error) or 'interrupted.'}", file=sys.stderr)
-        return INTERRUPTED
-    return code or 0
+        text, code = str(error) or "interrupted.", INTERRUPTED
+    print(f"{name}: {text}", file=sys.stderr)
+    return code
 
 
 def print_devices() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import os
 import re
 import shutil
@@ -11,7 +10,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from lapgs_wgpu.command import guarded
+from lapgs_wgpu.command import HelpFormatter, Parser, guarded
 from lapgs_wgpu.data.readers.colmap import IMAGES, SPARSE
 from lapgs_wgpu.data.readers.colmap_model import count_images, is_model
 from lapgs_wgpu.data.timestamps import write_times
@@ -24,7 +23,8 @@ ffmpeg and colmap must be installed.
   lapgs-prepare walk.mp4 --out DIR              one moving camera: a pose for each image
   lapgs-prepare a.mp4 b.mp4 c.mp4 --out DIR     several static cameras: a pose for each video; all videos must start at
                                                 the same moment
-"""
+
+Then train: lapgs-train hypernerf-tiny --data DIR (one camera) or neu3d-tiny (several). See docs/own-data.md."""
 FRAMES_PER_SECOND = 10.0
 NEIGHBOURS = 20  # a moving camera: match each image with so many before and after
 FEWEST = 0.5  # of the images need a pose
@@ -37,24 +37,14 @@ def prepare_command(arguments: Sequence[str] | None = None) -> int:
 
 
 def _prepare(arguments: list[str]) -> None:
-    parser = argparse.ArgumentParser(
-        "lapgs-prepare",
-        description=DESCRIPTION,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
-    parser.add_argument(
-        "videos", nargs="+", metavar="VIDEO", help="video files, one per camera, all of the same resolution"
-    )
-    parser.add_argument(
-        "--out", required=True, metavar="DIR", help="output folder for the capture; must be new or empty"
-    )
-    parser.add_argument(
-        "--fps",
-        type=float,
-        default=FRAMES_PER_SECOND,
-        help=f"maximum number of extracted images per second of video [{FRAMES_PER_SECOND:g}]",
-    )
+    parser = Parser("lapgs-prepare", description=DESCRIPTION, formatter_class=HelpFormatter, allow_abbrev=False)
+    # fmt: off
+    add = parser.add_argument
+    add("videos", nargs="+", metavar="VIDEO", help="video files, one per camera, all of the same resolution")
+    add("--out", required=True, metavar="DIR", help="output folder for the capture; must be new or empty")
+    add("--fps", type=float, default=FRAMES_PER_SECOND, help="maximum number of extracted images per second of video "
+        f"[{FRAMES_PER_SECOND:g}]")
+    # fmt: on
     given = parser.parse_args(arguments)
     prepare([Path(video) for video in given.videos], Path(given.out), given.fps)
 

@@ -27,18 +27,16 @@ def table_command(arguments: Sequence[str] | None = None) -> int:
 
 def _table(arguments: list[str]) -> int:
     parser = Parser("lapgs-table", description=DESCRIPTION, formatter_class=HelpFormatter, allow_abbrev=False)
-    parser.add_argument(
-        "spec", nargs="?", metavar="SPEC.toml", help="table definition; docs/tables/demo.toml documents the format"
-    )
-    parser.add_argument("--data", metavar="DIR", default=".", help="folder that contains the scenes' folders [.]")
-    parser.add_argument("--out", metavar="OUT", help="output folder for the runs and the table")
-    parser.add_argument(
-        "--from", metavar="FILE", nargs="+", default=[], dest="known", help="results.json files whose runs are reused"
-    )
-    parser.add_argument("--device", metavar="NAME", help=DEVICE_HELP)
-    parser.add_argument(
-        "--slim", action="store_true", help="delete checkpoint.ply and eval/ of each finished run, to save disk space"
-    )
+    # fmt: off
+    add = parser.add_argument
+    add("spec", nargs="?", metavar="SPEC.toml", help="table definition; docs/tables/demo.toml documents the format")
+    add("--data", metavar="DIR", default=".", help="folder that contains the scenes' folders [.]")
+    add("--out", metavar="OUT", help="output folder for the runs and the table; required with SPEC.toml")
+    add("--from", metavar="FILE", nargs="+", default=[], dest="known", help="results.json files of lapgs-table; their "
+        "runs are reused or, without SPEC.toml, printed")
+    add("--device", metavar="NAME", help=DEVICE_HELP)
+    add("--slim", action="store_true", help="delete checkpoint.ply and eval/ of each finished run, to save disk space")
+    # fmt: on
     given = parser.parse_args(arguments)
     if given.spec and not given.out:
         raise InputError("name a folder for the runs and the table with --out.")

@@ -41,7 +41,7 @@ _METAVARS = {int: "INT", float: "FLOAT", str: "TEXT", bool: "true|false"}
 def parse_options(arguments: list[str]) -> dict[str, typing.Any]:
     """Option name -> value; configuration keys by their dotted names, only those that were given. Raises InputError."""
     from lapgs_wgpu.io.dataclass_table import did_you_mean
-    from lapgs_wgpu.train.presets import ABLATION_HELP, config_keys, load_config, preset_names
+    from lapgs_wgpu.train.presets import ABLATIONS, config_keys, load_config, preset_names
 
     shown = next((word for word in arguments if word in preset_names()), "dnerf")
     preset = load_config(shown)
@@ -50,7 +50,7 @@ def parse_options(arguments: list[str]) -> dict[str, typing.Any]:
     )
     # fmt: off
     add = parser.add_argument
-    names, parts = ", ".join(preset_names()), "; ".join(f"{name} ({text})" for name, text in ABLATION_HELP.items())
+    names, parts = ", ".join(preset_names()), "; ".join(f"{name} ({text})" for name, (text, _, _) in ABLATIONS.items())
     add("preset", nargs="?", metavar="PRESET",
         help=f"preset configuration: {names}, or the path of a .toml file, such as RUN/config.toml")
     add("--field", metavar="NAME", help="method: static (3DGS, no motion), mlp (deformable 3DGS), hexplane (4D-GS), "
@@ -92,5 +92,5 @@ def parse_options(arguments: list[str]) -> dict[str, typing.Any]:
         word = unknown[0].split("=")[0]
         options = [name for action in parser._actions for name in action.option_strings]
         what = f"there is no option {word}" if word.startswith("-") else f"{word!r} is one word too many"
-        raise InputError(f"{what}{did_you_mean(word, options) or '; lapgs-train --help lists the options'}.")
+        raise InputError(f"{what}{did_you_mean(word, options, '; lapgs-train --help lists the options.')}")
     return vars(known)

@@ -1,9 +1,7 @@
 // Local cross-correlation, along the rows: each window's value and derivatives, and the sums of these over the windows
 // that hold a pixel column. A lane takes a run of one row of windows.
+#import common/constants
 #import common/picture
-
-const E: f32 = 1e-4;
-const TINY: f32 = 1e-14;
 
 @group(0) @binding(0) var<uniform> picture: Picture;
 #table 1 moments: vec4<f32>
@@ -49,9 +47,9 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>) {
         }
 #end
         moments_of_all /= 11.0;
-        let deviation = sqrt(moments_of_all.x * moments_of_all.y + TINY);
-        let norm = 1.0 / (deviation + E);
-        let correlation = (moments_of_all.z + E) * norm;
+        let deviation = sqrt(moments_of_all.x * moments_of_all.y + NCC_TINY);
+        let norm = 1.0 / (deviation + NCC_E);
+        let correlation = (moments_of_all.z + NCC_E) * norm;
         let begin = column - 10;   // of the window
         let valid = column >= run.x && begin >= 0 && column < width;
         sum += select(0.0, 1.0 - correlation, valid && begin >= run.x && begin < run.y);

@@ -21,6 +21,17 @@ const DEPTH = 16u;       // inner elements of a step; a lane loads TILE x DEPTH 
 const LANES = 256u;
 const PITCH = TILE + 4u; // so that the elements that are stored together lie in different banks
 
+#ifdef A_INNER
+const A_INNER = true;
+#else
+const A_INNER = false;
+#endif
+#ifdef B_INNER
+const B_INNER = true;
+#else
+const B_INNER = false;
+#endif
+
 @group(0) @binding(0) var<uniform> product: Matmul;
 @group(0) @binding(1) var<storage, read> a: array<f32>;
 @group(0) @binding(2) var<storage, read> b: array<f32>;
@@ -29,13 +40,17 @@ const PITCH = TILE + 4u; // so that the elements that are stored together lie in
 var<workgroup> of_a: array<f32, DEPTH * PITCH>;   // by inner element, then by row
 var<workgroup> of_b: array<f32, DEPTH * PITCH>;
 
-// Place of the k-th element that a lane loads in a tile: along the tile's side (x) and along the inner dimension (y).
-fn along_inner(lane: u32, k: u32) -> vec2<u32> {
-    return vec2(lane / DEPTH + k * (LANES / DEPTH), lane % DEPTH);
+// Place of the k-th element that a lane loads in a tile: along the tile's side (x) and along the inner dimension (y). Lanes
+// beside one another load what lies beside one another in memory.
+fn place_in_tile(lane: u32, k: u32, inner_first: bool) -> vec2<u32> {
+    let along_inner = vec2(lane / DEPTH + k * (LANES / DEPTH), lane % DEPTH);
+    let along_side = vec2(lane % TILE, lane / TILE + k * (LANES / TILE));
+    return select(along_side, along_inner, inner_first);
 }
 
-fn along_side(lane: u32, k: u32) -> vec2<u32> {
-    return vec2(lane % TILE, lane / TILE + k * (LANES / TILE));
+// Index of an element of A or B, whose steps along the side and along the inner dimension are 1 and `stride`, or the reverse.
+fn index_of(side: u32, inner: u32, stride: u32, inner_first: bool) -> u32 {
+    return select(inner * stride + side, side * stride + inner, inner_first);
 }
 
 @compute @workgroup_size(256)
@@ -61,42 +76,24 @@ fn main(
     for (var at = begin; at < end; at += DEPTH) {
 #unroll k 4
         {
-            {
-#ifdef A_INNER
-                let place = along_inner(lane, $(k)u);
-#else
-                let place = along_side(lane, $(k)u);
-#endif
-                let row = tile.x + place.x;
-                let inner = at + place.y;
-                var value = 0.0;
-                if (row < product.rows && inner < end) {
-#ifdef A_INNER
-                    value = a[product.first.x + row * product.a_stride + inner];
-#else
-                    value = a[product.first.x + inner * product.a_stride + row];
-#endif
-                }
-                of_a[place.y * PITCH + place.x] = value;
+            let of_row = place_in_tile(lane, $(k)u, A_INNER);
+            let row = tile.x + of_row.x;
+            let inner = at + of_row.y;
+            var value = 0.0;
+            if (row < product.rows && inner < end) {
+                value = a[product.first.x + index_of(row, inner, product.a_stride, A_INNER)];
             }
-            {
-#ifdef B_INNER
-                let place = along_inner(lane, $(k)u);
-#else
-                let place = along_side(lane, $(k)u);
-#endif
-                let column = tile.y + place.x;
-                let inner = at + place.y;
-                var value = 0.0;
-                if (column < product.columns && inner < end) {
-#ifdef B_INNER
-                    value = b[product.first.y + column * product.b_stride + inner];
-#else
-                    value = b[product.first.y + inner * product.b_stride + column];
-#endif
-                }
-                of_b[place.y * PITCH + place.x] = value;
+            of_a[of_row.y * PITCH + of_row.x] = value;
+        }
+        {
+            let of_column = place_in_tile(lane, $(k)u, B_INNER);
+            let column = tile.y + of_column.x;
+            let inner = at + of_column.y;
+            var value = 0.0;
+            if (column < product.columns && inner < end) {
+                value = b[product.first.y + index_of(column, inner, product.b_stride, B_INNER)];
             }
+            of_b[of_column.y * PITCH + of_column.x] = value;
         }
 #end
         workgroupBarrier();

@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 import pytest
 import safetensors.numpy
-from helpers.ply_files import INRIA, assert_same, mutate, random_still
+from helpers.ply_files import INRIA, assert_same, mutate, random_still, read_ply
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.checkpoint import read_checkpoint, write_checkpoint
-from lapgs_wgpu.io.ply import read_ply, write_ply
+from lapgs_wgpu.io.ply import write_ply
 from lapgs_wgpu.io.safetensors_file import MAX_HEADER_BYTES, pack_tensors
 
 STILL = random_still(4)

@@ -169,7 +169,10 @@ MISTAKES = {
     "unknown field": (["tiny", "--data", "SCENE", "--out", "OUT", "--field", "grid5d"], "did you mean grid4d?"),
     "unknown device": (["tiny", "--data", "SCENE", "--out", "OUT", "--device", "GTX 9999"], "'GTX 9999'"),
     "missing folder": (["tiny", "--data", "nowhere", "--out", "OUT"], "nowhere does not exist"),
-    "unprintable folder": (["tiny", "--data", "a\udcff", "--out", "OUT"], "rename the folder"),
+    "unprintable folder": (
+        ["tiny", "--data", "a\udcff", "--out", "OUT"],
+        "--data.path holds 'a\\udcff', with characters that cannot be printed",
+    ),
     "no scene": (["tiny", "--data", "USED", "--out", "OUT"], "is no scene in a known format"),
     "run folder in use": (["tiny", "--data", "SCENE", "--out", "USED"], "is not empty"),
     "run folder is a file": (["tiny", "--data", "SCENE", "--out", "USED/file"], "is a file"),

@@ -1,4 +1,4 @@
-"""Colours seen through `rasterize`: splats far apart, of which each fills the middle of its own square of pixels."""
+"""Colors seen through `rasterize`: splats far apart, of which each fills the middle of its own square of pixels."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import math
 
 import pytest
 import torch
+from helpers.reference import color
 from helpers.scenes import Scene, front_camera, random_scene, relative, step
 from torch import Tensor
 
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.splat.rasterize import rasterize
 from lapgs_wgpu.splat.rasterizer import Rasterizer
-from lapgs_wgpu.splat.reference import color
 
 pytestmark = pytest.mark.kernels
 
@@ -39,7 +39,7 @@ def squares(colors: Tensor) -> Scene:
 
 
 def seen_colors(scene: Scene, device: Device, sh_degree: int | None) -> Tensor:
-    """(N, 3) the colour of each splat: that of its pixel, divided by the opacity there."""
+    """(N, 3) the color of each splat: that of its pixel, divided by the opacity there."""
     drawn = rasterize(**scene, camera=CAMERA, sh_degree=sh_degree, device=device)
     return (drawn.image[MIDDLE] / drawn.alpha[MIDDLE][..., None]).reshape(COUNT, 3)
 
@@ -48,7 +48,7 @@ def normal(seed: int, *shape: int) -> Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
 
 
-def test_given_colours_pass_through(device: Device) -> None:
+def test_given_colors_pass_through(device: Device) -> None:
     """Whatever they are: nothing is cut at zero or one."""
     colors = 2 * normal(0, COUNT, 3)
     torch.testing.assert_close(seen_colors(squares(colors), device, None), colors, rtol=1e-5, atol=1e-6)
@@ -79,7 +79,7 @@ def test_degree_one_brightens_along_its_axis(device: Device) -> None:
     torch.testing.assert_close(seen_colors(squares(colors), device, 1), expected, rtol=1e-5, atol=1e-5)
 
 
-def test_no_gradient_where_the_colour_is_cut_at_zero(device: Device) -> None:
+def test_no_gradient_where_the_color_is_cut_at_zero(device: Device) -> None:
     colors = torch.zeros(COUNT, 4, 3)
     colors[:, 0] = torch.tensor([-3.0, 0.5, 3.0])  # red is cut
     colors[:, 1:] = 0.1 * normal(1, COUNT, 3, 3)
@@ -101,7 +101,7 @@ def test_no_gradient_for_degrees_that_are_not_used(device: Device, degree: int) 
 
 @pytest.mark.parametrize("degree", [1, 2, 3])
 def test_the_direction_of_view_carries_gradient_to_the_mean(device: Device, degree: int) -> None:
-    """A loss on colours alone: moving a mean along its own ray of view changes none of them."""
+    """A loss on colors alone: moving a mean along its own ray of view changes none of them."""
     scene = squares(0.5 * normal(degree, COUNT, 16, 3))
     leaves = {name: value.clone().requires_grad_() for name, value in scene.items()}
     drawn = rasterize(**leaves, camera=CAMERA, sh_degree=degree, device=device)

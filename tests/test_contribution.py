@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 from helpers.captures import cameras
+from helpers.reference import rasterize_reference
 from helpers.scene_files import moving_scene
 
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.splat.reference import rasterize_reference
 from lapgs_wgpu.train import trainer
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.contribution import MOST_VIEWS, contributions, spread_over_time

@@ -28,8 +28,8 @@ from lapgs_wgpu.motion.fields.hash_grid_config import HashConfig
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterize import rasterizer_of
 from lapgs_wgpu.splat.rasterizer import Rasterizer
+from lapgs_wgpu.train.config import LossWeights
 from lapgs_wgpu.train.fused_loss import image_loss_of, render_loss
-from lapgs_wgpu.train.losses import LossWeights
 from lapgs_wgpu.train.truth_cache import TruthCache
 
 pytestmark = pytest.mark.kernels

@@ -93,13 +93,13 @@ def test_pictures_may_be_smaller_than_the_model_says(toy: Path, device: Device) 
 
 
 @pytest.mark.parametrize("name", ["toy", "text"])
-def test_the_cloud_brings_its_colours(name: str, request: pytest.FixtureRequest) -> None:
+def test_the_cloud_brings_its_colors(name: str, request: pytest.FixtureRequest) -> None:
     data = load_dataset(request.getfixturevalue(name))
     blobs = Blobs.random()
     assert data.cloud is not None
     assert data.normalization is not None
     np.testing.assert_allclose(data.cloud.points[:40], data.normalization.points(blobs.means.numpy()), atol=1e-5)
-    np.testing.assert_allclose(data.cloud.colours[:40], blobs.colors.numpy(), atol=0.5 / 255 + 1e-6)
+    np.testing.assert_allclose(data.cloud.colors[:40], blobs.colors.numpy(), atol=0.5 / 255 + 1e-6)
     assert np.abs(data.cloud.points[:40]).max() == pytest.approx(1.3, rel=0.1)
 
 
@@ -109,7 +109,7 @@ def test_a_sparse_cloud_is_filled_up_where_cameras_look(toy: Path) -> None:
     assert len(data.cloud.points) == 4096
     assert (views_of(data.cloud.points.astype(float), data.cameras) >= len(data.cameras) / 2)[40:].all()
     nearest = cKDTree(data.cloud.points[:40]).query(data.cloud.points[40:])[1]
-    np.testing.assert_array_equal(data.cloud.colours[40:], data.cloud.colours[nearest])
+    np.testing.assert_array_equal(data.cloud.colors[40:], data.cloud.colors[nearest])
 
 
 def test_rotations_are_quaternions_wxyz() -> None:
@@ -175,10 +175,10 @@ def test_a_camera_that_was_not_placed_is_left_out(rig: Path) -> None:
 def test_the_largest_of_several_models_is_taken(toy: Path) -> None:
     blobs = Blobs.random()
     poses = {"frame_0001.png": cameras(6)[0]}
-    colours = np.zeros((40, 3), np.uint8)
+    colors = np.zeros((40, 3), np.uint8)
     (toy / "sparse/0").rename(toy / "sparse/1")
     write_model(
-        toy / "sparse/0", "SIMPLE_PINHOLE", (WIDTH, HEIGHT), [70, 32, 24], poses, blobs.means.double().numpy(), colours,
+        toy / "sparse/0", "SIMPLE_PINHOLE", (WIDTH, HEIGHT), [70, 32, 24], poses, blobs.means.double().numpy(), colors,
         binary=False,
     )  # fmt: skip
     data = load_dataset(toy)

@@ -112,7 +112,7 @@ def test_shrinking_averages_what_is_seen(tmp_path: Path) -> None:
             assert np.abs(composite(b.load(), background) - seen).max() < 3
 
 
-def test_transparent_colour_does_not_bleed(tmp_path: Path) -> None:
+def test_transparent_color_does_not_bleed(tmp_path: Path) -> None:
     def change(folder: Path, scene: Scene) -> None:
         pixels = np.zeros((HEIGHT, WIDTH, 4), dtype=np.uint8)
         pixels[::2, ::2] = 255  # one opaque white pixel in four, the others transparent black

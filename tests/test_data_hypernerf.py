@@ -132,7 +132,7 @@ def test_cloud_and_cameras_are_moved_alike(toy: Path) -> None:
     assert data.normalization is not None
     means = Blobs.random().means.double().numpy()
     np.testing.assert_allclose(data.cloud.points, data.normalization.points(means), atol=1e-5)
-    assert (data.cloud.colours == 0.5).all()
+    assert (data.cloud.colors == 0.5).all()
     raw = json.loads((toy / f"camera/{ID}.json").read_text())["position"]
     np.testing.assert_allclose(data.train[1].camera.position, data.normalization.points(np.array(raw)), atol=1e-9)
     assert np.abs(data.cloud.points).max() == pytest.approx(1.3, rel=0.1)
@@ -157,7 +157,7 @@ def test_a_ply_cloud_is_in_the_coordinates_of_the_camera_files(toy: Path) -> Non
     assert cloud is not None
     assert with_npy is not None
     np.testing.assert_allclose(cloud.points, with_npy.points, atol=1e-5)
-    np.testing.assert_allclose(cloud.colours, 0.2)
+    np.testing.assert_allclose(cloud.colors, 0.2)
 
 
 @pytest.mark.parametrize(

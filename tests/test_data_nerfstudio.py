@@ -57,7 +57,7 @@ def test_times_splits_and_cloud(make: Any) -> None:
     assert data.cloud is not None
     assert data.normalization is not None
     np.testing.assert_allclose(data.cloud.points[:40], data.normalization.points(blobs.means.numpy()), atol=1e-5)
-    np.testing.assert_allclose(data.cloud.colours[:40], blobs.colors.numpy(), atol=0.5 / 255 + 1e-6)
+    np.testing.assert_allclose(data.cloud.colors[:40], blobs.colors.numpy(), atol=0.5 / 255 + 1e-6)
 
 
 def test_applied_transform_was_applied_to_cameras_and_cloud(make: Any, device: Device) -> None:
@@ -86,7 +86,7 @@ def test_a_binary_cloud(make: Any) -> None:
     assert cloud is not None
     assert expected is not None
     np.testing.assert_allclose(cloud.points, expected.points, atol=1e-5)
-    np.testing.assert_allclose(cloud.colours, expected.colours, atol=1e-6)
+    np.testing.assert_allclose(cloud.colors, expected.colors, atol=1e-6)
 
 
 def test_without_a_cloud_the_views_fill_the_box(make: Any, device: Device) -> None:

@@ -28,7 +28,7 @@ from helpers.captures import (
 from PIL import Image
 
 from lapgs_wgpu.data import load_dataset, video_frames
-from lapgs_wgpu.data.init import first_points
+from lapgs_wgpu.data.initial_gaussians import first_points
 from lapgs_wgpu.data.readers import neu3d
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
@@ -170,7 +170,7 @@ def test_without_pyav(clip: Path, toy: Path, monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_the_cloud_comes_along(toy: Path) -> None:
-    """The downsampled one before the whole one, with its colours, moved like the cameras."""
+    """The downsampled one before the whole one, with its colors, moved like the cameras."""
     blobs = Blobs.random()
     write_points(toy / "points3D.ply", np.zeros((7, 3)))
     write_points(toy / "points3D_downsample2.ply", blobs.means.numpy(), np.round(255 * blobs.colors.numpy()))
@@ -178,24 +178,24 @@ def test_the_cloud_comes_along(toy: Path) -> None:
     assert data.cloud is not None
     assert data.normalization is not None
     np.testing.assert_allclose(data.cloud.points, data.normalization.points(blobs.means.double().numpy()), atol=1e-5)
-    np.testing.assert_allclose(data.cloud.colours, blobs.colors, atol=0.5 / 255 + 1e-6)
+    np.testing.assert_allclose(data.cloud.colors, blobs.colors, atol=0.5 / 255 + 1e-6)
     assert np.abs(data.cloud.points).max() == pytest.approx(1.3, rel=0.1)
-    points, colours = first_points(data, 1000, 1.3, 0)
+    points, colors = first_points(data, 1000, 1.3, 0)
     np.testing.assert_array_equal(points, data.cloud.points)
-    few, few_colours = first_points(data, 10, 1.3, 0)
+    few, few_colors = first_points(data, 10, 1.3, 0)
     assert few.shape == (10, 3)
     index = [int(np.flatnonzero((points == point).all(axis=1))[0]) for point in few]
-    np.testing.assert_array_equal(few_colours, colours[index])
+    np.testing.assert_array_equal(few_colors, colors[index])
 
 
 def test_without_a_cloud_gaussians_start_where_views_overlap(toy: Path) -> None:
     data = load_dataset(toy)
     assert data.cloud is None
     assert data.normalization is not None
-    points, colours = first_points(data, 2000, 99.0, 0)
-    assert points.shape == colours.shape == (2000, 3)
+    points, colors = first_points(data, 2000, 99.0, 0)
+    assert points.shape == colors.shape == (2000, 3)
     assert points.dtype == np.float32
-    assert (colours == 0.5).all()
+    assert (colors == 0.5).all()
     inside = np.zeros(len(points))
     for camera in data.cameras:
         local = points @ camera.T_cam_world[:3, :3].T + camera.T_cam_world[:3, 3]
@@ -243,7 +243,7 @@ def test_the_true_poses_of_a_published_scene(tmp_path: Path) -> None:
 
 
 def test_a_real_capture(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Videos and, for the test camera, pictures: the same scene, in the same colours."""
+    """Videos and, for the test camera, pictures: the same scene, in the same colors."""
     folder = SHARED / "rendered/swing_mv"
     if not folder.is_dir():
         pytest.skip("scenes not at hand")
@@ -268,7 +268,7 @@ def test_a_real_capture(monkeypatch: pytest.MonkeyPatch) -> None:
     decoded = video_frames.Video(folder / "cam00.mp4").read(20, (336, 252)).astype(float)
     error = decoded - data.test[20].load()[..., :3]
     assert 10 * np.log10(255**2 / np.square(error).mean()) > 30
-    assert np.abs(error.mean(axis=(0, 1))).max() < 0.8  # another colour matrix, or range, shows here
+    assert np.abs(error.mean(axis=(0, 1))).max() < 0.8  # another color matrix, or range, shows here
 
 
 # What is refused

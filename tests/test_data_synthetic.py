@@ -83,14 +83,14 @@ def test_the_scene_stays_as_published() -> None:
     assert digest.hexdigest() == "4aa1f6738e87c9422d7b4832add004bceb8cd15afb2290df0f8ec4e2c77cccbd"
 
 
-def test_edges_are_smooth_and_colours_straight() -> None:
+def test_edges_are_smooth_and_colors_straight() -> None:
     picture = render(cameras(1, 0, size=64)[0], 0.0)
     alpha = picture[..., 3]
     assert (alpha == 0).any()
     assert (alpha == 255).any()
     edge = picture[(alpha > 0) & (alpha < 128)]
     assert len(edge) > 20
-    assert np.median(edge[:, :3].max(axis=1)) > 100  # premultiplied colours would be dark here
+    assert np.median(edge[:, :3].max(axis=1)) > 100  # premultiplied colors would be dark here
     assert (picture[alpha == 0] == 0).all()
 
 

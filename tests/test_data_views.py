@@ -36,11 +36,11 @@ def view_of(source: Source, name: str = "train_000", time: float = 0.0) -> View:
 
 
 def test_composite_rounds_to_nearest() -> None:
-    colour, alpha = (a.ravel() for a in np.meshgrid(np.arange(256), np.arange(256)))
-    image = np.stack([colour, colour, colour, alpha], axis=-1).astype(np.uint8)[None]
+    color, alpha = (a.ravel() for a in np.meshgrid(np.arange(256), np.arange(256)))
+    image = np.stack([color, color, color, alpha], axis=-1).astype(np.uint8)[None]
     for background in ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (0.25, 0.5, 0.75)):
         got = composite(image, background)[0]
-        exact = colour * alpha / 255
+        exact = color * alpha / 255
         for channel, b in enumerate(background):
             assert np.abs(got[:, channel] - (exact + 255 * b * (1 - alpha / 255))).max() <= 0.5 + 1e-4
     assert composite(image, (0, 0, 0)).dtype == np.uint8

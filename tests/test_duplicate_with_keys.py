@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 import torch
+from helpers.reference import ALPHA_MIN
 from helpers.scenes import Scene, front_camera, needles, oblique_camera, random_scene
 from helpers.stages import all_of, capture
 from numpy.typing import NDArray
@@ -14,7 +15,6 @@ from numpy.typing import NDArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.rasterize import rasterize, rasterizer_of
-from lapgs_wgpu.splat.reference import ALPHA_MIN
 
 pytestmark = pytest.mark.kernels
 

@@ -32,8 +32,8 @@ CAMERA = Camera.looking_at([0, -4, 0], [0, 0, 0], up=[0, 0, 1], fov_x=0.7, width
 @pytest.fixture(scope="module")
 def scene(device: Device) -> Scene4D:
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (40, 3))
-    colours = np.random.default_rng(1).uniform(0, 1, (40, 3))
-    return Scene4D.from_points(points, colours, np.full(40, 0.1), FieldConfig(kind="static"), device=device)
+    colors = np.random.default_rng(1).uniform(0, 1, (40, 3))
+    return Scene4D.from_points(points, colors, np.full(40, 0.1), FieldConfig(kind="static"), device=device)
 
 
 def view(name: str, pixels: np.ndarray, mask: np.ndarray | None = None) -> View:

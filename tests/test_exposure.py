@@ -14,6 +14,7 @@ import pytest
 import torch
 from helpers.image_losses import BACKGROUND, CAMERA, TRUTH, WEIGHTS, gaussians, gradients, step
 from helpers.interrupts import interrupt_at
+from helpers.loss_reference import exposure, total
 from helpers.scenes import relative
 from helpers.training import configure
 from numpy.typing import NDArray
@@ -27,9 +28,8 @@ from lapgs_wgpu.gpu.kernel import Commands
 from lapgs_wgpu.splat.rasterize import rasterize
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 from lapgs_wgpu.train.config import Rate
-from lapgs_wgpu.train.exposure import ExposurePasses, Exposures, exposure
+from lapgs_wgpu.train.exposure import ExposurePasses, Exposures
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
-from lapgs_wgpu.train.losses import total
 from lapgs_wgpu.train.run import resume, train
 from lapgs_wgpu.train.trainer import Trainer
 from lapgs_wgpu.train.truth_cache import upload_rgba
@@ -122,7 +122,7 @@ def test_without_a_gradient_no_backward_pass_runs(device: Device, monkeypatch: p
 # The corrections
 
 
-def test_corrections_move_against_their_gradient_and_leave_the_scene_its_colours() -> None:
+def test_corrections_move_against_their_gradient_and_leave_the_scene_its_colors() -> None:
     exposures = Exposures(4, RATE)
     exposures.step(1)  # without a gradient
     assert torch.equal(exposures.values, IDENTITY.expand(4, 3, 4))
@@ -132,7 +132,7 @@ def test_corrections_move_against_their_gradient_and_leave_the_scene_its_colours
     torch.testing.assert_close(moved.mean(dim=0), torch.zeros(3, 4), rtol=0, atol=1e-7)
     torch.testing.assert_close(moved[2] - moved[0], torch.full((3, 4), -RATE.at(1)))
     assert torch.equal(moved[0], moved[3])
-    assert exposures.gradients() == {}
+    assert exposures.values.grad is None
     assert exposures.state()["steps"].flatten().tolist() == [0, 0, 1, 0]
 
 
@@ -193,8 +193,8 @@ def flickering(dataset: Dataset) -> Dataset:
     offsets = np.stack([rng.permutation(np.linspace(-0.1, 0.1, count)) for _ in range(3)], axis=1)
 
     def pixels(view: View, gain: NDArray[np.float64], offset: NDArray[np.float64]) -> NDArray[np.uint8]:
-        colours = 0.2 + 0.5 * composite(view.load(), np.zeros(3)) / 255
-        return (255 * (gain * colours + offset)).clip(0, 255).round().astype(np.uint8)
+        colors = 0.2 + 0.5 * composite(view.load(), np.zeros(3)) / 255
+        return (255 * (gain * colors + offset)).clip(0, 255).round().astype(np.uint8)
 
     def changed(views: tuple[View, ...], gains: NDArray[np.float64], offsets: NDArray[np.float64]) -> tuple[View, ...]:
         return tuple(

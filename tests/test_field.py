@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import pytest
 import torch
+from helpers.encoder_reference import encode_reference
 from torch import Tensor
 
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.fields.deformation import Deformation
 from lapgs_wgpu.motion.fields.grid_field import GridField
-from lapgs_wgpu.motion.fields.hash_encoder import encode_reference
 from lapgs_wgpu.motion.fields.hash_grid_config import HashConfig
 from lapgs_wgpu.motion.scene import make_field
 

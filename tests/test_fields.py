@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import pytest
 import torch
+from helpers.encoder_reference import encode_reference
 from helpers.fields import COUNT, DYNAMICS, NEARBY, OURS, POINTS, ROWS, grid_field, made, parts, stirred
 from torch import Tensor, nn
 
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields import grid_field as grid_field_module
 from lapgs_wgpu.motion.fields.config import PLANES, FieldKind
-from lapgs_wgpu.motion.fields.hash_encoder import encode_reference
 from lapgs_wgpu.motion.fields.hexplane_field import HexPlaneField
 from lapgs_wgpu.motion.fields.laplacian import LaplacianMotion, TimeMotion
 from lapgs_wgpu.motion.fields.layers import last_product

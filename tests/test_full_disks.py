@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 from helpers.camera_paths import keys
 from helpers.faults import FAILING, Disk
+from helpers.ply_files import read_ply
 from helpers.training import configure
 
 from lapgs_wgpu import cli
@@ -26,7 +27,6 @@ from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu import device as device_module
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.io.ply import read_ply
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.config import Config

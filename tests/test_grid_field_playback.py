@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from helpers.encoder_reference import encode_reference
 from helpers.trained_scenes import CONFIGS, GRID4D, OURS, trained
 from torch import Tensor, nn
 
@@ -16,7 +17,6 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.fields.grid_field import GridField
-from lapgs_wgpu.motion.fields.hash_encoder import encode_reference
 from lapgs_wgpu.motion.fields.parameter_shapes import parameter_shapes
 from lapgs_wgpu.motion.playback.grid_field_playback import (
     GridFieldPlayback,
@@ -67,7 +67,7 @@ def expected(scene: Scene4D, t: float) -> dict[str, Tensor]:
 
 
 def device_field(scene: Scene4D, block: int | None = None) -> tuple[GridFieldPlayback, Gaussians[DeviceArray]]:
-    """The scene's field without torch, and buffers for what it moves: colours as they are, rubbish elsewhere."""
+    """The scene's field without torch, and buffers for what it moves: colors as they are, rubbish elsewhere."""
     assert scene.field is not None
     parameters = {name: value.numpy(force=True) for name, value in scene.field.state_dict().items()}
     stored = {name: value.numpy(force=True) for name, value in scene.parameters.items()}
@@ -110,7 +110,7 @@ def test_no_gaussians(device: Device) -> None:
 
 
 def test_only_what_changes_is_written(device: Device) -> None:
-    """The colours above their constant part stand in the buffer that is drawn, and stay."""
+    """The colors above their constant part stand in the buffer that is drawn, and stay."""
     scene = trained(device, replace(OURS, appearance="none"), 50)
     field, out = device_field(scene)
     before = out.sh.read()

@@ -7,11 +7,12 @@ import math
 
 import pytest
 import torch
+from helpers.encoder_reference import encode_reference
 from helpers.scenes import relative
 from torch import Tensor
 
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.motion.fields.hash_encoder import HashEncoder, HashGrid, encode_reference
+from lapgs_wgpu.motion.fields.hash_encoder import HashEncoder, HashGrid
 from lapgs_wgpu.motion.fields.hash_grid_config import TIME, HashConfig, make_levels
 
 pytestmark = pytest.mark.kernels

@@ -7,10 +7,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
+from helpers.reference import project
 
 from lapgs_wgpu.motion.playback.motion_bounds import MotionBounds
 from lapgs_wgpu.splat.camera import Camera
-from lapgs_wgpu.splat.reference import project
 
 PARTS = 16
 # 100 pixels a world unit at the distance of the origin.

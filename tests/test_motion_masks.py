@@ -77,8 +77,8 @@ def test_the_residual_of_a_static_fit_is_averaged() -> None:
 @pytest.fixture(scope="module")
 def scene(device: Device) -> Scene4D:
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (40, 3))
-    colours = np.random.default_rng(1).uniform(0, 1, (40, 3))
-    return Scene4D.from_points(points, colours, np.full(40, 0.1), FieldConfig(kind="static"), device=device)
+    colors = np.random.default_rng(1).uniform(0, 1, (40, 3))
+    return Scene4D.from_points(points, colors, np.full(40, 0.1), FieldConfig(kind="static"), device=device)
 
 
 def test_the_evaluation_of_a_still_camera_reports_its_moving_pixels(scene: Scene4D, tmp_path: Path) -> None:

@@ -170,16 +170,16 @@ def test_names_of_scenes() -> None:
 @pytest.mark.parametrize(
     ("name", "problem"),
     [
-        ("motion:pth=4", "no key 'pth'; did you mean path?"),
-        ("motion:x=4", "no key 'x'; known: path, cycles, camera, background, objects."),
-        ("motion:path", "path needs a value, as in path=2.0."),
+        ("motion:pth=4", "no key pth; did you mean path?"),
+        ("motion:x=4", "no key x; known: path, cycles, camera, background, objects."),
+        ("motion:path", "path must be a number, got ''."),
         ("motion:path=long", "path must be a number, got 'long'."),
-        ("motion:path=nan", "path above 0 and up to 20, got nan."),
-        ("motion:cycles=-1", "cycles above 0 and up to 20, got -1."),
-        ("motion:camera=jmp", "no camera 'jmp'; did you mean jump?"),
-        ("motion:background=grey", "no background 'grey'; known: black, white, room."),
+        ("motion:path=nan", "path must lie between 0 and 2147483647, got nan."),
+        ("motion:cycles=-1", "cycles must lie between 0 and 2147483647, got -1.0."),
+        ("motion:camera=jmp", "camera must be jump or walk or still, got 'jmp'; did you mean jump?"),
+        ("motion:background=grey", "background must be black or white or room, got 'grey'."),
         ("motion:path=1,path=2", "path is given twice."),
-        ("motion:path=1,objects=occluded", "needs a path of at least 3"),
+        ("motion:path=1,objects=occluded", "path must be at least 3 with objects=occluded"),
     ],
 )
 def test_mistakes_in_names(name: str, problem: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

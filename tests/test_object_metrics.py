@@ -52,8 +52,8 @@ def layers(view: View, one: ObjectTruth, background: np.ndarray) -> tuple[np.nda
     return clean, composite(view.load(), background) - clean * (1 - alpha), alpha
 
 
-def over(clean: np.ndarray, colour: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    return np.clip(colour + clean * (1 - alpha), 0, 255).round().astype(np.uint8)
+def over(clean: np.ndarray, color: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+    return np.clip(color + clean * (1 - alpha), 0, 255).round().astype(np.uint8)
 
 
 def moved(planes: np.ndarray, rows: float, columns: float) -> np.ndarray:
@@ -66,16 +66,16 @@ def enlarged(planes: np.ndarray, centre: np.ndarray, scale: float) -> np.ndarray
 
 
 def frames_of(views: tuple[tuple[View, ...], np.ndarray], draw: Any) -> list[ObjectFrame]:
-    """Measure what `draw(clean, colour, alpha, diameter)` makes of each visible object."""
+    """Measure what `draw(clean, color, alpha, diameter)` makes of each visible object."""
     found = []
     for view in views[0]:
         masks = {one.name: one.mask() for one in view.objects}
         for one in view.objects:
             if visible(masks[one.name], one.diameter):
-                clean, colour, alpha = layers(view, one, views[1])
+                clean, color, alpha = layers(view, one, views[1])
                 others = np.any([mask > 0 for name, mask in masks.items() if name != one.name], axis=0)
-                truth = over(clean, colour, alpha)
-                image = draw(clean, colour, alpha, one.diameter)
+                truth = over(clean, color, alpha)
+                image = draw(clean, color, alpha, one.diameter)
                 plate = clean.astype(np.uint8)
                 found.append(measure_object(one.name, image, truth, plate, masks[one.name], others, one.diameter))
     assert len(found) >= 5
@@ -87,33 +87,33 @@ def distances(frames: list[ObjectFrame]) -> list[float | None]:
 
 
 def test_the_truth_itself_is_found_exactly(views: Any) -> None:
-    frames = frames_of(views, lambda clean, colour, alpha, d: over(clean, colour, alpha))
+    frames = frames_of(views, lambda clean, color, alpha, d: over(clean, color, alpha))
     assert min(frame.iou for frame in frames) > 0.88
     assert max(frame.distance or 0 for frame in frames) < 0.05
     assert {frame.psnr for frame in frames} == {BEST_PSNR}
 
 
 def test_a_missing_object_is_not_found(views: Any) -> None:
-    frames = frames_of(views, lambda clean, colour, alpha, d: clean.astype(np.uint8))
+    frames = frames_of(views, lambda clean, color, alpha, d: clean.astype(np.uint8))
     assert {frame.iou for frame in frames} == {0.0}
     assert set(distances(frames)) == {None}
     assert max(frame.psnr for frame in frames) < 16
 
 
 def test_a_ghost_is_not_found(views: Any) -> None:
-    frames = frames_of(views, lambda clean, colour, alpha, d: over(clean, 0.4 * colour, 0.4 * alpha))
+    frames = frames_of(views, lambda clean, color, alpha, d: over(clean, 0.4 * color, 0.4 * alpha))
     assert max(frame.iou for frame in frames) < 0.1
 
 
 def test_blur_of_the_background_is_no_object(views: Any) -> None:
-    frames = frames_of(views, lambda clean, colour, alpha, d: gaussian_filter(clean, (3, 3, 0)).astype(np.uint8))
+    frames = frames_of(views, lambda clean, color, alpha, d: gaussian_filter(clean, (3, 3, 0)).astype(np.uint8))
     assert max(frame.iou for frame in frames) < 0.1
 
 
 @pytest.mark.parametrize("share", [0.5, 0.9])
 def test_a_shifted_object_is_not_found_and_its_distance_is_known(views: Any, share: float) -> None:
-    def draw(clean: np.ndarray, colour: np.ndarray, alpha: np.ndarray, d: float) -> np.ndarray:
-        return over(clean, moved(colour, share * d, 0), moved(alpha, share * d, 0))
+    def draw(clean: np.ndarray, color: np.ndarray, alpha: np.ndarray, d: float) -> np.ndarray:
+        return over(clean, moved(color, share * d, 0), moved(alpha, share * d, 0))
 
     frames = frames_of(views, draw)
     assert max(frame.iou for frame in frames) < 0.5
@@ -123,12 +123,12 @@ def test_a_shifted_object_is_not_found_and_its_distance_is_known(views: Any, sha
 
 
 def test_a_slightly_shifted_or_enlarged_object_is_found(views: Any) -> None:
-    def near(clean: np.ndarray, colour: np.ndarray, alpha: np.ndarray, d: float) -> np.ndarray:
-        return over(clean, moved(colour, 0, 0.15 * d), moved(alpha, 0, 0.15 * d))
+    def near(clean: np.ndarray, color: np.ndarray, alpha: np.ndarray, d: float) -> np.ndarray:
+        return over(clean, moved(color, 0, 0.15 * d), moved(alpha, 0, 0.15 * d))
 
-    def larger(clean: np.ndarray, colour: np.ndarray, alpha: np.ndarray, d: float, scale: float = 1.25) -> np.ndarray:
+    def larger(clean: np.ndarray, color: np.ndarray, alpha: np.ndarray, d: float, scale: float = 1.25) -> np.ndarray:
         centre = np.stack(np.nonzero(alpha[..., 0] > 0.5)).mean(axis=1)
-        return over(clean, enlarged(colour, centre, scale), enlarged(alpha, centre, scale))
+        return over(clean, enlarged(color, centre, scale), enlarged(alpha, centre, scale))
 
     assert np.mean([frame.iou >= 0.5 for frame in frames_of(views, near)]) > 0.85
     assert np.mean([frame.iou >= 0.5 for frame in frames_of(views, larger)]) > 0.85
@@ -145,11 +145,11 @@ def test_soft_and_wrongly_textured_objects_are_found(views: Any) -> None:
         assert max(frame.psnr for frame in frames) < 30
 
 
-def square(size: int, at: tuple[int, int], colour: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
+def square(size: int, at: tuple[int, int], color: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
     image = np.zeros((40, 40, 3), np.uint8)
     mask = np.zeros((40, 40), np.uint8)
     rows, columns = slice(at[0], at[0] + size), slice(at[1], at[1] + size)
-    image[rows, columns], mask[rows, columns] = colour, 255
+    image[rows, columns], mask[rows, columns] = color, 255
     return image, mask
 
 

@@ -68,7 +68,7 @@ def test_it_shows_the_scene(device: Device, tmp_path: Path, name: str) -> None:
         shown = picture(playback, t)
         drawn = scene.render(CAMERA, t, torch.tensor([0.1, 0.2, 0.3])).image.numpy()
         assert np.ptp(drawn) > 0.3
-        # Rounding may add or drop the faint rim of a splat, which is 1/255 of its colour.
+        # Rounding may add or drop the faint rim of a splat, which is 1/255 of its color.
         assert np.quantile(np.abs(shown - drawn), 0.99) < 2e-4
         assert np.abs(shown - drawn).max() < 1 / 255
         means = scene.at(t).means.detach().numpy()

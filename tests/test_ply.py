@@ -23,13 +23,14 @@ from helpers.ply_files import (
     mutate,
     ply_bytes,
     random_still,
+    read_ply,
 )
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.atomic import atomic_write
-from lapgs_wgpu.io.ply import GaussianSnapshot, read_ply, write_ply
+from lapgs_wgpu.io.ply import GaussianSnapshot, write_ply
 
 REAL_FILES = Path(__file__).parents[2] / "shared" / "data" / "ply"
 
@@ -108,7 +109,7 @@ def with_value(name: str, value: float, rows: tuple[int, ...] = (2,)) -> bytes:
     return ply_bytes(columns)
 
 
-ROW = 4 * 23  # x y z, 3 + 9 colours, opacity, 3 scales, 4 of rotation
+ROW = 4 * 23  # x y z, 3 + 9 colors, opacity, 3 scales, 4 of rotation
 BAD = {
     "empty": (b"", ["empty", "0 bytes"]),
     "not a PLY": (b"\x89PNG\r\n\x1a\n" + bytes(100), ["begins with", "PNG"]),

@@ -56,20 +56,20 @@ def near(got: Floats, expected: Floats) -> None:
     assert off.max() <= ROUNDING, f"off by {off.max():.2f} of 255 in {(off > ROUNDING).sum()} values"
 
 
-def colours(planes: Floats) -> Floats:
+def colors(planes: Floats) -> Floats:
     return planes[:3].transpose(1, 2, 0)
 
 
 def scaled(total: Floats, alpha: Floats, low: float, high: float) -> Floats:
-    """A mean value a pixel by the scale of colours, over the background."""
+    """A mean value a pixel by the scale of colors, over the background."""
     share = np.clip((total / np.maximum(alpha, 1e-6) - low) / (high - low), 0, 1)
     stops = np.linspace(0, 1, len(HEAT))
-    heat = np.stack([np.interp(share, stops, [colour[c] for colour in HEAT]) for c in range(3)], axis=-1)
+    heat = np.stack([np.interp(share, stops, [color[c] for color in HEAT]) for c in range(3)], axis=-1)
     return heat * alpha[..., None] + np.array(BACKGROUND) * (1 - alpha[..., None])
 
 
-def test_colours(bench: Bench) -> None:
-    near(bench.show(bench.placed), colours(bench.planes))
+def test_colors(bench: Bench) -> None:
+    near(bench.show(bench.placed), colors(bench.planes))
 
 
 def test_coverage(bench: Bench) -> None:
@@ -78,7 +78,7 @@ def test_coverage(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize(("shows", "plane"), [("depth", 4), ("value", 0)])
-def test_values_by_a_scale_of_colours(bench: Bench, shows: str, plane: int) -> None:
+def test_values_by_a_scale_of_colors(bench: Bench, shows: str, plane: int) -> None:
     got = bench.show(bench.placed._replace(shows=shows, low=0.5, high=3.0))
     near(got, scaled(bench.planes[plane], 1 - bench.planes[3], 0.5, 3.0))
 
@@ -108,10 +108,10 @@ def enlarged(picture: Floats, width: int, height: int) -> Floats:
 
 def test_enlargement_is_bilinear(bench: Bench) -> None:
     got = bench.show(bench.placed._replace(size=(40, 30)), size=(40, 30))
-    near(got, enlarged(colours(bench.planes), 40, 30))
+    near(got, enlarged(colors(bench.planes), 40, 30))
 
 
-def test_values_are_enlarged_as_colours(bench: Bench) -> None:
+def test_values_are_enlarged_as_colors(bench: Bench) -> None:
     got = bench.show(bench.placed._replace(size=(26, 14), shows="depth", high=3.0), size=(26, 14))
     near(got, enlarged(scaled(bench.planes[4], 1 - bench.planes[3], 0.0, 3.0), 26, 14))
 
@@ -119,14 +119,14 @@ def test_values_are_enlarged_as_colours(bench: Bench) -> None:
 def test_margins_surround_the_picture(bench: Bench) -> None:
     got = bench.show(bench.placed._replace(origin=(5, 3)), size=(30, 20))
     expected = np.broadcast_to(MARGIN, (20, 30, 3)).copy()
-    expected[3 : 3 + HEIGHT, 5 : 5 + WIDTH] = colours(bench.planes)
+    expected[3 : 3 + HEIGHT, 5 : 5 + WIDTH] = colors(bench.planes)
     near(got, expected)
 
 
 def test_split(bench: Bench) -> None:
     got = bench.show(bench.with_truth._replace(truth_until=0.4))
     centres = (np.arange(WIDTH) + 0.5) / WIDTH
-    expected = np.where((centres < 0.4)[None, :, None], bench.truth / 255, colours(bench.planes))
+    expected = np.where((centres < 0.4)[None, :, None], bench.truth / 255, colors(bench.planes))
     near(got, expected)
     assert (got[:, 5] == bench.truth[:, 5] / 255).sum() < got[:, 5].size  # the sixth column is already the picture's
 
@@ -136,12 +136,12 @@ def test_side_by_side(bench: Bench) -> None:
     right = bench.with_truth._replace(truth_until=0.0, origin=(WIDTH, 0))
     got = bench.show(left, right, size=(2 * WIDTH, HEIGHT))
     near(got[:, :WIDTH], bench.truth / 255)
-    near(got[:, WIDTH:], colours(bench.planes))
+    near(got[:, WIDTH:], colors(bench.planes))
 
 
 def test_error(bench: Bench) -> None:
     got = bench.show(bench.with_truth._replace(error_gain=4.0))
-    off = 255 * np.abs(got - np.clip(4 * np.abs(np.clip(colours(bench.planes), 0, 1) - bench.truth / 255), 0, 1))
+    off = 255 * np.abs(got - np.clip(4 * np.abs(np.clip(colors(bench.planes), 0, 1) - bench.truth / 255), 0, 1))
     assert off.max() <= ROUNDING
 
 
@@ -156,4 +156,4 @@ def test_a_target_of_another_size_follows(bench: Bench) -> None:
     for size in ((70, 3), (WIDTH, HEIGHT)):  # rows of 280 bytes are no multiple of the copy's 256
         got = bench.show(bench.placed, size=size) if size[1] >= HEIGHT else bench.show(size=size)
         assert got.shape == (size[1], size[0], 3)
-    near(got, colours(bench.planes))
+    near(got, colors(bench.planes))

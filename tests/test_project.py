@@ -7,13 +7,13 @@ import math
 import numpy as np
 import pytest
 import torch
+from helpers.reference import ALPHA_MIN, NEAR, project
 from helpers.scenes import Scene, front_camera, needles, oblique_camera, random_scene
 from helpers.stages import all_of, capture
 
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.rasterize import rasterize
-from lapgs_wgpu.splat.reference import ALPHA_MIN, NEAR, project
 
 pytestmark = pytest.mark.kernels
 

@@ -68,7 +68,7 @@ def test_the_same_step_again(device: Device, use: Use, scene: Scene, expected: S
 
 
 def test_after_other_images(device: Device, scene: Scene, expected: Step) -> None:
-    """More and fewer Gaussians, another size, another kind of colour, nothing at all."""
+    """More and fewer Gaussians, another size, another kind of color, nothing at all."""
     for other, camera, degree in (
         (random_scene(3000, 2, size=0.3), oblique_camera(130, 90), None),
         (random_scene(5, 3, sh=16), oblique_camera(7, 3), 3),

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
+from helpers.reference import near_discontinuity
 from helpers.scenes import Scene, Step, front_camera, oblique_camera, random_scene, reference_step, relative, step
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -15,7 +16,6 @@ from hypothesis import strategies as st
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.splat.rasterize import rasterize
 from lapgs_wgpu.splat.rasterizer import Rasterizer
-from lapgs_wgpu.splat.reference import near_discontinuity
 
 pytestmark = [pytest.mark.kernels, pytest.mark.subgroups]
 
@@ -83,7 +83,7 @@ def test_an_invisible_gaussian_disturbs_nobody(device: Device, name: str) -> Non
 
 
 @pytest.mark.parametrize("sh_degree", [None, 1])
-def test_bad_colours_of_invisible_gaussians_do_no_harm(device: Device, sh_degree: int | None) -> None:
+def test_bad_colors_of_invisible_gaussians_do_no_harm(device: Device, sh_degree: int | None) -> None:
     good = in_front(40, 2, sh=sh_degree and 4)
     rows = torch.arange(40) % 7 == 3
     for value in (NAN, INF):

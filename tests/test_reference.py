@@ -9,13 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from scipy.special import lpmv
-from torch import Tensor
-
-from lapgs_wgpu.errors import InputError
-from lapgs_wgpu.splat.camera import Camera
-from lapgs_wgpu.splat.rasterize import Rendering
-from lapgs_wgpu.splat.reference import (
+from helpers.reference import (
     ALPHA_MAX,
     ALPHA_MIN,
     CONSTANTS,
@@ -28,6 +22,12 @@ from lapgs_wgpu.splat.reference import (
     rasterize_reference,
     sh_basis,
 )
+from scipy.special import lpmv
+from torch import Tensor
+
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.splat.rasterize import Rendering
 from lapgs_wgpu.splat.rotation import rotation_matrices
 
 Scene = dict[str, Tensor]
@@ -58,7 +58,7 @@ def oblique_camera(width: int, height: int) -> Camera:
 
 
 def splats(*rows: tuple[list[float], float, float, list[float]]) -> Scene:
-    """Round Gaussians from (mean, scale, opacity, colour)."""
+    """Round Gaussians from (mean, scale, opacity, color)."""
     means, scales, opacities, colors = zip(*rows, strict=True)
     return {
         "means": torch.tensor(means, dtype=torch.float64),
@@ -85,6 +85,11 @@ def random_scene(count: int, seed: int, sh_degree: int | None = None, spread: fl
 
 
 # One Gaussian, by hand
+
+
+def test_the_logarithm_of_the_smallest_alpha() -> None:
+    """A constant of its own, since WGSL cannot be relied on to compute it when compiled."""
+    assert CONSTANTS["LOG2_ALPHA_MIN"] == pytest.approx(math.log2(ALPHA_MIN), rel=1e-15)
 
 
 def test_single_gaussian_pixels_by_hand() -> None:
@@ -231,7 +236,7 @@ def literal(scene: Scene, camera: Camera, background: np.ndarray) -> tuple[np.nd
     W, t = camera.T_cam_world[:3, :3], camera.T_cam_world[:3, 3]
     image, alpha, depth = np.zeros((camera.height, camera.width, 3)), *np.zeros((2, camera.height, camera.width))
     gaussians = []
-    for mean, (w, *v), scale, opacity, colour in zip(*(group.tolist() for group in scene.values()), strict=True):
+    for mean, (w, *v), scale, opacity, rgb in zip(*(group.tolist() for group in scene.values()), strict=True):
         x, y, z = W @ np.array(mean) + t
         if z <= 0.01:
             continue
@@ -244,14 +249,12 @@ def literal(scene: Scene, camera: Camera, background: np.ndarray) -> tuple[np.nd
         tx, ty = z * min(max(x / z, u_min), u_max), z * min(max(y / z, v_min), v_max)
         J = np.array([[fx / z, 0, -fx * tx / z**2], [0, fy / z, -fy * ty / z**2]])
         cov = J @ W @ R @ np.diag(np.square(scale)) @ R.T @ W.T @ J.T + 0.3 * np.eye(2)
-        gaussians.append(
-            (z, np.array([fx * x / z + cx, fy * y / z + cy]), np.linalg.inv(cov), opacity, np.array(colour))
-        )
+        gaussians.append((z, np.array([fx * x / z + cx, fy * y / z + cy]), np.linalg.inv(cov), opacity, np.array(rgb)))
     gaussians.sort(key=lambda gaussian: gaussian[0])
     for row in range(camera.height):
         for column in range(camera.width):
             T = 1.0
-            for z, centre, conic, opacity, colour in gaussians:
+            for z, centre, conic, opacity, rgb in gaussians:
                 d = np.array([column + 0.5, row + 0.5]) - centre
                 density = opacity * math.exp(-0.5 * d @ conic @ d)
                 if density < 1 / 255:
@@ -259,7 +262,7 @@ def literal(scene: Scene, camera: Camera, background: np.ndarray) -> tuple[np.nd
                 a = min(0.99, density)
                 if T * (1 - a) <= 1e-4:
                     break
-                image[row, column] += T * a * colour
+                image[row, column] += T * a * rgb
                 depth[row, column] += T * a * z
                 T *= 1 - a
             image[row, column] += T * background
@@ -360,7 +363,7 @@ def test_sh_degree_0_is_the_same_from_everywhere() -> None:
     sh = 4 * scene["colors"]
     colors = color(sh, scene["means"], oblique_camera(9, 7), 0)
     torch.testing.assert_close(colors, (0.5 / math.sqrt(math.pi) * sh[:, 0] + 0.5).clamp(min=0))
-    assert colors.min() == 0, "no colour was cut at zero: the scene is too easy"
+    assert colors.min() == 0, "no color was cut at zero: the scene is too easy"
 
 
 def test_sh_looks_from_the_camera_to_the_mean() -> None:
@@ -438,7 +441,7 @@ def test_gradcheck(sh_degree: int | None, with_background: bool) -> None:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_gradcheck_of_the_colour(degree: int) -> None:
+def test_gradcheck_of_the_color(degree: int) -> None:
     """Every coefficient, and the mean through the view direction."""
     scene, camera = delicate_scene(degree)
     groups = scene["colors"].requires_grad_(), scene["means"].requires_grad_()

@@ -70,7 +70,7 @@ def drawn(
 
 
 def check_pile(count: int, device: Device) -> None:
-    """Against what follows from the formulas: no pixel stops, and its splats differ in nothing but colour."""
+    """Against what follows from the formulas: no pixel stops, and its splats differ in nothing but color."""
     found = drawn(pile(count), TILE, device)
     each = -(-count // 64)
     order = torch.arange(count) // 64
@@ -81,7 +81,7 @@ def check_pile(count: int, device: Device) -> None:
     picture.index_add_(0, torch.arange(count) % 64, weights[:, None] * pile(count)["colors"].double())
     assert each * 64 >= count
     assert (found["image"].reshape(64, 3) - picture).abs().max() < 2e-3 * picture.max()
-    # The gradient by colour is the splat's weight times the pixel's.
+    # The gradient by color is the splat's weight times the pixel's.
     d_image = torch.linspace(-1, 1, 192).view(64, 3).double()
     expected = weights[:, None] * d_image[torch.arange(count) % 64]
     assert (found["d colors"] - expected).abs().max() < 2e-3 * ALPHA

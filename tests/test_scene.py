@@ -8,16 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers.ply_files import read_ply
 from helpers.scene_files import CONFIG, DAMAGE, moving_scene, rewrite, with_grid
 from helpers.scenes import oblique_camera
 from torch import Tensor
 
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.io.ply import GaussianSnapshot, read_ply, write_ply
+from lapgs_wgpu.io.ply import GaussianSnapshot, write_ply
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.fields.hash_encoder import HashGrid
-from lapgs_wgpu.motion.scene import Scene4D, draw, load
+from lapgs_wgpu.motion.scene import Scene4D, load
+from lapgs_wgpu.splat.rasterize import rasterize
 
 CAMERA = oblique_camera(48, 32)
 TIMES = (0.0, 0.37, 1.0)
@@ -81,7 +83,8 @@ def test_an_untrained_field_leaves_the_scene_as_it_is(device: Device) -> None:
 
 def test_a_picture_trains_every_parameter(device: Device) -> None:
     scene = moving_scene(device)
-    rendering = draw(scene.at(0.4), CAMERA, None, device)
+    now = scene.at(0.4)
+    rendering = rasterize(*vars(now).values(), CAMERA, sh_degree=now.sh_degree, device=device)
     rendering.image.square().sum().backward()
     for name, parameter in scene.parameters.items():
         assert parameter.grad is not None, name

@@ -27,10 +27,10 @@ from lapgs_wgpu.motion.passes.decoder_passes import DecoderPasses
 from lapgs_wgpu.motion.scene import Scene4D, load
 from lapgs_wgpu.train import autotune, trainer
 from lapgs_wgpu.train import run as run_module
+from lapgs_wgpu.train.config import LossWeights
 from lapgs_wgpu.train.dataloader import Pictures
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
 from lapgs_wgpu.train.log import Log
-from lapgs_wgpu.train.losses import LossWeights
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.run import train
 from lapgs_wgpu.train.trainer import Trainer
@@ -377,13 +377,13 @@ def test_pictures_lie_on_their_background(background: str, dataset: Dataset, dev
     """On a fixed background they lie before they are uploaded, on a random one in the loss's first pass."""
     generator = torch.Generator().manual_seed(3)
     with closing(Pictures(dataset.train, background, 1.0, generator, device)) as pictures:  # type: ignore[arg-type]
-        drawn = [(view, pictures.on_device(view), colour) for view, colour in (pictures.choose() for _ in range(4))]
-    for view, truth, colour in drawn:
+        drawn = [(view, pictures.on_device(view), color) for view, color in (pictures.choose() for _ in range(4))]
+    for view, truth, color in drawn:
         picture = truth.read().view(np.uint8).reshape(32, 32, 4)
         if background == "random":
             assert (picture == view.load()).all()
         else:
-            assert colour.tolist() == [float(background == "white")] * 3
+            assert color.tolist() == [float(background == "white")] * 3
             assert (picture[..., 3] == 255).all()
             assert (picture[0, 0, :3] == 255 * int(background == "white")).all()
     if background == "random":

@@ -9,6 +9,7 @@ import pytest
 
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.viewer.camera import ViewCamera
+from lapgs_wgpu.viewer.path import Pose
 
 UP = np.array([0.0, 0.6, 0.8])
 
@@ -135,7 +136,7 @@ def test_snapping_is_exact(view: ViewCamera) -> None:
 @pytest.mark.parametrize("move", ["orbit", "look", "pan", "zoom", "fly", "focus_on", "stand", "reset"])
 def test_any_move_leaves_the_exact_camera(view: ViewCamera, move: str) -> None:
     arguments = {"zoom": (0.9,), "fly": (0, 0, 1), "focus_on": ([0, 0, 0],), "reset": ()}
-    arguments["stand"] = (view.position, view.rotation, 0.5)
+    arguments["stand"] = (view.pose,)
     view.snap(captured())
     getattr(view, move)(*arguments.get(move, (0.1, 0.1)))
     assert view.exact is None
@@ -145,7 +146,7 @@ def test_any_move_leaves_the_exact_camera(view: ViewCamera, move: str) -> None:
 def test_standing_on_a_pose(view: ViewCamera) -> None:
     distance = view.distance
     wanted = captured()
-    view.stand(wanted.position, wanted.T_cam_world[:3, :3], 0.5)
+    view.stand(Pose(wanted.position, wanted.T_cam_world[:3, :3], 0.5))
     assert np.allclose(view.camera(60, 40).T_cam_world, wanted.T_cam_world)
     assert view.fov_y == 0.5
     assert view.distance == pytest.approx(distance)

@@ -36,8 +36,8 @@ def moving_scene(device: Device) -> Scene4D:
     rng = np.random.default_rng(0)
     grid = HashConfig(2, (4, 4, 4), (8, 8, 8), 10)
     config = FieldConfig(static=grid, temporal=grid, width=8)
-    points, colours = rng.uniform(-0.8, 0.8, (COUNT, 3)), rng.uniform(0, 1, (COUNT, 3))
-    scene = Scene4D.from_points(points, colours, rng.uniform(0.05, 0.2, COUNT), config, opacity=0.7, device=device)
+    points, colors = rng.uniform(-0.8, 0.8, (COUNT, 3)), rng.uniform(0, 1, (COUNT, 3))
+    scene = Scene4D.from_points(points, colors, rng.uniform(0.05, 0.2, COUNT), config, opacity=0.7, device=device)
     torch.manual_seed(0)
     with torch.no_grad():
         scene.parameters["sh_rest"].copy_(0.2 * torch.randn(COUNT, 15, 3))
@@ -83,8 +83,8 @@ def picture(file: Path) -> np.ndarray:
 # Pictures
 
 
-def expected_picture(scene: Scene4D, camera: Camera, time: float, colour: float = 1.0) -> np.ndarray:
-    return to_8_bit(scene.render(camera, time, torch.full((3,), colour)).image).astype(int)
+def expected_picture(scene: Scene4D, camera: Camera, time: float, color: float = 1.0) -> np.ndarray:
+    return to_8_bit(scene.render(camera, time, torch.full((3,), color)).image).astype(int)
 
 
 @kernels
@@ -130,7 +130,7 @@ def frames_of(file: Path) -> np.ndarray:
 
 
 def distance(a: np.ndarray, b: np.ndarray) -> float:
-    """Mean difference of two pictures (H, W, 3), 2 x 2 pixels at a time: yuv420p keeps no finer colours."""
+    """Mean difference of two pictures (H, W, 3), 2 x 2 pixels at a time: yuv420p keeps no finer colors."""
     height, width = a.shape[:2]
     blocks = (a - b).reshape(height // 2, 2, width // 2, 2, 3).mean(axis=(1, 3))
     return float(np.abs(blocks).mean())
@@ -155,7 +155,7 @@ def test_a_video_of_the_clip(run: Path, scene: Scene4D, tmp_path: Path, capsys: 
 
 
 @kernels
-def test_colours_survive_the_video(tmp_path: Path, device: Device) -> None:
+def test_colors_survive_the_video(tmp_path: Path, device: Device) -> None:
     """Red, green, blue and grey come back: the matrix and the range are those that the file names."""
     from lapgs_wgpu.viewer.video import write_video
 
@@ -180,11 +180,11 @@ def test_a_turn_goes_around_while_time_stands(run: Path, tmp_path: Path) -> None
 
 def test_a_turn_is_a_whole_one() -> None:
     from lapgs_wgpu.viewer.camera import ViewCamera
-    from lapgs_wgpu.viewer.video import turn_shots
+    from lapgs_wgpu.viewer.video import orbit_views
 
-    shots = list(turn_shots(ViewCamera([3, 0, 1], [1, 0, 0], [0, 0, 1], 0.7), (8, 6), 4, None))
-    assert [time for _, time in shots] == pytest.approx([0, 1 / 3, 2 / 3, 1])
-    places = np.stack([camera.position for camera, _ in shots])
+    views = list(orbit_views(ViewCamera([3, 0, 1], [1, 0, 0], [0, 0, 1], 0.7), (8, 6), 4, None))
+    assert [time for _, time in views] == pytest.approx([0, 1 / 3, 2 / 3, 1])
+    places = np.stack([camera.position for camera, _ in views])
     np.testing.assert_allclose(places[[0, 2]], [[3, 0, 1], [-1, 0, 1]], atol=1e-9)
     np.testing.assert_allclose(np.sort(places[[1, 3], 1]), [-2, 2], atol=1e-9)
 

@@ -38,9 +38,9 @@ def run(tmp_path_factory: pytest.TempPathFactory, device: Device) -> Path:
     dataset = load_dataset(data)
     generator = torch.Generator().manual_seed(0)
     points = 0.5 * torch.randn(400, 3, generator=generator)
-    colours = torch.rand(400, 3, generator=generator)
+    colors = torch.rand(400, 3, generator=generator)
     scales = np.full(400, 0.06)
-    scene = Scene4D.from_points(points.numpy(), colours.numpy(), scales, CONFIG, opacity=0.7, device=device)
+    scene = Scene4D.from_points(points.numpy(), colors.numpy(), scales, CONFIG, opacity=0.7, device=device)
     assert scene.field is not None
     with torch.no_grad():
         for parameter in scene.field.parameters():
@@ -105,7 +105,7 @@ def test_scrub_play_orbit_and_modes(desktop: Desktop, run: Path, backend: str) -
         desktop.events("key", "m")
         seen.append(desktop.wait_for(lambda s: all(changed(s, other) for other in seen), f"the mode {mode}"))
     desktop.events("key", "m")
-    desktop.wait_for(lambda s: not changed(s, first), "colours again")
+    desktop.wait_for(lambda s: not changed(s, first), "colors again")
 
     desktop.events("key", "question")
     desktop.wait_for(lambda s: changed(s, first), "the help")

@@ -13,7 +13,7 @@ from .loaded_scene import LoadedScene, load_scene
 from .view_state import ViewState
 from .viewport import SETTLED, Viewport
 
-_GUI_DRAWS = 3  # after an event, until the panels have found their sizes and colours
+_GUI_DRAWS = 3  # after an event, until the panels have found their sizes and colors
 
 
 class App:

@@ -9,6 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from lapgs_wgpu.splat.camera import Camera
 
+from .path import Pose
+
 Vector = NDArray[np.float64]
 _STEEPEST = math.radians(89)  # of the line of sight, up or down: beyond it the picture would turn over
 
@@ -52,12 +54,16 @@ class ViewCamera:
         self.fov_y = 2 * math.atan(0.5 * camera.height / camera.K[1, 1])
         self.exact = camera
 
-    def stand(self, position: ArrayLike, rotation: ArrayLike, fov_y: float) -> None:
-        """Stand at a position (3,), turned by a rotation (3, 3) from world to camera; the focus stays as far ahead."""
+    @property
+    def pose(self) -> Pose:
+        """Position, rotation and field of view."""
+        return Pose(self.position.copy(), self.rotation.copy(), self.fov_y)
+
+    def stand(self, pose: Pose) -> None:
+        """Move to a pose. The distance to the focus, which lies straight ahead, does not change."""
         distance = self.distance
-        self.position, self.rotation = np.array(position, np.float64), np.array(rotation, np.float64)
-        self.focus = self.position + distance * self.rotation[2]
-        self.fov_y, self.exact = fov_y, None
+        self.position, self.rotation, self.fov_y = pose.position.copy(), pose.rotation.copy(), pose.fov_y
+        self.focus, self.exact = self.position + distance * self.rotation[2], None
 
     def reset(self) -> None:
         """Back to where it started."""
@@ -101,10 +107,7 @@ class ViewCamera:
         if self.exact is not None:
             scale = min(width / self.exact.width, height / self.exact.height)
             return self.exact.resized(max(1, round(scale * self.exact.width)), max(1, round(scale * self.exact.height)))
-        f = 0.5 * height / math.tan(0.5 * self.fov_y)
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = self.rotation, -self.rotation @ self.position
-        return Camera(np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]]), T, width, height)
+        return self.pose.camera(width, height)
 
     def _shift(self, by: Vector) -> None:
         self.position, self.focus, self.exact = self.position + by, self.focus + by, None

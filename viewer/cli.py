@@ -114,9 +114,9 @@ def _screenshot(given: Any, scene: LoadedScene) -> None:
         camera = framed(view.camera, *given.size) if given.size else view.camera
     else:
         camera = scene.camera().camera(*(given.size or _WINDOW_SIZE))
-    shoot = OffscreenRenderer(scene, given.mode or "rgb", BACKGROUNDS.get(given.background))
+    render = OffscreenRenderer(scene, given.mode or "rgb", BACKGROUNDS.get(given.background))
     time = given.time if given.time is not None else view.time if view is not None else 0.0
-    write_png(file, shoot(camera, time))
+    write_png(file, render(camera, time))
     print(f"{file}: {camera.width}x{camera.height}, time {time:g}")
 
 
@@ -150,19 +150,19 @@ def _video(given: Any, scene: LoadedScene) -> None:
     frames = video.count_frames(given.seconds or usual, fps)
 
     if held is not None:
-        shots = video.path_shots(held.path, size, frames)
+        cameras = video.path_views(held.path, size, frames)
     elif path == "time":
         camera = framed(view.camera, *size) if view else scene.camera().camera(*size)
-        shots = video.clip_shots(camera, frames)
+        cameras = video.clip_views(camera, frames)
     else:
         start = scene.camera()
         if view is not None:
             start = ViewCamera.of(view.camera, scene.look.focus, scene.look.up)
         usual_time = view.time if view is not None else 0.0
         time = None if path == "both" else usual_time if given.time is None else given.time
-        shots = video.turn_shots(start, size, frames, time)
-    shoot = OffscreenRenderer(scene, given.mode or "rgb", BACKGROUNDS.get(given.background))
-    video.write_video(file, shots, frames, fps, shoot)
+        cameras = video.orbit_views(start, size, frames, time)
+    render = OffscreenRenderer(scene, given.mode or "rgb", BACKGROUNDS.get(given.background))
+    video.write_video(file, cameras, frames, fps, render)
     print(f"{file}: {frames} frames of {size[0]}x{size[1]} at {fps:g} a second")
 
 

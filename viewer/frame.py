@@ -1,4 +1,4 @@
-"""Drawing a frame: the scene at a time, seen by a camera, as its colours or as one of its values."""
+"""Drawing a frame: the scene at a time, seen by a camera, as its colors or as one of its values."""
 
 from __future__ import annotations
 
@@ -88,8 +88,8 @@ class FrameRenderer:
         gaussians = self.playback.at(request.time, camera if passing else None)
         exact = self.playback.exact
         if value is not None:
-            colours, low, high = value
-            gaussians = dataclasses.replace(gaussians, sh=colours)
+            colors, low, high = value
+            gaussians = dataclasses.replace(gaussians, sh=colors)
             background = (0.0, 0.0, 0.0)
         taken = self._profiler() if profile else None
         while True:
@@ -128,7 +128,7 @@ class FrameRenderer:
         return float(low), float(high)
 
     def _value(self, mode: Mode, t: float) -> tuple[DeviceArray, float, float]:
-        """A value of each Gaussian as its colour (N, 3), and the values at the ends of the scale."""
+        """A value of each Gaussian as its color (N, 3), and the values at the ends of the scale."""
         key = (mode, t if mode == "scale" else 0.0)
         held = self._values.get(key)
         if held is None:

@@ -19,13 +19,13 @@ from .loaded_scene import LoadedScene
 from .present import Offscreen
 from .render_modes import Mode
 
-Colour = tuple[float, float, float]
+Color = tuple[float, float, float]
 
 
 class OffscreenRenderer:
     """Renders images of a scene. Raises InputError where the scene has nothing to show in this mode."""
 
-    def __init__(self, scene: LoadedScene, mode: Mode = "rgb", background: Colour | None = None) -> None:
+    def __init__(self, scene: LoadedScene, mode: Mode = "rgb", background: Color | None = None) -> None:
         self._renderer = FrameRenderer(scene.playback)
         check_mode(scene, self._renderer, mode)
         self._offscreen = Offscreen(scene.playback.device)

@@ -85,18 +85,19 @@ def _parse(arguments: Sequence[str]) -> Any:
         "time of --view]")
     modes = "; ".join(f"{mode}: {about}" for mode, about in MODES.items())
     add("--mode", choices=list(MODES), help=f"what to render; {modes} [rgb]")
-    add("--background", choices=list(BACKGROUNDS), help="background color [that of the training, otherwise black]")
+    add("--background", choices=list(BACKGROUNDS), help="color behind the Gaussians [the training's, otherwise black]")
     add("--size", type=_size, metavar="WxH", help="width and height of the window, screenshot or video, pixels "
         "[1280x720, or that of --view or of the camera path]")
-    add("--view", metavar="N|NAME", help="use a camera of the training's capture, by name or by number from 0; test "
-        "views come first [a camera stored in the file, otherwise one chosen to show the whole scene]")
+    add("--view", metavar="N|NAME", help="use a camera of the capture that the config.toml beside FILE.ply names, by "
+        "name or by number from 0; test views come first [a camera stored in the file, otherwise one that shows the "
+        "whole scene]")
 
     add = parser.add_argument_group("window").add_argument
     add("--time-slider", action=argparse.BooleanOptionalAction, help="show or hide the time slider [shown if the "
         "scene moves]")
     add("--play", action="store_const", const=True, help="start playing at once [paused]")
     add("--fps", type=_number(0.1, 1000.0), metavar="F", help="frames per second of the clip at speed 1, and of "
-        "--video [30]")
+        "--video [30, or that of the camera path]")
     add("--speed", type=_number(0.01, 100.0), metavar="X", help="playback speed, a factor [1]")
     add("--loop", choices=list(LOOPS), help="at the end of the clip; loop: start again; bounce: play backwards; "
         "once: stop [loop]")
@@ -114,7 +115,7 @@ def _parse(arguments: Sequence[str]) -> Any:
     add("--screenshot", metavar="FILE.png", help="render one image to a PNG file")
     add("--video", metavar="FILE.mp4", help="render a video to an MP4 file (H.264)")
     add("--path", metavar="time|view|both|CAMERAS.json", help="camera motion of --video; time: static camera while "
-        "the clip plays; view: one orbit around the focus point at a fixed time; both: one orbit while the clip "
+        "the clip plays; view: one orbit around the focus point at --time; both: one orbit while the clip "
         "plays; CAMERAS.json: camera path in nerfstudio's format [time, or view if the scene does not move]")
     add("--seconds", type=_number(0.001, 86400.0), metavar="S", help="length of --video, seconds [length of the clip "
         "or of the camera path; 6 for view]")
@@ -122,8 +123,8 @@ def _parse(arguments: Sequence[str]) -> Any:
     add = parser.add_argument_group("export (no window)").add_argument
     add("--export", metavar="FILE.ply|DIR", help="write a static 3DGS .ply file of the Gaussians at --time; with "
         "--frames: a sequence of such files in the folder DIR")
-    add("--frames", type=_count, metavar="N", help="number of files that --export writes, at equally spaced times "
-        "from 0 to 1")
+    add("--frames", type=_count, metavar="N", help="with --export DIR: number of files, at equally spaced times from "
+        "0 to 1")
     add("--overwrite", action="store_const", const=True, help="allow --export to replace existing files")
     # fmt: on
     return parser.parse_args(arguments)

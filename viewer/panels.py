@@ -21,7 +21,6 @@ from .viewport import Viewport
 
 _FIXED = imgui.WindowFlags_.no_move | imgui.WindowFlags_.no_resize | imgui.WindowFlags_.no_saved_settings
 _BAR = _FIXED | imgui.WindowFlags_.no_title_bar | imgui.WindowFlags_.no_scrollbar
-_TEXT = _BAR | imgui.WindowFlags_.no_inputs | imgui.WindowFlags_.always_auto_resize | imgui.WindowFlags_.no_nav
 _GAP = 8.0
 _BAR_HEIGHT = 62.0  # of the time slider
 _SIDE = 230.0  # width of the panel at the left
@@ -106,12 +105,12 @@ class Panels:
         if frame is not None and frame.placed.shows in ("depth", "value"):
             _legend(frame.placed.low, frame.placed.high)
         names = list(BACKGROUNDS)
-        colours = list(BACKGROUNDS.values())
+        colors = list(BACKGROUNDS.values())
         imgui.set_next_item_width(-70)
-        present = colours.index(state.background) if state.background in colours else 0
+        present = colors.index(state.background) if state.background in colors else 0
         changed, chosen = imgui.combo("ground", present, names)
         if changed:
-            state.background = colours[chosen]
+            state.background = colors[chosen]
         _tip("background")
         for text, action, tip in (
             ("Reset", state.reset_camera, "camera back to where it started (R)"),
@@ -221,13 +220,13 @@ def _tip(text: str) -> None:
 
 
 def _legend(low: float, high: float) -> None:
-    """The scale of colours with the values at its ends."""
+    """The scale of colors with the values at its ends."""
     x, y = imgui.get_cursor_screen_pos()
     width = imgui.get_content_region_avail().x
     step = width / (len(HEAT) - 1)
     draw = imgui.get_window_draw_list()
     for i in range(len(HEAT) - 1):
-        a, b = (imgui.get_color_u32((*colour, 1.0)) for colour in HEAT[i : i + 2])
+        a, b = (imgui.get_color_u32((*color, 1.0)) for color in HEAT[i : i + 2])
         draw.add_rect_filled_multi_color((x + i * step, y), (x + (i + 1) * step, y + 10), a, b, b, a)
     imgui.dummy((width, 12))
     imgui.text(f"{low:.3g}")
@@ -240,10 +239,10 @@ def _style() -> None:
     style.window_rounding, style.frame_rounding, style.grab_rounding = 6.0, 4.0, 4.0
     style.window_border_size = 0.0
     style.grab_min_size = 14.0
-    for name, colour in (
+    for name, color in (
         (imgui.Col_.window_bg, (0.08, 0.08, 0.09, 0.85)),
         (imgui.Col_.slider_grab, _ACCENT),
         (imgui.Col_.slider_grab_active, (1.0, 0.75, 0.4, 1.0)),
         (imgui.Col_.check_mark, _ACCENT),
     ):
-        style.set_color_(name, colour)
+        style.set_color_(name, color)

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lapgs_wgpu.data.poses import world_to_camera
 from lapgs_wgpu.splat.camera import Camera
 
 Array = NDArray[np.float64]
@@ -27,9 +28,8 @@ class Pose(NamedTuple):
     def camera(self, width: int, height: int) -> Camera:
         """The rasteriser's camera for a picture of this size."""
         f = 0.5 * height / math.tan(0.5 * self.fov_y)
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = self.rotation, -self.rotation @ self.position
-        return Camera(np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]]), T, width, height)
+        K = np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]])
+        return Camera(K, world_to_camera(self.rotation.T, self.position), width, height)
 
 
 class KeyFrame(NamedTuple):

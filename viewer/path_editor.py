@@ -31,13 +31,13 @@ class PathEditor:
     def add(self, camera: ViewCamera, time: float) -> None:
         """A new key-frame here and now, some seconds after the last one."""
         second = self.keys[-1].second + _STEP if self.keys else 0.0
-        self.keys.append(KeyFrame(second, time, _pose(camera)))
+        self.keys.append(KeyFrame(second, time, camera.pose))
         self.chosen = len(self.keys) - 1
 
     def replace(self, camera: ViewCamera, time: float) -> None:
         """The chosen key-frame moves here and now; its second stays."""
         assert self.chosen is not None
-        self.keys[self.chosen] = KeyFrame(self.keys[self.chosen].second, time, _pose(camera))
+        self.keys[self.chosen] = KeyFrame(self.keys[self.chosen].second, time, camera.pose)
 
     def delete(self) -> None:
         """Drop the chosen key-frame; the next one is chosen."""
@@ -92,7 +92,3 @@ class PathEditor:
 def beside(ply: Path | None) -> Path:
     """The file of the camera path that belongs to a .ply file."""
     return ply.with_name(f"{ply.stem}.camera_path.json") if ply else Path("camera_path.json")
-
-
-def _pose(camera: ViewCamera) -> Pose:
-    return Pose(camera.position.copy(), camera.rotation.copy(), camera.fov_y)

@@ -13,7 +13,7 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.gpu.shader import compose, pack
 
-# The scale of colours for values, from low to high.
+# The scale of colors for values, from low to high.
 HEAT = (
     (0.05, 0.03, 0.20),
     (0.33, 0.06, 0.43),
@@ -75,7 +75,7 @@ class Presenter:
         )
 
     def __call__(self, target: Any, pictures: list[Placed], margin: tuple[float, float, float]) -> None:
-        """Submit: `target`, a texture view, filled with the margin's colour and then with the pictures."""
+        """Submit: `target`, a texture view, filled with the margin's color and then with the pictures."""
         uniforms = [self._uniform(i, placed) for i, placed in enumerate(pictures)]
         native = self.device.wgpu_device
         encoder = native.create_command_encoder()
@@ -93,7 +93,7 @@ class Presenter:
         self.device.queue.submit([encoder.finish()])
 
     def _uniform(self, number: int, placed: Placed) -> DeviceArray:
-        values: dict[str, object] = {f"heat{i}": (*colour, 1.0) for i, colour in enumerate(HEAT)}
+        values: dict[str, object] = {f"heat{i}": (*color, 1.0) for i, color in enumerate(HEAT)}
         values |= {
             "background": (*placed.background, 1.0),
             "origin": placed.origin,

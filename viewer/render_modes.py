@@ -10,8 +10,8 @@ COMPARES: tuple[Compare, ...] = ("off", "side", "split", "error")
 MODES: dict[Mode, str] = {
     "rgb": "colors",
     "depth": "depth along the camera axis, world units",
-    "alpha": "opacity",
-    "motion": "distance that each Gaussian moves over the clip, world units",
+    "alpha": "opacity of the image",
+    "motion": "largest distance of each Gaussian from its mean position over the clip, world units",
     "dynamics": "norm of each Gaussian's dynamics attribute",
     "scale": "largest standard deviation of each Gaussian, world units",
 }

@@ -1,4 +1,4 @@
-"""Videos without a screen: H.264 in mp4."""
+"""Write videos (H.264 in MP4), and the cameras of their frames."""
 
 from __future__ import annotations
 
@@ -19,27 +19,27 @@ from lapgs_wgpu.splat.camera import Camera
 from .camera import ViewCamera
 from .path import CameraPath
 
-Shot = tuple[Camera, float]  # a camera and a time in the clip
+TimedCamera = tuple[Camera, float]  # a camera and a time in the clip
 PATHS = ("time", "view", "both")
-_QUALITY = "18"  # H.264's crf: hardly to be told from the pictures
+_QUALITY = "18"  # H.264's crf: hardly distinguishable from the rendered images
 _MOST_FRAMES = 1_000_000
 
 
 def count_frames(seconds: float, fps: float) -> int:
-    """Of a video. Raises InputError where there would be none, or no end of them."""
+    """Number of frames of a video. Raises InputError if it is 0 or above the limit."""
     frames = round(seconds * fps)
     if not 1 <= frames <= _MOST_FRAMES:
         raise InputError(f"{seconds:g} s at {fps:g} frames a second are {frames} frames; give --seconds or --fps.")
     return frames
 
 
-def clip_shots(camera: Camera, frames: int) -> Iterator[Shot]:
-    """The clip once, from its first to its last moment, seen by a camera that stands."""
+def clip_views(camera: Camera, frames: int) -> Iterator[TimedCamera]:
+    """A static camera while the clip plays once."""
     return ((camera, share) for share in np.linspace(0, 1, frames).tolist())
 
 
-def turn_shots(start: ViewCamera, size: tuple[int, int], frames: int, time: float | None) -> Iterator[Shot]:
-    """Once around the focus, so that the first picture follows the last one. time: stands, or None: the clip once."""
+def orbit_views(start: ViewCamera, size: tuple[int, int], frames: int, time: float | None) -> Iterator[TimedCamera]:
+    """One closed orbit around the focus. time: fixed, in [0, 1]; None plays the clip once."""
     times = np.linspace(0, 1, frames).tolist()
     for number in range(frames):
         if number:
@@ -47,26 +47,26 @@ def turn_shots(start: ViewCamera, size: tuple[int, int], frames: int, time: floa
         yield start.camera(*size), times[number] if time is None else time
 
 
-def path_shots(path: CameraPath, size: tuple[int, int], frames: int) -> Iterator[Shot]:
-    """Along a camera path, from its first to its last key-frame."""
+def path_views(path: CameraPath, size: tuple[int, int], frames: int) -> Iterator[TimedCamera]:
+    """Along a camera path, from its first to its last key frame."""
     for second in np.linspace(0, path.seconds, frames).tolist():
         pose, time = path.at(second)
         yield pose.camera(*size), time
 
 
 def even(size: tuple[int, int]) -> tuple[int, int]:
-    """The largest size within this one that yuv420p can have."""
+    """The largest size, at most this one, that the pixel format yuv420p allows: even and at least 2x2."""
     return max(2, size[0] // 2 * 2), max(2, size[1] // 2 * 2)
 
 
 def write_video(
     file: Path,
-    shots: Iterator[Shot],
+    cameras: Iterator[TimedCamera],
     frames: int,
     fps: float,
-    shoot: Callable[[Camera, float], NDArray[np.uint8]],
+    render: Callable[[Camera, float], NDArray[np.uint8]],
 ) -> None:
-    """Draw the shots, all of one even size, into an mp4. Atomic: on any exception no file, or the old one, is there.
+    """Render the cameras, all of one even size, to an MP4 file. Atomic: on any exception the old file stays, if any.
 
     Raises InputError where PyAV is missing or the file cannot be written.
     """
@@ -80,12 +80,12 @@ def write_video(
         with Progress(frames, "frames") as progress, av.open(sink, "w", format="mp4") as container:
             stream = container.add_stream("libx264", rate, options={"crf": _QUALITY, "preset": "medium"})
             stream.pix_fmt = "yuv420p"
-            # Players guess the meaning of the values by the size unless they are stated: BT.601's matrix, as swscale
-            # converts, in the limited range, and sRGB's primaries.
+            # Without these, players guess the color space from the image size: BT.601's matrix and limited range, as
+            # swscale converts, and sRGB's primaries.
             context = stream.codec_context
             context.colorspace, context.color_primaries, context.color_trc, context.color_range = 6, 1, 13, 1
-            for camera, time in shots:
-                image = shoot(camera, time)
+            for camera, time in cameras:
+                image = render(camera, time)
                 if not context.is_open:  # the first encoded frame opens it
                     stream.height, stream.width = image.shape[:2]
                 container.mux(stream.encode(av.VideoFrame.from_ndarray(image, "rgb24")))
@@ -96,14 +96,17 @@ def write_video(
 
 
 class _Sink:
-    """The file, for PyAV, which must not learn of a full disk: it would encode on in a destructor, and print errors."""
+    """A file for PyAV that keeps errors of the disk to itself until `check`.
+
+    PyAV would otherwise continue to encode in a destructor, and print errors.
+    """
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
         self._error: OSError | None = None
 
     def check(self) -> None:
-        """Raises what has kept the file from being written."""
+        """Raise the first error of writing, if any."""
         if self._error is not None:
             raise self._error
 
@@ -117,7 +120,7 @@ class _Sink:
 
     def seek(self, *place: int) -> int:
         try:
-            return self._file.seek(*place)  # which writes what is still waiting
+            return self._file.seek(*place)  # flushes, so it may fail, too
         except OSError as error:
             self._error = self._error or error
             return 0

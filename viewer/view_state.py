@@ -76,7 +76,7 @@ class ViewState:
 
     def stand_on(self, pose: Pose, time: float) -> None:
         """Go to a pose of a camera path and to a time."""
-        self.camera.stand(pose.position, pose.rotation, pose.fov_y)
+        self.camera.stand(pose)
         self.clock.playing = False
         self.clock.seek(time)
 

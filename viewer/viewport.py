@@ -14,7 +14,7 @@ from .present import Placed, Presenter
 from .view_state import ViewState
 
 SETTLED = 0.2  # seconds without a change after which the full resolution is drawn
-MARGIN = (0.11, 0.11, 0.12)  # colour around an image that does not fill the canvas
+MARGIN = (0.11, 0.11, 0.12)  # color around an image that does not fill the canvas
 _TARGET_SECONDS = 1 / 12  # for a frame while something moves; where it takes longer, the resolution falls
 _SMALLEST = 0.25  # least resolution, share of the canvas's width and height
 _ERROR_GAIN = 4.0
@@ -33,7 +33,7 @@ class Viewport:
         self.device = state.scene.playback.device
         self._context = canvas.get_wgpu_context()
         wanted = self._context.get_preferred_format(self.device.wgpu_device.adapter)
-        self.format = wanted.removesuffix("-srgb")  # our colours are already sRGB
+        self.format = wanted.removesuffix("-srgb")  # our colors are already sRGB
         self._context.configure(device=self.device.wgpu_device, format=self.format)
         self._presenter = Presenter(self.device, self.format)
         self.frame: Frame | None = None

@@ -21,35 +21,31 @@ FILLED = 0.95  # share of cells with points from which on a cloud is random: the
 
 
 class Cloud(NamedTuple):
-    """points: (N, 3) world units. colours: (N, 3) RGB in [0, 1]. Both float32."""
+    """points: (N, 3) world units. colors: (N, 3) RGB in [0, 1]. Both float32."""
 
     points: NDArray[np.float32]
-    colours: NDArray[np.float32]
+    colors: NDArray[np.float32]
 
     def at_most(self, count: int, seed: int) -> Cloud:
         """Return at most `count` points: all of them, or a random subset in their order."""
         if len(self.points) <= count:
             return self
         chosen = np.sort(np.random.default_rng(seed).choice(len(self.points), count, replace=False))
-        return Cloud(self.points[chosen], self.colours[chosen])
+        return Cloud(self.points[chosen], self.colors[chosen])
 
 
 def find_cloud(folder: Path, patterns: Sequence[str]) -> Path | None:
     """Find the last file by name of the first pattern that matches any."""
-    for pattern in patterns:
-        found = sorted(folder.glob(pattern))
-        if found:
-            return found[-1]
-    return None
+    return next((found[-1] for pattern in patterns if (found := sorted(folder.glob(pattern)))), None)
 
 
 def read_cloud(path: Path) -> Cloud:
-    """Read a .npy or a .ply file; points without colours are mid-gray. Raises InputError."""
-    colours = None
+    """Read a .npy or a .ply file; points without colors are mid-gray. Raises InputError."""
+    colors = None
     if path.suffix == ".npy":
         points = read_npy(path)
     else:
-        points, colours = read_points(path)
+        points, colors = read_points(path)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
         raise InputError(f"{path} must hold at least one point of 3 numbers, an array of (N, 3), got {points.shape}.")
     with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite, which is reported below
@@ -60,7 +56,7 @@ def read_cloud(path: Path) -> Cloud:
             f"{path} holds NaN or infinite coordinates in {len(bad)} of {len(points)} points, first in point {bad[0]}; "
             "remove them."
         )
-    return Cloud(points, np.full_like(points, 0.5) if colours is None else colours)
+    return Cloud(points, np.full_like(points, 0.5) if colors is None else colors)
 
 
 def read_npy(path: Path) -> NDArray[np.floating]:

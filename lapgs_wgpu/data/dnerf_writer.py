@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lapgs_wgpu.data.images import encode_png
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
 
@@ -24,28 +25,52 @@ def split_times(train_times: int, test_times: int) -> tuple[NDArray[np.float64],
     return train, test
 
 
-def frame_name(split: str, index: int) -> str:
-    """Path of a frame's image in the folder, without its suffix."""
-    return f"{split}/r_{index:03d}"
+def write_scene(
+    folder: Path,
+    record: str,
+    parameters: Mapping[str, object],
+    splits: Mapping[str, tuple[Sequence[Camera], NDArray[np.float64]]],
+    fov_x: float,
+    write_frame: Callable[[Path, str, str, Camera, float], None],
+    details: Mapping[str, object] | None = None,
+) -> Path:
+    """Write a scene, unless the folder already holds it; the folder appears only when it is complete. Returns it.
+
+    record: name of a JSON file that stores `parameters`, which identify the scene, and `details`. splits: cameras and
+    times of the images of train, val and test. fov_x: horizontal field of view of all cameras, radians. write_frame:
+    writes the files of one image, from folder, split, name without suffix, camera and time.
+    Raises InputError where the folder holds anything else, and for errors of the file system.
+    """
+    if _already_holds(folder, record, parameters):
+        return folder
+    with _new_folder(folder) as unfinished:
+        for split, (cameras, times) in splits.items():
+            frames = []
+            for index, (camera, time) in enumerate(zip(cameras, times, strict=True)):
+                name = f"r_{index:03d}"
+                write_frame(unfinished, split, name, camera, time)
+                T_world_cam = np.eye(4)
+                T_world_cam[:3, :3] = camera.T_cam_world[:3, :3].T * [1, -1, -1]  # OpenGL's axes: y up, z backward
+                T_world_cam[:3, 3] = camera.position
+                pose = T_world_cam.tolist()
+                frames.append({"file_path": f"./{split}/{name}", "time": time, "transform_matrix": pose})
+            _write_json(unfinished / f"transforms_{split}.json", {"camera_angle_x": fov_x, "frames": frames})
+        _write_json(unfinished / record, {**parameters, **(details or {})})
+    return folder
 
 
-def write_transforms(
-    folder: Path, split: str, cameras: Sequence[Camera], times: NDArray[np.float64], fov_x: float
-) -> None:
-    """Write transforms_SPLIT.json. fov_x: horizontal field of view of all cameras, radians."""
-    frames = []
-    for index, (camera, time) in enumerate(zip(cameras, times, strict=True)):
-        T_world_cam = np.eye(4)
-        T_world_cam[:3, :3] = camera.T_cam_world[:3, :3].T * [1, -1, -1]  # OpenGL's axes: y up, z backward
-        T_world_cam[:3, 3] = camera.position
-        name = f"./{frame_name(split, index)}"
-        frames.append({"file_path": name, "time": time, "transform_matrix": T_world_cam.tolist()})
-    data = {"camera_angle_x": fov_x, "frames": frames}
-    (folder / f"transforms_{split}.json").write_text(json.dumps(data, indent=1) + "\n")
+def write_image(path: Path, image: NDArray[np.uint8]) -> None:
+    """Write a PNG file, and its folder if that is missing."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(encode_png(image))
+
+
+def _write_json(path: Path, value: object) -> None:
+    path.write_text(json.dumps(value, indent=1) + "\n")
 
 
 @contextmanager
-def new_folder(folder: Path) -> Iterator[Path]:
+def _new_folder(folder: Path) -> Iterator[Path]:
     """A folder to fill, which takes the name `folder` when the block ends without an exception.
 
     `folder` must not exist, or be empty. Errors of the file system are raised as InputError.
@@ -63,7 +88,7 @@ def new_folder(folder: Path) -> Iterator[Path]:
         shutil.rmtree(unfinished, ignore_errors=True)
 
 
-def already_holds(folder: Path, record: str, parameters: Mapping[str, object]) -> bool:
+def _already_holds(folder: Path, record: str, parameters: Mapping[str, object]) -> bool:
     """Whether a folder holds the scene of these parameters, which its JSON file `record` stores at the top level.
 
     Raises InputError where the folder holds anything else.

@@ -108,7 +108,7 @@ def encode_png(image: Pixels, *, level: int = 6) -> bytes:
 
 def resize(image: Pixels, size: Size, resampling: Image.Resampling) -> Pixels:
     """Resample an image (H, W, C) to (width, height)."""
-    # Pillow premultiplies RGBA around the filter: the colour of transparent pixels does not bleed into edges.
+    # Pillow premultiplies RGBA around the filter: the color of transparent pixels does not bleed into edges.
     return image if image.shape[1::-1] == size else np.array(Image.fromarray(image).resize(size, resampling))
 
 

@@ -201,7 +201,7 @@ def _cube(capture: Capture, cameras: Sequence[Camera], depths: tuple[float, floa
 def _filled(cloud: Cloud, cameras: Sequence[Camera]) -> Cloud:
     """Fill up a cloud to DENSE points.
 
-    The new points are random where views overlap, between the depths of the cloud. Each has the colour of the nearest
+    The new points are random where views overlap, between the depths of the cloud. Each has the color of the nearest
     old one.
     """
     from scipy.spatial import cKDTree  # slow to import
@@ -216,7 +216,7 @@ def _filled(cloud: Cloud, cameras: Sequence[Camera]) -> Cloud:
     _, nearest = cKDTree(points).query(added)
     return Cloud(
         np.concatenate([cloud.points, added.astype(np.float32)]),
-        np.concatenate([cloud.colours, cloud.colours[nearest]]),
+        np.concatenate([cloud.colors, cloud.colors[nearest]]),
     )
 
 

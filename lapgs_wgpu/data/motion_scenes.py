@@ -1,9 +1,9 @@
-"""Built-in scenes that measure motion: two objects travel a known path, seen by cameras of a known kind.
+"""Built-in scenes for measuring motion: two objects travel along known paths.
 
-A ball runs along a circle and a box along a line, both `path` of their diameters wide and `cycles` times over the clip;
-a small ball below them stands still. z is up. All objects stay within [-1.3, 1.3]^3 and within the view of all cameras
-except where the scene says otherwise, so the objects' size follows from the path. `write_motion` writes a scene in
-the D-NeRF layout with its true trajectories, masks and clean plates (`objects.json`, docs/metrics.md).
+A ball moves along a circle and a box along a line. Both paths are `path` diameters wide and travelled `cycles` times
+over the clip. A small ball below them is static. z is up. All objects stay within [-1.3, 1.3]^3 and within the view of
+all cameras, unless `objects` says otherwise, so their size depends on the path. `write_motion` writes a scene in the
+D-NeRF layout with true trajectories, masks and clean plates (`objects.json`, docs/metrics.md).
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lapgs_wgpu.data.raytrace import Floats, Hits, Solid, Vector, pixel_rays, plane_hits, rays_around, solid_hits
 from lapgs_wgpu.data.synthetic import camera_at, jumps
-from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.io.dataclass_table import Options, option
 from lapgs_wgpu.splat.camera import Camera
 
 CameraMotion = Literal["jump", "walk", "still"]
@@ -38,46 +38,42 @@ SHORTEST_OCCLUDED_PATH = 3  # leaves space for a column
 
 
 @dataclass(frozen=True)
-class MotionScene:
-    """What moves in a scene, and how it is seen.
+class MotionScene(Options):
+    """What moves in a scene, and how it is seen. Raises ValueError for a path or cycles out of range."""
 
-    path: width of each path in diameters of the object. cycles: how often each path is travelled over the clip.
-    camera: "jump" takes each image from elsewhere, as D-NeRF does; "walk" moves slowly around the scene, as a phone;
-    "still" is six cameras that stand still and see each time together.
-    background: "black" or "white" gives transparent images, to be trained and measured on that colour
-    (data.background); "room" a textured floor and two walls.
-    objects: "two" moving ones; "enter": the box drops into the scene at t = 0.4; "occluded": both circle a column.
-    """
-
-    path: float = 2.0
-    cycles: float = 2.0
-    camera: CameraMotion = "jump"
-    background: Backdrop = "black"
-    objects: ObjectSet = "two"
+    path: float = option("width of each path in diameters of the object", 2.0, above=0, at_most=20)
+    cycles: float = option("how often each path is travelled over the clip", 2.0, above=0, at_most=20)
+    camera: CameraMotion = option(
+        "jump: each image from elsewhere, as in D-NeRF; walk: a slow walk around the scene, as with a phone; still: "
+        "six cameras that stand still and see each time together",
+        "jump",
+    )
+    background: Backdrop = option(
+        "black, white: transparent images, for training and evaluation on that color (data.background); room: a "
+        "textured floor and two walls",
+        "black",
+    )
+    objects: ObjectSet = option(
+        "two: two moving objects; enter: the box drops into the scene at t = 0.4; occluded: both circle a column", "two"
+    )
 
     def __post_init__(self) -> None:
-        for name, most in (("path", 20), ("cycles", 20)):
-            value = float(getattr(self, name))
-            object.__setattr__(self, name, value)  # 4 and 4.0 are written alike
-            if not (math.isfinite(value) and 0 < value <= most):
-                raise InputError(f"a motion scene needs {name} above 0 and up to {most}, got {value:g}.")
-        for name, kind in (("camera", CameraMotion), ("background", Backdrop), ("objects", ObjectSet)):
-            if getattr(self, name) not in get_args(kind):
-                known = ", ".join(get_args(kind))
-                raise InputError(f"a motion scene needs {name} of {known}, got {getattr(self, name)!r}.")
+        super().__post_init__()
+        for name in ("path", "cycles"):
+            object.__setattr__(self, name, float(getattr(self, name)))  # 4 and 4.0 are written alike
         if self.objects == "occluded" and self.path < SHORTEST_OCCLUDED_PATH:
-            raise InputError(
-                f"a motion scene with objects=occluded needs a path of at least {SHORTEST_OCCLUDED_PATH}, which leaves "
-                f"space for the column, got {self.path:g}."
+            raise ValueError(
+                f"path must be at least {SHORTEST_OCCLUDED_PATH} with objects=occluded, which leaves space for the "
+                f"column, got {self.path:g}"
             )
 
 
 @dataclass(frozen=True)
 class MovingObject:
-    """A solid whose centre is at `centre + cosine cos(2 pi f t) + sine sin(2 pi f t)`, f = `cycles`, world units.
+    """A solid with center `centre + cosine cos(2 pi f t) + sine sin(2 pi f t)`, f = `cycles`, world units.
 
-    diameter: of the ball, or of the ball of the same volume as the box. drop: height from which it enters.
-    A still object has `cycles` 0 and no mask is asked of it.
+    diameter: of the ball, or of a ball with the volume of the box. drop: height from which it enters. A static object
+    has 0 cycles; no masks are written for it.
     """
 
     name: str
@@ -95,11 +91,11 @@ class MovingObject:
 
     @property
     def reach(self) -> float:
-        """Radius of the smallest ball around the centre that holds the object."""
+        """Radius of the bounding sphere around the center."""
         return math.hypot(*self.solid.half) if self.solid.shape == "box" else self.solid.half[0]
 
     def positions(self, times: ArrayLike) -> Floats:
-        """Centre of the object at times (T,): (T, 3) world units."""
+        """Centers at times (T,): (T, 3) world units."""
         time = np.asarray(times, dtype=np.float64)[:, None]
         phase = 2 * np.pi * self.cycles * time
         path = np.array(self.centre) + np.cos(phase) * self.cosine + np.sin(phase) * self.sine
@@ -109,7 +105,7 @@ class MovingObject:
 
 
 def moving_objects(scene: MotionScene) -> tuple[MovingObject, ...]:
-    """All objects of a scene, those that move first."""
+    """All objects of a scene, the moving ones first."""
     diameter = min(0.55, 2.1 / (scene.path + 1))
     edge = 0.806 * diameter  # of the box that has the ball's volume
     radius = scene.path * diameter / 2  # of the circle, and half the length of the line
@@ -150,7 +146,7 @@ def moving_objects(scene: MotionScene) -> tuple[MovingObject, ...]:
 
 
 def trace(scene: MotionScene, camera: Camera, time: float) -> list[Hits]:
-    """Hits of every surface: first those of `moving_objects`, in their order, then those of the room."""
+    """Hits of all surfaces: first those of `moving_objects`, in that order, then those of the room."""
     rays = pixel_rays(camera)
     eye = camera.position
     surfaces = []
@@ -166,7 +162,7 @@ def trace(scene: MotionScene, camera: Camera, time: float) -> list[Hits]:
 
 
 def _floor(x: Floats, y: Floats) -> tuple[NDArray[np.bool_], Floats]:
-    """Tiles of two greys, each third one warmer."""
+    """Tiles in two shades of gray, every third one warmer."""
     inside = (np.abs(x) <= WALL) & (np.abs(y) <= WALL)
     column, row = np.floor(x[inside] / 0.29), np.floor(y[inside] / 0.29)
     light = (column + row) % 2 == 0
@@ -199,8 +195,10 @@ def fov_x(scene: MotionScene) -> float:
 
 
 def scene_cameras(scene: MotionScene, split: str, times: ArrayLike, seed: int, *, size: int) -> list[Camera]:
-    """The cameras of the images of a split taken at `times` (T,): for training cameras that stand still T is a
-    multiple of STILL_CAMERAS, image by image camera 0 to 5. seed: of the jumps."""
+    """Cameras of the images of a split, at `times` (T,). seed: of the jumps.
+
+    For training images of static cameras, T is a multiple of STILL_CAMERAS, and the cameras 0 to 5 alternate.
+    """
     time = np.asarray(times, dtype=np.float64)
     room = scene.background == "room"
     places: Sequence[tuple[float, float]]

@@ -1,27 +1,27 @@
-"""Writes a motion scene in the D-NeRF layout, with the truth about its objects beside the images.
+"""Writes a motion scene in the D-NeRF layout, with the ground truth of its objects.
 
-objects.json: parameters of the scene; of every object its size, and its positions at the times of each split's images.
-masks/SPLIT/VIEW_OBJECT.png: which pixels of a held-out image show a moving object, 8-bit grey, antialiased.
-clean/SPLIT/VIEW_OBJECT.png: the same image without that object, RGBA.
+objects.json: parameters of the scene; size of each object, and its positions at the times of each split's images.
+masks/SPLIT/VIEW_OBJECT.png: pixels of a test image that show a moving object, 8-bit gray, antialiased.
+clean/SPLIT/VIEW_OBJECT.png: the image without that object, RGBA.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import json
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
-from lapgs_wgpu.data.dnerf_writer import already_holds, frame_name, new_folder, split_times, write_transforms
-from lapgs_wgpu.data.images import encode_png
+from lapgs_wgpu.data.dnerf_writer import split_times, write_image, write_scene
 from lapgs_wgpu.data.motion_scenes import STILL_CAMERAS, MotionScene, fov_x, moving_objects, scene_cameras, trace
 from lapgs_wgpu.data.objects import FORMAT, RECORD
 from lapgs_wgpu.data.raytrace import SAMPLES, Hits, combine, pixel_means, to_bytes, to_pixels
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
 
-VERSION = 2  # of the scenes' looks: raise it with every change of what is rendered
+VERSION = 2  # of the rendered images: increase it with every change of them
 
 
 def write_motion(
@@ -33,17 +33,17 @@ def write_motion(
     test_views: int = 20,
     seed: int = 0,
 ) -> Path:
-    """Write a scene: training images evenly spread over the clip, and test and validation images halfway between them.
+    """Write a scene: training images at equally spaced times, test and validation images halfway between them.
 
-    The same arguments give the same bytes. A folder that already holds this very scene is left as it is.
+    Equal arguments give equal bytes. A folder that already holds the scene is not changed.
 
     Args:
-        folder: to write; it appears only when it is whole.
+        folder: appears only when it is complete.
         size: of the square images, pixels.
-        train_times: training times; cameras that stand still take STILL_CAMERAS images of each, others one.
-            None for 120, or 40 where the cameras stand still.
-        test_views: of each of the splits test and val.
-        seed: of the cameras that jump.
+        train_times: number of training times, with one image each, or STILL_CAMERAS images from static cameras. None
+            for 120, or 40 with static cameras.
+        test_views: number of images of each of the splits test and val.
+        seed: of the jumping cameras.
 
     Returns:
         The folder.
@@ -59,7 +59,6 @@ def write_motion(
             "a motion scene needs a size of at least 1, 2 training times, 1 test view and a seed from 0 up, "
             f"got {size}, {train_times}, {test_views} and {seed}."
         )
-    folder = Path(folder)
     parameters = {
         "format": FORMAT,
         "version": VERSION,
@@ -69,51 +68,39 @@ def write_motion(
         "test_views": test_views,
         "seed": seed,
     }
-    if already_holds(folder, RECORD, parameters):
-        return folder
-
     train, test = split_times(train_times, test_views)
-    splits = {"train": np.repeat(train, STILL_CAMERAS) if still else train, "val": test, "test": test}
-    with new_folder(folder) as unfinished:
-        for split, times in splits.items():
-            for kind in ("", "masks", "clean")[: 1 if split == "train" else 3]:
-                (unfinished / kind / split).mkdir(parents=True)
-            cameras = scene_cameras(scene, split, times, seed, size=size)
-            for index, (camera, time) in enumerate(zip(cameras, times, strict=True)):
-                _write_image(unfinished, frame_name(split, index), scene, camera, time, truth=split != "train")
-            write_transforms(unfinished, split, cameras, times, fov_x(scene))
-        objects = [
-            {
-                "name": one.name,
-                "moves": one.moves,
-                "shape": one.solid.shape,
-                "half": one.solid.half,
-                "diameter": one.diameter,
-                "positions": {split: one.positions(times).tolist() for split, times in splits.items()},
-            }
-            for one in moving_objects(scene)
-        ]
-        record = {**parameters, "objects": objects}
-        (unfinished / RECORD).write_text(json.dumps(record, indent=1) + "\n")
-    return folder
+    times_of = {"train": np.repeat(train, STILL_CAMERAS) if still else train, "val": test, "test": test}
+    splits = {split: (scene_cameras(scene, split, times, seed, size=size), times) for split, times in times_of.items()}
+    objects = [
+        {
+            "name": one.name,
+            "moves": one.moves,
+            "shape": one.solid.shape,
+            "half": one.solid.half,
+            "diameter": one.diameter,
+            "positions": {split: one.positions(times).tolist() for split, times in times_of.items()},
+        }
+        for one in moving_objects(scene)
+    ]
+    write_frame = partial(_write_frame, scene)
+    return write_scene(Path(folder), RECORD, parameters, splits, fov_x(scene), write_frame, {"objects": objects})
 
 
-def _write_image(folder: Path, name: str, scene: MotionScene, camera: Camera, time: float, *, truth: bool) -> None:
-    """Write one image and, with `truth`, the mask and the clean plate of each moving object."""
+def _write_frame(scene: MotionScene, folder: Path, split: str, name: str, camera: Camera, time: float) -> None:
+    """Write an image; for test and validation also the mask and the clean plate of each moving object."""
     surfaces = trace(scene, camera, time)
     count = camera.width * camera.height * SAMPLES**2
 
-    def image(hits: list[Hits]) -> bytes:
-        colour, owner = combine(hits, count)
-        return encode_png(to_pixels(colour, owner >= 0, camera))
+    def image(hits: list[Hits]) -> NDArray[np.uint8]:
+        color, owner = combine(hits, count)
+        return to_pixels(color, owner >= 0, camera)
 
-    (folder / f"{name}.png").write_bytes(image(surfaces))
-    if not truth:
+    write_image(folder / split / f"{name}.png", image(surfaces))
+    if split == "train":
         return
     _, owner = combine(surfaces, count)
     for number, one in enumerate(moving_objects(scene)):
         if one.moves:
-            mask = encode_png(to_bytes(pixel_means(owner == number, camera)))
-            (folder / "masks" / f"{name}_{one.name}.png").write_bytes(mask)
-            clean = image([*surfaces[:number], *surfaces[number + 1 :]])
-            (folder / "clean" / f"{name}_{one.name}.png").write_bytes(clean)
+            file = f"{split}/{name}_{one.name}.png"
+            write_image(folder / "masks" / file, to_bytes(pixel_means(owner == number, camera)))
+            write_image(folder / "clean" / file, image([*surfaces[:number], *surfaces[number + 1 :]]))

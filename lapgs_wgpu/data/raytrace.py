@@ -19,7 +19,7 @@ from lapgs_wgpu.splat.camera import Camera
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Vector = tuple[float, float, float]
-Colour = tuple[float, float, float]
+Color = tuple[float, float, float]
 
 SAMPLES = 3  # a pixel is the mean of SAMPLES x SAMPLES rays
 LIGHT = np.array([0.30, -0.35, 0.887])  # unit vector towards the light
@@ -31,21 +31,21 @@ class Solid:
     """A textured ball or box around its own centre.
 
     half: half of its size along each axis, world units; three equal numbers for a ball.
-    colours: the two between which its pattern alternates, RGB in [0, 1].
+    colors: the two between which its pattern alternates, RGB in [0, 1].
     """
 
     shape: Literal["beach ball", "ringed ball", "box"]
     half: Vector
-    colours: tuple[Colour, Colour]
+    colors: tuple[Color, Color]
 
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """Where rays meet one surface: index (n,) of the rays, distance (n,) along them, colour (3, n) there."""
+    """Where rays meet one surface: index (n,) of the rays, distance (n,) along them, color (3, n) there."""
 
     index: Ints
     distance: Floats
-    colour: Floats
+    color: Floats
 
 
 def pixel_rays(camera: Camera) -> Floats:
@@ -106,18 +106,18 @@ def solid_hits(
     near, d, distance = near[met], d[:, met], distance[met]
 
     p = (origin[:, None] + distance * d) / half[:, None]
-    if solid.shape == "box":  # one half of each colour, and a belt of the other
+    if solid.shape == "box":  # one half of each color, and a belt of the other
         normal = np.where(np.arange(3)[:, None] == np.argmax(np.abs(p), axis=0), np.sign(p), 0.0)
         pattern = (p[0] > 0) != (np.abs(p[2]) < 0.35)
     else:
         normal = p
-        if solid.shape == "beach ball":  # six segments, and caps of one colour
+        if solid.shape == "beach ball":  # six segments, and caps of one color
             pattern = (np.floor(np.arctan2(p[1], p[0]) * (3 / np.pi)) % 2 == 0) | (np.abs(p[2]) > 0.88)
         else:
             pattern = np.floor(p[2] * 2 + 0.5) % 2 == 0
-    one, other = np.array(solid.colours)[:, :, None]
-    colour = _lit(np.where(pattern, one, other), _turned(normal, angle))
-    return Hits(near if among is None else among[near], distance, colour)
+    one, other = np.array(solid.colors)[:, :, None]
+    color = _lit(np.where(pattern, one, other), _turned(normal, angle))
+    return Hits(near if among is None else among[near], distance, color)
 
 
 def plane_hits(
@@ -127,36 +127,36 @@ def plane_hits(
     """Where rays (3, N) meet the plane on which coordinate `axis` is `at`, from the side of its normal only.
 
     facing: 1 or -1, the normal's direction along the axis. albedo: of the two other coordinates (n,) of the points, in
-    their order: which belong to the surface (n,), and the colours (3, k) of those k that do.
+    their order: which belong to the surface (n,), and the colors (3, k) of those k that do.
     """
     towards = np.flatnonzero(rays[axis] * facing < 0)
     distance = (at - eye[axis]) / rays[axis, towards]
     a, b = (i for i in range(3) if i != axis)
-    inside, colours = albedo(eye[a] + distance * rays[a, towards], eye[b] + distance * rays[b, towards])
-    normal = np.zeros((3, colours.shape[1]))
+    inside, colors = albedo(eye[a] + distance * rays[a, towards], eye[b] + distance * rays[b, towards])
+    normal = np.zeros((3, colors.shape[1]))
     normal[axis] = facing
-    return Hits(towards[inside], distance[inside], _lit(colours, normal))
+    return Hits(towards[inside], distance[inside], _lit(colors, normal))
 
 
 def combine(surfaces: Sequence[Hits], count: int) -> tuple[Floats, NDArray[np.int64]]:
-    """The nearest surface along each of `count` rays: its colour (3, count), 0 where there is none, and its number
+    """The nearest surface along each of `count` rays: its color (3, count), 0 where there is none, and its number
     (count,) in `surfaces`, -1 where there is none."""
     nearest = np.full(count, np.inf)
-    colour = np.zeros((3, count))
+    color = np.zeros((3, count))
     owner = np.full(count, -1)
     for number, hits in enumerate(surfaces):
         first = hits.distance < nearest[hits.index]
         index = hits.index[first]
         nearest[index] = hits.distance[first]
-        colour[:, index] = hits.colour[:, first]
+        color[:, index] = hits.color[:, first]
         owner[index] = number
-    return colour, owner
+    return color, owner
 
 
-def to_pixels(colour: Floats, hit: NDArray[np.bool_], camera: Camera) -> NDArray[np.uint8]:
-    """Average the rays of each pixel: colours (3, N) and whether a ray hit anything (N,) -> (H, W, 4) straight RGBA."""
-    rgba = pixel_means(np.concatenate([colour, hit[None]]), camera)
-    rgba[:3] /= np.maximum(rgba[3], 1e-9)  # so far colours are premultiplied by the share of rays that hit
+def to_pixels(color: Floats, hit: NDArray[np.bool_], camera: Camera) -> NDArray[np.uint8]:
+    """Average the rays of each pixel: colors (3, N) and whether a ray hit anything (N,) -> (H, W, 4) straight RGBA."""
+    rgba = pixel_means(np.concatenate([color, hit[None]]), camera)
+    rgba[:3] /= np.maximum(rgba[3], 1e-9)  # so far colors are premultiplied by the share of rays that hit
     return to_bytes(np.moveaxis(rgba, 0, 2))
 
 
@@ -183,5 +183,5 @@ def _turned(p: Floats, angle: float) -> Floats:
 
 
 def _lit(albedo: Floats, normal: Floats) -> Floats:
-    """Diffuse shading: albedo (3, n), unit normals (3, n) -> colours (3, n)."""
+    """Diffuse shading: albedo (3, n), unit normals (3, n) -> colors (3, n)."""
     return albedo * (AMBIENT + SKY * normal[2] + DIFFUSE * np.maximum(dot(normal, LIGHT), 0))

@@ -7,7 +7,6 @@ frame to frame.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,10 +16,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lapgs_wgpu.data.dnerf_writer import already_holds, frame_name, new_folder, split_times, write_transforms
-from lapgs_wgpu.data.images import encode_png
+from lapgs_wgpu.data.dnerf_writer import split_times, write_image, write_scene
 from lapgs_wgpu.data.raytrace import (
-    Colour,
+    Color,
     Floats,
     Solid,
     Vector,
@@ -48,7 +46,7 @@ class Toy:
     """A moving thing. Its centre is at `centre + cosine cos(2 pi f t) + sine sin(2 pi f t)`.
 
     radius: of the ball; half the edge of the box. turns: whether it also turns about z, f turns over the clip.
-    colours: the two between which its pattern alternates. All in world units, RGB in [0, 1].
+    colors: the two between which its pattern alternates. All in world units, RGB in [0, 1].
     """
 
     name: str
@@ -57,12 +55,12 @@ class Toy:
     centre: Vector
     cosine: Vector
     sine: Vector
-    colours: tuple[Colour, Colour]
+    colors: tuple[Color, Color]
     turns: bool = False
 
     @property
     def solid(self) -> Solid:
-        return Solid(self.shape, (self.radius,) * 3, self.colours)
+        return Solid(self.shape, (self.radius,) * 3, self.colors)
 
 
 # Each moves by about its own radius, so that the mean over time still shows it: a model that first fits a still scene
@@ -99,8 +97,8 @@ def render(camera: Camera, time: float, frequencies: Sequence[float] = FREQUENCI
         angle = 2 * np.pi * f * time if toy.turns else 0.0
         surfaces.append(solid_hits(toy.solid, centres[toy.name][0], camera.position, rays, angle=angle))
     surfaces.append(plane_hits(2, TABLE_HEIGHT, 1, _table, camera.position, rays))
-    colour, owner = combine(surfaces, rays.shape[1])
-    return to_pixels(colour, owner >= 0, camera)
+    color, owner = combine(surfaces, rays.shape[1])
+    return to_pixels(color, owner >= 0, camera)
 
 
 def _table(x: Floats, y: Floats) -> tuple[NDArray[np.bool_], Floats]:
@@ -161,7 +159,6 @@ def write_synthetic(
         )
     if not 1 <= len(frequencies) <= len(TOYS) or not all(math.isfinite(f) and f >= 0 for f in frequencies):
         raise InputError(f"the built-in scene needs 1 to {len(TOYS)} frequencies from 0 up, got {list(frequencies)}.")
-    folder = Path(folder)
     parameters = {
         "version": VERSION,
         "size": size,
@@ -170,17 +167,13 @@ def write_synthetic(
         "seed": seed,
         "frequencies": [float(f) for f in frequencies],
     }
-    if already_holds(folder, RECORD, parameters):
-        return folder
-
     train, test = split_times(train_views, test_views)
-    with new_folder(folder) as unfinished:
-        for index, (split, times) in enumerate((("train", train), ("val", test), ("test", test))):
-            (unfinished / split).mkdir()
-            taken = cameras(len(times), 3 * seed + index, size=size)
-            for i, (camera, time) in enumerate(zip(taken, times, strict=True)):
-                image = encode_png(render(camera, time, frequencies))
-                (unfinished / f"{frame_name(split, i)}.png").write_bytes(image)
-            write_transforms(unfinished, split, taken, times, CAMERA_ANGLE_X)
-        (unfinished / RECORD).write_text(json.dumps(parameters, indent=1) + "\n")
-    return folder
+    splits = {
+        split: (cameras(len(times), 3 * seed + index, size=size), times)
+        for index, (split, times) in enumerate((("train", train), ("val", test), ("test", test)))
+    }
+
+    def write_frame(unfinished: Path, split: str, name: str, camera: Camera, time: float) -> None:
+        write_image(unfinished / split / f"{name}.png", render(camera, time, frequencies))
+
+    return write_scene(Path(folder), RECORD, parameters, splits, CAMERA_ANGLE_X, write_frame)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
@@ -176,15 +177,7 @@ def check_in_view(dataset: Dataset, points: NDArray[np.floating]) -> list[str]:
             f"{dataset.name}: none of {len(dataset.train)} training cameras sees where the first Gaussians lie ({box} "
             "along x, y, z); check the poses and their axes, or raise points.box and field.bound."
         )
-    spans: list[list[float]] = []
-    before = False
-    for time in sorted(blind):
-        if blind[time]:
-            if before:
-                spans[-1].append(time)
-            else:
-                spans.append([time])
-        before = blind[time]
+    spans = [list(span) for is_blind, span in groupby(sorted(blind), key=blind.__getitem__) if is_blind]
     if not spans:
         return []
     longest = max(spans, key=len)

@@ -20,7 +20,7 @@ from lapgs_wgpu.data.images import LANCZOS, ImageFile, Pixels, Size, encode_png,
 from lapgs_wgpu.errors import InputError
 
 # Flags of swscale: bicubic, accurate rounding, chroma interpolated along rows. Its default darkens by 1 or 2 levels.
-EXACT_COLOURS = 0x4 | 0x40000 | 0x2000
+EXACT_COLORS = 0x4 | 0x40000 | 0x2000
 COMPRESSION = 1  # of PNG: the next levels take twice as long for a tenth of the bytes
 LARGEST_FRAME = 8192 * 8192  # pixels; the decoder holds several frames
 WRITERS = min(8, os.cpu_count() or 1)  # threads that shrink and write the frames of the video that is being unpacked
@@ -100,7 +100,7 @@ class Video:
                             f"{self.path}: frame {count} has {frame.width}x{frame.height} pixels, and its header says "
                             f"{self.size[0]}x{self.size[1]}; record it with one size."
                         )
-                    image = frame.to_ndarray(format="rgb24", interpolation=EXACT_COLOURS)
+                    image = frame.to_ndarray(format="rgb24", interpolation=EXACT_COLORS)
                     if len(written) == 2 * WRITERS:  # the decoder is ahead of the writers: bound the frames in memory
                         written.popleft().result()
                     written.append(pool.submit(_write, image, size, unfinished / f"{count:05d}.png"))

@@ -1,4 +1,4 @@
-"""What every reader of captures produces: views with lazily decoded 8-bit pixels, and a byte-bounded cache for them."""
+"""Datasets: views with lazily decoded 8-bit images, and a cache of images with a limit in bytes."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ from lapgs_wgpu.splat.camera import Camera
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One picture of a capture: where and when it was taken, and how to get its pixels.
+    """One image of a capture: camera, time, and access to its pixels.
 
     name: unique within its dataset and safe as a file name, such as "train_007".
     camera: its size is that of the pixels.
     time: in [0, 1] over the clip.
-    source: what errors call the pixels: a file, or a video and its frame.
-    pixels: decodes them, each time anew and from any thread: (height, width, 3) RGB or (height, width, 4) straight
-        (not premultiplied) RGBA, uint8. Raises InputError where they cannot be read.
-    mask: decodes which pixels of a held-out view the masked metrics measure, such as DyCheck's covisibility masks (what
-        enough training cameras saw): (height, width) bool. Raises InputError, too.
-    objects: the truth about moving objects in a held-out view of a generated scene (data/objects.py).
+    source: description of the image for errors: a file, or a video and its frame.
+    pixels: decodes the image on each call, from any thread: (height, width, 3) RGB or (height, width, 4) straight (not
+        premultiplied) RGBA, uint8. Raises InputError.
+    mask: decodes the mask of the masked metrics of a test view, such as DyCheck's covisibility masks: (height, width)
+        bool. Raises InputError.
+    objects: ground truth of moving objects in a test view of a generated scene (data/objects.py).
     """
 
     name: str
@@ -45,7 +45,7 @@ class View:
     objects: tuple[ObjectTruth, ...] = ()
 
     def load(self) -> NDArray[np.uint8]:
-        """Decode: (H, W, 3) RGB or (H, W, 4) straight RGBA, uint8, read-only. Raises InputError."""
+        """Decode the image: (H, W, 3) RGB or (H, W, 4) straight RGBA, uint8, read-only. Raises InputError."""
         image = self.pixels()
         size = (self.camera.height, self.camera.width)
         if image.dtype != np.uint8 or image.shape not in {(*size, 3), (*size, 4)}:
@@ -57,7 +57,7 @@ class View:
         return image
 
     def load_mask(self) -> NDArray[np.bool_] | None:
-        """Which pixels the masked metrics measure: (H, W) bool, at least one; None without mask. Raises InputError."""
+        """Decode the mask: (H, W) bool, at least one pixel set; None without a mask. Raises InputError."""
         if self.mask is None:
             return None
         mask = self.mask()
@@ -72,12 +72,11 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Dataset:
-    """A capture: the views to train on and the views held out for testing, all of which share one time axis.
+    """A capture: training views and test views, which share one time axis.
 
-    cloud: points that it brings, where Gaussians start. depths: nearest and furthest of what the cameras see, world
-    units, where the capture says so. placement: how it was moved, None where its coordinates are those of its files.
-    warnings: what looks wrong but does not stop a training, a sentence each. time_source: field and file of the times,
-    for errors.
+    cloud: point cloud for the initial Gaussians. depths: nearest and furthest depth, world units, if stated or derived.
+    normalization: transform from the files' coordinates, None if they were kept. warnings: problems that do not prevent
+    a training, one sentence each. time_source: field and file of the times, for errors.
     """
 
     name: str
@@ -91,18 +90,18 @@ class Dataset:
 
     @cached_property
     def cameras(self) -> tuple[Camera, ...]:
-        """The training cameras, those that stay where they are once."""
+        """The distinct training cameras."""
         return tuple({id(view.camera): view.camera for view in self.train}.values())
 
     @cached_property
     def extent(self) -> float:
-        """1.1 times the largest distance of a training camera from their mean, world units; 0 where all coincide."""
+        """1.1 times the largest distance of a training camera from their mean, world units; 0 if all coincide."""
         centres = np.stack([view.camera.position for view in self.train])
         return 1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
 
     @cached_property
     def fingerprint(self) -> str:
-        """16 hexadecimal digits that change with the cameras, the times and the sizes of the files."""
+        """16 hexadecimal digits that depend on cameras, times and file sizes."""
         digest = hashlib.sha256()
         for view in (*self.train, *self.test):
             camera, file = view.camera, Path(view.source)
@@ -113,7 +112,7 @@ class Dataset:
 
     @cached_property
     def up(self) -> NDArray[np.float64]:
-        """(3,) of unit length: what is up in the pictures, on average over the training cameras."""
+        """(3,) unit vector: the up direction of the images, averaged over the training cameras."""
         mean = -np.mean([view.camera.T_cam_world[1, :3] for view in self.train], axis=0)
         length = np.linalg.norm(mean)
         return mean / length if length > 1e-3 else -self.train[0].camera.T_cam_world[1, :3]
@@ -130,8 +129,10 @@ class Dataset:
 
 
 def focus_of(cameras: Sequence[Camera]) -> NDArray[np.float64]:
-    """(3,) the point nearest to the lines of sight of all cameras; where these are parallel, and say little, one extent
-    (1.1 times the largest distance of a camera from their mean) in front of them."""
+    """(3,) the point nearest to all optical axes, in the least-squares sense.
+
+    Parallel axes do not determine it; the result is then a point one extent (see `Dataset.extent`) in front.
+    """
     centres = np.stack([camera.position for camera in cameras])
     ahead = np.stack([camera.T_cam_world[2, :3] for camera in cameras])
     across = np.eye(3) - ahead[:, :, None] * ahead[:, None, :]
@@ -143,9 +144,9 @@ def focus_of(cameras: Sequence[Camera]) -> NDArray[np.float64]:
 
 
 def composite(image: NDArray[np.uint8], background: ArrayLike) -> NDArray[np.uint8]:
-    """Lay straight RGBA over a background colour, rounded to the nearest 8-bit value (truncating would darken by 0.5).
+    """Composite straight RGBA over a background color, rounded to the nearest 8-bit value.
 
-    image: (H, W, 4) uint8, or (H, W, 3), which has no transparency and is returned as it is.
+    image: (H, W, 4) uint8, or (H, W, 3), which is returned unchanged.
     background: (3,) in [0, 1]. Returns (H, W, 3) uint8.
     """
     if image.shape[2] == 3:
@@ -159,26 +160,22 @@ def composite(image: NDArray[np.uint8], background: ArrayLike) -> NDArray[np.uin
 
 
 class ImageCache:
-    """Decoded views, the most recently used first to stay, within a bound in bytes. Safe to use from many threads.
+    """A least-recently-used cache of decoded images with a limit in bytes. Thread-safe.
 
-    max_bytes: bound on the pixels that are kept; a picture larger than this is handed out and not kept.
-    workers: threads that decode what `prefetch` names. Each can hold one picture beyond the bound while it decodes.
+    max_bytes: limit; a larger image is returned and not kept.
+    used_bytes: of the pixels kept at present.
+    workers: threads for `prefetch`; each may hold one image beyond the limit while it decodes.
     """
 
     def __init__(self, max_bytes: int, *, workers: int = 1) -> None:
         self.max_bytes = max_bytes
         self._lock = Lock()
         self._entries: OrderedDict[View, Future[NDArray[np.uint8]]] = OrderedDict()
-        self._bytes = 0
+        self.used_bytes = 0
         self._pool = ThreadPoolExecutor(workers, thread_name_prefix="decode")
 
-    @property
-    def used_bytes(self) -> int:
-        """Bytes of pixels kept at present."""
-        return self._bytes
-
     def get(self, view: View) -> NDArray[np.uint8]:
-        """The view's pixels as `View.load` gives them. A view asked for by several threads is decoded once."""
+        """The result of `View.load`. If several threads request a view, it is decoded once."""
         with self._lock:
             entry = self._entries.get(view)
             if entry is not None:
@@ -190,29 +187,29 @@ class ImageCache:
         try:
             image = view.load()
         except BaseException as error:
-            with self._lock:  # so that a later call tries again
+            with self._lock:  # a later call tries again
                 del self._entries[view]
             mine.set_exception(error)
             raise
         mine.set_result(image)
         with self._lock:
-            self._bytes += image.nbytes
+            self.used_bytes += image.nbytes
             self._evict()
         return image
 
     def prefetch(self, views: Iterable[View]) -> None:
-        """Decode views ahead of need on the worker threads. What fails here is reported by `get`."""
+        """Decode views in the background. Errors are raised by `get`."""
         for view in views:
             self._pool.submit(self.get, view)
 
     def close(self) -> None:
-        """Drop what is queued and wait for the decodes under way."""
+        """Cancel queued decodes and wait for running ones."""
         self._pool.shutdown(cancel_futures=True)
 
     def _evict(self) -> None:
         for view, entry in list(self._entries.items()):
-            if self._bytes <= self.max_bytes:
+            if self.used_bytes <= self.max_bytes:
                 return
             if entry.done():
-                self._bytes -= entry.result().nbytes
+                self.used_bytes -= entry.result().nbytes
                 del self._entries[view]

@@ -1,1 +1,1 @@
-"""Choosing an adapter, composing WGSL, binding buffers by name, scan and sort. Knows nothing of splats."""
+"""Devices, WGSL preprocessing, kernels with arrays bound by name, scan, sort, matrix products. Knows no splats."""

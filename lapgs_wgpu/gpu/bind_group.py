@@ -1,4 +1,4 @@
-"""Cached bind groups, which go when one of their buffers goes."""
+"""Cached bind groups, which are dropped together with any of their buffers."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from typing import Any
 
 @dataclass(eq=False)
 class BindGroup:
-    """What a kernel is given, in wgpu's form, and the kernel's store of such groups, where it has the key."""
+    """A wgpu bind group, and its entry in the kernel's cache."""
 
     native: Any
-    textures: dict[str, Any]  # kept, so that an id in the key cannot come to mean another view
+    textures: dict[str, Any]  # kept alive: their ids are part of the key
     store: dict[Any, BindGroup]
     key: Any
 
     def drop(self) -> None:
-        """One of its buffers is gone."""
+        """Remove it from the cache, since one of its buffers was freed."""
         self.store.pop(self.key, None)

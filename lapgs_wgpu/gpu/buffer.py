@@ -1,4 +1,4 @@
-"""Buffers on the device, how they are written, and the textures made from them."""
+"""Buffers on the device, their uploads, and the textures made from them."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ class _Texture:
 
 
 class Buffer:
-    """A storage or uniform buffer of `nbytes` (rounded up to 16), zero at first.
+    """A storage or uniform buffer of `nbytes` (rounded up to 16), initially zero.
 
-    Where the device can map its own memory (CPU and integrated devices) reading and writing is one copy by the
-    processor; elsewhere it goes through staging buffers of the same size, which are kept: for reading from the first
-    time on, for writing from the second one on, so that what is written once does not take its memory twice.
+    Devices that can map their own memory (CPU and integrated ones) read and write with one copy by the processor.
+    Others use staging buffers of the same size. The one for reading is kept; the one for writing is kept from the
+    second write on, so that write-once buffers do not take their memory twice.
     """
 
     def __init__(self, device: Device, nbytes: int, label: str) -> None:
@@ -57,19 +57,19 @@ class Buffer:
                 f"buffer {label!r} needs {self.nbytes} bytes, but a buffer of this device holds {limit}"
             )
         self.wgpu_buffer = self._create(_STORAGE | (_MAPPABLE if device.mappable else 0))
-        self.number = next(_numbers)  # no other buffer has it, not even later
-        # Bind groups keep the device's memory: those with this buffer go when it goes.
+        self.number = next(_numbers)  # unique, also among freed buffers
+        # Bind groups keep device memory alive: they are dropped with the buffer.
         self.bound: weakref.WeakSet[BindGroup] = weakref.WeakSet()
         weakref.finalize(self, _forget, self.bound).atexit = False
-        self.version = 0  # counts the writes, so that a texture made from the buffer is known to be out of date
+        self.version = 0  # number of writes: tells whether a texture made from the buffer is out of date
         self._textures: dict[str, _Texture] = {}
         self._upload: Any = None
-        self._uploaded = False  # has a write gone through staging before?
+        self._uploaded = False  # whether a write used staging before
         self._download: Any = None
 
     @property
     def download(self) -> Any:
-        """The staging buffer to read through, where the device cannot map its own memory."""
+        """The staging buffer for reading, on devices that cannot map their own memory."""
         if self._download is None:
             self._download = self._create(wgpu.BufferUsage.MAP_READ | wgpu.BufferUsage.COPY_DST)
         return self._download
@@ -109,9 +109,9 @@ class Buffer:
             content[: data.nbytes] = data
 
     def texture(self, encoder: Encoder, texel_format: str, offset: int, size: int) -> Any:
-        """A texture view of `size` bytes from `offset` on, row after row of TABLE_WIDTH texels.
+        """A view of a texture that holds `size` bytes from `offset` on, in rows of TABLE_WIDTH texels.
 
-        The copy is recorded in `encoder` where the buffer has changed since the last one.
+        If the buffer has changed, a copy is recorded in `encoder`.
         """
         texel = next(nbytes for name, nbytes, _ in TABLE_TYPES.values() if name == texel_format)
         count = size // texel

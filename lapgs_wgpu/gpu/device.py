@@ -1,4 +1,4 @@
-"""Choosing an adapter and opening it."""
+"""Graphics adapters and opened devices."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from typing import Any
 from ..errors import NoAdapterError
 from .cffi_patch import parse_named_types_only
 
-# Features that the kernels can use. Each is requested only where the adapter has it, and each has a fallback.
+# Optional features; each has a fallback.
 _WANTED_FEATURES = ("subgroup", "mappable-primary-buffers", "timestamp-query")
 
-# The WebGPU default limits, to which every kernel keeps; larger bindings are used where the adapter has them.
+# WebGPU's default limits, which suffice for every kernel; larger bindings are used if the adapter has them.
 _DEFAULT_LIMITS = {
     "max-storage-buffers-per-shader-stage": 8,
     "max-storage-buffer-binding-size": 128 << 20,
@@ -24,7 +24,7 @@ _DEFAULT_LIMITS = {
 }
 _RAISED_LIMITS = ("max-storage-buffer-binding-size", "max-buffer-size", "max-storage-textures-per-shader-stage")
 
-# Mesa's software driver ends an invocation without a word when all its loops together have turned this many times.
+# Mesa's software driver silently ends an invocation after this many iterations of all its loops together.
 SOFTWARE_LOOP_TURNS = 65_535
 
 INSTALL_HINT = (
@@ -35,7 +35,7 @@ INSTALL_HINT = (
 
 @dataclass(frozen=True)
 class DeviceInfo:
-    """What is known of an adapter before it is opened. kind: cpu, integrated, discrete, virtual or other."""
+    """An adapter that is not opened. kind: cpu, integrated, discrete or other."""
 
     name: str
     kind: str
@@ -45,14 +45,14 @@ class DeviceInfo:
 
 @functools.cache
 def _instance() -> Any:
-    """wgpu's instance, without the validation dispatch that wgpu otherwise adds before each indirect dispatch."""
-    os.environ.setdefault("XDG_RUNTIME_DIR", "/tmp")  # Mesa warns on stderr where it is not set
+    """wgpu's instance, without the validation that wgpu otherwise runs before each indirect dispatch."""
+    os.environ.setdefault("XDG_RUNTIME_DIR", "/tmp")  # otherwise Mesa prints a warning
     import wgpu
     from wgpu.backends.wgpu_native import ffi
     from wgpu.backends.wgpu_native.extras import set_instance_extras
 
     parse_named_types_only(ffi)
-    # Not OpenGL: the same hardware again, with less of what the kernels need.
+    # Not OpenGL: it offers the same hardware with fewer features.
     set_instance_extras(backends=["Vulkan", "Metal", "DX12"], flags=["Empty"])
     return wgpu.gpu
 
@@ -65,22 +65,23 @@ def _adapters() -> list[tuple[DeviceInfo, Any]]:
         kind = kinds.get(info["adapter_type"], "other")
         found.append((DeviceInfo(info["device"], kind, info["backend_type"], info["description"]), adapter))
     order = ("discrete", "integrated", "other", "cpu")
-    # The same card through Vulkan and through D3D12: Vulkan is what the kernels were tested on.
+    # Prefer Vulkan, on which the kernels were tested, to D3D12 on the same card.
     return sorted(found, key=lambda pair: (order.index(pair[0].kind), pair[0].backend != "Vulkan"))
 
 
 def list_devices() -> list[DeviceInfo]:
-    """The adapters of this machine, the one that is chosen by default first."""
+    """The adapters of this machine; the default one comes first."""
     return [info for info, _ in _adapters()]
 
 
 class Device:
     """An opened adapter.
 
-    queue and wgpu_device are wgpu's objects.
-    textures: tables are read through textures (see gpu/shader), which is far faster on Mesa's software driver.
-    mappable: buffers can be mapped where they are (CPU and integrated devices), without a staging copy.
-    max_loop_turns: after so many turns of all loops of an invocation together the driver ends it; None: never.
+    wgpu_device, queue: wgpu's objects.
+    textures: whether tables are read through textures (gpu/shader), which is much faster on Mesa's software driver.
+    mappable: whether buffers can be mapped without a staging copy (CPU and integrated devices).
+    max_loop_turns: number of iterations, of all loops of an invocation together, after which the driver ends it; None
+        for no limit.
     """
 
     def __init__(self, adapter: Any, info: DeviceInfo, *, subgroups: bool = True, default_limits: bool = False) -> None:
@@ -113,7 +114,7 @@ class Device:
 
     @property
     def max_binding(self) -> int:
-        """The largest range of a buffer, in bytes, that a kernel can see."""
+        """Largest size of one binding, bytes."""
         return int(self.limits["max-storage-buffer-binding-size"])
 
 
@@ -122,11 +123,15 @@ def _matches(info: DeviceInfo, wanted: str) -> bool:
 
 
 def open_device(name: str | None = None, *, number: int = 0) -> Device:
-    """Open an adapter: by a part of its name, by kind (cpu, integrated, discrete), or the best one.
+    """Open an adapter. Equal arguments give the same Device.
 
-    name: also taken from the environment variable LAPGS_DEVICE where it is None. number: which of several adapters of
-    the best one's kind, counted around where there are fewer. One Device a name and number and process.
-    Raises NoAdapterError.
+    Args:
+        name: part of the adapter's name, or its kind (cpu, integrated, discrete). None: the environment variable
+            LAPGS_DEVICE, otherwise the best adapter.
+        number: index among the adapters that match and are of the best one's kind, modulo their number.
+
+    Raises:
+        NoAdapterError: no adapter, or none that matches.
     """
     return _open_device(name or os.environ.get("LAPGS_DEVICE") or None, number)
 

@@ -1,8 +1,9 @@
-"""Compute kernels whose buffers are bound by name, and the command list that runs them."""
+"""Compute kernels, whose arrays are bound by name, and lists of commands that run them."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from types import TracebackType
 from typing import Any
 
@@ -22,7 +23,7 @@ _LAYOUT_TYPE = {"uniform": "uniform", "read": "read-only-storage", "read_write":
 
 
 class Kernel:
-    """shaders/<name>.wgsl under some defines, compiled for a device."""
+    """shaders/<name>.wgsl with some defines, compiled for a device."""
 
     def __init__(self, device: Device, name: str, defines: Defines) -> None:
         self.device = device
@@ -63,13 +64,14 @@ class Kernel:
 
     @staticmethod
     def get(device: Device, name: str, **defines: int) -> Kernel:
-        """The kernel of this name and defines; compiled once a device."""
+        """The kernel with these defines, compiled once per device. False stands for a define that is absent."""
+        defines = {define: int(value) for define, value in defines.items() if value is not False}
         if device.textures:
             defines["TEXTURES"] = 1
         key = (name, tuple(sorted(defines.items())))
-        kernel = device.kernel_cache.get(key)
-        if kernel is None:
-            kernel = device.kernel_cache[key] = Kernel(device, name, defines)
+        if key not in device.kernel_cache:
+            device.kernel_cache[key] = Kernel(device, name, defines)
+        kernel: Kernel = device.kernel_cache[key]
         return kernel
 
     def uniform(self, struct_name: str, **values: object) -> bytes:
@@ -77,8 +79,8 @@ class Kernel:
         return pack(self.source, struct_name, values)
 
     def check(self, arrays: dict[str, DeviceArray]) -> None:
-        """Raise ShaderError where the arrays are not those that the shader declares, by name and by dtype, and
-        DeviceMemoryError where one is too large for a binding."""
+        """Raise ShaderError unless names and dtypes of the arrays match the shader's bindings, and DeviceMemoryError
+        if an array is too large for a binding."""
         if arrays.keys() != self.bindings.keys():
             missing, unknown = self.bindings.keys() - arrays.keys(), arrays.keys() - self.bindings.keys()
             raise ShaderError(
@@ -97,7 +99,7 @@ class Kernel:
                 )
 
     def bind(self, arrays: dict[str, DeviceArray], textures: dict[str, Any]) -> Any:
-        """wgpu's bind group for arrays, and for the textures that stand for some of them. Raises as `check` does."""
+        """wgpu's bind group for arrays; `textures` replace some of them. Raises as `check` does."""
         key = tuple((name, array.key, id(textures.get(name))) for name, array in arrays.items())
         group = self._groups.get(key)
         if group is None:
@@ -106,7 +108,7 @@ class Kernel:
             for name, array in arrays.items():
                 resource = textures.get(name, array.resource)
                 entries.append({"binding": self.bindings[name].number, "resource": resource})
-            if len(self._groups) > 64:  # arrays of other sizes leave groups behind
+            if len(self._groups) > 64:  # groups of earlier array sizes accumulate
                 self._groups.clear()
             native = self.device.wgpu_device.create_bind_group(layout=self._layout, entries=entries)
             group = self._groups[key] = BindGroup(native, textures, self._groups, key)
@@ -128,7 +130,7 @@ def _scalar(binding: Binding) -> str | None:
 class Commands:
     """A list of dispatches, submitted when the `with` block ends without an error.
 
-    profile: a Profile that takes the time of each dispatch (each then has a compute pass of its own).
+    profile: measures the time of each dispatch, which then gets a compute pass of its own.
     """
 
     def __init__(self, device: Device, profile: Profile | None = None) -> None:
@@ -139,13 +141,17 @@ class Commands:
         self._copied: list[Buffer] = []
 
     def dispatch(self, kernel: Kernel, groups: int, **arrays: DeviceArray) -> None:
-        """Run `groups` workgroups, folded into two dimensions where one does not hold them (see common/index)."""
+        """Run `groups` workgroups, in two dimensions if there are too many for one (common/index.wgsl)."""
         limit = self.device.limits["max-compute-workgroups-per-dimension"]
         rows = max(1, -(-groups // limit))
         self.dispatch_grid(kernel, (-(-groups // rows), rows), **arrays)
 
+    def run(self, kernel: Kernel, groups: int, arrays: Mapping[str, DeviceArray]) -> None:
+        """`dispatch` with those of the arrays that the shader binds."""
+        self.dispatch(kernel, groups, **{name: arrays[name] for name in kernel.bindings})
+
     def dispatch_grid(self, kernel: Kernel, groups: tuple[int, int], **arrays: DeviceArray) -> None:
-        """Run columns x rows workgroups on arrays by the names of the shader's bindings."""
+        """Run columns x rows workgroups on arrays, given by the names of the shader's bindings."""
         if min(groups) <= 0:
             return
         if arrays.keys() != kernel.bindings.keys() or not all(
@@ -171,7 +177,7 @@ class Commands:
         self._encoder.clear(array.buffer.wgpu_buffer, array.offset, (array.nbytes + 3) & ~3)
 
     def copy(self, source: DeviceArray, target: DeviceArray) -> None:
-        """Copy all of one array to another of the same size in bytes."""
+        """Copy an array to another of the same size in bytes."""
         if source.nbytes != target.nbytes:
             raise ValueError(f"{target.buffer.label}: {source.nbytes} bytes are copied to {target.nbytes}")
         target.buffer.version += 1

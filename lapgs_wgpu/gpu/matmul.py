@@ -1,4 +1,4 @@
-"""Products of matrices on the device."""
+"""Matrix products on the device."""
 
 from __future__ import annotations
 
@@ -10,13 +10,15 @@ from .kernel import Commands, Kernel
 from .pool import BufferPool
 
 _TILE = 64  # matmul.wgsl
-_SPLIT = 1 << 11  # inner elements over which a long product is summed at once
+_SPLIT = 1 << 11  # inner elements of a partial sum of a long product
 
 
 @dataclass(frozen=True)
 class Matrix:
-    """float32, in rows of `stride` floats in an array, `first` floats after its start; where it is transposed, in
-    columns."""
+    """A float32 matrix stored in an array: rows of `stride` floats, the first of them `first` floats after its start.
+
+    transposed: the columns are stored this way instead.
+    """
 
     array: DeviceArray
     rows: int
@@ -27,7 +29,7 @@ class Matrix:
 
     @staticmethod
     def of(array: DeviceArray) -> Matrix:
-        """All of an array (rows, columns)."""
+        """A whole array (rows, columns)."""
         rows, columns = array.shape
         return Matrix(array, rows, columns, columns)
 
@@ -37,38 +39,41 @@ class Matrix:
         return replace(self, rows=self.columns, columns=self.rows, transposed=not self.transposed)
 
     def from_column(self, first: int, count: int) -> Matrix:
-        """Some columns of one that is not transposed."""
+        """`count` columns from column `first` on; the matrix must not be transposed."""
         return replace(self, first=self.first + first, columns=count)
 
 
 class Matmul:
-    """Records products whose sums are in one order, so the same to the last bit on every run. name, in the calls: tells
-    apart those that are submitted together."""
+    """Records matrix products. Sums have a fixed order, so results are the same to the last bit on every run.
+
+    name, in the calls: distinguishes products that are submitted together.
+    """
 
     def __init__(self, device: Device, pool: BufferPool) -> None:
         self._device, self._pool = device, pool
 
     def __call__(self, commands: Commands, name: str, a: Matrix, b: Matrix, c: Matrix, *, add: bool = False) -> None:
-        """c = a b, or c += a b; c is not transposed, and neither a nor b."""
-        self._dispatch(commands, name, a, b, c, a.columns, {"ADD": 1} if add else {})
+        """c = a b, or c += a b with `add`. c must not be transposed."""
+        self._dispatch(commands, name, a, b, c, a.columns, add=add)
 
     def long(
         self, commands: Commands, name: str, a: Matrix, b: Matrix, total: DeviceArray, *, add: bool = False
     ) -> None:
-        """total = a b, or total += a b, for a long inner dimension, which is split: so that the device is busy, and
-        into sums of thousands of elements, so that they are accurate."""
+        """total = a b, or total += a b with `add`, for a long inner dimension.
+
+        The dimension is split, which occupies the device and keeps partial sums short, hence accurate.
+        """
         size, count = a.rows * b.columns, -(-a.columns // _SPLIT)
         parts = self._pool.array("parts", (count, a.rows, b.columns))
-        self._dispatch(commands, name, a, b, Matrix(parts, a.rows, b.columns, b.columns), _SPLIT, {})
-        kernel = Kernel.get(self._device, "matmul_sum", **({"ADD": 1} if add else {}))
+        self._dispatch(commands, name, a, b, Matrix(parts, a.rows, b.columns, b.columns), _SPLIT)
+        kernel = Kernel.get(self._device, "matmul_sum", ADD=add)
         uniform = self._pool.constant(f"sum {name}", kernel.uniform("Sum", count=size, parts=count))
         commands.dispatch(kernel, -(-size // 64), sum=uniform, parts=parts, total=total)
 
     def _dispatch(
-        self, commands: Commands, name: str, a: Matrix, b: Matrix, c: Matrix, split: int, options: dict[str, int]
+        self, commands: Commands, name: str, a: Matrix, b: Matrix, c: Matrix, split: int, *, add: bool = False
     ) -> None:
-        ways = {"A_INNER": not a.transposed, "B_INNER": b.transposed}
-        kernel = Kernel.get(self._device, "matmul", **options, **{way: 1 for way, on in ways.items() if on})
+        kernel = Kernel.get(self._device, "matmul", ADD=add, A_INNER=not a.transposed, B_INNER=b.transposed)
         content = kernel.uniform(
             "Matmul",
             rows=c.rows,

@@ -1,4 +1,4 @@
-"""Named arrays that a module keeps from call to call."""
+"""Buffers that a module reuses from call to call."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from .device import Device
 
 
 class BufferPool:
-    """Buffers by name that grow and never shrink, so that a training step allocates nothing in steady state.
+    """Buffers by name, which grow and never shrink: a training step allocates nothing in steady state.
 
-    A name means one thing, in the module that owns the pool; other modules get its arrays as arguments or results.
+    Only the object that owns the pool asks it for arrays; it passes them to others as arguments and results.
     """
 
     def __init__(self, device: Device) -> None:
@@ -25,7 +25,7 @@ class BufferPool:
         self._constants: dict[str, bytes] = {}
 
     def array(self, name: str, shape: tuple[int, ...], dtype: str = "float32") -> DeviceArray:
-        """An array at the start of the buffer of this name; its content is lost when the buffer has to grow."""
+        """An array at the start of the named buffer, whose content is lost if it has to grow."""
         buffer = self._buffers.get(name)
         nbytes = math.prod(shape) * np.dtype(dtype).itemsize
         if buffer is None or buffer.nbytes < nbytes:
@@ -39,9 +39,9 @@ class BufferPool:
         return array
 
     def constant(self, name: str, content: bytes) -> DeviceArray:
-        """A small array with this content, written only when the content changes.
+        """A small array with this content, written only when it changes.
 
-        It must not change between the recording of a command that reads it and that command's submission.
+        The content must not change between recording and submission of a command that reads it.
         """
         array = self.array(f"constant {name}", (len(content),), "uint8")
         if self._constants.get(name) != content:
@@ -51,5 +51,5 @@ class BufferPool:
 
     @property
     def nbytes(self) -> int:
-        """Bytes held by all buffers of the pool."""
+        """Bytes of all buffers."""
         return sum(buffer.nbytes for buffer in self._buffers.values())

@@ -1,4 +1,4 @@
-"""The time that each pass takes on the device, by timestamps that the device itself writes."""
+"""Duration of each pass, from timestamps that the device writes."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from .device import Device
 
 
 class Profile:
-    """Takes the time of each dispatch of the Commands to which it is given.
+    """Measures each dispatch of the `Commands` that it is passed to.
 
-    capacity: how many dispatches it can hold until `read`. Raises RuntimeError where the device has no timestamps.
+    capacity: maximum number of dispatches between two calls of `read`. Raises RuntimeError if the device has no
+    timestamps.
     """
 
     def __init__(self, device: Device, capacity: int = 1024) -> None:
@@ -43,25 +44,25 @@ class Profile:
         }
 
     def resolve(self, encoder: Any) -> None:
-        """Record the copy of all timestamps so far to where `read` finds them."""
+        """Record the copy of all timestamps to the array that `read` reads."""
         count = 2 * len(self._names)
         if count:
             encoder.resolve_query_set(self._queries, 0, count, self._resolved, 0)
             encoder.copy_buffer_to_buffer(self._resolved, 0, self._ticks.buffer.wgpu_buffer, 0, 8 * count)
 
     def read(self) -> list[tuple[str, float]]:
-        """Each dispatch's name and milliseconds, in order. Waits for the device; the profile is empty afterwards."""
+        """Name and milliseconds of each dispatch, in order. Waits for the device, and empties the profile."""
         if not self._names:
             return []
         ticks = self._ticks.rows(0, len(self._names)).read()
-        # Differences first: the clock itself has more digits than a float holds.
+        # Subtract first: a timestamp has more digits than a float.
         milliseconds = (ticks[:, 1] - ticks[:, 0]).astype(np.float64) * self._tick_nanoseconds * 1e-6
         names, self._names = self._names, []
         return list(zip(names, milliseconds.tolist(), strict=True))
 
 
 def _timestamp_period(device: Device) -> float:
-    """Nanoseconds a tick: 1 on most devices, but not on all. wgpu-py has no name of its own for it."""
+    """Nanoseconds per tick of a timestamp, which is 1 on most devices. wgpu-py does not expose it."""
     from wgpu.backends.wgpu_native import lib
 
     return float(lib.wgpuQueueGetTimestampPeriod(device.queue._internal))

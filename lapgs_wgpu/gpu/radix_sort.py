@@ -1,4 +1,4 @@
-"""Stable radix sort on the device, with a length that only the device knows."""
+"""Stable radix sort on the device. The number of elements is read on the device."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _SORT_BLOCK_ITEMS = 2048  # common/sort.wgsl: 128 lanes x 16 elements
 class RadixSort:
     """A stable sort of u32 keys with a u32 payload, least significant digit first.
 
-    lane_runs: the shape for CPU devices (digits of up to 8 bits, a run of elements a lane); otherwise 4-bit digits
+    lane_runs: variant for CPU devices: digits of up to 8 bits, a run of elements per lane. Otherwise 4-bit digits are
     ranked in workgroups. Both give the same result.
     """
 
@@ -36,8 +36,7 @@ class RadixSort:
     ) -> tuple[DeviceArray, DeviceArray]:
         """Sort the first length[0] <= capacity elements by the lowest `bits` bits of their keys.
 
-        payload None stands for 0, 1, 2, ... Returns the arrays of sorted keys and payload; `keys` and
-        `payload` are used as scratch and lose their content.
+        payload: None stands for 0, 1, 2, ... `keys` and `payload` are overwritten. Returns sorted keys and payload.
         """
         widest = 8 if self._lane_runs else 4
         passes = -(-bits // widest)
@@ -56,43 +55,22 @@ class RadixSort:
         second_payload = payload
         if second_payload is None:
             second_payload = self._pool.array(f"{self._name} second payload", (capacity,), "uint32")
-        shape = {"LANE_RUNS": 1} if self._lane_runs else {}
         groups = owners // 8 if self._lane_runs else owners
-        count_kernel = Kernel.get(self._device, "sort_count", **shape)
+        count_kernel = Kernel.get(self._device, "sort_count", LANE_RUNS=self._lane_runs)
         for step in range(passes):
             uniform = self._pool.constant(
                 f"{self._name} pass {step}",
                 count_kernel.uniform("Sort", shift=step * width, digits=digits, owners=owners, capacity=capacity),
             )
-            commands.dispatch(
-                count_kernel,
-                groups,
-                sort=uniform,
-                length=length,
-                keys=keys,
-                counters=counters,
+            arrays = {"sort": uniform, "length": length, "keys": keys}
+            commands.dispatch(count_kernel, groups, counters=counters, **arrays)
+            scanned = {"values": counters, "prefix": places, "total": ignored}
+            self._scan(commands, length=counter_count, capacity=digits * owners, **scanned)
+            scatter = Kernel.get(
+                self._device, "sort_scatter", LANE_RUNS=self._lane_runs, IOTA=step == 0 and payload is None
             )
-            self._scan(
-                commands,
-                length=counter_count,
-                capacity=digits * owners,
-                values=counters,
-                prefix=places,
-                total=ignored,
-            )
-            iota = step == 0 and payload is None
-            source = {} if iota else {"payload": second_payload}
-            commands.dispatch(
-                Kernel.get(self._device, "sort_scatter", **shape, **({"IOTA": 1} if iota else {})),
-                groups,
-                sort=uniform,
-                length=length,
-                keys=keys,
-                counters=places,
-                keys_out=keys_out,
-                payload_out=payload_out,
-                **source,
-            )
+            arrays |= {"counters": places, "keys_out": keys_out, "payload_out": payload_out, "payload": second_payload}
+            commands.run(scatter, groups, arrays)
             keys, keys_out = keys_out, keys
             second_payload, payload_out = payload_out, second_payload
         return keys, second_payload

@@ -1,4 +1,4 @@
-"""Exclusive scan on the device, with a length that only the device knows."""
+"""Exclusive scan on the device. The number of elements is read on the device."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ _BLOCK_ITEMS = 2048  # common/block.wgsl
 class Scan:
     """Exclusive prefix sums of u32.
 
-    source: "values"; "flags" adds 1 for each value that is not zero; "gather" adds values[indices[i]].
-    saturating: sums end at 2^32 - 1 instead of beginning anew, provided that no element reaches 2^21.
+    source: of element i; "values": values[i]; "flags": 1 if values[i] is not zero; "gather": values[indices[i]].
+    saturating: sums stop at 2^32 - 1 instead of wrapping around; each element must be below 2^21.
     """
 
     def __init__(
         self, device: Device, pool: BufferPool, name: str, source: str = "values", *, saturating: bool = False
     ) -> None:
         self._pool, self._name = pool, name
-        defines = {"SCAN_LANES": 8 if device.is_cpu else 256} | ({} if source == "values" else {source.upper(): 1})
+        lanes = 8 if device.is_cpu else 256
+        defines = {"SCAN_LANES": lanes, "FLAGS": source == "flags", "GATHER": source == "gather"}
         self._reduce = Kernel.get(device, "scan_reduce", **defines)
-        blocks = {"SCAN_LANES": defines["SCAN_LANES"]} | ({"SATURATING": 1} if saturating else {})
-        self._blocks = Kernel.get(device, "scan_blocks", **blocks)
+        self._blocks = Kernel.get(device, "scan_blocks", SCAN_LANES=lanes, SATURATING=saturating)
         self._apply = Kernel.get(device, "scan_apply", **defines)
 
     def __call__(

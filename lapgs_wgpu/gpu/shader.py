@@ -1,4 +1,4 @@
-"""Composing WGSL from the files in shaders/: imports, conditions, unrolled loops; and reading its bindings back.
+"""WGSL preprocessing: imports, conditions, unrolled loops; and reflection of bindings and structs.
 
 Directives, each on a line of its own:
     #import common/frame            the text of shaders/common/frame.wgsl, once
@@ -6,12 +6,11 @@ Directives, each on a line of its own:
     #table N name: type             a read-only array at binding N (f32, u32, or vec2, vec4 of them), read by name_at(i)
     #unroll i COUNT / #end          COUNT copies of the lines between, `$i` or `$(i)` replaced by 0, 1, ...
 `$NAME` elsewhere is replaced by the value of the define NAME; upper case for defines, lower case for loop variables.
-Loops are unrolled here and not by the driver because naga adds a counter to each loop, which hides its trip count from
-the driver's own unrolling.
+Loops are unrolled here because naga adds a counter to each loop, which prevents the driver from unrolling it.
 
-A table is a storage buffer, or, with the define TEXTURES, a storage texture of TABLE_WIDTH texels a row: on many
-processors Mesa's software driver reads a texel of four words in a tenth of the time that it takes to read one word of
-a buffer (docs/results.md).
+A table is a storage buffer or, with the define TEXTURES, a storage texture with rows of TABLE_WIDTH texels: on many
+processors, Mesa's software driver reads a texel of four words ten times faster than one word of a buffer
+(docs/results.md).
 """
 
 from __future__ import annotations
@@ -57,7 +56,7 @@ _LAYOUT = {
 
 
 class ShaderError(Exception):
-    """A shader that cannot be composed, or a dispatch that does not match it: a programming error."""
+    """Programming error: a shader that cannot be composed, or a dispatch that does not match it."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +79,7 @@ def shader_text(name: str) -> str:
 
 
 def compose(name: str, defines: Defines) -> str:
-    """The complete WGSL of shaders/<name>.wgsl under the given defines."""
+    """The WGSL of shaders/<name>.wgsl with the given defines, complete."""
     imported: set[str] = set()
 
     def expand(file: str) -> list[str]:
@@ -184,7 +183,7 @@ def reflect(source: str) -> dict[str, Binding]:
 
 
 def pack(source: str, struct_name: str, values: Mapping[str, object]) -> bytes:
-    """The bytes of a WGSL struct, each member taken from `values` by name (matrices column by column)."""
+    """The bytes of a WGSL struct with these members (matrices column by column)."""
     members = _members(source, struct_name)
     if {name for name, _ in members} != set(values):
         difference = {name for name, _ in members} ^ set(values)
@@ -204,7 +203,7 @@ def pack(source: str, struct_name: str, values: Mapping[str, object]) -> bytes:
 
 @functools.cache
 def _members(source: str, struct_name: str) -> tuple[tuple[str, str], ...]:
-    """Name and type of each member of a struct; a training step asks for the same ones again and again."""
+    """Name and type of each member of a struct. Cached, since each training step needs them."""
     body = re.search(rf"struct\s+{struct_name}\s*{{(.*?)}}", source, re.S)
     if body is None:
         raise ShaderError(f"no struct {struct_name} in the shader")

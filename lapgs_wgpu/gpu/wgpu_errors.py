@@ -1,9 +1,9 @@
-"""Translates what wgpu raises when a device runs out of memory or is lost into errors with a text for users.
+"""Translates wgpu's errors for exhausted memory and lost devices into errors with texts for users.
 
-wgpu-py 0.32 reports both at the call: memory as a validation error, a lost device as a validation error or, where a
-buffer is mapped, as an AttributeError of its own. One call cannot be guarded: a submission that the native library
-refuses ends the process. Commands are therefore finished right before they are submitted, which a lost device refuses
-in time, and sizes are checked before buffers are made.
+wgpu-py 0.32 raises both at the call: exhausted memory as a validation error, a lost device as a validation error or,
+when mapping a buffer, as an AttributeError. A submission that the native library refuses ends the process instead.
+Hence commands are finished right before their submission, where a lost device raises an error in time, and sizes are
+checked before buffers are created.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _LOST = "device is lost"
 class TranslatedErrors:
     """A context that turns exhausted memory and a lost device into a DeviceError; other errors pass unchanged.
 
-    what: what the memory is for. nbytes: how much, 0 if unknown.
+    what: purpose of the memory. nbytes: its size, 0 if unknown.
     """
 
     def __init__(self, device: Device, what: str, nbytes: int = 0) -> None:

@@ -1,1 +1,1 @@
-"""Files that outlive a run: PLY checkpoints."""
+"""Splat files and checkpoints; JSON, TOML and safetensors files; configuration tables."""

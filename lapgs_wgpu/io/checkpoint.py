@@ -1,7 +1,7 @@
-"""The checkpoint: one .ply file that any splat viewer opens as a still, and that carries the motion behind it.
+"""The checkpoint: a .ply file that any splat viewer opens as a static scene, with the motion in a further element.
 
-After the Gaussians of a 3DGS .ply stands one more element, `lapgs4d`, whose rows of one uint are a safetensors file
-(docs/format.md). Equal models give equal bytes; nothing in the file is ever executed.
+The element `lapgs4d` follows the Gaussians of a 3DGS .ply; its rows of one uint are the bytes of a safetensors file
+(docs/format.md). Equal models give equal bytes; nothing in the file is executed.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _ELEMENT = "lapgs4d"
 
 
 class Checkpoint(NamedTuple):
-    """still: the Gaussians at the reference time. tensors and metadata: the motion, both empty for a static scene."""
+    """still: Gaussians at the reference time. tensors, metadata: the motion; both empty for other 3DGS files."""
 
     still: GaussianSnapshot
     tensors: dict[str, NDArray[Any]]
@@ -54,7 +54,7 @@ def write_checkpoint(
 
 
 def read_checkpoint(path: PathLike) -> Checkpoint:
-    """A checkpoint, or any 3DGS .ply: then tensors and metadata are empty and the scene is static.
+    """Read a checkpoint, or any 3DGS .ply file: tensors and metadata are then empty.
 
     Raises InputError when the file is neither, is damaged, or holds NaN or infinity.
     """

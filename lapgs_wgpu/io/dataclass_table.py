@@ -1,66 +1,121 @@
-"""Configuration dataclasses from parsed TOML and JSON: the one place that checks keys, types and ranges."""
+"""Dataclasses from parsed TOML and JSON: the one place that checks keys, types and ranges."""
 
 from __future__ import annotations
 
 import dataclasses
 import difflib
+import operator
 import typing
 from collections.abc import Iterable
+from contextlib import suppress
 from typing import Any, Literal, TypeVar
 
 from lapgs_wgpu.errors import InputError, shown
 
 T = TypeVar("T")
 LARGEST_NUMBER = 2**31 - 1  # no key has a use for more
+_LIMITS = {"above": operator.gt, "at_least": operator.ge, "below": operator.lt, "at_most": operator.le}
 
 
-def build_dataclass(cls: type[T], table: Any, source: str, prefix: str = "") -> T:
+def option(text: str, default: Any = dataclasses.MISSING, **limits: float) -> Any:
+    """A field of `Options`.
+
+    Args:
+        text: help text.
+        default: a field without one must stand in every table.
+        limits: above, at_least, below, at_most; of a tuple they hold for each entry.
+    """
+    return dataclasses.field(default=default, metadata={"help": text, "limits": limits})
+
+
+class Options:
+    """Base class of dataclasses made of `option`s. Raises ValueError for a value outside its limits."""
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):  # type: ignore[arg-type]
+            limits, value = field.metadata.get("limits", {}), getattr(self, field.name)
+            for number in value if isinstance(value, tuple) else (value,):
+                if not all(_LIMITS[name](number, limit) for name, limit in limits.items()):
+                    allowed = " and ".join(f"{name.replace('_', ' ')} {limit:g}" for name, limit in limits.items())
+                    raise ValueError(f"{field.name} must be {allowed}, got {number:g}")
+
+
+def build_dataclass(cls: type[T], table: Any, source: str, prefix: str = "", *, advice: str = "") -> T:
     """A dataclass from a parsed TOML or JSON table. Every key must be known, and every value of the field's type.
 
-    source: where the table comes from, for errors. prefix: of the keys in errors. Missing keys take the field's
-    default. Raises InputError.
+    Args:
+        table: a missing key takes the field's default.
+        source: where the table comes from, for errors.
+        prefix: of the keys, for errors.
+        advice: what to do where a key without a default is missing, for errors.
+
+    Raises:
+        InputError: names the key.
     """
     if not isinstance(table, dict):
-        raise InputError(f"{source}: {prefix.rstrip('.')} must be a table, got {shown(table)}.")
+        raise InputError(f"{source}: {prefix.rstrip('.') or 'it'} must be a table, got {shown(table)}.")
     types = field_types(cls)
     for key in table:
         if key not in types:
-            raise InputError(f"{source}: there is no key {prefix}{key}{did_you_mean(key, types)}.")
-    values = {}
+            known = f"; known: {', '.join(types)}."
+            raise InputError(f"{source}: there is no key {prefix}{key}{did_you_mean(key, types, known)}")
+    values: dict[str, Any] = {}
     for field in dataclasses.fields(cls):  # type: ignore[arg-type]
         name, kind = field.name, types[field.name]
-        if name in table:
-            inner = dataclasses.is_dataclass(kind)
-            values[name] = (
-                build_dataclass(typing.cast(type, kind), table[name], source, f"{prefix}{name}.")
-                if inner
-                else checked(kind, table[name], f"{source}: {prefix}{name}")
-            )
-        elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
-            raise InputError(f'{source} lacks the key {prefix}{name}; add it, or start the file with base = "dnerf".')
+        if name in table and dataclasses.is_dataclass(kind):
+            inner = typing.cast(type, kind)
+            values[name] = build_dataclass(inner, table[name], source, f"{prefix}{name}.", advice=advice)
+        elif name in table:
+            least = min(0, field.metadata.get("limits", {}).get("at_least", 0))
+            values[name] = checked(kind, table[name], f"{source}: {prefix}{name}", least)
+        elif field.default is dataclasses.MISSING:
+            raise InputError(f"{source} lacks the key {prefix}{name}{advice}.")
     try:
         return cls(**values)
     except ValueError as error:
-        raise InputError(f"{source}: {prefix.rstrip('.')}: {error}.") from None
+        raise InputError(f"{source}: {prefix}{error}.") from None
 
 
-def checked(kind: Any, value: Any, where: str) -> Any:
-    """A TOML or JSON value as a value of this type; numbers from 0 to LARGEST_NUMBER. Raises InputError."""
-    parts = typing.get_args(kind)
-    if typing.get_origin(kind) is Literal:
+def checked(kind: Any, value: Any, where: str, least: float = 0) -> Any:
+    """A TOML or JSON value as a value of this type. Raises InputError.
+
+    Numbers must be from `least` to LARGEST_NUMBER, and texts printable.
+    """
+    origin, parts = typing.get_origin(kind), typing.get_args(kind)
+    if type(None) in parts:
+        return None if value is None else checked(parts[0], value, where, least)
+    if origin is Literal:
         if value in parts:
             return value
-        hint = did_you_mean(value, parts) if isinstance(value, str) else ""
-        raise InputError(f"{where} must be {' or '.join(parts)}, got {shown(value)}{hint}.")
-    if typing.get_origin(kind) is tuple:
+        hint = did_you_mean(value, parts) if isinstance(value, str) else "."
+        raise InputError(f"{where} must be {' or '.join(parts)}, got {shown(value)}{hint}")
+    if origin is tuple:
         if not isinstance(value, list | tuple) or len(value) != len(parts):
             raise InputError(f"{where} must be {len(parts)} numbers, got {shown(value)}.")
-        return tuple(checked(part, entry, where) for part, entry in zip(parts, value, strict=True))
+        return tuple(checked(part, entry, where, least) for part, entry in zip(parts, value, strict=True))
+    if origin is dict and isinstance(value, dict):
+        return {key: checked(parts[1], entry, f"{where}.{key}", least) for key, entry in value.items()}
+    if kind is Any:
+        return value
     if type(value) is not kind and not (kind is float and type(value) is int):
-        raise InputError(f"{where} must be {_KIND_NAMES[kind]}, got {shown(value)}.")
-    if kind in (int, float) and not 0 <= value <= LARGEST_NUMBER:
-        raise InputError(f"{where} must lie between 0 and {LARGEST_NUMBER}, got {shown(value)}.")
+        raise InputError(f"{where} must be {_KIND_NAMES.get(kind, 'a table')}, got {shown(value)}.")
+    if kind in (int, float) and not least <= value <= LARGEST_NUMBER:
+        raise InputError(f"{where} must lie between {least:g} and {LARGEST_NUMBER}, got {shown(value)}.")
+    if kind is str and not value.isprintable():
+        raise InputError(f"{where} holds {shown(value)}, with characters that cannot be printed.")
     return float(value) if kind is float else value
+
+
+def from_text(text: str | list[str], kind: Any) -> Any:
+    """Text as a value of this type; a list as a tuple's entries. Text that is no number stays as it is."""
+    if isinstance(text, list):
+        return [from_text(entry, part) for entry, part in zip(text, typing.get_args(kind), strict=True)]
+    if kind is bool:
+        return {"true": True, "false": False}.get(text, text)
+    if kind in (int, float):
+        with suppress(ValueError):
+            return kind(text)
+    return text
 
 
 _KIND_NAMES = {int: "a whole number", float: "a number", bool: "true or false", str: "a text"}
@@ -72,7 +127,7 @@ def field_types(cls: type) -> dict[str, Any]:
     return {field.name: hints[field.name] for field in dataclasses.fields(cls)}
 
 
-def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """ "; did you mean X?" for a name that is close to a known one, else nothing."""
+def did_you_mean(name: str, known: Iterable[str], otherwise: str = ".") -> str:
+    """The end of a sentence about an unknown name: "; did you mean X?" if a known one is close."""
     close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.6)
-    return f"; did you mean {close[0]}?" if close else ""
+    return f"; did you mean {close[0]}?" if close else otherwise

@@ -1,7 +1,7 @@
-"""Still Gaussians in a .ply file, in the layout of 3DGS ("Inria's"), which every splat viewer opens.
+"""Gaussians in a .ply file in the layout of 3DGS (Inria), which every splat viewer opens.
 
-Layout: binary little-endian rows of one Gaussian each, parameters before their activations; docs/format.md has it byte
-by byte. Properties are found by name, for other programs order them otherwise and add their own.
+Each Gaussian is a binary little-endian row of parameters before their activations (docs/format.md). Properties are
+found by name, since other programs use other orders and add properties.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.atomic import atomic_write
-from lapgs_wgpu.io.ply_header import Element, PathLike, open_ply
+from lapgs_wgpu.io.ply_header import Element, PathLike
 
 Floats = NDArray[np.float32]
 
@@ -24,7 +24,7 @@ _BLOCK_BYTES = 1 << 20  # rows are converted in blocks that stay in the cache
 
 @dataclass(frozen=True, eq=False)
 class GaussianSnapshot:
-    """N Gaussians at one moment, as stored: before the activations. Everything is float32.
+    """N Gaussians at one time as stored, before the activations. All arrays are float32.
 
     means: (N, 3) world units. sh: (N, K, 3) spherical harmonics, K = (degree + 1)^2 coefficients, degree 0 to 3.
     opacity_logits: (N,), opacity = sigmoid. log_scales: (N, 3), standard deviation in world units = exp.
@@ -56,7 +56,7 @@ class GaussianSnapshot:
 
 
 def _names(rest: int) -> list[str]:
-    """The properties that are read, in the order of 3DGS, with `rest` SH coefficients above degree 0 (all channels)."""
+    """Names of the read properties in the order of 3DGS, with `rest` values of SH above degree 0 (all channels)."""
     return [
         "x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{i}" for i in range(rest)), "opacity",
         "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3",
@@ -64,16 +64,6 @@ def _names(rest: int) -> list[str]:
 
 
 _WRITTEN_NAMES = [*_names(0)[:3], "nx", "ny", "nz", *_names(45)[3:]]
-
-
-def read_ply(path: PathLike) -> GaussianSnapshot:
-    """The Gaussians of any 3DGS .ply: properties in any order, SH degree 0 to 3, further scalar properties skipped.
-
-    Raises InputError when the file is not such a file, is damaged, or holds a value that cannot be rendered. Needs
-    memory for about twice the Gaussians.
-    """
-    with open_ply(path) as (file, elements):
-        return read_vertices(file, elements, path)
 
 
 def write_ply(path: PathLike, still: GaussianSnapshot) -> None:
@@ -88,14 +78,14 @@ def write_ply(path: PathLike, still: GaussianSnapshot) -> None:
 
 
 def ply_header(count: int, trailer: str = "") -> bytes:
-    """The header for `count` Gaussians; `trailer` holds the lines of further elements."""
+    """The header for `count` Gaussians. trailer: lines of further elements."""
     properties = "".join(f"property float {name}\n" for name in _WRITTEN_NAMES)
-    # Some viewers look for the count on the third line: nothing may come between.
+    # Some viewers expect the count on the third line.
     return f"ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{properties}{trailer}end_header\n".encode()
 
 
 def vertex_rows(still: GaussianSnapshot, path: PathLike) -> Floats:
-    """(N, 62) little-endian rows as 3DGS stores them. Raises InputError where `path` could not be read back."""
+    """(N, 62) little-endian rows as in 3DGS. path: for errors. Raises InputError if they could not be read back."""
     if len(still) == 0:
         raise InputError(f"{path}: not written, because it would hold 0 Gaussians; at least 1 is needed")
     rest = still.sh.shape[1] - 1
@@ -112,7 +102,11 @@ def vertex_rows(still: GaussianSnapshot, path: PathLike) -> Floats:
 
 
 def read_vertices(file: BinaryIO, elements: dict[str, Element], path: PathLike) -> GaussianSnapshot:
-    """The Gaussians of an opened file: see read_ply."""
+    """The Gaussians of an opened 3DGS .ply: properties in any order, SH degree 0 to 3, further scalar ones skipped.
+
+    Takes memory for about twice the Gaussians. Raises InputError when the file is not such a file, is damaged, or holds
+    a value that cannot be rendered.
+    """
     if "vertex" not in elements:
         raise InputError(f"{path}: has no element vertex, so it holds no Gaussians; give a 3DGS .ply file")
     vertex = elements["vertex"]
@@ -120,7 +114,7 @@ def read_vertices(file: BinaryIO, elements: dict[str, Element], path: PathLike) 
     names = _names(rest)
     values = read_columns(file, vertex, names, path)
     _check_values(values, names, f"{path}:")
-    end = 6 + rest  # of the colours
+    end = 6 + rest  # of the colors
     sh = np.empty((len(values), 1 + rest // 3, 3), np.float32)
     sh[:, 0] = values[:, 3:6]
     for channel in range(3):  # channel-major: all of red, then green, then blue
@@ -135,7 +129,7 @@ def read_vertices(file: BinaryIO, elements: dict[str, Element], path: PathLike) 
 
 
 def _rest_count(vertex: Element, path: PathLike) -> int:
-    """The number of f_rest_* properties of a complete, known layout."""
+    """Number of f_rest_* properties. Raises InputError unless the layout is complete and supported."""
     properties = vertex.properties
     if "packed_position" in properties:
         raise InputError(
@@ -160,7 +154,7 @@ def _rest_count(vertex: Element, path: PathLike) -> int:
 
 
 def read_columns(file: BinaryIO, vertex: Element, names: list[str], path: PathLike) -> Floats:
-    """(N, len(names)) float32: the named properties of every row."""
+    """(N, len(names)) float32: the named properties of all rows."""
     offsets, offset = {}, 0
     for name, dtype in vertex.properties.items():
         offsets[name] = offset
@@ -181,14 +175,14 @@ def read_columns(file: BinaryIO, vertex: Element, names: list[str], path: PathLi
         rows = np.fromfile(file, row, wanted)
         if len(rows) != wanted:
             raise InputError(f"{path}: became shorter while it was read, at row {start + len(rows)} of {vertex.count}")
-        with np.errstate(all="ignore"):  # a double beyond float32 becomes Inf, which _check_values names
+        with np.errstate(all="ignore"):  # a double beyond float32 becomes infinite, which _check_values reports
             for column, name in enumerate(names):
                 values[start : start + wanted, column] = rows[name]
     return values
 
 
 def _check_values(values: Floats, names: list[str], where: str) -> None:
-    """Raise InputError unless every value (N, len(names)) is finite, and stays so once it is activated."""
+    """Raise InputError unless all values (N, len(names)) are finite, also after their activations."""
 
     def refuse(bad: NDArray[np.bool_], what: str) -> None:
         if bad.any():

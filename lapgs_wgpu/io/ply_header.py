@@ -1,7 +1,7 @@
-"""The header of a PLY file: which elements it declares and where in the file each one lies.
+"""The header of a PLY file: its elements and their positions in the file.
 
-Headers come from strangers: the length is bounded, and every declared size is compared with the file before anything
-is allocated. Only what Gaussians need is accepted: binary little-endian elements of scalar properties.
+Files are untrusted: the header's length is limited, and declared sizes are compared with the file size before any
+allocation. Only binary little-endian elements with scalar properties are supported, which suffices for Gaussians.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _SCALARS = {
 
 @dataclass
 class Element:
-    """One element of a PLY header: `count` rows of `properties` that begin at byte `offset` of the file."""
+    """An element: `count` rows of `properties` from byte `offset` of the file on."""
 
     name: str
     count: int
@@ -46,9 +46,9 @@ class Element:
 
 @contextmanager
 def open_ply(path: PathLike) -> Iterator[tuple[BinaryIO, dict[str, Element]]]:
-    """The opened file and the elements of its header, every size of which agrees with the file's size."""
+    """Open a file and read its header. The sizes of the elements add up to the file size. Raises InputError."""
     try:
-        mode = os.stat(path).st_mode  # before opening: a pipe would block, a device never end
+        mode = os.stat(path).st_mode  # before opening: a pipe would block, a device could be endless
         if stat.S_ISDIR(mode):
             raise InputError(f"{path}: is a folder; give a .ply file, for example the checkpoint.ply in it")
         if not stat.S_ISREG(mode):
@@ -80,7 +80,7 @@ def _read_header(file: BinaryIO, path: PathLike) -> dict[str, Element]:
 
 
 def _parse_lines(lines: list[str], path: PathLike) -> dict[str, Element]:
-    """The elements that a header's lines (without `ply` and `end_header`) declare."""
+    """Parse the header's lines between `ply` and `end_header`."""
     elements: dict[str, Element] = {}
     last: Element | None = None
     encoding: str | None = None
@@ -118,7 +118,7 @@ def _parse_lines(lines: list[str], path: PathLike) -> dict[str, Element]:
 
 
 def _place(elements: dict[str, Element], start: int, size: int, path: PathLike) -> dict[str, Element]:
-    """Set every element's offset. The elements must end exactly where the file of `size` bytes ends."""
+    """Set the elements' offsets. The last element must end at the end of the file of `size` bytes."""
     end = start
     for element in elements.values():
         element.offset = end

@@ -1,4 +1,4 @@
-"""A coloured cloud of points in a .ply file, as structure from motion leaves it (COLMAP, and what is made of it)."""
+"""Point clouds with colors in .ply files, as written by COLMAP and nerfstudio."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.ply import Floats, read_columns
 from lapgs_wgpu.io.ply_header import MAX_HEADER_BYTES, PathLike, open_ply
 
-COLOURS = ["red", "green", "blue"]
+COLORS = ["red", "green", "blue"]
 
 
 def read_points(path: PathLike) -> tuple[Floats, Floats | None]:
-    """Positions (N, 3), and colours (N, 3) in [0, 1] where the properties red, green and blue are bytes, else None.
+    """Read positions (N, 3), and colors (N, 3) in [0, 1], None unless red, green and blue are byte properties.
 
-    Values may be NaN or infinite. Raises InputError where the file is no cloud.
+    Values may be NaN or infinite. Raises InputError if the file is not a point cloud.
     """
     if _is_text(path):
         return _read_text(path)
@@ -25,9 +25,9 @@ def read_points(path: PathLike) -> tuple[Floats, Floats | None]:
         vertex = elements.get("vertex")
         if vertex is None or not {"x", "y", "z"} <= set(vertex.properties):
             raise InputError(f"{path}: has no element vertex with properties x, y, z, so it is no cloud of points.")
-        coloured = all(vertex.properties.get(name) == np.uint8 for name in COLOURS)
-        values = read_columns(file, vertex, ["x", "y", "z", *(COLOURS if coloured else [])], path)
-        return values[:, :3].copy(), values[:, 3:] / np.float32(255) if coloured else None
+        colored = all(vertex.properties.get(name) == np.uint8 for name in COLORS)
+        values = read_columns(file, vertex, ["x", "y", "z", *(COLORS if colored else [])], path)
+        return values[:, :3].copy(), values[:, 3:] / np.float32(255) if colored else None
 
 
 def _is_text(path: PathLike) -> bool:
@@ -36,7 +36,7 @@ def _is_text(path: PathLike) -> bool:
 
 
 def _read_text(path: PathLike) -> tuple[Floats, Floats | None]:
-    """A cloud written as text, which is how nerfstudio leaves it. Its vertices come first, a line each."""
+    """Read an ASCII file, as nerfstudio writes it. The vertices are the first element, one per line."""
     lines = Path(path).read_text(encoding="utf-8", errors="replace").splitlines()
     end = next((i for i, line in enumerate(lines) if line.strip() == "end_header"), None)
     if end is None:
@@ -67,6 +67,6 @@ def _read_text(path: PathLike) -> tuple[Floats, Floats | None]:
             ) from None
     bytes_ = {line[-1] for line in properties if line[1] in ("uchar", "uint8")}
     columns = [names.index(name) for name in "xyz"]
-    if not set(COLOURS) <= bytes_:
+    if not set(COLORS) <= bytes_:
         return values[:, columns].copy(), None
-    return values[:, columns].copy(), values[:, [names.index(name) for name in COLOURS]] / np.float32(255)
+    return values[:, columns].copy(), values[:, [names.index(name) for name in COLORS]] / np.float32(255)

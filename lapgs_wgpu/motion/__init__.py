@@ -1,1 +1,1 @@
-"""How Gaussians move: the hash encoder, the deformation field, the 4D scene."""
+"""Deformation fields, which move Gaussians; the 4D scene; its playback."""

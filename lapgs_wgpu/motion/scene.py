@@ -1,4 +1,4 @@
-"""The 4D scene: canonical Gaussians and the field that moves them; what a checkpoint holds."""
+"""The 4D scene: canonical Gaussians and the field that moves them, as stored in a checkpoint."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ Field = GridField | MlpField | HexPlaneField
 
 
 def make_field(config: FieldConfig, device: Device, seed: int = 0) -> Field | None:
-    """The field of this configuration, None for static scenes."""
+    """The field of this configuration; None for static scenes."""
     if config.kind == "static":
         return None
     if config.kind == "mlp":
@@ -46,10 +46,10 @@ def make_field(config: FieldConfig, device: Device, seed: int = 0) -> Field | No
 class Scene4D:
     """A moving scene.
 
-    parameters: canonical Gaussians as they are optimised, each an nn.Parameter of float32: means (N, 3) world units,
-    log_scales (N, 3), quats (N, 4) wxyz of any length, opacity_logits (N,), sh_dc (N, 1, 3), sh_rest (N, 15, 3), and
-    dynamics (N, D) where the field has a use for it (paper eq. 8).
-    field: None where nothing moves. sh_degree: the degree in use, 0 to 3. metadata: what the checkpoint said of itself.
+    parameters: canonical Gaussians as they are optimized, each an nn.Parameter of float32: means (N, 3) world units,
+    log_scales (N, 3), quats (N, 4) wxyz of any length, opacity_logits (N,), sh_dc (N, 1, 3), sh_rest (N, 15, 3); for
+    the field laplacian also dynamics (N, D) (paper eq. 8).
+    field: None for static scenes. sh_degree: degree in use, 0 to 3. metadata: of the checkpoint.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class Scene4D:
         device: Device | None = None,
         seed: int = 0,
     ) -> Scene4D:
-        """Round Gaussians at points (N, 3), world units, with colors (N, 3) in [0, 1] and scales (N,)."""
+        """Isotropic Gaussians at points (N, 3), world units, with colors (N, 3) in [0, 1] and scales (N,)."""
         n = len(points)
         parameters = {
             "means": torch.as_tensor(np.asarray(points, np.float32)),
@@ -99,7 +99,7 @@ class Scene4D:
 
     @property
     def spectrum(self) -> LaplacianMotion | None:
-        """The spectrum of the motion, where the field has one."""
+        """The motion spectrum of the field, if it has one."""
         motion = self.field.motion if isinstance(self.field, GridField) else None
         return motion if isinstance(motion, LaplacianMotion) else None
 
@@ -123,7 +123,7 @@ class Scene4D:
         return self.deformed(t)[0]
 
     def deformed(self, t: float, nearby: Nearby | None = None) -> tuple[Gaussians, Tensor | None]:
-        """`at`, and the loss that keeps the field smooth, where `nearby` says where to ask it once more."""
+        """The Gaussians at time t, and the weighted smoothness loss for `nearby`, None without it."""
         still = self.canonical()
         if self.field is None or len(self) == 0:
             return still, None
@@ -146,12 +146,16 @@ class Scene4D:
         return moved, move.smoothness
 
     def render(self, camera: Camera, t: float, background: Tensor | None = None, *, depth: bool = True) -> Rendering:
-        """The picture of a camera at time t in [0, 1], without gradients. background: (3,), black where None.
+        """Render the scene at time t in [0, 1], without gradients. background: (3,), None for black.
 
-        depth: whether to draw it; without, its picture is zero, and a tenth of the time is saved.
+        depth: whether to render depth, see `rasterize`.
         """
         with torch.no_grad():
-            return draw(self.at(t), camera, background, self.device, depth=depth)
+            now = self.at(t)
+            tensors = (now.means, now.quats, now.scales, now.opacities, now.sh)
+            return rasterize(
+                *tensors, camera, sh_degree=now.sh_degree, background=background, depth=depth, device=self.device
+            )
 
     def still(self, t: float) -> GaussianSnapshot:
         """The Gaussians at time t in [0, 1] before their activations, as 3DGS viewers read them."""
@@ -170,9 +174,10 @@ class Scene4D:
         )
 
     def save(self, path: str | os.PathLike[str], metadata: Mapping[str, str] | None = None) -> None:
-        """Write the scene to one file, which 3DGS viewers open as a still at time 0 (docs/format.md). Atomic.
+        """Write the scene to one file, which 3DGS viewers open as a static scene at time 0 (docs/format.md). Atomic.
 
-        Raises InputError where the disk or the values do not allow it; an older file then stays as it was.
+        Raises InputError for errors of the file system and for values that cannot be stored; an older file is then
+        unchanged.
         """
         arrays = self.still(0.0)
         tensors = {f"gaussians.{name}": value.numpy(force=True) for name, value in self.parameters.items()}
@@ -182,35 +187,17 @@ class Scene4D:
         write_checkpoint(path, arrays, tensors, {**self.metadata, **(metadata or {}), **header})
 
 
-def draw(
-    gaussians: Gaussians, camera: Camera, background: Tensor | None, device: Device, *, depth: bool = True
-) -> Rendering:
-    """Rasterise activated Gaussians; differentiable. depth: see `rasterize`."""
-    return rasterize(
-        gaussians.means,
-        gaussians.quats,
-        gaussians.scales,
-        gaussians.opacities,
-        gaussians.sh,
-        camera,
-        sh_degree=gaussians.sh_degree,
-        background=background,
-        depth=depth,
-        device=device,
-    )
-
-
 def load(path: str | os.PathLike[str], device: Device | None = None) -> Scene4D:
-    """Read a checkpoint, or any 3DGS .ply, which becomes a static scene. Raises InputError."""
+    """Read a checkpoint, or any 3DGS .ply file as a static scene. Raises InputError."""
     return scene_of(read_scene(path), device)
 
 
 def scene_of(file: SceneFile, device: Device | None = None) -> Scene4D:
-    """The scene in a file that was read. Raises InputError where the field's parameters are damaged."""
+    """The scene of a file that was read."""
     parameters = {name: torch.from_numpy(array.copy()) for name, array in file.gaussians.items()}
     scene = Scene4D(parameters, file.field_config, device or open_device(), sh_degree=file.sh_degree)
     if scene.field is not None:
-        # Copied into the module by load_state_dict, so that they may be views of the file's bytes.
+        # load_state_dict copies the arrays, which may be read-only.
         scene.field.load_state_dict({name: torch.from_numpy(array) for name, array in file.field.items()})
     scene.metadata = file.metadata
     return scene

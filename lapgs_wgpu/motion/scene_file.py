@@ -1,4 +1,4 @@
-"""What a file says of a scene, checked, as arrays: read without torch, for training's Scene4D and for playback."""
+"""Read and validate the scene in a file as arrays, without torch, for Scene4D and for playback."""
 
 from __future__ import annotations
 
@@ -30,8 +30,11 @@ _SHAPES = {
 
 @dataclass(frozen=True, eq=False)
 class SceneFile:
-    """gaussians: the canonical ones by name, float32, in the shapes of `row_shapes`. field: the field's parameters by
-    name, in the shapes of `parameter_shapes`. metadata: the file's own texts."""
+    """The content of a file, float32.
+
+    gaussians: canonical ones by name, (N, ...) with rows as in `row_shapes`. field: the field's parameters by name, in
+    the shapes of `parameter_shapes`. metadata: further texts.
+    """
 
     path: str | os.PathLike[str]
     field_config: FieldConfig
@@ -42,7 +45,7 @@ class SceneFile:
 
 
 def read_scene(path: str | os.PathLike[str]) -> SceneFile:
-    """Read a checkpoint, or any 3DGS .ply, which becomes a static scene. Raises InputError."""
+    """Read a checkpoint, or any 3DGS .ply file as a static scene. Raises InputError."""
     still, tensors, metadata = read_checkpoint(path)
     if not tensors:
         sh = np.zeros((len(still.means), 16, 3), np.float32)
@@ -63,13 +66,13 @@ def read_scene(path: str | os.PathLike[str]) -> SceneFile:
         name: _tensor(tensors, f"gaussians.{name}", (count, *shape), path) for name, shape in row_shapes(config).items()
     }
     texts = {key: value for key, value in metadata.items() if key not in ("field", "sh_degree")}
-    # Here, since the description may ask for more memory than there is: no module is made of it before.
+    # Before a module is created: a damaged description may ask for more memory than there is.
     field = {name: _tensor(tensors, f"field.{name}", shape, path) for name, shape in parameter_shapes(config).items()}
     return SceneFile(path, config, degree, gaussians, field, texts)
 
 
 def row_shapes(config: FieldConfig) -> dict[str, tuple[int, ...]]:
-    """What each Gaussian carries with this field: name -> shape of a row."""
+    """Parameters of each Gaussian with this field: name -> shape of a row."""
     size = config.dynamics_size
     return _SHAPES | ({"dynamics": (size,)} if size else {})
 
@@ -98,6 +101,6 @@ def _tensor(
     if array.shape != shape:
         raise InputError(f"{path}: tensor {name!r} has shape {array.shape}, but the scene needs {shape}")
     values = array.astype(np.float32, copy=False)
-    if values is not array and not np.isfinite(values).all():  # as read, all values are finite
+    if values is not array and not np.isfinite(values).all():  # all values are finite before the conversion
         raise InputError(f"{path}: tensor {name!r} holds values beyond float32: it was written by another program")
     return values

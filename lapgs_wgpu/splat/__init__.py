@@ -1,1 +1,1 @@
-"""Rasterising 3D Gaussians: the camera, the passes, their float64 reference."""
+"""Rasterization of 3D Gaussians: the camera, the Gaussians, the device passes and their autograd function."""

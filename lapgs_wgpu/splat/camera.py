@@ -1,4 +1,4 @@
-"""The pinhole camera that every pass and every reader of data shares."""
+"""The pinhole camera."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 class Camera:
     """A pinhole camera in OpenCV axes: x right, y down, z forward.
 
-    K: (3, 3) float64 intrinsics in pixels; pixel (column, row) has its centre at (column + 0.5, row + 0.5).
+    K: (3, 3) float64 intrinsics in pixels; the center of pixel (column, row) is (column + 0.5, row + 0.5).
     T_cam_world: (4, 4) float64 rigid transform from world to camera coordinates.
     width, height: image size in pixels.
     """
@@ -37,12 +37,12 @@ class Camera:
 
     @property
     def position(self) -> NDArray[np.float64]:
-        """(3,) the camera's centre in world coordinates."""
+        """(3,) camera center in world coordinates."""
         R, t = self.T_cam_world[:3, :3], self.T_cam_world[:3, 3]
         return -R.T @ t
 
     def resized(self, width: int, height: int) -> Camera:
-        """The same view on an image of another size."""
+        """The same camera for an image of another size."""
         scale = np.diag([width / self.width, height / self.height, 1.0])
         return Camera(scale @ self.K, self.T_cam_world, width, height)
 
@@ -56,7 +56,10 @@ class Camera:
         width: int,
         height: int,
     ) -> Camera:
-        """A camera at `position` that looks at `target`; `up` is up in the image, fov_x in radians, square pixels."""
+        """A camera at `position` that looks at `target`, with square pixels.
+
+        up: world direction that points up in the image. fov_x: horizontal field of view, radians.
+        """
         eye = np.asarray(position, dtype=np.float64)
         forward = np.asarray(target, dtype=np.float64) - eye
         forward /= np.linalg.norm(forward)
@@ -69,6 +72,6 @@ class Camera:
 
 
 def intrinsics_of_fov(fov_x: float, width: int, height: int) -> NDArray[np.float64]:
-    """(3, 3) K of a horizontal field of view in radians; square pixels, principal point in the middle of the image."""
+    """(3, 3) K for a horizontal field of view in radians, with square pixels and a centered principal point."""
     focal = 0.5 * width / math.tan(0.5 * fov_x)
     return np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])

@@ -1,4 +1,4 @@
-"""The rasteriser's constants, by name, read from the shaders, where each stands once."""
+"""Constants that kernels and Python share, by name. They are defined in shaders/common/constants.wgsl."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the rasteriser hands from its forward to its backward passes, as arrays on the device."""
+"""Results of the rasterizer's forward and backward passes, as arrays on the device."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from .gaussians import Gaussians
 
 @dataclass(frozen=True)
 class Plan:
-    """How an image is drawn. None of it changes a bit.
+    """How an image is drawn. The plan does not change the result.
 
-    capacity: intersections (tile, splat) for which the lists have room. bands: of tile rows, drawn one after another.
-    rounds: in which the tiles' lists are drawn.
+    capacity: maximum number of intersections (tile, splat). bands: number of bands of tile rows, which are drawn one
+    after another. rounds: number of dispatches that draw the tiles' lists.
     """
 
     capacity: int
@@ -24,12 +24,12 @@ class Plan:
 
 
 class TileLists(NamedTuple):
-    """The lists of a band's tiles. visible: the number of Gaussians in them."""
+    """The sorted lists of splats of a band's tiles."""
 
     tile_counts: DeviceArray  # (N,) uint32, tiles of each Gaussian; 0: not visible
-    visible: DeviceArray  # (1,) uint32
+    visible: DeviceArray  # (1,) uint32, number of Gaussians in the lists
     sorted_ids: DeviceArray  # (N,) uint32, the first visible[0] of them, by depth
-    offsets: DeviceArray  # (N,) uint32, of the same: their first slots
+    offsets: DeviceArray  # (N,) uint32, first slot of each of these
     slot_ids: DeviceArray  # (capacity,) uint32, the Gaussian of each slot
     slots: DeviceArray  # (capacity,) uint32, by tile and depth
     ranges: DeviceArray  # (tiles + 1, 4) uint32: first, end and drawn end of a tile's part of `slots`; then flags
@@ -37,12 +37,11 @@ class TileLists(NamedTuple):
 
 @dataclass(eq=False)
 class Drawing:
-    """An image that was submitted. Its arrays are valid until the rasteriser draws the next one.
+    """A submitted image. Its arrays are valid until the rasterizer draws another one.
 
-    image: (4, H, W) red, green, blue and transmittance, and with `depth` (5, H, W), the last the sum of weight times
-    camera depth. splats: (N, SPLAT_FLOATS), see splat_layout. needed: (3,) uint32 of each band: its intersections;
-    nothing; whether a list needs more rounds. lists: of the band that was drawn last. number: of this drawing among all
-    of its rasteriser.
+    image: (4, H, W) red, green, blue, transmittance; with `depth` (5, H, W), the last plane is the sum of weight times
+    camera depth. splats: (N, SPLAT_FLOATS), see splat_layout. needed: (3,) uint32 per band: number of intersections;
+    unused; whether a list needs more rounds. lists: of the band drawn last. number: counts the rasterizer's drawings.
     """
 
     gaussians: Gaussians[DeviceArray]
@@ -66,8 +65,11 @@ class Drawing:
 
 
 class GaussianGradients(NamedTuple):
-    """Gradients by the projected splats (N, SPLAT_FLOATS), see splat_layout, by means (N, 3), quats (N, 4), scales
-    (N, 3) and sh (N, K, 3), which is None where the Gaussians have colours: these are the splats'."""
+    """Gradients with respect to the Gaussians.
+
+    splats: projected ones, (N, SPLAT_FLOATS), see splat_layout. means (N, 3), quats (N, 4), scales (N, 3). sh:
+    (N, K, 3); None for Gaussians with colors, whose gradient is a column of `splats`.
+    """
 
     splats: DeviceArray
     means: DeviceArray
@@ -76,5 +78,5 @@ class GaussianGradients(NamedTuple):
     sh: DeviceArray | None
 
     def arrays(self) -> list[DeviceArray]:
-        """All of them, in this order (for `read_all`)."""
+        """The arrays in this order, for `read_all`."""
         return [array for array in self if array is not None]

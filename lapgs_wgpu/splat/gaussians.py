@@ -1,4 +1,4 @@
-"""3D Gaussians at one moment, activated and ready to rasterise."""
+"""3D Gaussians at one time, activated, as the rasterizer takes them."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ class Gaussians(Generic[Array]):
     """N Gaussians with their activations applied, float32: torch tensors, numpy arrays or DeviceArrays.
 
     means: (N, 3) world units. quats: (N, 4) wxyz, any non-zero length. scales: (N, 3) standard deviations, world units.
-    opacities: (N,) in [0, 1]. sh: (N, K, 3) spherical harmonics, K = (degree + 1)^2 coefficients, degree 0 to 3; or
-    colours (N, 3), which do not depend on the view.
+    opacities: (N,) in [0, 1]. sh: (N, K, 3) spherical harmonics with K = (degree + 1)^2 coefficients, degree 0 to 3;
+    or view-independent colors (N, 3).
     """
 
     means: Array
@@ -28,7 +28,7 @@ class Gaussians(Generic[Array]):
 
     @property
     def sh_degree(self) -> int | None:
-        """Degree of the harmonics; None where `sh` holds colours."""
+        """Degree of the harmonics; None for colors."""
         shape = _shape(self.sh)
         return None if len(shape) == 2 else int(shape[1] ** 0.5) - 1
 

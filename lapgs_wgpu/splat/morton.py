@@ -1,7 +1,7 @@
-"""An order of Gaussians in which neighbours in space are neighbours in memory.
+"""Order Gaussians along a Morton curve, so that neighbors in space are neighbors in memory.
 
-Passes over the splats of a tile, and over the hash grids' cells, then read from fewer lines of memory: on a CPU device
-the rasteriser's take a seventh less time (docs/results.md).
+Passes over the splats of a tile, and over the cells of hash grids, then use fewer cache lines: on a CPU device, the
+rasterizer takes a seventh less time (docs/results.md).
 """
 
 from __future__ import annotations
@@ -9,12 +9,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-_BITS = 20  # an axis; three of them fit into int64
+_BITS = 20  # per axis; three axes fit into int64
 
 
 def morton_order(points: Tensor) -> Tensor:
-    """The indices (N,), int64, of points (N, 3) along a Morton curve through their bounding box; equal ones stay in
-    their order."""
+    """Indices (N,), int64, that sort points (N, 3) along a Morton curve through their bounding box. Stable."""
     if len(points) == 0:
         return torch.zeros(0, dtype=torch.int64)
     low, high = points.min(dim=0).values, points.max(dim=0).values

@@ -1,4 +1,4 @@
-"""The shape of the raster kernels on a device: which tile a workgroup draws, and how its lanes share the pixels."""
+"""Configuration of the raster kernels for a device: tile size, and the pixels of each lane."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ from dataclasses import dataclass
 from ..gpu.device import SOFTWARE_LOOP_TURNS, Device
 from ..gpu.probe_subgroup import subgroup_size
 
-# Of an image, or a band of one, where the device limits loops: a splat that covers it all is counted, listed and summed
-# up a turn a tile. Below every device's `max_loop_turns`.
+# Per band, on devices that limit loops: loops over the tiles of a splat take one iteration per tile, and a splat may
+# cover all. Below the `max_loop_turns` of every device.
 MAX_BAND_TILES = 60_000
 
 
 @dataclass(frozen=True)
 class RasterConfig:
-    """A workgroup of `lanes` draws a tile of tile_width x tile_height pixels, each lane `rows` pixels of one column.
+    """A workgroup of `lanes` draws a tile of tile_width x tile_height pixels, each lane `rows` pixels of a column.
 
-    subgroups: the lanes lie in one subgroup and exchange values by shuffles instead of workgroup memory.
-    lane_runs: the radix sort's shape for CPU devices, which also have no fast exp2.
-    round_splats: most splats of a tile's list that a dispatch draws, where the driver ends long loops; else None.
-    long_list: length from which on a list is drawn in several rounds in any case, there. All its slots then have no
-    record beforehand, and the backward pass need not turn to say so of the splats that nobody sees.
+    subgroups: the lanes form one subgroup and exchange values by shuffles instead of workgroup memory.
+    lane_runs: use the radix sort for CPU devices, and a polynomial for exp2, which is slow there.
+    round_splats: maximum number of splats of a list that one dispatch draws, on devices that limit loops; else None.
+    long_list: on such devices, lists from this length on are always drawn in several rounds. Their slots start without
+    a record, which saves the backward pass a loop over the splats that no pixel sees.
     """
 
     tile_width: int
@@ -40,26 +40,25 @@ class RasterConfig:
         return {"TILE_W": self.tile_width, "TILE_H": self.tile_height}
 
     def raster_defines(self, *, depth: bool) -> dict[str, int]:
-        """Defines of rasterize and rasterize_bwd."""
+        """Defines of rasterize and rasterize_bwd. depth: whether to draw it, too."""
         flags = {"SUBGROUPS": self.subgroups, "DEPTH": depth, "LANES_16": self.lanes > 8, "LANES_32": self.lanes > 16}
-        flags["POLYNOMIAL_EXP2"] = self.lane_runs
-        values = self.tile_defines | {"LANES": self.lanes, "ROWS": self.rows}
+        values = {"LANES": self.lanes, "ROWS": self.rows, "POLYNOMIAL_EXP2": self.lane_runs}
         if self.round_splats:
             values |= {"ROUND_SPLATS": self.round_splats, "LONG_LIST": self.long_list}
-        return values | {name: 1 for name, on in flags.items() if on}
+        return self.tile_defines | values | flags
 
 
 def cpu_config(subgroup_size: int, max_loop_turns: int = SOFTWARE_LOOP_TURNS) -> RasterConfig:
-    """A workgroup is one vector of the processor, so that nothing has to wait at barriers."""
+    """A workgroup is one vector of the processor, so that no barrier waits."""
     lanes = 16 if subgroup_size == 16 else 8
     subgroups = subgroup_size >= lanes
-    # Without subgroups the backward pass adds up a splat's ten values by loops over the lanes, 20 turns a splat.
+    # Without subgroups the backward pass sums a splat's ten values in loops over the lanes: 20 iterations per splat.
     round_splats = (max_loop_turns + 1) // (2 if subgroups else 32)
     return RasterConfig(8, 8, lanes, subgroups, True, round_splats, long_list=max_loop_turns + 1)
 
 
 def gpu_config(subgroup_size: int) -> RasterConfig:
-    """Wider tiles, hence fewer intersections to sort, and a subgroup of 16 or 32 lanes a tile."""
+    """Wider tiles, hence fewer intersections to sort; a subgroup of 16 or 32 lanes per tile."""
     lanes = 16 if subgroup_size == 16 else 32
     return RasterConfig(16, 8, lanes, subgroups=subgroup_size >= lanes, lane_runs=False)
 

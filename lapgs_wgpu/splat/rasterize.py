@@ -1,10 +1,10 @@
-"""`rasterize`: the differentiable door to the rasteriser for torch tensors."""
+"""`rasterize`: the rasterizer as a differentiable function of torch tensors."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -22,9 +22,12 @@ from .splat_layout import COLOR, MEAN, OPACITY, RADIUS
 
 
 class Rendering(NamedTuple):
-    """image (H, W, 3); alpha (H, W); depth (H, W): sum of weight times camera depth, not divided by alpha;
-    radii (N,) int32 in pixels, 0 where a Gaussian is not seen; means2d (N, 2) in pixels, whose .grad holds, after
-    backward(), the loss's gradient by them (what density control needs)."""
+    """A rendered image and the projected Gaussians.
+
+    image: (H, W, 3). alpha: (H, W). depth: (H, W) sum of weight times camera depth, not divided by alpha. radii: (N,)
+    int32 in pixels, 0 for invisible Gaussians. means2d: (N, 2) in pixels; after backward(), its .grad is the gradient
+    of the loss, which density control needs.
+    """
 
     image: Tensor
     alpha: Tensor
@@ -33,18 +36,9 @@ class Rendering(NamedTuple):
     means2d: Tensor
 
 
-class Seen(Protocol):
-    """What density control needs of a `Rendering`."""
-
-    @property
-    def radii(self) -> Tensor: ...
-    @property
-    def means2d(self) -> Tensor: ...
-
-
 @functools.cache
 def rasterizer_of(device: Device) -> Rasterizer:
-    """The rasteriser that `rasterize` uses on this device; its buffers serve all calls."""
+    """The rasterizer that `rasterize` uses on this device. Its buffers are reused by all calls."""
     return Rasterizer(device)
 
 
@@ -61,16 +55,25 @@ def rasterize(
     depth: bool = True,
     device: Device | None = None,
 ) -> Rendering:
-    """Draw N Gaussians. Differentiable in all tensors. Argument names follow gsplat.
+    """Render N Gaussians. Differentiable in all tensors. Argument names follow gsplat.
 
-    means (N, 3) world units; quats (N, 4) wxyz of any length; scales (N, 3) standard deviations; opacities (N,) in
-    [0, 1]; colors (N, 3), or (N, K, 3) spherical harmonics when sh_degree (0 to 3, (sh_degree + 1)^2 <= K) is given;
-    background (3,), black where None. All activated, float32, on any torch device; the result is on means' device.
-    depth: whether to draw it; without, its picture is zero and a tenth of the time is saved.
-    device: a lapgs_wgpu Device, the default adapter where None.
+    Args:
+        means: (N, 3) world units. All tensors are float32, activated, on any torch device.
+        quats: (N, 4) wxyz, of any length.
+        scales: (N, 3) standard deviations, world units.
+        opacities: (N,) in [0, 1].
+        colors: (N, 3); with sh_degree: (N, K, 3) spherical harmonics, K >= (sh_degree + 1)^2.
+        sh_degree: 0 to 3.
+        background: (3,); None for black.
+        depth: whether to render depth, which takes a tenth of the time; otherwise it is zero.
+        device: None for the default adapter.
 
-    The gradient is the same to the last bit on every run of one adapter and driver.
-    Raises ValueError where shapes disagree.
+    Returns:
+        Rendering, on the device of `means`. Image and gradients are the same to the last bit on every run with one
+        adapter and driver.
+
+    Raises:
+        ValueError: shapes do not match.
     """
     n = means.shape[0]
     expected = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,)}
@@ -136,7 +139,7 @@ class _Rasterize(torch.autograd.Function):
         if not rasterizer.holds(ctx.drawing):  # another image was drawn in between
             ctx.drawing, _, _ = _draw(rasterizer, Gaussians(*tensors), background, ctx.camera, ctx.depth)
         planes = torch.cat([d_image.permute(2, 0, 1), d_alpha[None], *([d_depth[None]] if ctx.depth else [])])
-        gradients = rasterizer.backward(ctx.drawing, _upload(rasterizer.pool, "d_image", planes))
+        gradients = rasterizer.backward(ctx.drawing, upload(rasterizer.pool, "d_image", planes))
         by_gaussians, d_means2d = gradient_tensors(read_all(gradients.arrays()), background.device)
         return (*by_gaussians, d_background, d_means2d, *[None] * 3)
 
@@ -144,7 +147,7 @@ class _Rasterize(torch.autograd.Function):
 def _draw(
     rasterizer: Rasterizer, gaussians: Gaussians[Tensor], background: Tensor, camera: Camera, depth: bool
 ) -> tuple[Drawing, NDArray[np.float32], NDArray[np.float32]]:
-    """Upload, draw until the buffers are large enough, read back: planes (4 or 5, H, W) and splats."""
+    """Upload, draw until the buffers are large enough, and read back planes (4 or 5, H, W) and splats."""
     arrays = upload_gaussians(rasterizer.pool, gaussians)
     red, green, blue = background.tolist()
     while True:
@@ -155,24 +158,24 @@ def _draw(
 
 
 def upload_gaussians(pool: BufferPool, gaussians: Gaussians[Tensor]) -> Gaussians[DeviceArray]:
-    """The Gaussians in buffers of a pool."""
+    """Upload Gaussians to buffers of a pool."""
     names = [field.name for field in dataclasses.fields(gaussians)]
-    return Gaussians(*(_upload(pool, name, getattr(gaussians, name)) for name in names))
+    return Gaussians(*(upload(pool, name, getattr(gaussians, name)) for name in names))
 
 
 def radii_and_centres(splats: NDArray[np.float32], device: torch.device) -> tuple[Tensor, Tensor]:
-    """`radii` and `means2d` of a Rendering, from splats that were read back."""
+    """`radii` and `means2d` of a Rendering, from splats (N, SPLAT_FLOATS) that were read back."""
     projected = torch.from_numpy(splats).to(device)
     return projected[:, RADIUS].to(torch.int32), projected[:, MEAN].contiguous()
 
 
 def gradient_tensors(arrays: list[NDArray[np.float32]], device: torch.device) -> tuple[tuple[Tensor, ...], Tensor]:
-    """The gradients by means, quats, scales, opacities and sh, and by means2d, from those of GaussianGradients that
-    were read back."""
+    """Gradients of means, quats, scales, opacities and sh; and of means2d. arrays: GaussianGradients, read back."""
     d_splats, d_means, d_quats, d_scales, *d_sh = (torch.from_numpy(array).to(device) for array in arrays)
     d_colors = d_sh[0] if d_sh else d_splats[:, COLOR]
     return (d_means, d_quats, d_scales, d_splats[:, OPACITY], d_colors), d_splats[:, MEAN]
 
 
-def _upload(pool: BufferPool, name: str, tensor: Tensor) -> DeviceArray:
+def upload(pool: BufferPool, name: str, tensor: Tensor) -> DeviceArray:
+    """A copy of a tensor, as float32, in the buffer `input NAME` of a pool."""
     return pool.upload(f"input {name}", tensor.detach().to("cpu", torch.float32).contiguous().numpy())

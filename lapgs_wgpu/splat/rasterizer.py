@@ -1,7 +1,6 @@
-"""The passes that draw an image from Gaussians, and those that carry its gradient back, on arrays of a device.
+"""The rasterizer's forward and backward passes on arrays of a device (docs/architecture.md lists them in order).
 
-See docs/architecture.md for the order of the passes. Nothing here waits for the device except `grow_on_overflow` and,
-once a pass, `Rasterizer._subgroup_mismatch`.
+Only `grow_on_overflow` and, once per pass, `Rasterizer._subgroup_mismatch` wait for the device.
 """
 
 from __future__ import annotations
@@ -36,9 +35,9 @@ def _groups(count: int) -> int:
 
 
 class Rasterizer:
-    """Draws images on one device; keeps its buffers, and the plan that they follow, from image to image.
+    """Draws images on one device. Buffers and plan are reused from image to image.
 
-    capacity: of the first image's plan, see Plan.
+    capacity: of the plan of the first image, see Plan.
     """
 
     def __init__(self, device: Device, *, config: RasterConfig | None = None, capacity: int = 1 << 16) -> None:
@@ -48,13 +47,13 @@ class Rasterizer:
         self.plan = Plan(capacity)
         self.max_capacity = device.max_binding // (4 * _RECORD_FLOATS)
         self._flags_scan = Scan(device, self.pool, "visible", "flags")
-        # A number of intersections that no buffer holds must not come back as a small one.
+        # Saturating: a number of intersections beyond 2^32 must not wrap around to a small one.
         self._offset_scan = Scan(device, self.pool, "offsets", "gather", saturating=True)
         self._depth_sort = RadixSort(device, self.pool, "depth sort", lane_runs=self.config.lane_runs)
         self._tile_sort = RadixSort(device, self.pool, "tile sort", lane_runs=self.config.lane_runs)
-        self._size: tuple[int, int] | None = None  # of the image for which the plan was made
+        self._size: tuple[int, int] | None = None  # of the image that the plan was made for
         self._drawings = 0
-        self._trusted: set[tuple[str, bool, bool]] = set()  # passes whose workgroups are known to be subgroups
+        self._trusted: set[tuple[str, bool, bool]] = set()  # passes whose subgroups were checked
 
     # Forward ---------------------------------------------------------------------------------------------------------
 
@@ -67,9 +66,9 @@ class Rasterizer:
         depth: bool = False,
         profile: Profile | None = None,
     ) -> Drawing:
-        """Submit the passes that draw an image. It is valid once `grow_on_overflow` has returned False."""
+        """Submit the passes that draw an image, which is valid once `grow_on_overflow` has returned False."""
         if self._size not in (None, (camera.width, camera.height)):
-            self.plan = Plan(self.plan.capacity)  # what an image of another size needed would slow this one down
+            self.plan = Plan(self.plan.capacity)  # bands and rounds of another size would be slower
         self._size = (camera.width, camera.height)
         if self.config.round_splats:
             rows, columns = self._tiles(camera)
@@ -95,15 +94,15 @@ class Rasterizer:
         return drawing
 
     def holds(self, drawing: Drawing) -> bool:
-        """Whether the drawing's arrays are still its own: no other image was drawn since."""
+        """Whether the arrays still hold this drawing: no other image was drawn since."""
         return drawing.number == self._drawings
 
     def grow_on_overflow(self, drawing: Drawing, needed: list[NDArray[np.uint32]] | None = None) -> bool:
-        """Whether the drawing's intersections did not fit. Then it is invalid and has to be drawn again: the plan now
-        has larger buffers, more bands of tile rows, or more rounds.
+        """Whether the intersections overflowed the plan. The drawing is then invalid and has to be drawn again, with a
+        plan that now has larger buffers, more bands or more rounds.
 
-        needed: the content of `drawing.needed` where it was read already; without, this waits for the device.
-        Raises DeviceMemoryError where a row of tiles does not fit into the largest buffers.
+        needed: content of `drawing.needed`; None reads it and waits for the device.
+        Raises DeviceMemoryError if a row of tiles does not fit into the largest buffers.
         """
         counts = read_all(drawing.needed) if needed is None else needed
         totals, plan = [int(count[0]) for count in counts], drawing.plan
@@ -126,106 +125,56 @@ class Rasterizer:
         return True
 
     def _draw_band(self, commands: Commands, drawing: Drawing, band: int) -> TileLists:
-        device, pool, config, splats = self.device, self.pool, self.config, drawing.splats
-        gaussians, n, capacity = drawing.gaussians, len(drawing.gaussians), drawing.plan.capacity
-        frame, tiles, needed = self._frame(drawing, band), self._band_tiles(drawing, band), drawing.needed[band]
+        device, pool, config, gaussians = self.device, self.pool, self.config, drawing.gaussians
+        n, capacity, tiles = len(gaussians), drawing.plan.capacity, self._band_tiles(drawing, band)
+        frame, needed, visible = self._frame(drawing, band), drawing.needed[band], pool.array("visible", (1,), "uint32")
         tile_counts, ids, keys, offsets = (
             pool.array(name, (n,), "uint32") for name in ("tile counts", "ids", "depth keys", "offsets")
         )
-        visible = pool.array("visible", (1,), "uint32")
+        tile_keys, slot_ids = (pool.array(name, (capacity,), "uint32") for name in ("tile keys", "slot ids"))
         ranges = pool.array("ranges", (tiles + 1, 4), "uint32")
+        length = pool.constant("gaussians", n.to_bytes(4, "little"))
+        arrays = vars(gaussians) | {"frame": frame, "splats": drawing.splats, "image": drawing.image, "needed": needed}
+        arrays |= {"tile_counts": tile_counts, "ids": ids, "keys": keys, "prefix": offsets, "visible": visible}
+        arrays |= {"offsets": offsets, "tile_keys": tile_keys, "slot_ids": slot_ids, "ranges": ranges}
         if config.round_splats:
             commands.clear(needed)
-        length = pool.constant("gaussians", n.to_bytes(4, "little"))
-        commands.dispatch(
-            Kernel.get(device, "project", **config.tile_defines),
-            _groups(n),
-            frame=frame,
-            means=gaussians.means,
-            quats=gaussians.quats,
-            scales=gaussians.scales,
-            opacities=gaussians.opacities,
-            splats=splats,
-            tile_counts=tile_counts,
-        )
+        commands.run(Kernel.get(device, "project", **config.tile_defines), _groups(n), arrays)
         self._color(commands, drawing, frame, tile_counts)
         self._flags_scan(commands, length=length, capacity=n, values=tile_counts, prefix=offsets, total=visible)
-        commands.dispatch(
-            Kernel.get(device, "compact"),
-            _groups(n),
-            frame=frame,
-            splats=splats,
-            tile_counts=tile_counts,
-            prefix=offsets,
-            keys=keys,
-            ids=ids,
+        commands.run(Kernel.get(device, "compact"), _groups(n), arrays)
+        _, arrays["ids"] = self._depth_sort(
+            commands, length=visible, capacity=n, bits=_DEPTH_BITS, keys=keys, payload=ids
         )
-        _, sorted_ids = self._depth_sort(commands, length=visible, capacity=n, bits=_DEPTH_BITS, keys=keys, payload=ids)
-        self._offset_scan(
-            commands,
-            length=visible,
-            capacity=n,
-            values=tile_counts,
-            indices=sorted_ids,
-            prefix=offsets,
-            total=needed,
-        )
-        tile_keys, slot_ids = (pool.array(name, (capacity,), "uint32") for name in ("tile keys", "slot ids"))
-        commands.dispatch(
-            Kernel.get(device, "duplicate_with_keys", **config.tile_defines),
-            _groups(n),
-            frame=frame,
-            visible=visible,
-            splats=splats,
-            ids=sorted_ids,
-            tile_counts=tile_counts,
-            offsets=offsets,
-            tile_keys=tile_keys,
-            slot_ids=slot_ids,
-        )
+        scanned = {"values": tile_counts, "indices": arrays["ids"], "prefix": offsets, "total": needed}
+        self._offset_scan(commands, length=visible, capacity=n, **scanned)
+        commands.run(Kernel.get(device, "duplicate_with_keys", **config.tile_defines), _groups(n), arrays)
         bits = max(1, tiles.bit_length())  # one key more than there are tiles, for pads
-        sorted_keys, slots = self._tile_sort(
+        arrays["tile_keys"], arrays["slots"] = self._tile_sort(
             commands, length=needed, capacity=capacity, bits=bits, keys=tile_keys, payload=None
         )
         commands.clear(ranges)
-        commands.dispatch(
-            Kernel.get(device, "tile_ranges"),
-            _groups(-(-capacity // 4)),
-            frame=frame,
-            needed=needed,
-            tile_keys=sorted_keys,
-            ranges=ranges,
-        )
+        commands.run(Kernel.get(device, "tile_ranges"), _groups(-(-capacity // 4)), arrays)
         for number in range(drawing.plan.rounds):
-            last = number == drawing.plan.rounds - 1
-            rounds = {"CONTINUED": number > 0, "LAST_ROUND": last} if config.round_splats else {}
-            commands.dispatch(
-                Kernel.get(
-                    device,
-                    "rasterize",
-                    **config.raster_defines(depth=drawing.depth),
-                    **{name: 1 for name, on in rounds.items() if on},
-                ),
-                tiles,
-                frame=frame,
-                ranges=ranges,
-                slots=slots,
-                slot_ids=slot_ids,
-                splats=splats,
-                image=drawing.image,
-                **({"needed": needed} if config.round_splats else {}),
-            )
-        return TileLists(tile_counts, visible, sorted_ids, offsets, slot_ids, slots, ranges)
+            defines = config.raster_defines(depth=drawing.depth)
+            if config.round_splats:
+                defines |= {"CONTINUED": number > 0, "LAST_ROUND": number == drawing.plan.rounds - 1}
+            commands.run(Kernel.get(device, "rasterize", **defines), tiles, arrays)
+        return TileLists(tile_counts, visible, arrays["ids"], offsets, slot_ids, arrays["slots"], ranges)
 
     def _color(self, commands: Commands, drawing: Drawing, frame: DeviceArray, tile_counts: DeviceArray) -> None:
         kernel = Kernel.get(self.device, "color", **drawing.sh_defines)
-        means = {} if drawing.gaussians.sh_degree is None else {"means": drawing.gaussians.means}
+        arrays = {
+            "frame": frame,
+            "means": drawing.gaussians.means,
+            "tile_counts": tile_counts,
+            "splats": drawing.splats,
+        }
         for part, colors in self._color_parts(kernel, drawing.gaussians.sh):
-            arrays = {"colors": colors, "tile_counts": tile_counts, "splats": drawing.splats} | means
-            commands.dispatch(kernel, _groups(colors.shape[0]), frame=frame, part=part, **arrays)
+            commands.run(kernel, _groups(colors.shape[0]), arrays | {"part": part, "colors": colors})
 
     def _color_parts(self, kernel: Kernel, colors: DeviceArray) -> list[tuple[DeviceArray, DeviceArray]]:
-        """The kernel's uniform and rows of the colours, for ranges of Gaussians whose rows fit into one binding."""
+        """The kernel's uniform and the rows of colors for each range of Gaussians that fits into one binding."""
         count = colors.shape[0]
         most = self.device.max_binding // (4 * math.prod(colors.shape[1:])) // 64 * 64  # parts begin at 256 bytes
         parts = []
@@ -236,7 +185,7 @@ class Rasterizer:
         return parts
 
     def _tiles(self, camera: Camera) -> tuple[int, int]:
-        """Rows and columns of tiles."""
+        """Number of rows and columns of tiles."""
         return -(-camera.height // self.config.tile_height), -(-camera.width // self.config.tile_width)
 
     def _band_rows(self, drawing: Drawing, band: int) -> tuple[int, int]:
@@ -266,9 +215,11 @@ class Rasterizer:
         return self.pool.constant(f"frame {band}", content)
 
     def _subgroup_mismatch(self, name: str, drawing: Drawing) -> bool:
-        """Whether the driver has cut the workgroups of a pass, which was submitted for the first time, into several
-        subgroups. The config then does without subgroups, and the pass has to be done again. Waits for the device, but
-        once a pass."""
+        """Whether the driver has split the workgroups of a pass into several subgroups, checked after its first run.
+
+        If so, the config no longer uses subgroups, and the pass has to be run again. Waits for the device, once per
+        pass.
+        """
         key = (name, drawing.depth, drawing.plan.rounds > 1)
         if not self.config.subgroups or key in self._trusted:
             return False
@@ -282,10 +233,10 @@ class Rasterizer:
     # Backward --------------------------------------------------------------------------------------------------------
 
     def backward(self, drawing: Drawing, d_image: DeviceArray, *, profile: Profile | None = None) -> GaussianGradients:
-        """Submit the passes that carry the gradient of a drawing back to its Gaussians.
+        """Submit the backward passes of a drawing.
 
-        d_image: planes as those of the image, with the gradient by alpha in place of the transmittance.
-        Raises RuntimeError where another image was drawn since: the drawing's arrays hold that one's values.
+        d_image: gradient of the image's planes, with that of alpha instead of the transmittance.
+        Raises RuntimeError if another image was drawn since, which has overwritten the drawing's arrays.
         """
         if not self.holds(drawing):
             raise RuntimeError("backward needs the drawing that was drawn last; its buffers now hold another image")
@@ -303,19 +254,10 @@ class Rasterizer:
         if self._subgroup_mismatch("rasterize_bwd", drawing):
             return self.backward(drawing, d_image, profile=profile)
         d_sh = None
+        arrays = vars(gaussians) | {"frame": self._frame(drawing, 0), "d_splats": d_splats}
+        arrays |= {"d_means": d_means, "d_quats": d_quats, "d_scales": d_scales}
         with Commands(self.device, profile) as commands:
-            commands.dispatch(
-                Kernel.get(self.device, "project_bwd"),
-                _groups(n),
-                frame=self._frame(drawing, 0),
-                means=gaussians.means,
-                quats=gaussians.quats,
-                scales=gaussians.scales,
-                d_splats=d_splats,
-                d_means=d_means,
-                d_quats=d_quats,
-                d_scales=d_scales,
-            )
+            commands.run(Kernel.get(self.device, "project_bwd"), _groups(n), arrays)
             if gaussians.sh_degree is not None:
                 d_sh = self.pool.array("d_sh", gaussians.sh.shape)
                 self._color_bwd(commands, drawing, d_splats, d_means, d_sh)
@@ -324,66 +266,33 @@ class Rasterizer:
     def _backward_band(
         self, commands: Commands, drawing: Drawing, band: int, d_image: DeviceArray, d_splats: DeviceArray
     ) -> None:
-        lists, plan, splats = drawing.lists, drawing.plan, drawing.splats
+        lists, plan = drawing.lists, drawing.plan
         records = self.pool.array("records", (plan.capacity, _RECORD_FLOATS))
         tails = (3 if drawing.depth else 2) * plan.capacity
         states = 2 * drawing.camera.width * drawing.camera.height if plan.rounds > 1 else 0
         record_tails = self.pool.array("record tails", (tails + states,), "uint32")
-        kernel = Kernel.get(
-            self.device,
-            "rasterize_bwd",
-            **self.config.raster_defines(depth=drawing.depth),
-            **({"ROUNDS": 1} if plan.rounds > 1 else {}),
-        )
+        defines = self.config.raster_defines(depth=drawing.depth)
+        kernel = Kernel.get(self.device, "rasterize_bwd", ROUNDS=plan.rounds > 1, **defines)
+        gather = Kernel.get(self.device, "gather_gradients", DEPTH=drawing.depth)
+        arrays = lists._asdict() | {"ids": lists.sorted_ids, "frame": self._frame(drawing, band)}
+        arrays |= {"splats": drawing.splats, "image": drawing.image, "d_image": d_image, "d_splats": d_splats}
+        arrays |= {"records": records, "record_tails": record_tails}
+        arrays["tails"] = self.pool.constant("tails", gather.uniform("Tails", capacity=plan.capacity))
         commands.clear(record_tails.rows(0, plan.capacity))  # no slot has a record yet
         for number in range(plan.rounds):
-            piece = {}
             if plan.rounds > 1:
                 uniform = kernel.uniform("Piece", number=number, state=tails)
-                piece["piece"] = self.pool.constant(f"piece {number}", uniform)
-            commands.dispatch(
-                kernel,
-                self._band_tiles(drawing, band),
-                frame=self._frame(drawing, band),
-                ranges=lists.ranges,
-                slots=lists.slots,
-                slot_ids=lists.slot_ids,
-                splats=splats,
-                image=drawing.image,
-                d_image=d_image,
-                records=records,
-                record_tails=record_tails,
-                **piece,
-            )
-        gather = Kernel.get(self.device, "gather_gradients", **({"DEPTH": 1} if drawing.depth else {}))
-        commands.dispatch(
-            gather,
-            _groups(len(drawing.gaussians)),
-            visible=lists.visible,
-            ids=lists.sorted_ids,
-            tile_counts=lists.tile_counts,
-            offsets=lists.offsets,
-            splats=splats,
-            records=records,
-            record_tails=record_tails,
-            d_splats=d_splats,
-            tails=self.pool.constant("tails", gather.uniform("Tails", capacity=plan.capacity)),
-        )
+                arrays["piece"] = self.pool.constant(f"piece {number}", uniform)
+            commands.run(kernel, self._band_tiles(drawing, band), arrays)
+        commands.run(gather, _groups(len(drawing.gaussians)), arrays)
 
     def _color_bwd(
         self, commands: Commands, drawing: Drawing, d_splats: DeviceArray, d_means: DeviceArray, d_sh: DeviceArray
     ) -> None:
         kernel = Kernel.get(self.device, "color_bwd", **drawing.sh_defines)
         inputs, outputs = self._color_parts(kernel, drawing.gaussians.sh), self._color_parts(kernel, d_sh)
+        arrays = {"frame": self._frame(drawing, 0), "means": drawing.gaussians.means}
+        arrays |= {"d_splats": d_splats, "d_means": d_means}
         for (part, colors), (_, d_colors) in zip(inputs, outputs, strict=True):
-            commands.dispatch(
-                kernel,
-                _groups(colors.shape[0]),
-                frame=self._frame(drawing, 0),
-                part=part,
-                colors=colors,
-                means=drawing.gaussians.means,
-                d_splats=d_splats,
-                d_colors=d_colors,
-                d_means=d_means,
-            )
+            arrays |= {"part": part, "colors": colors, "d_colors": d_colors}
+            commands.run(kernel, _groups(colors.shape[0]), arrays)

@@ -1,4 +1,4 @@
-"""Quaternions as rotations, differentiable."""
+"""Rotations by quaternions, differentiable."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def rotation_matrices(quats: Tensor) -> Tensor:
 
 
 def rotate(quats: Tensor, vectors: Tensor) -> Tensor:
-    """Vectors (N, 3) turned by unit quaternions (N, 4) wxyz."""
+    """Rotate vectors (N, 3) by unit quaternions (N, 4) wxyz."""
     w, axis = quats[:, :1], quats[:, 1:]
     twice = 2.0 * torch.linalg.cross(axis, vectors)
     return vectors + w * twice + torch.linalg.cross(axis, twice)

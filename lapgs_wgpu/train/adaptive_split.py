@@ -33,7 +33,8 @@ def adaptive_split(rows: Mapping[str, Tensor], candidates: Tensor, config: Densi
     of = candidates.nonzero()[:, 0]
     if len(of) == 0:
         return candidates
-    sound = torch.stack([row.isfinite().flatten(1).all(dim=1) for row in _looked_at(rows).values()]).all(dim=0)
+    looked_at = (rows[name] for name in ("means", "log_scales", "quats", "dynamics") if name in rows)
+    sound = torch.stack([row.isfinite().flatten(1).all(dim=1) for row in looked_at]).all(dim=0)
     if not bool(sound.all()):  # which neither have neighbours nor are any
         split = torch.zeros_like(candidates)
         split[sound] = adaptive_split({name: row[sound] for name, row in rows.items()}, candidates[sound], config)
@@ -44,10 +45,6 @@ def adaptive_split(rows: Mapping[str, Tensor], candidates: Tensor, config: Densi
     if "dynamics" in rows:
         split |= candidates & outliers(rows["dynamics"])
     return split
-
-
-def _looked_at(rows: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    return {name: rows[name] for name in ("means", "log_scales", "quats", "dynamics") if name in rows}
 
 
 def split_scores(rows: Mapping[str, Tensor], of: Tensor, count: int, divergence_weight: float) -> Tensor:

@@ -4,17 +4,15 @@ but for keys that the config.toml of older runs lacks.
 Each key carries the text that lapgs-train --help shows of it. No torch here, which takes seconds to import.
 """
 
-# ruff: noqa: RUF009 (described() makes a dataclass field)
-
 from __future__ import annotations
 
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
+from lapgs_wgpu.io.dataclass_table import Options, option
 from lapgs_wgpu.motion.fields.config import DynamicsMode, FieldConfig
-from lapgs_wgpu.motion.fields.hash_grid_config import option
 
 Background = Literal["black", "white", "random"]
 Split = Literal["plain", "adaptive"]
@@ -22,24 +20,19 @@ Precision = Literal["float32", "bfloat16"]
 DecoderPlace = Literal["auto", "torch", "device"]
 
 
-def described(text: str, default: Any = dataclasses.MISSING) -> Any:
-    """A key of the configuration with its help text; one without a default must stand in every preset."""
-    return option(default, text)
-
-
 @dataclass(frozen=True)
-class DataConfig:
+class DataConfig(Options):
     """The capture."""
 
-    size: int = described("longer side of the images, pixels; larger images are downscaled; 0 keeps the original size")
-    background: Background = described(
+    size: int = option("longer side of the images, pixels; larger images are downscaled; 0 keeps the original size")
+    background: Background = option(
         "background behind transparent images; random: a new color in each step, black during evaluation"
     )
-    cache_gb: float = described(
+    cache_gb: float = option(
         "memory limit for decoded images, gigabytes: one limit for host memory and one for device memory; a "
         "single limit for both where the device shares host memory"
     )
-    path: str = described(
+    path: str = option(
         'folder of the capture, or a built-in scene: "synthetic", or "motion:path=4,cycles=2"; a built-in '
         "scene is generated next to the run folder",
         "",
@@ -47,61 +40,46 @@ class DataConfig:
 
 
 @dataclass(frozen=True)
-class PointsConfig:
+class PointsConfig(Options):
     """The initial Gaussians."""
 
-    count: int = described(
-        "number of initial Gaussians; if the capture has a point cloud, the maximum number taken from it"
+    count: int = option(
+        "number of initial Gaussians; if the capture has a point cloud, the maximum number taken from it", at_least=1
     )
-    box: float = described(
+    box: float = option(
         "half side length of the cube around the origin in which initial Gaussians are placed at random, "
-        "world units; used only if the capture has neither a point cloud nor depth maps"
+        "world units; used only if the capture has neither a point cloud nor depth bounds",
+        above=0,
     )
-    opacity: float = described("initial opacity of each Gaussian, between 0 and 1")
-
-    def __post_init__(self) -> None:
-        if self.count < 1 or self.box <= 0 or not 0 < self.opacity < 1:
-            raise ValueError(
-                "count must be at least 1, box above 0 and opacity between 0 and 1, "
-                f"got {self.count}, {self.box:g} and {self.opacity:g}"
-            )
+    opacity: float = option("initial opacity of each Gaussian, between 0 and 1", above=0, below=1)
 
 
 @dataclass(frozen=True)
-class ScheduleConfig:
+class ScheduleConfig(Options):
     """Lengths and intervals, in steps."""
 
-    steps: int = described("number of training steps")
-    batch: int = described("images per step; their gradients are averaged")
-    warm_up: int = described(
+    steps: int = option("number of training steps", at_least=1)
+    batch: int = option("images per step; their gradients are averaged", at_least=1)
+    warm_up: int = option(
         "number of initial steps without motion: the deformation field is off, and only the static Gaussians "
         "are trained"
     )
-    sh_interval: int = described(
-        "the degree of the spherical harmonics starts at 0 and increases by one every this many steps, up to 3"
+    sh_interval: int = option(
+        "the degree of the spherical harmonics starts at 0 and increases by one every this many steps, up to 3",
+        at_least=1,
     )
-    save_interval: int = described("save the training state every this many steps, for --resume; 0: never")
-
-    def __post_init__(self) -> None:
-        if min(self.steps, self.batch, self.sh_interval) < 1:
-            given = f"{self.steps}, {self.batch} and {self.sh_interval}"
-            raise ValueError(f"steps, batch and sh_interval must be at least 1, got {given}")
+    save_interval: int = option("save the training state every this many steps, for --resume; 0: never")
 
 
 @dataclass(frozen=True)
-class Rate:
+class Rate(Options):
     """A learning rate that goes from start to end exponentially and then stays there."""
 
-    start: float = described("initial value")
-    end: float = described("final value")
-    steps: int = described("steps of the exponential decay from the initial to the final value; constant afterwards")
-
-    def __post_init__(self) -> None:
-        if not (0 < self.start < math.inf and 0 < self.end < math.inf and self.steps >= 1):
-            raise ValueError(
-                "a learning rate needs start and end above 0 and steps of at least 1, "
-                f"got {self.start:g}, {self.end:g} and {self.steps}"
-            )
+    start: float = option("initial value", above=0, below=math.inf)
+    end: float = option("final value", above=0, below=math.inf)
+    steps: int = option(
+        "steps of the exponential decay from the initial to the final value; constant afterwards", at_least=1
+    )
 
     def at(self, step: int) -> float:
         """The rate of a step, which are counted from 1."""
@@ -110,22 +88,21 @@ class Rate:
 
 
 @dataclass(frozen=True)
-class RatesConfig:
+class RatesConfig(Options):
     """Adam's learning rates, for each parameter of the Gaussians and for the field's hash tables and its MLP."""
 
-    means: Rate = described("learning rate of the means, world units per step")
-    log_scales: float = described("learning rate of the log-scales")
-    quats: float = described("learning rate of the rotations (quaternions)")
-    opacity_logits: float = described("learning rate of the opacities (logits)")
-    sh_dc: float = described("learning rate of the base colors (spherical harmonics of degree 0)")
-    sh_rest: float = described("learning rate of the view-dependent colors (spherical harmonics of degree 1 to 3)")
-    dynamics: float = described("learning rate of the per-Gaussian dynamics attributes")
-    hash: Rate = described("learning rate of the field's hash tables or feature planes")
-    mlp: Rate = described("learning rate of the field's MLP weights")
-    frequencies: Rate = described("learning rate of the motion spectrum's frequencies, cycles per clip per step")
-
-    def __post_init__(self) -> None:
-        self.schedules()
+    means: Rate = option("learning rate of the means, world units per step")
+    log_scales: float = option("learning rate of the log-scales", above=0)
+    quats: float = option("learning rate of the rotations (quaternions)", above=0)
+    opacity_logits: float = option("learning rate of the opacities (logits)", above=0)
+    sh_dc: float = option("learning rate of the base colors (spherical harmonics of degree 0)", above=0)
+    sh_rest: float = option(
+        "learning rate of the view-dependent colors (spherical harmonics of degree 1 to 3)", above=0
+    )
+    dynamics: float = option("learning rate of the per-Gaussian dynamics attributes", above=0)
+    hash: Rate = option("learning rate of the field's hash tables or feature planes")
+    mlp: Rate = option("learning rate of the field's MLP weights")
+    frequencies: Rate = option("learning rate of the motion spectrum's frequencies, cycles per clip per step")
 
     def schedules(self) -> dict[str, Rate]:
         """Parameter name, or group of the field -> schedule."""
@@ -134,74 +111,63 @@ class RatesConfig:
 
 
 @dataclass(frozen=True)
-class DensityConfig:
+class DensityConfig(Options):
     """Densification and pruning."""
 
-    start: int = described("densify and prune only after this step")
-    stop: int = described("densify, prune and reset opacities only before this step")
-    interval: int = described("densify and prune every this many steps")
-    gradient: float = described(
+    start: int = option("densify and prune only after this step")
+    stop: int = option("densify, prune and reset opacities only before this step")
+    interval: int = option("densify and prune every this many steps", at_least=1)
+    gradient: float = option(
         "densify (clone or split) Gaussians whose mean gradient norm of the 2-D mean exceeds this value; "
         "normalized device coordinates, where the image is 2 units wide"
     )
-    split_size: float = described(
+    split_size: float = option(
         "largest standard deviation of a Gaussian that is cloned; larger ones are split; relative to the "
-        "extent of the cameras"
+        "extent of the cameras (1.1 times the largest distance of a training camera from their mean)",
+        above=0,
     )
-    split: Split = described(
+    split: Split = option(
         "which large Gaussians above the gradient threshold are split; plain: all; adaptive (the paper's): "
         "those that differ most from their neighbors in shape and dynamics"
     )
-    neighbours: int = described("adaptive split: number of nearest neighbors that each Gaussian is compared with")
-    divergence_weight: float = described(
-        "adaptive split: weight of the difference in dynamics relative to the difference in shape"
+    neighbours: int = option(
+        "adaptive split: number of nearest neighbors that each Gaussian is compared with", at_least=1
     )
-    split_quantile: float = described(
+    divergence_weight: float = option(
+        "adaptive split: weight of the difference in dynamics relative to the difference in shape",
+        at_least=0,
+        below=math.inf,
+    )
+    split_quantile: float = option(
         "adaptive split: fraction of the candidates, those with the lowest scores, that are not split unless "
-        "their dynamics differ strongly"
+        "their dynamics differ strongly",
+        at_least=0,
+        at_most=1,
     )
-    min_opacity: float = described(
-        "prune Gaussians with an opacity below this value; the 256 most opaque ones always stay"
+    min_opacity: float = option(
+        "prune Gaussians with an opacity below this value; the 256 most opaque ones always stay", at_least=0, below=1
     )
-    max_screen_radius: float = described(
+    max_screen_radius: float = option(
         "prune Gaussians that had a larger radius in a rendered image, pixels; applies after the first "
         "opacity reset; 0: no limit"
     )
-    max_world_size: float = described(
+    max_world_size: float = option(
         "prune Gaussians with a larger standard deviation, relative to the extent of the cameras; applies "
         "after the first opacity reset; 0: no limit"
     )
-    reset_interval: int = described("reset the opacities every this many steps")
-    reset_opacity: float = described("an opacity reset lowers all larger opacities to this value")
-    limit: int = described(
+    reset_interval: int = option("reset the opacities every this many steps", at_least=1)
+    reset_opacity: float = option("an opacity reset lowers all larger opacities to this value", above=0, below=1)
+    limit: int = option(
         "maximum number of Gaussians; at the limit, those with the largest gradients are densified first; 0: no limit",
         0,
     )
-    min_contribution: float = described(
+    min_contribution: float = option(
         "prune Gaussians whose blending weights sum to less than this in every training image that is tried, pixels; "
         "at most 50 images are tried, evenly chosen over the clip; 0: no such pruning",
         0.0,
+        at_least=0,
     )
-    contribution_interval: int = described("prune by min_contribution every this many steps", 500)
-
-    def __post_init__(self) -> None:
-        if min(self.interval, self.reset_interval, self.contribution_interval) < 1:
-            raise ValueError(
-                "interval, reset_interval and contribution_interval must be at least 1 step, got "
-                f"{self.interval}, {self.reset_interval} and {self.contribution_interval}"
-            )
-        if self.min_contribution < 0:
-            raise ValueError(f"min_contribution must be at least 0 pixels, got {self.min_contribution:g}")
-        if self.split_size <= 0 or not (0 < self.reset_opacity < 1 and 0 <= self.min_opacity < 1):
-            raise ValueError(
-                "split_size must be above 0, reset_opacity and min_opacity between 0 and 1, "
-                f"got {self.split_size:g}, {self.reset_opacity:g} and {self.min_opacity:g}"
-            )
-        if self.neighbours < 1 or not (0 <= self.divergence_weight < math.inf and 0 <= self.split_quantile <= 1):
-            raise ValueError(
-                "neighbours must be at least 1, divergence_weight at least 0, and split_quantile between 0 and 1, "
-                f"got {self.neighbours}, {self.divergence_weight:g} and {self.split_quantile:g}"
-            )
+    contribution_interval: int = option("prune by min_contribution every this many steps", 500, at_least=1)
 
     def changes_at(self, step: int) -> bool:
         """Whether Gaussians are cloned, split and pruned after this step (counted from 1)."""
@@ -229,26 +195,24 @@ class LossWeights(NamedTuple):
 
 
 @dataclass(frozen=True)
-class LossConfig:
+class LossConfig(Options):
     """The training loss."""
 
-    ssim: float = described("weight w of the structural similarity; the image loss is (1 - w) L1 + w (1 - SSIM)")
-    pyramid: float = described(
+    ssim: float = option(
+        "weight w of the structural similarity; the image loss is (1 - w) L1 + w (1 - SSIM)", at_most=1
+    )
+    pyramid: float = option(
         "weight of the Laplacian pyramid loss (L1 between the pyramids of the two images), added to the image "
         "loss; 0: off"
     )
-    ncc: float = described(
+    ncc: float = option(
         "weight of 1 - local normalized cross-correlation, added to the image loss after the warm-up; 0: off"
     )
-    dynamics: float = described("weight of the regularization of the dynamics attributes (paper eq. 12)")
-    dynamics_mode: DynamicsMode = described(
+    dynamics: float = option("weight of the regularization of the dynamics attributes (paper eq. 12)")
+    dynamics_mode: DynamicsMode = option(
         "sign of the dynamics regularization; literal: pulls outliers towards the mean, as in the paper's "
         "equation; promote: pushes outliers away, as in the paper's text; off: no regularization"
     )
-
-    def __post_init__(self) -> None:
-        if self.ssim > 1:
-            raise ValueError(f"ssim is a share and must be at most 1, got {self.ssim:g}")
 
     def weights(self, *, warm: bool) -> LossWeights:
         """Of the image losses' terms; warm: whether the warm-up is over."""
@@ -256,64 +220,56 @@ class LossConfig:
 
 
 @dataclass(frozen=True)
-class SmoothnessConfig:
+class SmoothnessConfig(Options):
     """The smoothness loss: squared differences of the field's features at nearby points (Grid4D)."""
 
-    static: float = described("weight of the smoothness loss on the features of the spatial grid")
-    temporal: float = described("weight of the smoothness loss on the features of the space-time grids")
-    share: float = described(
-        "fraction of the Gaussians that the smoothness loss samples in each step, between 0 and 1; 0: off"
+    static: float = option(
+        "weight of the smoothness loss (squared differences between features at nearby points), spatial grid"
     )
-    reach: float = described("largest offset between the two sampled positions along each axis, world units")
-    time_reach: float = described("largest offset between the two sampled times, as a fraction of the clip")
-
-    def __post_init__(self) -> None:
-        if self.share > 1:
-            raise ValueError(f"share must be at most 1, got {self.share:g}")
+    temporal: float = option("weight of the smoothness loss, space-time grids")
+    share: float = option(
+        "fraction of the Gaussians that the smoothness loss samples in each step, between 0 and 1; 0: off", at_most=1
+    )
+    reach: float = option("largest offset between the two sampled positions along each axis, world units")
+    time_reach: float = option("largest offset between the two sampled times, as a fraction of the clip")
 
 
 @dataclass(frozen=True)
-class DiscoveryConfig:
+class DiscoveryConfig(Options):
     """Motion discovery before the training (train/discovery). Has defaults, since older config.toml files lack it."""
 
-    enabled: bool = described(
+    enabled: bool = option(
         "before training, search for objects that move far, and initialize Gaussians on them; skipped for the "
         "field static and if schedule.steps is at most discovery.steps",
         False,
     )
-    steps: int = described("training steps of the static model that separates what moves from what does not", 800)
-    size: int = described("longer side of the images for this search, pixels", 100)
-    field_steps: int = described("steps that fit the deformation field to the motion that was found", 500)
-    least: float = described(
+    steps: int = option(
+        "training steps of the static model that separates what moves from what does not", 800, at_least=1
+    )
+    size: int = option("longer side of the images for this search, pixels", 100, at_least=16)
+    field_steps: int = option("steps that fit the deformation field to the motion that was found", 500, at_least=1)
+    least: float = option(
         "minimum fraction of the moving surface points that the static model must miss; below it, no "
         "Gaussians are added",
         0.05,
+        at_most=1,
     )
-
-    def __post_init__(self) -> None:
-        if min(self.steps, self.field_steps) < 1 or self.size < 16 or self.least > 1:
-            raise ValueError(
-                "steps and field_steps must be at least 1, size at least 16 and least at most 1, "
-                f"got {self.steps}, {self.field_steps}, {self.size} and {self.least:g}"
-            )
 
 
 @dataclass(frozen=True)
-class ExposureConfig:
+class ExposureConfig(Options):
     """Per-image color correction. Has defaults, since older config.toml files lack it."""
 
-    enabled: bool = described(
+    enabled: bool = option(
         "learn an affine color correction for each training image, for cameras with varying exposure or white "
         "balance; never applied in evaluation",
         False,
     )
-    rate: Rate = dataclasses.field(
-        default=Rate(2e-2, 2e-3, 20_000), metadata={"help": "learning rate of the color corrections"}
-    )
+    rate: Rate = option("learning rate of the color corrections", Rate(2e-2, 2e-3, 20_000))
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(Options):
     """The configuration of a training."""
 
     data: DataConfig
@@ -324,15 +280,15 @@ class Config:
     density: DensityConfig
     loss: LossConfig
     smoothness: SmoothnessConfig
-    seed: int = described("seed of all random numbers")
-    exposure: ExposureConfig = dataclasses.field(default=ExposureConfig())
-    discovery: DiscoveryConfig = dataclasses.field(default=DiscoveryConfig())
-    precision: Precision = described(
+    seed: int = option("seed of all random numbers")
+    exposure: ExposureConfig = option("", ExposureConfig())
+    discovery: DiscoveryConfig = option("", DiscoveryConfig())
+    precision: Precision = option(
         "data type of the field's features and of its decoder's matrix products and their gradients; bfloat16 "
         "is faster on processors with bfloat16 instructions; everything else is float32",
         "float32",
     )
-    decoder: DecoderPlace = described(
+    decoder: DecoderPlace = option(
         "where the decoder of the fields grid4d and laplacian runs during training; torch: on the CPU; "
         "device: as kernels on the device, which changes the last bits; auto: torch on CPU devices, otherwise "
         "the faster of the two in a trial at the start, recorded in config.toml",
@@ -340,6 +296,7 @@ class Config:
     )
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.decoder == "device" and not self.field.decodes_on_device:
             raise ValueError(
                 "decoder device is for the fields grid4d and laplacian with field.depth 0 and field.motion laplacian, "

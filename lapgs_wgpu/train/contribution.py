@@ -37,7 +37,7 @@ def contributions(scene: Scene4D, views: Sequence[View], *, moving: bool) -> Ten
 
 
 def _blending_weights(gaussians: Gaussians[Tensor], view: View, scene: Scene4D) -> Tensor:
-    """(N,) their sums over the pixels of a view: the gradient of the sum of the image by the colours."""
+    """(N,) their sums over the pixels of a view: the gradient of the sum of the image by the colors."""
     colors = torch.zeros_like(gaussians.means, requires_grad=True)
     shape = gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities
     rendering = rasterize(*shape, colors, view.camera, depth=False, device=scene.device)

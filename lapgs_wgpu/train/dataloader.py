@@ -15,7 +15,7 @@ from lapgs_wgpu.data.views import ImageCache, View, composite
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.train.config import Background
-from lapgs_wgpu.train.evaluate import COLOURS
+from lapgs_wgpu.train.evaluate import BACKGROUND_LEVELS
 from lapgs_wgpu.train.truth_cache import TruthCache
 
 AHEAD = 8  # pictures that are decoded before they are needed
@@ -37,8 +37,8 @@ class Pictures:
         generator: torch.Generator,
         device: Device,
     ) -> None:
-        self._colour = None if background == "random" else torch.full((3,), COLOURS[background])
-        self._views = views if self._colour is None else tuple(_on_background(v, self._colour.numpy()) for v in views)
+        self._color = None if background == "random" else torch.full((3,), BACKGROUND_LEVELS[background])
+        self._views = views if self._color is None else tuple(_on_background(v, self._color.numpy()) for v in views)
         bound = int(cache_gb * 1e9)
         in_memory = bound
         if device.info.kind in ("cpu", "integrated"):
@@ -63,17 +63,13 @@ class Pictures:
         view = self._views[self.order.pop(0)]
         coming = (self._views[i] for i in self.order[:AHEAD])
         self._cache.prefetch(each for each in coming if each not in self._truths)
-        return view, torch.rand(3, generator=self._generator) if self._colour is None else self._colour
+        return view, torch.rand(3, generator=self._generator) if self._color is None else self._color
 
     def on_device(self, view: View) -> DeviceArray:
         """The picture of a view that `choose` gave, for `render_loss`."""
         return self._truths.get(view, partial(self._cache.get, view))
 
 
-def _on_background(view: View, colour: NDArray[np.float32]) -> View:
+def _on_background(view: View, color: NDArray[np.float32]) -> View:
     """The view without transparency, so that it is laid on its background once and not at every step."""
-    return dataclasses.replace(view, pixels=partial(_flat, view, colour))
-
-
-def _flat(view: View, colour: NDArray[np.float32]) -> NDArray[np.uint8]:
-    return composite(view.load(), colour)
+    return dataclasses.replace(view, pixels=lambda: composite(view.load(), color))

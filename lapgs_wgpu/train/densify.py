@@ -8,16 +8,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from lapgs_wgpu.splat.camera import Camera
-from lapgs_wgpu.splat.rasterize import Seen
+from lapgs_wgpu.splat.rasterize import Rendering
 from lapgs_wgpu.splat.rotation import rotation_matrices
 from lapgs_wgpu.train.adaptive_split import adaptive_split
 from lapgs_wgpu.train.config import DensityConfig
+from lapgs_wgpu.train.fused_loss import RenderLoss
 
 CHILDREN = 2  # of a split Gaussian
 # The most opaque Gaussians stay, these many or a quarter of all: where images show little but the background, all
@@ -28,6 +30,7 @@ SHRINK = 0.8 * CHILDREN  # how much smaller the children are
 Rows = Mapping[str, Tensor]
 
 
+@dataclass
 class Statistics:
     """What was seen of N Gaussians since the last change of their number.
 
@@ -35,12 +38,16 @@ class Statistics:
     each was visible. radii (N,): the largest radius on an image, in pixels.
     """
 
-    def __init__(self, count: int, device: torch.device) -> None:
-        self.gradients = torch.zeros(count, device=device)
-        self.views = torch.zeros(count, device=device)
-        self.radii = torch.zeros(count, device=device)
+    gradients: Tensor
+    views: Tensor
+    radii: Tensor
 
-    def add(self, rendering: Seen, camera: Camera, *, scale: float = 1.0) -> None:
+    @staticmethod
+    def zeros(count: int, device: torch.device) -> Statistics:
+        """Nothing was seen yet."""
+        return Statistics(*torch.zeros(3, count, device=device).unbind())
+
+    def add(self, rendering: Rendering | RenderLoss, camera: Camera, *, scale: float = 1.0) -> None:
         """Take in a rendering after its backward pass. scale: of its gradients, where its loss had a share in a sum."""
         pixels = rendering.means2d.grad
         if pixels is None:
@@ -58,19 +65,9 @@ class Statistics:
             self.views += other.views
             self.radii = torch.maximum(self.radii, other.radii)
 
-    def state(self) -> dict[str, Tensor]:
-        """All that was noted."""
-        return {"gradients": self.gradients, "views": self.views, "radii": self.radii}
-
-    def restore(self, state: Mapping[str, Tensor]) -> None:
-        """Go on from what `state` gave."""
-        self.gradients, self.views, self.radii = state["gradients"], state["views"], state["radii"]
-
     def of(self, keep: Tensor) -> Statistics:
-        """Those of the Gaussians of a mask (N,)."""
-        kept = Statistics(0, keep.device)
-        kept.restore({name: values[keep] for name, values in self.state().items()})
-        return kept
+        """The statistics of the Gaussians of a mask (N,)."""
+        return Statistics(*(values[keep] for values in vars(self).values()))
 
     @property
     def mean_gradients(self) -> Tensor:
@@ -79,13 +76,10 @@ class Statistics:
 
 
 class Change(NamedTuple):
-    """keep: (N,) which Gaussians stay. added: rows (M, ...) to append. cloned, split, pruned: how many, for the log."""
+    """keep: (N,) bool, which Gaussians stay. added: rows (M, ...) to append."""
 
     keep: Tensor
     added: dict[str, Tensor]
-    cloned: int
-    split: int
-    pruned: int
 
 
 @torch.no_grad()
@@ -125,13 +119,7 @@ def densify(
     # A Gaussian that was just born has not been seen on any image.
     unseen = torch.zeros_like(born["opacity_logits"])
     stillborn = prunable(born, unseen, config, extent, bound_sizes=bound_sizes)
-    return Change(
-        keep=~(split | prune),
-        added={name: row[~stillborn] for name, row in born.items()},
-        cloned=int(clone.sum()),
-        split=int(split.sum()),
-        pruned=int((prune & ~split).sum()) + int(stillborn.sum()),
-    )
+    return Change(keep=~(split | prune), added={name: row[~stillborn] for name, row in born.items()})
 
 
 def split_rows(parents: Rows, generator: torch.Generator) -> dict[str, Tensor]:

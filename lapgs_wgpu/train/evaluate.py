@@ -33,7 +33,7 @@ ERROR_GAIN = 4  # of the error pictures
 MEASURES = ("psnr", "ssim", "ms_ssim", "lpips", "lpips_unscaled", "masked_psnr", "masked_ssim")
 MOTION_MEASURES = ("psnr_moving", "psnr_still")  # of views of which motion masks are known
 NOT_AVAILABLE = "not available"
-COLOURS = {"black": 0.0, "white": 1.0, "random": 0.0}  # of the background under test views
+BACKGROUND_LEVELS = {"black": 0.0, "white": 1.0, "random": 0.0}  # of the background under test views
 
 
 def evaluate(
@@ -60,20 +60,20 @@ def evaluate(
     Raises InputError where a picture or a mask cannot be read.
     """
     start = time.perf_counter()
-    colour = torch.full((3,), COLOURS[background])
+    color = torch.full((3,), BACKGROUND_LEVELS[background])
     rows = []
     frames = []
     listed = any(view.objects for view in views)
-    medians = still_backgrounds(views, partial(_on, colour)) if not listed and static is None else [None] * len(views)
+    medians = still_backgrounds(views, partial(_on, color)) if not listed and static is None else [None] * len(views)
     for view, still in zip(views, medians, strict=True):
-        truth = _on(colour, view)
-        image = _render(scene, view, colour)
+        truth = _on(color, view)
+        image = _render(scene, view, color)
         row: dict[str, Any] = {"view": view.name, "time": view.time}
         row |= _measures(_unit(image), _unit(truth), view.load_mask(), lpips)
-        frames.append(measure_objects(image, truth, view.objects, colour.numpy()))
+        frames.append(measure_objects(image, truth, view.objects, color.numpy()))
         if not listed:
             if static is not None:
-                row |= _moving(image, truth, differs_from_static(truth, _render(static, view, colour)))
+                row |= _moving(image, truth, differs_from_static(truth, _render(static, view, color)))
             elif still is not None:
                 row |= _moving(image, truth, differs_from_median(truth, still))
         rows.append(row)
@@ -98,14 +98,14 @@ def evaluate(
     }
 
 
-def _on(colour: Tensor, view: View) -> NDArray[np.uint8]:
+def _on(color: Tensor, view: View) -> NDArray[np.uint8]:
     """The ground truth of a view on a background: (H, W, 3)."""
-    return composite(view.load(), colour.numpy())
+    return composite(view.load(), color.numpy())
 
 
-def _render(scene: Scene4D, view: View, colour: Tensor) -> NDArray[np.uint8]:
+def _render(scene: Scene4D, view: View, color: Tensor) -> NDArray[np.uint8]:
     """The rendering of a view on a background: (H, W, 3)."""
-    return to_8_bit(scene.render(view.camera, view.time, colour, depth=False).image)
+    return to_8_bit(scene.render(view.camera, view.time, color, depth=False).image)
 
 
 def _moving(image: NDArray[np.uint8], truth: NDArray[np.uint8], pixels: NDArray[np.bool_]) -> dict[str, float]:

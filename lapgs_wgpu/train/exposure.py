@@ -1,6 +1,6 @@
-"""Exposure: an affine correction of the colours for each training picture of a camera that does not keep its own.
+"""Exposure: an affine correction of the colors for each training picture of a camera that does not keep its own.
 
-A correction is a matrix (3, 4): corrected colour = its first three columns times the colour, plus its last one. It is
+A correction is a matrix (3, 4): corrected color = its first three columns times the color, plus its last one. It is
 applied to the rendered image before the losses, and never to a view that is measured.
 """
 
@@ -20,11 +20,6 @@ from .config import Rate
 
 MEAN_DECAY, SQUARE_DECAY = 0.9, 0.999  # Adam's
 TINY = 1e-15  # keeps 0 / 0 away
-
-
-def exposure(image: Tensor, correction: Tensor) -> Tensor:
-    """The image (H, W, 3) after a correction (3, 4): the reference of the passes."""
-    return image @ correction[:, :3].mT + correction[:, 3]
 
 
 class Exposed(NamedTuple):
@@ -69,9 +64,11 @@ class ExposurePasses:
 class Exposures:
     """The corrections of all training pictures, (V, 3, 4), the identity at first, and how they learn.
 
-    Adam, but a picture's moments and step count stand still while other pictures are trained on. Colours that all
+    Adam, but a picture's moments and step count stand still while other pictures are trained on. Colors that all
     corrections share belong to the scene, which is measured without any: the mean of all stays the identity.
     """
+
+    name = "exposures"
 
     def __init__(self, count: int, rate: Rate) -> None:
         self._identity = torch.eye(3, 4)
@@ -80,18 +77,6 @@ class Exposures:
         self._mean = torch.zeros(count, 3, 4)
         self._square = torch.zeros(count, 3, 4)
         self._steps = torch.zeros(count, 1, 1)
-
-    def parameters(self) -> dict[str, list[Tensor]]:
-        """The corrections."""
-        return {"exposures": [self.values]}
-
-    def gradients(self) -> dict[str, list[Tensor]]:
-        """Their gradient, if they have one."""
-        return {} if self.values.grad is None else {"exposures": [self.values.grad]}
-
-    def zero_grad(self) -> None:
-        """Forget it."""
-        self.values.grad = None
 
     @torch.no_grad()
     def step(self, step: int) -> None:

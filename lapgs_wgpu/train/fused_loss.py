@@ -15,9 +15,10 @@ from ..gpu.kernel import Commands
 from ..splat.camera import Camera
 from ..splat.gaussians import Gaussians
 from ..splat.rasterize import gradient_tensors, radii_and_centres, rasterizer_of, upload_gaussians
+from .config import LossWeights
 from .exposure import ExposurePasses
 from .image_loss import ImageLoss
-from .losses import LEAST_ERROR, LossWeights
+from .losses import LEAST_ERROR
 
 
 class RenderLoss(NamedTuple):
@@ -36,16 +37,8 @@ class RenderLoss(NamedTuple):
         return -10.0 * float(np.log10(max(self.terms["mse"], LEAST_ERROR)))
 
 
-@functools.cache
-def image_loss_of(device: Device) -> ImageLoss:
-    """The losses that `render_loss` uses on this device; their buffers serve all calls."""
-    return ImageLoss(device)
-
-
-@functools.cache
-def exposure_of(device: Device) -> ExposurePasses:
-    """The passes of `render_loss`'s correction on this device."""
-    return ExposurePasses(device)
+# The passes of a device, whose buffers serve all calls of `render_loss`.
+image_loss_of, exposure_of = functools.cache(ImageLoss), functools.cache(ExposurePasses)
 
 
 def render_loss(
@@ -57,11 +50,11 @@ def render_loss(
     device: Device,
     correction: Tensor | None = None,
 ) -> RenderLoss:
-    """The loss of the Gaussians' image (train/losses.total), computed on the device from end to end.
+    """The weighted sum of the image losses of the rendered Gaussians, computed on the device from end to end.
 
     gaussians: activated, float32, with harmonics. truth: (H, W) as `upload_rgba` leaves it, of the camera's size.
     background: (3,) in [0, 1], under both; not differentiable. weights: of the terms. correction: (3, 4), of the
-    image's colours before they are compared (train/exposure); none where None.
+    image's colors before they are compared (train/exposure); none where None.
     The same bits on every run of one adapter and driver. Under torch.no_grad(), or where no tensor wants a gradient,
     none is computed.
     """

@@ -1,4 +1,4 @@
-"""The image losses and their gradient on the device: what train/losses computes in torch, as passes over buffers.
+"""The image losses and their gradient on the device.
 
 The order of the passes is that of `ImageLoss.record`; docs/architecture.md lists them. Nothing here waits for the
 device.
@@ -14,7 +14,8 @@ from ..gpu.array import DeviceArray
 from ..gpu.device import Device
 from ..gpu.kernel import Commands, Kernel
 from ..gpu.pool import BufferPool
-from .losses import NCC_WINDOW, LossWeights, pyramid_sizes, pyramid_weights
+from .config import LossWeights
+from .losses import NCC_WINDOW, pyramid_sizes, pyramid_weights
 
 TERMS = 5  # in the buffer that `record` leaves
 _WHOLE = 1 << 14  # longer than any side of an image: a lane takes a whole row or column

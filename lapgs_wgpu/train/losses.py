@@ -1,7 +1,6 @@
-"""Image losses and measures: L1, SSIM, Laplacian pyramid, NCC, PSNR. Images are (H, W, 3) in [0, 1].
+"""Measures of images: SSIM, MS-SSIM, PSNR; and the sizes of the image losses. Images are (H, W, 3) in [0, 1].
 
-In plain torch, differentiable, of any float dtype, all sums in a fixed order: what the kernels of train/image_loss are
-held to.
+In torch, differentiable, for any float dtype; all sums have a fixed order.
 """
 
 from __future__ import annotations
@@ -12,38 +11,16 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from .config import LossWeights
+from ..splat.constants import CONSTANTS
 
 SSIM_WINDOW = 11
 SSIM_SIGMA = 1.5  # pixels
-SSIM_C1 = 0.01**2
-SSIM_C2 = 0.03**2
+SSIM_C1, SSIM_C2 = CONSTANTS["SSIM_C1"], CONSTANTS["SSIM_C2"]
 MS_SSIM_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)  # of the scales, the finest first
 MS_SSIM_SMALLEST = (SSIM_WINDOW - 1) * 2 ** (len(MS_SSIM_WEIGHTS) - 1) + 1  # 161: the coarsest has one window
 PYRAMID_BANDS = 3  # band-pass levels; below them lies the residual
-PYRAMID_TAPS = (1.0, 4.0, 6.0, 4.0, 1.0)  # sum 16
 NCC_WINDOW = 11
-NCC_E = 1e-4  # a covariance; what varies less counts as flat
-NCC_TINY = 1e-14  # keeps the square root differentiable; its own root lies far below NCC_E
-LUMINANCE = (0.299, 0.587, 0.114)  # Rec. 601, which is meant for gamma-encoded pictures such as ours
 LEAST_ERROR = 1e-10  # mean squared error that PSNR takes equal images to have: 100 dB
-
-
-def total(image: Tensor, target: Tensor, weights: LossWeights) -> Tensor:
-    """The weighted sum of all image losses, a scalar; with l1 0.8 and ssim 0.2 that of 3DGS (Kerbl et al. 2023)."""
-    loss = weights.l1 * l1(image, target)
-    if weights.ssim:
-        loss = loss + weights.ssim * (1 - ssim(image, target))
-    if weights.pyramid:
-        loss = loss + weights.pyramid * pyramid_loss(image, target)
-    if weights.ncc:
-        loss = loss + weights.ncc * ncc_loss(image, target)
-    return loss
-
-
-def l1(image: Tensor, target: Tensor) -> Tensor:
-    """Mean absolute difference."""
-    return (image - target).abs().mean()
 
 
 def ssim(image: Tensor, target: Tensor) -> Tensor:
@@ -119,45 +96,6 @@ def pyramid_weights(levels: int) -> list[float]:
     return [weight / sum(weights) for weight in weights]
 
 
-def pyramid_loss(image: Tensor, target: Tensor) -> Tensor:
-    """Weighted mean absolute difference of the levels of two Laplacian pyramids (Burt and Adelson 1983), a scalar.
-
-    3 band-pass levels and the low-pass residual, 5x5 binomial kernel, borders reflected (without repeating the border
-    pixel); `pyramid_sizes` says what becomes of small images, `pyramid_weights` what each level counts. Since pyramids
-    are linear, it is that of the difference.
-    """
-    level = (image - target).permute(2, 0, 1)
-    sizes = pyramid_sizes(*level.shape[1:])
-    loss = level.new_zeros(())
-    for weight, coarse in zip(pyramid_weights(len(sizes)), [*sizes[1:], None], strict=True):
-        if coarse is None:
-            return loss + weight * level.abs().mean()
-        below = _binomial(level)[:, ::2, ::2]
-        loss = loss + weight * (level - _enlarge(below, level.shape[1], level.shape[2])).abs().mean()
-        level = below
-    raise AssertionError("the last level is the residual")
-
-
-def ncc_loss(image: Tensor, target: Tensor) -> Tensor:
-    """1 - mean local normalised cross-correlation of the luminances, a scalar.
-
-    (covariance + e) / (sqrt(variance variance + tiny) + e) over every 11x11 window that lies inside the image. Hence a
-    flat window agrees with every other (what it lacks, the other losses see), and brightness and contrast do not count,
-    as long as the variances are well above e. An image with a side below 11 pixels has no window: its loss is 0.
-    """
-    if min(image.shape[:2]) < NCC_WINDOW:
-        return 0.0 * image.sum()
-    weights = image.new_tensor(LUMINANCE)
-    a, b = image @ weights, target @ weights
-    mean_a, mean_b, aa, bb, ab = functional.avg_pool2d(torch.stack([a, b, a * a, b * b, a * b]), NCC_WINDOW, stride=1)
-    covariance = ab - mean_a * mean_b
-    variances = (
-        (aa - mean_a * mean_a).clamp(min=0),
-        (bb - mean_b * mean_b).clamp(min=0),
-    )
-    return 1 - ((covariance + NCC_E) / ((variances[0] * variances[1] + NCC_TINY).sqrt() + NCC_E)).mean()
-
-
 def psnr(image: Tensor, target: Tensor) -> float:
     """Peak signal-to-noise ratio in dB over all pixels and channels, at most 100 dB."""
     error = (image - target).square().mean().clamp(min=LEAST_ERROR)
@@ -196,18 +134,3 @@ def _window(dtype: torch.dtype, device: torch.device) -> Tensor:
     x = torch.arange(SSIM_WINDOW, dtype=torch.float64) - SSIM_WINDOW // 2
     weights = torch.exp(-x * x / (2 * SSIM_SIGMA**2))
     return (weights / weights.sum()).to(dtype=dtype, device=device)
-
-
-def _binomial(planes: Tensor) -> Tensor:
-    """(P, H, W) planes under the 5x5 binomial kernel, borders reflected; H and W are at least 3."""
-    taps = planes.new_tensor(PYRAMID_TAPS) / 16
-    padded = functional.pad(planes[None], (2, 2, 2, 2), mode="reflect")
-    kernel = (taps[:, None] * taps).expand(len(planes), 1, 5, 5)
-    return functional.conv2d(padded, kernel, groups=len(planes))[0]
-
-
-def _enlarge(planes: Tensor, height: int, width: int) -> Tensor:
-    """(P, height, width): planes with zeros between their pixels, under four times the kernel. A constant stays one."""
-    spread = planes.new_zeros(len(planes), height, width)
-    spread[:, ::2, ::2] = planes
-    return 4 * _binomial(spread)

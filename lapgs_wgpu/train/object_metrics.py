@@ -1,15 +1,15 @@
 """How well a rendering shows a moving object, from images alone: PSNR, silhouette and displacement of each object.
 
-A rendering's silhouette of an object is found by colour, so the measure is the same for every representation. A pixel
+A rendering's silhouette of an object is found by color, so the measure is the same for every representation. A pixel
 is claimed for the object where the rendering
 
 - differs from the clean plate (the true view without the object) by at least CONTRAST of what the truth differs there
   or, outside the true mask, of the median of that difference over the mask: a ghost of low opacity claims nothing; and
-- is nearer to a colour of the object than to any colour of the clean plate: blurred or misplaced parts of the rest of
+- is nearer to a color of the object than to any color of the clean plate: blurred or misplaced parts of the rest of
   the scene claim nothing.
 
 Pixels count within REACH diameters of the true mask, except those of other moving objects, and except those of the
-object that have the clean plate's colour.
+object that have the clean plate's color.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from statistics import mean, median
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import distance_transform_edt
+from scipy.spatial import cKDTree
 
 from lapgs_wgpu.data.objects import ObjectTruth
 from lapgs_wgpu.data.views import composite
@@ -119,9 +120,9 @@ def silhouette(
         return claimed, counted
     needed = CONTRAST * np.where(shown, contrast, np.median(contrast[shown & counted]))
     candidates = counted & (_norm(image, clean) >= np.maximum(needed, CONTRAST * LEAST_DIFFERENCE))
-    colours = image[candidates]
-    own = _to_nearest(colours, truth[whole])
-    rest = _to_nearest(colours, clean.reshape(-1, 3))
+    colors = image[candidates]
+    own = _to_nearest(colors, truth[whole])
+    rest = _to_nearest(colors, clean.reshape(-1, 3))
     claimed[candidates] = own <= rest
     return claimed, counted
 
@@ -170,21 +171,16 @@ def _entries(figures: Sequence[float] | NDArray[np.float64]) -> dict[str, float 
 
 
 def _norm(a: Image, b: Image) -> NDArray[np.float64]:
-    """Euclidean distance of the colours of two (H, W, 3) images, levels of 255: (H, W)."""
+    """Euclidean distance of the colors of two (H, W, 3) images, levels of 255: (H, W)."""
     return np.sqrt(np.square(a.astype(np.float64) - b).sum(axis=2))
 
 
-def _to_nearest(colours: Image, palette: Image) -> NDArray[np.float64]:
-    """Squared distances (n,) of colours (n, 3) from the nearest of a palette (m, 3), which is rounded to 8 levels."""
-    if not len(colours) or not len(palette):
-        return np.full(len(colours), np.inf)
-    coarse = np.unique(palette // 8, axis=0).astype(np.float32) * 8 + 3.5
-    distance = np.full(len(colours), np.inf, dtype=np.float32)
-    points = colours.astype(np.float32)
-    for start in range(0, len(coarse), 256):
-        apart = np.square(points[:, None] - coarse[None, start : start + 256]).sum(axis=2)
-        np.minimum(distance, apart.min(axis=1), out=distance)
-    return distance.astype(np.float64)
+def _to_nearest(colors: Image, palette: Image) -> NDArray[np.float64]:
+    """Distances (n,) of colors (n, 3) from the nearest of a palette (m, 3), which is rounded to 8 levels."""
+    if not len(colors) or not len(palette):
+        return np.full(len(colors), np.inf)
+    distance, _ = cKDTree(np.unique(palette // 8, axis=0) * 8.0 + 3.5).query(colors)
+    return np.asarray(distance)
 
 
 def _distance_from(mask: Mask) -> NDArray[np.float64]:

@@ -126,18 +126,12 @@ class FrequencyOptimizer:
         self._square = 0.0
         self._steps = 0
 
-    def parameters(self) -> dict[str, list[Tensor]]:
+    name = "frequencies"
+
+    @property
+    def values(self) -> Tensor:
         """The frequencies."""
-        return {"frequencies": [self._motion.frequencies]}
-
-    def gradients(self) -> dict[str, list[Tensor]]:
-        """The frequencies' gradient, if they have one."""
-        gradient = self._motion.frequencies.grad
-        return {} if gradient is None else {"frequencies": [gradient]}
-
-    def zero_grad(self) -> None:
-        """Forget it."""
-        self._motion.frequencies.grad = None
+        return self._motion.frequencies
 
     @torch.no_grad()
     def step(self, step: int) -> None:

@@ -26,13 +26,11 @@ if typing.TYPE_CHECKING:
 
 Floats = NDArray[np.floating[Any]]
 
-MOST_TRAJECTORIES = 12
 SAMPLE = 2000  # Gaussians among which those that move most are looked for
 VISIBLE = 0.1  # opacity from which on a Gaussian's trajectory says something about the scene
 TIMES = 64  # points of a trajectory
-# Okabe and Ito's colours, which people with any colour vision tell apart; without their yellow, too faint for lines.
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-STYLES = ("-", "--")  # the second round of colours is dashed
+# Okabe and Ito's colors, which people with any color vision tell apart; without their yellow, too faint for lines.
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 TIME_LABEL = "time t (0 to 1: the clip)"
 FREQUENCY_LABEL = "frequency $f_k$ (cycles per clip)"
 AMPLITUDE_LABEL = "amplitude $|c_k|$ (RMS over channels)"
@@ -104,7 +102,7 @@ def sample_trajectories(scene: Scene4D) -> tuple[Floats, Floats]:
     with torch.no_grad():
         places = np.stack([scene.at(float(t)).means.numpy(force=True)[sample] for t in times])
     travelled = np.linalg.norm(np.diff(places, axis=0), axis=2).sum(axis=0)
-    most = np.argsort(-travelled, kind="stable")[: len(COLOURS)]
+    most = np.argsort(-travelled, kind="stable")[: len(COLORS)]
     return times, places[:, most]
 
 
@@ -115,8 +113,8 @@ def training_curves(path: Path, steps: ArrayLike, loss: ArrayLike, psnr: ArrayLi
     figure = _figure(7, 7)
     panels = figure.subplots(3, 1, sharex=True)
     shown = ((loss, "loss (mean over 50 steps)"), (psnr, "PSNR, training views (dB)"), (gaussians, "Gaussians"))
-    for axes, (values, label), colour in zip(panels, shown, COLOURS, strict=False):
-        axes.plot(steps, values, color=colour, marker="." if np.size(steps) < 3 else None)
+    for axes, (values, label), color in zip(panels, shown, COLORS, strict=False):
+        axes.plot(steps, values, color=color, marker="." if np.size(steps) < 3 else None)
         axes.set_ylabel(label)
     panels[0].set_yscale("log")
     panels[0].yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
@@ -133,8 +131,8 @@ def spectrum(path: Path, frequencies: ArrayLike, amplitudes: ArrayLike) -> None:
     figure = _figure(7, 4)
     axes = figure.subplots()
     stems = axes.stem(frequencies, amplitudes, basefmt=" ")
-    stems.stemlines.set_color(COLOURS[0])
-    stems.markerline.set_color(COLOURS[0])
+    stems.stemlines.set_color(COLORS[0])
+    stems.markerline.set_color(COLORS[0])
     axes.set_xlim(left=min(0.0, float(np.min(frequencies))))
     axes.set_ylim(bottom=0)
     axes.set_xlabel(FREQUENCY_LABEL)
@@ -147,12 +145,12 @@ def spectrum_path(path: Path, steps: ArrayLike, frequencies: ArrayLike, amplitud
     figure = _figure(7, 7)
     panels = figure.subplots(2, 1, sharex=True)
     frequencies, amplitudes = np.asarray(frequencies), np.asarray(amplitudes)
-    # The colour goes with the last frequency, from low to high: K may be too many for colours by name.
+    # The color goes with the last frequency, from low to high: K may be too many for colors by name.
     order = np.argsort(np.argsort(frequencies[-1]))
-    colours = _colour_map(order / max(len(order) - 1, 1) * 0.9)
+    colors = _color_map(order / max(len(order) - 1, 1) * 0.9)
     for axes, values in zip(panels, (frequencies, amplitudes), strict=True):
-        for k, colour in enumerate(colours):
-            axes.plot(steps, values[:, k], color=colour)
+        for k, color in enumerate(colors):
+            axes.plot(steps, values[:, k], color=color)
     panels[0].set_ylabel(FREQUENCY_LABEL)
     panels[0].set_ylim(bottom=min(0.0, float(frequencies.min())))
     panels[1].set_ylabel(AMPLITUDE_LABEL)
@@ -166,9 +164,9 @@ def dynamics_histogram(path: Path, dynamics: ArrayLike) -> None:
     lengths = np.linalg.norm(np.asarray(dynamics), axis=1)
     figure = _figure(7, 4)
     axes = figure.subplots()
-    axes.hist(lengths, bins=60, color=COLOURS[0])
+    axes.hist(lengths, bins=60, color=COLORS[0])
     median = float(np.median(lengths))
-    axes.axvline(median, color=COLOURS[1], linestyle="--", label=f"median {median:.3g}")
+    axes.axvline(median, color=COLORS[1], linestyle="--", label=f"median {median:.3g}")
     axes.set_yscale("log")  # most Gaussians stand still: those that move would be no more than a line at the bottom
     axes.set_xlabel("length of the dynamics vector $\\|d_i\\|$ (no unit)")
     axes.set_ylabel("Gaussians")
@@ -177,20 +175,13 @@ def dynamics_histogram(path: Path, dynamics: ArrayLike) -> None:
 
 
 def trajectories(path: Path, times: ArrayLike, places: ArrayLike) -> None:
-    """x, y and z over the times (T,) of places (T, M, 3); M of at most 12."""
+    """x, y and z over the times (T,) of positions (T, M, 3); M is at most len(COLORS)."""
     places = np.asarray(places)
-    if places.shape[1] > MOST_TRAJECTORIES:
-        raise ValueError(f"at most {MOST_TRAJECTORIES} trajectories can be told apart, got {places.shape[1]}")
     figure = _figure(7, 8)
     panels = figure.subplots(3, 1, sharex=True)
     for axis, axes in enumerate(panels):
-        for i in range(places.shape[1]):
-            axes.plot(
-                times,
-                places[:, i, axis],
-                color=COLOURS[i % len(COLOURS)],
-                linestyle=STYLES[i // len(COLOURS)],
-            )
+        for place, color in zip(places[:, :, axis].T, COLORS, strict=False):
+            axes.plot(times, place, color=color)
         axes.set_ylabel(f"{'xyz'[axis]} (world units)")
     panels[-1].set_xlabel(TIME_LABEL)
     panels[-1].set_xlim(0, 1)
@@ -207,8 +198,8 @@ def _figure(width: float, height: float) -> Figure:
     return figure
 
 
-def _colour_map(shares: Floats) -> Floats:
-    """Colours (K, 4) of shares (K,) in [0, 1]: viridis, which grows lighter evenly."""
+def _color_map(shares: Floats) -> Floats:
+    """Colors (K, 4) of shares (K,) in [0, 1]: viridis, which grows lighter evenly."""
     from matplotlib import colormaps
 
     return np.asarray(colormaps["viridis"](shares))

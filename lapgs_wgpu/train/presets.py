@@ -8,41 +8,31 @@ from __future__ import annotations
 import dataclasses
 import importlib.resources
 import json
-import typing
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from lapgs_wgpu.errors import InputError, shown
-from lapgs_wgpu.io.dataclass_table import build_dataclass, checked, did_you_mean, field_types
+from lapgs_wgpu.io.dataclass_table import build_dataclass, checked, did_you_mean, field_types, from_text
 from lapgs_wgpu.io.safe_json_toml import read_toml
 from lapgs_wgpu.motion.fields.config import FieldKind
 from lapgs_wgpu.train.config import Config
 
 Table = dict[str, Any]
+ADVICE = '; add it, or start the file with base = "dnerf"'
 
 # The paper's parts beside its field: off for every other method.
 PAPER_ONLY = {"loss.pyramid": 0.0, "loss.ncc": 0.0, "density.split": "plain"}
-# The parts of the method that --ablate turns off: the keys that it sets, and its help text.
-ABLATIONS: dict[str, dict[str, Any]] = {
-    "laplacian": {"field.motion": "mlp"},
-    "dynamics": {"field.dynamics": 0},
-    "split": {"density.split": "plain"},
-    "lap": {"loss.pyramid": 0.0},
-    "ncc": {"loss.ncc": 0.0},
-    "dy": {"loss.dynamics_mode": "off"},
-    "hash": {"field.temporal_hash": False},
-    "appearance": {"field.appearance": "none"},
-}
-ABLATION_HELP = {
-    "laplacian": "motion spectrum, replaced by an MLP",
-    "dynamics": "dynamics attributes",
-    "split": "adaptive split",
-    "lap": "Laplacian pyramid loss",
-    "ncc": "cross-correlation loss",
-    "dy": "dynamics regularization",
-    "hash": "space-time hash grids",
-    "appearance": "color changes over time",
+# The parts of the method that --ablate turns off: help text, key, and value of the key without the part.
+ABLATIONS: dict[str, tuple[str, str, Any]] = {
+    "laplacian": ("motion spectrum, replaced by an MLP", "field.motion", "mlp"),
+    "dynamics": ("dynamics attributes", "field.dynamics", 0),
+    "split": ("adaptive split", "density.split", "plain"),
+    "lap": ("Laplacian pyramid loss", "loss.pyramid", 0.0),
+    "ncc": ("cross-correlation loss", "loss.ncc", 0.0),
+    "dy": ("dynamics regularization", "loss.dynamics_mode", "off"),
+    "hash": ("space-time hash grids", "field.temporal_hash", False),
+    "appearance": ("color changes over time", "field.appearance", "none"),
 }
 
 
@@ -66,15 +56,13 @@ def load_config(
     method that are left out (ABLATIONS). Overrides come last.
     Raises InputError where the preset, a key or a value is not valid.
     """
-    table = _read(preset)
     known = {key.name: key.kind for key in config_keys()}
-    for key, value in _shorthands(method, ablate).items():
-        _set(table, key, value)
+    table: Table = {}
     for key, text in (overrides or {}).items():
         if key not in known:
-            raise InputError(f"there is no option --{key}{did_you_mean(key, known)}.")
-        _set(table, key, checked(known[key], _from_text(text, known[key]), f"--{key}"))
-    return build_dataclass(Config, table, preset)
+            raise InputError(f"there is no option --{key}{did_you_mean(key, known)}")
+        _set(table, key, checked(known[key], from_text(text, known[key]), f"--{key}"))
+    return build_config(preset, table, preset, method=method, ablate=ablate)
 
 
 def build_config(
@@ -87,7 +75,7 @@ def build_config(
     base = _read(preset)
     for key, value in _shorthands(method, ablate).items():
         _set(base, key, value)
-    return build_dataclass(Config, merge(base, table), source)
+    return build_dataclass(Config, merge(base, table), source, advice=ADVICE)
 
 
 def _shorthands(method: str | None, ablate: Iterable[str]) -> dict[str, Any]:
@@ -99,8 +87,9 @@ def _shorthands(method: str | None, ablate: Iterable[str]) -> dict[str, Any]:
     for part in ablate:
         if part not in ABLATIONS:
             hint = did_you_mean(part, ABLATIONS)
-            raise InputError(f"--ablate knows {', '.join(ABLATIONS)}, not {shown(part)}{hint}.")
-        values |= ABLATIONS[part]
+            raise InputError(f"--ablate knows {', '.join(ABLATIONS)}, not {shown(part)}{hint}")
+        _, key, value = ABLATIONS[part]
+        values[key] = value
     return values
 
 
@@ -140,7 +129,7 @@ def _read(preset: str, seen: tuple[str, ...] = ()) -> Table:
         file = Path(str(importlib.resources.files("lapgs_wgpu.configs") / f"{preset}.toml"))
     else:
         names = preset_names()
-        hint = did_you_mean(preset, names) or f"; there are {', '.join(names)}, or give a .toml file."
+        hint = did_you_mean(preset, names, f"; there are {', '.join(names)}, or give a .toml file.")
         raise InputError(f"there is no preset {preset!r}{hint}")
     table = read_toml(file)
     table.pop("record", None)  # what a run noted about itself
@@ -167,20 +156,6 @@ def _set(table: Table, key: str, value: Any) -> None:
         inner = table.get(part)
         table[part] = table = dict(inner) if isinstance(inner, dict) else {}
     table[name] = value
-
-
-def _from_text(text: str | list[str], kind: Any) -> Any:
-    """Words of the command line as a value of this type; what is no number stays text, for `checked` to refuse."""
-    if isinstance(text, list):
-        return [_from_text(entry, part) for entry, part in zip(text, typing.get_args(kind), strict=True)]
-    if kind is bool:
-        return {"true": True, "false": False}.get(text, text)
-    if kind in (int, float):
-        try:
-            return kind(text)
-        except ValueError:
-            return text
-    return text
 
 
 def _toml_lines(table: Mapping[str, Any], prefix: str) -> Iterator[str]:

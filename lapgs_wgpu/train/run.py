@@ -14,7 +14,7 @@ from types import FrameType
 
 import torch
 
-from lapgs_wgpu.data.init import first_points
+from lapgs_wgpu.data.initial_gaussians import first_points
 from lapgs_wgpu.data.validation import check_in_view, check_times
 from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.errors import DeviceError, InputError, NumericalError

@@ -123,11 +123,9 @@ def load_state(out: Path) -> dict[str, NDArray[Any]] | None:
                 raise InputError(f"{path}: is not a regular file")
             with path.open("rb") as file:
                 state = unpack_tensors(file, path.stat().st_size, str(path))[0]
-        except InputError as error:
-            damaged = damaged or error
-            continue
-        except OSError as error:
-            damaged = damaged or InputError(f"{path}: cannot be read ({error.strerror or error})")
+        except (InputError, OSError) as error:
+            reason = str(error) if isinstance(error, InputError) else f"{path}: cannot be read ({error.strerror})"
+            damaged = damaged or InputError(reason)
             continue
         if damaged is not None:
             print(f"{damaged}; going on from {name}, which is older.", file=sys.stderr)

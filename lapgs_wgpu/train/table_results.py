@@ -11,40 +11,37 @@ from pathlib import Path
 from statistics import mean, stdev
 from typing import Any
 
-from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.errors import InputError, shown
 from lapgs_wgpu.io.atomic import atomic_write
+from lapgs_wgpu.io.dataclass_table import Options, build_dataclass, checked, option
 from lapgs_wgpu.io.safe_json_toml import read_json, read_toml
 from lapgs_wgpu.train.presets import Table, load_config
 from lapgs_wgpu.train.table_spec import Run, RunKey, fingerprint
 
 FORMAT = "lapgs-table 1"
-LARGEST = 1e15  # of a figure
 MOTION = ("psnr_moving", "found", "track_error")  # the figures that a run may lack
 
 
 @dataclass(frozen=True)
-class Result:
-    """A finished run. seconds: of the training alone. overrides: what its configuration changed of the preset.
+class Result(Options):
+    """A finished run."""
 
-    psnr_moving, found, track_error: where they were measured (docs/metrics.md).
-    """
-
-    scene: str
-    row: str
-    seed: int
-    fingerprint: str
-    psnr: float
-    ssim: float
-    gaussians: int
-    steps: int
-    seconds: float
-    size: list[int]
-    views: int
-    overrides: Table
-    environment: dict[str, str]
-    psnr_moving: float | None = None
-    found: float | None = None
-    track_error: float | None = None
+    scene: str = option("name of the scene")
+    row: str = option("name of the row")
+    seed: int = option("seed of the training")
+    fingerprint: str = option("of the configuration")
+    psnr: float = option("mean over the test views, dB")
+    ssim: float = option("mean over the test views", at_least=-1, at_most=1)
+    gaussians: int = option("number of Gaussians")
+    steps: int = option("training steps")
+    seconds: float = option("time of the training alone")
+    size: tuple[int, int] = option("width and height of the images, pixels", at_least=1)
+    views: int = option("number of test views")
+    overrides: Table = option("what the configuration changed of the preset")
+    environment: dict[str, str] = option("versions, adapter and driver")
+    psnr_moving: float | None = option("docs/metrics.md; None where it was not measured", None)
+    found: float | None = option("docs/metrics.md; None where it was not measured", None)
+    track_error: float | None = option("docs/metrics.md; None where it was not measured", None)
 
     @property
     def key(self) -> RunKey:
@@ -88,7 +85,7 @@ def read_run(folder: Path, run: Run) -> Result | None:
             "environment": record,
             **{name: metrics[name] for name in MOTION if isinstance(metrics.get(name), int | float)},
         }
-        return _read_result(entry, str(folder))
+        return build_dataclass(Result, entry, str(folder))
     except (OSError, ValueError, KeyError, TypeError):  # missing or damaged: it is trained again
         return None
 
@@ -100,45 +97,13 @@ def read_results(path: Path) -> Results:
     content = read_json(path)
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise InputError(f"{path} is no results.json of this version of lapgs-table (format {FORMAT!r}).")
-    runs = _checked(content, "runs", list, f"{path}")
+    name, preset = (checked(str, content.get(key), f"{path}: {key}") for key in ("name", "preset"))
+    runs = content.get("runs")
+    if not isinstance(runs, list):
+        raise InputError(f"{path}: runs must be a list, got {shown(runs)}.")
     return Results(
-        _checked(content, "name", str, f"{path}"),
-        _checked(content, "preset", str, f"{path}"),
-        tuple(_read_result(entry, f"{path}: run {number}") for number, entry in enumerate(runs, 1)),
+        name, preset, tuple(build_dataclass(Result, run, f"{path}: run {number}") for number, run in enumerate(runs, 1))
     )
-
-
-def _read_result(entry: Any, where: str) -> Result:
-    kinds = {
-        "str": str,
-        "int": int,
-        "float": int | float,
-        "float | None": int | float,
-        "list[int]": list,
-    }  # the remaining values are tables
-    return Result(
-        **{
-            field.name: _checked(entry, field.name, kinds.get(str(field.type), dict), where)
-            for field in dataclasses.fields(Result)
-            if field.name not in MOTION or (isinstance(entry, dict) and entry.get(field.name) is not None)
-        }
-    )
-
-
-def _checked(table: Any, name: str, kind: Any, where: str) -> Any:
-    value: Any = table.get(name) if isinstance(table, dict) else None
-    sound = isinstance(value, kind) and not isinstance(value, bool)
-    if isinstance(value, int | float):
-        sound = sound and abs(value) < LARGEST  # and no NaN
-    if isinstance(value, str) and kind is str:
-        sound = sound and value.isprintable()
-    if name == "size":
-        sound = sound and len(value) == 2 and all(type(side) is int and 0 < side < LARGEST for side in value)
-    if name == "environment":
-        sound = sound and all(isinstance(text, str) and text.isprintable() for text in value.values())
-    if not sound:
-        raise InputError(f"{where}: {name} is missing or has the wrong type or value; the file was damaged.")
-    return value
 
 
 def merge_results(parts: Sequence[Results]) -> Results:
@@ -161,12 +126,9 @@ def write_results(folder: Path, results: Results) -> None:
 
 def _content(results: Results) -> dict[str, Any]:
     """What a results.json holds; figures that a run lacks are left out."""
-    content = {"format": FORMAT, **dataclasses.asdict(results)}
-    for run in content["runs"]:
-        for name in MOTION:
-            if run[name] is None:
-                del run[name]
-    return content
+    content = dataclasses.asdict(results)
+    runs = [{name: value for name, value in run.items() if value is not None} for run in content["runs"]]
+    return {"format": FORMAT, **content, "runs": runs}
 
 
 def markdown(results: Results) -> str:

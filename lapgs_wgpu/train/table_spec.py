@@ -79,7 +79,7 @@ def read_spec(path: Path) -> Spec:
     known = ("preset", "seeds", "common", "scenes", "rows")
     for key in table:
         if key not in known:
-            raise InputError(f"{path}: there is no key {key}{did_you_mean(key, known) or f'; known: {_list(known)}'}.")
+            raise InputError(f"{path}: there is no key {key}{did_you_mean(key, known, f'; known: {_list(known)}.')}")
     preset = table.get("preset")
     if not isinstance(preset, str):
         raise InputError(f"{path}: preset must be the name of a preset, got {shown(preset)}.")

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lapgs_wgpu.data.init import first_points, initial_scales, limit_optical_depth
+from lapgs_wgpu.data.initial_gaussians import first_points, initial_scales, limit_optical_depth
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
@@ -109,7 +109,7 @@ class Trainer:
         self._numbers = {view.name: number for number, view in enumerate(dataset.train)}
         # Cameras that all stand at one place have no extent; the scene's own size must serve.
         self._extent = dataset.extent or config.points.box
-        self._statistics = Statistics(len(scene), scene.parameters["means"].device)
+        self._statistics = Statistics.zeros(len(scene), scene.parameters["means"].device)
         self._health = Health()
         data = config.data
         self._pictures = Pictures(dataset.train, data.background, data.cache_gb, self._generator, scene.device)
@@ -144,7 +144,7 @@ class Trainer:
         looks = [_Look(*each, self._nearby(each[0]) if moving else None) for each in chosen]
 
         self._zero_grad()
-        seen = Statistics(len(scene), scene.parameters["means"].device)
+        seen = Statistics.zeros(len(scene), scene.parameters["means"].device)
         renderings, totals = [], torch.zeros(2, dtype=torch.float64)
         for look in looks[ranks.rank :: ranks.count]:
             loss, rendering = self._loss(look, moving)
@@ -203,13 +203,12 @@ class Trainer:
     def _gradients(self) -> dict[str, list[Tensor]]:
         """By group, of all parameters that have one."""
         gradients = self._optimizer.gradients()
-        for beside in self._beside:
-            gradients |= beside.gradients()
-        return gradients
+        return gradients | {each.name: [each.values.grad] for each in self._beside if each.values.grad is not None}
 
     def _zero_grad(self) -> None:
-        for each in (self._optimizer, *self._beside):
-            each.zero_grad()
+        self._optimizer.zero_grad()
+        for each in self._beside:
+            each.values.grad = None
 
     def _put_together(self) -> None:
         """Every rank's gradients become the sums over the ranks."""
@@ -218,21 +217,13 @@ class Trainer:
             gradient.copy_(total)
 
     def _seen_by_all(self, seen: Statistics) -> list[Statistics]:
-        names = list(seen.state())
-        parts = self.ranks.gather(list(seen.state().values()))
-        found = []
-        for values in zip(*parts, strict=True):
-            one = Statistics(0, values[0].device)
-            one.restore(dict(zip(names, values, strict=True)))
-            found.append(one)
-        return found
+        return [Statistics(*values) for values in zip(*self.ranks.gather(list(vars(seen).values())), strict=True)]
 
     def _examine(self, renderings: list[RenderLoss], loss: float, step: int, views: str) -> Skipped | None:
         """Whether the step of these gradients is to be skipped, and why. Raises NumericalError for a parameter, whose
         values a step cannot mend."""
         parameters, gradients = self._optimizer.parameters(), self._gradients()
-        for beside in self._beside:
-            parameters |= beside.parameters()
+        parameters |= {each.name: [each.values] for each in self._beside}
         places = [each.means2d.grad for each in renderings if each.means2d.grad is not None]
         gradients |= {"the places in the image": places} if places else {}
         if not self.ranks.any(not (math.isfinite(loss) and finite(parameters, gradients))):
@@ -270,7 +261,7 @@ class Trainer:
                 )
             self._optimizer.edit_rows(change.keep, change.added)
             self._optimizer.reorder(morton_order(scene.parameters["means"].detach()))
-            self._statistics = Statistics(len(scene), scene.parameters["means"].device)
+            self._statistics = Statistics.zeros(len(scene), scene.parameters["means"].device)
         if density.resets_at(step):
             logits = reset_opacities(scene.parameters["opacity_logits"], density.reset_opacity)
             self._optimizer.reset("opacity_logits", logits)
@@ -295,7 +286,7 @@ class Trainer:
             "adam": self._optimizer.state(),
             "frequencies": self._frequencies.state() if self._frequencies else {},
             "exposure": self._exposures.state() if self._exposures else {},
-            "statistics": self._statistics.state(),
+            "statistics": vars(self._statistics),
             "training": {
                 "done": torch.tensor(self.done),
                 "warm_up": torch.tensor(self._warm_up),
@@ -327,7 +318,7 @@ class Trainer:
             self._frequencies.restore(parts["frequencies"])
         if self._exposures is not None:
             self._exposures.restore(parts["exposure"])
-        self._statistics.restore(parts["statistics"])
+        self._statistics = Statistics(**parts["statistics"])
         own = parts["training"]
         self.done, scene.sh_degree = int(own["done"]), int(own["sh_degree"])
         self._warm_up = int(own.get("warm_up", self._warm_up))  # older states lack it
@@ -338,14 +329,14 @@ class Trainer:
 def initial_points(
     config: PointsConfig, dataset: Dataset, seed: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """The first Gaussians (data/init): points (N, 3), colours (N, 3) and scales (N,)."""
-    points, colours = first_points(dataset, config.count, config.box, seed)
+    """The first Gaussians (data/initial_gaussians): points (N, 3), colors (N, 3) and scales (N,)."""
+    points, colors = first_points(dataset, config.count, config.box, seed)
     scales = initial_scales(points)
     # Published figures of D-NeRF start from a fog, which the empty background there soon lifts.
     if dataset.cloud is not None or dataset.depths is not None:
         scales = limit_optical_depth(points, scales, config.opacity, dataset.cameras)
     order = morton_order(torch.from_numpy(points)).numpy()
-    return points[order], colours[order], scales[order]
+    return points[order], colors[order], scales[order]
 
 
 def draw_nearby(config: SmoothnessConfig, count: int, t: float, generator: torch.Generator) -> Nearby | None:

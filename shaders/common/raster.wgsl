@@ -10,7 +10,6 @@
 const LANES = $LANES;
 const ROWS = $ROWS;
 const LOG2_E: f32 = 1.4426950408889634;
-const LOG2_ALPHA_MIN: f32 = -7.994353436858858;   // log2 ALPHA_MIN: compared before the exponential is taken
 
 // The splat that a lane holds, in the tile's own coordinates (pixel centres at whole numbers):
 // log2 alpha at (x, y) = log2_opacity + a x^2 + y (b x + c y), with x and y relative to the mean.

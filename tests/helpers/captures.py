@@ -26,7 +26,7 @@ Change = Callable[[Path, dict[str, Any]], Any]
 
 
 class Blobs(NamedTuple):
-    """Coloured Gaussians of different sizes around a place that is not the origin."""
+    """Colored Gaussians of different sizes around a place that is not the origin."""
 
     means: Tensor
     scales: Tensor
@@ -202,7 +202,7 @@ def moved(frame: int) -> Blobs:
 
 
 def write_video(path: Path, pictures: Sequence[np.ndarray]) -> None:
-    """H.264 with colours at full resolution, almost lossless; one keyframe, at the beginning."""
+    """H.264 with colors at full resolution, almost lossless; one keyframe, at the beginning."""
     av = __import__("av")
     with av.open(str(path), "w") as file:
         stream = file.add_stream("libx264", rate=30, options={"crf": "4"})
@@ -214,15 +214,15 @@ def write_video(path: Path, pictures: Sequence[np.ndarray]) -> None:
             file.mux(packet)
 
 
-def write_points(path: Path, points: np.ndarray, colours: np.ndarray | None = None) -> None:
+def write_points(path: Path, points: np.ndarray, colors: np.ndarray | None = None) -> None:
     """A .ply cloud as 3DGS's readers store it: floats x y z, and bytes red green blue."""
     fields = [(name, "<f4") for name in "xyz"] + ([(name, "u1") for name in ("red", "green", "blue")])
-    rows = np.zeros(len(points), np.dtype(fields if colours is not None else fields[:3]))
+    rows = np.zeros(len(points), np.dtype(fields if colors is not None else fields[:3]))
     for column, name in enumerate("xyz"):
         rows[name] = points[:, column]
-    if colours is not None:
+    if colors is not None:
         for column, name in enumerate(("red", "green", "blue")):
-            rows[name] = colours[:, column]
+            rows[name] = colors[:, column]
     kinds = {"<f4": "float", "|u1": "uchar"}
     properties = "".join(f"property {kinds[rows.dtype[name].str]} {name}\n" for name in rows.dtype.names or ())
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{properties}end_header\n"
@@ -247,7 +247,7 @@ def write_model(
     parameters: Sequence[float],
     poses: dict[str, Camera],
     points: np.ndarray,
-    colours: np.ndarray,
+    colors: np.ndarray,
     *,
     binary: bool,
 ) -> None:
@@ -264,8 +264,8 @@ def write_model(
             images += struct.pack("<Q", 2) + 2 * struct.pack("<ddq", 1.5, 2.5, -1)
         (folder / "images.bin").write_bytes(images)
         cloud = struct.pack("<Q", len(points))
-        for i, (point, colour) in enumerate(zip(points.tolist(), colours.tolist(), strict=True)):
-            cloud += struct.pack("<Q3d3BdQ", i + 1, *point, *colour, 0.5, 2) + struct.pack("<4I", 1, 0, 2, 1)
+        for i, (point, color) in enumerate(zip(points.tolist(), colors.tolist(), strict=True)):
+            cloud += struct.pack("<Q3d3BdQ", i + 1, *point, *color, 0.5, 2) + struct.pack("<4I", 1, 0, 2, 1)
         (folder / "points3D.bin").write_bytes(cloud)
         return
     text = " ".join(map(repr, map(float, parameters)))
@@ -275,8 +275,8 @@ def write_model(
         lines += [f"{i + 1} {' '.join(map(repr, map(float, pose)))} 7 {name}", "1.5 2.5 -1 1.5 2.5 -1" if i else ""]
     (folder / "images.txt").write_text("\n".join(lines) + "\n")
     lines = ["# Points"]
-    for i, (point, colour) in enumerate(zip(points.tolist(), colours.tolist(), strict=True)):
-        lines.append(f"{i + 1} {' '.join(map(repr, point))} {' '.join(map(str, colour))} 0.5 1 0 2 1")
+    for i, (point, color) in enumerate(zip(points.tolist(), colors.tolist(), strict=True)):
+        lines.append(f"{i + 1} {' '.join(map(repr, point))} {' '.join(map(str, color))} 0.5 1 0 2 1")
     (folder / "points3D.txt").write_text("\n".join(lines) + "\n")
 
 
@@ -306,7 +306,7 @@ def write_colmap(
     principal: tuple[float, float] = (0, 0),
     name: str = "frame_{:04d}.png",
 ) -> Path:
-    """One camera that moves past the blobs; the cloud is their middles, in their colours."""
+    """One camera that moves past the blobs; the cloud is their middles, in their colors."""
     poses = {}
     (folder / "images").mkdir(parents=True)
     for i, (camera, picture) in enumerate(film(device, count, lens, principal)):
@@ -345,9 +345,9 @@ def write_rig(folder: Path, device: Device, *, count: int = 4, frames: int = 3) 
             picture.save(folder / f"images/cam{number:02d}/{frame:04d}.png")
     blobs = Blobs.random()
     parameters = [camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]]
-    colours = (blobs.colors * 255).round().byte().numpy()
+    colors = (blobs.colors * 255).round().byte().numpy()
     means = blobs.means.double().numpy()
-    write_model(folder / "sparse/0", "PINHOLE", (WIDTH, HEIGHT), parameters, poses, means, colours, binary=True)
+    write_model(folder / "sparse/0", "PINHOLE", (WIDTH, HEIGHT), parameters, poses, means, colors, binary=True)
     return folder
 
 

@@ -64,7 +64,7 @@ RESULTS = Results(
     "a table",
     "tiny",
     tuple(
-        Result("a", row, 0, "f", 20.0, 0.5, 9, 3, 1.0, [24, 24], 2, {"field": {"kind": "static"}}, {"torch": "2"})
+        Result("a", row, 0, "f", 20.0, 0.5, 9, 3, 1.0, (24, 24), 2, {"field": {"kind": "static"}}, {"torch": "2"})
         for row in "xy"
     ),
 )

@@ -85,8 +85,8 @@ class Desktop:
         """(height, width, 3) of the whole screen, from the server's frame buffer in xwd's format."""
         data = (Path(self._folder.name) / "Xvfb_screen0").read_bytes()
         header = struct.unpack(">25I", data[:100])
-        width, height, pitch, colours = header[4], header[5], header[12], header[19]
-        pixels = np.frombuffer(data, np.uint8, height * pitch, header[0] + 12 * colours).reshape(height, pitch)
+        width, height, pitch, colors = header[4], header[5], header[12], header[19]
+        pixels = np.frombuffer(data, np.uint8, height * pitch, header[0] + 12 * colors).reshape(height, pitch)
         return pixels[:, : 4 * width].reshape(height, width, 4)[..., 2::-1].astype(np.int32)
 
     def wait_for(self, true: Callable[[NDArray[np.int32]], bool], what: str) -> NDArray[np.int32]:

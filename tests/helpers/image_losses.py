@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.splat.gaussians import Gaussians
+from lapgs_wgpu.train.config import LossWeights
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
-from lapgs_wgpu.train.losses import LossWeights
 from lapgs_wgpu.train.truth_cache import upload_rgba
 
 WEIGHTS = {

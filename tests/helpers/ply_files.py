@@ -8,7 +8,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from hypothesis import strategies as st
 
+from lapgs_wgpu.io.checkpoint import read_checkpoint
 from lapgs_wgpu.io.ply import GaussianSnapshot
+from lapgs_wgpu.io.ply_header import PathLike
 
 FIELDS = ["means", "sh", "opacity_logits", "log_scales", "quats"]
 # Written out by hand, so that it checks the code's own lists.
@@ -17,6 +19,11 @@ INRIA = (
     + " ".join(f"f_rest_{i}" for i in range(45))
     + " opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3"
 ).split()
+
+
+def read_ply(path: PathLike) -> GaussianSnapshot:
+    """The Gaussians of any 3DGS .ply."""
+    return read_checkpoint(path).still
 
 
 def random_still(n: int = 5, degree: int = 3, seed: int = 0) -> GaussianSnapshot:

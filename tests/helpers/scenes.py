@@ -6,12 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from helpers.reference import near_discontinuity, rasterize_reference
 from torch import Tensor
 
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.rasterize import rasterize
-from lapgs_wgpu.splat.reference import near_discontinuity, rasterize_reference
 
 Scene = dict[str, Tensor]  # the tensors that `rasterize` takes, by argument name, float32
 
@@ -30,7 +30,7 @@ def oblique_camera(width: int, height: int) -> Camera:
 def random_scene(count: int, seed: int, *, sh: int | None = None, size: float = 0.05, spread: float = 0.8) -> Scene:
     """Gaussians around the origin, every tenth far away (beside the image, or behind the oblique camera).
 
-    sh: coefficients of spherical harmonics a channel; plain colours where None.
+    sh: coefficients of spherical harmonics a channel; plain colors where None.
     """
     generator = torch.Generator().manual_seed(seed)
 

@@ -55,7 +55,7 @@ def _read(folder: Path, image_size: int | None) -> Capture:
         raise InputError(
             f"{model.points_file}: {len(bad)} of {len(model.points)} points are not finite, first {bad[0]}."
         )
-    cloud = Cloud(model.points.astype(np.float32), (model.colours / 255).astype(np.float32))
+    cloud = Cloud(model.points.astype(np.float32), (model.colors / 255).astype(np.float32))
     return Capture(frames, cloud, model.points_file, warnings=warnings, own_footage=True, axes_hint=AXES)
 
 

@@ -60,12 +60,12 @@ class ColmapImage(NamedTuple):
 
 
 class ColmapModel(NamedTuple):
-    """cameras: by id. images: in file order. points: (N, 3), colours: (N, 3) uint8. points_file: their file."""
+    """cameras: by id. images: in file order. points: (N, 3), colors: (N, 3) uint8. points_file: their file."""
 
     cameras: dict[int, ColmapCamera]
     images: list[ColmapImage]
     points: Array
-    colours: NDArray[np.uint8]
+    colors: NDArray[np.uint8]
     points_file: Path
 
 
@@ -84,14 +84,14 @@ def read_model(folder: Path) -> ColmapModel:
             raise InputError(f"{path} does not exist, but {files['cameras']} does; a sparse model needs both.")
     cameras = (_binary_cameras if binary else _text_cameras)(files["cameras"])
     images = (_binary_images if binary else _text_images)(files["images"])
-    points, colours = (_binary_points if binary else _text_points)(files["points3D"])
+    points, colors = (_binary_points if binary else _text_points)(files["points3D"])
     for image in images:
         if image.camera not in cameras:
             raise InputError(
                 f"{image.where} was taken by camera {image.camera}, which is not among the {len(cameras)} of "
                 f"{files['cameras']}."
             )
-    return ColmapModel(cameras, images, points, colours, files["points3D"])
+    return ColmapModel(cameras, images, points, colors, files["points3D"])
 
 
 def count_images(folder: Path) -> int:
@@ -196,7 +196,7 @@ def _image(name: str, camera: int, pose: Array, where: str) -> ColmapImage:
 
 BINARY_CAMERA_BYTES = 24 + 3 * 8  # at least: id, model, width, height, parameters
 BINARY_IMAGE_BYTES = 4 + 7 * 8 + 4 + 1 + 8  # at least: id, pose, camera, the name's end, count of points
-BINARY_POINT_BYTES = 8 + 3 * 8 + 3 + 8 + 8  # at least: id, position, colour, error, length of the track
+BINARY_POINT_BYTES = 8 + 3 * 8 + 3 + 8 + 8  # at least: id, position, color, error, length of the track
 
 
 class _Reader:
@@ -285,10 +285,10 @@ def _binary_images(path: Path) -> list[ColmapImage]:
 def _binary_points(path: Path) -> tuple[Array, NDArray[np.uint8]]:
     with _binary(path) as reader:
         count = reader.count(BINARY_POINT_BYTES, "points")
-        points, colours = np.empty((count, 3)), np.empty((count, 3), np.uint8)
+        points, colors = np.empty((count, 3)), np.empty((count, 3), np.uint8)
         for index in range(count):
             _, *values, _ = reader.take("Q3d3Bd")
-            points[index], colours[index] = values[:3], values[3:]
+            points[index], colors[index] = values[:3], values[3:]
             reader.skip(8 * reader.count(8, f"images that see point {index}"))
         reader.end()
-    return points, colours
+    return points, colors

@@ -1,7 +1,7 @@
 """Reader of the D-NeRF format.
 
-transforms_train.json and transforms_test.json hold `camera_angle_x` (horizontal field of view, radians) or INTRINSICS
-(those of a frame override those of the file, and both override the angle), and `frames`:
+transforms_train.json and transforms_test.json hold `camera_angle_x` (horizontal field of view, radians) or intrinsics
+(`transforms`; those of a frame override those of the file, and both override the angle), and `frames`:
 `file_path` of an image (.png is appended if it has no suffix), `transform_matrix` (camera to world, OpenGL axes) and
 `time` in [0, 1], in all frames of a file or in none; frames without times are evenly spaced. transforms_val.json is not
 read. objects.json (`objects`) is optional, and so is a cloud: fused.ply, points3d.ply or points3D.ply.
@@ -19,7 +19,7 @@ import numpy as np
 from lapgs_wgpu.data.cloud import find_cloud, is_random, read_cloud
 from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
 from lapgs_wgpu.data.images import Size, check_image
-from lapgs_wgpu.data.json_fields import finite, image_path, kind, number, read_json, required
+from lapgs_wgpu.data.json_fields import image_path, number, read_json, required
 from lapgs_wgpu.data.objects import read_objects
 from lapgs_wgpu.data.poses import opengl_pose
 from lapgs_wgpu.data.timestamps import ImageName
@@ -27,9 +27,9 @@ from lapgs_wgpu.data.undistort import Lens
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import intrinsics_of_fov
 
+from .transforms import frame_entries, intrinsics
+
 NEEDED = "which a D-NeRF scene needs"
-INTRINSICS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2")  # pixels of an image w x h
-LARGEST = 1e6  # of them
 CLOUDS = ("fused.ply", "points3d.ply", "points3D.ply")
 
 
@@ -60,26 +60,15 @@ def _read_split(folder: Path, split: Split) -> list[Frame]:
     if not path.is_file():
         raise InputError(f"{path} does not exist; a D-NeRF scene needs transforms_train.json and transforms_test.json.")
     data = read_json(path, "camera_angle_x and frames")
-    entries = required(data, "frames", path, NEEDED)
-    if not isinstance(entries, list) or not entries:
-        raise InputError(f"{path}: frames must be a list of at least one frame, got {kind(entries)}.")
-
-    timed = sum(isinstance(entry, dict) and "time" in entry for entry in entries)
+    entries = list(frame_entries(data, path, NEEDED))
     frames: list[Frame] = []
     lenses: dict[tuple[float, ...], Lens] = {}
-    for index, entry in enumerate(entries):
-        where = f"{path}, frame {index}"
-        if not isinstance(entry, dict):
-            raise InputError(f"{where} must be a JSON object, got {kind(entry)}.")
+    for index, (entry, where, stated) in enumerate(entries):
         file_path, file = image_path(entry, folder, where, NEEDED, suffix=".png")
         T_cam_world = opengl_pose(required(entry, "transform_matrix", where, NEEDED), where)
-        if timed == 0:
-            time = index / max(len(entries) - 1, 1)
-        else:
-            hint = f"though {timed} of {len(entries)} frames have it; give it for all frames or for none"
-            time = number(required(entry, "time", where, hint), "time", where)
-            if not 0 <= time <= 1:
-                raise InputError(f"{where}: time must lie in [0, 1], got {time:g}; divide by the clip's duration.")
+        time = index / max(len(entries) - 1, 1) if stated is None else number(stated, "time", where)
+        if not 0 <= time <= 1:
+            raise InputError(f"{where}: time must lie in [0, 1], got {time:g}; divide by the clip's duration.")
         image = check_image(file)
         lens = _lens(entry, data, image.size, where, path)
         lens = lenses.setdefault((*lens.K.ravel(), *lens.radial, *lens.tangential), lens)
@@ -93,14 +82,7 @@ def _read_split(folder: Path, split: Split) -> list[Frame]:
 
 def _lens(entry: dict[str, Any], shared: dict[str, Any], size: Size, where: str, path: Path) -> Lens:
     """The lens of a frame, for images of this size."""
-    values: dict[str, float] = {}
-    for name in INTRINSICS:
-        source, at = (entry, where) if name in entry else (shared, str(path))
-        if source.get(name) is None:
-            continue
-        values[name] = finite(source[name], name, at)
-        if abs(values[name]) > LARGEST or (name in ("w", "h", "fl_x", "fl_y") and values[name] <= 0):
-            raise InputError(f"{at}: {name} is {values[name]:g}, which no camera has; it must be in pixels.")
+    values = intrinsics(entry, shared, where, path)
     across, down = size[0] / values.get("w", size[0]), size[1] / values.get("h", size[1])
     if "fl_x" in values:
         focal = values["fl_x"] * across
@@ -115,10 +97,6 @@ def _lens(entry: dict[str, Any], shared: dict[str, Any], size: Size, where: str,
         if name in values:
             K[row, column] = values[name] * scale
     k1, k2, k3, p1, p2 = (values.get(name, 0.0) for name in ("k1", "k2", "k3", "p1", "p2"))
-    if values.get("k4"):
-        raise InputError(
-            f"{where}: k4 is {values['k4']:g}, and only k1, k2, k3, p1 and p2 are read; undistort the images."
-        )
     return Lens(K, *size, (k1, k2, k3), (p1, p2))
 
 

@@ -22,16 +22,12 @@ from lapgs_wgpu.data.timestamps import ImageName
 from lapgs_wgpu.data.undistort import Lens
 from lapgs_wgpu.errors import InputError
 
+from .transforms import frame_entries, intrinsics
+
 NEEDED = "which a capture in nerfstudio's layout needs"
 MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
-LARGEST = 1e6  # of a camera's numbers
+PINHOLE = ("w", "h", "fl_x", "fl_y", "cx", "cy")  # fields of a camera without distortion
 AXES = "transform_matrix must be camera to world in OpenGL's axes (y up, z backward), and it may be in OpenCV's"
-
-# Fields of a camera; those of a frame override those of the file. Fields without a default are required.
-FIELDS: dict[str, float | None] = {
-    "w": None, "h": None, "fl_x": None, "fl_y": None, "cx": None, "cy": None,
-    "k1": 0.0, "k2": 0.0, "k3": 0.0, "k4": 0.0, "p1": 0.0, "p2": 0.0,
-}  # fmt: skip
 
 
 def _matches(folder: Path) -> bool:
@@ -41,28 +37,16 @@ def _matches(folder: Path) -> bool:
 def _read(folder: Path, image_size: int | None) -> Capture:
     path = folder / "transforms.json"
     data = read_json(path, "frames and the camera's fl_x")
-    entries = required(data, "frames", path, NEEDED)
-    if not isinstance(entries, list) or not entries:
-        raise InputError(f"{path}: frames must be a list of at least one frame, got {kind(entries)}.")
-    timed = sum(isinstance(entry, dict) and "time" in entry for entry in entries)
     frames: list[Frame] = []
-    lenses: dict[tuple[float, ...], Lens] = {}
+    lenses: dict[tuple[tuple[str, float], ...], Lens] = {}
     poses: dict[bytes, np.ndarray] = {}
-    for index, entry in enumerate(entries):
-        where = f"{path}, frame {index}"
-        if not isinstance(entry, dict):
-            raise InputError(f"{where} must be a JSON object, got {kind(entry)}.")
+    for entry, where, stated in frame_entries(data, path, NEEDED):
         name_in_file, file = image_path(entry, folder, where, NEEDED)
-        values = _intrinsics(entry, data, where)
-        width, height, fx, fy, cx, cy, k1, k2, k3, _, p1, p2 = values
-        K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-        lens = lenses.setdefault(values, Lens(K, int(width), int(height), (k1, k2, k3), (p1, p2)))
+        values = _intrinsics(entry, data, where, path)
+        lens = lenses.setdefault(tuple(values.items()), _lens(values))
         T_cam_world = opengl_pose(required(entry, "transform_matrix", where, NEEDED), where)
         T_cam_world = poses.setdefault(T_cam_world.tobytes(), T_cam_world)  # equal poses share the camera
-        time = None
-        if timed:
-            hint = f"though {timed} of {len(entries)} frames have it; give it for all frames or for none"
-            time = finite(required(entry, "time", where, hint), "time", where)
+        time = None if stated is None else finite(stated, "time", where)
         normal = PurePosixPath(name_in_file)
         name = ImageName(str(normal), str(normal.parent))
         frames.append(Frame(check_image(file), lens, T_cam_world, where, name, time))
@@ -100,29 +84,25 @@ def _cloud_file(data: dict[str, Any], folder: Path, path: Path) -> Path | None:
     return folder / ply
 
 
-def _intrinsics(entry: dict[str, Any], shared: dict[str, Any], where: str) -> tuple[float, ...]:
-    """The values of FIELDS."""
+def _intrinsics(entry: dict[str, Any], shared: dict[str, Any], where: str, path: Path) -> dict[str, float]:
+    """The fields of a pinhole camera, which are required, and those of its distortion. Raises InputError."""
     model = entry.get("camera_model", shared.get("camera_model", "OPENCV"))
     if model not in MODELS:
         raise InputError(
             f"{where}: camera_model {kind(model)} is not among those that are read ({', '.join(MODELS)}); undistort "
             "the images first."
         )
-    values = []
-    for name, default in FIELDS.items():
-        source, at = (entry, where) if name in entry else (shared, f"{where} and the file")
-        value = required(source, name, at, NEEDED) if default is None else source.get(name, default)
-        got = finite(value, name, where)
-        low = 1 if name in ("w", "h") else 0
-        positive = name in ("w", "h", "fl_x", "fl_y")
-        if abs(got) > LARGEST or (positive and (got <= 0 or got < low)) or (name in ("w", "h") and got > 1e5):
-            raise InputError(f"{where}: {name} is {got:g}, which no camera has; it must be in pixels.")
-        values.append(got)
-    if values[list(FIELDS).index("k4")]:
-        raise InputError(
-            f"{where}: k4 is {values[9]:g}, and only k1, k2, k3, p1 and p2 are read; undistort the images."
-        )
-    return tuple(values)
+    values: dict[str, float] = intrinsics(entry, shared, where, path)
+    for name in PINHOLE:
+        required(values, name, f"{where} and the file", NEEDED)
+    return values
+
+
+def _lens(values: dict[str, float]) -> Lens:
+    width, height, fx, fy, cx, cy = (values[name] for name in PINHOLE)
+    k1, k2, k3, p1, p2 = (values.get(name, 0.0) for name in ("k1", "k2", "k3", "p1", "p2"))
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    return Lens(K, int(width), int(height), (k1, k2, k3), (p1, p2))
 
 
 def _tested(data: dict[str, Any], names: list[str], path: Path) -> set[str] | None:

@@ -1,1 +1,1 @@
-"""The deformation fields: their configuration, one module a field, their encoder and decoder as torch sees them."""
+"""Deformation fields: configuration, one module per field, and their encoder and decoder as torch functions."""

@@ -1,6 +1,6 @@
-"""Encoder and decoder of the grid fields on the device, as one autograd function.
+"""Encoder and decoder of the grid fields on the device (motion/passes), as one autograd function.
 
-Features and their gradients stay on the device; only outputs and parameters are exchanged. See motion/passes.
+Features and their gradients stay on the device; only outputs and parameters are transferred.
 """
 
 from __future__ import annotations
@@ -16,13 +16,17 @@ from ...gpu.array import DeviceArray, read_all
 from ...gpu.device import Device
 from ...gpu.kernel import Commands, Kernel
 from ...gpu.pool import BufferPool
+from ...splat.rasterize import upload
 from ..passes.decoder_passes import DecoderPasses, DecoderShape
 from .hash_encoder import Encoded, HashEncoder, Place
 
 
 class Decoded(NamedTuple):
-    """outputs (N, outputs) of the heads, without their biases; apart: for each group of grids the sum of the squared
-    differences between the features of the places that are compared, none where there are none."""
+    """Results of a decoder.
+
+    outputs: (N, outputs) of the heads, without their biases. apart: for each group of grids, the sum of the squared
+    differences between the features of the compared places; empty without them.
+    """
 
     outputs: Tensor
     apart: Tensor
@@ -31,7 +35,7 @@ class Decoded(NamedTuple):
 class Decoder:
     """Encodes Gaussians and decodes their features on one device.
 
-    encoder: of one group of grids, over place, or of two, the second over place and time.
+    encoder: has one group of grids over space, or a second one over space and time.
     """
 
     def __init__(self, device: Device, encoder: HashEncoder, shape: DecoderShape, *, block: int | None = None) -> None:
@@ -47,10 +51,10 @@ class Decoder:
         weights: Mapping[str, Tensor],
         compared: tuple[Place, Place] | None = None,
     ) -> Decoded:
-        """Decode the Gaussians at their means (N, 3) and a time, and what stands beside their features, (N, columns).
+        """Encode and decode Gaussians. Differentiable in `beside`, the weights and the encoder's tables. float32.
 
-        weights: of the shapes `DecoderShape.weights`. compared: two sets of as many places whose features are compared.
-        Differentiable in `beside`, the weights and the encoder's tables. float32.
+        gaussians: their means (N, 3) and a time. beside: (N, columns) further inputs of the decoder. weights: in the
+        shapes of `DecoderShape.weights`. compared: two sets of equally many places whose features are compared.
         """
         places = [gaussians, *(compared or ())]
         tables = [grid.table for grid in self.encoder.grids]
@@ -62,18 +66,20 @@ class Decoder:
     def write(
         self, places: Sequence[Place], beside: Tensor, weights: Sequence[Tensor], tables: Sequence[Tensor]
     ) -> _Written:
-        """Bring all that the forward pass reads to the device."""
+        """Upload the inputs of the forward pass."""
         encoded = self.encoder.write(places, tables)
-        arrays = {"beside": self._upload("beside", beside)}
+        arrays = {"beside": upload(self._pool, "beside", beside)}
         inputs = dict(zip(self.shape.inputs, [arrays["beside"], *encoded.encodings[0]], strict=True))
         named = zip(self.shape.weights, weights, strict=True)
-        return _Written(encoded, inputs, {name: self._upload(f"weights {name}", weight) for name, weight in named})
+        return _Written(
+            encoded, inputs, {name: upload(self._pool, f"weights {name}", weight) for name, weight in named}
+        )
 
     def record(self, commands: Commands, written: _Written) -> list[DeviceArray]:
-        """The forward pass: the outputs and, for each group of grids, the sums of each pair."""
+        """Record the forward pass. Returns the outputs and, for each group of grids, the sum of each compared pair."""
         encoded = written.encoded
         self.encoder.record(commands, encoded)
-        outputs = self._pool.array("outputs", (encoded.counts[0], self.shape.outputs))
+        outputs = self._pool.array("outputs", (encoded.points[0].count, self.shape.outputs))
         self._passes.decode(commands, written.inputs, written.weights, outputs)
         results = [outputs]
         for group, (here, there) in enumerate(written.compared):
@@ -93,8 +99,10 @@ class Decoder:
     def record_bwd(
         self, commands: Commands, written: _Written, d_outputs: DeviceArray, d_apart: Sequence[float]
     ) -> list[DeviceArray]:
-        """The backward pass, from the gradient of the outputs: the gradients of `beside`, of the weights and of the
-        tables. Features and tables on the device become their gradients."""
+        """Record the backward pass. Returns the gradients of `beside`, of the weights and of the tables.
+
+        Features and tables on the device are overwritten by their gradients.
+        """
         for group, (here, there) in enumerate(written.compared):
             pairs = here.shape[0]
             commands.dispatch(
@@ -114,12 +122,9 @@ class Decoder:
         content = kernel.uniform("Smoothness", pairs=pairs, features=self.encoder.features[group], scale=scale)
         return self._pool.constant(f"smoothness {group} {'back' if scale else 'forth'}", content)
 
-    def _upload(self, name: str, tensor: Tensor) -> DeviceArray:
-        return self._pool.upload(name, tensor.detach().to("cpu", torch.float32).contiguous().numpy())
-
 
 class _Written(NamedTuple):
-    """What a forward pass reads: its encodings, and the decoder's inputs and weights by the names of DecoderShape."""
+    """Inputs of a forward pass: encodings, and the decoder's inputs and weights by the names of DecoderShape."""
 
     encoded: Encoded
     inputs: dict[str, DeviceArray]
@@ -127,7 +132,7 @@ class _Written(NamedTuple):
 
     @property
     def compared(self) -> list[tuple[DeviceArray, DeviceArray]]:
-        """For each group of grids, the encodings of the two sets of places that are compared."""
+        """For each group of grids, the encodings of the two compared sets of places."""
         here, there = self.encoded.encodings[1:] or ([], [])
         return list(zip(here, there, strict=True))
 
@@ -156,7 +161,7 @@ class _Decode(torch.autograd.Function):
         lost = not decoder.encoder.holds(ctx.written.encoded)  # something else was encoded in between
         if lost:
             ctx.written = decoder.write(places, beside, tensors[: ctx.count], tensors[ctx.count :])
-        upstream = decoder._upload("d outputs", d_outputs)
+        upstream = upload(decoder._pool, "d outputs", d_outputs)
         with Commands(decoder._device) as commands:
             if lost:
                 decoder.record(commands, ctx.written)

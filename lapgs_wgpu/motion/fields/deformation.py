@@ -1,8 +1,8 @@
-"""The interface of all deformation fields: what a field is asked and what it returns.
+"""The interface of all deformation fields.
 
-A field is an nn.Module that is called as field(means, t, dynamics, nearby) -> Deformation. means: (N, 3) canonical,
-world units; they get no gradient from the field. t: in [0, 1]. dynamics: (N, D) or None. nearby: a Nearby or None.
-A new field changes nothing. parameter_groups() returns its parameters by learning rate: "hash" (tables and planes) and
+A field is an nn.Module with the call field(means, t, dynamics, nearby) -> Deformation. means: (N, 3) canonical, world
+units; the field gives them no gradient. t: in [0, 1]. dynamics: (N, D) or None. nearby: a Nearby or None.
+A new field is the identity. parameter_groups() returns its parameters by learning rate: "hash" (tables and planes) and
 "mlp".
 """
 
@@ -14,8 +14,11 @@ from torch import Tensor
 
 
 class Nearby(NamedTuple):
-    """Where a field is asked once more, to keep it smooth: Gaussians `rows` (M,), at their means + offsets (M, 3),
-    world units, and at another time in [0, 1]. The weights are those of the two parts of the smoothness loss."""
+    """Second sample points of the smoothness loss, which compares features at nearby points.
+
+    rows: (M,) Gaussians. offsets: (M, 3) from their means, world units. time: in [0, 1]. static_weight,
+    temporal_weight: of the loss on spatial and on space-time features.
+    """
 
     rows: Tensor
     offsets: Tensor
@@ -25,12 +28,12 @@ class Nearby(NamedTuple):
 
 
 class Deformation(NamedTuple):
-    """What is done to N Gaussians at a time.
+    """Changes of N Gaussians at a time. None: no change.
 
-    Means are turned by `rotation` (N, 4) wxyz of unit length about the origin and shifted by `translation` (N, 3);
-    d_quats (N, 4) and d_scales (N, 3) are added to unit quaternions and to scales, d_dc (N, 3) to the colours' constant
-    part and d_opacity (N,) to the opacities' logits, None where the field leaves them as they are.
-    smoothness: a scalar, the weighted loss that keeps the field smooth; None where it was not asked for.
+    rotation: (N, 4) unit quaternions wxyz, which rotate the means about the origin. translation: (N, 3), added to the
+    rotated means. d_quats (N, 4), d_scales (N, 3): added to unit quaternions and to scales. d_dc: (N, 3), added to the
+    constant part of the colors. d_opacity: (N,), added to the opacity logits. smoothness: the weighted smoothness loss,
+    a scalar; None if it was not requested.
     """
 
     rotation: Tensor | None

@@ -1,6 +1,6 @@
-"""The dynamics attribute d of the Gaussians (the paper's section on it, equations 10 to 12): who stands out, and L_dy.
+"""The dynamics attributes d of the Gaussians: their outliers, and the loss L_dy (paper eqs. 10 to 12).
 
-d: (N, 16) float32, without a unit. The distance of a Gaussian is that of its row from the mean row.
+d: (N, 16) float32, without a unit. The distance of a Gaussian is that between its row and the mean row.
 """
 
 from __future__ import annotations
@@ -10,24 +10,23 @@ from torch import Tensor
 
 from .config import DynamicsMode
 
-# Distances that are equal but for float32's rounding must not stand out. Where they differ it changes nothing.
+# Tolerance: distances that are equal except for rounding are no outliers.
 ROUNDING = 1e-6
-# Bounds the gradient of `promote` while the rows still are (nearly) equal, so that Adam's squares of it stay finite.
+# Bounds the gradient of `promote` while all rows are nearly equal, so that Adam's squares of it stay finite.
 LEAST_DEVIATION = 1e-8
 
 
 def outliers(d: Tensor) -> Tensor:
-    """(N,) bool: whose distance from the mean row exceeds the mean distance by a standard deviation (equations 10, 11).
+    """(N,) bool: rows whose distance exceeds the mean distance by a standard deviation (eqs. 10, 11).
 
-    The deviation is that of all N distances (divided by N, not by N - 1). No row stands out where all are equal, nor
-    where there is but one.
+    The standard deviation of the N distances is divided by N, not by N - 1. If all rows are equal, none is an outlier.
     """
     mask, _ = _outliers(_offsets(d.detach()))
     return mask
 
 
 def dynamics_loss(d: Tensor, mode: DynamicsMode) -> Tensor:
-    """L_dy (equation 12), a scalar: the mean over all N rows of a term that is zero but for the outliers.
+    """L_dy (eq. 12), a scalar: the mean over all N rows of a term that is zero except for outliers.
 
     literal: the squared distance, as in the paper's equation; its descent pulls outliers to the mean.
     promote: -log(1 + squared distance / squared deviation of the distances), as in the paper's text; its descent pushes

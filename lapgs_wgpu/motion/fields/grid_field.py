@@ -1,4 +1,4 @@
-"""The fields over the four-grid hash encoder: Grid4D's, and the paper's, which adds to it."""
+"""The fields grid4d and laplacian (the paper's, an extension of grid4d), over four hash grids."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from .laplacian import LaplacianMotion, TimeMotion
 from .layers import last_product, linear, product, zero_head
 from .parameter_shapes import parameter_shapes
 
-_BLOCK = 1 << 13  # Gaussians that are decoded at once
-_KEPT = 1 << 16  # of all, up to which a step keeps the decoder's activations instead of computing them once more
+_BLOCK = 1 << 13  # Gaussians per decoded block
+_KEPT = 1 << 16  # Gaussians up to which activations are kept for the backward pass instead of recomputed
 
 
 class GridField(nn.Module):
     """grid4d: temporal hash features, gated by spatial ones, then linear heads (Grid4D, Xu et al. 2024; paper eq. 9).
 
-    laplacian: each Gaussian's dynamics attribute stands beside its temporal features (eq. 8), the Laplacian motion is
-    added before the heads (eq. 6), and an appearance head compensates for changes of brightness. Without these, or
-    with all of them at zero, it is grid4d.
+    laplacian: concatenates each Gaussian's dynamics attribute with its temporal features (eq. 8), adds the Laplacian
+    motion before the heads (eq. 6), and has an appearance head for changes of brightness. With all of these at zero it
+    equals grid4d.
 
-    Where gradients are wanted, the decoder works in torch, or by kernels of ours where `on_device` is set, for
-    which the configuration must be one that `decodes_on_device`; without gradients in torch.
-    precision: torch.float32 or torch.bfloat16, of features and of the decoder's products where gradients are wanted, in
-    torch; the parameters, what the heads give and everything without gradients are float32.
+    on_device: compute the decoder by kernels if gradients are needed; the configuration must be one that
+    `decodes_on_device`. Otherwise, and without gradients, torch computes it.
+    precision: torch.float32 or torch.bfloat16; data type of features and of the decoder's products in torch if
+    gradients are needed. Parameters, outputs of the heads, and everything without gradients are float32.
     """
 
     def __init__(self, config: FieldConfig, device: Device, seed: int) -> None:
@@ -73,7 +73,7 @@ class GridField(nn.Module):
 
     @property
     def grids(self) -> list[HashGrid]:
-        """The static one first."""
+        """All hash grids, the spatial one first."""
         return [self.static_grid, *(grid for grid in self.temporal_grids if isinstance(grid, HashGrid))]
 
     def forward(
@@ -98,8 +98,8 @@ class GridField(nn.Module):
     def _in_torch(
         self, means: Tensor, t: float, dynamics: Tensor | None, nearby: Nearby | None
     ) -> tuple[Tensor, Tensor]:
-        """Outputs of the geometry heads (N, 14) and, beside them, of the appearance head; and, for static and temporal
-        features, the sum of the squared differences between those of near places."""
+        """Outputs of the geometry heads (N, 14) and, in further columns, of the appearance head; and the sums of the
+        squared differences between features of nearby points, for spatial and for space-time features."""
         places = [(means, self.config.grid_time(t))]
         if nearby is not None:
             places.append((means[nearby.rows] + nearby.offsets, self.config.grid_time(nearby.time)))
@@ -115,7 +115,7 @@ class GridField(nn.Module):
     def _on_device(
         self, means: Tensor, t: float, dynamics: Tensor | None, nearby: Nearby | None
     ) -> tuple[Tensor, Tensor]:
-        """The same, without features or their gradients ever coming to the host."""
+        """The same on the device, without transferring features or their gradients."""
         time = self.config.grid_time(t)
         compared = None
         if nearby is not None:
@@ -150,15 +150,14 @@ class GridField(nn.Module):
         return 0.5 * self.spatial.weight, 0.5 * self.spatial.bias
 
     def _heads(self) -> tuple[Tensor, Tensor]:
-        """Weight and bias of all heads, as one matrix: they read the same features, whose gradient goes through
-        (N, width) once then."""
+        """Weight and bias of all heads as one matrix, so that the features' gradient (N, width) is written once."""
         looks = [] if self.appearance is None else [self.appearance]
         weight = torch.cat([self.heads.weight, *(APPEARANCE_SCALE * head.weight for head in looks)])
         return weight, torch.cat([self.heads.bias, *(APPEARANCE_SCALE * head.bias for head in looks)])
 
     def _decode_blocks(self, t: float, dynamics: Tensor | None, *features: Tensor) -> Tensor:
-        """`_decode`, block by block, so that no step asks for large pieces of memory. Of many Gaussians it is done
-        anew in the backward pass: the activations would be most of a training's memory, 4 KB each at a width of 256."""
+        """`_decode` in blocks, which avoids large allocations. For many Gaussians the backward pass recomputes it: the
+        activations, 4 KB per Gaussian at a width of 256, would be most of a training's memory."""
         decode = self._decode
         if len(features[0]) > _KEPT:
             decode = partial(checkpoint, decode, use_reentrant=False, preserve_rng_state=False)
@@ -167,7 +166,7 @@ class GridField(nn.Module):
         return torch.cat([decode(t, *block) for block in zip(of_dynamics, *blocks, strict=True)])
 
     def _decode(self, t: float, dynamics: Tensor | None, static: Tensor, *temporal: Tensor) -> Tensor:
-        """Outputs of the geometry heads (N, 14) and, beside them, of the appearance head."""
+        """Outputs of the geometry heads (N, 14) and, in further columns, of the appearance head."""
         half = product(static, *self._gate_weights())
         open_features = gated(self._moving(dynamics, static, *temporal), half)
         motion = self.motion(static, t) if self.motion is not None else None
@@ -184,8 +183,8 @@ class GridField(nn.Module):
         return outputs
 
     def _moving(self, dynamics: Tensor | None, static: Tensor, *temporal: Tensor) -> Tensor:
-        """(N, width) of the dynamics attribute and the temporal features, as far as the field has them, side by side.
-        They are multiplied apart, since putting them together first would copy the largest tensors of all."""
+        """The temporal layer (N, width) of dynamics attributes and temporal features, if the field has them. They are
+        multiplied separately, since concatenation would copy the largest tensors of all."""
         size = self.config.dynamics_size
         bias, weight = self.temporal.bias, self.temporal.weight
         if size and dynamics is not None:

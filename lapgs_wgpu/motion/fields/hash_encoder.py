@@ -1,10 +1,10 @@
-"""The hash encoder as torch sees it: grids whose tables belong to torch, their encoding and its gradient on the device
-(motion/passes/hash_encoder_passes), and its plain-torch reference."""
+"""The hash encoder as torch sees it: grids whose tables belong to torch; encoding and gradient run on the device
+(motion/passes/hash_encoder_passes)."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -15,29 +15,27 @@ from ...gpu.array import DeviceArray, read_all
 from ...gpu.device import Device
 from ...gpu.kernel import Commands
 from ...gpu.pool import BufferPool
-from ..passes.hash_encoder_passes import HashEncoderPasses
-from .hash_grid_config import TIME, GridShape, HashConfig
+from ..passes.hash_encoder_passes import HashEncoderPasses, PointSet
+from .hash_grid_config import GridShape, HashConfig
 
 Place = tuple[Tensor, float]  # points (N, 3), world units, and a time in [0, 1]
 _NUMPY = {torch.float32: "float32", torch.bfloat16: "int16"}  # the dtype of arrays, which have no bfloat16
 
 
 class Encoded(NamedTuple):
-    """Several sets of points and their encodings on the device. Valid until the encoder writes other points.
+    """Sets of points and their encodings on the device. Valid until the encoder writes other points.
 
-    counts, times: of each set. points: (N, 4) of each. tables: (entries, 2) of each grid, group by group. encodings:
-    (N, features) of each set and group; where gradients are recorded, they and the tables become their gradients.
+    tables: (entries, 2) of each grid, group by group. encodings: (N, features) of each set and group; where gradients
+    are recorded, they and the tables become their gradients.
     """
 
-    counts: list[int]
-    times: list[float]
-    points: list[DeviceArray]
+    points: list[PointSet]
     tables: list[list[DeviceArray]]
     encodings: list[list[DeviceArray]]
 
 
 class HashGrid(GridShape, nn.Module):
-    """A grid with its table: (entries, 2) float32."""
+    """A hash grid with its table (entries, 2), float32."""
 
     def __init__(self, config: HashConfig, axes: tuple[int, int, int], generator: torch.Generator) -> None:
         nn.Module.__init__(self)
@@ -46,10 +44,10 @@ class HashGrid(GridShape, nn.Module):
 
 
 class HashEncoder:
-    """Encodes points with several grids at once on one device. Axes and levels are fixed; tables come with each call.
+    """Encodes points with several grids on one device. Axes and levels are fixed; tables are passed to each call.
 
-    groups: of grids whose features lie beside one another in one encoding.
-    lane_levels: the shape of the backward pass for CPU devices; otherwise fixed-point atomics.
+    groups: the features of the grids of a group are concatenated to one encoding.
+    lane_levels: use the backward pass for CPU devices; otherwise fixed-point atomics.
     """
 
     def __init__(
@@ -68,25 +66,24 @@ class HashEncoder:
 
     @property
     def grids(self) -> list[HashGrid]:
-        """Those of all groups."""
+        """The grids of all groups."""
         return [grid for group in self.groups for grid in group]
 
     @property
     def features(self) -> list[int]:
-        """Of a point, for each group."""
+        """Length of a point's encoding, for each group."""
         return [sum(grid.features for grid in group) for group in self.groups]
 
     def __call__(self, points: Tensor, time: float = 0.0, dtype: torch.dtype = torch.float32) -> list[Tensor]:
         """Encode points (N, 3), world units, at a time in [0, 1]: an (N, features) tensor for each group.
 
-        Differentiable in the tables, not in the points (the encoder sees sg[mean]). A point outside the box
-        [-bound, bound]^3 has zero features. dtype: of the encodings and of their gradients, float32 or bfloat16, to
-        which sums in float32 are rounded; the tables and their gradients are float32.
+        Differentiable in the tables, not in the points. Outside the box [-bound, bound]^3 the features are zero. dtype:
+        of the encodings and their gradients, float32 or bfloat16; sums, tables and their gradients are float32.
         """
         return self.encode_all([(points, time)], dtype)[0]
 
     def encode_all(self, places: Sequence[Place], dtype: torch.dtype = torch.float32) -> list[list[Tensor]]:
-        """Encode several sets of points, each at its own time, and exchange the tables with the device only once."""
+        """Encode several sets of points, each at its own time; the tables are uploaded once."""
         detached = [(points.detach(), time) for points, time in places]
         outputs = _Encode.apply(self, detached, dtype, *[grid.table for grid in self.grids])
         count = len(self.groups)
@@ -95,7 +92,7 @@ class HashEncoder:
     def encode(
         self, places: Sequence[Place], dtype: torch.dtype, tables: Sequence[Tensor]
     ) -> tuple[Encoded, list[Tensor]]:
-        """The forward pass without autograd: the encodings of the first place, group by group, then of the second."""
+        """The forward pass without autograd. Returns the encodings by place, then by group."""
         encoded = self.write(places, tables, dtype)
         with Commands(self._device) as commands:
             self.record(commands, encoded)
@@ -106,8 +103,10 @@ class HashEncoder:
     def backward(
         self, places: Sequence[Place], d_encodings: Sequence[Tensor], encoded: Encoded | None = None
     ) -> list[Tensor]:
-        """The gradients of the tables, from those of the encodings in the order of `encode`. encoded: its result, whose
-        points need not be written again while the encoder holds them."""
+        """Gradients of the tables from those of the encodings, in the order of `encode`.
+
+        encoded: result of `encode`, whose points are reused if the encoder still holds them.
+        """
         if encoded is None or not self.holds(encoded):
             encoded = self.write(places, (), d_encodings[0].dtype)
         for array, d_encoding in zip(itertools.chain(*encoded.encodings), d_encodings, strict=True):
@@ -116,24 +115,22 @@ class HashEncoder:
             gradients = self.record_gradient(commands, encoded)
         return [torch.from_numpy(array).to(places[0][0].device) for array in read_all(gradients)]
 
-    # What `encode` and `backward` consist of, without waiting for the device. Everything is written before anything is
-    # submitted: a buffer can only be mapped while the device rests.
+    # The parts of `encode` and `backward`, which do not wait for the device. All writes precede the first submission: a
+    # buffer can only be mapped while the device does not use it.
 
     def write(
         self, places: Sequence[Place], tables: Sequence[Tensor] = (), dtype: torch.dtype = torch.float32
     ) -> Encoded:
-        """Bring points, and tables where they are given, to the device. dtype: of the encodings."""
+        """Upload points and, if given, tables. dtype: of the encodings."""
         for number, table in enumerate(tables):
             self._pool.upload(f"table {number}", _host(table))
         numbers = itertools.count()
-        points = [
-            self._pool.upload(f"points {number}", _host(torch.nn.functional.pad(points.detach().float(), (0, 1))))
-            for number, (points, _) in enumerate(places)
-        ]
+        sets = []
+        for number, (points, time) in enumerate(places):
+            padded = _host(torch.nn.functional.pad(points.detach().float(), (0, 1)))
+            sets.append(PointSet(number, self._pool.upload(f"points {number}", padded), len(points), time))
         self._held = Encoded(
-            [len(points) for points, _ in places],
-            [time for _, time in places],
-            points,
+            sets,
             [
                 [self._pool.array(f"table {next(numbers)}", tuple(grid.table.shape)) for grid in group]
                 for group in self.groups
@@ -149,31 +146,29 @@ class HashEncoder:
         return self._held
 
     def holds(self, encoded: Encoded) -> bool:
-        """Whether the device still has these encodings: nothing else was written, and they are no gradients yet."""
+        """Whether the device still holds these encodings: neither other points nor gradients have overwritten them."""
         return encoded is self._held
 
     def record(self, commands: Commands, encoded: Encoded) -> None:
-        """The passes that encode what was written."""
-        for number, count in enumerate(encoded.counts):
-            for passes, tables, encoding in zip(self._passes, encoded.tables, encoded.encodings[number], strict=True):
-                if count:
-                    passes.encode(
-                        commands, number, encoded.points[number], count, encoded.times[number], tables, encoding
-                    )
+        """Record the passes that encode the written points."""
+        for points, passes, tables, encoding in self._calls(encoded):
+            passes.encode(commands, points, tables, encoding)
 
     def record_gradient(self, commands: Commands, encoded: Encoded) -> list[DeviceArray]:
-        """The passes from the encodings' gradients, in the arrays of the encodings, to those of the tables, in the
-        arrays of the tables, which are returned."""
+        """Record the backward passes. They read the encodings' gradients from the arrays of the encodings, and write
+        those of the tables to the arrays of the tables, which are returned."""
         self._held = None
         for table in itertools.chain(*encoded.tables):
             commands.clear(table)
-        for number, count in enumerate(encoded.counts):
-            for passes, tables, encoding in zip(self._passes, encoded.tables, encoded.encodings[number], strict=True):
-                if count:
-                    passes.add_gradient(
-                        commands, number, encoded.points[number], count, encoded.times[number], encoding, tables
-                    )
+        for points, passes, tables, encoding in self._calls(encoded):
+            passes.add_gradient(commands, points, encoding, tables)
         return list(itertools.chain(*encoded.tables))
+
+    def _calls(self, encoded: Encoded) -> Iterator[tuple[PointSet, HashEncoderPasses, list[DeviceArray], DeviceArray]]:
+        for points, encodings in zip(encoded.points, encoded.encodings, strict=True):
+            for passes, tables, encoding in zip(self._passes, encoded.tables, encodings, strict=True):
+                if points.count:
+                    yield points, passes, tables, encoding
 
 
 def _host(tensor: Tensor) -> NDArray[Any]:
@@ -195,35 +190,3 @@ class _Encode(torch.autograd.Function):
     def backward(ctx: Any, *d_encodings: Tensor) -> tuple[Tensor | None, ...]:
         places = list(zip(ctx.saved_tensors, ctx.times, strict=True))
         return (None, None, None, *ctx.encoder.backward(places, d_encodings, ctx.encoded))
-
-
-def encode_reference(grid: HashGrid, table: Tensor, points: Tensor, time: float, bound: float) -> Tensor:
-    """The reference: (N, 2 x levels) in the table's precision; cells are found in float32, as on the device."""
-    columns = [(points[:, axis] + bound) / (2 * bound) if axis != TIME else None for axis in grid.axes]
-    unit = torch.stack([torch.full_like(points[:, 0], time) if c is None else c for c in columns], dim=1)
-    inside = ((unit >= 0) & (unit <= 1)).all(dim=1)
-    primes = (1, 2654435761, 805459861)
-    encodings = []
-    for level, rows in zip(grid.levels, table.split([level.entries for level in grid.levels]), strict=True):
-        p = torch.where(inside[:, None], unit * torch.tensor(level.scale, dtype=unit.dtype), 0.0)
-        low = p.floor()
-        fraction = (p - low).to(table.dtype)
-        up = fraction * fraction * (3 - 2 * fraction)
-        base = low.long()
-        total = table.new_zeros((len(points), 2))
-        for corner in range(8):
-            weight = inside.to(table.dtype)
-            at = []
-            for axis in range(3):
-                high = (corner >> axis) & 1
-                weight = weight * (up[:, axis] if high else 1 - up[:, axis])
-                at.append((base[:, axis] + high).clamp(max=level.resolution[axis] - 1))
-            x, y, z = at
-            if level.dense:
-                index = x + level.resolution[0] * (y + level.resolution[1] * z)
-            else:
-                hashed = [((a * prime) & 0xFFFFFFFF) for a, prime in zip(at, primes, strict=True)]
-                index = (hashed[0] ^ hashed[1] ^ hashed[2]) % level.entries
-            total = total + weight[:, None] * rows[index]
-        encodings.append(total)
-    return torch.cat(encodings, dim=1)

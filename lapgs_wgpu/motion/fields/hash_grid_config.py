@@ -1,40 +1,35 @@
-"""Shapes of multi-resolution hash grids (Instant-NGP's, with the resolutions of Grid4D; paper eq. 1), without torch."""
+"""Shapes of multi-resolution hash grids (Instant-NGP, with the resolutions of Grid4D; paper eq. 1). Without torch."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
 
-_SLICE_CELLS = 1 << 14  # a level with more cells a plane than this is looked up directly, not cut
+from ...io.dataclass_table import Options, option
+
+_SLICE_CELLS = 1 << 14  # a level with more cells per plane is not sliced
 TIME = 3  # the axis number of time
 
 
-def option(default: Any, help_text: str) -> Any:
-    """A field of a configuration, with the help that lapgs-train --help shows."""
-    return field(default=default, metadata={"help": help_text})
-
-
 @dataclass(frozen=True)
-class HashConfig:
+class HashConfig(Options):
     """The shape of a grid."""
 
-    levels: int = option(16, "number of resolution levels")
-    base: tuple[int, int, int] = option((16, 16, 16), "resolution of the coarsest level along each axis")
-    finest: tuple[int, int, int] = option((2048, 2048, 2048), "resolution of the finest level along each axis")
-    table_log2: int = option(19, "log2 of the largest number of entries per level; larger levels are hashed")
-
-    def __post_init__(self) -> None:
-        if not (1 <= self.levels <= 64 and 1 <= self.table_log2 <= 24):
-            raise ValueError(f"levels must be 1 to 64 and table_log2 1 to 24, got {self.levels} and {self.table_log2}")
-        for size in (*self.base, *self.finest):
-            if not 2 <= size <= 1 << 16:
-                raise ValueError(f"base and finest must be 2 to {1 << 16} entries, got {size}")
+    levels: int = option("number of resolution levels", 16, at_least=1, at_most=64)
+    base: tuple[int, int, int] = option(
+        "resolution of the coarsest level along each axis", (16, 16, 16), at_least=2, at_most=1 << 16
+    )
+    finest: tuple[int, int, int] = option(
+        "resolution of the finest level along each axis", (2048, 2048, 2048), at_least=2, at_most=1 << 16
+    )
+    table_log2: int = option(
+        "log2 of the largest number of entries per level; larger levels are hashed", 19, at_least=1, at_most=24
+    )
 
 
 @dataclass(frozen=True)
 class Level:
-    """scale: cells along each axis, a real number; resolution: entries along each axis; first: its first entry."""
+    """A level. scale: cells along each axis, a real number. resolution: entries along each axis. first: first entry."""
 
     scale: tuple[float, float, float]
     resolution: tuple[int, int, int]
@@ -47,7 +42,7 @@ class Level:
 
 
 def make_levels(config: HashConfig) -> list[Level]:
-    """The levels of a grid: the resolution grows geometrically along each axis."""
+    """Levels of a grid, whose resolution grows geometrically along each axis."""
     levels, first = [], 0
     for number in range(config.levels):
         share = number / max(1, config.levels - 1)
@@ -61,7 +56,7 @@ def make_levels(config: HashConfig) -> list[Level]:
 
 
 class GridShape:
-    """A grid without its table: over three of the axes x, y, z (0 to 2) and t (3, only as the last)."""
+    """A grid without its table. axes: three of x, y, z (0 to 2) and t (3, only as the last one)."""
 
     def __init__(self, config: HashConfig, axes: tuple[int, int, int]) -> None:
         self.axes = axes
@@ -69,7 +64,7 @@ class GridShape:
 
     @property
     def entries(self) -> int:
-        """Rows of the table, of two features each."""
+        """Number of rows of the table, which hold two features each."""
         return self.levels[-1].first + self.levels[-1].entries
 
     @property
@@ -79,7 +74,7 @@ class GridShape:
 
     @property
     def sliced(self) -> list[int]:
-        """The levels that are cut at the time of the step."""
+        """Levels that are sliced at the time of the points before the lookup."""
         if self.axes[2] != TIME:
             return []
         cells = [level.resolution[0] * level.resolution[1] for level in self.levels]

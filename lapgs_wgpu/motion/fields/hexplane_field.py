@@ -1,4 +1,4 @@
-"""The field of 4D-GS (Wu et al. 2024), the baseline `hexplane`: features from six planes of space and time."""
+"""The field hexplane, a baseline (4D-GS, Wu et al. 2024): features from six planes of space and time."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ SPACE_SMOOTHNESS, TIME_SMOOTHNESS, TIME_SPARSITY = 1e-4, 1e-2, 1e-4
 
 
 class HexPlaneField(nn.Module):
-    """Features are products over the six planes, beside each other for each resolution, decoded by small networks.
+    """Features are products over the six planes, concatenated over the resolutions, and decoded by small MLPs.
 
-    Places outside the box take the values of its border.
+    Outside the box, features are those of its border.
     """
 
     def __init__(self, config: FieldConfig, seed: int) -> None:
@@ -58,7 +58,7 @@ class HexPlaneField(nn.Module):
         return Deformation(None, shift, d_quats, d_scales, smoothness=smoothness)
 
     def _features(self, unit: Tensor, first: int) -> Tensor:
-        """(N, F) at places and a time (N, 4) in [-1, 1] from the six planes from number `first` on."""
+        """(N, F) features at points and time (N, 4) in [-1, 1], from six planes starting with number `first`."""
         product: Tensor | None = None
         for plane, pair in zip(list(self.planes)[first : first + len(PLANES)], PLANES, strict=True):
             at = unit[None, None, :, list(pair)]
@@ -68,7 +68,7 @@ class HexPlaneField(nn.Module):
         return product
 
     def _smoothness(self) -> Tensor:
-        """4D-GS's: squared second differences along the second axis of each plane, and time planes close to one."""
+        """4D-GS's: squared second differences along the second axis of each plane; time planes close to one."""
         total = self.planes[0].new_zeros(())
         for number, plane in enumerate(self.planes):
             bend = plane[:, :, 2:] - 2 * plane[:, :, 1:-1] + plane[:, :, :-2]

@@ -1,4 +1,4 @@
-"""Linear layers: their initial weights, from a given generator, and their products in the precision of their inputs."""
+"""Linear layers: initialization from a generator, and products in the precision of the inputs."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def linear(shape: tuple[int, ...], generator: torch.Generator) -> nn.Linear:
 
 
 def zero_head(shape: tuple[int, ...]) -> nn.Linear:
-    """A linear layer with a weight of this shape (outputs, inputs), of zeros: what it changes starts unchanged."""
+    """A linear layer with a weight of this shape (outputs, inputs), initialized to zero: it starts without effect."""
     outputs, inputs = shape
     layer = nn.Linear(inputs, outputs)
     nn.init.zeros_(layer.weight)
@@ -29,13 +29,15 @@ def zero_head(shape: tuple[int, ...]) -> nn.Linear:
 
 
 def product(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    """x (N, inputs) @ weight.T + bias in the precision of x, of which float32 weights are rounded copies then."""
+    """x (N, inputs) @ weight.T + bias in the precision of x, to which the float32 weights are rounded."""
     return nn.functional.linear(x, weight.to(x.dtype), bias.to(x.dtype))
 
 
 def last_product(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    """The same in float32, whatever x is, for outputs that are no features: rounding x's single features is a noise
-    that evens out in the sum, rounding the sum would move Gaussians. Gradients are in the precision of x."""
+    """The same product in float32 for any precision of x; gradients have the precision of x.
+
+    For the heads: rounding errors of single features average out in the sum, but rounding the sum would move Gaussians.
+    """
     return nn.functional.linear(x, weight, bias) if x.dtype == weight.dtype else _LastProduct.apply(x, weight, bias)
 
 

@@ -1,4 +1,4 @@
-"""The field of deformable 3DGS (Yang et al. 2024), the baseline `mlp`: one network of place and time, without grids."""
+"""The field mlp, a baseline (deformable 3DGS, Yang et al. 2024): one MLP of position and time, without grids."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .parameter_shapes import parameter_shapes
 
 
 class MlpField(nn.Module):
-    """Eight layers over sines of the place and of the time; its outputs are added to mean, quaternion and scale."""
+    """Eight layers over sines of position and time, whose outputs are added to mean, quaternion and scale."""
 
     def __init__(self, config: FieldConfig, seed: int) -> None:
         super().__init__()
@@ -45,6 +45,6 @@ class MlpField(nn.Module):
 
 
 def octaves(values: Tensor, count: int) -> Tensor:
-    """(N, D (1 + 2 count)): the values (N, D) beside their sines and cosines at 1, 2, 4, ... radians a unit."""
+    """(N, D (1 + 2 count)): values (N, D), and their sines and cosines at pi, 2 pi, 4 pi, ... radians per unit."""
     angles = [values * (math.pi * 2.0**k) for k in range(count)]
     return torch.cat([values, *(f(angle) for angle in angles for f in (torch.sin, torch.cos))], dim=1)

@@ -1,4 +1,4 @@
-"""The names and shapes of a field's parameters, in the order of its module's state_dict; without torch."""
+"""Names and shapes of the parameters of fields, in the order of the module's state_dict. Without torch."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Shapes = dict[str, tuple[int, ...]]
 
 
 def parameter_shapes(config: FieldConfig) -> Shapes:
-    """All parameters of the field of this configuration; none where nothing moves."""
+    """Parameters of the field of this configuration; none for static scenes."""
     if config.kind == "mlp":
         return _mlp(config)
     if config.kind == "hexplane":
@@ -30,13 +30,13 @@ def parameter_shapes(config: FieldConfig) -> Shapes:
 
 
 def laplacian_motion(inputs: int, width: int, components: int) -> Shapes:
-    """Those of LaplacianMotion."""
+    """Parameters of LaplacianMotion."""
     series: Shapes = {"alpha": (components, width), "beta": (components, width), "frequencies": (components,)}
     return series | _layer("first", width, inputs) | _layer("second", width, width)
 
 
 def time_motion(inputs: int, width: int) -> Shapes:
-    """Those of TimeMotion."""
+    """Parameters of TimeMotion."""
     return _layer("first", width, inputs + 1) | _layer("second", width, width)
 
 

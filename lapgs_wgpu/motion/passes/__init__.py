@@ -1,1 +1,1 @@
-"""The device passes of the hash encoder and of the decoder, without torch."""
+"""Device passes of the hash encoder and the decoder, without torch."""

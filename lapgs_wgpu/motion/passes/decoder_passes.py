@@ -1,7 +1,7 @@
-"""The passes of the grid fields' decoder for training, without torch: from features to outputs of the heads, and back.
+"""Device passes of the grid fields' decoder for training, forward and backward, without torch.
 
-The decoder is that of motion/fields/grid_field without hidden layers, in matrices: layers = beside W_beside^T, to whose
-channels of place static W_static^T is added, and to the temporal ones temporal W_temporal^T; features = gate(layers);
+The decoder of motion/fields/grid_field, without hidden layers, as matrix products: layers = beside W_beside^T; static
+W_static^T is added to the spatial channels, temporal W_temporal^T to the temporal ones; features = gate(layers);
 outputs = features W_heads^T. The layers' biases are the weights of a column of ones in `beside`.
 """
 
@@ -17,13 +17,16 @@ from ...gpu.matmul import Matmul, Matrix
 from ...gpu.pool import BufferPool
 from ..fields.config import GEOMETRY, FieldConfig, static_grid, temporal_grids
 
-_BLOCK = 1 << 14  # Gaussians that are decoded at once: layers and features of a block take 80 MB at a width of 256
+_BLOCK = 1 << 14  # Gaussians per block: its layers and features take 80 MB at a width of 256
 
 
 @dataclass(frozen=True)
 class DecoderShape:
-    """width: channels of a layer. beside, static, temporal: columns of the inputs; temporal may be 0. motion: whether
-    the inner layer of the Laplacian motion stands between the gate and the temporal layer."""
+    """Sizes of a decoder.
+
+    width: channels of a layer. beside, static, temporal: columns of the inputs; temporal may be 0. motion: whether the
+    decoder includes the inner layer of the Laplacian motion.
+    """
 
     width: int
     beside: int
@@ -34,17 +37,17 @@ class DecoderShape:
 
     @property
     def placed(self) -> int:
-        """Channels that depend on the static features; as many are read by the heads."""
+        """Number of channels that depend on the static features; the heads read as many."""
         return self.width * (2 if self.motion else 1)
 
     @property
     def channels(self) -> int:
-        """Of all layers."""
+        """Number of channels of all layers."""
         return self.placed + self.width
 
     @property
     def inputs(self) -> dict[str, tuple[int, int, int]]:
-        """Columns of each input, and the first and the number of the channels that depend on it."""
+        """For each input: its columns, and the first and the number of the channels that depend on it."""
         inputs = {
             "beside": (self.beside, 0, self.channels),
             "static": (self.static, 0, self.placed),
@@ -54,13 +57,13 @@ class DecoderShape:
 
     @property
     def weights(self) -> dict[str, tuple[int, int]]:
-        """Shapes of the layers' weights, by input, and of the heads'."""
+        """Shapes of the layers' weights, by input, and of the heads' weights."""
         shapes = {name: (channels, columns) for name, (columns, _, channels) in self.inputs.items()}
         return shapes | {"heads": (self.outputs, self.placed)}
 
 
 def decoder_shape(config: FieldConfig) -> DecoderShape:
-    """Of a field that `decodes_on_device`."""
+    """The decoder of a field that `decodes_on_device`."""
     return DecoderShape(
         width=config.width,
         beside=config.dynamics_size + 1,
@@ -72,10 +75,10 @@ def decoder_shape(config: FieldConfig) -> DecoderShape:
 
 
 class DecoderPasses:
-    """Records the passes on one device. `inputs` are arrays (N, columns) float32 by the names of `DecoderShape.inputs`,
-    `weights` by those and in the shapes of `DecoderShape.weights`.
+    """Records the passes on one device.
 
-    block: how many Gaussians are decoded at once, a multiple of 64.
+    inputs: (N, columns) float32, by the names of `DecoderShape.inputs`. weights: as `DecoderShape.weights`.
+    block: number of Gaussians per block, a multiple of 64.
     """
 
     def __init__(self, device: Device, shape: DecoderShape, *, block: int | None = None) -> None:
@@ -91,7 +94,7 @@ class DecoderPasses:
         weights: Mapping[str, DeviceArray],
         outputs: DeviceArray,
     ) -> None:
-        """outputs: (N, outputs) float32."""
+        """Record the forward pass. outputs: (N, outputs) float32."""
         for first, count in self._blocks(outputs):
             _, features = self._activate(commands, first, count, inputs, weights)
             target = Matrix.of(outputs.rows(first, count))
@@ -105,7 +108,7 @@ class DecoderPasses:
         d_outputs: DeviceArray,
         d_weights: Mapping[str, DeviceArray],
     ) -> None:
-        """Carry the gradient of the outputs back to the weights, and to the inputs, which become their gradients."""
+        """Record the backward pass to d_weights and to the inputs, which are overwritten by their gradients."""
         for first, count in self._blocks(d_outputs):
             layers, features = self._activate(commands, first, count, inputs, weights)
             d = Matrix.of(d_outputs.rows(first, count))
@@ -131,19 +134,19 @@ class DecoderPasses:
         inputs: Mapping[str, DeviceArray],
         weights: Mapping[str, DeviceArray],
     ) -> tuple[Matrix, Matrix]:
-        """What the layers give for a block, and what the heads read."""
+        """Outputs of the layers for a block, and the inputs of the heads."""
         shape = self.shape
         layers = Matrix.of(self.pool.array("layers", (count, shape.channels)))
         features = Matrix.of(self.pool.array("features", (count, shape.placed)))
         for number, (name, (_, channel, channels)) in enumerate(shape.inputs.items()):
             given, own = Matrix.of(inputs[name].rows(first, count)), layers.from_column(channel, channels)
-            # The first input, beside the features, goes into all channels.
+            # The first input, `beside`, contributes to all channels.
             self._product(commands, f"{name} {first}", given, Matrix.of(weights[name]).transpose, own, add=number > 0)
         self._gate("gate", commands, first, count, layers=layers.array, features=features.array)
         return layers, features
 
     def _gate(self, name: str, commands: Commands, first: int, count: int, **arrays: DeviceArray) -> None:
-        kernel = Kernel.get(self.device, name, **({"MOTION": 1} if self.shape.motion else {}))
+        kernel = Kernel.get(self.device, name, MOTION=self.shape.motion)
         content = kernel.uniform("Gate", gaussians=count, width=self.shape.width)
         uniform = self.pool.constant(f"gate {first}", content)
         commands.dispatch(kernel, -(-count * self.shape.width // 64), gate=uniform, **arrays)

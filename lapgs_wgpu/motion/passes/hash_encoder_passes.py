@@ -1,7 +1,7 @@
-"""The passes of the hash encoder, without torch: points through several hash grids, and the gradient of their tables.
+"""Device passes of the hash encoder, without torch: lookup of points in several hash grids, and gradients of tables.
 
-All points share one time, so a grid with a time axis is first cut at that time wherever that is cheaper than looking up
-the planes around it for each point.
+All points share one time. Levels of a grid with a time axis are first sliced at that time, if that is cheaper than
+looking up two planes for each point.
 """
 
 from __future__ import annotations
@@ -17,13 +17,27 @@ from ...gpu.kernel import Commands, Kernel
 from ...gpu.pool import BufferPool
 from ..fields.hash_grid_config import GridShape
 
-_ALIGNED = 64  # so many rows are a multiple of 256 bytes, at which a binding may begin, whatever the row
+_ALIGNED = 64  # rows; a multiple of 256 bytes for every row size, at which a binding may begin
 _LEVEL_WORDS = 12  # common/hashgrid.wgsl: struct Level
 
 
 @dataclass(frozen=True)
+class PointSet:
+    """Points at one time.
+
+    number: distinguishes the sets that are submitted together. array: (N, 4) world units. count: number of points to
+    encode. time: in [0, 1].
+    """
+
+    number: int
+    array: DeviceArray
+    count: int
+    time: float
+
+
+@dataclass(frozen=True)
 class _Part:
-    """Some levels of a grid that are handled alike."""
+    """The levels of a grid that are sliced, or those that are not."""
 
     grid: int
     sliced: bool
@@ -34,12 +48,11 @@ class _Part:
 
 
 class HashEncoderPasses:
-    """Records the passes that encode points with several grids at once. Axes and levels are fixed; tables (entries, 2),
-    points (N, 4) and the encoding come with each call, in float32 but for an encoding that is wanted in bfloat16.
+    """Records the passes that encode points with several grids. Axes and levels are fixed.
 
-    lane_levels: the shape of the backward pass for CPU devices; otherwise fixed-point atomics.
-    row, column: the encoding's rows have `row` floats, in which the features of one grid lie behind those of the other
-    from `column` on; both even. By default the rows hold just these.
+    lane_levels: use the backward pass for CPU devices; otherwise fixed-point atomics.
+    row, column: the encoding's rows have `row` floats; the grids' features are written one after another from `column`
+    on. Both are even. By default the rows hold the features only.
     """
 
     def __init__(
@@ -55,7 +68,7 @@ class HashEncoderPasses:
         self.device, self.grids, self.bound = device, list(grids), bound
         self.pool = BufferPool(device)
         self.lane_levels = device.is_cpu if lane_levels is None else lane_levels
-        # Where a lane takes all points: no more than half of the turns that the driver lets a loop have.
+        # If a lane loops over all points: at most half of the iterations that the driver allows.
         turns = SOFTWARE_LOOP_TURNS if self.lane_levels else None
         self._most_points = None if turns is None else (turns + 1) // 2
         self._row = sum(grid.features for grid in grids) if row is None else row
@@ -84,7 +97,7 @@ class HashEncoderPasses:
         return _Part(number, sliced, len(chosen), array, largest, slices if sliced else 0)
 
     def _uniform(self, part: _Part, place: str, points: int, all_points: int, time: float) -> DeviceArray:
-        """What the kernels are told of a block of points; all blocks of all places are submitted at once."""
+        """The uniform of a block of points. All blocks of all sets are submitted together, so each has its own."""
         content = Kernel.get(self.device, "hashgrid_slice", SLICED=1, CORNERS=4).uniform(
             "Grid",
             points=points,
@@ -102,8 +115,7 @@ class HashEncoderPasses:
         return {"SLICED": 1, "CORNERS": 4} if part.sliced else {"CORNERS": 8}
 
     def _blocks(self, n: int, encoding: DeviceArray, most: int | None = None) -> Iterator[tuple[int, int]]:
-        """First and number of the points that a dispatch takes, at most so many, whose rows of the
-        encoding fit into a binding."""
+        """First point and number of points of each dispatch: at most `most`, with rows that fit into a binding."""
         row = encoding.nbytes // max(n, 1)
         size = self.device.max_binding // max(row, 1) // _ALIGNED * _ALIGNED
         size = size if most is None else min(size, most)
@@ -112,67 +124,51 @@ class HashEncoderPasses:
     def encode(
         self,
         commands: Commands,
-        number: int,
-        points: DeviceArray,
-        n: int,
-        time: float,
+        points: PointSet,
         tables: list[DeviceArray],
         encoding: DeviceArray,
         *,
         rows: DeviceArray | None = None,
     ) -> None:
-        """Encode n points (N, 4) at a time in [0, 1]; outside the box [-bound, bound]^3 features are zero.
+        """Encode points; outside the box [-bound, bound]^3 features are zero.
 
-        number: tells apart the calls that are submitted together. tables: (entries, 2) of each grid. encoding:
-        (N, row), float32, or int16, which stands for bfloat16. rows: uint32, its first n say which of the points; the
-        encoding, which must fit into a binding, then keeps its other rows. Without, n is N.
+        tables: (entries, 2) of each grid. encoding: (N, row), float32, or int16, which stands for bfloat16. rows:
+        uint32, the first `points.count` select the points; the encoding, which must then fit into a binding, keeps its
+        other rows.
         """
+        number, n = points.number, points.count
         sources = []
         for part in self._parts:
             source = tables[part.grid]
             if part.sliced:
                 slices = self.pool.array(f"slices {part.grid}", (part.entries, 2))
-                commands.dispatch_grid(
-                    Kernel.get(self.device, "hashgrid_slice", **self._defines(part)),
-                    (-(-part.cells // 64), part.count),
-                    grid=self._uniform(part, f"{number}", n, n, time),
-                    levels=part.levels,
-                    features=source,
-                    slices=slices,
-                )
+                kernel = Kernel.get(self.device, "hashgrid_slice", **self._defines(part))
+                grid = self._uniform(part, f"{number}", n, n, points.time)
+                arrays = {"grid": grid, "levels": part.levels, "features": source, "slices": slices}
+                commands.dispatch_grid(kernel, (-(-part.cells // 64), part.count), **arrays)
                 source = slices
             sources.append(source)
         options = _precision(encoding)
         if rows is None:
             blocks = [
-                (first, count, {"points": points.rows(first, count), "encoding": encoding.rows(first, count)})
+                (first, count, {"points": points.array.rows(first, count), "encoding": encoding.rows(first, count)})
                 for first, count in self._blocks(n, encoding)
             ]
         else:
             options |= {"ROWS": 1}
-            blocks = [(0, n, {"points": points, "encoding": encoding, "rows": rows})]
-        for first, count, arrays in blocks:
+            blocks = [(0, n, {"points": points.array, "encoding": encoding, "rows": rows})]
+        for first, count, of_points in blocks:
             for part, source in zip(self._parts, sources, strict=True):
-                commands.dispatch(
-                    Kernel.get(self.device, "hashgrid", **self._defines(part), **options),
-                    -(-count // 512) * part.count,
-                    grid=self._uniform(part, f"{number} from {first}", count, n, time),
-                    levels=part.levels,
-                    features=source,
-                    **arrays,
-                )
+                kernel = Kernel.get(self.device, "hashgrid", **self._defines(part), **options)
+                grid = self._uniform(part, f"{number} from {first}", count, n, points.time)
+                arrays = {"grid": grid, "levels": part.levels, "features": source}
+                commands.dispatch(kernel, -(-count // 512) * part.count, **arrays, **of_points)
 
     def add_gradient(
-        self,
-        commands: Commands,
-        number: int,
-        points: DeviceArray,
-        n: int,
-        time: float,
-        d_encoding: DeviceArray,
-        d_tables: list[DeviceArray],
+        self, commands: Commands, points: PointSet, d_encoding: DeviceArray, d_tables: list[DeviceArray]
     ) -> None:
         """Add the gradient of the tables, from that of the encoding, whose rows must hold nothing else."""
+        number, n = points.number, points.count
         targets, sums = [], []
         for part in self._parts:
             target = d_tables[part.grid]
@@ -186,53 +182,41 @@ class HashEncoderPasses:
             sums.append(target)
 
         options = _precision(d_encoding)
-        largest = {} if self.lane_levels else {"largest": self._largest(commands, number, n, time, d_encoding, options)}
+        largest = {} if self.lane_levels else {"largest": self._largest(commands, points, d_encoding, options)}
         options |= {"LANE_LEVELS": 1} if self.lane_levels else {}
         for first, count in self._blocks(n, d_encoding, self._most_points):
             for part, target in zip(self._parts, sums, strict=True):
-                commands.dispatch(
-                    Kernel.get(self.device, "hashgrid_bwd", **self._defines(part), **options),
-                    -(-part.count // 8) if self.lane_levels else -(-count // 64) * part.count,
-                    grid=self._uniform(part, f"{number} from {first}", count, n, time),
-                    levels=part.levels,
-                    points=points.rows(first, count),
-                    d_encoding=d_encoding.rows(first, count),
-                    **{"d_features" if self.lane_levels else "d_fixed": target},
-                    **largest,
-                )
+                kernel = Kernel.get(self.device, "hashgrid_bwd", **self._defines(part), **options)
+                groups = -(-part.count // 8) if self.lane_levels else -(-count // 64) * part.count
+                arrays = {"points": points.array.rows(first, count), "d_encoding": d_encoding.rows(first, count)}
+                arrays |= {"levels": part.levels, "d_features": target, "d_fixed": target, **largest}
+                arrays["grid"] = self._uniform(part, f"{number} from {first}", count, n, points.time)
+                commands.run(kernel, groups, arrays)
 
         for part, target, fixed in zip(self._parts, targets, sums, strict=True):
-            uniform = self._uniform(part, f"{number}", n, n, time)
+            uniform = self._uniform(part, f"{number}", n, n, points.time)
             if not self.lane_levels:
                 unfix = Kernel.get(self.device, "hashgrid_unfix", **self._defines(part))
                 commands.dispatch(
                     unfix, -(-target.size // 64), grid=uniform, d_fixed=fixed, d_features=target, **largest
                 )
             if part.sliced:
-                commands.dispatch_grid(
-                    Kernel.get(self.device, "hashgrid_slice_bwd", **self._defines(part)),
-                    (-(-part.cells // 64), part.count),
-                    grid=uniform,
-                    levels=part.levels,
-                    d_slices=target,
-                    d_features=d_tables[part.grid],
-                )
+                kernel = Kernel.get(self.device, "hashgrid_slice_bwd", **self._defines(part))
+                arrays = {"levels": part.levels, "d_slices": target, "d_features": d_tables[part.grid]}
+                commands.dispatch_grid(kernel, (-(-part.cells // 64), part.count), grid=uniform, **arrays)
 
     def _largest(
-        self, commands: Commands, number: int, n: int, time: float, d_encoding: DeviceArray, options: dict[str, int]
+        self, commands: Commands, points: PointSet, d_encoding: DeviceArray, options: dict[str, int]
     ) -> DeviceArray:
-        """The largest absolute value of a gradient, by which sums in fixed point are scaled."""
+        """The largest absolute value of a gradient, which scales fixed-point sums."""
+        number, n = points.number, points.count
         largest = self.pool.array(f"largest {number}", (1,), "uint32")
         commands.clear(largest)
         kernel = Kernel.get(self.device, "hashgrid_largest", CORNERS=4, **options)
         for first, count in self._blocks(n, d_encoding):
-            commands.dispatch(
-                kernel,
-                -(-count * self._row // 4096),
-                grid=self._uniform(self._parts[0], f"{number} largest from {first}", count, n, time),
-                d_encoding=d_encoding.rows(first, count),
-                largest=largest,
-            )
+            grid = self._uniform(self._parts[0], f"{number} largest from {first}", count, n, points.time)
+            gradient = d_encoding.rows(first, count)
+            commands.dispatch(kernel, -(-count * self._row // 4096), grid=grid, d_encoding=gradient, largest=largest)
         return largest
 
 

@@ -1,1 +1,1 @@
-"""Showing a scene at any time, where possible without torch."""
+"""Playback of scenes at any time, without torch where possible."""

@@ -1,6 +1,6 @@
-"""Grid fields on the device, without torch: the Gaussians of a grid4d or laplacian scene at a time, for playback.
+"""Playback of the fields grid4d and laplacian on the device, without torch.
 
-What needs no time is computed once. Then a time costs the temporal encoding and one pass, `deform`.
+What does not depend on the time is computed once. A time then costs the temporal encoding and one pass, `deform`.
 """
 
 from __future__ import annotations
@@ -18,26 +18,26 @@ from ...gpu.kernel import Commands, Kernel
 from ...gpu.pool import BufferPool
 from ...splat.gaussians import Gaussians
 from ..fields.config import APPEARANCE_SCALE, GEOMETRY, FieldConfig, static_grid, temporal_grids
-from ..passes.hash_encoder_passes import HashEncoderPasses
+from ..passes.hash_encoder_passes import HashEncoderPasses, PointSet
 
 Floats = NDArray[np.float32]
 
 _LANES = 64  # deform.wgsl
 _CANONICAL = 16  # deform.wgsl: floats of a Gaussian before its still features
-_BLOCK_BYTES = 128 << 20  # of the features that one dispatch sees: WebGPU's default limit of a binding
+_BLOCK_BYTES = 128 << 20  # of the features that a dispatch reads: WebGPU's default limit of a binding
 
 
 def runs_on_device(config: FieldConfig, device: Device) -> bool:
-    """Whether `GridFieldPlayback` can show this field on the device."""
+    """Whether `GridFieldPlayback` supports this field on the device."""
     if not config.decodes_on_device or device.max_loop_turns is None:
         return config.decodes_on_device
     sizes = _Sizes(config)
-    # Of 8 channels (on CPU devices), with the loops over channels and the round itself.
+    # Iterations of a round of 8 channels (on CPU devices), with the loops over channels and the round itself.
     return (sizes.width // 8 + 1) * (sizes.still_quads + sizes.moving_quads + 11) < device.max_loop_turns
 
 
 class _Sizes:
-    """Lengths of the rows that the pass reads, in floats and in quads of them."""
+    """Lengths of the rows that the pass reads, in floats and in quads of four floats."""
 
     def __init__(self, config: FieldConfig) -> None:
         self.width = config.width
@@ -51,21 +51,22 @@ class _Sizes:
 
 @dataclass(frozen=True)
 class _Block:
-    """Gaussians that one dispatch takes: a range of all, with what is read of them."""
+    """The range of Gaussians of one dispatch, and its inputs."""
 
     first: int
     count: int
     points: DeviceArray  # (count, 4)
     still: DeviceArray  # (count, 16 + still features)
     moving: DeviceArray  # (count, dynamics and temporal features)
-    rows: DeviceArray  # (count,) uint32, of which the first say what a dispatch takes
+    rows: DeviceArray  # (count,) uint32; the first ones select the Gaussians of a dispatch
 
 
 class GridFieldPlayback:
-    """Moves activated Gaussians (`still`, means (N, 3), quats (N, 4) of unit length, ..., with opacity_logits in place
-    of opacities) by a field whose parameters have the names and shapes of fields/parameter_shapes.
+    """Moves Gaussians by a field.
 
-    block: how many Gaussians a dispatch takes, a multiple of 64; by default what fits into 128 MiB.
+    parameters: of the field, by the names and in the shapes of fields/parameter_shapes. gaussians: activated, but with
+    opacity_logits, and with quats of unit length. block: number of Gaussians per dispatch, a multiple of 64; by default
+    as many as fit into 128 MiB.
     """
 
     def __init__(
@@ -103,7 +104,7 @@ class GridFieldPlayback:
         self._encode_static(parameters["static_grid.table"])
         heads, stream = self._heads(0.0), self._stream()
         self._stream_at, self._rows_at = len(heads), len(heads) + len(stream)
-        # Vectors of four floats: heads, stream, and the numbers of the rows that are moved.
+        # Vectors of four floats: heads, stream, and the indices of the moved rows.
         self._weights = self._pool.array("weights", (self._rows_at + -(-count // 4), 4))
         self._weights.rows(0, self._rows_at).write(np.concatenate([heads, stream]))
 
@@ -121,26 +122,26 @@ class GridFieldPlayback:
         return _Block(first, count, **{name: self._pool.upload(f"{name} from {first}", a) for name, a in named.items()})
 
     def _encode_static(self, entries: Floats) -> None:
-        """H_s, into the rows of what does not change."""
+        """Compute the spatial features H_s."""
         row = _CANONICAL + 4 * self._sizes.still_quads
         encoder = HashEncoderPasses(
             self._device, [static_grid(self._config)], self._config.bound, row=row, column=_CANONICAL
         )
-        table = DeviceArray.upload(self._device, "static table", entries)  # not in the pool: it is needed once
+        table = DeviceArray.upload(self._device, "static table", entries)  # not in the pool, since it is needed once
         with Commands(self._device) as commands:
             for number, block in enumerate(self._blocks):
-                encoder.encode(commands, number, block.points, block.count, 0.0, [table], block.still)
+                encoder.encode(commands, PointSet(number, block.points, block.count, 0.0), [table], block.still)
 
     # Weights ---------------------------------------------------------------------------------------------------------
 
     def _columns(self, weight: Floats, quads: int) -> Floats:
-        """(rounds, input quads, output quads of a round, 4 inputs, 4 outputs) of a layer's weight (width, inputs)."""
+        """Rearrange a weight (width, inputs): (rounds, input quads, output quads of a round, 4 inputs, 4 outputs)."""
         padded = np.zeros((self._rounds * self._channels, 4 * quads), np.float32)
         padded[: weight.shape[0], : weight.shape[1]] = weight
         return padded.reshape(self._rounds, self._channels // 4, 4, quads, 4).transpose(0, 3, 1, 4, 2)
 
     def _stream(self) -> Floats:
-        """(vectors, 4): biases and layers of the decoder, in the order in which the pass reads them."""
+        """(vectors, 4) biases and layers of the decoder, in the order in which the pass reads them."""
         p, sizes, rounds = self._parameters, self._sizes, self._rounds
         p = p | {name: np.float32(0.5) * p[name] for name in ("spatial.weight", "spatial.bias")}  # see common/gate.wgsl
         moving = np.zeros((sizes.width, sizes.first_temporal + sizes.temporal), np.float32)
@@ -155,7 +156,7 @@ class GridFieldPlayback:
         return np.concatenate([part.reshape(rounds, -1, 4) for part in parts], axis=1).reshape(-1, 4)
 
     def _heads(self, t: float) -> Floats:
-        """(vectors, 4): biases and, by channel, weights of the heads; with the Laplacian motion at a time folded in."""
+        """(vectors, 4) biases and, by channel, weights of the heads, with the Laplacian motion at a time folded in."""
         p, width = self._parameters, self._sizes.width
         weight = p["heads.weight"]
         heads, channels = self._defines["HEADS"], self._rounds * self._channels
@@ -166,7 +167,7 @@ class GridFieldPlayback:
         if self._config.kind == "laplacian":
             phase = 2 * math.pi * t * p["motion.frequencies"].astype(np.float64)
             series = np.cos(phase) @ p["motion.alpha"] + np.sin(phase) @ p["motion.beta"]
-            # Factors.through: A_L goes into nothing but these heads.
+            # As Factors.through: only these heads read A_L.
             _fill_geometry(columns[:width, heads:], (weight @ (series[:, None] * p["motion.second.weight"])).T)
             bias = p["heads.bias"] + weight @ (series * p["motion.second.bias"])
             _fill_geometry(start[None], bias[None])
@@ -180,10 +181,10 @@ class GridFieldPlayback:
     # A time ----------------------------------------------------------------------------------------------------------
 
     def move(self, t: float, out: Gaussians[DeviceArray], rows: NDArray[np.integer] | None = None) -> None:
-        """Submit the passes that write the Gaussians at a time in [0, 1]: all of `out` but the colours above their
-        constant part, which stay, and the constant part, too, where the field changes no colours.
+        """Submit the passes that write the Gaussians at a time in [0, 1] to `out`.
 
-        rows: (M,) ascending, the Gaussians to be moved, None for all; the others stay as they are in `out`.
+        Of the colors only the constant part is written, if the field changes colors.
+        rows: (M,) ascending, the Gaussians to be moved; None for all. The others keep their values in `out`.
         """
         kernel = Kernel.get(self._device, "deform", **self._defines)
         rows = np.arange(self._count) if rows is None else rows
@@ -193,23 +194,15 @@ class GridFieldPlayback:
         listed = np.zeros((-(-len(rows) // 4), 4), np.float32)
         listed.reshape(-1)[: len(rows)] = of_block
         self._weights.rows(self._rows_at, len(listed)).write(listed)
-        points = self._defines["POINTS"]
+        lanes = _LANES * self._defines["POINTS"]  # Gaussians of a workgroup
         with Commands(self._device) as commands:
             for number, block in enumerate(self._blocks):
                 start, end = np.searchsorted(rows, (block.first, block.first + block.count)).tolist()
                 if start == end:
                     continue
                 block.rows.rows(0, end - start).write(of_block[start:end].astype(np.uint32))
-                self._temporal.encode(
-                    commands,
-                    number,
-                    block.points,
-                    end - start,
-                    self._config.grid_time(t),
-                    self._tables,
-                    block.moving,
-                    rows=block.rows,
-                )
+                points = PointSet(number, block.points, end - start, self._config.grid_time(t))
+                self._temporal.encode(commands, points, self._tables, block.moving, rows=block.rows)
                 uniform = self._pool.constant(
                     f"deform {number}",
                     kernel.uniform(
@@ -229,7 +222,7 @@ class GridFieldPlayback:
                 outputs = {name: getattr(out, of).rows(block.first, block.count) for name, of in names.items()}
                 commands.dispatch(
                     kernel,
-                    -(-(end - start) // (_LANES * points)),
+                    -(-(end - start) // lanes),
                     deform=uniform,
                     still=block.still,
                     moving=block.moving,
@@ -239,6 +232,6 @@ class GridFieldPlayback:
 
 
 def _fill_geometry(quads: NDArray[np.float32], outputs: NDArray[np.floating]) -> None:
-    """Lay the geometry heads' 14 outputs (rows, 14) out as deform.wgsl has them, in quads (rows, 4 or more, 4)."""
+    """Write the geometry heads' outputs (rows, 14) in the layout of deform.wgsl: quads (rows, 4 or more, 4)."""
     turn, shift, quaternion, scale = np.split(outputs, np.cumsum(GEOMETRY)[:-1], axis=1)
     quads[:, 0], quads[:, 1], quads[:, 2, :3], quads[:, 3, :3] = turn, quaternion, shift, scale

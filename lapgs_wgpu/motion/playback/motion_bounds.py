@@ -1,6 +1,6 @@
-"""What playback has seen of each Gaussian's motion, and so which of them a picture cannot do without.
+"""Bounds of each Gaussian's motion during playback, which tell the Gaussians that an image needs.
 
-On the host: a hundred operations for each Gaussian, where the field takes a hundred thousand.
+On the host: a hundred operations per Gaussian, whereas the field takes a hundred thousand.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ from ...splat.constants import CONSTANTS
 
 Floats = NDArray[np.float32]
 
-_FEW = 8  # parts of the clip that must have been seen before any Gaussian is taken to stand still
-_STILL_PIXELS = 0.25  # it does where what lies a standard deviation from its mean, on the steepest slope, moves less
-_STILL_SHADE = 1 / 64  # and its opacity and colours, of range 1, change less
-_BEYOND = 1.5  # times the box of the means: between the times seen a path may leave it
-_RIM = math.sqrt(-2 * math.log(CONSTANTS["ALPHA_MIN"]))  # standard deviations to where even an opaque Gaussian ends
-_DILATED = _RIM * math.sqrt(CONSTANTS["DILATION"])  # pixels that the low-pass adds to a rim, at most
+_FEW = 8  # parts of the clip that must have been seen before a Gaussian can count as still
+_STILL_PIXELS = 0.25  # a still Gaussian moves less, one standard deviation from its mean, where its slope is steepest
+_STILL_SHADE = 1 / 64  # and its opacity and colors change less
+_BEYOND = 1.5  # factor of the box of the means: between the seen times a path may leave the box
+_RIM = math.sqrt(-2 * math.log(CONSTANTS["ALPHA_MIN"]))  # standard deviations to the rim of an opaque Gaussian
+_DILATED = _RIM * math.sqrt(CONSTANTS["DILATION"])  # pixels that the low-pass filter adds to a rim, at most
 
 
 class MotionBounds:
-    """Boxes of the values that `count` Gaussians have had so far.
+    """Bounding boxes of the values that `count` Gaussians have had so far.
 
-    parts: of the clip, so short that next to nothing happens within one.
+    parts: number of parts of the clip, each so short that the values hardly change within it.
     """
 
     def __init__(self, count: int, parts: int) -> None:
@@ -36,9 +36,9 @@ class MotionBounds:
         self._high = -self._low
 
     def add(self, values: Floats, t: float | None) -> None:
-        """Widen the boxes by values (count, 14): mean, quaternion, scales, opacity, constant part of the colour.
+        """Extend the boxes by values (count, 14): mean, quaternion, scales, opacity, constant part of the color.
 
-        t: the time in [0, 1] of all of them; None where they are of several times.
+        t: their time in [0, 1]; None if they belong to several times.
         """
         np.minimum(self._low, values.T, out=self._low)
         np.maximum(self._high, values.T, out=self._high)
@@ -48,12 +48,12 @@ class MotionBounds:
     def _part(self, t: float) -> int:
         return min(int(t * self._parts), self._parts - 1)
 
-    @np.errstate(invalid="ignore", over="ignore")  # what is not finite is needed
+    @np.errstate(invalid="ignore", over="ignore")  # non-finite values count as needed
     def needed(self, t: float, camera: Camera) -> NDArray[np.bool_]:
-        """(count,) whether a picture of a time in [0, 1] needs the Gaussian as it is at that very time.
+        """(count,) bool: Gaussians that an image at a time in [0, 1] needs with their values of exactly that time.
 
-        Not where its box is so small that any values in it will do, nor where the box lies beside the picture: values
-        of another time that were added lie beside it, too. At times of which too little was seen all are needed.
+        Not needed are those whose box is so small that any values in it suffice, and those whose box is outside the
+        image, as are then all values that were added. While too little of the clip was seen, all are needed.
         """
         low, high = self._low, self._high
         if len(self._seen) < min(_FEW, self._parts) or self._part(t) not in self._seen:
@@ -65,7 +65,7 @@ class MotionBounds:
         spread = 0.5 * _BEYOND * path
 
         focal, centre, pixels = camera.K[[0, 1], [0, 1]], camera.K[:2, 2], np.array([camera.width, camera.height])
-        # The half axes in the image of a unit ball at depth 1 are at most this long (`project`).
+        # Upper bound of the half axes of the image of a unit ball at depth 1 (`project`).
         tangent = np.maximum(centre, pixels - centre) / focal + CONSTANTS["FRUSTUM_MARGIN"] * 0.5 * pixels / focal
         stretch = focal * np.sqrt(1 + tangent**2)
         T = camera.T_cam_world.astype(np.float32)
@@ -77,7 +77,7 @@ class MotionBounds:
             reach = stretch[axis] * (spread + _RIM * widest) + _DILATED * np.maximum(depth, 0)
             beside |= (at + reach < 0) | (at - reach > pixels[axis] * depth)
 
-        moved = path + growth + 2 * turn * widest  # a quaternion turns by twice its own angle
+        moved = path + growth + 2 * turn * widest  # a quaternion rotates by twice its angle
         nearest = np.maximum(depth - spread, CONSTANTS["NEAR"])
         still = (stretch.max() * moved < _STILL_PIXELS * nearest) & (shade < _STILL_SHADE)
         return ~(still | beside)

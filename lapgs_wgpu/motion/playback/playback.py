@@ -1,7 +1,6 @@
-"""Showing a trained scene at any time: what a viewer needs of it, and opening a file for that.
+"""Playback of a trained scene at any time: the interface, and opening files.
 
-Where a scene stands still or the device evaluates its field (motion/deform), torch is not imported, which alone would
-take longer than all the rest.
+torch is not imported for static scenes and for fields that the device evaluates: that would take longer than the rest.
 """
 
 from __future__ import annotations
@@ -27,9 +26,9 @@ Floats = NDArray[np.float32]
 
 
 class Playback(Protocol):
-    """A scene that can be shown: `count` Gaussians of `sh_degree`, which stand still unless it `moves`.
+    """A scene that can be rendered at any time in [0, 1].
 
-    metadata: what the checkpoint says of itself. Times are in [0, 1].
+    count: number of Gaussians. moves: False for static scenes. metadata: of the checkpoint.
     """
 
     device: Device
@@ -44,23 +43,23 @@ class Playback(Protocol):
     def moves(self) -> bool: ...
     @property
     def exact(self) -> bool:
-        """Whether all that `at` gave last was of the time that was asked for."""
+        """Whether all Gaussians of the last call of `at` are of the requested time."""
 
     def at(self, t: float, seen_by: Camera | None = None) -> Gaussians[DeviceArray]:
-        """The activated Gaussians at a time, on the device: submitted, not waited for. Valid until the next call.
+        """The activated Gaussians at a time, on the device. Does not wait for it. Valid until the next call.
 
-        seen_by: the only camera that draws them, for a picture that passes; Gaussians that hardly move, or that it does
-        not see, may be of other times.
+        seen_by: the only camera that renders them, for images of a moving view or time: Gaussians that hardly move or
+        are outside its image may then be of other times.
         """
 
     def means(self, t: float) -> Floats:
-        """(count, 3), world units, at a time."""
+        """(count, 3) means at a time, world units."""
 
     def dynamics(self) -> Floats | None:
-        """(count, D) the dynamics attributes; None where the field has none."""
+        """(count, D) dynamics attributes; None for fields without them."""
 
     def still(self, t: float) -> GaussianSnapshot:
-        """All Gaussians at a time, as 3DGS viewers read them; what `Scene4D.save` writes for time 0."""
+        """All Gaussians at a time, as 3DGS viewers read them. `Scene4D.save` writes those at time 0."""
 
 
 def open_playback(path: str | os.PathLike[str], device: Device) -> Playback:
@@ -69,11 +68,11 @@ def open_playback(path: str | os.PathLike[str], device: Device) -> Playback:
 
 
 def playback_of(file: SceneFile, device: Device) -> Playback:
-    """Show a file that was read.
+    """Playback of a file that was read.
 
-    torch is imported for the fields mlp and hexplane, for hidden layers, and for the ablated motion alone.
-    Raises MemoryError where a buffer of all Gaussians is beyond the device's limits: colours are the largest,
-    1.4 million Gaussians of degree 3 at WebGPU's default limits.
+    torch is imported only for the fields mlp and hexplane, for hidden layers, and for the ablation of the motion.
+    Raises MemoryError if a buffer of all Gaussians exceeds the device's limits. The colors are the largest one: 1.4
+    million Gaussians of degree 3 at WebGPU's default limits.
     """
     if file.field_config.kind == "static" or runs_on_device(file.field_config, device):
         return DevicePlayback(file, device)
@@ -84,9 +83,9 @@ def playback_of(file: SceneFile, device: Device) -> Playback:
 
 
 class DevicePlayback:
-    """A file whose scene stands still, or moves by a field that the device evaluates. See Playback.
+    """A Playback of static scenes, and of fields that the device evaluates.
 
-    block: how many Gaussians a dispatch takes, see GridFieldPlayback.
+    block: number of Gaussians per dispatch, see GridFieldPlayback.
     """
 
     def __init__(self, file: SceneFile, device: Device, *, block: int | None = None) -> None:
@@ -101,19 +100,18 @@ class DevicePlayback:
         self.exact = True
         self._field: GridFieldPlayback | None = None
         if self.moves:
-            self._times = np.full(self.count, np.nan)  # of what the buffers hold
-            # Features change from entry to entry of the temporal grids' time axis, so little within half of one.
+            self._times = np.full(self.count, np.nan)  # of each Gaussian in the buffers
+            # Parts of half an entry of the temporal grids' time axis, within which features hardly change.
             self._bounds = MotionBounds(self.count, 2 * self.field_config.temporal.finest[2])
-            self._bounded = True  # do the bounds hold what is in the buffers?
+            self._bounded = True  # whether the bounds include the values in the buffers
             self._field = GridFieldPlayback(device, file.field_config, file.field, activated, block=block)
 
     def at(self, t: float, seen_by: Camera | None = None) -> Gaussians[DeviceArray]:
-        """See Playback."""
         if self._field is None:
             return self._now
         old = self._times != t
         moved = old
-        # The choice needs the values on the host each time: not where they lie in memory of the device's own.
+        # The choice reads the values back each time, which is too slow from separate device memory.
         if seen_by is not None and self.device.mappable and old.any():
             self._bound()
             moved = old & self._bounds.needed(t, seen_by)
@@ -125,8 +123,7 @@ class DevicePlayback:
         return self._now
 
     def _bound(self) -> None:
-        """Widen the bounds by what the buffers hold. Done before each choice, it leaves no Gaussian outside of its own
-        bounds, whatever time it is of."""
+        """Extend the bounds by the values in the buffers, of whatever times. Called before each choice."""
         if self._bounded:
             return
         now = self._now
@@ -137,15 +134,12 @@ class DevicePlayback:
         self._bounded = True
 
     def means(self, t: float) -> Floats:
-        """See Playback."""
         return self.at(t).means.read() if self.moves else self._stored["means"]
 
     def dynamics(self) -> Floats | None:
-        """See Playback."""
         return self._stored.get("dynamics")
 
     def still(self, t: float) -> GaussianSnapshot:
-        """See Playback."""
         now = self.at(t)
         means, quats, scales, opacities, colors = read_all([now.means, now.quats, now.scales, now.opacities, now.sh])
         logits = self._stored["opacity_logits"]
@@ -157,7 +151,7 @@ class DevicePlayback:
 
 
 def activate(stored: dict[str, Floats], sh_degree: int) -> dict[str, Floats]:
-    """What is stored, and beside it the Gaussians after their activations, as Scene4D.canonical has them."""
+    """The stored arrays, and the activated Gaussians as in `Scene4D.canonical`."""
     quats, used = stored["quats"], (sh_degree + 1) ** 2 - 1
     with np.errstate(over="ignore"):
         scales = np.maximum(np.exp(stored["log_scales"]), np.float32(MIN_SCALE))

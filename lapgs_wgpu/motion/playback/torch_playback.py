@@ -1,4 +1,4 @@
-"""Showing a scene that torch evaluates: the fields that the device does not, and a scene that is being trained."""
+"""Playback of scenes that torch evaluates: other fields, and scenes in training."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from ..scene import Scene4D
 
 
 class _Shown(NamedTuple):
-    """What was uploaded last, and of which time, degree and parameters, each with torch's count of what was written."""
+    """The last upload: its time, degree and parameters, each with torch's version counter."""
 
     gaussians: Gaussians[DeviceArray]
     t: float
     sh_degree: int
-    parameters: list[tuple[weakref.ref[Tensor], int]]  # weak: a training replaces large ones, and drops them
+    parameters: list[tuple[weakref.ref[Tensor], int]]  # weak references, since a training replaces large tensors
 
     def is_of(self, scene: Scene4D, t: float) -> bool:
-        """Whether an evaluation of the scene would give the same."""
+        """Whether an evaluation of the scene would give the same result."""
         parameters = _parameters(scene)
         return (self.t, self.sh_degree, len(self.parameters)) == (t, scene.sh_degree, len(parameters)) and all(
             known() is parameter and version == parameter._version
@@ -41,39 +41,35 @@ def _parameters(scene: Scene4D) -> list[Tensor]:
 
 
 class TorchPlayback:
-    """A Scene4D as it is at each call: parameters, their number and sh_degree may change in between. See Playback.
+    """A Playback of a Scene4D in its present state: parameters, their number and sh_degree may change between calls.
 
-    It is evaluated only where the time, the degree or a parameter has changed, by torch's count of what was written to
-    it. Fused optimisers do not count by themselves (train/optimizer).
+    The scene is evaluated only if the time, the degree or a parameter has changed, according to torch's version
+    counters. Fused optimizers do not increment them by themselves (train/optimizer).
     """
 
     def __init__(self, scene: Scene4D) -> None:
         self.scene = scene
         self.device, self.field_config, self.metadata = scene.device, scene.field_config, scene.metadata
         self.exact = True
-        self._pool = BufferPool(scene.device)  # a training draws with its own
+        self._pool = BufferPool(scene.device)  # a training uses its own
         self._shown: _Shown | None = None
 
     @property
     def count(self) -> int:
-        """See Playback."""
         return len(self.scene)
 
     @property
     def sh_degree(self) -> int:
-        """See Playback."""
         return self.scene.sh_degree
 
     @property
     def moves(self) -> bool:
-        """See Playback."""
         return self.scene.field is not None
 
     def at(self, t: float, seen_by: Camera | None = None) -> Gaussians[DeviceArray]:
-        """See Playback."""
         scene = self.scene
         if self._shown is None or not self._shown.is_of(scene, t):
-            self._shown = None  # where it fails halfway, the buffers hold a mixture
+            self._shown = None  # after a failure the buffers would be inconsistent
             known = [(weakref.ref(parameter), parameter._version) for parameter in _parameters(scene)]
             with torch.no_grad():
                 now = scene.at(t)
@@ -81,15 +77,12 @@ class TorchPlayback:
         return self._shown.gaussians
 
     def means(self, t: float) -> NDArray[np.float32]:
-        """See Playback."""
         with torch.no_grad():
             return np.array(self.scene.at(t).means.numpy(force=True))
 
     def dynamics(self) -> NDArray[np.float32] | None:
-        """See Playback."""
         d = self.scene.parameters.get("dynamics")
         return None if d is None else np.array(d.numpy(force=True))
 
     def still(self, t: float) -> GaussianSnapshot:
-        """See Playback."""
         return self.scene.still(t)

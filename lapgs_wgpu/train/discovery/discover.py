@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from lapgs_wgpu.data.init import initial_scales
+from lapgs_wgpu.data.initial_gaussians import initial_scales
 from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device

@@ -15,7 +15,7 @@ from lapgs_wgpu.data.views import Dataset, View, composite
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.config import Config, Rate
-from lapgs_wgpu.train.evaluate import COLOURS
+from lapgs_wgpu.train.evaluate import BACKGROUND_LEVELS
 from lapgs_wgpu.train.trainer import Trainer
 
 from .residual import Residual
@@ -45,7 +45,7 @@ def static_fit(
             progress(step + 1)
     finally:
         training.close()
-    background = torch.full((3,), COLOURS[config.data.background])
+    background = torch.full((3,), BACKGROUND_LEVELS[config.data.background])
     images = []
     for view in small:
         image = (composite(view.load(), background.numpy()) / 255).astype(np.float32)

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from lapgs_wgpu.data.cloud import Cloud
-from lapgs_wgpu.data.init import MIN_SCALE, initial_scales, limit_optical_depth, random_points
+from lapgs_wgpu.data.initial_gaussians import MIN_SCALE, initial_scales, limit_optical_depth, random_points
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.splat.camera import Camera
@@ -31,13 +31,13 @@ ROOM = Dataset("room", VIEWS, VIEWS[:1], depths=(0.9, 3.7))
 
 
 def test_random_points() -> None:
-    means, colours = random_points(5000, -1.3, 1.3, 0)
-    assert means.dtype == colours.dtype == np.float32
-    assert means.shape == colours.shape == (5000, 3)
+    means, colors = random_points(5000, -1.3, 1.3, 0)
+    assert means.dtype == colors.dtype == np.float32
+    assert means.shape == colors.shape == (5000, 3)
     assert -1.3 <= means.min() < -1.29
     assert 1.29 < means.max() <= 1.3
     np.testing.assert_allclose(means.mean(axis=0), 0, atol=0.05)
-    np.testing.assert_array_equal(colours, np.float32(0.5))
+    np.testing.assert_array_equal(colors, np.float32(0.5))
     np.testing.assert_array_equal(means, random_points(5000, -1.3, 1.3, 0)[0])
     assert (means != random_points(5000, -1.3, 1.3, 1)[0]).any()
 
@@ -77,10 +77,10 @@ def test_misuse() -> None:
 def first_picture(dataset: Dataset, device: Device) -> tuple[Rendering, torch.Tensor]:
     """What the first camera sees of a training's first Gaussians, and the gradient of its brightness by opacities."""
     config = load_config("neu3d-tiny").points
-    points, colours, scales = (torch.from_numpy(array) for array in initial_points(config, dataset, 0))
+    points, colors, scales = (torch.from_numpy(array) for array in initial_points(config, dataset, 0))
     opacities = torch.full((len(points),), config.opacity, requires_grad=True)
     quats = torch.tensor([1.0, 0, 0, 0]).expand(len(points), 4)
-    drawn = rasterize(points, quats, scales[:, None].expand(-1, 3), opacities, colours, CAMERAS[0], device=device)
+    drawn = rasterize(points, quats, scales[:, None].expand(-1, 3), opacities, colors, CAMERAS[0], device=device)
     drawn.image.sum().backward()
     assert opacities.grad is not None
     return drawn, opacities.grad

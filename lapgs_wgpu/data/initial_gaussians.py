@@ -20,7 +20,7 @@ MAX_OPTICAL_DEPTH = 1.0  # of the initial Gaussians: 1 / e of the light passes t
 def first_points(
     dataset: Dataset, count: int, box: float, seed: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return means (n, 3), world units, and colours (n, 3), RGB in [0, 1], of the initial Gaussians. Both float32.
+    """Return means (n, 3), world units, and colors (n, 3), RGB in [0, 1], of the initial Gaussians. Both float32.
 
     These are at most `count` points of the capture's cloud; without a cloud, `count` random points, mid-gray: where the
     cameras' views overlap if the capture has depths, else in [-box, box]^3.
@@ -34,9 +34,9 @@ def first_points(
 
 
 def random_points(n: int, low: float, high: float, seed: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Draw n points uniformly from the cube [low, high]^3: means (n, 3) in world units, colours (n, 3), RGB in [0, 1].
+    """Draw n points uniformly from the cube [low, high]^3: means (n, 3) in world units, colors (n, 3), RGB in [0, 1].
 
-    All colours are mid-gray, as in 3DGS (except for its noise of 1/255).
+    All colors are mid-gray, as in 3DGS (except for its noise of 1/255).
     """
     if n < 1 or not low < high:
         raise ValueError(f"random_points needs n >= 1 and low < high, got n = {n}, low = {low}, high = {high}")

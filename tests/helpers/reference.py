@@ -12,11 +12,11 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from ..errors import InputError
-from .camera import Camera
-from .constants import CONSTANTS
-from .rasterize import Rendering
-from .rotation import rotation_matrices
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.splat.constants import CONSTANTS
+from lapgs_wgpu.splat.rasterize import Rendering
+from lapgs_wgpu.splat.rotation import rotation_matrices
 
 DILATION, NEAR, FRUSTUM_MARGIN, ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN = (
     CONSTANTS[name] for name in ("DILATION", "NEAR", "FRUSTUM_MARGIN", "ALPHA_MAX", "ALPHA_MIN", "TRANSMITTANCE_MIN")
@@ -131,8 +131,8 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
     return torch.stack(basis[: (degree + 1) ** 2], dim=-1)
 
 
-def _sh_colour(sh: Tensor, means: Tensor, camera: Camera, degree: int) -> Tensor:
-    """(N, 3) colour before the cut at zero."""
+def _sh_color(sh: Tensor, means: Tensor, camera: Camera, degree: int) -> Tensor:
+    """(N, 3) color before the cut at zero."""
     if sh.ndim != 3 or sh.shape[1] < (degree + 1) ** 2:
         raise InputError(
             f"colors has shape {tuple(sh.shape)}, but sh_degree {degree} needs (N, K, 3) with K at least "
@@ -144,11 +144,11 @@ def _sh_colour(sh: Tensor, means: Tensor, camera: Camera, degree: int) -> Tensor
 
 
 def color(sh: Tensor, means: Tensor, camera: Camera, degree: int) -> Tensor:
-    """(N, 3) colours max(SH + 0.5, 0) seen from the camera, with the gradient to means through the view direction.
+    """(N, 3) colors max(SH + 0.5, 0) seen from the camera, with the gradient to means through the view direction.
 
     sh: (N, K, 3), K >= (degree + 1)^2; further coefficients are ignored. means: (N, 3) world.
     """
-    return _sh_colour(sh, means, camera, degree).relu()
+    return _sh_color(sh, means, camera, degree).relu()
 
 
 def _tiles(means2d: Tensor, half_sides: Tensor, camera: Camera) -> Iterator[tuple[slice, slice, Tensor, Tensor]]:
@@ -263,7 +263,7 @@ def near_discontinuity(
 
     band: relative distance of alpha to ALPHA_MIN or ALPHA_MAX, or of transmittance to TRANSMITTANCE_MIN.
     gate: relative distance of the depths of two Gaussians that follow each other in a pixel; distance of x/z, y/z to
-    the frustum limits, and of a colour to the cut at zero.
+    the frustum limits, and of a color to the cut at zero.
     """
     projection = project(means, quats, scales, opacities, camera)
     order = projection.front_to_back()
@@ -272,7 +272,7 @@ def near_discontinuity(
     limits = points.new_tensor(_frustum_limits(camera))
     fragile = ((points[:, :2, None] / points[:, 2:, None] - limits).abs() < gate).flatten(1).any(1)
     if sh_degree is not None:
-        fragile |= (_sh_colour(colors[order], means[order], camera, sh_degree).abs() < gate).any(1)
+        fragile |= (_sh_color(colors[order], means[order], camera, sh_degree).abs() < gate).any(1)
 
     mask = torch.zeros(camera.height, camera.width, dtype=torch.bool, device=means.device)
     for rows, columns, centres, near in _tiles(means2d, projection.half_sides[order], camera):
