@@ -27,6 +27,7 @@ REACH = 0.07  # distance within which a track explains a point
 CALM = 0.02  # jitter of a part's center that is no leaping
 LEAST_SEEN = 0.2  # share of the times at which a part must be seen
 LEAPS = 1.7  # jitter of a part's center that is leaping, in steps of its smoothed path
+LEAP_SIZE = 0.28  # and in sizes of the part
 EXPLAINED = 0.3  # weight of points that an earlier key time's tracks explain
 SMOOTHING = 2.0  # times; standard deviation of the weights by which paths are smoothed
 RIDGE = 1e-2  # of slope and curvature, which few times do not determine
@@ -197,7 +198,7 @@ def _steady(tracks: Tracks, paths: Floats, half_side: float) -> NDArray[np.bool_
         step = np.median(steps) if len(steps) else 0.0
         size = np.ptp(tracks.positions[members], axis=0).max()
         still = np.ptp(center[seen], axis=0).max() < 0.5 * size
-        steady[k] = still or jitter < max(LEAPS * step, CALM * half_side)
+        steady[k] = still or jitter < max(min(LEAPS * step, LEAP_SIZE * size), CALM * half_side)
     return steady
 
 
