@@ -21,7 +21,7 @@ if typing.TYPE_CHECKING:
     from lapgs_wgpu.train.run import Watch
 
 # Of the keys, what goes with --eval: where the pictures lie now, and how they are read. The size must be the run's own.
-EVAL_KEYS = ("data.path", "data.size", "data.background", "data.cache_gb")
+EVAL_KEYS = ("data.path", "data.size", "data.split", "data.background", "data.cache_gb")
 
 
 def train_command(arguments: Sequence[str] | None = None) -> int:
@@ -192,6 +192,10 @@ def _open_data(config: Config, parent: Path, ranks: Ranks, *, normalize: bool = 
     if ranks.first:
         ranks.any(False)
     dataset = load_dataset(folder, image_size=config.data.size or None, normalize=normalize)
+    if config.data.split == "val":
+        if not dataset.val:
+            raise InputError(f"{folder} has no validation views (transforms_val.json); leave out data.split.")
+        dataset = dataclasses.replace(dataset, test=dataset.val)
     data = dataclasses.replace(config.data, path=str(folder.resolve()))
     return dataclasses.replace(config, data=data), dataset
 

@@ -173,6 +173,10 @@ MISTAKES = {
         ["tiny", "--data", "a\udcff", "--out", "OUT"],
         "--data.path holds 'a\\udcff', with characters that cannot be printed",
     ),
+    "no validation views": (
+        ["tiny", "--data", "SCENE", "--out", "OUT", "--data.split", "val"],
+        "has no validation views (transforms_val.json)",
+    ),
     "no scene": (["tiny", "--data", "USED", "--out", "OUT"], "is no scene in a known format"),
     "run folder in use": (["tiny", "--data", "SCENE", "--out", "USED"], "is not empty"),
     "run folder is a file": (["tiny", "--data", "SCENE", "--out", "USED/file"], "is a file"),

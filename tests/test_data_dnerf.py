@@ -145,10 +145,22 @@ def test_file_path_may_carry_its_suffix(tmp_path: Path) -> None:
     assert load_dataset(make_scene(tmp_path / "toy", change)).train[2].load().shape == (HEIGHT, WIDTH, 4)
 
 
-def test_validation_frames_are_not_read(tmp_path: Path) -> None:
+def test_validation_views_are_optional(tmp_path: Path) -> None:
+    def with_val(folder: Path, scene: Scene) -> None:
+        scene["val"] = {**scene["test"], "frames": scene["test"]["frames"] * 2}
+
+    dataset = load_dataset(make_scene(tmp_path / "with", with_val))
+    assert [view.name for view in dataset.val] == ["val_000", "val_001"]
+    assert (len(dataset.train), len(dataset.test), dataset.warnings) == (3, 1, load_dataset(tmp_path / "with").warnings)
+    assert load_dataset(make_scene(tmp_path / "without")).val == ()
+
+
+def test_validation_views_that_are_not_usable_are_left_out_with_a_warning(tmp_path: Path) -> None:
     folder = make_scene(tmp_path / "toy")
     (folder / "transforms_val.json").write_text("spoilt")
-    assert len(load_dataset(folder).train) == 3
+    dataset = load_dataset(folder)
+    assert (len(dataset.train), dataset.val) == (3, ())
+    assert any("validation views" in warning and "transforms_val.json" in warning for warning in dataset.warnings)
 
 
 def frame_with(**fields: Any) -> Callable[[Path, Scene], None]:

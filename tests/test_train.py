@@ -93,6 +93,27 @@ def test_a_run_is_whole(run: Path, dataset: Dataset) -> None:
         assert Image.open(run / "eval" / f"{view.name}.png").size == (3 * 32, 32)
 
 
+@pytest.mark.parametrize("validated", [True, False])
+def test_an_evaluation_while_training_changes_nothing(
+    run: Path, dataset: Dataset, device: Device, tmp_path: Path, *, validated: bool
+) -> None:
+    val = tuple(dataclasses.replace(view, name=f"val_{view.name}") for view in dataset.test) if validated else ()
+    watched = dataclasses.replace(dataset, val=val)
+    train(configure(eval__interval=str(STEPS // 2)), watched, tmp_path / "run", device=device)
+    first, second = (line for line in lines(tmp_path / "run") if "val_psnr" in line)
+    assert [first["step"], second["step"]] == [STEPS // 2, STEPS // 2 * 2]
+    assert first["val_views"] == second["val_views"] == ("val" if validated else "train")
+    assert all(0 < line["val_psnr"] < 60 for line in (first, second))
+    assert second["timing"]["seconds"] > first["timing"]["seconds"] > 0
+    assert load(tmp_path / "run" / "checkpoint.ply", device).metadata["step"] == str(STEPS)
+    written, known = (read_checkpoint(folder / "checkpoint.ply").tensors for folder in (tmp_path / "run", run))
+    assert written.keys() == known.keys()
+    assert all(np.array_equal(written[name], known[name]) for name in known)
+    if validated and STEPS % 2 == 0:
+        psnr = json.loads((tmp_path / "run" / "metrics.json").read_text())["psnr"]
+        assert second["val_psnr"] == pytest.approx(psnr, abs=1e-3)
+
+
 def test_the_checkpoint_is_the_last_model(run: Path, dataset: Dataset, device: Device) -> None:
     scene = load(run / "checkpoint.ply", device)
     metrics = run_module.evaluate(scene, dataset.test, "black")

@@ -21,7 +21,7 @@ from lapgs_wgpu.data.timestamps import ImageName
 from lapgs_wgpu.data.undistort import Lens
 from lapgs_wgpu.data.video_frames import VideoFrame
 
-Split = Literal["train", "test"]
+Split = Literal["train", "val", "test"]
 ImageSource = ImageFile | VideoFrame
 
 

@@ -74,6 +74,7 @@ class View:
 class Dataset:
     """A capture: training views and test views, which share one time axis.
 
+    val: validation views, to choose settings by; none in most formats.
     cloud: point cloud for the initial Gaussians. depths: nearest and furthest depth, world units, if stated or derived.
     normalization: transform from the files' coordinates, None if they were kept. warnings: problems that do not prevent
     a training, one sentence each. time_source: field and file of the times, for errors.
@@ -82,6 +83,7 @@ class Dataset:
     name: str
     train: tuple[View, ...]
     test: tuple[View, ...]
+    val: tuple[View, ...] = ()
     cloud: Cloud | None = None
     depths: tuple[float, float] | None = None
     normalization: Normalization | None = None

@@ -16,6 +16,7 @@ from lapgs_wgpu.motion.fields.config import DynamicsMode, FieldConfig
 
 Background = Literal["black", "white", "random"]
 Split = Literal["plain", "adaptive"]
+HeldOut = Literal["test", "val"]
 Precision = Literal["float32", "bfloat16"]
 DecoderPlace = Literal["auto", "torch", "device"]
 
@@ -31,6 +32,11 @@ class DataConfig(Options):
     cache_gb: float = option(
         "memory limit for decoded images, gigabytes: one limit for host memory and one for device memory; a "
         "single limit for both where the device shares host memory"
+    )
+    split: HeldOut = option(
+        "held-out views that are evaluated in the end; val: those of a D-NeRF scene's transforms_val.json, to choose "
+        "settings without the test views",
+        "test",
     )
     path: str = option(
         'folder of the capture, or a built-in scene: "synthetic", or "motion:path=4,cycles=2"; a built-in '
@@ -269,6 +275,18 @@ class ExposureConfig(Options):
 
 
 @dataclass(frozen=True)
+class EvalConfig(Options):
+    """Evaluation during the training. Has defaults, since older config.toml files lack it."""
+
+    interval: int = option(
+        "every this many steps, measure the PSNR of the validation views (a D-NeRF scene's transforms_val.json) or, if "
+        "there are none, of 8 training views, and write it to log.jsonl; 0: off",
+        0,
+        at_least=0,
+    )
+
+
+@dataclass(frozen=True)
 class Config(Options):
     """The configuration of a training."""
 
@@ -283,6 +301,7 @@ class Config(Options):
     seed: int = option("seed of all random numbers")
     exposure: ExposureConfig = option("", ExposureConfig())
     discovery: DiscoveryConfig = option("", DiscoveryConfig())
+    eval: EvalConfig = option("", EvalConfig())
     precision: Precision = option(
         "data type of the field's features and of its decoder's matrix products and their gradients; bfloat16 "
         "is faster on processors with bfloat16 instructions; everything else is float32",

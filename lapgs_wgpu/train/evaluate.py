@@ -98,6 +98,12 @@ def evaluate(
     }
 
 
+def mean_psnr(scene: Scene4D, views: Sequence[View], background: str) -> float:
+    """The mean over the views of the PSNR, dB, as in `evaluate`. Raises InputError."""
+    color = torch.full((3,), BACKGROUND_LEVELS[background])
+    return float(np.mean([psnr(_unit(_render(scene, view, color)), _unit(_on(color, view))) for view in views]))
+
+
 def _on(color: Tensor, view: View) -> NDArray[np.uint8]:
     """The ground truth of a view on a background: (H, W, 3)."""
     return composite(view.load(), color.numpy())

@@ -30,7 +30,8 @@ class Log:
     path: log.jsonl, written anew, or continued after the step `done`. Each line holds step, loss, psnr (dB, training
     views) and gaussians, and the frequencies and amplitudes of the motion's spectrum where there is one, all of which
     repeat from run to run, but for the first line after a resumption, which averages what came since; and under
-    "timing" seconds and steps_per_second, which do not.
+    "timing" seconds and steps_per_second, which do not. An evaluation during the training has a line of its own: step,
+    val_psnr, val_views ("val" or "train") and "timing". Its time does not count as time of the training.
     """
 
     def __init__(self, path: Path, steps: int, *, done: int = 0, terminal: TextIO | None = None) -> None:
@@ -88,6 +89,14 @@ class Log:
             )
 
         self._progress.at(step, text)
+
+    def evaluated(self, step: int, psnr: float, views: str, seconds: float) -> None:
+        """Take in the mean PSNR (dB) of views after a step, and how long it took to measure."""
+        self._start += seconds
+        self._times = deque((at + seconds for at in self._times), maxlen=self._times.maxlen)
+        timing = {"seconds": round(self.seconds, 3)}
+        self._write(json.dumps({"step": step, "val_psnr": round(psnr, 4), "val_views": views, "timing": timing}) + "\n")
+        self.tell(f"step {step}: {psnr:.2f} dB on the {'validation' if views == 'val' else 'training'} views")
 
     def _write(self, line: str) -> None:
         try:

@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
@@ -26,7 +27,7 @@ from lapgs_wgpu.train.autotune import Choice
 from lapgs_wgpu.train.config import Background, Config
 from lapgs_wgpu.train.discovery.discover import discover
 from lapgs_wgpu.train.distributed import SINGLE_PROCESS, Ranks
-from lapgs_wgpu.train.evaluate import evaluate, write_metrics
+from lapgs_wgpu.train.evaluate import evaluate, mean_psnr, write_metrics
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.lpips import Lpips
 from lapgs_wgpu.train.malloc import keep_freed_memory, return_freed_memory
@@ -43,6 +44,7 @@ from lapgs_wgpu.train.run_folder import (
 from lapgs_wgpu.train.trainer import StepResult, Trainer
 
 PROBES = 2048  # points of the scene that say whether a camera sees it
+WATCHED = 8  # training views that eval.interval measures if there are no validation views
 OUTSIDE = 0.05  # warn if this share of the Gaussians, or more, is outside the encoder's box
 
 # Takes over a training's steps, such as a viewer does: called with the scene, where to look at it from, and the steps,
@@ -185,7 +187,7 @@ def _run(training: Trainer, dataset: Dataset, out: Path, watch: Watch | None) ->
     config, scene = training.config, training.scene
     look = InitialView((dataset.test or dataset.train)[0].camera, dataset.focus, dataset.up, len(dataset.times))
     with Log(out / "log.jsonl", config.schedule.steps, done=training.done) as log, _interruptible() as interrupted:
-        steps = _steps(training, log, out, interrupted)
+        steps = _steps(training, dataset, log, out, interrupted)
         if watch is not None:
             watch(scene, look, steps)
         for _ in steps:
@@ -212,7 +214,9 @@ def _run(training: Trainer, dataset: Dataset, out: Path, watch: Watch | None) ->
     return scene
 
 
-def _steps(training: Trainer, log: Log, out: Path, interrupted: threading.Event) -> Iterator[StepResult]:
+def _steps(
+    training: Trainer, dataset: Dataset, log: Log, out: Path, interrupted: threading.Event
+) -> Iterator[StepResult]:
     """The steps that are left, each logged, and the state saved now and then, until `interrupted` is set."""
     schedule = training.config.schedule
     try:
@@ -221,6 +225,8 @@ def _steps(training: Trainer, log: Log, out: Path, interrupted: threading.Event)
             if progress.skipped is not None:
                 log.tell(str(progress.skipped))
             log.step(progress.step, progress.loss, progress.psnr, len(training.scene), training.scene.spectrum)
+            if training.config.eval.interval and training.done % training.config.eval.interval == 0:
+                _watch(training, dataset, log)
             yield progress
             if schedule.save_interval and training.done % schedule.save_interval == 0 < schedule.steps - training.done:
                 save_state(out, training.state())
@@ -232,6 +238,15 @@ def _steps(training: Trainer, log: Log, out: Path, interrupted: threading.Event)
         raise
     finally:
         training.close()
+
+
+def _watch(training: Trainer, dataset: Dataset, log: Log) -> None:
+    """Log the PSNR of the validation views or, without any, of some training views."""
+    started = time.perf_counter()
+    count = min(WATCHED, len(dataset.train))
+    views = dataset.val or [dataset.train[i * len(dataset.train) // count] for i in range(count)]
+    psnr = mean_psnr(training.scene, views, training.config.data.background)
+    log.evaluated(training.done, psnr, "val" if dataset.val else "train", time.perf_counter() - started)
 
 
 def _saved(training: Trainer, out: Path) -> str:

@@ -3,8 +3,9 @@
 transforms_train.json and transforms_test.json hold `camera_angle_x` (horizontal field of view, radians) or intrinsics
 (`transforms`; those of a frame override those of the file, and both override the angle), and `frames`:
 `file_path` of an image (.png is appended if it has no suffix), `transform_matrix` (camera to world, OpenGL axes) and
-`time` in [0, 1], in all frames of a file or in none; frames without times are evenly spaced. transforms_val.json is not
-read. objects.json (`objects`) is optional, and so is a cloud: fused.ply, points3d.ply or points3D.ply.
+`time` in [0, 1], in all frames of a file or in none; frames without times are evenly spaced. transforms_val.json is
+optional, and left out with a warning if it is not usable. objects.json (`objects`) is optional, and so is a cloud:
+fused.ply, points3d.ply or points3D.ply.
 """
 
 from __future__ import annotations
@@ -38,7 +39,12 @@ def _matches(folder: Path) -> bool:
 
 
 def _read(folder: Path, image_size: int | None) -> Capture:
-    frames = [*_read_split(folder, "train"), *_read_split(folder, "test")]
+    frames, warnings = [*_read_split(folder, "train"), *_read_split(folder, "test")], []
+    if (folder / "transforms_val.json").is_file():
+        try:
+            frames += _read_split(folder, "val")
+        except InputError as error:
+            warnings.append(f"the validation views are left out: {error}")
     path = find_cloud(folder, CLOUDS)
     cloud = None if path is None else read_cloud(path)
     if cloud is not None and is_random(cloud):  # other trainers write one, often of 1.3 whatever the scene's size
@@ -47,6 +53,7 @@ def _read(folder: Path, image_size: int | None) -> Capture:
     return Capture(
         frames,
         cloud,
+        warnings=warnings,
         source=cameras if path is None or cloud is None else path,
         time_source=f"time in {cameras}",
         time_range=(0.0, 1.0),
