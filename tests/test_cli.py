@@ -173,10 +173,6 @@ MISTAKES = {
         ["tiny", "--data", "a\udcff", "--out", "OUT"],
         "--data.path holds 'a\\udcff', with characters that cannot be printed",
     ),
-    "no validation views": (
-        ["tiny", "--data", "SCENE", "--out", "OUT", "--data.split", "val"],
-        "has no validation views (transforms_val.json)",
-    ),
     "no scene": (["tiny", "--data", "USED", "--out", "OUT"], "is no scene in a known format"),
     "run folder in use": (["tiny", "--data", "SCENE", "--out", "USED"], "is not empty"),
     "run folder is a file": (["tiny", "--data", "SCENE", "--out", "USED/file"], "is a file"),
@@ -205,6 +201,17 @@ def test_mistakes_end_in_one_sentence(
     assert message in err
     assert [file.name for file in tmp_path.iterdir()] == ["used"]
     assert [file.name for file in used.iterdir()] == ["file"]
+
+
+def test_a_scene_without_validation_views_cannot_be_evaluated_on_them(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = shutil.copytree(scene, tmp_path / "scene")
+    (folder / "transforms_val.json").unlink(missing_ok=True)
+    arguments = ["tiny", "--data", str(folder), "--out", str(tmp_path / "out"), "--data.split", "val"]
+    assert cli.train_command(arguments) == 2
+    assert "has no validation views (transforms_val.json)" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_damaged_scene_starts_no_run(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
