@@ -125,7 +125,7 @@ def test_base_gives_what_a_file_leaves_out(tmp_path: Path) -> None:
 def test_presets_are_complete_without_defaults_in_the_code() -> None:
     """But for what the config.toml of older runs lacks, which is off then."""
     optional = {field.name for field in dataclasses.fields(Config) if field.default is not dataclasses.MISSING}
-    assert optional == {"exposure", "precision", "decoder", "discovery"}
+    assert optional == {"exposure", "precision", "decoder", "discovery", "eval"}
     assert not ExposureConfig().enabled
     assert not DiscoveryConfig().enabled
 
