@@ -1,6 +1,7 @@
 # Everything lives in .venv; `make` or `make setup` makes it, and the other goals call that first.
 #   make demo   trains the built-in scene         make test   all tests        make lint   ruff and mypy
 #   make test-all  all tests, with all kernels in every configuration of the device (CI: every night)
+#   make test-swiftshader  all kernel tests on a second Vulkan driver, SwiftShader, which comes with Chromium
 #   make soak   what takes hours: 10,000 hostile files a format, failing disks, 20 kills, large scenes, 30 minutes of training
 #   make bench  times the kernels, beside what the device can do; options go into ARGS, for example:
 #               make bench ARGS="--scenes 50k@400x400 --parts raster --json new.json"
@@ -11,7 +12,7 @@ READY := .venv/.ready
 PYTEST = $(BIN)/pytest
 export XDG_RUNTIME_DIR ?= /tmp
 
-.PHONY: setup demo test test-shapes test-all soak bench lint
+.PHONY: setup demo test test-shapes test-all test-swiftshader soak bench lint
 setup: $(READY)
 
 # torch first: where there is no CUDA device, by exact version, so that an index with CPU builds can offer its own
@@ -94,3 +95,11 @@ test-all: $(READY)
 	@for name in no-subgroups default-limits gpu-shape staging; do $(call kernels,$$name,kernels) || exit 1; done
 	@echo "== all tests"
 	@$(PYTEST)
+
+# Debian's package has the driver's description; other builds of Chromium name it alike.
+SWIFTSHADER ?= /usr/lib/chromium/vk_swiftshader_icd.json
+test-swiftshader: $(READY)
+	@[ -e $(SWIFTSHADER) ] || { echo "$(SWIFTSHADER) is not there: apt-get install chromium, or name another with\
+	 SWIFTSHADER=FILE" >&2; exit 1; }
+	@echo "== kernels tests, SwiftShader"
+	@VK_DRIVER_FILES=$(SWIFTSHADER) VK_ICD_FILENAMES=$(SWIFTSHADER) $(PYTEST) -m kernels

@@ -14,7 +14,10 @@
 #import common/raster
 
 #ifndef SUBGROUPS
+// Barriers need control flow that is uniform to the compiler: what decides on them is read by workgroupUniformLoad.
 var<workgroup> seeing: array<u32, LANES>;
+var<workgroup> any_seeing: u32;
+var<workgroup> list: vec4<u32>;
 #endif
 
 @compute @workgroup_size($LANES)
@@ -53,7 +56,14 @@ fn main(
     T[$r] = select(-1.0, 1.0, corner.x + my.column < frame.size.x && corner.y + my.row + $(r)u < frame.size.y);
 #end
 
+#ifdef SUBGROUPS
     let range = ranges[tile];
+#else
+    if (lane == 0u) {
+        list = ranges[tile];
+    }
+    let range = workgroupUniformLoad(&list);
+#endif
 #ifdef ROUND_SPLATS
 #ifdef CONTINUED
     if (range.w == 0u) {
@@ -137,12 +147,14 @@ fn main(
 #else
         seeing[lane] = select(0u, 1u, open);
         workgroupBarrier();
-        var any_open = 0u;
-        for (var k = 0u; k < u32(LANES); k++) {
-            any_open |= seeing[k];
+        if (lane == 0u) {
+            var any_open = 0u;
+            for (var k = 0u; k < u32(LANES); k++) {
+                any_open |= seeing[k];
+            }
+            any_seeing = any_open;
         }
-        workgroupBarrier();
-        if (any_open == 0u) {
+        if (workgroupUniformLoad(&any_seeing) == 0u) {
 #ifdef ROUND_SPLATS
             closed = true;
 #endif

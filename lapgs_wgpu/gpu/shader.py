@@ -171,6 +171,14 @@ def _substitute(text: str, defines: Defines, file: str) -> str:
     return re.sub(r"\$(\w+)", value, text)
 
 
+def browser_source(source: str) -> str:
+    """Composed WGSL as browsers take it: with the extension that wgpu-native enables unasked, and without Tint's proof
+    of uniform subgroups, which no workgroup of one subgroup needs (RasterConfig)."""
+    if "subgroup" not in re.sub(r"//[^\n]*", "", source):
+        return source
+    return f"enable subgroups;\ndiagnostic(off, subgroup_uniformity);\n{source}"
+
+
 def reflect(source: str) -> dict[str, Binding]:
     """The bindings of group 0 in composed WGSL, by name."""
     found = {}
