@@ -63,7 +63,8 @@ class _Block:
 
 class GridFieldPlayback:
     """Moves activated Gaussians (`still`, means (N, 3), quats (N, 4) of unit length, ..., with opacity_logits in place
-    of opacities) by a field whose parameters have the names and shapes of fields/parameter_shapes.
+    of opacities) by a field whose parameters have the names and shapes of fields/parameter_shapes. With
+    "static_features" (N, F) the field's static table is not needed.
 
     block: how many Gaussians a dispatch takes, a multiple of 64; by default what fits into 128 MiB.
     """
@@ -100,7 +101,8 @@ class GridFieldPlayback:
             self._pool.upload(f"table {i}", parameters[f"temporal_grids.{i}.table"])
             for i in range(len(self._temporal.grids))
         ]
-        self._encode_static(parameters["static_grid.table"])
+        if "static_features" not in gaussians:
+            self._encode_static(parameters["static_grid.table"])
         heads, stream = self._heads(0.0), self._stream()
         self._stream_at, self._rows_at = len(heads), len(heads) + len(stream)
         # Vectors of four floats: heads, stream, and the numbers of the rows that are moved.
@@ -114,6 +116,8 @@ class GridFieldPlayback:
         still = np.zeros((count, _CANONICAL + 4 * self._sizes.still_quads), np.float32)
         still[:, :3], still[:, 3], still[:, 4:8] = g["means"], g["opacity_logits"], g["quats"]
         still[:, 8:11], still[:, 12:15] = g["scales"], g["colors"][:, 0]
+        if "static_features" in g:
+            still[:, _CANONICAL : _CANONICAL + self._sizes.static] = g["static_features"]
         moving = np.zeros((count, max(4, 4 * self._sizes.moving_quads)), np.float32)
         if self._sizes.dynamics:
             moving[:, : self._sizes.dynamics] = g["dynamics"]
@@ -130,6 +134,11 @@ class GridFieldPlayback:
         with Commands(self._device) as commands:
             for number, block in enumerate(self._blocks):
                 encoder.encode(commands, number, block.points, block.count, 0.0, [table], block.still)
+
+    def static_features(self) -> Floats:
+        """(N, F) H_s: the static grid's features at the canonical means."""
+        parts = [block.still.read()[:, _CANONICAL : _CANONICAL + self._sizes.static] for block in self._blocks]
+        return np.concatenate(parts)
 
     # Weights ---------------------------------------------------------------------------------------------------------
 
