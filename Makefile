@@ -54,9 +54,10 @@ LAPGS_SOAK_MINUTES ?= 30
 LAPGS_FUZZ ?= 10000
 soak: $(READY)
 	LAPGS_FUZZ=$(LAPGS_FUZZ) $(PYTEST) tests/test_hostile_files.py tests/test_hostile_captures.py \
-	  tests/test_full_disks.py
+	  tests/test_hostile_pages.py tests/test_full_disks.py
 	LAPGS_SOAK_KILLS=20 $(PYTEST) tests/test_resume.py
 	LAPGS_SOAK=1 $(PYTEST) -s tests/test_scale.py
+	LAPGS_SOAK=1 $(PYTEST) tests/test_web_player.py -k 200_000
 	LAPGS_SOAK_MINUTES=$(LAPGS_SOAK_MINUTES) $(PYTEST) tests/soak
 
 bench: $(READY)
