@@ -40,6 +40,7 @@ pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt-ge
 
 SAME = 90.0  # dB: less is another picture
 TIMES = (0.0, 0.37, 1.0)
+OWN_DEVICE = "const own = GPUAdapter.prototype.requestDevice;"
 POSITION, FOCUS = [3.0, 1.0, 2.0], [0.2, 0.0, -0.1]
 
 
@@ -150,13 +151,22 @@ def test_the_desktop_runs_the_same_dispatches(browser: Browser, page: Path, monk
 
 def test_default_limits(window: Browser, page: Path, desktop: Desktop) -> None:
     """A device without any feature or limit beyond WebGPU's own."""
-    script = "const own = GPUAdapter.prototype.requestDevice;"
-    script += "GPUAdapter.prototype.requestDevice = function () { return own.call(this, {}); };"
-    made = window.call("Page.addScriptToEvaluateOnNewDocument", source=script)
-    open_page(window, page.as_uri() + "?default")
-    window.call("Page.removeScriptToEvaluateOnNewDocument", identifier=made["identifier"])
+    script = "GPUAdapter.prototype.requestDevice = function () { return own.call(this, {}); };"
+    open_page(window, page.as_uri() + "?default", first=OWN_DEVICE + script)
     call(window, "setTime", 0.37)
     assert same(window, desktop, 0.37)
+
+
+def test_workgroups_that_are_no_subgroups(window: Browser, page: Path, desktop: Desktop) -> None:
+    """An adapter that promises subgroups of 32 lanes and has less: the pass says so, and the page does without them."""
+    script = "Object.defineProperty(GPUAdapterInfo.prototype, 'subgroupMinSize', { get: () => 32 });"
+    script += "GPUAdapter.prototype.requestDevice = async function (...given) {"
+    script += " const device = await own.apply(this, given); window.features = [...device.features]; return device; };"
+    open_page(window, page.as_uri() + "?subgroups", first=OWN_DEVICE + script)
+    assert "subgroups" in window.value("features")
+    call(window, "setTime", 0.37)
+    assert same(window, desktop, 0.37)
+    assert {name for name, *_ in call(window, "passes", 0.5) if name.startswith("rasterize")} == {"rasterize"}
 
 
 @pytest.mark.skipif("LAPGS_SOAK" not in os.environ, reason="takes minutes: LAPGS_SOAK=1, or make soak")
@@ -305,13 +315,9 @@ def test_what_cannot_be_fetched(window: Browser, page: Path, server: str) -> Non
 
 def test_a_lost_device(window: Browser, page: Path) -> None:
     """A sentence, and the last picture stays on the screen."""
-    script = (
-        "const own = GPUAdapter.prototype.requestDevice; GPUAdapter.prototype.requestDevice = async function (...given)"
-    )
+    script = "GPUAdapter.prototype.requestDevice = async function (...given)"
     script += " { return window.device = await own.apply(this, given); };"
-    made = window.call("Page.addScriptToEvaluateOnNewDocument", source=script)
-    open_page(window, page.as_uri() + "?lost")
-    window.call("Page.removeScriptToEvaluateOnNewDocument", identifier=made["identifier"])
+    open_page(window, page.as_uri() + "?lost", first=OWN_DEVICE + script)
     page_picture(window)
     before = window.picture()
     window.value("device.destroy()")

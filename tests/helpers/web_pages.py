@@ -49,10 +49,12 @@ def export_scene(scene: Scene4D, folder: Path, device: Device, name: str = "scen
     return folder / f"{name}.html"
 
 
-def open_page(browser: Browser, url: str, seconds: float = 120) -> None:
-    """Open a page and wait until it shows its scene."""
+def open_page(browser: Browser, url: str, *, seconds: float = 120, first: str = "") -> None:
+    """Open a page and wait until it shows its scene. first: a script that runs before the page's own."""
+    made = browser.call("Page.addScriptToEvaluateOnNewDocument", source=first)
     browser.open(url)
     wait_for(lambda: shown(browser), seconds, "the scene")
+    browser.call("Page.removeScriptToEvaluateOnNewDocument", identifier=made["identifier"])
 
 
 def shown(browser: Browser) -> bool:
