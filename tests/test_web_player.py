@@ -31,7 +31,6 @@ from helpers.web_pages import (
 from lapgs_wgpu.gpu.device import Device, _adapters
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.shader import browser_source
-from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.viewer.camera import ViewCamera
 from lapgs_wgpu.viewer.controls import ORBIT, ZOOM
 from lapgs_wgpu.viewer.web_page import player_data
@@ -171,14 +170,16 @@ def test_workgroups_that_are_no_subgroups(window: Browser, page: Path, desktop: 
 
 @pytest.mark.skipif("LAPGS_SOAK" not in os.environ, reason="takes minutes: LAPGS_SOAK=1, or make soak")
 def test_200_000_gaussians(window: Browser, folder: Path, device: Device) -> None:
-    """With the field of the preset dnerf: its rows are more than a binding holds, and so are taken in two blocks."""
-    scene = trained(device, load_config("dnerf", {}).field, 200_000)
+    """With grids as those of the preset dnerf: rows of features are more than a binding holds, hence two blocks."""
+    config = dataclasses.replace(OURS, temporal=dataclasses.replace(OURS.temporal, levels=32))
+    scene = trained(device, config, 200_000)
     with torch.no_grad():
-        scene.parameters["log_scales"] -= 2
+        scene.parameters["log_scales"] -= 3
     made = export_scene(scene, folder, device, "many")
     open_page(window, made.as_uri(), seconds=300)
     call(window, "setTime", 0.7)
     assert same(window, Desktop(made, device), 0.7)
+    assert sum(name.startswith("deform") for name, *_ in call(window, "passes", 0.5)) == 2
 
 
 # Input
@@ -301,6 +302,34 @@ def test_from_a_static_server(window: Browser, page: Path, server: str, device: 
     made = export_scene(trained(device, CONFIGS["color"], 200), folder, device, "other")
     open_page(window, f"{server}/{page.name}?src=other.lapgs")
     assert same(window, Desktop(made, device), 0.0)
+
+
+def test_a_dropped_file(browser: Browser, device: Device, folder: Path, desktop: Desktop) -> None:
+    """A scene takes the place of the one on show; what is no scene does not, and is refused in a sentence."""
+
+    def drop(file: Path) -> None:
+        for kind in ("dragEnter", "dragOver", "drop"):
+            data = {"items": [], "files": [str(file)], "dragOperationsMask": 1}
+            browser.call("Input.dispatchDragEvent", type=kind, x=100, y=80, data=data)
+
+    drop(folder / "scene.ply")
+    wait_for(lambda: "do not begin as a scene does" in browser.note(), 60, "the sentence")
+    assert same(browser, desktop, 0.0)
+    made = export_scene(trained(device, CONFIGS["no dynamics"], 200), folder, device, "dropped")
+    drop(made.with_suffix(".lapgs"))
+    wait_for(lambda: browser.note() == "", 120, "the dropped scene")
+    assert same(browser, Desktop(made, device), 0.0)
+    browser.key("End")
+    assert same(browser, Desktop(made, device), 1.0)
+    browser.open("about:blank")  # the next test begins anew
+
+
+def test_an_adapter_that_is_too_small(window: Browser, page: Path) -> None:
+    script = "Object.defineProperty(GPUSupportedLimits.prototype, 'maxBufferSize', { get: () => 2000 });"
+    made = window.call("Page.addScriptToEvaluateOnNewDocument", source=script)
+    window.open(page.as_uri() + "?small")
+    wait_for(lambda: "but a buffer of this adapter holds 2000" in window.note(), 60, "the sentence")
+    window.call("Page.removeScriptToEvaluateOnNewDocument", identifier=made["identifier"])
 
 
 def test_what_cannot_be_fetched(window: Browser, page: Path, server: str) -> None:
