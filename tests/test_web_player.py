@@ -177,8 +177,8 @@ def test_200_000_gaussians(window: Browser, folder: Path, device: Device) -> Non
         scene.parameters["log_scales"] -= 3
     made = export_scene(scene, folder, device, "many")
     open_page(window, made.as_uri(), seconds=300)
-    call(window, "setTime", 0.7)
-    assert same(window, Desktop(made, device), 0.7)
+    call(window, "setTime", 0.2)
+    assert same(window, Desktop(made, device), 0.2)
     assert sum(name.startswith("deform") for name, *_ in call(window, "passes", 0.5)) == 2
 
 
