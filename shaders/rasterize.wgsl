@@ -16,7 +16,6 @@
 #ifndef SUBGROUPS
 // Barriers need control flow that is uniform to the compiler: what decides on them is read by workgroupUniformLoad.
 var<workgroup> seeing: array<u32, LANES>;
-var<workgroup> any_seeing: u32;
 var<workgroup> list: vec4<u32>;
 #endif
 
@@ -146,15 +145,12 @@ fn main(
         }
 #else
         seeing[lane] = select(0u, 1u, open);
-        workgroupBarrier();
-        if (lane == 0u) {
-            var any_open = 0u;
-            for (var k = 0u; k < u32(LANES); k++) {
-                any_open |= seeing[k];
-            }
-            any_seeing = any_open;
-        }
-        if (workgroupUniformLoad(&any_seeing) == 0u) {
+        let votes = workgroupUniformLoad(&seeing);
+        var any_open = 0u;
+#unroll k $LANES
+        any_open |= votes[$k];
+#end
+        if (any_open == 0u) {
 #ifdef ROUND_SPLATS
             closed = true;
 #endif

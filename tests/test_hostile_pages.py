@@ -6,6 +6,9 @@ A few hundred files, always the same; LAPGS_FUZZ=10000 takes as many new ones (m
 from __future__ import annotations
 
 import base64
+import json
+import struct
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -88,3 +91,16 @@ def test_damaged_files(page: Browser, files: list[bytes], damage: CompactDamage)
     assert not said.startswith("no sentence"), said
     assert said.isprintable()
     assert len(said) < 500
+
+
+def test_names_that_every_object_has(page: Browser, files: list[bytes]) -> None:
+    """What JavaScript finds on the prototype of a table is not in the table."""
+    for name, value in (("appearance", "constructor"), ("kind", "toString"), ("appearance", "__proto__")):
+        content = zlib.decompress(files[2][20:])
+        length = int.from_bytes(content[:8], "little")
+        table = json.loads(content[8 : 8 + length])
+        table["__metadata__"]["field"] = json.dumps(json.loads(table["__metadata__"]["field"]) | {name: value})
+        text = json.dumps(table).encode()
+        content = len(text).to_bytes(8, "little") + text + content[8 + length :]
+        said = read(page, struct.pack("<8sIQ", files[2][:8], 1, len(content)) + zlib.compress(content))
+        assert "is none that this page can evaluate" in said

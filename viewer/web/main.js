@@ -68,23 +68,28 @@ async function fetched(address) {
 // Show the scene whose bytes `load` gives, in place of the present one; where it fails the present one stays.
 async function open(load, data) {
     const number = ++wanted;
+    let gpu;
     try {
         say("Loading");
         const scene = await readScene(await load());
-        const next = await prepare(scene, data);
-        if (number !== wanted) return;
+        gpu = await openGpu(data.kernels);
+        const next = await prepare(gpu, scene, data);
+        if (number !== wanted) {
+            gpu.device.destroy();
+            return;
+        }
         shown?.();
         const { api, stop } = next();
         shown = stop;
         window.lapgs = api;
         say("");
     } catch (error) {
+        gpu?.device.destroy();
         if (number === wanted) say(sentence(error));
     }
 }
 
-async function prepare(scene, data) {
-    const gpu = await openGpu(data.kernels);
+async function prepare(gpu, scene, data) {
     const rasterizer = new Rasterizer(gpu, data.raster);
     const keys = [...data.always, data.raster.plain, rasterizer.rasterize, `color SH ${scene.shDegree}`];
     gpu.device.pushErrorScope("out-of-memory");
@@ -97,7 +102,8 @@ async function prepare(scene, data) {
     await gpu.compile([...new Set(keys)], () => say(`Compiling ${++compiled} of ${new Set(keys).size} passes`));
     const first = firstView(scene.metadata.view, scene.gaussians.means);
     const clock = new Clock(scene.field ? first.frames : 1, data.loops, data.speeds);
-    const background = data.backgrounds[scene.metadata.background] ?? data.backgrounds.black;
+    const trained = scene.metadata.background; // on it
+    const background = data.backgrounds[Object.hasOwn(data.backgrounds, trained) ? trained : "black"];
     const state = { camera: new ViewCamera(first), clock, background };
     return () => start(gpu, { scene, playback, rasterizer }, state, data);
 }

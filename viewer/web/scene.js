@@ -5,6 +5,7 @@ import { Refusal, quoted } from "./refusal.js";
 
 const EXACT = "motion.frequencies"; // float32, the other weights are float16
 const GEOMETRY_OUTPUTS = 14;
+const APPEARANCES = new Map([["none", 0], ["color", 3], ["color+opacity", 4]]); // outputs of the head
 
 const damaged = reason => new Refusal(`The scene cannot be read: ${reason}; the file is damaged.`);
 
@@ -52,7 +53,7 @@ function readField(text) {
     const kind = field?.kind;
     if (kind === "static") return null;
     const laplacian = kind === "laplacian";
-    const appearance = laplacian ? { none: 0, color: 3, "color+opacity": 4 }[field.appearance] : 0;
+    const appearance = laplacian ? APPEARANCES.get(field.appearance) : 0;
     if (!(laplacian || kind === "grid4d") || field.depth !== 0 || (laplacian && field.motion !== "laplacian")
         || appearance === undefined || typeof field.temporal_hash !== "boolean") {
         throw damaged(`its field ${quoted(kind)} is none that this page can evaluate`);
