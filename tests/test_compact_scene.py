@@ -96,6 +96,8 @@ def test_lapgs_view_opens_and_writes_it(device: Device, tmp_path: Path, capsys: 
     assert f"{page}: {FEW} Gaussians" in capsys.readouterr().out
     assert cli.view_command([scene, "--export", page]) == 2
     assert "is there already; --overwrite replaces it" in capsys.readouterr().err
+    assert cli.view_command([scene, "--export", scene, "--overwrite"]) == 2
+    assert "is the opened file; take another name" in capsys.readouterr().err
     assert cli.view_command([scene, "--export", page, "--time", "0.5"]) == 2
     assert "--time has no use" in capsys.readouterr().err
     with pytest.raises(InputError, match="is a compact scene, which lapgs-view shows"):

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.browser import CHROMIUM, WEBGPU, Browser, wait_for
+from helpers.scene_files import moving_scene
 from helpers.trained_scenes import CONFIGS, OURS, trained
 from helpers.web_pages import (
     FRAMES,
@@ -31,6 +32,7 @@ from helpers.web_pages import (
 from lapgs_wgpu.gpu.device import Device, _adapters
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.shader import browser_source
+from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.viewer.camera import ViewCamera
 from lapgs_wgpu.viewer.controls import ORBIT, ZOOM
 from lapgs_wgpu.viewer.web_page import player_data
@@ -123,6 +125,16 @@ def test_every_field(window: Browser, folder: Path, device: Device, name: str) -
     open_page(window, made.as_uri())
     call(window, "setTime", 0.7)
     assert same(window, Desktop(made, device), 0.7)
+
+
+def test_a_still_scene(window: Browser, folder: Path, device: Device) -> None:
+    """No time slider, and nothing that plays."""
+    made = export_scene(moving_scene(device, FieldConfig(kind="static"), sh_degree=3), folder, device, "still")
+    open_page(window, made.as_uri())
+    assert same(window, Desktop(made, device), 0.0)
+    assert window.value("document.getElementById('bar').hidden")
+    window.key(" ")
+    assert not window.value("lapgs.playing")
 
 
 def test_the_desktop_runs_the_same_dispatches(browser: Browser, page: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -42,8 +42,10 @@ def export_compact(scene: LoadedScene, file: Path, *, overwrite: bool = False) -
     Raises InputError where it cannot be written, where the file is there already and `overwrite` is not given, and
     where only torch evaluates the field.
     """
-    _check_free(file, overwrite)
     assert scene.path is not None
+    if file.exists() and file.samefile(scene.path):
+        raise InputError(f"{file}: is the opened file; take another name.")
+    _check_free(file, overwrite)
     stored = read_scene(scene.path)
     features = scene.playback.static_features() if isinstance(scene.playback, DevicePlayback) else None
     metadata = stored.metadata | {"view": scene.look.to_json()}
