@@ -1,6 +1,7 @@
 # Everything lives in .venv; `make` or `make setup` makes it, and the other goals call that first.
 #   make demo   trains the built-in scene         make test   all tests        make lint   ruff and mypy
 #   make test-all  all tests, with all kernels in every configuration of the device (CI: every night)
+#   make test-swiftshader  all kernel tests on a second Vulkan driver, SwiftShader, which comes with Chromium
 #   make soak   what takes hours: 10,000 hostile files a format, failing disks, 20 kills, large scenes, 30 minutes of training
 #   make bench  times the kernels, beside what the device can do; options go into ARGS, for example:
 #               make bench ARGS="--scenes 50k@400x400 --parts raster --json new.json"
@@ -11,7 +12,7 @@ READY := .venv/.ready
 PYTEST = $(BIN)/pytest
 export XDG_RUNTIME_DIR ?= /tmp
 
-.PHONY: setup demo test test-shapes test-all soak bench lint
+.PHONY: setup demo test test-shapes test-all test-swiftshader soak bench lint
 setup: $(READY)
 
 # torch first: where there is no CUDA device, by exact version, so that an index with CPU builds can offer its own
@@ -53,9 +54,10 @@ LAPGS_SOAK_MINUTES ?= 30
 LAPGS_FUZZ ?= 10000
 soak: $(READY)
 	LAPGS_FUZZ=$(LAPGS_FUZZ) $(PYTEST) tests/test_hostile_files.py tests/test_hostile_captures.py \
-	  tests/test_full_disks.py
+	  tests/test_hostile_pages.py tests/test_full_disks.py
 	LAPGS_SOAK_KILLS=20 $(PYTEST) tests/test_resume.py
 	LAPGS_SOAK=1 $(PYTEST) -s tests/test_scale.py
+	LAPGS_SOAK=1 $(PYTEST) tests/test_web_player.py -k 200_000
 	LAPGS_SOAK_MINUTES=$(LAPGS_SOAK_MINUTES) $(PYTEST) tests/soak
 
 bench: $(READY)
@@ -94,3 +96,11 @@ test-all: $(READY)
 	@for name in no-subgroups default-limits gpu-shape staging; do $(call kernels,$$name,kernels) || exit 1; done
 	@echo "== all tests"
 	@$(PYTEST)
+
+# Debian's package has the driver's description; other builds of Chromium name it alike.
+SWIFTSHADER ?= /usr/lib/chromium/vk_swiftshader_icd.json
+test-swiftshader: $(READY)
+	@[ -e $(SWIFTSHADER) ] || { echo "$(SWIFTSHADER) is not there: apt-get install chromium, or name another with\
+	 SWIFTSHADER=FILE" >&2; exit 1; }
+	@echo "== kernels tests, SwiftShader"
+	@VK_DRIVER_FILES=$(SWIFTSHADER) VK_ICD_FILENAMES=$(SWIFTSHADER) $(PYTEST) -m kernels

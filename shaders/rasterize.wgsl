@@ -14,7 +14,9 @@
 #import common/raster
 
 #ifndef SUBGROUPS
+// Barriers need control flow that is uniform to the compiler: what decides on them is read by workgroupUniformLoad.
 var<workgroup> seeing: array<u32, LANES>;
+var<workgroup> list: vec4<u32>;
 #endif
 
 @compute @workgroup_size($LANES)
@@ -53,7 +55,14 @@ fn main(
     T[$r] = select(-1.0, 1.0, corner.x + my.column < frame.size.x && corner.y + my.row + $(r)u < frame.size.y);
 #end
 
+#ifdef SUBGROUPS
     let range = ranges[tile];
+#else
+    if (lane == 0u) {
+        list = ranges[tile];
+    }
+    let range = workgroupUniformLoad(&list);
+#endif
 #ifdef ROUND_SPLATS
 #ifdef CONTINUED
     if (range.w == 0u) {
@@ -136,12 +145,11 @@ fn main(
         }
 #else
         seeing[lane] = select(0u, 1u, open);
-        workgroupBarrier();
+        let votes = workgroupUniformLoad(&seeing);
         var any_open = 0u;
-        for (var k = 0u; k < u32(LANES); k++) {
-            any_open |= seeing[k];
-        }
-        workgroupBarrier();
+#unroll k $LANES
+        any_open |= votes[$k];
+#end
         if (any_open == 0u) {
 #ifdef ROUND_SPLATS
             closed = true;

@@ -27,6 +27,7 @@ from helpers.damaged_files import (
     with_checksums,
     with_table,
 )
+from helpers.damaged_lapgs import CompactDamage, damage_compact, damaged_compact_scenes
 from helpers.dnerf_scene import make_scene
 from helpers.hostile import (
     ByteEdits,
@@ -47,8 +48,8 @@ from PIL import Image
 from lapgs_wgpu.data import Dataset, load_dataset
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.initial_view import InitialView
-from lapgs_wgpu.motion.playback.playback import open_playback
-from lapgs_wgpu.motion.scene_file import read_scene
+from lapgs_wgpu.motion.playback.playback import DevicePlayback, open_playback
+from lapgs_wgpu.motion.scene_file import compact_bytes, read_scene
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.plots import _columns, _read_log
@@ -128,6 +129,29 @@ def test_checkpoints_with_another_description(
 
     (folder / "a.ply").write_bytes(with_table(checkpoints[kind], change))
     refused_or(lambda: shown_at_all_times(folder / "a.ply", device))
+
+
+# Compact scenes ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def compact_scenes(device: Device, tmp_path_factory: pytest.TempPathFactory) -> list[bytes]:
+    """One of each field that such a file can hold."""
+    file = tmp_path_factory.mktemp("compact") / "a.ply"
+    found = []
+    for kind in ("static", "grid4d", "laplacian"):
+        small_scene(kind, device).save(file, {"background": "white"})
+        playback = open_playback(file, device)
+        assert isinstance(playback, DevicePlayback)
+        found.append(compact_bytes(read_scene(file), playback.static_features()))
+    return found
+
+
+@fuzzed()
+@given(damaged_compact_scenes(3))
+def test_compact_scenes(compact_scenes: list[bytes], device: Device, folder: Path, damage: CompactDamage) -> None:
+    (folder / "a.lapgs").write_bytes(damage_compact(compact_scenes, damage))
+    refused_or(lambda: shown_at_all_times(folder / "a.lapgs", device))
 
 
 @np.errstate(all="ignore")

@@ -337,7 +337,7 @@ MISTAKES = {
     "frames of a still scene": (["STILL", "--export", "a", "--frames", "3"], "holds no motion"),
     "clip of a still scene": (["STILL", "--video", "a.mp4", "--path", "both"], "holds no motion"),
     "motion of a still scene": (["STILL", "--screenshot", "a.png", "--mode", "motion"], "nothing to show in mode"),
-    "no file": (["--screenshot", "a.png"], "name a .ply file"),
+    "no file": (["--screenshot", "a.png"], "name a .ply or .lapgs file"),
     "a missing file": (["none.ply", "--screenshot", "a.png"], "none.ply"),
     "time beyond the clip": (["CHECKPOINT", "--screenshot", "a.png", "--time", "1.5"], "from 0 to 1"),
     "time of NaN": (["CHECKPOINT", "--screenshot", "a.png", "--time", "nan"], "from 0 to 1"),

@@ -33,7 +33,7 @@ def _view(arguments: list[str]) -> None:
         print_devices()
         return
     if given.file is None:
-        raise InputError("name a .ply file; lapgs-view --help says more.")
+        raise InputError("name a .ply or .lapgs file; lapgs-view --help says more.")
     with ThreadPoolExecutor(1) as other:
         # Beside all that follows: the driver and its compiler take longer than the rest together.
         device = other.submit(_warm_device, given.device)
@@ -167,11 +167,20 @@ def _video(given: Any, scene: LoadedScene) -> None:
 
 
 def _export(given: Any, scene: LoadedScene) -> None:
-    from .export import export_frames, export_still
+    from .export import export_compact, export_frames, export_still
 
     overwrite = bool(given.overwrite)
+    if given.export.lower().endswith((".lapgs", ".html")):
+        for name in ("time", "frames"):
+            if getattr(given, name) is not None:
+                raise InputError(f"--{name} has no use with --export {given.export}, which holds the whole clip.")
+        file = Path(given.export)
+        export_compact(scene, file, overwrite=overwrite)
+        print(f"{file}: {scene.playback.count} Gaussians, {file.stat().st_size / 1e6:.2f} MB")
+        return
     if given.frames is None:
-        file = _named(given.export, ".ply", "--export", "; a sequence of frames in a folder needs --frames")
+        more = ", .lapgs or .html; a sequence of frames in a folder needs --frames"
+        file = _named(given.export, ".ply", "--export", more)
         export_still(scene, file, given.time or 0.0, overwrite=overwrite)
         print(f"{file}: {scene.playback.count} Gaussians at time {given.time or 0.0:g}")
         return

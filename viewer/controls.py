@@ -11,10 +11,10 @@ from .view_state import ViewState
 from .viewport import Viewport
 
 _ACTIONS = {key.key: key.action for key in KEYS} | {"/": "toggle_help"}  # where "?" is told as "/" with Shift
-_ORBIT = 0.008  # radians a pixel of dragging
-_LOOK = 0.4 * _ORBIT  # about the camera itself, where a turn moves more of the picture
-_ZOOM = 0.0015  # of the distance's logarithm a pixel of the wheel
-_FLY = 0.6  # of the distance to the focus a second
+ORBIT = 0.008  # radians a pixel of dragging
+LOOK = 0.4 * ORBIT  # about the camera itself, where a turn moves more of the picture
+ZOOM = 0.0015  # of the distance's logarithm a pixel of the wheel
+FLY_REACH = 0.6  # of the distance to the focus a second
 _GRIP = 0.01  # of the width: how near to the split it can be dragged
 
 
@@ -59,7 +59,7 @@ class Controls:
         moves = [FLY[key] for key in self._held if key in FLY]
         if moves:
             fast = 4.0 if "Shift" in self._held else 0.25 if "Alt" in self._held else 1.0
-            reach = seconds * _FLY * fast * self.state.camera.distance
+            reach = seconds * FLY_REACH * fast * self.state.camera.distance
             right, down, forward = (reach * sum(axis) for axis in zip(*moves, strict=True))
             self.state.camera.fly(right, down, forward)
 
@@ -99,9 +99,9 @@ class Controls:
         right, down = x - self.pointer[0], y - self.pointer[1]
         self.pointer = (x, y)
         if self._dragging == "orbit":
-            state.camera.orbit(_ORBIT * right, _ORBIT * down)
+            state.camera.orbit(ORBIT * right, ORBIT * down)
         elif self._dragging == "look":
-            state.camera.look(_LOOK * right, _LOOK * down)
+            state.camera.look(LOOK * right, LOOK * down)
         elif self._dragging == "pan":
             height = self.viewport.canvas.get_logical_size()[1]
             state.camera.pan(right / height, down / height)
@@ -121,4 +121,4 @@ class Controls:
     def _on_wheel(self, event: dict[str, Any]) -> None:
         self.pointer = (event["x"], event["y"])
         if not self._covered(*self.pointer):
-            self.state.camera.zoom(math.exp(_ZOOM * event["dy"]))
+            self.state.camera.zoom(math.exp(ZOOM * event["dy"]))

@@ -1,20 +1,27 @@
-"""Stills of a moving scene as plain .ply files in Inria's layout, one or one a moment."""
+"""Files for other viewers: stills as plain .ply in Inria's layout, one or one a moment; a compact scene; a web page."""
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from pathlib import Path
 
 import numpy as np
 
 from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.io.ply import write_ply
+from lapgs_wgpu.motion.playback.playback import DevicePlayback
+from lapgs_wgpu.motion.scene_file import compact_bytes, read_scene
 from lapgs_wgpu.progress import Progress
 
 from .loaded_scene import LoadedScene
+from .offscreen import OffscreenRenderer
+from .web_page import page_html
 
 _FRAME = re.compile(r"frame_\d+\.ply")
 MOST_FRAMES = 100_000
+_POSTER_SIZE = (960, 540)
 
 
 def export_still(scene: LoadedScene, file: Path, time: float, *, overwrite: bool = False) -> None:
@@ -23,12 +30,37 @@ def export_still(scene: LoadedScene, file: Path, time: float, *, overwrite: bool
     Raises InputError where it cannot be written, where the file is there already and `overwrite` is not given, and
     always where it is the opened file, whose motion would be lost.
     """
-    if file.exists():
-        if scene.path is not None and file.samefile(scene.path):
-            raise InputError(f"{file}: is the opened file, and a still holds no motion; take another name.")
-        if not overwrite:
-            raise InputError(f"{file}: is there already; --overwrite replaces it.")
+    if scene.path is not None and file.exists() and file.samefile(scene.path):
+        raise InputError(f"{file}: is the opened file, and a still holds no motion; take another name.")
+    _check_free(file, overwrite)
     write_ply(file, scene.playback.still(time))
+
+
+def export_compact(scene: LoadedScene, file: Path, *, overwrite: bool = False) -> None:
+    """Write a compact scene (.lapgs), or a web page with one inside (.html). Atomic.
+
+    Raises InputError where it cannot be written, where the file is there already and `overwrite` is not given, and
+    where only torch evaluates the field.
+    """
+    assert scene.path is not None
+    if file.exists() and file.samefile(scene.path):
+        raise InputError(f"{file}: is the opened file; take another name.")
+    _check_free(file, overwrite)
+    stored = read_scene(scene.path)
+    features = scene.playback.static_features() if isinstance(scene.playback, DevicePlayback) else None
+    metadata = stored.metadata | {"view": scene.look.to_json()}
+    content = compact_bytes(dataclasses.replace(stored, metadata=metadata), features)
+    if file.suffix.lower() == ".html":
+        camera = scene.camera().camera(*_POSTER_SIZE)
+        poster = OffscreenRenderer(scene)(camera, 0.0)
+        content = page_html(content, scene.path.stem, poster).encode()
+    with atomic_write(file) as target:
+        target.write(content)
+
+
+def _check_free(file: Path, overwrite: bool) -> None:
+    if file.exists() and not overwrite:
+        raise InputError(f"{file}: is there already; --overwrite replaces it.")
 
 
 def export_frames(scene: LoadedScene, folder: Path, frames: int, *, overwrite: bool = False) -> None:

@@ -9,7 +9,7 @@ from imgui_bundle import imgui
 
 
 class FileBrowser:
-    """A section of a panel, closed at first. open_file: gets the .ply that the user chooses."""
+    """A section of a panel, closed at first. open_file: gets the .ply or .lapgs that the user chooses."""
 
     def __init__(self, folder: Path, open_file: Callable[[Path], None]) -> None:
         self._folder, self._open_file = folder, open_file
@@ -38,7 +38,7 @@ class FileBrowser:
                 continue
             if entry.is_dir() and imgui.selectable(f"{entry.name}/", False)[0]:
                 self._folder = entry
-            elif entry.suffix.lower() == ".ply" and imgui.selectable(entry.name, False)[0]:
+            elif entry.suffix.lower() in (".ply", ".lapgs") and imgui.selectable(entry.name, False)[0]:
                 self._shown = False
                 self._open_file(entry)
         imgui.end_child()

@@ -46,7 +46,10 @@ class LoadedScene(NamedTuple):
 
 
 def load_scene(path: Path, device: Callable[[], Device]) -> LoadedScene:
-    """Open a checkpoint, or any 3DGS .ply. device: is asked for when the file has been read. Raises InputError."""
+    """Open a checkpoint, a compact scene, or any 3DGS .ply. Raises InputError.
+
+    device: is asked for when the file has been read.
+    """
     playback = playback_of(read_scene(path), device())
     look = InitialView.from_json(playback.metadata.get("view", ""))
     return LoadedScene(path, playback, look or guess_look(playback))

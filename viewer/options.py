@@ -28,6 +28,8 @@ Without a display:
   lapgs-view CHECKPOINT.ply --video a.mp4 --path CAMERAS.json         along a camera path (nerfstudio's format)
   lapgs-view CHECKPOINT.ply --export still.ply --time 0.5             static .ply for other splat viewers
   lapgs-view CHECKPOINT.ply --export frames --frames 60               sequence of static .ply files for SuperSplat
+  lapgs-view CHECKPOINT.ply --export scene.html                       web page that plays the scene on the visitor's GPU
+  lapgs-view CHECKPOINT.ply --export scene.lapgs                      compact scene for such a page, or for lapgs-view
 
 [Values in brackets] are defaults.
 """
@@ -76,7 +78,8 @@ def _parse(arguments: Sequence[str]) -> Any:
     # fmt: off
     add = parser.add_argument
     # All defaults are None, which tells given options from others.
-    add("file", nargs="?", metavar="FILE.ply", help="checkpoint of lapgs-train, or any 3DGS .ply file")
+    add("file", nargs="?", metavar="FILE.ply", help="checkpoint of lapgs-train, compact scene (.lapgs), or any "
+        "3DGS .ply file")
     add("--device", metavar="NAME", help=DEVICE_HELP)
     add("--list-devices", action="store_const", const=True, help=LIST_DEVICES_HELP)
 
@@ -121,8 +124,9 @@ def _parse(arguments: Sequence[str]) -> Any:
         "or of the camera path; 6 for view]")
 
     add = parser.add_argument_group("export (no window)").add_argument
-    add("--export", metavar="FILE.ply|DIR", help="write a static 3DGS .ply file of the Gaussians at --time; with "
-        "--frames: a sequence of such files in the folder DIR")
+    add("--export", metavar="FILE.ply|.lapgs|.html|DIR", help="write a static 3DGS .ply file of the Gaussians at "
+        "--time; .lapgs: a compact scene with its motion; .html: a web page that plays it; with --frames: a "
+        "sequence of static files in the folder DIR")
     add("--frames", type=_count, metavar="N", help="with --export DIR: number of files, at equally spaced times from "
         "0 to 1")
     add("--overwrite", action="store_const", const=True, help="allow --export to replace existing files")

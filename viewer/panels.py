@@ -114,7 +114,7 @@ class Panels:
         _tip("background")
         for text, action, tip in (
             ("Reset", state.reset_camera, "camera back to where it started (R)"),
-            ("Open", self._files.toggle, "another .ply file; one can also be dropped on the window"),
+            ("Open", self._files.toggle, "another .ply or .lapgs file; one can also be dropped on the window"),
             ("Help", state.toggle_help, "keys and mouse (?)"),
         ):
             if imgui.button(text, (66, 0)):

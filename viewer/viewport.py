@@ -15,8 +15,8 @@ from .view_state import ViewState
 
 SETTLED = 0.2  # seconds without a change after which the full resolution is drawn
 MARGIN = (0.11, 0.11, 0.12)  # color around an image that does not fill the canvas
-_TARGET_SECONDS = 1 / 12  # for a frame while something moves; where it takes longer, the resolution falls
-_SMALLEST = 0.25  # least resolution, share of the canvas's width and height
+TARGET_SECONDS = 1 / 12  # for a frame while something moves; where it takes longer, the resolution falls
+SMALLEST_SCALE = 0.25  # least resolution, share of the canvas's width and height
 _ERROR_GAIN = 4.0
 
 
@@ -83,9 +83,9 @@ class Viewport:
         self._drawn, self.stale = key, False
         self._times.append(time.perf_counter())
         if moving:
-            ideal = self.scale * math.sqrt(_TARGET_SECONDS / max(self.frame.seconds, 1e-4))
+            ideal = self.scale * math.sqrt(TARGET_SECONDS / max(self.frame.seconds, 1e-4))
             ideal = 0.5 * (self._moving_scale + ideal)
-            self._moving_scale = min(max(math.floor(16 * ideal) / 16, _SMALLEST), 1.0)
+            self._moving_scale = min(max(math.floor(16 * ideal) / 16, SMALLEST_SCALE), 1.0)
 
     def present(self) -> None:
         """Copy the frame, with the ground truth where the two are compared, to the canvas's texture."""

@@ -170,6 +170,14 @@ def _substitute(text: str, defines: Defines, file: str) -> str:
     return re.sub(r"\$(\w+)", value, text)
 
 
+def browser_source(source: str) -> str:
+    """Composed WGSL as browsers take it: with the extension that wgpu-native enables unasked, and without Tint's proof
+    of uniform subgroups, which no workgroup of one subgroup needs (RasterConfig)."""
+    if "subgroup" not in re.sub(r"//[^\n]*", "", source):
+        return source
+    return f"enable subgroups;\ndiagnostic(off, subgroup_uniformity);\n{source}"
+
+
 def reflect(source: str) -> dict[str, Binding]:
     """The bindings of group 0 in composed WGSL, by name."""
     found = {}
@@ -184,27 +192,38 @@ def reflect(source: str) -> dict[str, Binding]:
 
 def pack(source: str, struct_name: str, values: Mapping[str, object]) -> bytes:
     """The bytes of a WGSL struct with these members (matrices column by column)."""
-    members = _members(source, struct_name)
-    if {name for name, _ in members} != set(values):
-        difference = {name for name, _ in members} ^ set(values)
+    size, members = struct_layout(source, struct_name)
+    if members.keys() != values.keys():
+        difference = members.keys() ^ values.keys()
         raise ShaderError(f"struct {struct_name}: members that only one side has: {sorted(difference)}")
-    out = bytearray()
-    largest = 4
-    for name, kind in members:
-        alignment, _, code = _LAYOUT[kind]
-        largest = max(largest, alignment)
-        out += bytes(-len(out) % alignment)
+    out = bytearray(size)
+    for name, (offset, code) in members.items():
         value = values[name]
         numbers = [value] if isinstance(value, (int, float)) else list(value)  # type: ignore[call-overload]
-        out += struct.pack("<" + code, *numbers)
-    out += bytes(-len(out) % max(16, largest))  # uniform buffers come in units of 16 bytes
+        struct.pack_into("<" + code, out, offset, *numbers)
     return bytes(out)
 
 
 @functools.cache
-def _members(source: str, struct_name: str) -> tuple[tuple[str, str], ...]:
-    """Name and type of each member of a struct. Cached, since each training step needs them."""
+def struct_layout(source: str, struct_name: str) -> tuple[int, dict[str, tuple[int, str]]]:
+    """Size of a WGSL struct as a uniform, bytes, and by name of each member its offset and struct format.
+
+    Cached, since each training step needs them.
+    """
+    members: dict[str, tuple[int, str]] = {}
+    size, largest = 0, 4
+    for name, kind in _members(source, struct_name):
+        alignment, length, code = _LAYOUT[kind]
+        largest = max(largest, alignment)
+        size += -size % alignment
+        members[name] = (size, code)
+        size += length
+    return size + -size % max(16, largest), members  # uniform buffers come in units of 16 bytes
+
+
+def _members(source: str, struct_name: str) -> list[tuple[str, str]]:
+    """Name and type of each member of a struct."""
     body = re.search(rf"struct\s+{struct_name}\s*{{(.*?)}}", source, re.S)
     if body is None:
         raise ShaderError(f"no struct {struct_name} in the shader")
-    return tuple(_MEMBER.findall(re.sub(r"//[^\n]*", "", body[1])))
+    return list(_MEMBER.findall(re.sub(r"//[^\n]*", "", body[1])))

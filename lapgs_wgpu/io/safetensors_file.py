@@ -61,7 +61,7 @@ def pack_tensors(tensors: Mapping[str, Array], metadata: Mapping[str, str]) -> l
 
 
 def unpack_tensors(file: BinaryIO, size: int, where: str) -> tuple[dict[str, Array], dict[str, str]]:
-    """Read tensors and metadata from the next `size` bytes of `file`, a file on disk.
+    """Read tensors and metadata from the next `size` bytes of `file`.
 
     Allocates `size` bytes, and at most some tens of MB for the header. Raises InputError, whose message begins with
     `where`, if sizes contradict each other or a float is not finite.
@@ -137,8 +137,8 @@ def _check_cover(specs: list[_Spec], size: int, where: str) -> None:
 
 def _read_array(file: BinaryIO, spec: _Spec, where: str) -> Array:
     count = math.prod(spec.shape)
-    array = np.fromfile(file, spec.dtype, count)
-    if len(array) != count:
+    array = np.empty(count, spec.dtype)
+    if file.readinto(array.view(np.uint8)) != array.nbytes:  # type: ignore[attr-defined]  # all binary files have it
         raise InputError(f"{where}: became shorter while it was read, in tensor {spec.name[:80]!r}")
     _check_finite(array, f"{where}: tensor {spec.name[:80]!r}")
     return array.reshape(spec.shape)

@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from ..errors import InputError
 from ..gpu.device import Device, open_device
 from ..io.checkpoint import write_checkpoint
 from ..io.ply import GaussianSnapshot
@@ -188,12 +189,20 @@ class Scene4D:
 
 
 def load(path: str | os.PathLike[str], device: Device | None = None) -> Scene4D:
-    """Read a checkpoint, or any 3DGS .ply file as a static scene. Raises InputError."""
+    """Read a checkpoint, or any 3DGS .ply file as a static scene.
+
+    Raises InputError; also for a compact scene that moves, which lacks the static grid: `open_playback` shows it.
+    """
     return scene_of(read_scene(path), device)
 
 
 def scene_of(file: SceneFile, device: Device | None = None) -> Scene4D:
-    """The scene of a file that was read."""
+    """The scene of a file that was read. Raises InputError for a compact scene that moves."""
+    if "static_features" in file.gaussians:
+        raise InputError(
+            f"{file.path}: is a compact scene, which lapgs-view shows, without the static grid that a Scene4D needs: "
+            "load the checkpoint that it was made of"
+        )
     parameters = {name: torch.from_numpy(array.copy()) for name, array in file.gaussians.items()}
     scene = Scene4D(parameters, file.field_config, device or open_device(), sh_degree=file.sh_degree)
     if scene.field is not None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,7 +15,9 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..io.checkpoint import read_checkpoint
 from ..io.dataclass_table import build_dataclass
+from ..io.lapgs_file import is_lapgs, pack_lapgs, read_lapgs
 from ..io.safe_json_toml import parse_json
+from .compact_scene import compress, expand
 from .fields.config import FieldConfig
 from .fields.parameter_shapes import parameter_shapes
 
@@ -33,7 +37,8 @@ class SceneFile:
     """The content of a file, float32.
 
     gaussians: canonical ones by name, (N, ...) with rows as in `row_shapes`. field: the field's parameters by name, in
-    the shapes of `parameter_shapes`. metadata: further texts.
+    the shapes of `parameter_shapes`. metadata: further texts. The Gaussians of a compact scene that moves have
+    static_features (N, F) in place of the field's static table.
     """
 
     path: str | os.PathLike[str]
@@ -45,7 +50,11 @@ class SceneFile:
 
 
 def read_scene(path: str | os.PathLike[str]) -> SceneFile:
-    """Read a checkpoint, or any 3DGS .ply file as a static scene. Raises InputError."""
+    """Read a checkpoint, a compact scene, or any 3DGS .ply file as a static scene. Raises InputError."""
+    if is_lapgs(path):
+        tensors, metadata = read_lapgs(path)
+        config, degree = _read_header(metadata, path)
+        return SceneFile(path, config, degree, *expand(tensors, config, degree, str(path)), _texts(metadata))
     still, tensors, metadata = read_checkpoint(path)
     if not tensors:
         sh = np.zeros((len(still.means), 16, 3), np.float32)
@@ -65,10 +74,32 @@ def read_scene(path: str | os.PathLike[str]) -> SceneFile:
     gaussians = {
         name: _tensor(tensors, f"gaussians.{name}", (count, *shape), path) for name, shape in row_shapes(config).items()
     }
-    texts = {key: value for key, value in metadata.items() if key not in ("field", "sh_degree")}
     # Before a module is created: a damaged description may ask for more memory than there is.
     field = {name: _tensor(tensors, f"field.{name}", shape, path) for name, shape in parameter_shapes(config).items()}
-    return SceneFile(path, config, degree, gaussians, field, texts)
+    return SceneFile(path, config, degree, gaussians, field, _texts(metadata))
+
+
+def compact_bytes(file: SceneFile, static_features: NDArray[np.float32] | None) -> bytes:
+    """The bytes of a compact scene (docs/format.md). Raises InputError where only torch evaluates the field.
+
+    static_features: (N, F) of the Gaussians of a checkpoint that moves, else None.
+    """
+    config = file.field_config
+    if config.kind != "static" and not config.decodes_on_device:
+        raise InputError(
+            f"{file.path}: only torch evaluates its field ({config.kind}, {config.depth} hidden layers, "
+            f"motion {config.motion}), which no compact scene holds; --export FOLDER --frames N writes stills"
+        )
+    gaussians = file.gaussians | ({} if static_features is None else {"static_features": static_features})
+    header = {"field": json.dumps(dataclasses.asdict(config)), "sh_degree": str(file.sh_degree)}
+    try:
+        return pack_lapgs(compress(gaussians, file.field, config, file.sh_degree), file.metadata | header)
+    except InputError as error:
+        raise InputError(f"{file.path}: no compact scene can be made of it, because {error}") from error
+
+
+def _texts(metadata: Mapping[str, str]) -> dict[str, str]:
+    return {key: value for key, value in metadata.items() if key not in ("field", "sh_degree")}
 
 
 def row_shapes(config: FieldConfig) -> dict[str, tuple[int, ...]]:

@@ -58,10 +58,14 @@ class Drawing:
     @property
     def sh_defines(self) -> dict[str, int]:
         """Defines of color and color_bwd."""
-        degree = self.gaussians.sh_degree
-        if degree is None:
-            return {}
-        return {"SH": 1, "SH_COUNT": (degree + 1) ** 2} | {f"SH_{d}": 1 for d in range(1, degree + 1)}
+        return sh_defines(self.gaussians.sh_degree)
+
+
+def sh_defines(degree: int | None) -> dict[str, int]:
+    """Defines of color and color_bwd for harmonics of this degree, or for colours (None)."""
+    if degree is None:
+        return {}
+    return {"SH": 1, "SH_COUNT": (degree + 1) ** 2} | {f"SH_{d}": 1 for d in range(1, degree + 1)}
 
 
 class GaussianGradients(NamedTuple):

@@ -34,14 +34,21 @@ fn seen(pixel: vec4<u32>) -> vec3<f32> {
     return bitcast<vec3<f32>>(pixel.xyz);
 }
 
+// Bytes / 255, rounded correctly: WGSL lets drivers divide with an error of 2.5 ulp, which L1 and the pyramid, that look at
+// signs, would take for a difference between equal images. 2^16 / 255 is 257 + 1 / 255, and the first product is exact; it is
+// taken in integers, so that no driver puts the two together again.
+fn share(byte: vec3<u32>) -> vec3<f32> {
+    return (vec3<f32>(257u * byte) + vec3<f32>(byte) * (1.0 / 255.0)) * (1.0 / 65536.0);
+}
+
 fn truth(pixel: vec4<u32>) -> vec3<f32> {
-    return vec3<f32>((vec3(pixel.w) >> vec3(0u, 8u, 16u)) & vec3(255u)) / 255.0;
+    return share((vec3(pixel.w) >> vec3(0u, 8u, 16u)) & vec3(255u));
 }
 
 // Both in one channel.
 fn channel_of(pixel: vec4<u32>, channel: u32) -> vec2<f32> {
     let bits = select(select(pixel.z, pixel.y, channel == 1u), pixel.x, channel == 0u);
-    return vec2(bitcast<f32>(bits), f32((pixel.w >> (8u * channel)) & 255u) / 255.0);
+    return vec2(bitcast<f32>(bits), share(vec3((pixel.w >> (8u * channel)) & 255u)).x);
 }
 
 const LUMINANCE = vec3<f32>(0.299, 0.587, 0.114);   // Rec. 601

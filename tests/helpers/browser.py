@@ -21,7 +21,6 @@ CHROMIUM = next((path for path in map(shutil.which, ("chromium", "chromium-brows
 _FLAGS = (
     "--headless",
     "--no-sandbox",
-    "--disable-gpu",
     "--disable-quic",
     "--no-first-run",
     "--disable-background-networking",
@@ -30,18 +29,33 @@ _FLAGS = (
     "--force-color-profile=srgb",
     "--remote-debugging-port=0",
 )
+NO_GPU = ("--disable-gpu",)
+# WebGPU, and a canvas that it draws on, by SwiftShader, which comes with Chromium.
+WEBGPU = (
+    "--enable-unsafe-webgpu",
+    "--use-webgpu-adapter=swiftshader",
+    "--enable-features=Vulkan",
+    "--use-vulkan=swiftshader",
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--disable-gpu-watchdog",
+)
 
 
 class Browser:
-    """One window of a fresh profile, of `size` pixels. Leave the `with` block to end it."""
+    """One window of a fresh profile, of `size` pixels. Leave the `with` block to end it.
 
-    def __init__(self, profile: Path, size: tuple[int, int]) -> None:
+    graphics: NO_GPU or WEBGPU.
+    """
+
+    def __init__(self, profile: Path, size: tuple[int, int], graphics: tuple[str, ...] = NO_GPU) -> None:
         from websockets.sync.client import connect
 
         assert CHROMIUM is not None
         self._open = contextlib.ExitStack()
         self._process = subprocess.Popen(
-            [CHROMIUM, *_FLAGS, f"--user-data-dir={profile}", "about:blank"],
+            [CHROMIUM, *_FLAGS, *graphics, f"--user-data-dir={profile}", "about:blank"],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         )
@@ -69,7 +83,7 @@ class Browser:
         self._calls += 1
         self._socket.send(json.dumps({"id": self._calls, "method": method, "params": parameters}))
         while True:
-            message = json.loads(self._socket.recv(timeout=60))
+            message = json.loads(self._socket.recv(timeout=300))
             if message.get("id") == self._calls:
                 assert "error" not in message, message
                 return message["result"]
@@ -82,8 +96,10 @@ class Browser:
         self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
 
     def value(self, script: str) -> Any:
-        """What a JavaScript expression gives on the page."""
-        return self.call("Runtime.evaluate", expression=script, returnByValue=True)["result"].get("value")
+        """What a JavaScript expression, or the promise that it is, gives on the page. Fails where it throws."""
+        done = self.call("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
+        assert "exceptionDetails" not in done, done["exceptionDetails"]
+        return done["result"].get("value")
 
     def note(self) -> str:
         """What the page says, empty while it shows pictures."""

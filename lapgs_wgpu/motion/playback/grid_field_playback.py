@@ -66,7 +66,7 @@ class GridFieldPlayback:
 
     parameters: of the field, by the names and in the shapes of fields/parameter_shapes. gaussians: activated, but with
     opacity_logits, and with quats of unit length. block: number of Gaussians per dispatch, a multiple of 64; by default
-    as many as fit into 128 MiB.
+    as many as fit into 128 MiB. Gaussians with static_features (N, F) need no static table.
     """
 
     def __init__(
@@ -101,7 +101,8 @@ class GridFieldPlayback:
             self._pool.upload(f"table {i}", parameters[f"temporal_grids.{i}.table"])
             for i in range(len(self._temporal.grids))
         ]
-        self._encode_static(parameters["static_grid.table"])
+        if "static_features" not in gaussians:
+            self._encode_static(parameters["static_grid.table"])
         heads, stream = self._heads(0.0), self._stream()
         self._stream_at, self._rows_at = len(heads), len(heads) + len(stream)
         # Vectors of four floats: heads, stream, and the indices of the moved rows.
@@ -115,6 +116,8 @@ class GridFieldPlayback:
         still = np.zeros((count, _CANONICAL + 4 * self._sizes.still_quads), np.float32)
         still[:, :3], still[:, 3], still[:, 4:8] = g["means"], g["opacity_logits"], g["quats"]
         still[:, 8:11], still[:, 12:15] = g["scales"], g["colors"][:, 0]
+        if "static_features" in g:
+            still[:, _CANONICAL : _CANONICAL + self._sizes.static] = g["static_features"]
         moving = np.zeros((count, max(4, 4 * self._sizes.moving_quads)), np.float32)
         if self._sizes.dynamics:
             moving[:, : self._sizes.dynamics] = g["dynamics"]
@@ -131,6 +134,11 @@ class GridFieldPlayback:
         with Commands(self._device) as commands:
             for number, block in enumerate(self._blocks):
                 encoder.encode(commands, PointSet(number, block.points, block.count, 0.0), [table], block.still)
+
+    def static_features(self) -> Floats:
+        """(N, F) H_s: the static grid's features at the canonical means."""
+        parts = [block.still.read()[:, _CANONICAL : _CANONICAL + self._sizes.static] for block in self._blocks]
+        return np.concatenate(parts)
 
     # Weights ---------------------------------------------------------------------------------------------------------
 

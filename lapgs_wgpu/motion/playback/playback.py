@@ -133,6 +133,10 @@ class DevicePlayback:
         self._bounds.add(np.concatenate(values, axis=1), float(self._times[0]) if whole else None)
         self._bounded = True
 
+    def static_features(self) -> Floats | None:
+        """(count, F) what a compact scene holds in place of the static table; None where nothing moves."""
+        return self._field.static_features() if self._field else None
+
     def means(self, t: float) -> Floats:
         return self.at(t).means.read() if self.moves else self._stored["means"]
 

@@ -1,0 +1,93 @@
+"""The container of a compact scene, `scene.lapgs`: a deflated safetensors file behind a header of 20 bytes.
+
+docs/format.md has it byte by byte. Browsers unpack it by themselves (DecompressionStream).
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import stat
+import struct
+import zlib
+from collections.abc import Mapping
+from typing import Any
+
+from numpy.typing import NDArray
+
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.io.safetensors_file import pack_tensors, unpack_tensors
+
+PathLike = str | os.PathLike[str]
+
+MAGIC = b"lapgs4d\n"
+VERSION = 1
+MAX_BYTES = 1 << 30  # unpacked: 1.5 million Gaussians with the field of the preset dnerf
+_HEADER = struct.Struct("<8sIQ")  # magic, version, bytes once unpacked
+_MOST_RATIO = 1032  # of deflate
+
+
+def is_lapgs(path: PathLike) -> bool:
+    """Whether a file begins as a compact scene does; False where it cannot be read."""
+    try:
+        if not stat.S_ISREG(os.stat(path).st_mode):
+            return False
+        with open(path, "rb") as file:
+            return file.read(len(MAGIC)) == MAGIC
+    except (OSError, ValueError):
+        return False
+
+
+def pack_lapgs(tensors: Mapping[str, NDArray[Any]], metadata: Mapping[str, str]) -> bytes:
+    """The bytes of a compact scene; equal arguments give equal bytes on every machine with the same zlib.
+
+    Raises InputError where a value is NaN or infinite, or where the reader would refuse the size.
+    """
+    content = b"".join(bytes(part) for part in pack_tensors(tensors, metadata))
+    if len(content) > MAX_BYTES:
+        raise InputError(f"a compact scene holds at most {MAX_BYTES} bytes, and this one needs {len(content)}")
+    return _HEADER.pack(MAGIC, VERSION, len(content)) + zlib.compress(content, 9)
+
+
+def read_lapgs(path: PathLike) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
+    """Tensors and metadata of a compact scene. Memory: the file, and twice what it unpacks to, at most MAX_BYTES.
+
+    Raises InputError where the file cannot be read, is damaged, or comes from a later version.
+    """
+    try:
+        with open(path, "rb") as file:
+            data = file.read(MAX_BYTES + 1)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the path.") from None
+    return unpack_lapgs(data, str(path))
+
+
+def unpack_lapgs(data: bytes, where: str) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
+    """As `read_lapgs`, of the bytes of a file. where: begins the message of an InputError."""
+    if len(data) < _HEADER.size or not data.startswith(MAGIC):
+        raise InputError(
+            f"{where}: is not a compact scene: it lacks the header of {_HEADER.size} bytes; the file is damaged"
+        )
+    _, version, size = _HEADER.unpack_from(data)
+    packed = len(data) - _HEADER.size
+    if version != VERSION:
+        raise InputError(
+            f"{where}: has version {version} of the compact scene, and this program reads version {VERSION}; "
+            "export the scene again, or use the program that wrote it"
+        )
+    most = min(MAX_BYTES, _MOST_RATIO * packed)
+    if size > most:
+        raise InputError(
+            f"{where}: declares {size} bytes in {packed} packed ones, of at most {most}; the file is damaged"
+        )
+    unpacker = zlib.decompressobj()
+    try:
+        content = unpacker.decompress(memoryview(data)[_HEADER.size :], size + 1)
+    except zlib.error as error:
+        raise InputError(f"{where}: cannot be unpacked ({str(error)[:80]}); the file is damaged") from None
+    if len(content) != size or not unpacker.eof or unpacker.unused_data:
+        held = "more, or are followed by others" if len(content) >= size else f"{len(content)}"
+        raise InputError(
+            f"{where}: declares {size} bytes, but its {packed} packed ones hold {held}; the file is damaged"
+        )
+    return unpack_tensors(io.BytesIO(content), size, where)

@@ -1,0 +1,156 @@
+"""A scene for playback alone, a tenth of its checkpoint: quantized, and without what playback does not read.
+
+The static hash grid is read only at the canonical means, so each Gaussian carries its features instead of the table.
+docs/format.md has the tensors; the web page (viewer/web) reads the same file.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..splat.constants import CONSTANTS
+from .fields.config import MIN_SCALE, FieldConfig, static_grid, temporal_grids
+from .fields.parameter_shapes import parameter_shapes
+from .quantize import dequantize, quantize
+
+Floats = NDArray[np.float32]
+Arrays = dict[str, Floats]
+
+STATIC_TABLE = "static_grid.table"
+# Name of a Gaussian's values -> bits of each, and whether zero is exact. docs/results.md has what fewer bits cost.
+_BITS = {
+    "means": (16, False),
+    "log_scales": (8, False),
+    "quats": (8, True),
+    "opacity_logits": (8, False),
+    "sh_dc": (8, False),
+    "sh_rest": (5, True),
+    "dynamics": (6, True),
+    "static_features": (6, True),
+}
+_TABLE_BITS = 8
+_EXACT = ("motion.frequencies",)  # a phase is up to 2 pi times this: 16 bits would move the end of the clip
+_MOST_LOGIT = 16.0  # beyond it an opacity is 0 or 1 to seven digits, and an outlier would widen the steps of all
+
+
+def row_columns(config: FieldConfig, sh_degree: int) -> dict[str, int]:
+    """Name of what a compact scene holds of each Gaussian -> number of values."""
+    columns = {"means": 3, "log_scales": 3, "quats": 4, "opacity_logits": 1, "sh_dc": 3}
+    if sh_degree:
+        columns["sh_rest"] = 3 * ((sh_degree + 1) ** 2 - 1)
+    if config.dynamics_size:
+        columns["dynamics"] = config.dynamics_size
+    if config.kind != "static":
+        columns["static_features"] = static_grid(config).features
+    return columns
+
+
+def compress(
+    gaussians: Mapping[str, Floats], field: Mapping[str, Floats], config: FieldConfig, sh_degree: int
+) -> dict[str, NDArray[Any]]:
+    """The tensors of a compact scene.
+
+    gaussians: as SceneFile has them, and "static_features" (N, F) where the scene moves. field: as SceneFile has it.
+    Gaussians that are too faint to be drawn at any time are left out.
+    """
+    stored = {name: gaussians[name] for name in _BITS if name in gaussians}
+    stored["log_scales"] = np.maximum(stored["log_scales"], np.float32(math.log(MIN_SCALE)))
+    stored["quats"] = stored["quats"] / np.maximum(np.linalg.norm(stored["quats"], axis=1, keepdims=True), 1e-12)
+    stored["opacity_logits"] = stored["opacity_logits"].clip(-_MOST_LOGIT, _MOST_LOGIT)
+    stored["sh_rest"] = stored["sh_rest"][:, : (sh_degree + 1) ** 2 - 1]
+    seen = np.ones(len(stored["means"]), bool)
+    if config.appearance_size < 4:  # opacities do not change
+        least = CONSTANTS["ALPHA_MIN"]
+        seen = stored["opacity_logits"] >= math.log(least / (1 - least))
+        seen[:1] |= not seen.any()  # a file holds at least one
+    tensors: dict[str, NDArray[Any]] = {}
+    for name, columns in row_columns(config, sh_degree).items():
+        bits, centered = _BITS[name]
+        values = stored[name].reshape(-1, columns)[seen]
+        whole, ranges = quantize(values, bits, centered=centered)
+        tensors |= {f"gaussians.{name}": whole, f"gaussians.{name}.range": ranges}
+    starts = _table_starts(config)
+    for name, values in field.items():
+        if name == STATIC_TABLE:
+            continue
+        if name.endswith(".table"):
+            whole, ranges = quantize(values, _TABLE_BITS, centered=True, starts=starts)
+            tensors |= {f"field.{name}": whole, f"field.{name}.range": ranges}
+        else:
+            with np.errstate(over="ignore"):  # refused when it is written
+                tensors[f"field.{name}"] = values if name in _EXACT else values.astype(np.float16)
+    return tensors
+
+
+def expand(
+    tensors: Mapping[str, NDArray[Any]], config: FieldConfig, sh_degree: int, where: str
+) -> tuple[Arrays, Arrays]:
+    """Gaussians, with "static_features" where the scene moves, and field, of the tensors of a compact scene.
+
+    Shapes are SceneFile's; the field lacks its static table. Raises InputError, whose message begins with `where`.
+    """
+    if config.kind != "static" and not config.decodes_on_device:
+        raise InputError(f"{where}: its field {config.kind} is none that a compact scene can hold; the file is damaged")
+    reader = _Reader(tensors, where)
+    columns = row_columns(config, sh_degree)
+    means = tensors.get("gaussians.means")
+    count = means.shape[1] if means is not None and means.ndim == 2 else 0
+    if not count:
+        raise InputError(f"{where}: holds no Gaussians in its tensor 'gaussians.means'; the file is damaged")
+    gaussians = {name: reader.columns(f"gaussians.{name}", count, width) for name, width in columns.items()}
+    rest = np.zeros((count, 15, 3), np.float32)
+    if sh_degree:
+        rest[:, : (sh_degree + 1) ** 2 - 1] = gaussians["sh_rest"].reshape(count, -1, 3)
+    gaussians["sh_rest"] = rest
+    gaussians["sh_dc"] = gaussians["sh_dc"].reshape(count, 1, 3)
+    gaussians["opacity_logits"] = gaussians["opacity_logits"].reshape(count)
+    field: Arrays = {}
+    starts = _table_starts(config)
+    for name, shape in parameter_shapes(config).items():
+        if name.endswith(".table"):
+            if name != STATIC_TABLE:
+                field[name] = reader.columns(f"field.{name}", shape[0], shape[1], starts)
+        else:
+            code = "f4" if name in _EXACT else "f2"
+            field[name] = reader.tensor(f"field.{name}", shape, code).astype(np.float32)
+    return gaussians, field
+
+
+def _table_starts(config: FieldConfig) -> list[int]:
+    """First entries of the levels of a temporal grid."""
+    grids = temporal_grids(config)
+    return [level.first for level in grids[0].levels] if grids else [0]
+
+
+class _Reader:
+    """Tensors by name, checked."""
+
+    def __init__(self, tensors: Mapping[str, NDArray[Any]], where: str) -> None:
+        self._tensors, self._where = tensors, where
+
+    def tensor(self, name: str, shape: tuple[int, ...], *codes: str) -> NDArray[Any]:
+        array = self._tensors.get(name)
+        if array is None:
+            raise InputError(f"{self._where}: has no tensor {name!r}; the file is damaged, or of another version")
+        if array.shape != shape or array.dtype.str[1:] not in codes:
+            raise InputError(
+                f"{self._where}: tensor {name!r} is {array.dtype} {array.shape}, but the scene needs "
+                f"{' or '.join(np.dtype(code).name for code in codes)} {shape}; the file is damaged"
+            )
+        return array
+
+    def columns(self, name: str, rows: int, columns: int, starts: Sequence[int] = (0,)) -> Floats:
+        """(rows, columns)."""
+        whole = self.tensor(name, (columns, rows), "u1", "u2")
+        ranges = self.tensor(f"{name}.range", (len(starts), columns, 2), "f4")
+        with np.errstate(over="ignore"):
+            values = dequantize(whole, ranges, starts)
+        if not np.isfinite(values).all():
+            raise InputError(f"{self._where}: tensor {name!r} has a range beyond float32; the file is damaged")
+        return values

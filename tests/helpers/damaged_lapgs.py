@@ -1,0 +1,43 @@
+"""Compact scenes, damaged at random: as a file, in what it unpacks to, or in its table."""
+
+from __future__ import annotations
+
+import json
+import struct
+import zlib
+from collections.abc import Sequence
+
+from hypothesis import strategies as st
+
+from .hostile import ByteEdits, TreeEdits, byte_edits, edit_bytes, edit_tree, json_text, tree_edits
+
+CompactDamage = tuple[int, str, ByteEdits, TreeEdits]
+_WORDS = [b'"shape":[0', b'"F16"', b'"U16"', b'"data_offsets":[0,9007199254740991]', b"lapgs4d\n", b"\xff" * 8]
+
+
+def damaged_compact_scenes(files: int) -> st.SearchStrategy[CompactDamage]:
+    """Damage to one of so many files."""
+    places = st.sampled_from(["file", "content", "table", "field"])
+    return st.tuples(st.integers(0, files - 1), places, byte_edits(_WORDS), tree_edits)
+
+
+def damage_compact(files: Sequence[bytes], damage: CompactDamage) -> bytes:
+    """One of the files with its damage; but in the file itself, the sizes of the header stay right."""
+    number, place, edits, changes = damage
+    data = files[number]
+    if place == "file":
+        return edit_bytes(data, edits, head=40)
+    content = zlib.decompress(data[20:])
+    length = int.from_bytes(content[:8], "little")
+    table = json.loads(content[8 : 8 + length])
+    if place == "content":
+        content = edit_bytes(content, edits, head=length)
+    else:
+        if place == "field":
+            field = edit_tree(json.loads(table["__metadata__"]["field"]), changes)
+            table["__metadata__"]["field"] = json_text(field).decode("utf-8", "replace")
+            text = json_text(table)
+        else:
+            text = json_text(edit_tree(table, changes))
+        content = len(text).to_bytes(8, "little") + text + content[8 + length :]
+    return struct.pack("<8sIQ", data[:8], 1, len(content)) + zlib.compress(content)

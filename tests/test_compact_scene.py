@@ -1,0 +1,160 @@
+"""Compact scenes: what a file keeps of a checkpoint, and what is refused."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.scene_files import moving_scene
+from helpers.trained_scenes import CONFIGS, OURS, trained
+
+from lapgs_wgpu import load
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.io.lapgs_file import MAGIC, MAX_BYTES, is_lapgs, pack_lapgs, read_lapgs
+from lapgs_wgpu.motion.fields.config import FieldConfig
+from lapgs_wgpu.motion.playback.playback import DevicePlayback, playback_of
+from lapgs_wgpu.motion.scene_file import SceneFile, compact_bytes, read_scene
+from lapgs_wgpu.splat.constants import CONSTANTS
+from lapgs_wgpu.viewer import cli
+
+FEW = 400
+
+
+def checkpoint(device: Device, folder: Path, config: FieldConfig, count: int = FEW) -> SceneFile:
+    trained(device, config, count).save(folder / "a.ply", {"background": "white"})
+    return read_scene(folder / "a.ply")
+
+
+def compact(device: Device, folder: Path, file: SceneFile) -> Path:
+    playback = playback_of(file, device)
+    assert isinstance(playback, DevicePlayback)
+    (folder / "a.lapgs").write_bytes(compact_bytes(file, playback.static_features()))
+    return folder / "a.lapgs"
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_every_field_is_kept(device: Device, tmp_path: Path, name: str) -> None:
+    """Within the steps of its quantization; what needs no rounding, exactly."""
+    file = checkpoint(device, tmp_path, CONFIGS[name])
+    found = read_scene(compact(device, tmp_path, file))
+    assert (found.field_config, found.sh_degree) == (file.field_config, file.sh_degree)
+    assert found.metadata == {"background": "white"}
+    assert found.field.keys() == file.field.keys() - {"static_grid.table"}
+    for parameter, values in found.field.items():
+        allowed = 2e-2 * np.abs(file.field[parameter]).max() if parameter.endswith("table") else 1e-3
+        np.testing.assert_allclose(values, file.field[parameter], rtol=1e-3, atol=allowed)
+        assert values.dtype == np.float32
+    if file.field_config.appearance_size < 4:
+        limit = np.log(CONSTANTS["ALPHA_MIN"] / (1 - CONSTANTS["ALPHA_MIN"]))
+        assert len(found.gaussians["means"]) == (file.gaussians["opacity_logits"] >= limit).sum() < FEW
+    else:
+        means = file.gaussians["means"]
+        np.testing.assert_allclose(found.gaussians["means"], means, atol=np.ptp(means, axis=0).max() / 65535)
+        features = playback_of(file, device).static_features()  # type: ignore[attr-defined]
+        steps = np.abs(features).max(axis=0) / 31
+        assert (np.abs(found.gaussians["static_features"] - features) <= 0.51 * steps + 1e-6).all()
+
+
+def test_exact_features_give_the_same_bits(device: Device, tmp_path: Path) -> None:
+    """H_s of each Gaussian stands for the static table without any loss of its own."""
+    file = checkpoint(device, tmp_path, OURS)
+    whole = playback_of(file, device)
+    assert isinstance(whole, DevicePlayback)
+    gaussians = file.gaussians | {"static_features": whole.static_features()}
+    field = {name: values for name, values in file.field.items() if name != "static_grid.table"}
+    without = SceneFile("", file.field_config, file.sh_degree, gaussians, field, {})
+    assert playback_of(without, device).means(0.3).tobytes() == whole.means(0.3).tobytes()
+
+
+def test_equal_scenes_give_equal_bytes(device: Device, tmp_path: Path) -> None:
+    file = checkpoint(device, tmp_path, OURS)
+    first = compact(device, tmp_path, file).read_bytes()
+    assert compact(device, tmp_path, file).read_bytes() == first
+    assert len(first) < 0.4 * (tmp_path / "a.ply").stat().st_size
+
+
+def test_a_still_scene(device: Device, tmp_path: Path) -> None:
+    scene = moving_scene(device, FieldConfig(kind="static"), sh_degree=1)
+    scene.save(tmp_path / "a.ply")
+    found = read_scene(compact(device, tmp_path, read_scene(tmp_path / "a.ply")))
+    assert found.field == {}
+    assert found.sh_degree == 1
+    assert not found.gaussians["sh_rest"][:, 3:].any()
+
+
+def test_lapgs_view_opens_and_writes_it(device: Device, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    checkpoint(device, tmp_path, OURS)
+    scene, again, page = (str(tmp_path / name) for name in ("b.lapgs", "c.lapgs", "d.html"))
+    assert cli.view_command([str(tmp_path / "a.ply"), "--export", scene]) == 0
+    assert cli.view_command([scene, "--export", again]) == 0
+    assert cli.view_command([scene, "--screenshot", str(tmp_path / "a.png"), "--size", "64x48"]) == 0
+    assert cli.view_command([scene, "--export", page]) == 0
+    assert f"{page}: {FEW} Gaussians" in capsys.readouterr().out
+    assert cli.view_command([scene, "--export", page]) == 2
+    assert "is there already; --overwrite replaces it" in capsys.readouterr().err
+    assert cli.view_command([scene, "--export", scene, "--overwrite"]) == 2
+    assert "is the opened file; take another name" in capsys.readouterr().err
+    assert cli.view_command([scene, "--export", page, "--time", "0.5"]) == 2
+    assert "--time has no use" in capsys.readouterr().err
+    with pytest.raises(InputError, match="is a compact scene, which lapgs-view shows"):
+        load(scene)
+
+
+@pytest.mark.parametrize("kind", ["mlp", "hexplane"])
+def test_fields_of_torch_are_refused(device: Device, tmp_path: Path, kind: str) -> None:
+    moving_scene(device, FieldConfig(kind=kind, width=8)).save(tmp_path / "a.ply")  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=f"only torch evaluates its field \\({kind}"):
+        compact_bytes(read_scene(tmp_path / "a.ply"), None)
+
+
+# The container
+
+
+def rewritten(path: Path, content: bytes, version: int = 1, size: int | None = None) -> Path:
+    path.write_bytes(
+        struct.pack("<8sIQ", MAGIC, version, len(content) if size is None else size) + zlib.compress(content)
+    )
+    return path
+
+
+@pytest.mark.parametrize(
+    ("version", "size", "packed", "reason"),
+    [
+        (2, None, b"", "has version 2 of the compact scene, and this program reads version 1"),
+        (1, MAX_BYTES + 1, b"", f"declares {MAX_BYTES + 1} bytes in .* packed ones"),
+        (1, 10**6, b"", "declares 1000000 bytes in [0-9]+ packed ones, of at most"),
+        (1, 20, b"", "hold 19;"),
+        (1, 18, b"", "hold more"),
+        (1, None, b"more", "hold more, or are followed by others"),
+        (1, 3, b"", "hold more"),
+    ],
+)
+def test_containers_that_are_refused(
+    tmp_path: Path, version: int, size: int | None, packed: bytes, reason: str
+) -> None:
+    path = rewritten(tmp_path / "a.lapgs", b"nineteen characters", version, size)
+    path.write_bytes(path.read_bytes() + packed)
+    with pytest.raises(InputError, match=reason):
+        read_scene(path)
+
+
+def test_a_truncated_file(tmp_path: Path) -> None:
+    data = pack_lapgs({"a": np.arange(1000, dtype=np.uint16)}, {"b": "c"})
+    path = tmp_path / "a.lapgs"
+    path.write_bytes(data)
+    tensors, metadata = read_lapgs(path)
+    assert (tensors["a"] == np.arange(1000)).all()
+    assert metadata == {"b": "c"}
+    for length in (8, 19, 20, 40, len(data) - 1):
+        path.write_bytes(data[:length])
+        with pytest.raises(InputError, match="damaged"):
+            read_scene(path)
+
+
+def test_what_is_not_there_is_no_compact_scene(tmp_path: Path) -> None:
+    assert not is_lapgs(tmp_path / "missing")
+    assert not is_lapgs(tmp_path)

@@ -1,0 +1,106 @@
+"""The page's reader of compact scenes, in Chromium: the desktop's bits, and one sentence for every damaged file.
+
+A few hundred files, always the same; LAPGS_FUZZ=10000 takes as many new ones (make soak).
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import struct
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.browser import CHROMIUM, Browser
+from helpers.damaged_files import small_scene
+from helpers.damaged_lapgs import CompactDamage, damage_compact, damaged_compact_scenes
+from helpers.hostile import fuzzed
+from helpers.trained_scenes import OURS, trained
+from hypothesis import given
+
+from lapgs_wgpu import Scene4D
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.motion.playback.playback import DevicePlayback, open_playback
+from lapgs_wgpu.motion.scene_file import compact_bytes, read_scene
+from lapgs_wgpu.viewer.web_page import module_script
+
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt-get install chromium")
+
+READ = """(async text => {
+    const bytes = Uint8Array.from(atob(text), letter => letter.charCodeAt(0));
+    try {
+        window.scene = await scene_js.readScene(bytes);
+        return "";
+    } catch (error) {
+        return error instanceof refusal_js.Refusal ? error.message : `no sentence: ${error.stack}`;
+    }
+})"""
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    folder = tmp_path_factory.mktemp("reader")
+    (folder / "empty.html").write_text("<!doctype html><title>empty</title>")
+    with Browser(folder / "profile", (64, 64)) as browser:
+        browser.open((folder / "empty.html").as_uri())
+        for name in ("refusal", "lapgs_file", "hash_grid", "scene"):
+            browser.value(module_script(name) + "undefined")
+        yield browser
+
+
+def read(page: Browser, data: bytes) -> str:
+    """What the page says of a file; nothing where it takes it."""
+    said: str = page.value(f"{READ}('{base64.b64encode(data).decode()}')")
+    return said
+
+
+def compact(scene: Scene4D, file: Path, device: Device) -> bytes:
+    scene.save(file, {"background": "white"})
+    playback = open_playback(file, device)
+    assert isinstance(playback, DevicePlayback)
+    return compact_bytes(read_scene(file), playback.static_features())
+
+
+def test_the_page_reads_the_same_bits(page: Browser, device: Device, tmp_path: Path) -> None:
+    data = compact(trained(device, OURS, 50), tmp_path / "a.ply", device)
+    (tmp_path / "a.lapgs").write_bytes(data)
+    expected = read_scene(tmp_path / "a.lapgs")
+    assert read(page, data) == ""
+    arrays = {f"gaussians.{name}": values for name, values in expected.gaussians.items() if name != "sh_rest"}
+    arrays["gaussians.sh_rest"] = expected.gaussians["sh_rest"][:, :8]  # of degree 2
+    arrays |= {f"parameters['{name}']": values for name, values in expected.field.items()}
+    for name, values in arrays.items():
+        bits = page.value(f"Array.from(new Uint32Array(scene.{name}.buffer))")
+        assert (np.array(bits, np.uint32) == np.ascontiguousarray(values).view(np.uint32).ravel()).all(), name
+
+
+@pytest.fixture(scope="module")
+def files(device: Device, tmp_path_factory: pytest.TempPathFactory) -> list[bytes]:
+    """One of each field that such a file can hold."""
+    file = tmp_path_factory.mktemp("compact") / "a.ply"
+    return [compact(small_scene(kind, device), file, device) for kind in ("static", "grid4d", "laplacian")]
+
+
+@fuzzed()
+@given(damaged_compact_scenes(3))
+def test_damaged_files(page: Browser, files: list[bytes], damage: CompactDamage) -> None:
+    said = read(page, damage_compact(files, damage))
+    assert not said.startswith("no sentence"), said
+    assert said.isprintable()
+    assert len(said) < 500
+
+
+def test_names_that_every_object_has(page: Browser, files: list[bytes]) -> None:
+    """What JavaScript finds on the prototype of a table is not in the table."""
+    for name, value in (("appearance", "constructor"), ("kind", "toString"), ("appearance", "__proto__")):
+        content = zlib.decompress(files[2][20:])
+        length = int.from_bytes(content[:8], "little")
+        table = json.loads(content[8 : 8 + length])
+        table["__metadata__"]["field"] = json.dumps(json.loads(table["__metadata__"]["field"]) | {name: value})
+        text = json.dumps(table).encode()
+        content = len(text).to_bytes(8, "little") + text + content[8 + length :]
+        said = read(page, struct.pack("<8sIQ", files[2][:8], 1, len(content)) + zlib.compress(content))
+        assert "is none that this page can evaluate" in said

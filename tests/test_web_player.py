@@ -1,0 +1,377 @@
+"""The web page in headless Chromium, on SwiftShader, against the desktop's viewer; driven by real events."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import http.server
+import os
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from helpers.browser import CHROMIUM, WEBGPU, Browser, wait_for
+from helpers.scene_files import moving_scene
+from helpers.trained_scenes import CONFIGS, OURS, trained
+from helpers.web_pages import (
+    FRAMES,
+    SIZE,
+    Desktop,
+    call,
+    export_scene,
+    open_page,
+    page_picture,
+    psnr,
+    shown,
+)
+
+from lapgs_wgpu.gpu.device import Device, _adapters
+from lapgs_wgpu.gpu.kernel import Commands, Kernel
+from lapgs_wgpu.gpu.shader import browser_source
+from lapgs_wgpu.motion.fields.config import FieldConfig
+from lapgs_wgpu.viewer.camera import ViewCamera
+from lapgs_wgpu.viewer.controls import ORBIT, ZOOM
+from lapgs_wgpu.viewer.web_page import player_data
+
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt-get install chromium")
+
+SAME = 90.0  # dB: less is another picture
+TIMES = (0.0, 0.37, 1.0)
+OWN_DEVICE = "const own = GPUAdapter.prototype.requestDevice;"
+POSITION, FOCUS = [3.0, 1.0, 2.0], [0.2, 0.0, -0.1]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("pages")
+
+
+@pytest.fixture(scope="module")
+def page(folder: Path, device: Device) -> Path:
+    """A scene whose field changes all that a field can change."""
+    return export_scene(trained(device, OURS, 300), folder, device)
+
+
+@pytest.fixture(scope="module")
+def desktop(page: Path, device: Device) -> Desktop:
+    return Desktop(page, device)
+
+
+@pytest.fixture(scope="module")
+def chromium(folder: Path) -> Iterator[Browser]:
+    with Browser(folder / "profile", SIZE, WEBGPU) as browser:
+        yield browser
+
+
+@pytest.fixture
+def window(chromium: Browser) -> Browser:
+    """In its usual size, with what was open before."""
+    chromium.resize(SIZE)
+    return chromium
+
+
+@pytest.fixture
+def browser(window: Browser, page: Path) -> Browser:
+    """With the page as it opens."""
+    if not window.value("location.href").startswith(page.as_uri() + "#") or not shown(window):
+        open_page(window, page.as_uri() + "#")
+    window.key("r")
+    window.value("(lapgs.onframe = null, location.hash = '#t=1')")
+    wait_for(lambda: window.value("lapgs.time") == 1, 20, "the end")
+    window.value("location.hash = '#t=0&speed=1&loop=loop&background=grey'")
+    wait_for(lambda: window.value("lapgs.time") == 0, 20, "the start")
+    return window
+
+
+def look_from_elsewhere(camera: ViewCamera) -> None:
+    camera.position, camera.focus = np.array(POSITION), np.array(FOCUS)
+    camera.focus_on(FOCUS)
+
+
+def same(browser: Browser, desktop: Desktop, time: float, *change: Any, **options: Any) -> bool:
+    return psnr(page_picture(browser), desktop.picture(time, *change, **options)) >= SAME
+
+
+# The picture
+
+
+def test_three_times_and_two_cameras(browser: Browser, desktop: Desktop) -> None:
+    for time in TIMES:
+        call(browser, "setTime", time)
+        assert same(browser, desktop, time)
+    call(browser, "setCamera", {"position": POSITION, "focus": FOCUS})
+    for time in TIMES:
+        call(browser, "setTime", time)
+        assert same(browser, desktop, time, look_from_elsewhere)
+    assert psnr(desktop.picture(0.0), desktop.picture(1.0)) < 40  # the scene moves
+
+
+def test_the_canvas_shows_it(browser: Browser, desktop: Desktop) -> None:
+    """What is on the screen, but for the bar and rounding to 8 bits."""
+    call(browser, "setTime", 0.37)
+    page_picture(browser)
+    screen = browser.picture()[: SIZE[1] - 60]
+    expected = 255 * desktop.picture(0.37).clip(0, 1)[: SIZE[1] - 60]
+    assert np.abs(screen - expected).max() < 2.5
+
+
+@pytest.mark.parametrize("name", ["grid4d", "grid4d without time", "no appearance", "odd width", "odd levels"])
+def test_every_field(window: Browser, folder: Path, device: Device, name: str) -> None:
+    made = export_scene(trained(device, CONFIGS[name], 300), folder, device, name.replace(" ", "-"))
+    open_page(window, made.as_uri())
+    call(window, "setTime", 0.7)
+    assert same(window, Desktop(made, device), 0.7)
+
+
+def test_a_still_scene(window: Browser, folder: Path, device: Device) -> None:
+    """No time slider, and nothing that plays."""
+    made = export_scene(moving_scene(device, FieldConfig(kind="static"), sh_degree=3), folder, device, "still")
+    open_page(window, made.as_uri())
+    assert same(window, Desktop(made, device), 0.0)
+    assert window.value("document.getElementById('bar').hidden")
+    window.key(" ")
+    assert not window.value("lapgs.playing")
+
+
+def test_the_desktop_runs_the_same_dispatches(browser: Browser, page: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Kernels, workgroups and bindings of a frame, in the shape for GPUs: all that the page's own code decides."""
+    info, adapter = _adapters()[0]
+    gpu = Device(adapter, dataclasses.replace(info, kind="discrete"), subgroups=False)
+    names = {kernel["source"]: name for name, kernel in player_data()["kernels"].items()}
+    found: list[Any] = []
+    dispatch = Commands.dispatch_grid
+
+    def record(commands: Commands, kernel: Kernel, groups: tuple[int, int], **arrays: Any) -> None:
+        bindings = {name: [array.binding[1], array.binding[2]] for name, array in arrays.items()}
+        found.append([names[browser_source(kernel.source)], *groups, bindings])
+        dispatch(commands, kernel, groups, **arrays)
+
+    desktop = Desktop(page, gpu)
+    for time in (0.0, 0.2):  # buffers grow alike
+        desktop.picture(time)
+    monkeypatch.setattr(Commands, "dispatch_grid", record)
+    desktop.picture(0.4)
+    call(browser, "setTime", 0.2)
+    assert call(browser, "passes", 0.4) == found
+    assert len(found) > 60
+
+
+def test_default_limits(window: Browser, page: Path, desktop: Desktop) -> None:
+    """A device without any feature or limit beyond WebGPU's own."""
+    script = "GPUAdapter.prototype.requestDevice = function () { return own.call(this, {}); };"
+    open_page(window, page.as_uri() + "?default", first=OWN_DEVICE + script)
+    call(window, "setTime", 0.37)
+    assert same(window, desktop, 0.37)
+
+
+def test_workgroups_that_are_no_subgroups(window: Browser, page: Path, desktop: Desktop) -> None:
+    """An adapter that promises subgroups of 32 lanes and has less: the pass says so, and the page does without them."""
+    script = "Object.defineProperty(GPUAdapterInfo.prototype, 'subgroupMinSize', { get: () => 32 });"
+    script += "GPUAdapter.prototype.requestDevice = async function (...given) {"
+    script += " const device = await own.apply(this, given); window.features = [...device.features]; return device; };"
+    open_page(window, page.as_uri() + "?subgroups", first=OWN_DEVICE + script)
+    assert "subgroups" in window.value("features")
+    call(window, "setTime", 0.37)
+    assert same(window, desktop, 0.37)
+    assert {name for name, *_ in call(window, "passes", 0.5) if name.startswith("rasterize")} == {"rasterize"}
+
+
+@pytest.mark.skipif("LAPGS_SOAK" not in os.environ, reason="takes minutes: LAPGS_SOAK=1, or make soak")
+def test_200_000_gaussians(window: Browser, folder: Path, device: Device) -> None:
+    """With grids as those of the preset dnerf: rows of features are more than a binding holds, hence two blocks."""
+    config = dataclasses.replace(OURS, temporal=dataclasses.replace(OURS.temporal, levels=32))
+    scene = trained(device, config, 200_000)
+    with torch.no_grad():
+        scene.parameters["log_scales"] -= 3
+    made = export_scene(scene, folder, device, "many")
+    open_page(window, made.as_uri(), seconds=300)
+    call(window, "setTime", 0.2)
+    assert same(window, Desktop(made, device), 0.2)
+    assert sum(name.startswith("deform") for name, *_ in call(window, "passes", 0.5)) == 2
+
+
+# Input
+
+
+def test_play_pause_and_scrub(browser: Browser, desktop: Desktop) -> None:
+    browser.key(" ")
+    wait_for(lambda: browser.value("lapgs.time") > 0.1, 60, "time goes on")
+    assert browser.value("lapgs.playing")
+    browser.key(" ")
+    time = browser.value("lapgs.time")
+    assert same(browser, desktop, time)
+    assert browser.value("lapgs.time") == time
+
+    slider = "document.getElementById('time').getBoundingClientRect()"
+    left, top, width, height = browser.value(f"(box => [box.left, box.top, box.width, box.height])({slider})")
+    for kind, share in (("mousePressed", 0.2), ("mouseMoved", 0.5), ("mouseMoved", 0.8), ("mouseReleased", 0.8)):
+        browser.mouse(kind, left + share * width, top + height / 2, down=kind != "mouseReleased")
+    time = browser.value("lapgs.time")
+    assert 0.7 < time < 0.95
+    assert same(browser, desktop, time)
+
+
+def test_keys(browser: Browser, desktop: Desktop) -> None:
+    for key, frame in ((".", 1), (".", 2), (",", 1), ("End", FRAMES - 1), ("Home", 0)):
+        browser.key(key)
+        assert browser.value("lapgs.time") == pytest.approx(frame / (FRAMES - 1))
+    for key, speed in (("]", "2x"), ("[", "1x"), ("[", "0.5x")):
+        browser.key(key)
+        assert browser.value("document.getElementById('speed').value") == speed
+    browser.key("l")
+    assert browser.value("document.getElementById('loop').value") == "bounce"
+    browser.key("?")
+    assert "play or pause" in browser.value("document.getElementById('help').innerText")
+    browser.key("?")
+    assert browser.value("document.getElementById('help').hidden")
+    browser.key("b")
+    assert same(browser, desktop, 0.0, background="black")
+
+
+def test_orbit_zoom_and_reset(browser: Browser, desktop: Desktop) -> None:
+    browser.mouse("mousePressed", 100, 80, down=True)
+    browser.mouse("mouseMoved", 160, 100, down=True)
+    browser.mouse("mouseReleased", 160, 100)
+    assert same(browser, desktop, 0.0, lambda camera: camera.orbit(60 * ORBIT, 20 * ORBIT))
+    browser.call("Input.dispatchMouseEvent", type="mouseWheel", x=100, y=80, deltaX=0, deltaY=-200)
+    wait_for(lambda: not same(browser, desktop, 0.0, lambda camera: camera.orbit(60 * ORBIT, 20 * ORBIT)), 20, "zoom")
+
+    def zoomed(camera: ViewCamera) -> None:
+        camera.orbit(60 * ORBIT, 20 * ORBIT)
+        camera.zoom(float(np.exp(-200 * ZOOM)))
+
+    assert same(browser, desktop, 0.0, zoomed)
+    browser.key("r")
+    assert same(browser, desktop, 0.0)
+
+
+def test_fingers(browser: Browser, desktop: Desktop) -> None:
+    """One turns the scene; two, moved apart, come nearer."""
+
+    def touch(kind: str, *points: tuple[float, float]) -> None:
+        fingers = [{"x": x, "y": y, "id": number} for number, (x, y) in enumerate(points)]
+        browser.call("Input.dispatchTouchEvent", type=kind, touchPoints=fingers)
+
+    touch("touchStart", (100, 80))
+    touch("touchMove", (130, 80))
+    touch("touchEnd")
+    assert same(browser, desktop, 0.0, lambda camera: camera.orbit(30 * ORBIT, 0))
+    browser.key("r")
+    touch("touchStart", (100, 100), (140, 100))
+    touch("touchMove", (80, 100), (160, 100))
+    touch("touchEnd")
+
+    def spread(camera: ViewCamera) -> None:  # the browser reports one finger after the other
+        for right, factor in ((20, 40 / 60), (-20, 60 / 80)):
+            camera.pan(0.5 * right / SIZE[1], 0)  # of their middle
+            camera.zoom(factor)
+
+    assert same(browser, desktop, 0.0, spread)
+
+
+def test_resize_and_density(browser: Browser, desktop: Desktop) -> None:
+    browser.resize((250, 311))
+    wait_for(lambda: browser.value("document.getElementById('canvas').width") == 250, 20, "the canvas")
+    assert same(browser, desktop, 0.0, size=(250, 311))
+    browser.call("Emulation.setDeviceMetricsOverride", width=200, height=150, deviceScaleFactor=2, mobile=False)
+    wait_for(lambda: browser.value("document.getElementById('canvas').width") == 400, 20, "the canvas")
+    assert same(browser, desktop, 0.0, size=(400, 300))
+
+
+def test_address_and_script(window: Browser, page: Path, desktop: Desktop) -> None:
+    open_page(window, page.as_uri() + "#t=0.3&speed=2&loop=once&background=white")
+    assert same(window, desktop, 0.3, background="white")
+    assert window.value("[lapgs.time, lapgs.playing]") == [0.3, False]
+    window.value("(window.seen = [], lapgs.onframe = time => seen.push(time), lapgs.play())")
+    wait_for(lambda: len(window.value("seen")) > 2, 60, "frames")
+    wait_for(lambda: window.value("lapgs.time") == 1 and not window.value("lapgs.playing"), 60, "the end")
+    seen = window.value("seen")
+    assert seen == sorted(seen)
+    window.value("location.hash = '#t=0.5'")
+    wait_for(lambda: window.value("lapgs.time") == 0.5, 20, "the new address")
+    assert "Error" in window.value("(() => { try { lapgs.setTime('x') } catch (error) { return String(error) } })()")
+
+
+# Served, dropped, refused
+
+
+@pytest.fixture(scope="module")
+def server(folder: Path) -> Iterator[str]:
+    handler = functools.partial(http.server.SimpleHTTPRequestHandler, directory=str(folder))
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as running:
+        handler.log_message = lambda *_: None  # type: ignore[attr-defined]
+        threading.Thread(target=running.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{running.server_port}"
+        running.shutdown()
+
+
+def test_from_a_static_server(window: Browser, page: Path, server: str, device: Device, folder: Path) -> None:
+    """Also another scene, by ?src, whose MIME type no server knows."""
+    made = export_scene(trained(device, CONFIGS["color"], 200), folder, device, "other")
+    open_page(window, f"{server}/{page.name}?src=other.lapgs")
+    assert same(window, Desktop(made, device), 0.0)
+
+
+def test_a_dropped_file(browser: Browser, device: Device, folder: Path, desktop: Desktop) -> None:
+    """A scene takes the place of the one on show; what is no scene does not, and is refused in a sentence."""
+
+    def drop(file: Path) -> None:
+        for kind in ("dragEnter", "dragOver", "drop"):
+            data = {"items": [], "files": [str(file)], "dragOperationsMask": 1}
+            browser.call("Input.dispatchDragEvent", type=kind, x=100, y=80, data=data)
+
+    drop(folder / "scene.ply")
+    wait_for(lambda: "do not begin as a scene does" in browser.note(), 60, "the sentence")
+    assert same(browser, desktop, 0.0)
+    made = export_scene(trained(device, CONFIGS["no dynamics"], 200), folder, device, "dropped")
+    drop(made.with_suffix(".lapgs"))
+    wait_for(lambda: browser.note() == "", 120, "the dropped scene")
+    assert same(browser, Desktop(made, device), 0.0)
+    browser.key("End")
+    assert same(browser, Desktop(made, device), 1.0)
+    browser.open("about:blank")  # the next test begins anew
+
+
+def test_an_adapter_that_is_too_small(window: Browser, page: Path) -> None:
+    script = "Object.defineProperty(GPUSupportedLimits.prototype, 'maxBufferSize', { get: () => 2000 });"
+    made = window.call("Page.addScriptToEvaluateOnNewDocument", source=script)
+    window.open(page.as_uri() + "?small")
+    wait_for(lambda: "but a buffer of this adapter holds 2000" in window.note(), 60, "the sentence")
+    window.call("Page.removeScriptToEvaluateOnNewDocument", identifier=made["identifier"])
+
+
+def test_what_cannot_be_fetched(window: Browser, page: Path, server: str) -> None:
+    for address, reason in (
+        (f"{server}/{page.name}?src=missing.lapgs", "the server says 404"),
+        (f"{server}/{page.name}?src=http://127.0.0.1:9/scene.lapgs", "only files beside this page"),
+        (f"{server}/{page.name}?src={page.name}", "do not begin as a scene does"),
+    ):
+        window.open(address)
+        wait_for(lambda reason=reason: reason in window.note(), 60, reason)  # type: ignore[misc]
+
+
+def test_a_lost_device(window: Browser, page: Path) -> None:
+    """A sentence, and the last picture stays on the screen."""
+    script = "GPUAdapter.prototype.requestDevice = async function (...given)"
+    script += " { return window.device = await own.apply(this, given); };"
+    open_page(window, page.as_uri() + "?lost", first=OWN_DEVICE + script)
+    page_picture(window)
+    before = window.picture()
+    window.value("device.destroy()")
+    wait_for(lambda: "The graphics device was lost" in window.note(), 20, "the sentence")
+    window.key(".")
+    note = int(window.value("document.getElementById('note').getBoundingClientRect().bottom")) + 1
+    assert np.abs(window.picture() - before)[note : SIZE[1] - 60].max() < 3
+    assert window.value("lapgs.time") == 0
+
+
+def test_without_webgpu(page: Path, tmp_path: Path) -> None:
+    with Browser(tmp_path / "profile", SIZE) as browser:
+        browser.open(page.as_uri())
+        wait_for(lambda: "WebGPU" in browser.note(), 60, "the sentence")
+        assert browser.value("document.getElementById('poster').complete && !document.getElementById('poster').hidden")
+        assert browser.picture()[: SIZE[1] // 2].std() > 10  # the poster shows the scene

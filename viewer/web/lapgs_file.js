@@ -1,0 +1,96 @@
+// The container of a compact scene (docs/format.md): a header, then a deflated safetensors file. Nothing in it is trusted.
+import { Refusal, quoted } from "./refusal.js";
+
+const MAGIC = "lapgs4d\n";
+const HEADER = 20; // magic, version, bytes once unpacked
+const VERSION = 1;
+const MOST_BYTES = 2 ** 30;
+const MOST_RATIO = 1032; // of deflate
+const MOST_TABLE = 2 ** 20; // of the safetensors file's table
+const ARRAYS = { F32: Float32Array, F16: Uint16Array, U16: Uint16Array, U8: Uint8Array };
+
+const damaged = reason => new Refusal(`The scene cannot be read: ${reason}; the file is damaged, or not a scene.lapgs.`);
+
+// {tensors: name -> {dtype, shape, data}, metadata: name -> text}. Raises Refusal.
+export async function readContainer(bytes) {
+    const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
+    if (bytes.length < HEADER || String.fromCharCode(...bytes.subarray(0, MAGIC.length)) !== MAGIC) {
+        throw damaged(`its ${bytes.length} bytes do not begin as a scene does`);
+    }
+    const version = view.getUint32(8, true);
+    if (version !== VERSION) {
+        throw new Refusal(`The scene has version ${version} of its format, and this page reads version ${VERSION}: `
+            + "export the page again with a newer lapgs-view.");
+    }
+    const size = Number(view.getBigUint64(12, true));
+    const packed = bytes.length - HEADER;
+    if (size > Math.min(MOST_BYTES, MOST_RATIO * packed)) {
+        throw damaged(`it declares ${size} bytes in ${packed} packed ones`);
+    }
+    return readTensors(await inflate(bytes.subarray(HEADER), size));
+}
+
+async function inflate(packed, size) {
+    let content;
+    try {
+        content = new Uint8Array(size);
+    } catch {
+        throw new Refusal(`The scene needs ${size} bytes of memory, which this browser does not give.`);
+    }
+    const reader = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate")).getReader();
+    let at = 0;
+    for (;;) {
+        const { done, value } = await reader.read().catch(() => {
+            throw damaged("it cannot be unpacked");
+        });
+        if (done) break;
+        if (at + value.length > size) {
+            reader.cancel().catch(() => {});
+            throw damaged(`it unpacks to more than the ${size} bytes that it declares`);
+        }
+        content.set(value, at);
+        at += value.length;
+    }
+    if (at !== size) throw damaged(`it unpacks to ${at} of the ${size} bytes that it declares`);
+    return content;
+}
+
+function readTensors(content) {
+    const length = content.length < 8 ? Infinity : Number(new DataView(content.buffer).getBigUint64(0, true));
+    if (length > Math.min(content.length - 8, MOST_TABLE)) throw damaged(`its table of ${length} bytes does not fit`);
+    let table;
+    try {
+        table = JSON.parse(new TextDecoder("utf-8", { fatal: true }).decode(content.subarray(8, 8 + length)));
+    } catch {
+        throw damaged("its table is not JSON");
+    }
+    if (!isTable(table)) throw damaged("its table is not a JSON object");
+    const { __metadata__: metadata = {}, ...entries } = table;
+    if (!isTable(metadata) || !Object.values(metadata).every(text => typeof text === "string")) {
+        throw damaged("its metadata are not texts");
+    }
+    const tensors = new Map();
+    let end = 0;
+    for (const [name, entry] of Object.entries(entries).sort(byBegin)) {
+        const type = isTable(entry) && Object.hasOwn(ARRAYS, entry.dtype) ? ARRAYS[entry.dtype] : undefined;
+        if (!type || !areSizes(entry.shape) || !areSizes(entry.data_offsets)) {
+            throw damaged(`its tensor ${quoted(name)} is not declared as known`);
+        }
+        const count = entry.shape.reduce((all, each) => all * each, 1);
+        const [begin, last] = entry.data_offsets;
+        if (begin !== end || last - begin !== count * type.BYTES_PER_ELEMENT) {
+            throw damaged(`its tensor ${quoted(name)} of ${count} values lies at bytes ${begin} to ${last}, after ${end}`);
+        }
+        end = last;
+        if (8 + length + end > content.length) throw damaged(`its tensor ${quoted(name)} ends beyond the file`);
+        const data = new type(content.slice(8 + length + begin, 8 + length + end).buffer);
+        tensors.set(name, { dtype: entry.dtype, shape: entry.shape, data });
+    }
+    if (8 + length + end !== content.length) throw damaged(`its tensors end at ${end} of ${content.length - 8 - length} bytes`);
+    return { tensors, metadata };
+}
+
+const isTable = value => typeof value === "object" && value !== null && !Array.isArray(value);
+const areSizes = value => Array.isArray(value) && value.length <= 8 && value.every(n => Number.isSafeInteger(n) && n >= 0);
+const byBegin = ([, a], [, b]) => (a?.data_offsets?.[0] ?? 0) - (b?.data_offsets?.[0] ?? 0)
+    || (a?.data_offsets?.[1] ?? 0) - (b?.data_offsets?.[1] ?? 0);

@@ -1,0 +1,212 @@
+// Opens the scene that the page carries, that ?src=URL names, or that is dropped on it, and shows it.
+import { applyAddress, makeApi } from "./api.js";
+import { ViewCamera, firstView } from "./camera.js";
+import { Clock } from "./clock.js";
+import { Controls } from "./controls.js";
+import { Playback } from "./field.js";
+import { openGpu } from "./gpu.js";
+import { Presenter } from "./presenter.js";
+import { Rasterizer } from "./rasterizer.js";
+import { Refusal } from "./refusal.js";
+import { readScene } from "./scene.js";
+import { Transport } from "./transport.js";
+import { Viewport } from "./viewport.js";
+
+const find = name => document.getElementById(name);
+const LONGEST_STEP = 0.25; // seconds that the clock goes on at once, after a tab was in the background
+let shown = null; // ends what is on the page
+let wanted = 0; // number of the scene that was asked for last
+
+// Keep a picture for the time when there is no device to draw another.
+function keep(blob) {
+    const poster = find("poster");
+    if (!blob) return;
+    if (poster.src.startsWith("blob:")) URL.revokeObjectURL(poster.src);
+    poster.src = URL.createObjectURL(blob);
+}
+
+// Say one sentence over the picture; an empty one goes away.
+function say(text) {
+    find("note").textContent = text;
+    find("note").hidden = !text;
+}
+
+function sentence(error) {
+    if (error instanceof Refusal) return error.message;
+    const reason = String(error?.message ?? error).split("\n")[0].slice(0, 200);
+    return `The scene cannot be shown on this adapter (${reason}): try another browser or a newer driver.`;
+}
+
+async function embedded() {
+    const text = find("scene").textContent.trim();
+    const bytes = Uint8Array.from(atob(text), letter => letter.charCodeAt(0));
+    if (!bytes.length) throw new Refusal("This page carries no scene: drop a scene.lapgs on it.");
+    return bytes;
+}
+
+async function fetched(address) {
+    let answer;
+    try {
+        answer = await fetch(address);
+    } catch {
+        throw new Refusal(`${address} cannot be fetched: only files beside this page on its own server can, and none from file://.`);
+    }
+    if (!answer.ok) throw new Refusal(`${address} cannot be fetched: the server says ${answer.status}; check the address.`);
+    const total = Number(answer.headers.get("Content-Length")) || 0;
+    const chunks = [];
+    let size = 0;
+    for (const reader = answer.body.getReader(); ;) {
+        const { done, value } = await reader.read();
+        if (done) break;
+        chunks.push(value);
+        size += value.length;
+        say(`Loading ${(size / 1e6).toFixed(1)}${total ? ` of ${(total / 1e6).toFixed(1)}` : ""} MB`);
+    }
+    return new Uint8Array(await new Blob(chunks).arrayBuffer());
+}
+
+// Show the scene whose bytes `load` gives, in place of the present one; where it fails the present one stays.
+async function open(load, data) {
+    const number = ++wanted;
+    let gpu;
+    try {
+        say("Loading");
+        const scene = await readScene(await load());
+        gpu = await openGpu(data.kernels);
+        const next = await prepare(gpu, scene, data);
+        if (number !== wanted) {
+            gpu.device.destroy();
+            return;
+        }
+        shown?.();
+        const { api, stop } = next();
+        shown = stop;
+        window.lapgs = api;
+        say("");
+    } catch (error) {
+        gpu?.device.destroy();
+        if (number === wanted) say(sentence(error));
+    }
+}
+
+async function prepare(gpu, scene, data) {
+    const rasterizer = new Rasterizer(gpu, data.raster);
+    const keys = [...data.always, data.raster.plain, rasterizer.rasterize, `color SH ${scene.shDegree}`];
+    gpu.device.pushErrorScope("out-of-memory");
+    const playback = new Playback(gpu, scene, data.minScale);
+    if (await gpu.device.popErrorScope()) {
+        throw new Refusal(`The adapter has not enough memory for ${scene.count} Gaussians: close other pages, or export fewer.`);
+    }
+    if (scene.field) keys.push(...data.field, playback.deform);
+    let compiled = 0;
+    await gpu.compile([...new Set(keys)], () => say(`Compiling ${++compiled} of ${new Set(keys).size} passes`));
+    const first = firstView(scene.metadata.view, scene.gaussians.means);
+    const clock = new Clock(scene.field ? first.frames : 1, data.loops, data.speeds);
+    const trained = scene.metadata.background; // on it
+    const background = data.backgrounds[Object.hasOwn(data.backgrounds, trained) ? trained : "black"];
+    const state = { camera: new ViewCamera(first), clock, background };
+    return () => start(gpu, { scene, playback, rasterizer }, state, data);
+}
+
+function start(gpu, { scene, playback, rasterizer }, state, data) {
+    const canvas = find("canvas");
+    const ended = new AbortController();
+    const { signal } = ended;
+    const { clock, camera } = state;
+    let last = performance.now();
+    const wake = () => transport.update();
+    const fail = error => {
+        if (signal.aborted) return;
+        ended.abort();
+        find("poster").hidden = false;
+        say(sentence(error));
+    };
+    const setBackground = color => (state.background = color);
+    const actions = {
+        toggle_playing: () => scene.field && clock.toggle(),
+        previous_frame: () => clock.step(-1),
+        next_frame: () => clock.step(1),
+        first_frame: () => clock.seek(0),
+        last_frame: () => clock.seek(1),
+        slower: () => clock.slower(),
+        faster: () => clock.faster(),
+        next_loop: () => clock.nextLoop(),
+        next_background: () => setBackground(after(Object.values(data.backgrounds), state.background)),
+        reset_camera: () => camera.reset(),
+        toggle_flying: () => controls.toggleFlying(),
+        toggle_transport: () => transport.toggle(),
+        toggle_help: () => transport.toggleHelp(),
+    };
+    const keys = data.keys.filter(({ action }) => action in actions);
+    const transport = new Transport(document, state, { actions, keys, mouse: data.mouse, wake, signal });
+    const controls = new Controls(canvas, state, { keys, ...data.controls }, actions, wake, signal);
+    transport.bar.hidden = !scene.field;
+    const address = () => {
+        applyAddress(location.hash, { clock, backgrounds: data.backgrounds, setBackground });
+        wake();
+    };
+    address();
+    addEventListener("hashchange", address, { signal });
+
+    const resize = () => {
+        const ratio = Math.min(devicePixelRatio, gpu.device.limits.maxTextureDimension2D
+            / Math.max(canvas.clientWidth, canvas.clientHeight, 1));
+        const size = [canvas.clientWidth, canvas.clientHeight].map(length => Math.max(1, Math.round(ratio * length)));
+        if (size[0] !== canvas.width || size[1] !== canvas.height) [canvas.width, canvas.height] = size;
+    };
+    const presenter = new Presenter(gpu, canvas, data.present);
+    const viewport = new Viewport(canvas, state, { playback, rasterizer, presenter, numbers: data.viewport });
+    const api = makeApi(state, viewport, wake);
+    gpu.device.lost.then(({ message }) => fail(new Refusal(
+        `The graphics device was lost (${message.split("\n")[0].slice(0, 120) || "no reason given"}): load the page again.`)));
+    gpu.device.addEventListener("uncapturederror", ({ error }) => fail(error), { signal });
+
+    async function tick(now) {
+        if (signal.aborted) return;
+        const seconds = Math.min((now - last) / 1000, LONGEST_STEP);
+        last = now;
+        const before = viewport.frames;
+        try {
+            controls.advance(seconds);
+            if (clock.playing) {
+                clock.advance(seconds);
+                wake();
+            }
+            resize();
+            await viewport.draw(now);
+        } catch (error) {
+            fail(error);
+            return;
+        }
+        if (viewport.frames === before) return;
+        if (viewport.scale === 1 && !clock.playing) canvas.toBlob(keep); // now: a canvas holds its picture for this task
+        find("poster").hidden = true;
+        api.onframe?.(clock.time);
+    }
+    (function loop(now) {
+        if (signal.aborted) return;
+        tick(now);
+        requestAnimationFrame(loop);
+    })(last);
+    const stop = () => {
+        ended.abort();
+        gpu.device.destroy();
+    };
+    return { api, stop };
+}
+
+const after = (choices, present) => choices[(choices.findIndex(each => String(each) === String(present)) + 1) % choices.length];
+
+function run() {
+    const data = JSON.parse(find("player").textContent);
+    const source = new URLSearchParams(location.search).get("src");
+    addEventListener("dragover", event => event.preventDefault());
+    addEventListener("drop", event => {
+        event.preventDefault();
+        const [file] = event.dataTransfer.files;
+        if (file) open(async () => new Uint8Array(await file.arrayBuffer()), data);
+    });
+    return open(source ? () => fetched(source) : embedded, data);
+}
+
+run();

@@ -1,0 +1,142 @@
+// A compact scene, checked and expanded to the arrays that its desktop twin motion/compact_scene.py gives, to the bit.
+import { temporalGrids } from "./hash_grid.js";
+import { readContainer } from "./lapgs_file.js";
+import { Refusal, quoted } from "./refusal.js";
+
+const EXACT = "motion.frequencies"; // float32, the other weights are float16
+const GEOMETRY_OUTPUTS = 14;
+const APPEARANCES = new Map([["none", 0], ["color", 3], ["color+opacity", 4]]); // outputs of the head
+
+const damaged = reason => new Refusal(`The scene cannot be read: ${reason}; the file is damaged.`);
+
+// {count, shDegree, field, gaussians, parameters, metadata}; field is null where nothing moves. Raises Refusal.
+export async function readScene(bytes) {
+    const { tensors, metadata } = await readContainer(bytes);
+    const shDegree = whole(Number(metadata.sh_degree ?? NaN), "sh_degree", 0, 3);
+    const field = readField(metadata.field);
+    const means = tensors.get("gaussians.means");
+    const count = means?.shape.length === 2 ? means.shape[1] : 0;
+    if (!count) throw damaged("it holds no Gaussians");
+    const columns = { means: 3, log_scales: 3, quats: 4, opacity_logits: 1, sh_dc: 3 };
+    if (shDegree) columns.sh_rest = 3 * ((shDegree + 1) ** 2 - 1);
+    if (field?.dynamics) columns.dynamics = field.dynamics;
+    if (field) columns.static_features = field.staticFeatures;
+    const gaussians = {};
+    for (const [name, width] of Object.entries(columns)) {
+        gaussians[name] = dequantize(tensors, `gaussians.${name}`, count, width, [0]);
+    }
+    return { count, shDegree, field, gaussians, parameters: field ? readParameters(tensors, field) : {}, metadata };
+}
+
+function whole(value, name, low, high) {
+    if (!Number.isInteger(value) || value < low || value > high) {
+        throw damaged(`its ${name} is ${quoted(value)}, where ${low} to ${high} are possible`);
+    }
+    return value;
+}
+
+function real(value, name, high) {
+    if (typeof value !== "number" || !(value > 0 && value <= high)) {
+        throw damaged(`its ${name} is ${quoted(value)}, where numbers above 0 and up to ${high} are possible`);
+    }
+    return value;
+}
+
+// What playback needs of FieldConfig (motion/fields/config.py).
+function readField(text) {
+    let field;
+    try {
+        field = JSON.parse(text);
+    } catch {
+        throw damaged("the description of its field is not JSON");
+    }
+    const kind = field?.kind;
+    if (kind === "static") return null;
+    const laplacian = kind === "laplacian";
+    const appearance = laplacian ? APPEARANCES.get(field.appearance) : 0;
+    if (!(laplacian || kind === "grid4d") || field.depth !== 0 || (laplacian && field.motion !== "laplacian")
+        || appearance === undefined || typeof field.temporal_hash !== "boolean") {
+        throw damaged(`its field ${quoted(kind)} is none that this page can evaluate`);
+    }
+    const temporal = field.temporal;
+    whole(temporal?.levels, "temporal.levels", 1, 64);
+    whole(temporal.table_log2, "temporal.table_log2", 1, 24);
+    for (const name of ["base", "finest"]) {
+        for (const axis of [0, 1, 2]) whole(temporal[name]?.[axis], `temporal.${name}`, 2, 65536);
+    }
+    return {
+        laplacian,
+        appearance,
+        temporal,
+        temporal_hash: field.temporal_hash,
+        bound: real(field.bound, "bound", 1e6),
+        timeScale: real(field.time_scale, "time_scale", 1),
+        width: whole(field.width, "width", 1, 4096),
+        staticFeatures: 2 * whole(field.static?.levels, "static.levels", 1, 64),
+        components: laplacian ? whole(field.components, "components", 1, 256) : 0,
+        dynamics: laplacian ? whole(field.dynamics, "dynamics", 0, 256) : 0,
+    };
+}
+
+function readParameters(tensors, field) {
+    const parameters = {};
+    const grids = temporalGrids(field);
+    const starts = grids.length ? grids[0].levels.map(level => level.first) : [0];
+    grids.forEach((grid, i) => {
+        const name = `temporal_grids.${i}.table`;
+        parameters[name] = dequantize(tensors, `field.${name}`, grid.entries, 2, starts);
+    });
+    const { width, staticFeatures, components } = field;
+    const moving = Math.max(1, field.dynamics + grids.reduce((all, grid) => all + grid.features, 0));
+    const layers = { spatial: [width, staticFeatures], temporal: [width, moving], heads: [GEOMETRY_OUTPUTS, width] };
+    if (field.laplacian) Object.assign(layers, { "motion.first": [width, staticFeatures], "motion.second": [width, width] });
+    if (field.appearance) layers.appearance = [field.appearance, width];
+    const shapes = field.laplacian
+        ? { "motion.alpha": [components, width], "motion.beta": [components, width], [EXACT]: [components] } : {};
+    for (const [name, shape] of Object.entries(layers)) {
+        Object.assign(shapes, { [`${name}.weight`]: shape, [`${name}.bias`]: [shape[0]] });
+    }
+    for (const [name, shape] of Object.entries(shapes)) {
+        const { data } = find(tensors, `field.${name}`, shape, name === EXACT ? ["F32"] : ["F16"]);
+        parameters[name] = name === EXACT ? data : Float32Array.from(data, half);
+        if (!parameters[name].every(Number.isFinite)) throw damaged(`its tensor ${quoted(name)} holds NaN or infinity`);
+    }
+    return parameters;
+}
+
+// The value of a float16.
+function half(bits) {
+    const sign = bits & 0x8000 ? -1 : 1;
+    const exponent = (bits >> 10) & 31;
+    const fraction = bits & 1023;
+    if (exponent === 31) return NaN;
+    return sign * (exponent ? (1 + fraction / 1024) * 2 ** (exponent - 15) : fraction * 2 ** -24);
+}
+
+function find(tensors, name, shape, types) {
+    const tensor = tensors.get(name);
+    if (!tensor) throw damaged(`it has no tensor ${quoted(name)}`);
+    if (!types.includes(tensor.dtype) || String(tensor.shape) !== String(shape)) {
+        throw damaged(`its tensor ${quoted(name)} is ${tensor.dtype} of ${quoted(tensor.shape)}, not ${types} of [${shape}]`);
+    }
+    return tensor;
+}
+
+// Values row by row; starts: first rows of the parts that have ranges of their own.
+function dequantize(tensors, name, rows, columns, starts) {
+    const { data } = find(tensors, name, [columns, rows], ["U8", "U16"]);
+    const ranges = find(tensors, `${name}.range`, [starts.length, columns, 2], ["F32"]).data;
+    const values = new Float32Array(rows * columns);
+    for (let part = 0; part < starts.length; part++) {
+        const end = starts[part + 1] ?? rows;
+        for (let column = 0; column < columns; column++) {
+            const low = ranges[2 * (part * columns + column)];
+            const step = ranges[2 * (part * columns + column) + 1];
+            for (let row = starts[part]; row < end; row++) {
+                values[row * columns + column] = low + step * data[column * rows + row];
+            }
+        }
+    }
+    if (!values.every(Number.isFinite)) throw damaged(`its tensor ${quoted(name)} has a range beyond float32`);
+    return values;
+}

@@ -1,0 +1,87 @@
+// Frames: drawn where something changed, at the resolution that keeps up, one at a time (viewer/viewport.py).
+import { Commands } from "./gpu.js";
+
+export class Viewport {
+    // state: {camera, clock, background}. numbers: settled and target seconds, smallest scale.
+    constructor(canvas, state, { playback, rasterizer, presenter, numbers }) {
+        Object.assign(this, { canvas, state, playback, rasterizer, presenter, ...numbers });
+        this.scale = 1; // of the frame on show; 1 is the full resolution
+        this.movingScale = 1;
+        this.drawn = ""; // all that the last frame depends on
+        this.movedAt = 0;
+        this.busy = false;
+        this.frame = null; // on show
+        this.frames = 0;
+        this.seconds = NaN; // that the last one took
+        this.log = null;
+    }
+
+    // Whether the picture on show is that of the state, in full resolution.
+    get atRest() {
+        return !this.busy && this.scale === 1 && this.drawn === this.key();
+    }
+
+    key() {
+        const { camera: { position, rotation, fovY }, clock, background } = this.state;
+        return [position, rotation, fovY, clock.time, background, this.canvas.width, this.canvas.height].join();
+    }
+
+    // Draw where something changed. now: milliseconds of performance.now().
+    async draw(now) {
+        if (this.busy) return;
+        const key = this.key();
+        const moving = key !== this.drawn && this.frame !== null;
+        if (key !== this.drawn) this.movedAt = now;
+        else if (this.scale === 1 || now - this.movedAt < 1000 * this.settled) return;
+        this.busy = true;
+        try {
+            const scale = moving ? this.movingScale : 1;
+            const start = performance.now();
+            this.frame = await this.drawWhole(scale);
+            this.presenter.present(this.frame);
+            this.frames++;
+            this.scale = scale;
+            this.drawn = key;
+            this.seconds = (performance.now() - start) / 1000;
+            if (moving) this.adapt(scale, this.seconds);
+        } finally {
+            this.busy = false;
+        }
+    }
+
+    // An image whose lists all fitted.
+    async drawWhole(scale) {
+        const { canvas, state, rasterizer } = this;
+        const [width, height] = [canvas.width, canvas.height].map(size => Math.max(1, Math.round(scale * size)));
+        const gaussians = this.playback.at(state.clock.time, this.log);
+        const camera = state.camera.camera(canvas.width, canvas.height);
+        const image = { ...camera, width, height, focal: scaled(camera.focal, canvas, width, height),
+            center: scaled(camera.center, canvas, width, height) };
+        for (;;) {
+            const drawing = rasterizer.draw(gaussians, image, state.background, this.log);
+            const counts = await drawing.counts;
+            if (rasterizer.valid(drawing, counts)) return drawing;
+        }
+    }
+
+    adapt(scale, seconds) {
+        const ideal = 0.5 * (this.movingScale + scale * Math.sqrt(this.target / Math.max(seconds, 1e-4)));
+        this.movingScale = Math.min(Math.max(Math.floor(16 * ideal) / 16, this.smallest), 1);
+    }
+
+    // The image on show as float planes: red, green, blue, transmittance, row by row.
+    async planes() {
+        const { image, camera } = this.frame;
+        const { device } = this.playback.gpu;
+        const staging = device.createBuffer({ size: image.bytes, usage: GPUBufferUsage.MAP_READ | GPUBufferUsage.COPY_DST });
+        const commands = new Commands(this.playback.gpu);
+        commands.copy(image, staging, 0);
+        commands.submit();
+        await staging.mapAsync(GPUMapMode.READ);
+        const values = new Float32Array(staging.getMappedRange().slice(0));
+        staging.destroy();
+        return { width: camera.width, height: camera.height, values };
+    }
+}
+
+const scaled = ([x, y], canvas, width, height) => [x * width / canvas.width, y * height / canvas.height];

@@ -1,0 +1,149 @@
+"""The scene as a web page: one file with the player (viewer/web), its shaders as data, the scene and a poster."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import html
+import io
+import json
+import re
+from importlib import resources
+from typing import Any
+
+import imageio.v3 as iio
+import numpy as np
+from numpy.typing import NDArray
+
+from lapgs_wgpu.gpu.shader import Binding, Defines, browser_source, compose, reflect, struct_layout
+from lapgs_wgpu.motion.fields.config import MIN_SCALE
+from lapgs_wgpu.splat.drawing import sh_defines
+from lapgs_wgpu.splat.raster_config import gpu_config
+
+from .clock import LOOPS, SPEEDS
+from .controls import FLY_REACH, LOOK, ORBIT, ZOOM
+from .key_bindings import FLY, KEYS, MOUSE
+from .render_modes import BACKGROUNDS
+from .viewport import SETTLED, SMALLEST_SCALE, TARGET_SECONDS
+
+# The player's modules, each after those that it imports.
+MODULES = (
+    "refusal", "lapgs_file", "hash_grid", "scene", "gpu", "scan", "radix_sort", "rasterizer", "hash_encoder", "field",
+    "camera", "clock", "presenter", "viewport", "controls", "transport", "api", "main",
+)  # fmt: skip
+_PLAIN, _SUBGROUPS = gpu_config(0), gpu_config(32)
+_SCAN = {"SCAN_LANES": 256}
+_HEADS = {"POINTS": 2, "QUADS": 1}
+# Name of a pass on the page -> shader and defines: in its shape for GPUs, tables in buffers, 8 storage buffers at most.
+PASSES: dict[str, tuple[str, Defines]] = {
+    "project": ("project", _PLAIN.tile_defines),
+    **{f"color SH {degree}": ("color", sh_defines(degree)) for degree in range(4)},
+    "compact": ("compact", {}),
+    "duplicate_with_keys": ("duplicate_with_keys", _PLAIN.tile_defines),
+    "tile_ranges": ("tile_ranges", {}),
+    "rasterize": ("rasterize", _PLAIN.raster_defines(depth=False)),
+    "rasterize SUBGROUPS": ("rasterize", _SUBGROUPS.raster_defines(depth=False)),
+    **{f"{name}{suffix}": (name, _SCAN | flag) for name in ("scan_reduce", "scan_apply")
+       for suffix, flag in (("", {}), (" FLAGS", {"FLAGS": 1}), (" GATHER", {"GATHER": 1}))},
+    "scan_blocks": ("scan_blocks", _SCAN),
+    "scan_blocks SATURATING": ("scan_blocks", _SCAN | {"SATURATING": 1}),
+    "sort_count": ("sort_count", {}),
+    "sort_scatter": ("sort_scatter", {}),
+    "sort_scatter IOTA": ("sort_scatter", {"IOTA": 1}),
+    "hashgrid_slice": ("hashgrid_slice", {"SLICED": 1, "CORNERS": 4}),
+    "hashgrid SLICED ROWS": ("hashgrid", {"SLICED": 1, "CORNERS": 4, "ROWS": 1}),
+    "hashgrid ROWS": ("hashgrid", {"CORNERS": 8, "ROWS": 1}),
+    "deform": ("deform", _HEADS | {"HEADS": 4}),
+    "deform MOTION": ("deform", _HEADS | {"HEADS": 4, "MOTION": 1}),
+    "deform COLOR MOTION": ("deform", _HEADS | {"HEADS": 5, "MOTION": 1, "COLOR": 1}),
+}  # fmt: skip
+_FIELD = ("hashgrid_slice", "hashgrid SLICED ROWS", "hashgrid ROWS")  # beside one of deform
+_CHOSEN = ("color", "rasterize", "deform")  # one of each
+
+
+def player_data() -> dict[str, Any]:
+    """What the player's code is told: passes, with their bindings and uniforms, and the viewer's own numbers."""
+    always = [name for name in PASSES if name not in _FIELD and name.split()[0] not in _CHOSEN]
+    return {
+        "kernels": {name: _shader(browser_source(compose(*shape))) for name, shape in PASSES.items()},
+        "always": always,
+        "field": _FIELD,
+        "raster": {
+            "tile": [_PLAIN.tile_width, _PLAIN.tile_height],
+            "plain": "rasterize",
+            "subgroups": "rasterize SUBGROUPS",
+        },
+        "present": _shader(compose("present", {})),
+        "minScale": MIN_SCALE,
+        "keys": [key._asdict() for key in KEYS],
+        "mouse": MOUSE[:3],
+        "controls": {"fly": FLY, "orbit": ORBIT, "look": LOOK, "zoom": ZOOM, "reach": FLY_REACH},
+        "viewport": {"settled": SETTLED, "target": TARGET_SECONDS, "smallest": SMALLEST_SCALE},
+        "loops": LOOPS,
+        "speeds": SPEEDS,
+        "backgrounds": BACKGROUNDS,
+    }
+
+
+def _shader(source: str) -> dict[str, Any]:
+    bindings = reflect(source)
+    uniforms = {name: _uniform(source, binding) for name, binding in bindings.items() if binding.kind == "uniform"}
+    numbers = {name: [binding.number, binding.kind] for name, binding in bindings.items()}
+    return {"source": source, "bindings": numbers, "uniforms": uniforms}
+
+
+def _uniform(source: str, binding: Binding) -> dict[str, Any]:
+    """Size in bytes, and of each member its offset, f or I, and how many numbers it has."""
+    size, members = struct_layout(source, binding.type)
+    return {
+        "size": size,
+        "members": {name: [at, code[-1], int(code[:-1] or 1)] for name, (at, code) in members.items()},
+    }
+
+
+def page_html(scene: bytes, title: str, poster: NDArray[np.uint8]) -> str:
+    """The page. scene: a scene.lapgs. poster: (H, W, 3), shown until the first frame, and where WebGPU is missing."""
+    script, style = _script(), _file("player.css")
+    policy = "; ".join([
+        "default-src 'none'",
+        f"script-src '{_digest(script)}'",
+        f"style-src '{_digest(style)}'",
+        "img-src data: blob:",
+        "connect-src 'self'",
+        "base-uri 'none'",
+        "form-action 'none'",
+    ])  # fmt: skip
+    picture = io.BytesIO()
+    iio.imwrite(picture, poster, extension=".jpg", quality=80)
+    values = {
+        "policy": policy,
+        "title": html.escape(title),
+        "style": style,
+        "poster": f"data:image/jpeg;base64,{base64.b64encode(picture.getvalue()).decode()}",
+        "player": json.dumps(player_data(), separators=(",", ":")).replace("<", "\\u003c"),
+        "scene": base64.b64encode(scene).decode(),
+        "script": script,
+    }
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: values[match[1]], _file("player.html"))
+
+
+def _script() -> str:
+    """The modules one after another: pages from file:// cannot import others."""
+    return "\n".join(module_script(name) for name in MODULES)
+
+
+def module_script(name: str) -> str:
+    """A module of the player as a script: a function of its own, whose exports are the members of `NAME_js`."""
+    text = _file(f"{name}.js")
+    exports = re.findall(r"^export (?:async )?(?:function|class|const) (\w+)", text, re.M)
+    text = re.sub(r"^import (\{.*\}) from \"\./(\w+)\.js\";", r"const \1 = \2_js;", text, flags=re.M)
+    text = re.sub(r"^export ", "", text, flags=re.M)
+    return f"const {name}_js = (() => {{\n{text}return {{ {', '.join(exports)} }};\n}})();"
+
+
+def _file(name: str) -> str:
+    return resources.files("lapgs_wgpu.viewer").joinpath("web", name).read_text(encoding="utf-8")
+
+
+def _digest(text: str) -> str:
+    return f"sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}"
