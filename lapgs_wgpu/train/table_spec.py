@@ -116,9 +116,9 @@ def read_spec(path: Path) -> Spec:
 
 
 def fingerprint(config: Config) -> str:
-    """Of all that the result of a training depends on: not of where its pictures lie, or how often it is saved."""
+    """Of all that the result of a training depends on: not of where its images lie, how often it is saved or watched."""
     values = dataclasses.asdict(config)
-    del values["data"]["path"], values["schedule"]["save_interval"]
+    del values["data"]["path"], values["schedule"]["save_interval"], values["eval"]
     # These keys are younger than results that are worth keeping.
     if values["schedule"]["batch"] == 1:
         del values["schedule"]["batch"]
@@ -128,6 +128,10 @@ def fingerprint(config: Config) -> str:
         del values["discovery"]
     if config.density.limit == 0:
         del values["density"]["limit"]
+    if config.density.min_contribution == 0:
+        del values["density"]["min_contribution"], values["density"]["contribution_interval"]
+    if config.data.split == "test":
+        del values["data"]["split"]
     if config.precision == "float32":
         del values["precision"]
     if config.decoder != "device":
