@@ -116,7 +116,7 @@ def read_spec(path: Path) -> Spec:
 
 
 def fingerprint(config: Config) -> str:
-    """Of all that the result of a training depends on: not of where its images lie, how often it is saved or watched."""
+    """Of all that the result of a training depends on: not of where its images lie or how often it is saved."""
     values = dataclasses.asdict(config)
     del values["data"]["path"], values["schedule"]["save_interval"], values["eval"]
     # These keys are younger than results that are worth keeping.
