@@ -146,7 +146,7 @@ def test_the_desktop_runs_the_same_dispatches(browser: Browser, page: Path, monk
     dispatch = Commands.dispatch_grid
 
     def record(commands: Commands, kernel: Kernel, groups: tuple[int, int], **arrays: Any) -> None:
-        bindings = {name: [array.binding[1], array.binding[2]] for name, array in arrays.items()}
+        bindings = {name: [array.offset, array.bound_bytes] for name, array in arrays.items()}
         found.append([names[browser_source(kernel.source)], *groups, bindings])
         dispatch(commands, kernel, groups, **arrays)
 

@@ -253,7 +253,7 @@ class DiscoveryConfig(Options):
         "training steps of the static model that separates what moves from what does not", 800, at_least=1
     )
     size: int = option("longer side of the images for this search, pixels", 100, at_least=16)
-    field_steps: int = option("steps that fit the deformation field to the motion that was found", 500, at_least=1)
+    field_steps: int = option("steps that fit the deformation field to the motion that was found", 1500, at_least=1)
     least: float = option(
         "minimum fraction of the moving surface points that the static model must miss; below it, no "
         "Gaussians are added",
