@@ -32,7 +32,9 @@ Train a 4D Gaussian splatting model of a moving scene on a folder of images. Run
   lapgs-train --eval RUN                        evaluate RUN/checkpoint.ply on the test views again
 
 The run folder receives config.toml, log.jsonl, metrics.json, checkpoint.ply (any 3DGS viewer opens it as a static
-scene) and eval/ with images: ground truth | rendering | 4 x error. [Values in brackets] are defaults."""
+scene) and eval/ with images: ground truth | rendering | 4 x error. [Values in brackets] are defaults; with a preset on
+the command line, as in lapgs-train tiny --help, they are that preset's. World units are those of the scene after it was
+moved and scaled into the presets' cube. "The paper" is "Laplacian Analysis Meets Dynamics Modelling"."""
 
 
 _METAVARS = {int: "INT", float: "FLOAT", str: "TEXT", bool: "true|false"}
@@ -58,17 +60,18 @@ def parse_options(arguments: list[str]) -> dict[str, typing.Any]:
         "adaptive split [the preset's]")
     add("--ablate", metavar="PART[,PART]", help=f"turn off parts of the paper's method, comma-separated: {parts}")
     add("--out", metavar="RUN", help="run folder for all output; must be new or empty [runs/SCENE-PRESET]")
-    add("--resume", metavar="RUN", help="continue the interrupted training in run folder RUN from its last saved state")
+    add("--resume", metavar="RUN", help="continue the interrupted training in run folder RUN from its last saved "
+        "state, with its own configuration. Can be combined with --view and --device only")
     add("--overwrite", action="store_true", help="replace an existing run in the run folder")
-    add("--view", action="store_true", help="show the training in a window, with pause and single step (P and S keys)")
+    add("--view", action="store_true", help="watch the training in a window; P pauses it, S takes a single step")
     add("--device", metavar="NAME", help=DEVICE_HELP)
     add("--list-devices", action="store_true", help=LIST_DEVICES_HELP)
     add("--eval", metavar="RUN", help="evaluate the finished run in folder RUN again, without training. Can be "
         "combined with --data, --data.background, --cache-gb, --device, --lpips-weights and --motion-from only")
-    add("--lpips-weights", metavar="FILE", help="with --eval: also compute LPIPS (VGG) with the weights in FILE "
-        "(docs/metrics.md)")
+    add("--lpips-weights", metavar="FILE", help="with --eval: also compute LPIPS (VGG) with the weights in FILE, "
+        "a .safetensors file (docs/metrics.md)")
     add("--motion-from", metavar="RUN", help="with --eval: also compute metrics of the moving pixels, found by "
-        "comparison with RUN, a run on the same capture with --field static (docs/metrics.md)")
+        "comparison with the images of RUN, a static model of the same capture (--field static; docs/metrics.md)")
     # fmt: on
     groups: dict[str, argparse._ArgumentGroup] = {}
     for name, kind, about in config_keys():

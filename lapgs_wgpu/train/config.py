@@ -30,8 +30,8 @@ class DataConfig(Options):
         "background behind transparent images; random: a new color in each step, black during evaluation"
     )
     cache_gb: float = option(
-        "memory limit for decoded images, gigabytes: one limit for host memory and one for device memory; a "
-        "single limit for both where the device shares host memory"
+        "memory limit for decoded images, gigabytes, beyond which images are decoded again: one limit for host memory "
+        "and one for device memory; a single limit for both where the device shares host memory"
     )
     split: HeldOut = option(
         "held-out views that are evaluated in the end; val: those of a D-NeRF scene's transforms_val.json, to choose "
@@ -84,7 +84,9 @@ class Rate(Options):
     start: float = option("initial value", above=0, below=math.inf)
     end: float = option("final value", above=0, below=math.inf)
     steps: int = option(
-        "steps of the exponential decay from the initial to the final value; constant afterwards", at_least=1
+        "training step, counted from the start, at which the exponential decay reaches the final value; constant "
+        "afterwards",
+        at_least=1,
     )
 
     def at(self, step: int) -> float:
@@ -145,8 +147,8 @@ class DensityConfig(Options):
         below=math.inf,
     )
     split_quantile: float = option(
-        "adaptive split: fraction of the candidates, those with the lowest scores, that are not split unless "
-        "their dynamics differ strongly",
+        "adaptive split: fraction of the candidates that are not split: those with the lowest score (difference in "
+        "shape plus divergence_weight times difference in dynamics), except outliers in dynamics",
         at_least=0,
         at_most=1,
     )
@@ -154,8 +156,8 @@ class DensityConfig(Options):
         "prune Gaussians with an opacity below this value; the 256 most opaque ones always stay", at_least=0, below=1
     )
     max_screen_radius: float = option(
-        "prune Gaussians that had a larger radius in a rendered image, pixels; applies after the first "
-        "opacity reset; 0: no limit"
+        "prune Gaussians that had a larger radius (to where alpha falls to 1/255) in an image since the last "
+        "densification, pixels; applies after the first opacity reset; 0: no limit"
     )
     max_world_size: float = option(
         "prune Gaussians with a larger standard deviation, relative to the extent of the cameras; applies "
@@ -173,7 +175,11 @@ class DensityConfig(Options):
         0.0,
         at_least=0,
     )
-    contribution_interval: int = option("prune by min_contribution every this many steps", 500, at_least=1)
+    contribution_interval: int = option(
+        "prune by min_contribution every this many steps, from density.start to the end of the training",
+        500,
+        at_least=1,
+    )
 
     def changes_at(self, step: int) -> bool:
         """Whether Gaussians are cloned, split and pruned after this step (counted from 1)."""
@@ -217,7 +223,7 @@ class LossConfig(Options):
     dynamics: float = option("weight of the regularization of the dynamics attributes (paper eq. 12)")
     dynamics_mode: DynamicsMode = option(
         "sign of the dynamics regularization; literal: pulls outliers towards the mean, as in the paper's "
-        "equation; promote: pushes outliers away, as in the paper's text; off: no regularization"
+        "equation; promote: pushes outliers away, as in the paper's text; off: no regularization, as loss.dynamics 0"
     )
 
     def weights(self, *, warm: bool) -> LossWeights:
@@ -255,8 +261,8 @@ class DiscoveryConfig(Options):
     size: int = option("longer side of the images for this search, pixels", 100, at_least=16)
     field_steps: int = option("steps that fit the deformation field to the motion that was found", 1500, at_least=1)
     least: float = option(
-        "minimum fraction of the moving surface points that the static model must miss; below it, no "
-        "Gaussians are added",
+        "add Gaussians only if the objects that were found, and that the static model lacks, explain at least this "
+        "fraction of all places where the images differ from the static model",
         0.05,
         at_most=1,
     )

@@ -56,32 +56,57 @@ class FieldConfig(Options):
         above=0,
         below=1e6,
     )
-    static: HashConfig = option("spatial hash grid (x, y, z)", HashConfig(16, (16, 16, 16), (2048, 2048, 2048)))
-    temporal: HashConfig = option("space-time hash grids (two axes and time)", HashConfig(32, (8, 8, 8), (32, 32, 16)))
-    planes: PlaneConfig = option("planes of the field hexplane", PlaneConfig())
-    width: int = option("width of the decoder's layers", 256, at_least=1, at_most=4096)
-    depth: int = option("number of hidden layers of the decoder before its output heads", 0, at_least=0, at_most=16)
-    time_scale: float = option(
-        "fraction of the temporal grids' time axis that the clip occupies", 0.9, above=0, at_most=1
+    static: HashConfig = option(
+        "fields grid4d and laplacian: spatial hash grid (x, y, z)", HashConfig(16, (16, 16, 16), (2048, 2048, 2048))
     )
-    temporal_hash: bool = option("grid4d and laplacian: use the three space-time hash grids", True)
+    temporal: HashConfig = option(
+        "fields grid4d and laplacian: space-time hash grids (two axes and time)",
+        HashConfig(32, (8, 8, 8), (32, 32, 16)),
+    )
+    planes: PlaneConfig = option("planes of the field hexplane", PlaneConfig())
+    width: int = option(
+        "width of the layers of the field's decoder; field mlp: of all its layers", 256, at_least=1, at_most=4096
+    )
+    depth: int = option(
+        "number of hidden layers of the decoder before its output heads (fields hexplane, grid4d, laplacian)",
+        0,
+        at_least=0,
+        at_most=16,
+    )
+    time_scale: float = option(
+        "fraction of the space-time grids' time axis that the clip occupies, in its middle", 0.9, above=0, at_most=1
+    )
+    temporal_hash: bool = option(
+        "fields grid4d and laplacian: use the three space-time hash grids; without them only the motion spectrum "
+        "depends on time",
+        True,
+    )
     motion: Motion = option(
         "field laplacian: how motion is decoded; laplacian: as a sum of sinusoids (the motion spectrum); mlp: "
         "by an MLP of features and time instead",
         "laplacian",
     )
-    components: int = option("number of frequencies in the motion spectrum", 16, at_least=1, at_most=256)
+    components: int = option(
+        "field laplacian: number of frequencies in the motion spectrum", 16, at_least=1, at_most=256
+    )
     frequency_step: float = option(
-        "initial spacing of the spectrum's frequencies, which start at 0; cycles per clip", 1.0, above=0, below=1e6
+        "field laplacian: initial spacing of the spectrum's frequencies, which start at 0; cycles per clip",
+        1.0,
+        above=0,
+        below=1e6,
     )
     amplitude: float = option(
-        "initial standard deviation of the sum of the spectrum's components; useful values are 0.03 to 1",
+        "field laplacian: initial standard deviation of the spectrum's sum, a feature without unit that the decoder "
+        "reads; useful values are 0.03 to 1",
         0.3,
         above=0,
         below=1e6,
     )
     dynamics: int = option(
-        "field laplacian: length of the dynamics attribute of each Gaussian; 0: none", 16, at_least=0, at_most=256
+        "field laplacian: number of values in each Gaussian's dynamics attribute, a learned motion code; 0: none",
+        16,
+        at_least=0,
+        at_most=256,
     )
     appearance: Appearance = option("field laplacian: what the field changes over time besides geometry", "color")
 
