@@ -62,7 +62,7 @@ _CHOSEN = ("color", "rasterize", "deform")  # one of each
 
 
 def player_data() -> dict[str, Any]:
-    """What the player's code is told: passes, with their bindings and uniforms, and the viewer's own numbers."""
+    """The data of the player: its passes with their bindings and uniforms, and the viewer's constants."""
     always = [name for name in PASSES if name not in _FIELD and name.split()[0] not in _CHOSEN]
     return {
         "kernels": {name: _shader(browser_source(compose(*shape))) for name, shape in PASSES.items()},
