@@ -44,7 +44,7 @@ from lapgs_wgpu.train.run_folder import (
 from lapgs_wgpu.train.trainer import StepResult, Trainer
 
 PROBES = 2048  # points of the scene that say whether a camera sees it
-WATCHED = 8  # training views that eval.interval measures if there are no validation views
+MONITORED = 8  # training views that eval.interval measures if there are no validation views
 OUTSIDE = 0.05  # warn if this share of the Gaussians, or more, is outside the encoder's box
 
 # Takes over a training's steps, such as a viewer does: called with the scene, where to look at it from, and the steps,
@@ -226,7 +226,7 @@ def _steps(
                 log.tell(str(progress.skipped))
             log.step(progress.step, progress.loss, progress.psnr, len(training.scene), training.scene.spectrum)
             if training.config.eval.interval and training.done % training.config.eval.interval == 0:
-                _watch(training, dataset, log)
+                _log_validation(training, dataset, log)
             yield progress
             if schedule.save_interval and training.done % schedule.save_interval == 0 < schedule.steps - training.done:
                 save_state(out, training.state())
@@ -240,10 +240,10 @@ def _steps(
         training.close()
 
 
-def _watch(training: Trainer, dataset: Dataset, log: Log) -> None:
+def _log_validation(training: Trainer, dataset: Dataset, log: Log) -> None:
     """Log the PSNR of the validation views or, without any, of some training views."""
     started = time.perf_counter()
-    count = min(WATCHED, len(dataset.train))
+    count = min(MONITORED, len(dataset.train))
     views = dataset.val or [dataset.train[i * len(dataset.train) // count] for i in range(count)]
     psnr = mean_psnr(training.scene, views, training.config.data.background)
     log.evaluated(training.done, psnr, "val" if dataset.val else "train", time.perf_counter() - started)
