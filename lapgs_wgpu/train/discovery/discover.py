@@ -64,7 +64,7 @@ def discover(config: Config, dataset: Dataset, device: Device, terminal: TextIO 
         )
     half_side = config.points.box
     clouds = surface_points(images, half_side)
-    tracks = find_tracks(clouds, half_side).tracks
+    tracks = find_tracks(clouds, half_side)
     tracks = None if tracks is None else lost_tracks(tracks, static)
     share = 0.0 if tracks is None else explained_share(clouds, tracks, half_side)
     if tracks is None or share < config.discovery.least:

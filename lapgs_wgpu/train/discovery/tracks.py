@@ -58,15 +58,9 @@ class Tracks(NamedTuple):
         return Tracks(self.positions[chosen], self.colors[chosen], part, paths, supported)
 
 
-class Found(NamedTuple):
-    """tracks: None where nothing can be followed. explained: share of the surface points within reach of a track."""
-
-    tracks: Tracks | None
-    explained: float
-
-
-def find_tracks(clouds: PointClouds, half_side: float) -> Found:
-    """Tracks of the surface points of a clip. half_side: of the box that they lie in, world units."""
+def find_tracks(clouds: PointClouds, half_side: float) -> Tracks | None:
+    """Tracks of the surface points of a clip; None where nothing can be followed. half_side: of the box that the
+    points lie in, world units."""
     free = [np.ones(len(cloud.scores), bool) for cloud in clouds.clouds]
     trajectories = find_trajectories(clouds, LINK * half_side, half_side)
     found: list[Tracks] = []
@@ -89,7 +83,7 @@ def find_tracks(clouds: PointClouds, half_side: float) -> Found:
             if len(points.scores):
                 mask &= cKDTree(path).query(points.positions)[0] >= REACH * half_side
     if not found:
-        return Found(None, 0.0)
+        return None
     offsets = np.cumsum([0, *(tracks.part.max() + 1 for tracks in found[:-1])])
     tracks = Tracks(
         np.concatenate([each.positions for each in found]),
@@ -98,8 +92,7 @@ def find_tracks(clouds: PointClouds, half_side: float) -> Found:
         np.concatenate([each.paths for each in found], axis=1),
         np.concatenate([each.supported for each in found], axis=1),
     )
-    explained = 1.0 - sum(int(mask.sum()) for mask in free) / clouds.total
-    return Found(tracks.of_parts(np.concatenate(steady)), explained)
+    return tracks.of_parts(np.concatenate(steady))
 
 
 def _key_time(clouds: list[Points], half_side: float) -> int | None:
