@@ -9,7 +9,7 @@
 // (N, 4): x, y, z, -
 #table 2 points: vec4<f32>
 #table 3 features: vec2<f32>
-// the table, or its slices
+// a grid's table, or the slices of all grids
 #ifdef BFLOAT16
 @group(0) @binding(4) var<storage, read_write> encoding: array<u32>;         // (N, all levels), two features in each
 #else
@@ -38,11 +38,11 @@ fn main(
     // All slices fit into a cache: level after level of the same points, whose rows of the encoding then stay there, too.
     let level = levels[number % grid.levels];
     let block = number / grid.levels;
-    let first = level.place.y;
+    let first = level.first_sliced;
 #else
     let level = levels[number / blocks];
     let block = number % blocks;
-    let first = level.place.x;
+    let first = level.first;
 #endif
     for (var k = 0u; k < LANE_POINTS; k++) {
         let n = (block * LANE_POINTS + k) * LANES + lane;
@@ -52,12 +52,12 @@ fn main(
 #else
             let i = n;
 #endif
-            let cell = find_cell(unit_point(points_at(i).xyz, grid), level);
+            let cell = find_cell(unit_point(points_at(i).xyz, level, grid), level);
             var sum = vec2(0.0);
 #unroll c $CORNERS
             sum += cell.weight[$c] * features_at(first + cell.index[$c]);
 #end
-            let at = i * grid.all_levels + level.place.z;
+            let at = i * grid.all_levels + level.number;
 #ifdef BFLOAT16
             encoding[at] = pack_bfloat16(sum);
 #else

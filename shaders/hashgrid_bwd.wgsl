@@ -1,4 +1,4 @@
-// The gradient of a grid's table, or of its slices. Each of its entries is a sum over many points, and the same to the
+// The gradient of a grid's table, or of the slices of all grids. Each of its entries is a sum over many points, and the same to the
 // last bit on every run:
 // LANE_LEVELS, for devices of few wide cores: a lane owns a level and adds the points in their order.
 // Otherwise: a lane owns a point and adds in 64-bit fixed point, whose sum does not depend on the order.
@@ -13,9 +13,9 @@
 #table 2 points: vec4<f32>
 fn first_entry(level: Level) -> u32 {
 #ifdef SLICED
-    return level.place.y;
+    return level.first_sliced;
 #else
-    return level.place.x;
+    return level.first;
 #endif
 }
 
@@ -23,15 +23,21 @@ fn first_entry(level: Level) -> u32 {
 @group(0) @binding(4) var<storage, read_write> d_features: array<vec2<f32>>;   // zero before
 
 @compute @workgroup_size(8)
-fn main(@builtin(global_invocation_id) id: vec3<u32>) {
-    if (id.x >= grid.levels) {
+fn main(
+    @builtin(workgroup_id) group: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let share = (grid.levels + groups.x - 1u) / groups.x;   // of a workgroup, at most 8
+    let number = group.x * share + lane;
+    if (lane >= share || number >= grid.levels) {
         return;
     }
-    let level = levels[id.x];
+    let level = levels[number];
     let first = first_entry(level);
     for (var i = 0u; i < grid.points; i++) {
-        let cell = find_cell(unit_point(points_at(i).xyz, grid), level);
-        let gradient = gradient_at(i * grid.all_levels + level.place.z);
+        let cell = find_cell(unit_point(points_at(i).xyz, level, grid), level);
+        let gradient = gradient_at(i * grid.all_levels + level.number);
 #unroll c $CORNERS
         d_features[first + cell.index[$c]] += cell.weight[$c] * gradient;
 #end
@@ -69,8 +75,8 @@ fn main(
     }
     let level = levels[number / blocks];
     let first = first_entry(level);
-    let cell = find_cell(unit_point(points_at(i).xyz, grid), level);
-    let gradient = gradient_at(i * grid.all_levels + level.place.z);
+    let cell = find_cell(unit_point(points_at(i).xyz, level, grid), level);
+    let gradient = gradient_at(i * grid.all_levels + level.number);
     let scale = fixed_scale(largest, grid.all_points);
 #unroll c $CORNERS
     add_fixed(4u * (first + cell.index[$c]), cell.weight[$c] * gradient.x, scale);

@@ -18,7 +18,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index
     let up = smooth_weight(vec3(p - floor(p))).x;
     let low = u32(floor(p));
     let high = min(low + 1u, level.resolution.z - 1u);
-    let below = features_at(level.place.x + low * plane + cell);
-    let above = features_at(level.place.x + high * plane + cell);
-    slices[level.place.y + cell] = (1.0 - up) * below + up * above;
+    let below = features_at(level.first + low * plane + cell);
+    let above = features_at(level.first + high * plane + cell);
+    slices[level.first_sliced + cell] = (1.0 - up) * below + up * above;
 }

@@ -18,7 +18,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index
     let up = smooth_weight(vec3(p - floor(p))).x;
     let low = u32(floor(p));
     let high = min(low + 1u, level.resolution.z - 1u);
-    let gradient = d_slices_at(level.place.y + cell);
-    d_features[level.place.x + low * plane + cell] += (1.0 - up) * gradient;
-    d_features[level.place.x + high * plane + cell] += up * gradient;
+    let gradient = d_slices_at(level.first_sliced + cell);
+    d_features[level.first + low * plane + cell] += (1.0 - up) * gradient;
+    d_features[level.first + high * plane + cell] += up * gradient;
 }

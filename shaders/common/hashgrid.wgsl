@@ -2,10 +2,14 @@
 // SLICED: the grid was cut at the time of the step, so that a level is a dense table over its two spatial axes.
 
 struct Level {
-    scale: vec4<f32>,        // cells along each axis, not rounded
-    resolution: vec4<u32>,   // entries along each axis; w: how many entries the level has
-    place: vec4<u32>,        // first entry of the level in its table (x) and in the slices (y); z: its number in the row;
-                             // w: 1 where it is dense (on the device the product of the resolution may overflow)
+    scale: vec3<f32>,        // cells along each axis, not rounded
+    dense: u32,              // 1 where every entry has a place of its own (on the device their number may overflow)
+    resolution: vec3<u32>,   // entries along each axis
+    entries: u32,            // of the level in its table
+    axes: vec3<u32>,         // which of x, y, z, t (0 to 3) each axis is
+    number: u32,             // of the level in a row of the encoding
+    first: u32,              // entry of the level in its table
+    first_sliced: u32,       // entry of the level in the slices
 }
 
 struct Grid {
@@ -13,7 +17,6 @@ struct Grid {
     all_points: u32,         // of all dispatches that add to the same sums
     levels: u32,             // in `levels`
     all_levels: u32,         // in a row of the encoding, which has two features for each
-    axes: vec4<u32>,         // which of x, y, z, t (0 to 3) each axis of the grid is
     time: f32,               // in [0, 1]
     bound: f32,              // half side of the box that the grid covers
 }
@@ -32,10 +35,9 @@ struct Cell {
 // Entry of the corner at whole-numbered coordinates: dense where the level fits into its table, else a hash; the number
 // of entries is then a power of two.
 fn entry(level: Level, at: vec3<u32>) -> u32 {
-    let r = level.resolution;
-    let dense = at.x + r.x * (at.y + r.y * at.z);
-    let hash = (at.x ^ (at.y * 2654435761u) ^ (at.z * 805459861u)) & (r.w - 1u);
-    return select(hash, dense, level.place.w != 0u);
+    let dense = at.x + level.resolution.x * (at.y + level.resolution.y * at.z);
+    let hash = (at.x ^ (at.y * 2654435761u) ^ (at.z * 805459861u)) & (level.entries - 1u);
+    return select(hash, dense, level.dense != 0u);
 }
 
 fn smooth_weight(f: vec3<f32>) -> vec3<f32> {
@@ -46,17 +48,17 @@ fn axis_value(point: vec3<f32>, axis: u32, grid: Grid) -> f32 {
     return select((point[min(axis, 2u)] + grid.bound) / (2.0 * grid.bound), grid.time, axis == 3u);
 }
 
-// The point in the grid's unit cube.
-fn unit_point(point: vec3<f32>, grid: Grid) -> vec3<f32> {
-    return vec3(
-        axis_value(point, grid.axes.x, grid), axis_value(point, grid.axes.y, grid), axis_value(point, grid.axes.z, grid));
+// The point in the level's unit cube.
+fn unit_point(point: vec3<f32>, level: Level, grid: Grid) -> vec3<f32> {
+    let axes = level.axes;
+    return vec3(axis_value(point, axes.x, grid), axis_value(point, axes.y, grid), axis_value(point, axes.z, grid));
 }
 
 fn find_cell(unit: vec3<f32>, level: Level) -> Cell {
     let inside = all(unit >= vec3(0.0)) && all(unit <= vec3(1.0));
-    let p = select(vec3(0.0), unit * level.scale.xyz, inside);
+    let p = select(vec3(0.0), unit * level.scale, inside);
     let low = vec3<u32>(floor(p));
-    let high = min(low + 1u, level.resolution.xyz - 1u);
+    let high = min(low + 1u, level.resolution - 1u);
     let up = smooth_weight(p - floor(p));
     let down = 1.0 - up;
     var cell: Cell;

@@ -2,61 +2,66 @@
 import { Pool } from "./gpu.js";
 import { isSliced } from "./hash_grid.js";
 
-const LEVEL_WORDS = 12; // common/hashgrid.wgsl: struct Level
+const LEVEL_WORDS = 16; // common/hashgrid.wgsl: struct Level
 
 export class HashEncoder {
     // row, column: an encoding has `row` floats, in which the features of one grid lie behind those of the other from
     // `column` on.
     constructor(gpu, grids, bound, row, column) {
-        Object.assign(this, { gpu, grids, bound, row, pool: new Pool(gpu), parts: [] });
+        Object.assign(this, { gpu, bound, row, pool: new Pool(gpu), cuts: [], sliceEntries: 0 });
+        const [direct, slices] = [[], []];
         grids.forEach((grid, number) => {
-            for (const sliced of [true, false]) {
-                const chosen = grid.levels.map((level, i) => [level, column / 2 + i])
-                    .filter(([level]) => (isSliced(level) === sliced));
-                if (chosen.length) this.parts.push(this.makePart(number, chosen, sliced));
+            const records = grid.levels.map((level, i) => this.levelRecord(grid, level, column / 2 + i));
+            const of = sliced => records.filter((_, i) => isSliced(grid.levels[i]) === sliced);
+            if (of(true).length) {
+                this.cuts.push(this.levels(`cut ${number}`, number, of(true)));
+                slices.push(...of(true));
             }
+            if (of(false).length) direct.push(this.levels(`direct ${number}`, number, of(false)));
             column += grid.features;
         });
+        this.lookups = slices.length ? [this.levels("slices", null, slices), ...direct] : direct;
     }
 
-    makePart(grid, chosen, sliced) {
-        const words = new Uint32Array(LEVEL_WORDS * chosen.length);
-        let [slices, cells] = [0, 0];
-        chosen.forEach(([level, pair], i) => {
-            new Float32Array(words.buffer, 4 * LEVEL_WORDS * i, 3).set(level.scale);
-            words.set([...level.resolution, level.entries, level.first, slices, pair, Number(level.dense)], LEVEL_WORDS * i + 4);
-            const plane = level.resolution[0] * level.resolution[1];
-            cells = Math.max(cells, plane);
-            slices += plane;
-        });
-        const levels = this.pool.upload(`levels ${grid} ${sliced ? "sliced" : "direct"}`, words);
-        return { grid, sliced, cells, levels, count: chosen.length, entries: slices };
+    // What the device knows of a level, and the number of cells of its plane.
+    levelRecord(grid, level, number) {
+        const words = new Uint32Array(LEVEL_WORDS);
+        new Float32Array(words.buffer, 0, 3).set(level.scale);
+        words.set([Number(level.dense), ...level.resolution, level.entries, ...grid.axes, number, level.first, this.sliceEntries], 3);
+        const cells = level.resolution[0] * level.resolution[1];
+        if (isSliced(level)) this.sliceEntries += cells;
+        return { words, cells };
     }
 
-    uniform(name, kernel, { grid, sliced, count }, points, all, time) {
-        const axes = [...this.grids[grid].axes, 0];
-        return this.pool.uniform(`grid ${grid} ${sliced} place ${name}`, this.gpu.kernel(kernel), "grid", {
-            points, all_points: all, levels: count, all_levels: this.row / 2, axes, time, bound: this.bound,
+    // grid: whose table is read; null for the slices of all grids.
+    levels(name, grid, records) {
+        const words = new Uint32Array(LEVEL_WORDS * records.length);
+        records.forEach((record, i) => words.set(record.words, LEVEL_WORDS * i));
+        const cells = Math.max(...records.map(record => record.cells));
+        return { name, grid, cells, count: records.length, array: this.pool.upload(`levels ${name}`, words) };
+    }
+
+    uniform(place, kernel, { name, count }, points, all, time) {
+        return this.pool.uniform(`${name} place ${place}`, this.gpu.kernel(kernel), "grid", {
+            points, all_points: all, levels: count, all_levels: this.row / 2, time, bound: this.bound,
         });
     }
 
     // Encode the n points that `rows` names. number: of the block, among those that are submitted together.
     record(commands, number, { points, rows, encoding, tables, n, time }) {
-        const sources = this.parts.map(part => {
-            if (!part.sliced) return tables[part.grid];
-            const slices = this.pool.array(`slices ${part.grid}`, 8 * part.entries);
-            commands.dispatchGrid("hashgrid_slice", Math.ceil(part.cells / 64), part.count, {
-                grid: this.uniform(`${number}`, "hashgrid_slice", part, n, n, time),
-                levels: part.levels, features: tables[part.grid], slices,
+        const slices = this.pool.array("slices", 8 * this.sliceEntries);
+        for (const cut of this.cuts) {
+            commands.dispatchGrid("hashgrid_slice", Math.ceil(cut.cells / 64), cut.count, {
+                grid: this.uniform(`${number}`, "hashgrid_slice", cut, n, n, time),
+                levels: cut.array, features: tables[cut.grid], slices,
             });
-            return slices;
-        });
-        this.parts.forEach((part, i) => {
-            const key = part.sliced ? "hashgrid SLICED ROWS" : "hashgrid ROWS";
-            commands.dispatch(key, Math.ceil(n / 512) * part.count, {
-                grid: this.uniform(`${number} from 0`, key, part, n, n, time),
-                levels: part.levels, features: sources[i], points, encoding, rows,
+        }
+        for (const levels of this.lookups) {
+            const key = levels.grid === null ? "hashgrid SLICED ROWS" : "hashgrid ROWS";
+            commands.dispatch(key, Math.ceil(n / 512) * levels.count, {
+                grid: this.uniform(`${number} from 0`, key, levels, n, n, time),
+                levels: levels.array, features: levels.grid === null ? slices : tables[levels.grid], points, encoding, rows,
             });
-        });
+        }
     }
 }

@@ -6,10 +6,12 @@ looking up two planes for each point.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...gpu.array import DeviceArray
 from ...gpu.device import SOFTWARE_LOOP_TURNS, Device
@@ -18,7 +20,7 @@ from ...gpu.pool import BufferPool
 from ..fields.hash_grid_config import GridShape
 
 _ALIGNED = 64  # rows; a multiple of 256 bytes for every row size, at which a binding may begin
-_LEVEL_WORDS = 12  # common/hashgrid.wgsl: struct Level
+_LEVEL_WORDS = 16  # common/hashgrid.wgsl: struct Level
 
 
 @dataclass(frozen=True)
@@ -36,15 +38,18 @@ class PointSet:
 
 
 @dataclass(frozen=True)
-class _Part:
-    """The levels of a grid that are sliced, or those that are not."""
+class _Levels:
+    """Levels that one dispatch takes. name: distinguishes them. cells: of the largest level's plane."""
 
-    grid: int
+    name: str
     sliced: bool
     count: int
-    levels: DeviceArray
-    cells: int  # of the largest plane
-    entries: int  # of all slices together
+    cells: int
+    array: DeviceArray
+
+    @property
+    def defines(self) -> dict[str, int]:
+        return {"SLICED": 1, "CORNERS": 4} if self.sliced else {"CORNERS": 8}
 
 
 class HashEncoderPasses:
@@ -72,47 +77,45 @@ class HashEncoderPasses:
         turns = SOFTWARE_LOOP_TURNS if self.lane_levels else None
         self._most_points = None if turns is None else (turns + 1) // 2
         self._row = sum(grid.features for grid in grids) if row is None else row
-        self._parts: list[_Part] = []
+        self._cuts: dict[int, _Levels] = {}  # by grid: the levels that are sliced
+        self._direct: dict[int, _Levels] = {}  # by grid: the others
+        self._slices: _Levels | None = None  # those that are sliced, of all grids
+        self._slice_entries = 0
+        of_slices: list[NDArray[np.uint32]] = []
         for number, grid in enumerate(grids):
-            sliced = grid.sliced
-            direct = [i for i in range(len(grid.levels)) if i not in sliced]
-            for chosen, cut in ((sliced, True), (direct, False)):
-                if chosen:
-                    self._parts.append(self._part(number, chosen, cut, column // 2))
+            words = _level_words(grid, column // 2, self._slice_entries)
+            sliced = np.isin(np.arange(len(words)), grid.sliced)
+            if sliced.any():
+                self._cuts[number] = self._levels(f"cut {number}", True, words[sliced])
+                of_slices.append(words[sliced])
+            if not sliced.all():
+                self._direct[number] = self._levels(f"direct {number}", False, words[~sliced])
+            self._slice_entries += int(words[sliced, 4:6].prod(axis=1).sum())
             column += grid.features
+        if of_slices:
+            self._slices = self._levels("slices", True, np.concatenate(of_slices))
 
-    def _part(self, number: int, chosen: list[int], sliced: bool, first_pair: int) -> _Part:
-        levels = self.grids[number].levels
-        words = np.zeros((len(chosen), _LEVEL_WORDS), np.uint32)
-        slices = largest = 0
-        for row, i in zip(words, chosen, strict=True):
-            level = levels[i]
-            row[:3] = np.asarray(level.scale, np.float32).view(np.uint32)
-            row[4:8] = (*level.resolution, level.entries)
-            row[8:12] = (level.first, slices, first_pair + i, level.dense)
-            cells = level.resolution[0] * level.resolution[1]
-            largest = max(largest, cells)
-            slices += cells
-        array = DeviceArray.upload(self.device, f"levels {number} {'sliced' if sliced else 'direct'}", words)
-        return _Part(number, sliced, len(chosen), array, largest, slices if sliced else 0)
+    def _levels(self, name: str, sliced: bool, words: NDArray[np.uint32]) -> _Levels:
+        array = DeviceArray.upload(self.device, f"levels {name}", words)
+        return _Levels(name, sliced, len(words), int(words[:, 4:6].prod(axis=1).max()), array)
 
-    def _uniform(self, part: _Part, place: str, points: int, all_points: int, time: float) -> DeviceArray:
+    def _lookups(self, slices: DeviceArray, tables: Sequence[DeviceArray]) -> list[tuple[_Levels, DeviceArray]]:
+        """The levels of each lookup, with what they are looked up in, or with its gradient."""
+        direct = [(levels, tables[number]) for number, levels in self._direct.items()]
+        return direct if self._slices is None else [(self._slices, slices), *direct]
+
+    def _uniform(self, place: str, levels: int, points: int, all_points: int, time: float) -> DeviceArray:
         """The uniform of a block of points. All blocks of all sets are submitted together, so each has its own."""
         content = Kernel.get(self.device, "hashgrid_slice", SLICED=1, CORNERS=4).uniform(
             "Grid",
             points=points,
             all_points=all_points,
-            levels=part.count,
+            levels=levels,
             all_levels=self._row // 2,
-            axes=(*self.grids[part.grid].axes, 0),
             time=time,
             bound=self.bound,
         )
-        return self.pool.constant(f"grid {part.grid} {part.sliced} place {place}", content)
-
-    @staticmethod
-    def _defines(part: _Part) -> dict[str, int]:
-        return {"SLICED": 1, "CORNERS": 4} if part.sliced else {"CORNERS": 8}
+        return self.pool.constant(f"grid {place}", content)
 
     def _blocks(self, n: int, encoding: DeviceArray, most: int | None = None) -> Iterator[tuple[int, int]]:
         """First point and number of points of each dispatch: at most `most`, with rows that fit into a binding."""
@@ -137,17 +140,12 @@ class HashEncoderPasses:
         other rows.
         """
         number, n = points.number, points.count
-        sources = []
-        for part in self._parts:
-            source = tables[part.grid]
-            if part.sliced:
-                slices = self.pool.array(f"slices {part.grid}", (part.entries, 2))
-                kernel = Kernel.get(self.device, "hashgrid_slice", **self._defines(part))
-                grid = self._uniform(part, f"{number}", n, n, points.time)
-                arrays = {"grid": grid, "levels": part.levels, "features": source, "slices": slices}
-                commands.dispatch_grid(kernel, (-(-part.cells // 64), part.count), **arrays)
-                source = slices
-            sources.append(source)
+        slices = self.pool.array("slices", (self._slice_entries, 2))
+        for grid, cut in self._cuts.items():
+            arrays = {"levels": cut.array, "features": tables[grid], "slices": slices}
+            arrays["grid"] = self._uniform(f"{cut.name} {number}", cut.count, n, n, points.time)
+            kernel = Kernel.get(self.device, "hashgrid_slice", **cut.defines)
+            commands.dispatch_grid(kernel, (-(-cut.cells // 64), cut.count), **arrays)
         options = _precision(encoding)
         if rows is None:
             blocks = [
@@ -158,52 +156,55 @@ class HashEncoderPasses:
             options |= {"ROWS": 1}
             blocks = [(0, n, {"points": points.array, "encoding": encoding, "rows": rows})]
         for first, count, of_points in blocks:
-            for part, source in zip(self._parts, sources, strict=True):
-                kernel = Kernel.get(self.device, "hashgrid", **self._defines(part), **options)
-                grid = self._uniform(part, f"{number} from {first}", count, n, points.time)
-                arrays = {"grid": grid, "levels": part.levels, "features": source}
-                commands.dispatch(kernel, -(-count // 512) * part.count, **arrays, **of_points)
+            for levels, features in self._lookups(slices, tables):
+                kernel = Kernel.get(self.device, "hashgrid", **levels.defines, **options)
+                arrays = {"levels": levels.array, "features": features, **of_points}
+                arrays["grid"] = self._uniform(
+                    f"{levels.name} {number} from {first}", levels.count, count, n, points.time
+                )
+                commands.dispatch(kernel, -(-count // 512) * levels.count, **arrays)
 
     def add_gradient(
         self, commands: Commands, points: PointSet, d_encoding: DeviceArray, d_tables: list[DeviceArray]
     ) -> None:
         """Add the gradient of the tables, from that of the encoding, whose rows must hold nothing else."""
         number, n = points.number, points.count
-        targets, sums = [], []
-        for part in self._parts:
-            target = d_tables[part.grid]
-            if part.sliced:
-                target = self.pool.array(f"d_slices {part.grid}", (part.entries, 2))
-                commands.clear(target)
-            targets.append(target)
-            if not self.lane_levels:
-                target = self.pool.array(f"d_fixed {part.grid} {part.sliced}", (2 * target.size,), "uint32")
-                commands.clear(target)
-            sums.append(target)
+        d_slices = self.pool.array("d_slices", (self._slice_entries, 2))
+        commands.clear(d_slices)
+        sums = floats = self._lookups(d_slices, d_tables)
+        if not self.lane_levels:
+            sums = [
+                (levels, self.pool.array(f"d_fixed {levels.name}", (2 * target.size,), "uint32"))
+                for levels, target in floats
+            ]
+            for _, fixed in sums:
+                commands.clear(fixed)
 
         options = _precision(d_encoding)
         largest = {} if self.lane_levels else {"largest": self._largest(commands, points, d_encoding, options)}
         options |= {"LANE_LEVELS": 1} if self.lane_levels else {}
         for first, count in self._blocks(n, d_encoding, self._most_points):
-            for part, target in zip(self._parts, sums, strict=True):
-                kernel = Kernel.get(self.device, "hashgrid_bwd", **self._defines(part), **options)
-                groups = -(-part.count // 8) if self.lane_levels else -(-count // 64) * part.count
+            for levels, target in sums:
+                kernel = Kernel.get(self.device, "hashgrid_bwd", **levels.defines, **options)
+                groups = _shared(levels.count) if self.lane_levels else -(-count // 64) * levels.count
                 arrays = {"points": points.array.rows(first, count), "d_encoding": d_encoding.rows(first, count)}
-                arrays |= {"levels": part.levels, "d_features": target, "d_fixed": target, **largest}
-                arrays["grid"] = self._uniform(part, f"{number} from {first}", count, n, points.time)
+                arrays |= {"levels": levels.array, "d_features": target, "d_fixed": target, **largest}
+                arrays["grid"] = self._uniform(
+                    f"{levels.name} {number} from {first}", levels.count, count, n, points.time
+                )
                 commands.run(kernel, groups, arrays)
 
-        for part, target, fixed in zip(self._parts, targets, sums, strict=True):
-            uniform = self._uniform(part, f"{number}", n, n, points.time)
-            if not self.lane_levels:
-                unfix = Kernel.get(self.device, "hashgrid_unfix", **self._defines(part))
-                commands.dispatch(
-                    unfix, -(-target.size // 64), grid=uniform, d_fixed=fixed, d_features=target, **largest
-                )
-            if part.sliced:
-                kernel = Kernel.get(self.device, "hashgrid_slice_bwd", **self._defines(part))
-                arrays = {"levels": part.levels, "d_slices": target, "d_features": d_tables[part.grid]}
-                commands.dispatch_grid(kernel, (-(-part.cells // 64), part.count), grid=uniform, **arrays)
+        if not self.lane_levels:
+            for (levels, target), (_, fixed) in zip(floats, sums, strict=True):
+                arrays = {"d_fixed": fixed, "d_features": target, **largest}
+                arrays["grid"] = self._uniform(f"{levels.name} {number}", levels.count, n, n, points.time)
+                unfix = Kernel.get(self.device, "hashgrid_unfix", **levels.defines)
+                commands.dispatch(unfix, -(-target.size // 64), **arrays)
+        for grid, cut in self._cuts.items():
+            arrays = {"levels": cut.array, "d_slices": d_slices, "d_features": d_tables[grid]}
+            arrays["grid"] = self._uniform(f"{cut.name} {number}", cut.count, n, n, points.time)
+            kernel = Kernel.get(self.device, "hashgrid_slice_bwd", **cut.defines)
+            commands.dispatch_grid(kernel, (-(-cut.cells // 64), cut.count), **arrays)
 
     def _largest(
         self, commands: Commands, points: PointSet, d_encoding: DeviceArray, options: dict[str, int]
@@ -214,11 +215,32 @@ class HashEncoderPasses:
         commands.clear(largest)
         kernel = Kernel.get(self.device, "hashgrid_largest", CORNERS=4, **options)
         for first, count in self._blocks(n, d_encoding):
-            grid = self._uniform(self._parts[0], f"{number} largest from {first}", count, n, points.time)
+            grid = self._uniform(f"largest {number} from {first}", 0, count, n, points.time)
             gradient = d_encoding.rows(first, count)
             commands.dispatch(kernel, -(-count * self._row // 4096), grid=grid, d_encoding=gradient, largest=largest)
         return largest
 
 
+def _shared(levels: int) -> int:
+    """The number of workgroups whose lanes own levels: as many for each core, and at most eight levels in each."""
+    cores = os.cpu_count() or 1
+    return min(levels, -(-levels // (8 * cores)) * cores)
+
+
 def _precision(encoding: DeviceArray) -> dict[str, int]:
     return {"BFLOAT16": 1} if encoding.dtype == "int16" else {}
+
+
+def _level_words(grid: GridShape, first_number: int, first_sliced: int) -> NDArray[np.uint32]:
+    """A grid's levels (levels, 16) as common/hashgrid.wgsl reads them.
+
+    first_number: of the grid's first level in a row of the encoding. first_sliced: the first free entry of the slices.
+    """
+    words = np.zeros((len(grid.levels), _LEVEL_WORDS), np.uint32)
+    for i, (row, level) in enumerate(zip(words, grid.levels, strict=True)):
+        row[:3] = np.asarray(level.scale, np.float32).view(np.uint32)
+        row[3:8] = (level.dense, *level.resolution, level.entries)
+        row[8:14] = (*grid.axes, first_number + i, level.first, first_sliced)
+        if i in grid.sliced:
+            first_sliced += level.resolution[0] * level.resolution[1]
+    return words
