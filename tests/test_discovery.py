@@ -23,7 +23,7 @@ from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.discovery.discover import density_at, discover, explained_share, lost_tracks
 from lapgs_wgpu.train.discovery.field_fit import fit_field
 from lapgs_wgpu.train.discovery.residual import Residual, moving_pixels
-from lapgs_wgpu.train.discovery.static_fit import small_view, static_config
+from lapgs_wgpu.train.discovery.static_fit import small_view, static_config, static_fit
 from lapgs_wgpu.train.discovery.surface_points import PointClouds, Points, surface_points
 from lapgs_wgpu.train.discovery.tracks import Tracks, find_tracks
 from lapgs_wgpu.train.discovery.trajectories import find_trajectories
@@ -333,7 +333,6 @@ def test_every_field_learns_tracks(device: Device, kind: str) -> None:
 def test_discovery_starts_a_training_with_what_moves(dataset: Dataset, device: Device) -> None:
     config = configure()
     found = discover(config, dataset, device)
-    assert found.scene is not None
     assert "moving parts" in found.summary
     with closing(Trainer(config, dataset, device, scene=found.scene)) as training:
         before = found.scene.parameters["means"].detach().clone()
@@ -346,6 +345,16 @@ def test_discovery_starts_a_training_with_what_moves(dataset: Dataset, device: D
     with closing(Trainer(config, dataset, device)) as resumed:
         resumed.restore(state)
         assert int(resumed.state()["training.warm_up"]) == 0
+
+
+def test_without_parts_to_follow_the_static_fit_starts_a_training(dataset: Dataset, device: Device) -> None:
+    config = configure(discovery__least="1")
+    static, _ = static_fit(config, dataset, device, lambda step: None)
+    found = discover(config, dataset, device)
+    assert "nothing is added" in found.summary
+    assert found.scene.parameters["dynamics"].abs().sum() == 0
+    ours, theirs = found.scene.parameters["means"], static.parameters["means"]
+    assert np.array_equal(np.sort(ours.numpy(force=True), axis=0), np.sort(theirs.numpy(force=True), axis=0))
 
 
 def test_a_whole_run_repeats_to_the_last_byte(dataset: Dataset, device: Device, tmp_path: Path) -> None:

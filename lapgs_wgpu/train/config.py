@@ -68,7 +68,7 @@ class ScheduleConfig(Options):
     batch: int = option("images per step; their gradients are averaged", at_least=1)
     warm_up: int = option(
         "number of initial steps without motion: the deformation field is off, and only the static Gaussians "
-        "are trained"
+        "are trained; ignored if discovery.enabled, whose static model replaces them"
     )
     sh_interval: int = option(
         "the degree of the spherical harmonics starts at 0 and increases by one every this many steps, up to 3",
@@ -251,14 +251,14 @@ class DiscoveryConfig(Options):
     """Motion discovery before the training (train/discovery). Has defaults, since older config.toml files lack it."""
 
     enabled: bool = option(
-        "before training, search for objects that move far, and initialize Gaussians on them; skipped for the "
+        "before training, fit a static model, search for objects that move far, and start from both; skipped for the "
         "field static and if schedule.steps is at most discovery.steps",
         False,
     )
     steps: int = option(
-        "training steps of the static model that separates what moves from what does not", 800, at_least=1
+        "training steps of this static model, which also separates what moves from what does not", 800, at_least=1
     )
-    size: int = option("longer side of the images for this search, pixels", 100, at_least=16)
+    size: int = option("longer side of the images for the static model and the search, pixels", 100, at_least=16)
     field_steps: int = option("steps that fit the deformation field to the motion that was found", 1500, at_least=1)
     least: float = option(
         "add Gaussians only if the objects that were found, and that the static model lacks, explain at least this "

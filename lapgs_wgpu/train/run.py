@@ -124,7 +124,7 @@ def resume(
 
 
 def _discovered(config: Config, dataset: Dataset, device: Device, ranks: Ranks) -> Scene4D | None:
-    """The scene that discovery starts a training with; None where it is off, finds nothing, or is out of proportion."""
+    """The scene that discovery starts a training with; None where it is off or out of proportion."""
     wanted = config.discovery.enabled and config.field.kind != "static"
     if not wanted or config.schedule.steps <= config.discovery.steps:
         return None

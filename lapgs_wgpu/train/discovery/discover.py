@@ -1,4 +1,4 @@
-"""What a training starts from, where the capture shows things that a static fit loses."""
+"""What a training starts from: the static fit, and what it loses of the things that move."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from torch import Tensor
 
 from lapgs_wgpu.data.initial_gaussians import initial_scales
 from lapgs_wgpu.data.views import Dataset
@@ -38,16 +37,17 @@ SHOWN = 2.0 / 255  # least difference from the background of an image that shows
 
 
 class Discovery(NamedTuple):
-    """scene: to start from; None where nothing is lost without it. summary: what was found, a line."""
+    """scene: to start from. summary: what was found, a line."""
 
-    scene: Scene4D | None
+    scene: Scene4D
     summary: str
 
 
 def discover(config: Config, dataset: Dataset, device: Device, terminal: TextIO | None = None) -> Discovery:
     """Find what moves, and build the scene that a training starts from.
 
-    It holds the Gaussians of the static fit and of the tracks, and a field that moves the latter.
+    It holds the Gaussians of the static fit and those of the tracks, if there are any, and a field that moves the
+    latter.
 
     The same configuration and capture give the same scene. Raises InputError where the images show nothing at all.
     """
@@ -67,23 +67,23 @@ def discover(config: Config, dataset: Dataset, device: Device, terminal: TextIO 
     tracks = find_tracks(clouds, half_side)
     tracks = None if tracks is None else lost_tracks(tracks, static)
     share = 0.0 if tracks is None else explained_share(clouds, tracks, half_side)
-    if tracks is None or share < config.discovery.least:
-        meter.clear()
-        return Discovery(None, f"discovery: {share:.1%} of what the static fit lacks can be followed: nothing is added")
+    if share < config.discovery.least:
+        tracks = None
     generator = torch.Generator().manual_seed(config.seed)
     scene = scene_with(static, tracks, config, device, generator)
-    error = fit_field(scene, tracks, clouds.times, len(static), fit_steps, generator, lambda s: meter.at(steps + s))
+    found = f"{share:.1%} of what it lacks can be followed: nothing is added"
+    if tracks is not None:
+        error = fit_field(scene, tracks, clouds.times, len(static), fit_steps, generator, lambda s: meter.at(steps + s))
+        found = (
+            f"{len(np.unique(tracks.part))} moving parts with {len(tracks.part)} Gaussians, {share:.0%} of what it "
+            f"lacks, followed within {error:.3f} world units"
+        )
     order = morton_order(scene.parameters["means"].detach())
     for name, values in scene.parameters.items():
         scene.parameters[name] = torch.nn.Parameter(values.detach()[order])
     meter.clear()
     seconds = time.perf_counter() - started
-    return Discovery(
-        scene,
-        f"discovery: {len(np.unique(tracks.part))} moving parts with {len(tracks.part)} Gaussians beside {len(static)} "
-        f"of the static fit; {share:.0%} of what the static fit lacks, followed within {error:.3f} world units; "
-        f"{seconds:.0f} s",
-    )
+    return Discovery(scene, f"discovery: a static fit of {len(static)} Gaussians; {found}; {seconds:.0f} s")
 
 
 def lost_tracks(tracks: Tracks, static: Scene4D) -> Tracks | None:
@@ -119,21 +119,25 @@ def explained_share(clouds: PointClouds, tracks: Tracks, half_side: float) -> fl
     return near / max(clouds.total, 1)
 
 
-def scene_with(static: Scene4D, tracks: Tracks, config: Config, device: Device, generator: torch.Generator) -> Scene4D:
+def scene_with(
+    static: Scene4D, tracks: Tracks | None, config: Config, device: Device, generator: torch.Generator
+) -> Scene4D:
     """The static fit's Gaussians, then one for each track; the field does not move them yet."""
-    count, size = len(tracks.part), config.field.dynamics_size
-    scales = SCALE * initial_scales(tracks.positions)
-    new = {
-        "means": torch.from_numpy(tracks.positions),
-        "log_scales": torch.from_numpy(np.log(scales))[:, None].repeat(1, 3),
-        "quats": torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
-        "opacity_logits": torch.full((count,), float(np.log(OPACITY / (1 - OPACITY)))),
-        "sh_dc": (torch.from_numpy(tracks.colors) - 0.5)[:, None] / CONSTANTS["SH_C0"],
-        "sh_rest": torch.zeros(count, 15, 3),
-    }
-    rows: dict[str, Tensor] = {
-        name: torch.cat([static.parameters[name].detach().cpu(), values.float()]) for name, values in new.items()
-    }
-    of_part = DYNAMICS * torch.randn(int(tracks.part.max()) + 1, size, generator=generator)
-    rows["dynamics"] = torch.cat([torch.zeros(len(static), size), of_part[torch.from_numpy(tracks.part)]])
+    size = config.field.dynamics_size
+    rows = {name: values.detach().cpu() for name, values in static.parameters.items()}
+    rows["dynamics"] = torch.zeros(len(static), size)
+    if tracks is not None:
+        count = len(tracks.part)
+        scales = SCALE * initial_scales(tracks.positions)
+        of_part = DYNAMICS * torch.randn(int(tracks.part.max()) + 1, size, generator=generator)
+        new = {
+            "means": torch.from_numpy(tracks.positions),
+            "log_scales": torch.from_numpy(np.log(scales))[:, None].repeat(1, 3),
+            "quats": torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
+            "opacity_logits": torch.full((count,), float(np.log(OPACITY / (1 - OPACITY)))),
+            "sh_dc": (torch.from_numpy(tracks.colors) - 0.5)[:, None] / CONSTANTS["SH_C0"],
+            "sh_rest": torch.zeros(count, 15, 3),
+            "dynamics": of_part[torch.from_numpy(tracks.part)],
+        }
+        rows = {name: torch.cat([rows[name], values.float()]) for name, values in new.items()}
     return Scene4D(rows, config.field, device, sh_degree=static.sh_degree, seed=config.seed)
