@@ -1,157 +1,293 @@
-"""lapgs-prepare: what it asks of ffmpeg and colmap, and what it says when they are missing or fail."""
+"""lapgs-prepare: films of phones, frames worth having, poses, and what it says of films that are of no use."""
 
 from __future__ import annotations
 
 import json
-import os
 import shutil
+import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
-from helpers.captures import cameras, moved, write_video
+from helpers.films import Board, drawn, pose_errors, turn_film, walk, write_film
 
-from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.prepare import extract, prepare_command
+from lapgs_wgpu.data import load_dataset
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.prepare.capture import prepare
+from lapgs_wgpu.prepare.extract import extract, images_per_second
+from lapgs_wgpu.prepare.film import Film
+from lapgs_wgpu.prepare.hdr import to_sdr
+from lapgs_wgpu.prepare.reconstruct import neighbouring_pairs
+from lapgs_wgpu.prepare_cli import prepare_command
 
-needs_ffmpeg = pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="ffmpeg is not installed")
-
-# Does what colmap does to the disk, and notes how it was called.
-FAKE = """#!/usr/bin/env python3
-import pathlib, shutil, sys
-words = sys.argv[1:]
-with open({log!r}, "a") as file:
-    file.write(" ".join(words) + "\\n")
-if "-h" in words:
-    print("  --" + ("FeatureExtraction" if "extractor" in words[0] else "SiftMatching") + ".use_gpu arg (=1)")
-elif words[0] == {failing!r}:
-    print("it says why")
-    sys.exit(1)
-elif words[0] == "mapper":
-    out = pathlib.Path(words[words.index("--output_path") + 1])
-    for name in {models!r}:
-        shutil.copytree(pathlib.Path({source!r}) / name, out / name)
-"""
+av = pytest.importorskip("av")
+pytest.importorskip("pycolmap")
 
 
-@pytest.fixture
-def films(device: Device, tmp_path: Path) -> list[Path]:
-    """Two cameras, 25 pictures a second for 0.4 seconds."""
-    pytest.importorskip("av")
-    paths = []
-    for i, camera in enumerate(cameras(2)):
-        paths.append(tmp_path / f"film{i}.mp4")
-        write_video(paths[-1], [moved(frame).drawn(camera, device) for frame in range(12)])
-    return paths
+def noise(count: int, width: int = 64, height: int = 48, seed: int = 0) -> list[np.ndarray]:
+    """Smooth pictures, each another one."""
+    rng = np.random.default_rng(seed)
+    return [np.kron(rng.integers(40, 216, (height // 8, width // 8, 3)), np.ones((8, 8, 1))).astype(np.uint8)
+            for _ in range(count)]  # fmt: skip
 
 
-def fake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, failing: str = "", models: dict[str, int]) -> Path:
-    """A colmap that finds models of so many pictures, by name; returns its log."""
-    log, source, programs = tmp_path / "calls.txt", tmp_path / "models", tmp_path / "programs"
-    programs.mkdir()
-    for name, count in models.items():
-        (source / name).mkdir(parents=True)
-        (source / name / "cameras.txt").write_text("1 PINHOLE 64 48 66 66 32 24\n")
-        lines = "".join(f"{i + 1} 1 0 0 0 0 0 0 1 {i}.png\n\n" for i in range(count))
-        (source / name / "images.txt").write_text(lines)
-        (source / name / "points3D.txt").write_text("")
-    text = FAKE.format(log=str(log), failing=failing, models=list(models), source=str(source))
-    (programs / "colmap").write_text(text)
-    (programs / "colmap").chmod(0o755)
-    monkeypatch.setenv("PATH", f"{programs}{os.pathsep}{os.environ['PATH']}")
-    return log
+def seconds(path: Path) -> list[float]:
+    return [frame.seconds for frame in Film(path).frames()]
 
 
-@needs_ffmpeg
-def test_pictures_carry_their_time(films: list[Path], tmp_path: Path) -> None:
-    """30 pictures a second: each one's own time, not that of an even clock."""
-    ffmpeg = shutil.which("ffmpeg")
-    assert ffmpeg is not None
-    every = extract(ffmpeg, films[0], tmp_path / "every", 1000)
-    assert [int(path.stem) for path in every] == [round(1000 * i / 30) for i in range(12)]
-    third = extract(ffmpeg, films[0], tmp_path / "third", 10)
-    assert [int(path.stem) for path in third] == [0, 100, 200, 300]
+# Films
 
 
-@needs_ffmpeg
-def test_one_film(
-    films: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
-    log = fake(tmp_path, monkeypatch, models={"0": 1, "1": 3})
+def test_times_of_a_film_of_variable_rate(tmp_path: Path) -> None:
+    times = [0.0, 0.033, 0.05, 0.2, 0.7, 0.71]
+    path = write_film(tmp_path / "film.mkv", noise(6), times=times)
+    assert seconds(path) == pytest.approx(times, abs=2e-3)
+
+
+@pytest.mark.parametrize("degrees", [90, 180, 270])
+def test_frames_stand_upright(tmp_path: Path, degrees: int) -> None:
+    picture = np.full((48, 64, 3), 30, np.uint8)
+    picture[:16, :16] = 220  # the top left of what is stored
+    path = write_film(tmp_path / "film.mp4", [picture] * 3)
+    turn_film(path, degrees)
+    film = Film(path)
+    frames = [(frame.gray, frame.pixels(1000)) for frame in film.frames()]
+    assert film.size == ((48, 64) if degrees != 180 else (64, 48))
+    expected = np.rot90(picture, -degrees // 90)
+    for gray, pixels in frames:
+        assert pixels.shape == expected.shape
+        assert np.abs(pixels.astype(int) - expected).max() < 40
+        assert np.abs(gray - expected[..., 0]).mean() < 8
+
+
+@pytest.mark.parametrize(("trc", "transfer"), [("arib-std-b67", "HLG"), ("smpte2084", "PQ")])
+def test_hdr_films_look_like_ordinary_ones(tmp_path: Path, trc: str, transfer: str) -> None:
+    """Gray of the reference white in 10 bits becomes (almost) white; half of its light sRGB's level for half."""
+    signal = {"HLG": (0.75, 0.632), "PQ": (0.58, 0.508)}[transfer]
+    for value, level in zip(signal, (233, 188), strict=True):
+        deep = np.full((4, 4, 3), round(65535 * value), np.uint16)
+        shown = to_sdr(deep, transfer)  # type: ignore[arg-type]
+        assert np.abs(shown.astype(int) - level).max() <= 12, shown[0, 0]
+    options = {"x264-params": f"colorprim=bt2020:transfer={trc}:colormatrix=bt2020nc"}
+    path = write_film(tmp_path / "film.mkv", [np.full((48, 64, 3), 140, np.uint8)] * 3, options=options,
+                      pix_fmt="yuv420p10le")  # fmt: skip
+    for frame in Film(path).frames():
+        pixels = frame.pixels(1000)
+        assert pixels.dtype == np.uint8
+        assert np.ptp(pixels) <= 3
+        plain = 140 if transfer == "PQ" else 133
+        assert abs(int(pixels[0, 0, 0]) - plain) > 5, "it was taken for an ordinary film"
+
+
+def test_frames_without_time_stamps_are_counted(tmp_path: Path) -> None:
+    """A bare H.264 stream has none."""
+    path = tmp_path / "film.h264"
+    write_film(path, noise(6), rate=25)
+    film = Film(path)
+    times = [frame.seconds for frame in film.frames()]
+    assert np.diff(times) == pytest.approx(1 / 25)
+    assert len(times) == 6
+
+
+def test_a_film_cut_in_the_middle_of_a_packet(tmp_path: Path) -> None:
+    """What comes before is used, and the user is told."""
+    path = write_film(tmp_path / "film.mkv", noise(40), options={"g": "5"})
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2 + 7])
+    film = Film(path)
+    count = len(list(film.frames()))
+    assert 10 < count < 30
+    assert any("damaged after" in note or "ends after" in note for note in film.notes), film.notes
+
+
+def test_the_larger_of_two_streams_is_used(tmp_path: Path) -> None:
+    path = tmp_path / "film.mkv"
+    with av.open(str(path), "w") as file:
+        streams = []
+        for width, height in ((32, 32), (64, 48)):
+            stream = file.add_stream("libx264", rate=30)
+            stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+            streams.append(stream)
+        for stream in streams:
+            for picture in noise(5, stream.width, stream.height):
+                file.mux(stream.encode(av.VideoFrame.from_ndarray(picture, "rgb24")))
+            file.mux(stream.encode())
+    film = Film(path)
+    assert [frame.pixels(1000).shape for frame in film.frames()] == [(48, 64, 3)] * 5
+    assert "2 video streams; number 2" in film.notes[0]
+    assert len(film.notes) == 1
+
+
+# Frames worth having
+
+
+def test_the_sharpest_frame_of_each_span(tmp_path: Path) -> None:
+    pictures = noise(12)
+    soft = [p if i % 3 == 1 else np.full_like(p, p.mean()) // 2 + p // 2 for i, p in enumerate(pictures)]
+    path = write_film(tmp_path / "film.mkv", soft, rate=30)
+    found = extract(Film(path), tmp_path / "images", "", 10, 1000, still=False)
+    assert [picture.name for picture in found.pictures] == [f"{round(100 * i + 33.3):08d}.jpg" for i in range(4)]
+    assert sorted(path.name for path in (tmp_path / "images").iterdir()) == [p.name for p in found.pictures]
+    still = extract(Film(path), tmp_path / "still", "cam00/", 10, 1000, still=True)
+    assert [picture.name for picture in still.pictures] == [f"cam00/{100 * i:08d}.jpg" for i in range(4)]
+
+
+def test_repeated_frames_are_left_out(tmp_path: Path) -> None:
+    one, two, three = noise(3)
+    path = write_film(tmp_path / "film.mkv", [one] * 6 + [two] * 6 + [three] * 3, rate=30)
+    found = extract(Film(path), tmp_path / "images", "", 10, 1000, still=False)
+    assert [round(10 * picture.seconds) for picture in found.pictures] == [0, 2, 4]
+    assert found.repeated == 2
+    assert "2 repeated left out" in str(found)
+
+
+def test_large_frames_are_shrunk(tmp_path: Path) -> None:
+    path = write_film(tmp_path / "film.mkv", noise(3, 160, 96))
+    frame = next(iter(Film(path).frames()))
+    assert frame.pixels(80).shape == (48, 80, 3)
+
+
+def test_a_long_film_gives_fewer_images_a_second(tmp_path: Path) -> None:
+    film = Film(write_film(tmp_path / "film.mkv", noise(3)))
+    film.seconds = 60.0
+    assert images_per_second(film, None, still=False) == 5
+    assert images_per_second(film, 12, still=False) == 12
+    film.seconds = 5.0
+    assert images_per_second(film, None, still=False) == 10
+    assert images_per_second(film, None, still=True) == 30
+
+
+def test_pairs() -> None:
+    names = [f"{i}" for i in range(100)]
+    pairs = neighbouring_pairs(names)
+    assert len(set(pairs)) == len(pairs) < 1200
+    assert {int(b) - int(a) for a, b in pairs} == {1, 2, 3, 4, 5, 6, 9, 14, 20, 30, 46, 68}
+
+
+# From films to a capture that trains
+
+
+WIDTH, HEIGHT, COUNT = 200, 150, 10
+
+
+def test_one_film(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    cameras = walk(COUNT, WIDTH, HEIGHT)
+    path = write_film(tmp_path / "walk.mp4", [drawn(camera, 0, Board())[0] for camera in cameras], rate=10)
     out = tmp_path / "out"
-    assert prepare_command([str(films[0]), "--out", str(out)]) == 0
-    assert json.loads((out / "times.json").read_text()) == {f"{i:08d}.jpg": i / 1000 for i in (0, 100, 200, 300)}
-    steps = [line for line in log.read_text().splitlines() if "-h" not in line]
-    assert [step.split()[0] for step in steps] == ["feature_extractor", "sequential_matcher", "mapper"]
-    assert "--FeatureExtraction.use_gpu 0" in steps[0]
-    assert "--SiftMatching.use_gpu 0" in steps[1]
-    assert "OPENCV" in steps[0]
-    assert len((out / "sparse/0/images.txt").read_text().split("\n\n")) == 4, "the larger model"
-    assert "3 of 4" in capsys.readouterr().out
+    assert prepare_command([str(path), "--out", str(out)]) == 0
+    said = capsys.readouterr()
+    assert f"{COUNT} of {COUNT} cameras placed; lapgs-train hypernerf-tiny" in said.out
+    assert "10 images of 10 frames" in said.err
+    times = json.loads((out / "times.json").read_text())
+    assert times == {f"{100 * i:08d}.jpg": i / 10 for i in range(COUNT)}
+    assert sorted(child.name for child in out.iterdir()) == ["images", "sparse", "times.json"]
+    data = load_dataset(out)
+    found = {f"{round(view.time * (COUNT - 1))}": view.camera.position for view in (*data.train, *data.test)}
+    errors = pose_errors(found, {f"{i}": camera.position for i, camera in enumerate(cameras)})
+    assert len(errors) == COUNT
+    assert errors.max() < 0.03
 
 
-@needs_ffmpeg
-def test_films_of_still_cameras(films: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    log = fake(tmp_path, monkeypatch, models={"0": 2})
+def test_films_of_still_cameras(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """Of different lengths, with a board that moves."""
+    cameras, board = walk(4, WIDTH, HEIGHT), Board(0.4)
+    films = []
+    for number, camera in enumerate(cameras):
+        pictures = [drawn(camera, t, board)[0] for t in np.linspace(0, 1, 4)]
+        films.append(write_film(tmp_path / f"{number}.mp4", pictures[: 3 if number == 2 else 4] * 2, rate=10))
     out = tmp_path / "out"
-    assert prepare_command([*map(str, films), "--out", str(out)]) == 0
-    assert (out / "colmap/list.txt").read_text() == "cam00/00000000.jpg\ncam01/00000000.jpg\n"
-    assert "exhaustive_matcher" in log.read_text()
-    assert sorted(json.loads((out / "times.json").read_text()))[4] == "cam01/00000000.jpg"
+    assert prepare_command([*map(str, films), "--out", str(out), "--fps", "10"]) == 0
+    said = capsys.readouterr()
+    assert "4 of 4 cameras placed; lapgs-train neu3d-tiny" in said.out
+    assert "the films are 0.50 to 0.70 s long; all are cut to 0.50 s" in said.err
+    assert len(json.loads((out / "times.json").read_text())) == 4 * 6
+    data = load_dataset(out)
+    assert len(data.cameras) == 3
+    found = {"0": data.test[0].camera.position} | {f"{i + 1}": c.position for i, c in enumerate(data.cameras)}
+    assert pose_errors(found, {f"{i}": camera.position for i, camera in enumerate(cameras)}).max() < 0.05
 
 
-@needs_ffmpeg
+# What is refused
+
+
+def refused(arguments: list[str], capsys: pytest.CaptureFixture) -> str:
+    assert prepare_command(arguments) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert lines[-1].startswith("lapgs-prepare: ")
+    return lines[-1]
+
+
 @pytest.mark.parametrize(
-    ("failing", "models", "words"),
+    ("pictures", "words"),
     [
-        ("mapper", {"0": 4}, ["colmap mapper failed with code 1", "it says why", "overlap too little", "colmap.log"]),
-        ("feature_extractor", {"0": 4}, ["colmap feature_extractor failed", "it says why"]),
-        ("", {}, ["found no cameras", "colmap.log"]),
-        ("", {"0": 1}, ["registered 1 of 4 images"]),
+        (noise(1), ["has 1 frames"]),
+        ([np.zeros((48, 64, 3), np.uint8)] * 8, ["is black", "of 255 levels"]),
+        (noise(1) * 10, ["gives 1 images", "repeat"]),
+        (noise(12), ["of 4 images could be placed", "film slower"]),
     ],
+    ids=["one frame", "black", "still", "nothing in common"],
 )
-def test_failures_of_colmap(
-    failing: str,
-    models: dict[str, int],
-    words: list[str],
-    films: list[Path],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture,
+def test_films_of_no_use(
+    pictures: list[np.ndarray], words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
-    fake(tmp_path, monkeypatch, failing=failing, models=models)
-    assert prepare_command([str(films[0]), "--out", str(tmp_path / "out")]) == 2
-    last = capsys.readouterr().err.strip().splitlines()[-1]
+    path = write_film(tmp_path / "film.mkv", pictures, rate=30)
+    said = refused([str(path), "--out", str(tmp_path / "out")], capsys)
     for word in words:
-        assert word in last
+        assert word in said
+    assert [child.name for child in tmp_path.iterdir()] == ["film.mkv"]
 
 
-@needs_ffmpeg
-def test_a_film_that_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
-    fake(tmp_path, monkeypatch, models={})
+def test_what_is_no_film(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     (tmp_path / "film.mp4").write_text("hello")
-    assert prepare_command([str(tmp_path / "film.mp4"), "--out", str(tmp_path / "out")]) == 2
-    assert "film.mp4: ffmpeg failed" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("missing", ["ffmpeg", "colmap"])
-def test_programs_that_are_missing(
-    missing: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
-    (tmp_path / "film.mp4").write_text("hello")
-    programs = tmp_path / "programs"
-    programs.mkdir()
-    for name in {"ffmpeg", "colmap"} - {missing}:
-        (programs / name).write_text("#!/bin/sh\n")
-        (programs / name).chmod(0o755)
-    monkeypatch.setenv("PATH", str(programs))
-    assert prepare_command([str(tmp_path / "film.mp4"), "--out", str(tmp_path / "out")]) == 2
-    assert f"the program {missing} is not installed" in capsys.readouterr().err
+    out = ["--out", str(tmp_path / "out")]
+    assert "film.mp4 is not a readable film" in refused([str(tmp_path / "film.mp4"), *out], capsys)
+    assert "is a folder; name the film" in refused([str(tmp_path), *out], capsys)
+    assert "none.mp4 does not exist" in refused([str(tmp_path / "none.mp4"), *out], capsys)
     assert not (tmp_path / "out").exists()
 
 
+def test_cameras_of_different_sizes(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    films = [write_film(tmp_path / f"{w}.mkv", noise(4, w, 48)) for w in (64, 80)]
+    assert "80x48 pixels and" in refused([*map(str, films), "--out", str(tmp_path / "out")], capsys)
+
+
+def test_options_out_of_range(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    film = str(write_film(tmp_path / "film.mkv", noise(3)))
+    out = ["--out", str(tmp_path / "out")]
+    assert "--fps must be above 0" in refused([film, *out, "--fps", "0"], capsys)
+    assert "--size must be 64 to 8192" in refused([film, *out, "--size", "10"], capsys)
+
+
 def test_nothing_is_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    (tmp_path / "film.mp4").write_text("hello")
-    assert prepare_command([str(tmp_path / "film.mp4"), "--out", str(tmp_path)]) == 2
-    assert "not an empty folder" in capsys.readouterr().err
-    assert prepare_command([str(tmp_path / "none.mp4"), "--out", str(tmp_path / "out")]) == 2
-    assert "none.mp4 does not exist" in capsys.readouterr().err
+    film = write_film(tmp_path / "film.mkv", noise(3))
+    assert "not an empty folder" in refused([str(film), "--out", str(tmp_path)], capsys)
+    assert film.is_file()
+
+
+def test_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+    from PIL import Image
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device", "image.jpg")
+
+    film = write_film(tmp_path / "film.mkv", noise(3))
+    monkeypatch.setattr(Image.Image, "save", full)
+    assert "No space left on device" in refused([str(film), "--out", str(tmp_path / "out")], capsys)
+    assert [child.name for child in tmp_path.iterdir()] == ["film.mkv"]
+
+
+@pytest.mark.parametrize("missing", ["av", "pycolmap"])
+def test_without_the_extra(
+    missing: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    film = write_film(tmp_path / "film.mkv", noise(3))
+    monkeypatch.setitem(sys.modules, missing, None)
+    assert "pip install 'lapgs-wgpu[prepare]'" in refused([str(film), "--out", str(tmp_path / "out")], capsys)
+
+
+def test_no_other_program_is_needed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", "")
+    assert shutil.which("ffmpeg") is None
+    film = write_film(tmp_path / "film.mkv", noise(8))
+    with pytest.raises(InputError, match="could be placed"):
+        prepare([film], tmp_path / "out")

@@ -33,7 +33,7 @@ class Video:
     def __init__(self, path: Path) -> None:
         """Read the header; count the packets if it does not state the number of frames. Raises InputError, also if PyAV
         is missing."""
-        av = _pyav(path)
+        av = import_av(path)
         self.path = path
         try:
             with av.open(str(path), metadata_errors="replace") as file:
@@ -79,7 +79,7 @@ class Video:
 
     def _unpack(self, folder: Path, size: Size) -> None:
         """Write every frame as PNG into a new folder, atomically."""
-        av = _pyav(self.path)
+        av = import_av(self.path)
         print(f"{self.path}: {self.frames} frames are unpacked once, into {folder}", file=sys.stderr, flush=True)
         unfinished = None
         try:
@@ -152,12 +152,13 @@ def _write(image: Pixels, size: Size, path: Path) -> None:
     path.write_bytes(encode_png(image, level=COMPRESSION))
 
 
-def _pyav(path: Path) -> Any:
+def import_av(path: Path) -> Any:
+    """The module PyAV. Raises InputError, which names the film, where it is not installed."""
     try:
         import av
     except ImportError:
         raise InputError(
-            f"{path} needs PyAV to be decoded: pip install 'lapgs-wgpu[video]', or extract its frames into "
+            f"{path} needs PyAV to be decoded: pip install 'lapgs-wgpu[prepare]', or extract its frames into "
             f"{path.with_suffix('')}/images/*.png."
         ) from None
     return av

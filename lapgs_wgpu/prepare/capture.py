@@ -1,0 +1,134 @@
+"""The whole way from films to a capture: frames, poses, masks of what moves, diagnosis."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from lapgs_wgpu.data.readers.colmap import IMAGES, SPARSE
+from lapgs_wgpu.data.timestamps import write_times
+from lapgs_wgpu.errors import InputError
+
+from .extract import LONGER_SIDE, Extraction, aligned, extract, images_per_second, shortened
+from .film import Film
+from .reconstruct import Reconstruction, all_pairs, import_pycolmap, merged, neighbouring_pairs
+
+MOMENTS = 8  # at which still cameras are compared
+LENS, FEW_CAMERAS_LENS = "OPENCV", "SIMPLE_RADIAL"  # few images do not determine more parameters
+FEWEST = 0.5  # of the images need a pose
+ADVICE = "film slower, with more texture and overlap, and walk around what moves instead of turning on the spot"
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A finished capture. images: their number. placed: cameras with a pose, of `cameras`. preset: that fits it."""
+
+    folder: Path
+    images: int
+    placed: int
+    cameras: int
+    preset: str
+
+
+def prepare(videos: Sequence[Path], out: Path, *, fps: float | None = None, longer_side: int = LONGER_SIDE) -> Prepared:
+    """Make a capture of one film of a moving camera, or of the films of several cameras that stand still.
+
+    out: a new or empty folder for images/, times.json and sparse/0; it appears when all of it is there.
+    fps: images a second, at most; None lets the length of the films decide. longer_side: of the images, pixels.
+    Raises InputError.
+    """
+    if fps is not None and not 0 < fps <= 1000:
+        raise InputError(f"--fps must be above 0 and at most 1000, got {fps:g}.")
+    if not 64 <= longer_side <= 8192:
+        raise InputError(f"--size must be 64 to 8192 pixels, got {longer_side}.")
+    import_pycolmap()
+    films = [Film(video) for video in videos]
+    with _appearing(out) as folder:
+        extractions = extract_all(films, folder / IMAGES, fps, longer_side)
+        pictures = [picture for each in extractions for picture in each.pictures]
+        write_times(folder, {picture.name: picture.seconds for picture in pictures})
+        still = len(films) > 1
+        model = _still_cameras(folder, extractions) if still else _moving_camera(folder, extractions[0])
+        wanted = len(films) if still else len(pictures)
+        placed = 0 if model is None else model.num_reg_images()
+        if placed < max(2, FEWEST * wanted):
+            raise InputError(
+                f"{placed} of {wanted} {'cameras' if still else 'images'} could be placed (at least half are needed): "
+                f"{ADVICE}."
+            )
+        (folder / SPARSE / "0").mkdir(parents=True)
+        model.write_binary(str(folder / SPARSE / "0"))
+    return Prepared(out, len(pictures), placed, wanted, "neu3d-tiny" if still else "hypernerf-tiny")
+
+
+def extract_all(films: Sequence[Film], images: Path, fps: float | None, longer_side: int) -> list[Extraction]:
+    """The images of all films. Says how many, and why. Several films end with the shortest."""
+    still = len(films) > 1
+    extractions = []
+    for index, film in enumerate(films):
+        prefix = f"cam{index:02d}/" if still else ""
+        rate = images_per_second(film, fps, still=still)
+        extractions.append(extract(film, images, prefix, rate, longer_side, still=still))
+        say(f"{film.path}: {extractions[-1]}")
+        for note in film.notes:
+            say(note)
+        if film.size != films[0].size:
+            raise InputError(
+                f"{film.path} is {film.size[0]}x{film.size[1]} pixels and {films[0].path} is "
+                f"{films[0].size[0]}x{films[0].size[1]}; film with one size."
+            )
+    if still:
+        end = aligned(extractions)
+        longest = max(each.pictures[-1].seconds for each in extractions)
+        if longest > end + 1 / extractions[0].fps:
+            say(f"the films are {end:.2f} to {longest:.2f} s long; all are cut to {end:.2f} s.")
+        extractions = [shortened(each, images, end) for each in extractions]
+    return extractions
+
+
+def _moving_camera(folder: Path, extraction: Extraction) -> Any:
+    names = [picture.name for picture in extraction.pictures]
+    reconstruction = Reconstruction(folder / IMAGES, names, folder / "colmap", LENS)
+    reconstruction.find_features()
+    reconstruction.match(neighbouring_pairs(names))
+    return reconstruction.solve()
+
+
+def _still_cameras(folder: Path, extractions: Sequence[Extraction]) -> Any:
+    """Compare all cameras at several moments."""
+    count = min(len(each.pictures) for each in extractions)
+    moments = sorted({round(i * (count - 1) / (MOMENTS - 1)) for i in range(MOMENTS)})
+    groups = [[each.pictures[moment].name for moment in moments] for each in extractions]
+    work = folder / "colmap"
+    source = Reconstruction(folder / IMAGES, [name for group in groups for name in group], work, FEW_CAMERAS_LENS)
+    source.find_features()
+    source.match([pair for moment in zip(*groups, strict=True) for pair in all_pairs(moment)])
+    return merged(source, groups, work / "merged").solve()
+
+
+@contextmanager
+def _appearing(out: Path) -> Iterator[Path]:
+    """A folder to write to, which becomes `out` if the block ends without an exception, and is removed otherwise."""
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"{out} is not an empty folder; name a new one with --out.")
+    partial = out.parent / f".{out.name}.unfinished"
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    try:
+        yield partial
+        shutil.rmtree(partial / "colmap", ignore_errors=True)
+        if out.exists():
+            out.rmdir()
+        partial.rename(out)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def say(text: str) -> None:
+    """Tell the user what was found or decided."""
+    print(text, file=sys.stderr, flush=True)

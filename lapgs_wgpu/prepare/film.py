@@ -1,0 +1,147 @@
+"""Films as phones and cameras record them: upright frames in 8-bit RGB, each with its own time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lapgs_wgpu.data.images import Pixels, Size, shrunk_size, size_text
+from lapgs_wgpu.data.video_frames import EXACT_COLORS, LARGEST_FRAME, import_av
+from lapgs_wgpu.errors import InputError
+
+from .hdr import Transfer, to_sdr, transfer_of
+
+THUMBNAIL = 320  # longer side, pixels: what is blurred or equal at this size is so for a training, too
+_FAST_BILINEAR = 0x1  # of swscale: exact enough for a thumbnail
+_ATTACHED_PICTURE = 0x400  # libavformat's flag of a cover image
+
+
+@dataclass(frozen=True, eq=False)
+class FilmFrame:
+    """A decoded frame. number: from 0. seconds: since the film's first frame. gray: (h, w) float32, levels 0 to 255,
+    upright, longer side THUMBNAIL at most."""
+
+    number: int
+    seconds: float
+    gray: NDArray[np.float32]
+    _frame: Any
+    _turns: int
+    _transfer: Transfer | None
+
+    def pixels(self, longer_side: int) -> Pixels:
+        """(H, W, 3) RGB, upright, shrunk to at most `longer_side` pixels."""
+        width, height = shrunk_size((self._frame.width, self._frame.height), longer_side)
+        if self._transfer is None:
+            image = self._frame.to_ndarray(format="rgb24", width=width, height=height, interpolation=EXACT_COLORS)
+        else:
+            deep = self._frame.to_ndarray(format="rgb48le", width=width, height=height, interpolation=EXACT_COLORS)
+            image = to_sdr(deep, self._transfer)
+        return np.ascontiguousarray(np.rot90(image, self._turns))
+
+
+class Film:
+    """A film whose header was checked.
+
+    size: (width, height) of the upright frames, pixels. seconds: length as the header states it, 0 if it does not.
+    notes: what the user should know of the file, one sentence each; `frames` adds to them while it decodes.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Read the header. Raises InputError."""
+        self.path = path
+        self.notes: list[str] = []
+        if path.is_dir():
+            raise InputError(f"{path} is a folder; name the film itself, or the films of all cameras one by one.")
+        if not path.is_file():
+            raise InputError(f"{path} does not exist; name the films of the capture.")
+        av = import_av(path)
+        try:
+            with av.open(str(path), metadata_errors="replace") as file:
+                stream = self._stream(file)
+                if stream.codec_context is None:
+                    raise InputError(f"{path} is in a format that PyAV cannot decode; convert it to H.264.")
+                coded = (int(stream.width), int(stream.height))
+                self.seconds = _seconds(stream, file)
+        except (av.error.FFmpegError, OSError) as error:
+            raise InputError(f"{path} is not a readable film ({error}); copy or record it again.") from None
+        if min(coded) < 1 or coded[0] * coded[1] > LARGEST_FRAME:
+            raise InputError(
+                f"{path} states frames of {size_text(coded)} pixels; 1 to {LARGEST_FRAME:,} pixels a frame are allowed."
+            )
+        self.size: Size = coded  # turned by `frames` where the first frame says so
+
+    def frames(self) -> Iterator[FilmFrame]:
+        """Decode the frames in the order of their times. Raises InputError; a film that is damaged after its first
+        frames ends there, with a note."""
+        av = import_av(self.path)
+        number, first, last, guessed, rate = 0, 0.0, -1.0, False, 30.0
+        try:
+            with av.open(str(self.path), metadata_errors="replace") as file:
+                stream = self._stream(file)
+                stream.thread_type = "AUTO"
+                stream.codec_context.options = {"max_pixels": str(LARGEST_FRAME)}  # whatever the header states
+                rate = float(stream.average_rate or stream.guessed_rate or rate)
+                for frame in file.decode(stream):
+                    turns = round(frame.rotation / 90) % 4
+                    size = (frame.height, frame.width) if turns % 2 else (frame.width, frame.height)
+                    if number == 0:
+                        self.size, first = size, frame.time or 0.0
+                    elif size != self.size:
+                        raise InputError(
+                            f"{self.path}: frame {number} has {size_text(size)} pixels and the first has "
+                            f"{size_text(self.size)}; cut the film where its size changes."
+                        )
+                    seconds = -1.0 if frame.time is None else frame.time - first
+                    if number and seconds <= last:  # no time stamp, or one that was there before
+                        guessed, seconds = True, last + 1 / rate
+                    seconds = max(seconds, 0.0)
+                    yield FilmFrame(number, seconds, _gray(frame, turns), frame, turns, transfer_of(frame))
+                    number, last = number + 1, seconds
+        except (av.error.FFmpegError, OSError) as error:
+            if number < 2:
+                raise InputError(f"{self.path} cannot be decoded ({error}); copy or record it again.") from None
+            self.notes.append(
+                f"{self.path} is damaged after {number} frames, at {last:.2f} s ({error}); what comes before is used."
+            )
+        if number < 2:
+            raise InputError(f"{self.path} has {number} frames; a film of something that moves is needed.")
+        if self.seconds > last + max(3 / rate, 0.1 * self.seconds):
+            self.notes.append(
+                f"{self.path} states {self.seconds:.1f} s and ends after {last:.1f} s; copy it again if the rest is "
+                "needed."
+            )
+        if guessed:
+            self.notes.append(
+                f"{self.path}: frames without a time stamp of their own are taken as {rate:g} a second; the motion is "
+                "too fast or too slow if that is wrong."
+            )
+
+    def _stream(self, file: Any) -> Any:
+        """The film among the streams: the largest one that is no cover picture."""
+        streams = [s for s in file.streams.video if not int(s.disposition) & _ATTACHED_PICTURE]
+        if not streams:
+            raise InputError(f"{self.path} has no video stream; give the camera's recording.")
+        best = max(streams, key=lambda s: (s.width or 0) * (s.height or 0))
+        if len(streams) > 1 and not self.notes:
+            self.notes.append(
+                f"{self.path} has {len(streams)} video streams; number {streams.index(best) + 1} of them, of "
+                f"{best.width}x{best.height} pixels, is used."
+            )
+        return best
+
+
+def _seconds(stream: Any, file: Any) -> float:
+    if stream.duration is not None and stream.time_base is not None:
+        return float(stream.duration * stream.time_base)
+    return file.duration / 1e6 if file.duration is not None else 0.0  # of the container: microseconds
+
+
+def _gray(frame: Any, turns: int) -> NDArray[np.float32]:
+    width, height = shrunk_size((frame.width, frame.height), THUMBNAIL)
+    small = frame.to_ndarray(format="gray", width=width, height=height, interpolation=_FAST_BILINEAR)
+    return np.rot90(small, turns).astype(np.float32)
