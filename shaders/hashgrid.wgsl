@@ -31,13 +31,13 @@ fn main(
 ) {
     let number = workgroup_number(group, groups);
     let blocks = (grid.points + LANES * LANE_POINTS - 1u) / (LANES * LANE_POINTS);
-    if (number >= blocks * grid.levels) {
+    if (number >= blocks * arrayLength(&levels)) {
         return;
     }
 #ifdef SLICED
     // All slices fit into a cache: level after level of the same points, whose rows of the encoding then stay there, too.
-    let level = levels[number % grid.levels];
-    let block = number / grid.levels;
+    let level = levels[number % arrayLength(&levels)];
+    let block = number / arrayLength(&levels);
     let first = level.first_sliced;
 #else
     let level = levels[number / blocks];

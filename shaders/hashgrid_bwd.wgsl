@@ -28,9 +28,9 @@ fn main(
     @builtin(num_workgroups) groups: vec3<u32>,
     @builtin(local_invocation_index) lane: u32,
 ) {
-    let share = (grid.levels + groups.x - 1u) / groups.x;   // of a workgroup, at most 8
+    let share = (arrayLength(&levels) + groups.x - 1u) / groups.x;   // of a workgroup, at most 8
     let number = group.x * share + lane;
-    if (lane >= share || number >= grid.levels) {
+    if (lane >= share || number >= arrayLength(&levels)) {
         return;
     }
     let level = levels[number];
@@ -70,7 +70,7 @@ fn main(
     let number = workgroup_number(group, groups);
     let blocks = (grid.points + 63u) / 64u;
     let i = number % blocks * 64u + lane;
-    if (number >= blocks * grid.levels || i >= grid.points) {
+    if (number >= blocks * arrayLength(&levels) || i >= grid.points) {
         return;
     }
     let level = levels[number / blocks];

@@ -15,7 +15,6 @@ struct Level {
 struct Grid {
     points: u32,             // of a dispatch
     all_points: u32,         // of all dispatches that add to the same sums
-    levels: u32,             // in `levels`
     all_levels: u32,         // in a row of the encoding, which has two features for each
     time: f32,               // in [0, 1]
     bound: f32,              // half side of the box that the grid covers

@@ -41,26 +41,22 @@ export class HashEncoder {
         return { name, grid, cells, count: records.length, array: this.pool.upload(`levels ${name}`, words) };
     }
 
-    uniform(place, kernel, { name, count }, points, all, time) {
-        return this.pool.uniform(`${name} place ${place}`, this.gpu.kernel(kernel), "grid", {
-            points, all_points: all, levels: count, all_levels: this.row / 2, time, bound: this.bound,
-        });
-    }
-
     // Encode the n points that `rows` names. number: of the block, among those that are submitted together.
     record(commands, number, { points, rows, encoding, tables, n, time }) {
+        const grid = this.pool.uniform(`grid ${number} from 0`, this.gpu.kernel("hashgrid_slice"), "grid", {
+            points: n, all_points: n, all_levels: this.row / 2, time, bound: this.bound,
+        });
         const slices = this.pool.array("slices", 8 * this.sliceEntries);
         for (const cut of this.cuts) {
             commands.dispatchGrid("hashgrid_slice", Math.ceil(cut.cells / 64), cut.count, {
-                grid: this.uniform(`${number}`, "hashgrid_slice", cut, n, n, time),
-                levels: cut.array, features: tables[cut.grid], slices,
+                grid, levels: cut.array, features: tables[cut.grid], slices,
             });
         }
         for (const levels of this.lookups) {
             const key = levels.grid === null ? "hashgrid SLICED ROWS" : "hashgrid ROWS";
+            const features = levels.grid === null ? slices : tables[levels.grid];
             commands.dispatch(key, Math.ceil(n / 512) * levels.count, {
-                grid: this.uniform(`${number} from 0`, key, levels, n, n, time),
-                levels: levels.array, features: levels.grid === null ? slices : tables[levels.grid], points, encoding, rows,
+                grid, levels: levels.array, features, points, encoding, rows,
             });
         }
     }

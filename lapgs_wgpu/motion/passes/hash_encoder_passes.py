@@ -17,7 +17,7 @@ from ...gpu.array import DeviceArray
 from ...gpu.device import SOFTWARE_LOOP_TURNS, Device
 from ...gpu.kernel import Commands, Kernel
 from ...gpu.pool import BufferPool
-from ..fields.hash_grid_config import GridShape
+from ..fields.hash_grid_config import TIME, GridShape
 
 _ALIGNED = 64  # rows; a multiple of 256 bytes for every row size, at which a binding may begin
 _LEVEL_WORDS = 16  # common/hashgrid.wgsl: struct Level
@@ -77,6 +77,7 @@ class HashEncoderPasses:
         turns = SOFTWARE_LOOP_TURNS if self.lane_levels else None
         self._most_points = None if turns is None else (turns + 1) // 2
         self._row = sum(grid.features for grid in grids) if row is None else row
+        self._timed = any(grid.axes[2] == TIME for grid in grids)
         self._cuts: dict[int, _Levels] = {}  # by grid: the levels that are sliced
         self._direct: dict[int, _Levels] = {}  # by grid: the others
         self._slices: _Levels | None = None  # those that are sliced, of all grids
@@ -104,25 +105,30 @@ class HashEncoderPasses:
         direct = [(levels, tables[number]) for number, levels in self._direct.items()]
         return direct if self._slices is None else [(self._slices, slices), *direct]
 
-    def _uniform(self, place: str, levels: int, points: int, all_points: int, time: float) -> DeviceArray:
-        """The uniform of a block of points. All blocks of all sets are submitted together, so each has its own."""
+    def _uniform(self, points: PointSet, first: int, count: int, most: int) -> DeviceArray:
+        """The uniform of a block of points, of at most so many (0: of all). All blocks of all sets are submitted
+        together, so each has its own."""
         content = Kernel.get(self.device, "hashgrid_slice", SLICED=1, CORNERS=4).uniform(
             "Grid",
-            points=points,
-            all_points=all_points,
-            levels=levels,
+            points=count,
+            all_points=points.count,
             all_levels=self._row // 2,
-            time=time,
+            time=points.time if self._timed else 0.0,
             bound=self.bound,
         )
-        return self.pool.constant(f"grid {place}", content)
+        return self.pool.constant(f"grid {points.number} from {first} by {most}", content)
 
-    def _blocks(self, n: int, encoding: DeviceArray, most: int | None = None) -> Iterator[tuple[int, int]]:
-        """First point and number of points of each dispatch: at most `most`, with rows that fit into a binding."""
+    def _blocks(
+        self, points: PointSet, encoding: DeviceArray, most: int | None = None
+    ) -> Iterator[tuple[int, int, DeviceArray]]:
+        """First point, number of points and uniform of each dispatch: at most `most` points, with rows that fit into a
+        binding."""
+        n = points.count
         row = encoding.nbytes // max(n, 1)
         size = self.device.max_binding // max(row, 1) // _ALIGNED * _ALIGNED
         size = size if most is None else min(size, most)
-        return ((first, min(size, n - first)) for first in range(0, n, size))
+        counts = ((first, min(size, n - first)) for first in range(0, n, size))
+        return ((first, count, self._uniform(points, first, count, size)) for first, count in counts)
 
     def encode(
         self,
@@ -139,36 +145,34 @@ class HashEncoderPasses:
         uint32, the first `points.count` select the points; the encoding, which must then fit into a binding, keeps its
         other rows.
         """
-        number, n = points.number, points.count
-        slices = self.pool.array("slices", (self._slice_entries, 2))
-        for grid, cut in self._cuts.items():
-            arrays = {"levels": cut.array, "features": tables[grid], "slices": slices}
-            arrays["grid"] = self._uniform(f"{cut.name} {number}", cut.count, n, n, points.time)
-            kernel = Kernel.get(self.device, "hashgrid_slice", **cut.defines)
-            commands.dispatch_grid(kernel, (-(-cut.cells // 64), cut.count), **arrays)
         options = _precision(encoding)
         if rows is None:
             blocks = [
-                (first, count, {"points": points.array.rows(first, count), "encoding": encoding.rows(first, count)})
-                for first, count in self._blocks(n, encoding)
+                (
+                    count,
+                    {"grid": grid, "points": points.array.rows(first, count), "encoding": encoding.rows(first, count)},
+                )
+                for first, count, grid in self._blocks(points, encoding)
             ]
         else:
             options |= {"ROWS": 1}
-            blocks = [(0, n, {"points": points.array, "encoding": encoding, "rows": rows})]
-        for first, count, of_points in blocks:
+            grid = self._uniform(points, 0, points.count, 0)
+            blocks = [(points.count, {"grid": grid, "points": points.array, "encoding": encoding, "rows": rows})]
+        slices = self.pool.array("slices", (self._slice_entries, 2))
+        for number, cut in self._cuts.items():
+            kernel = Kernel.get(self.device, "hashgrid_slice", **cut.defines)
+            arrays = {"levels": cut.array, "features": tables[number], "slices": slices, "grid": blocks[0][1]["grid"]}
+            commands.dispatch_grid(kernel, (-(-cut.cells // 64), cut.count), **arrays)
+        for count, of_block in blocks:
             for levels, features in self._lookups(slices, tables):
                 kernel = Kernel.get(self.device, "hashgrid", **levels.defines, **options)
-                arrays = {"levels": levels.array, "features": features, **of_points}
-                arrays["grid"] = self._uniform(
-                    f"{levels.name} {number} from {first}", levels.count, count, n, points.time
-                )
-                commands.dispatch(kernel, -(-count // 512) * levels.count, **arrays)
+                groups = -(-count // 512) * levels.count
+                commands.dispatch(kernel, groups, levels=levels.array, features=features, **of_block)
 
     def add_gradient(
         self, commands: Commands, points: PointSet, d_encoding: DeviceArray, d_tables: list[DeviceArray]
     ) -> None:
         """Add the gradient of the tables, from that of the encoding, whose rows must hold nothing else."""
-        number, n = points.number, points.count
         d_slices = self.pool.array("d_slices", (self._slice_entries, 2))
         commands.clear(d_slices)
         sums = floats = self._lookups(d_slices, d_tables)
@@ -183,39 +187,32 @@ class HashEncoderPasses:
         options = _precision(d_encoding)
         largest = {} if self.lane_levels else {"largest": self._largest(commands, points, d_encoding, options)}
         options |= {"LANE_LEVELS": 1} if self.lane_levels else {}
-        for first, count in self._blocks(n, d_encoding, self._most_points):
+        for first, count, grid in self._blocks(points, d_encoding, self._most_points):
+            arrays = {"points": points.array.rows(first, count), "d_encoding": d_encoding.rows(first, count)}
+            arrays |= {"grid": grid, **largest}
             for levels, target in sums:
                 kernel = Kernel.get(self.device, "hashgrid_bwd", **levels.defines, **options)
                 groups = _shared(levels.count) if self.lane_levels else -(-count // 64) * levels.count
-                arrays = {"points": points.array.rows(first, count), "d_encoding": d_encoding.rows(first, count)}
-                arrays |= {"levels": levels.array, "d_features": target, "d_fixed": target, **largest}
-                arrays["grid"] = self._uniform(
-                    f"{levels.name} {number} from {first}", levels.count, count, n, points.time
-                )
-                commands.run(kernel, groups, arrays)
+                commands.run(kernel, groups, arrays | {"levels": levels.array, "d_features": target, "d_fixed": target})
 
         if not self.lane_levels:
             for (levels, target), (_, fixed) in zip(floats, sums, strict=True):
-                arrays = {"d_fixed": fixed, "d_features": target, **largest}
-                arrays["grid"] = self._uniform(f"{levels.name} {number}", levels.count, n, n, points.time)
                 unfix = Kernel.get(self.device, "hashgrid_unfix", **levels.defines)
-                commands.dispatch(unfix, -(-target.size // 64), **arrays)
-        for grid, cut in self._cuts.items():
-            arrays = {"levels": cut.array, "d_slices": d_slices, "d_features": d_tables[grid]}
-            arrays["grid"] = self._uniform(f"{cut.name} {number}", cut.count, n, n, points.time)
+                groups = -(-target.size // 64)
+                commands.dispatch(unfix, groups, grid=grid, d_fixed=fixed, d_features=target, **largest)
+        for number, cut in self._cuts.items():
             kernel = Kernel.get(self.device, "hashgrid_slice_bwd", **cut.defines)
+            arrays = {"levels": cut.array, "d_slices": d_slices, "d_features": d_tables[number], "grid": grid}
             commands.dispatch_grid(kernel, (-(-cut.cells // 64), cut.count), **arrays)
 
     def _largest(
         self, commands: Commands, points: PointSet, d_encoding: DeviceArray, options: dict[str, int]
     ) -> DeviceArray:
         """The largest absolute value of a gradient, which scales fixed-point sums."""
-        number, n = points.number, points.count
-        largest = self.pool.array(f"largest {number}", (1,), "uint32")
+        largest = self.pool.array(f"largest {points.number}", (1,), "uint32")
         commands.clear(largest)
         kernel = Kernel.get(self.device, "hashgrid_largest", CORNERS=4, **options)
-        for first, count in self._blocks(n, d_encoding):
-            grid = self._uniform(f"largest {number} from {first}", 0, count, n, points.time)
+        for first, count, grid in self._blocks(points, d_encoding):
             gradient = d_encoding.rows(first, count)
             commands.dispatch(kernel, -(-count * self._row // 4096), grid=grid, d_encoding=gradient, largest=largest)
         return largest
