@@ -34,11 +34,19 @@ def _prepare(arguments: list[str]) -> None:
         "ones, less where a film would give more than 300 images]")
     add("--size", type=int, default=1920, metavar="PIXELS", help="longer side of the images; larger frames are shrunk "
         "[1920]")
+    add("--masks", metavar="DIR", help="PNG images of one moving camera, white where something moves, named as the "
+        "images of an earlier run: used instead of the masks that are found in the film")
     # fmt: on
     given = parser.parse_args(arguments)
     from lapgs_wgpu.prepare.capture import prepare  # after --help: numpy and Pillow take a moment
 
-    done = prepare([Path(film) for film in given.films], Path(given.out), fps=given.fps, longer_side=given.size)
+    done = prepare(
+        [Path(film) for film in given.films],
+        Path(given.out),
+        fps=given.fps,
+        longer_side=given.size,
+        masks=Path(given.masks) if given.masks else None,
+    )
     print(
         f"{done.folder}: {done.images} images, {done.placed} of {done.cameras} cameras placed; "
         f"lapgs-train {done.preset} --data {done.folder}"

@@ -10,16 +10,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from lapgs_wgpu.data.images import check_image
 from lapgs_wgpu.data.readers.colmap import IMAGES, SPARSE
 from lapgs_wgpu.data.timestamps import write_times
 from lapgs_wgpu.errors import InputError
 
 from .extract import LONGER_SIDE, Extraction, aligned, extract, images_per_second, shortened
 from .film import Film
+from .masks import MASKS, read_masks, write_masks
+from .moving import World, area, remove_matches, solve_world
 from .reconstruct import Reconstruction, all_pairs, import_pycolmap, merged, neighbouring_pairs
 
 MOMENTS = 8  # at which still cameras are compared
-LENS, FEW_CAMERAS_LENS = "OPENCV", "SIMPLE_RADIAL"  # few images do not determine more parameters
+# Square pixels: a lens with more freedom bends until things that move seem to stand still.
+LENS, FEW_CAMERAS_LENS = "RADIAL", "SIMPLE_RADIAL"  # few images do not determine more parameters
 FEWEST = 0.5  # of the images need a pose
 ADVICE = "film slower, with more texture and overlap, and walk around what moves instead of turning on the spot"
 
@@ -35,17 +39,27 @@ class Prepared:
     preset: str
 
 
-def prepare(videos: Sequence[Path], out: Path, *, fps: float | None = None, longer_side: int = LONGER_SIDE) -> Prepared:
+def prepare(
+    videos: Sequence[Path],
+    out: Path,
+    *,
+    fps: float | None = None,
+    longer_side: int = LONGER_SIDE,
+    masks: Path | None = None,
+) -> Prepared:
     """Make a capture of one film of a moving camera, or of the films of several cameras that stand still.
 
-    out: a new or empty folder for images/, times.json and sparse/0; it appears when all of it is there.
+    out: a new or empty folder for images/, times.json, sparse/0 and masks/; it appears when all of it is there.
     fps: images a second, at most; None lets the length of the films decide. longer_side: of the images, pixels.
+    masks: folder with a mask of what moves for each image of a moving camera; None to find them in the film.
     Raises InputError.
     """
     if fps is not None and not 0 < fps <= 1000:
         raise InputError(f"--fps must be above 0 and at most 1000, got {fps:g}.")
     if not 64 <= longer_side <= 8192:
         raise InputError(f"--size must be 64 to 8192 pixels, got {longer_side}.")
+    if masks is not None and len(videos) > 1:
+        raise InputError("--masks goes with one moving camera; cameras that stand still need no masks.")
     import_pycolmap()
     films = [Film(video) for video in videos]
     with _appearing(out) as folder:
@@ -53,7 +67,11 @@ def prepare(videos: Sequence[Path], out: Path, *, fps: float | None = None, long
         pictures = [picture for each in extractions for picture in each.pictures]
         write_times(folder, {picture.name: picture.seconds for picture in pictures})
         still = len(films) > 1
-        model = _still_cameras(folder, extractions) if still else _moving_camera(folder, extractions[0])
+        if still:
+            model = _still_cameras(folder, extractions)
+        else:
+            model, moving, _ = _moving_camera(folder, extractions[0], masks)
+            write_masks(folder / MASKS, moving)
         wanted = len(films) if still else len(pictures)
         placed = 0 if model is None else model.num_reg_images()
         if placed < max(2, FEWEST * wanted):
@@ -91,12 +109,21 @@ def extract_all(films: Sequence[Film], images: Path, fps: float | None, longer_s
     return extractions
 
 
-def _moving_camera(folder: Path, extraction: Extraction) -> Any:
+def _moving_camera(folder: Path, extraction: Extraction, masks: Path | None) -> World:
+    """masks: the user's; None to find them."""
     names = [picture.name for picture in extraction.pictures]
     reconstruction = Reconstruction(folder / IMAGES, names, folder / "colmap", LENS)
     reconstruction.find_features()
+    size = check_image(folder / IMAGES / names[0], whole=False).size
+    given = None if masks is None else read_masks(masks, names, size)
     reconstruction.match(neighbouring_pairs(names))
-    return reconstruction.solve()
+    if given is None:
+        return solve_world(reconstruction, size, say)
+    with reconstruction.database() as database:
+        share = remove_matches(database, given, size)
+    say(f"{masks}: {share:.0%} of the matches are masked.")
+    reconstruction.verify()
+    return World(reconstruction.solve(), given, area(given))
 
 
 def _still_cameras(folder: Path, extractions: Sequence[Extraction]) -> Any:

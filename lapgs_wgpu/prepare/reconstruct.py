@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -35,7 +36,7 @@ class Reconstruction:
         """Raises InputError where pycolmap is not installed."""
         self._colmap = import_pycolmap()
         self.images, self.names, self.model = images, list(names), model
-        self._work = work
+        self.work = work
         self._database = work / "database.db"
         work.mkdir(parents=True, exist_ok=True)
 
@@ -47,7 +48,7 @@ class Reconstruction:
         extraction = colmap.FeatureExtractionOptions()
         extraction.max_image_size = FEATURE_SIDE
         extraction.sift.max_num_features = MOST_FEATURES
-        with _logging_to(colmap, self._work), Progress(len(self.names), "images searched for features") as progress:
+        with _logging_to(colmap, self.work), Progress(len(self.names), "images searched for features") as progress:
             for names in _chunks(self.names, EXTRACTED_AT_ONCE):
                 colmap.extract_features(
                     self._database, self.images, names, colmap.CameraMode.SINGLE, options, extraction, colmap.Device.cpu
@@ -62,15 +63,15 @@ class Reconstruction:
         options.camera_model = self.model
         with self.database():  # makes the file
             pass
-        with _logging_to(colmap, self._work):
+        with _logging_to(colmap, self.work):
             colmap.import_images(self._database, self.images, colmap.CameraMode.SINGLE, self.names, options)
 
     def match(self, pairs: Sequence[Pair]) -> None:
         """Match the features of pairs of images, and keep what an epipolar geometry explains."""
-        colmap, listed = self._colmap, self._work / "pairs.txt"
+        colmap, listed = self._colmap, self.work / "pairs.txt"
         options = colmap.ImportedPairingOptions()
         options.match_list_path = listed
-        with _logging_to(colmap, self._work), Progress(len(pairs), "pairs of images matched") as progress:
+        with _logging_to(colmap, self.work), Progress(len(pairs), "pairs of images matched") as progress:
             for number, some in enumerate(_chunks(pairs, MATCHED_AT_ONCE)):
                 listed.write_text("".join(f"{a} {b}\n" for a, b in some), encoding="utf-8")
                 colmap.match_image_pairs(
@@ -89,9 +90,9 @@ class Reconstruction:
         options.min_model_size = FEWEST_IMAGES
         options.mapper.random_seed = options.triangulation.random_seed = SEED
         options.extract_colors = True
-        folder = self._work / "models"
+        folder = self.work / "models"
         folder.mkdir(exist_ok=True)
-        with _logging_to(colmap, self._work), Progress(len(self.names), "cameras placed") as progress:
+        with _logging_to(colmap, self.work), Progress(len(self.names), "cameras placed") as progress:
             placed = itertools.count(1)
             found = colmap.incremental_mapping(
                 self._database,
@@ -111,12 +112,18 @@ class Reconstruction:
         finally:
             database.close()
 
+    def copy(self, work: Path) -> Reconstruction:
+        """The same images, features and matches in a database of their own."""
+        result = Reconstruction(self.images, self.names, work, self.model)
+        shutil.copyfile(self._database, result._database)
+        return result
+
     def verify(self) -> None:
         """Find the epipolar geometries of all matches in the database anew."""
         colmap = self._colmap
         with self.database() as database:
             database.clear_two_view_geometries()
-        with _logging_to(colmap, self._work):
+        with _logging_to(colmap, self.work):
             colmap.geometric_verification(self._database, two_view_geometry_options=self._verification())
 
     def _verification(self) -> Any:

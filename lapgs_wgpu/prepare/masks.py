@@ -1,0 +1,52 @@
+"""Masks of what moves as images: written for the user to look at, and read where the user brings some."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lapgs_wgpu.data.images import Size, check_image, decode, encode_png, size_text
+from lapgs_wgpu.errors import InputError
+
+Mask = NDArray[np.bool_]
+MASKS = "masks"  # folder of a capture
+_WHITE = 128  # from this level on a pixel moves
+
+
+def write_masks(folder: Path, masks: Mapping[str, Mask]) -> None:
+    """Write PNG images below a folder, white where something moves, under the images' names."""
+    for name, mask in masks.items():
+        path = folder / PurePosixPath(name).with_suffix(".png")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(encode_png(mask.astype(np.uint8) * 255))
+
+
+def read_masks(folder: Path, names: Sequence[str], size: Size) -> dict[str, Mask]:
+    """Read the masks of images of (width, height), white where something moves, by the images' names.
+
+    Every image needs one: NAME.png or NAME.jpg.png (COLMAP's way) below the folder. Raises InputError.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder} is not a folder; --masks needs one with a PNG for each image.")
+    paths = {name: [folder / PurePosixPath(name).with_suffix(".png"), folder / f"{name}.png"] for name in names}
+    found = {name: next((path for path in both if path.is_file()), None) for name, both in paths.items()}
+    missing = [name for name, path in found.items() if path is None]
+    if missing:
+        raise InputError(
+            f"{folder} lacks {len(missing)} of {len(names)} masks, such as {paths[missing[0]][0].name}; name each mask "
+            "as its image in images/ of a first run without --masks, with the same --fps."
+        )
+    masks = {}
+    for name, path in found.items():
+        assert path is not None
+        stored = check_image(path, whole=False).size
+        if abs(stored[0] * size[1] / size[0] - stored[1]) > 1.5:
+            raise InputError(
+                f"{path} is {size_text(stored)} pixels, and the images are {size_text(size)}, which has other "
+                "proportions; make the masks from the images."
+            )
+        masks[name] = decode(path)[..., 0] >= _WHITE
+    return masks

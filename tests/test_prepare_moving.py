@@ -1,0 +1,141 @@
+"""Masks of what moves: cameras that follow the room though a board fills much of the film, and a user's own masks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.films import Board, drawn, pose_errors, walk, write_film
+from PIL import Image
+
+from lapgs_wgpu.data.images import encode_png
+from lapgs_wgpu.prepare.moving import Tracks, agreement, in_mask, rim, track_errors
+from lapgs_wgpu.prepare_cli import prepare_command
+
+pycolmap = pytest.importorskip("pycolmap")
+pytest.importorskip("av")
+
+COUNT, SIZE = 16, (240, 180)
+BOARD = Board(1.1, 0.35, 1.5)
+
+
+@pytest.fixture(scope="module")
+def film(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray]:
+    """A film in which a board wanders, and its true masks (COUNT, H, W)."""
+    taken = [drawn(camera, i / (COUNT - 1), BOARD) for i, camera in enumerate(walk(COUNT, *SIZE))]
+    masks = np.stack([mask for _, mask in taken])
+    assert 0.35 < masks.mean() < 0.5
+    path = tmp_path_factory.mktemp("film") / "film.mp4"
+    return write_film(path, [picture for picture, _ in taken], rate=10), masks
+
+
+def errors(out: Path) -> np.ndarray:
+    model = pycolmap.Reconstruction(str(out / "sparse/0"))
+    images = [model.image(i) for i in model.reg_image_ids()]
+    assert len(images) >= COUNT - 1
+    found = {str(int(image.name[:8]) // 100): np.array(image.projection_center()) for image in images}
+    return pose_errors(found, {str(i): camera.position for i, camera in enumerate(walk(COUNT, *SIZE))})
+
+
+def test_cameras_follow_what_stands_still(film: tuple[Path, np.ndarray], tmp_path: Path) -> None:
+    path, masks = film
+    out = tmp_path / "out"
+    assert prepare_command([str(path), "--out", str(out)]) == 0
+    assert errors(out).max() < 0.02
+    overlaps = []
+    for i, mask in enumerate(masks):
+        found = np.asarray(Image.open(out / f"masks/{100 * i:08d}.png").resize(SIZE, Image.Resampling.NEAREST)) > 0
+        overlaps.append((found & mask).sum() / (found | mask).sum())
+    assert np.median(overlaps) > 0.8
+    # What was found serves as a user's own masks.
+    again = tmp_path / "again"
+    assert prepare_command([str(path), "--out", str(again), "--masks", str(out / "masks")]) == 0
+    assert errors(again).max() < 0.02
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda folder: (folder / "00000300.png").unlink(), "lacks 1 of 16 masks, such as 00000300.png"),
+        (lambda folder: (folder / "00000300.png").write_bytes(encode_png(np.zeros((60, 60), np.uint8))), "is 60x60 "),
+        (lambda folder: (folder / "00000300.png").write_text("hello"), "is not a readable image"),
+    ],
+    ids=["one is missing", "another size", "no image"],
+)  # fmt: skip
+def test_masks_that_do_not_fit(
+    film: tuple[Path, np.ndarray], spoil, words: str, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    folder = tmp_path / "masks"
+    folder.mkdir()
+    for i, mask in enumerate(film[1]):
+        (folder / f"{100 * i:08d}.png").write_bytes(encode_png(mask.astype(np.uint8) * 255))
+    spoil(folder)
+    assert prepare_command([str(film[0]), "--out", str(tmp_path / "out"), "--masks", str(folder)]) == 2
+    assert words in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_masks_need_a_folder_and_one_camera(
+    film: tuple[Path, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    options = ["--out", str(tmp_path / "out"), "--masks", str(tmp_path / "none")]
+    assert prepare_command([str(film[0]), *options]) == 2
+    assert "none is not a folder" in capsys.readouterr().err
+    assert prepare_command([str(film[0]), str(film[0]), *options]) == 2
+    assert "--masks goes with one moving camera" in capsys.readouterr().err
+
+
+def synthetic(noise: float) -> tuple[Tracks, object]:
+    """Tracks of 30 still points and 20 that move up, in 6 images; and the true cameras as a reconstruction."""
+    rng = np.random.default_rng(0)
+    cameras = walk(6, 320, 240)
+    points = rng.uniform(-0.8, 0.8, (50, 3))
+    model = pycolmap.Reconstruction()
+    K = cameras[0].K
+    lens = pycolmap.Camera(
+        model="PINHOLE", width=320, height=240, params=[K[0, 0], K[1, 1], K[0, 2], K[1, 2]], camera_id=1
+    )
+    model.add_camera_with_trivial_rig(lens)
+    places = np.zeros((6, 50, 2))
+    for i, camera in enumerate(cameras):
+        pose = pycolmap.Rigid3d(camera.T_cam_world[:3])
+        model.add_image_with_trivial_frame(pycolmap.Image(name=f"{i}.png", camera_id=1, image_id=i + 1), pose)
+        moved = points + np.where(np.arange(50) < 30, 0, 0.06 * i)[:, None] * [0, 0, 1]
+        seen = moved @ camera.T_cam_world[:3, :3].T + camera.T_cam_world[:3, 3]
+        places[i] = seen[:, :2] / seen[:, 2:] * [K[0, 0], K[1, 1]] + [K[0, 2], K[1, 2]]
+    places += noise * rng.normal(size=places.shape)
+    names = tuple(f"{i}.png" for i in range(6))
+    return Tracks(names, np.tile(np.arange(6), 50), places.transpose(1, 0, 2).reshape(-1, 2), 6 * np.arange(50)), model
+
+
+def test_errors_of_tracks() -> None:
+    tracks, model = synthetic(0.0)
+    found = track_errors(tracks, model)
+    assert found[:30].max() < 1e-6
+    assert found[30:].min() > 1.0
+    noisy = track_errors(synthetic(0.3)[0], model)
+    assert noisy[:30].max() < 1.0
+
+
+def test_places_are_masked_by_the_features_around_them() -> None:
+    """Tracks of one image: on the left all still, on the right all moving, but for one in each half."""
+    rng = np.random.default_rng(1)
+    places = rng.uniform([0, 0], [320, 240], (400, 2))
+    right = places[:, 0] > 160
+    errors = np.where(right, 5.0, 0.2)
+    errors[np.flatnonzero(right)[0]], errors[np.flatnonzero(~right)[0]] = 0.2, 5.0
+    tracks = Tracks(("0.png",), np.zeros(400, np.int64), places, np.arange(400))
+    still, moving = (masks["0.png"] for masks in agreement(tracks, errors, (320, 240), 1.0))
+    assert not (still & moving).any()
+    assert still[:, 5:70].mean() > 0.9
+    assert moving[:, 90:155].mean() > 0.9
+    errors[:] = np.nan
+    assert not any(masks["0.png"].any() for masks in agreement(tracks, errors, (320, 240), 1.0))
+
+
+def test_places_in_masks_of_another_size() -> None:
+    mask = rim((320, 240))
+    assert mask.shape == (120, 160)
+    places = np.array([[160.0, 120.0], [5.0, 5.0], [319.9, 239.9]])
+    assert in_mask(mask, places, (320, 240)).tolist() == [True, False, False]
+    assert in_mask(None, places, (320, 240)).tolist() == [False] * 3
