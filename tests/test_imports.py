@@ -28,6 +28,8 @@ ALLOWED = {
     "viewer": {"errors", "command", "progress", "gpu", "splat", "motion", "data", "io"},
     "prepare": {"errors", "progress", "data"},
     "prepare_cli": {"errors", "command", "prepare"},
+    "doctor": {"errors", "gpu", "splat", "motion", "train"},
+    "doctor_cli": {"errors", "command", "doctor"},
     "train_options": {"errors", "command", "io", "train"},
     "cli": {"errors", "command", "gpu", "splat", "motion", "data", "io", "train", "train_options", "viewer"},
     "table_cli": {"errors", "command", "train"},
@@ -166,6 +168,7 @@ def test_readers_need_neither_torch_nor_a_device_nor_scipy(module: str) -> None:
         ("cli.train_command", SLOW),
         ("table_cli.table_command", SLOW),
         ("prepare_cli.prepare_command", SLOW),
+        ("doctor_cli.doctor_command", SLOW),
     ],
 )
 def test_help_loads_nothing_that_is_slow(command: str, slow: set[str]) -> None:

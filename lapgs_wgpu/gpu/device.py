@@ -43,6 +43,20 @@ class DeviceInfo:
     driver: str
 
 
+@dataclass(frozen=True)
+class AdapterDetails:
+    """An adapter that is not opened, and what it offers of what kernels use.
+
+    features: of the optional ones. limits: of the required and the larger ones, by WebGPU's names. too_small: offered
+    and needed value of each limit below what the kernels need; such an adapter cannot be opened.
+    """
+
+    info: DeviceInfo
+    features: tuple[str, ...]
+    limits: dict[str, int]
+    too_small: dict[str, tuple[int, int]]
+
+
 @functools.cache
 def _instance() -> Any:
     """wgpu's instance, without the validation that wgpu otherwise runs before each indirect dispatch."""
@@ -72,6 +86,17 @@ def _adapters() -> list[tuple[DeviceInfo, Any]]:
 def list_devices() -> list[DeviceInfo]:
     """The adapters of this machine; the default one comes first."""
     return [info for info, _ in _adapters()]
+
+
+def adapter_details() -> list[AdapterDetails]:
+    """As `list_devices`, with features and limits."""
+    found = []
+    for info, adapter in _adapters():
+        limits = {name: int(adapter.limits[name]) for name in dict.fromkeys((*_DEFAULT_LIMITS, *_RAISED_LIMITS))}
+        needed = {name: (limits[name], value) for name, value in _DEFAULT_LIMITS.items() if limits[name] < value}
+        features = tuple(name for name in _WANTED_FEATURES if name in adapter.features)
+        found.append(AdapterDetails(info, features, limits, needed))
+    return found
 
 
 class Device:
