@@ -68,7 +68,8 @@ class ScheduleConfig(Options):
     batch: int = option("images per step; their gradients are averaged", at_least=1)
     warm_up: int = option(
         "number of initial steps without motion: the deformation field is off, and only the static Gaussians "
-        "are trained; ignored if discovery.enabled, whose static model replaces them"
+        "are trained; if discovery.enabled, whose static model replaces them: number of initial steps over which the "
+        "learning rates rise linearly to their values"
     )
     sh_interval: int = option(
         "the degree of the spherical harmonics starts at 0 and increases by one every this many steps, up to 3",

@@ -47,10 +47,10 @@ class Optimizer:
         """Of those parameters that have one, by group."""
         return {name: [p.grad for p in group if p.grad is not None] for name, group in self.parameters().items()}
 
-    def step(self, step: int) -> None:
-        """Move every parameter that has a gradient, at the rates of this step (counted from 1)."""
+    def step(self, step: int, share: float = 1.0) -> None:
+        """Move every parameter that has a gradient, at a share of the rates of this step (counted from 1)."""
         for group in self._adam.param_groups:
-            group["lr"] = self.rates[group["name"]].at(step)
+            group["lr"] = share * self.rates[group["name"]].at(step)
         self._adam.step()
         # Fused Adam does not count what it writes, and a viewer knows by the count that it has to look again.
         for parameters in self.parameters().values():

@@ -78,7 +78,8 @@ class Trainer:
         self.ranks = ranks
         self.done = 0
         self._generator = torch.Generator().manual_seed(config.seed)
-        # What discovery found moves from the first step on.
+        # What discovery found moves from the first step on, at rates that rise: Adam's first steps, all of the size of
+        # the rate, would shake off what the field knows.
         self._warm_up = config.schedule.warm_up if scene is None else 0
         self.scene = scene or Scene4D.from_points(
             *initial_points(config.points, dataset, config.seed),
@@ -161,7 +162,8 @@ class Trainer:
         skipped = self._examine(renderings, value, step, names)
         self.whole = False
         if skipped is None:
-            self._optimizer.step(step)
+            rising = config.schedule.warm_up - self._warm_up
+            self._optimizer.step(step, min(1.0, step / rising) if rising else 1.0)
             for beside in self._beside:
                 beside.step(step)
             # After the optimiser's step, so that no gradient is lost with the rows that change.
