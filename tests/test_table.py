@@ -470,9 +470,10 @@ def test_why_a_run_failed_is_told(
     assert "No run is finished yet." in (spec_file.parent / "out" / "table.md").read_text()
 
 
-def test_measured_runs_keep_their_fingerprints() -> None:
+@pytest.mark.parametrize("name", ["method", "precision"])
+def test_measured_runs_keep_their_fingerprints(name: str) -> None:
     """Keys that are added to the configuration leave results as they are where their value is that of before."""
     folder = Path(__file__).parents[1] / "docs" / "tables"
-    planned = {(run.key, run.fingerprint) for run in read_spec(folder / "method.toml").runs}
-    measured = read_results(folder / "method.results.json").runs
+    planned = {(run.key, run.fingerprint) for run in read_spec(folder / f"{name}.toml").runs}
+    measured = read_results(folder / f"{name}.results.json").runs
     assert {(run.key, run.fingerprint) for run in measured} == planned
