@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -37,6 +38,11 @@ class DataConfig(Options):
         "held-out views that are evaluated in the end; val: those of a D-NeRF scene's transforms_val.json, to choose "
         "settings without the test views",
         "test",
+    )
+    undistort: bool = option(
+        "resample images of lenses with distortion or skew to those of a pinhole camera; false: ignore distortion, "
+        "skew and principal point, as the published code that trains on HyperNeRF's captures does",
+        True,
     )
     path: str = option(
         'folder of the capture, or a built-in scene: "synthetic", or "motion:path=4,cycles=2"; a built-in '
@@ -285,11 +291,35 @@ class EvalConfig(Options):
     """Evaluation during the training. Has defaults, since older config.toml files lack it."""
 
     interval: int = option(
-        "every this many steps, measure the PSNR of the validation views (a D-NeRF scene's transforms_val.json) or, if "
-        "there are none, of 8 training views, and write it to log.jsonl; 0: off",
+        "every this many steps, measure the PSNR of some views (eval.views) and write it to log.jsonl; 0: off",
         0,
         at_least=0,
     )
+    views: str = option(
+        "views for eval.interval; auto: the validation views (a D-NeRF scene's transforms_val.json) or, if there are "
+        "none, 8 training views; val; train: 8 training views; or names, comma-separated, such as train_003,train_010",
+        "auto",
+    )
+    snapshots: str = option(
+        "steps, comma-separated, such as 500,1000, after which the scene is saved to snapshots/step_NNNNNN.ply in the "
+        "run folder",
+        "",
+    )
+    tensorboard: bool = option(
+        "also write the figures of log.jsonl for TensorBoard, to the folder tensorboard of the run (needs the extra "
+        "tensorboard)",
+        False,
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not re.fullmatch(r"\s*(\d{1,9}(\s*,\s*\d{1,9})*)?\s*", self.snapshots, re.ASCII):
+            raise ValueError(f"snapshots must be whole numbers, separated by commas, got {self.snapshots!r}")
+
+    @property
+    def snapshot_steps(self) -> set[int]:
+        """The steps of `snapshots`."""
+        return {int(step) for step in self.snapshots.split(",") if step.strip()}
 
 
 @dataclass(frozen=True)

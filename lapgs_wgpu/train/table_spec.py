@@ -132,6 +132,8 @@ def fingerprint(config: Config) -> str:
         del values["density"]["min_contribution"], values["density"]["contribution_interval"]
     if config.data.split == "test":
         del values["data"]["split"]
+    if config.data.undistort:
+        del values["data"]["undistort"]
     if config.precision == "float32":
         del values["precision"]
     if config.decoder != "device":
