@@ -349,7 +349,7 @@ def test_discovery_starts_a_training_with_what_moves(dataset: Dataset, device: D
 
 def test_without_parts_to_follow_the_static_fit_starts_a_training(dataset: Dataset, device: Device) -> None:
     config = configure(discovery__least="1")
-    static, _ = static_fit(config, dataset, device, lambda step: None)
+    static, _ = static_fit(config, dataset, device, Trainer, lambda step: None)
     found = discover(config, dataset, device, Trainer)
     assert "nothing is added" in found.summary
     assert found.scene.parameters["dynamics"].abs().sum() == 0
