@@ -124,6 +124,7 @@ def _dataset(folder: Path, capture: Capture, image_size: int | None, normalize: 
         cloud=cloud if cloud is None or fit is None else fit.cloud(cloud),
         depths=depths if depths is None or fit is None else (depths[0] * fit.scale, depths[1] * fit.scale),
         normalization=fit if fit is None or capture.moved is None else capture.moved.then(fit),
+        scale=1.0 if fit is None else fit.scale,
         warnings=tuple(warnings),
         time_source=time_source,
     )

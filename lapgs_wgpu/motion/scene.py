@@ -154,7 +154,10 @@ class Scene4D:
         if move.d_quats is not None:
             quats = nn.functional.normalize(quats + move.d_quats, dim=1)
         if move.d_scales is not None:
-            scales = (scales + move.d_scales).clamp(min=MIN_SCALE)
+            scales = scales + move.d_scales
+            if self.field_config.negative_scales == "mirror":
+                scales = scales.abs()
+            scales = scales.clamp(min=MIN_SCALE)
         if move.d_dc is not None:
             sh = torch.cat([sh[:, :1] + move.d_dc[:, None], sh[:, 1:]], dim=1)
         if move.d_opacity is not None:

@@ -109,6 +109,7 @@ class Trainer:
                 config = dataclasses.replace(config, field=dataclasses.replace(config.field, kind="own"))
             except ValueError as error:
                 raise InputError(f"{error}.") from None
+        config = suited(config, dataset)
         self.dataset, self.parts, self.callbacks = dataset, parts, list(parts.callbacks)
         if config.schedule.batch % ranks.count:
             raise InputError(
@@ -274,6 +275,8 @@ class Trainer:
         return StepResult(step, config.schedule.steps, value, psnr, skipped, terms)
 
     def _nearby(self, view: View) -> Nearby | None:
+        if self.done < self.config.smoothness.start:
+            return None
         return draw_nearby(self.config.smoothness, len(self.scene), view.time, self._generator)
 
     def _loss(self, look: _Look, moving: bool) -> tuple[Tensor, RenderLoss, dict[str, float]]:
@@ -429,6 +432,25 @@ class Trainer:
         self._warm_up = int(own.get("warm_up", self._warm_up))  # older states lack it
         self._generator.set_state(own["random"])
         self._pictures.order = own["order"].tolist()
+
+
+def suited(config: Config, dataset: Dataset) -> Config:
+    """The configuration with lengths in world units, and no more frequencies than the training times can tell apart."""
+    field = config.field
+    if config.data.units == "capture":
+        scale, means = dataset.scale, config.rates.means
+        field = dataclasses.replace(field, bound=scale * field.bound)
+        config = dataclasses.replace(
+            config,
+            data=dataclasses.replace(config.data, units="world"),
+            rates=dataclasses.replace(
+                config.rates, means=dataclasses.replace(means, start=scale * means.start, end=scale * means.end)
+            ),
+            smoothness=dataclasses.replace(config.smoothness, reach=scale * config.smoothness.reach),
+        )
+    # The Nyquist frequency is half the number of times; all frequencies above it would end there.
+    most = 1 + math.floor(len(dataset.times) / 2 / field.frequency_step)
+    return dataclasses.replace(config, field=dataclasses.replace(field, components=min(field.components, max(1, most))))
 
 
 def _discovers(config: Config) -> bool:

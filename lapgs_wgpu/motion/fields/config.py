@@ -11,6 +11,7 @@ from .hash_grid_config import TIME, GridShape, HashConfig
 
 FieldKind = Literal["static", "mlp", "hexplane", "grid4d", "laplacian", "own"]
 Motion = Literal["laplacian", "mlp"]
+NegativeScales = Literal["floor", "mirror"]
 Appearance = Literal["none", "color", "color+opacity"]
 DynamicsMode = Literal[
     "literal", "promote", "off"
@@ -108,6 +109,11 @@ class FieldConfig(Options):
         16,
         at_least=0,
         at_most=256,
+    )
+    negative_scales: NegativeScales = option(
+        "scales that the field changes to below zero; mirror: count as their magnitude and keep their gradient, as in "
+        "Grid4D; floor: become 1e-7 and lose it",
+        "floor",
     )
     appearance: Appearance = option("field laplacian: what the field changes over time besides geometry", "color")
 
