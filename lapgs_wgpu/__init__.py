@@ -7,11 +7,19 @@ import os
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from .data.load import load_dataset
     from .gpu.device import list_devices, open_device
+    from .motion.fields.deformation import Deformation
     from .motion.scene import Scene4D, load
     from .splat.camera import Camera
     from .splat.gaussians import Gaussians
     from .splat.rasterize import Rendering, rasterize
+    from .train.densify import Change, DensityState, published_rule
+    from .train.loss_terms import Regularizer, TorchLoss, WgslLoss
+    from .train.parts import Parts
+    from .train.presets import load_config
+    from .train.step_result import StepResult
+    from .train.trainer import Trainer
 
 # torch's OpenMP threads otherwise spin while they wait, which takes the processor from a software Vulkan driver: a
 # training step there is three to ten times slower. It has no effect where torch was imported before.
@@ -26,8 +34,24 @@ _HOMES = {
     "load": "motion.scene",
     "list_devices": "gpu.device",
     "open_device": "gpu.device",
+    "load_config": "train.presets",
+    "load_dataset": "data.load",
+    "Trainer": "train.trainer",
+    "StepResult": "train.step_result",
+    "Parts": "train.parts",
+    "Deformation": "motion.fields.deformation",
+    "Regularizer": "train.loss_terms",
+    "TorchLoss": "train.loss_terms",
+    "WgslLoss": "train.loss_terms",
+    "DensityState": "train.densify",
+    "Change": "train.densify",
+    "published_rule": "train.densify",
 }
-__all__ = ["Camera", "Gaussians", "Rendering", "Scene4D", "list_devices", "load", "open_device", "rasterize"]
+__all__ = [
+    "Camera", "Change", "Deformation", "DensityState", "Gaussians", "Parts", "Regularizer", "Rendering", "Scene4D",
+    "StepResult", "TorchLoss", "Trainer", "WgslLoss", "list_devices", "load", "load_config", "load_dataset",
+    "open_device", "published_rule", "rasterize",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

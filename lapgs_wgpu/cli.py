@@ -18,10 +18,13 @@ if typing.TYPE_CHECKING:
     from lapgs_wgpu.motion.scene import Scene4D
     from lapgs_wgpu.train.config import Config
     from lapgs_wgpu.train.distributed import Ranks
+    from lapgs_wgpu.train.lpips import Lpips
     from lapgs_wgpu.train.run import Watch
 
 # Of the keys, what goes with --eval: where the pictures lie now, and how they are read. The size must be the run's own.
 EVAL_KEYS = ("data.path", "data.size", "data.split", "data.background", "data.cache_gb")
+# And with --resume: where they lie now, on another machine.
+RESUME_KEYS = ("data.path", "data.cache_gb")
 
 
 def train_command(arguments: Sequence[str] | None = None) -> int:
@@ -45,9 +48,9 @@ def _train(arguments: list[str]) -> None:
     if given["eval"]:
         _evaluate(Path(given["eval"]), given, overrides)
         return
-    for name in ("lpips_weights", "motion_from"):
-        if given[name]:
-            raise InputError(f"--{name.replace('_', '-')} goes with --eval RUN, after the training.")
+    if given["motion_from"]:
+        raise InputError("--motion-from goes with --eval RUN, after the training.")
+    lpips = _lpips(given)
     watch = None
     if given["view"]:
         from lapgs_wgpu.viewer import live
@@ -55,7 +58,7 @@ def _train(arguments: list[str]) -> None:
         watch = live.watch
     ranks = join_ranks()
     if given["resume"]:
-        _resume(Path(given["resume"]), given, overrides, watch, ranks)
+        _resume(Path(given["resume"]), given, overrides, watch, ranks, lpips)
         return
     if given["preset"] is None:
         raise InputError("name a preset, such as tiny, and the data to train on; lapgs-train --help says more.")
@@ -66,29 +69,35 @@ def _train(arguments: list[str]) -> None:
         check_run_folder(out, overwrite=given["overwrite"])
     device = open_device(given["device"], number=ranks.on_machine)
     config, dataset = _open_data(config, out.parent, ranks)
-    train(config, dataset, out, device=device, overwrite=given["overwrite"], watch=watch, ranks=ranks)
+    train(config, dataset, out, device=device, overwrite=given["overwrite"], watch=watch, ranks=ranks, lpips=lpips)
     if ranks.first:
         _report(out)
 
 
 def _resume(
-    run: Path, given: dict[str, typing.Any], overrides: dict[str, typing.Any], watch: Watch | None, ranks: Ranks
+    run: Path,
+    given: dict[str, typing.Any],
+    overrides: dict[str, typing.Any],
+    watch: Watch | None,
+    ranks: Ranks,
+    lpips: Lpips | None,
 ) -> None:
     from lapgs_wgpu.gpu.device import open_device
     from lapgs_wgpu.train.presets import load_config
     from lapgs_wgpu.train.run import resume
     from lapgs_wgpu.train.run_folder import changes_since
 
-    others = _others(given, ("preset", "field", "ablate", "out", "overwrite"), overrides)
+    names = ("preset", "field", "ablate", "out", "overwrite")
+    others = _others(given, names, [key for key in overrides if key not in RESUME_KEYS])
     if others:
         raise InputError(f"--resume goes on as the run began, so {others[0]} cannot be given.")
     _check_files("--resume", "a run", run / "config.toml")
-    config = load_config(str(run / "config.toml"))
+    config = load_config(str(run / "config.toml"), overrides)
     device = open_device(given["device"], number=ranks.on_machine)
     config, dataset = _open_data(config, run.parent, ranks)
     for what, before, now in changes_since(run, device, dataset) if ranks.first else ():
         print(f"lapgs-train: {what} was {before} when {run} began and is {now}: bits may differ.", file=sys.stderr)
-    resume(config, dataset, run, device=device, watch=watch, ranks=ranks)
+    resume(config, dataset, run, device=device, watch=watch, ranks=ranks, lpips=lpips)
     if ranks.first:
         _report(run)
 
@@ -105,7 +114,6 @@ def _evaluate(run: Path, given: dict[str, typing.Any], overrides: dict[str, str 
     from lapgs_wgpu.motion.scene import load
     from lapgs_wgpu.train import plots
     from lapgs_wgpu.train.distributed import SINGLE_PROCESS
-    from lapgs_wgpu.train.lpips import Lpips
     from lapgs_wgpu.train.presets import load_config
     from lapgs_wgpu.train.run import evaluate_run
 
@@ -113,7 +121,7 @@ def _evaluate(run: Path, given: dict[str, typing.Any], overrides: dict[str, str 
     others = _others(given, names, [key for key in overrides if key not in EVAL_KEYS])
     if others:
         raise InputError(f"--eval measures a run as it is, so {others[0]} cannot be given.")
-    lpips = Lpips(Path(given["lpips_weights"])) if given["lpips_weights"] else None
+    lpips = _lpips(given)
     _check_files("--eval", "a finished run", run / "config.toml", run / "checkpoint.ply")
     size = load_config(str(run / "config.toml")).data.size
     config = load_config(str(run / "config.toml"), overrides)
@@ -137,6 +145,13 @@ def _evaluate(run: Path, given: dict[str, typing.Any], overrides: dict[str, str 
     else:
         print(f"no plots: pip install 'lapgs-wgpu[plots]' adds them to {run / 'eval'}.", file=sys.stderr)
     _report(run)
+
+
+def _lpips(given: dict[str, typing.Any]) -> Lpips | None:
+    """LPIPS with the weights that were given. Raises InputError."""
+    from lapgs_wgpu.train.lpips import Lpips
+
+    return Lpips(Path(given["lpips_weights"])) if given["lpips_weights"] else None
 
 
 def _static_fit(run: Path, device: Device) -> Scene4D:
@@ -178,26 +193,14 @@ def _scene_name(config: Config) -> str:
 def _open_data(config: Config, parent: Path, ranks: Ranks, *, normalize: bool = True) -> tuple[Config, Dataset]:
     """The dataset, and the configuration with its folder. parent: folder for built-in scenes, which the first of
     several processes writes. normalize: of `load_dataset`."""
-    import dataclasses
+    from lapgs_wgpu.train.open_dataset import open_dataset, with_folder
 
-    from lapgs_wgpu.data import load_dataset
-    from lapgs_wgpu.data.builtin import SYNTHETIC, is_builtin, write_builtin
-
-    path = config.data.path
-    if not path:
-        raise InputError(f"name the folder of the scene with --data DIR, or take --data {SYNTHETIC}.")
     if not ranks.first:
         ranks.any(False)  # waits for the first process, which writes the scene
-    folder = write_builtin(path, parent) if is_builtin(path) else Path(path)
+    config = with_folder(config, parent)
     if ranks.first:
         ranks.any(False)
-    dataset = load_dataset(folder, image_size=config.data.size or None, normalize=normalize)
-    if config.data.split == "val":
-        if not dataset.val:
-            raise InputError(f"{folder} has no validation views (transforms_val.json); leave out data.split.")
-        dataset = dataclasses.replace(dataset, test=dataset.val)
-    data = dataclasses.replace(config.data, path=str(folder.resolve()))
-    return dataclasses.replace(config, data=data), dataset
+    return config, open_dataset(config, normalize=normalize)
 
 
 if __name__ == "__main__":  # lapgs-table starts its runs this way

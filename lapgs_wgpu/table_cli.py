@@ -17,7 +17,8 @@ Train all runs of a table (scenes x rows x seeds, defined in SPEC.toml), and wri
   lapgs-table --from A/results.json B/results.json              print a table of finished runs, without training
 
 Each run has its own run folder, OUT/SCENE/ROW/seedN. OUT/results.json and OUT/table.md are updated after each run. A
-run is skipped if its folder, OUT/results.json or a --from file has its results for the same configuration."""
+run is skipped if its folder, OUT/results.json or a --from file has its results for the same configuration; one that was
+interrupted goes on from its last saved state."""
 
 
 def table_command(arguments: Sequence[str] | None = None) -> int:
@@ -35,6 +36,10 @@ def _table(arguments: list[str]) -> int:
     add("--from", metavar="FILE", nargs="+", default=[], dest="known", help="results.json files of lapgs-table; their "
         "runs are reused or, without SPEC.toml, printed")
     add("--device", metavar="NAME", help=DEVICE_HELP)
+    add("--lpips-weights", metavar="FILE", help="also compute LPIPS (VGG) with the weights in FILE, a .safetensors "
+        "file (docs/metrics.md)")
+    add("--hours", type=float, metavar="H", help="stop after H hours: the run under way saves its state, and the same "
+        "command goes on with it, also on another machine that OUT was copied to")
     add("--slim", action="store_true", help="delete checkpoint.ply and eval/ of each finished run, to save disk space")
     # fmt: on
     given = parser.parse_args(arguments)
@@ -42,6 +47,8 @@ def _table(arguments: list[str]) -> int:
         raise InputError("name a folder for the runs and the table with --out.")
     if not given.spec and not given.known:
         raise InputError("name a SPEC.toml, or --from results.json; lapgs-table --help says more.")
+    if given.hours is not None and not given.hours > 0:
+        raise InputError(f"--hours must be a number above 0, got {given.hours:g}.")
     from lapgs_wgpu.train.table import make_table
     from lapgs_wgpu.train.table_results import markdown, merge_results, read_results, write_results
     from lapgs_wgpu.train.table_spec import read_spec
@@ -58,8 +65,23 @@ def _table(arguments: list[str]) -> int:
         print(markdown(results), end="")
         return 0
     spec, out = read_spec(Path(given.spec)), Path(given.out)
-    failed = make_table(spec, Path(given.data), out, known=known, device=given.device, slim=given.slim)
-    print(f"{out / 'table.md'}: {len(spec.runs) - len(failed)} of {len(spec.runs)} runs")
-    for key, reason in failed.items():
+    lpips = Path(given.lpips_weights).resolve() if given.lpips_weights else None
+    if lpips is not None:
+        from lapgs_wgpu.train.lpips import Lpips
+
+        Lpips(lpips)  # only to learn now, and not from every run, that it cannot be read
+    done = make_table(
+        spec,
+        Path(given.data),
+        out,
+        known=known,
+        device=given.device,
+        slim=given.slim,
+        lpips=lpips,
+        hours=given.hours,
+    )
+    over = "; the time is over, and the same command goes on" if done.stopped else ""
+    print(f"{out / 'table.md'}: {done.finished} of {len(spec.runs)} runs{over}")
+    for key, reason in done.failed.items():
         print(f"lapgs-table: {key} failed: {reason}", file=sys.stderr)
-    return 1 if failed else 0
+    return 1 if done.failed else 0

@@ -61,14 +61,15 @@ def parse_options(arguments: list[str]) -> dict[str, typing.Any]:
     add("--ablate", metavar="PART[,PART]", help=f"turn off parts of the paper's method, comma-separated: {parts}")
     add("--out", metavar="RUN", help="run folder for all output; must be new or empty [runs/SCENE-PRESET]")
     add("--resume", metavar="RUN", help="continue the interrupted training in run folder RUN from its last saved "
-        "state, with its own configuration. Can be combined with --view and --device only")
+        "state, with its own configuration. Can be combined with --view, --device, --lpips-weights, --cache-gb and "
+        "--data (where the capture is now) only")
     add("--overwrite", action="store_true", help="replace an existing run in the run folder")
     add("--view", action="store_true", help="watch the training in a window; P pauses it, S takes a single step")
     add("--device", metavar="NAME", help=DEVICE_HELP)
     add("--list-devices", action="store_true", help=LIST_DEVICES_HELP)
     add("--eval", metavar="RUN", help="evaluate the finished run in folder RUN again, without training. Can be "
         "combined with --data, --data.background, --cache-gb, --device, --lpips-weights and --motion-from only")
-    add("--lpips-weights", metavar="FILE", help="with --eval: also compute LPIPS (VGG) with the weights in FILE, "
+    add("--lpips-weights", metavar="FILE", help="also compute LPIPS (VGG) in the evaluation with the weights in FILE, "
         "a .safetensors file (docs/metrics.md)")
     add("--motion-from", metavar="RUN", help="with --eval: also compute metrics of the moving pixels, found by "
         "comparison with the images of RUN, a static model of the same capture (--field static; docs/metrics.md)")

@@ -23,7 +23,8 @@ const CANONICAL = 4u;        // quads of a Gaussian before its still features
 const LANES = 64u;
 
 @group(0) @binding(0) var<uniform> deform: Deform;
-// rows of: mean, opacity logit; quaternion; scales, -; colour, -; then the features that do not depend on time
+// rows of: mean, opacity logit; quaternion; scales, 1 where negative ones count as their magnitude, else 0; colour, -; then
+// the features that do not depend on time
 #table 1 still: vec4<f32>
 // rows of the others
 #table 2 moving: vec4<f32>
@@ -190,7 +191,9 @@ fn main(
             let q = unit(heads[0] + vec4(1.0, 0.0, 0.0, 0.0));
             let twice = 2.0 * cross(q.yzw, mean.xyz);
             let moved = mean.xyz + q.x * twice + cross(q.yzw, twice) + heads[2].xyz;
-            let size = max(still_at(row + 2u).xyz + heads[3].xyz, vec3(MIN_SCALE));
+            let scale = still_at(row + 2u);
+            let changed = scale.xyz + heads[3].xyz;
+            let size = max(max(changed, -scale.w * changed), vec3(MIN_SCALE));
 #unroll a 3
             means[3u * i + $(a)u] = moved[$a];
             scales[3u * i + $(a)u] = size[$a];

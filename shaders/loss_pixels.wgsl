@@ -1,6 +1,7 @@
 // Lays the ground truth on its background, puts it beside the image pixel by pixel, and sums up absolute and squared
 // differences. A workgroup takes a row.
 #import common/picture
+#import common/composite
 
 @group(0) @binding(0) var<uniform> picture: Picture;
 #table 1 image: f32
@@ -21,9 +22,7 @@ fn main(
     var squared = 0.0;
     for (var column = lane; column < picture.size.x; column += u32($LANES)) {
         let i = row * picture.size.x + column;
-        let texel = vec4<f32>((vec4(rgba_at(i)) >> vec4(0u, 8u, 16u, 24u)) & vec4(255u));
-        let mixed = texel.xyz * texel.w + (255.0 - texel.w) * (255.0 * picture.background);
-        let laid = vec3<u32>(floor(mixed / 255.0 + 0.5));
+        let laid = composite(rgba_at(i), picture.background);
         let bits = bitcast<vec3<u32>>(vec3(image_at(i), image_at(count + i), image_at(2u * count + i)));
         let pixel = vec4(bits, laid.x | (laid.y << 8u) | (laid.z << 16u));
         pixels[place(column, row, picture)] = pixel;

@@ -29,13 +29,13 @@ def test_dnerf_is_the_papers_schedule() -> None:
     assert (rates.log_scales, rates.quats) == (5e-3, 1e-3)
     density = config.density
     assert (density.start, density.stop, density.interval, density.gradient) == (500, 15_000, 100, 2e-4)
-    assert (density.min_opacity, density.max_screen_radius, density.max_world_size) == (0.005, 20, 0.1)
+    assert (density.min_opacity, density.max_screen_radius, density.max_world_size) == (0.005, 0, 0.1)
     assert (density.reset_interval, density.reset_opacity) == (3000, 0.01)
     assert (density.neighbours, density.divergence_weight, density.split_quantile) == (10, 0.5, 0.4)
     assert (config.points.count, config.points.box, config.points.opacity) == (100_000, 1.3, 0.1)
     assert (config.data.background, config.seed, config.loss.ssim) == ("black", 0, 0.2)
     assert (config.loss.pyramid, config.loss.ncc) == (0.2, 0.05)
-    assert config.field == FieldConfig()
+    assert config.field == FieldConfig(negative_scales="mirror")
 
 
 @pytest.mark.parametrize("name", preset_names())
@@ -161,7 +161,7 @@ def test_unknown_preset(preset: str, message: str) -> None:
         ('base = "dnerf"\n[loss]\nssim = 1.5', "at most 1, got 1.5"),
         ('base = "dnerf"\n[field.static]\nbase = [1, 2]', "field.static.base must be 3 numbers, got [1, 2]"),
         ('base = "dnerf"\n[data]\nbackground = "blak"', "must be black or white or random, got 'blak'"),
-        ('base = "dnerf"\n[rates.means]\nstart = 0', "rates.means.start must be above 0 and below inf, got 0."),
+        ('base = "dnerf"\n[rates.means]\nstart = -1', "rates.means.start must lie between 0 and 2147483647, got -1"),
         ('base = "dnerf"\n[points]\nopacity = 1.0', "points.opacity must be above 0 and below 1, got 1."),
         ('base = "dnerf"\n[density]\ninterval = 0', "density.interval must be at least 1, got 0."),
         ('base = "dnerf"\n[density]\nsplit = "adaptiv"', "must be plain or adaptive, got 'adaptiv'; did you mean"),

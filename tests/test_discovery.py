@@ -332,7 +332,7 @@ def test_every_field_learns_tracks(device: Device, kind: str) -> None:
 
 def test_discovery_starts_a_training_with_what_moves(dataset: Dataset, device: Device) -> None:
     config = configure()
-    found = discover(config, dataset, device)
+    found = discover(config, dataset, device, Trainer)
     assert "moving parts" in found.summary
     with closing(Trainer(config, dataset, device, scene=found.scene)) as training:
         before = found.scene.parameters["means"].detach().clone()
@@ -342,15 +342,15 @@ def test_discovery_starts_a_training_with_what_moves(dataset: Dataset, device: D
         assert field is not None
         assert any(p.grad is not None and p.grad.abs().sum() > 0 for p in field.parameters())  # from the first step on
         assert not torch.equal(before, training.scene.parameters["means"])
-    with closing(Trainer(config, dataset, device)) as resumed:
+    with closing(Trainer(config, dataset, device, resumed=True)) as resumed:
         resumed.restore(state)
         assert int(resumed.state()["training.warm_up"]) == 0
 
 
 def test_without_parts_to_follow_the_static_fit_starts_a_training(dataset: Dataset, device: Device) -> None:
     config = configure(discovery__least="1")
-    static, _ = static_fit(config, dataset, device, lambda step: None)
-    found = discover(config, dataset, device)
+    static, _ = static_fit(config, dataset, device, Trainer, lambda step: None)
+    found = discover(config, dataset, device, Trainer)
     assert "nothing is added" in found.summary
     assert found.scene.parameters["dynamics"].abs().sum() == 0
     ours, theirs = found.scene.parameters["means"], static.parameters["means"]
@@ -366,7 +366,7 @@ def test_a_whole_run_repeats_to_the_last_byte(dataset: Dataset, device: Device, 
 
 def test_a_training_that_discovery_started_goes_on_to_the_same_bits(dataset: Dataset, device: Device) -> None:
     config = configure()
-    scene = discover(config, dataset, device).scene
+    scene = discover(config, dataset, device, Trainer).scene
     with closing(Trainer(config, dataset, device, scene=scene)) as whole:
         for _ in range(5):
             whole.step()
@@ -374,7 +374,7 @@ def test_a_training_that_discovery_started_goes_on_to_the_same_bits(dataset: Dat
         for _ in range(5):
             whole.step()
         expected = whole.state()
-    with closing(Trainer(config, dataset, device)) as resumed:
+    with closing(Trainer(config, dataset, device, resumed=True)) as resumed:
         resumed.restore(state)
         for _ in range(5):
             resumed.step()
@@ -390,7 +390,7 @@ def test_images_that_show_nothing_are_refused(dataset: Dataset, device: Device) 
 
     views = tuple(dataclasses.replace(view, pixels=empty) for view in dataset.train)
     with pytest.raises(InputError, match="show nothing but the black background"):
-        discover(configure(), dataclasses.replace(dataset, train=views), device)
+        discover(configure(), dataclasses.replace(dataset, train=views), device, Trainer)
 
 
 def test_short_trainings_go_without(

@@ -134,5 +134,5 @@ def test_two_processes_discover_the_same(device: Device, tmp_path: Path) -> None
     steps = {"schedule__steps": "46", "discovery__steps": "40", "discovery__field_steps": "40"}
     config = configure(schedule__batch="2", data__path=str(data), density__stop="0", **steps)
     dataset = load_dataset(data)
-    assert discover(config, dataset, device).scene is not None
+    assert discover(config, dataset, device, Trainer).scene is not None
     check_two_processes(config, dataset, device, tmp_path)

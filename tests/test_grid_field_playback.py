@@ -57,10 +57,11 @@ def expected(scene: Scene4D, t: float) -> dict[str, Tensor]:
     if look is not None:
         dc = dc + look[:, None, :3]
         logits = logits + look[:, 3] if look.shape[1] == 4 else logits
+    changed = p["log_scales"].exp().clamp(min=1e-7) + d_scales
     return {
         "means": rotate(turn, p["means"]) + shift,
         "quats": unit(unit(p["quats"], dim=1) + d_quats, dim=1),
-        "scales": (p["log_scales"].exp().clamp(min=1e-7) + d_scales).clamp(min=1e-7),
+        "scales": (changed.abs() if config.negative_scales == "mirror" else changed).clamp(min=1e-7),
         "opacities": logits.sigmoid(),
         "sh": torch.cat([dc, p["sh_rest"][:, :8]], dim=1),
     }

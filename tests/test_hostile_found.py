@@ -40,6 +40,7 @@ from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.run import evaluate_run, resume
 from lapgs_wgpu.train.run_folder import STATE, load_state, locked_run_folder, save_state, start_run_folder
+from lapgs_wgpu.train.step_result import StepResult
 from lapgs_wgpu.train.table_results import read_results, write_results
 from lapgs_wgpu.train.table_spec import read_spec
 from lapgs_wgpu.train.trainer import Trainer
@@ -226,7 +227,7 @@ def test_nothing_is_written_through_a_link(tmp_path: Path) -> None:
         start_run_folder(run, load_config("tiny"), None, None)  # type: ignore[arg-type]
     save_state(run, {"training.done": np.array(1)})
     with Log(run / "log.jsonl", 1, terminal=io.StringIO()) as log:
-        log.step(1, 0.5, 10.0, 3)
+        log.step(StepResult(1, 1, 0.5, 10.0), 3)
     assert [file.name for file in mine.iterdir()] == ["file"]
     assert (mine / "file").read_text() == "precious"
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
+import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -249,7 +251,7 @@ def trained(monkeypatch: pytest.MonkeyPatch) -> list[RunKey]:
     """Instead of training, leaves a run folder with made-up figures, and notes here which run it was."""
     done: list[RunKey] = []
 
-    def train(run: Run, data: Path, out: Path, device: str | None) -> None:
+    def train(run: Run, data: Path, out: Path, launch: table.Launch) -> None:
         done.append(run.key)
         (out / "eval").mkdir(parents=True, exist_ok=True)
         (out / "checkpoint.ply").write_text("large")
@@ -321,6 +323,82 @@ def test_unfinished_and_changed_runs_are_trained_again(
     assert "1 runs of" in capsys.readouterr().err
 
 
+def test_measures_that_some_runs_lack_have_columns(tmp_path: Path) -> None:
+    runs = (result(), result(seed=1, ms_ssim=0.91, lpips=0.123, lpips_unscaled=0.045), result("b", ms_ssim=0.5))
+    shown = markdown(Results("t", "tiny", runs)).splitlines()
+    assert "| PSNR | ± | SSIM | MS-SSIM | LPIPS | LPIPS [0, 1] | Gaussians |" in shown[2]
+    assert "| 0.5000 | - | - | - | 1,000 |" in shown[4]
+    assert "| 0.5000 | 0.5000 | - | - | 1,000 |" in shown[5]
+    write_results(tmp_path, Results("t", "tiny", runs))
+    assert read_results(tmp_path / "results.json").runs == runs
+    assert "lpips" not in json.loads((tmp_path / "results.json").read_text())["runs"][0]
+
+
+def test_weights_for_lpips_reach_every_run_and_are_checked_first(
+    spec_file: Path, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert make(spec_file, data, "--lpips-weights", str(tmp_path / "none.safetensors")) == 2
+    assert "none.safetensors cannot be read" in capsys.readouterr().err
+    commands: list[list[str]] = []
+
+    def start(command: list[str], **_: object) -> None:
+        commands.append(command)
+        raise InputError("not today")
+
+    monkeypatch.setattr("lapgs_wgpu.train.lpips.Lpips", lambda file: None)
+    monkeypatch.setattr(table.subprocess, "Popen", start)
+    assert make(spec_file, data, "--lpips-weights", str(tmp_path / "vgg.safetensors")) == 2
+    assert f"--lpips-weights={tmp_path / 'vgg.safetensors'}" in commands[0]
+
+
+def test_a_table_stops_in_time(
+    spec_file: Path, data: Path, trained: list[RunKey], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert make(spec_file, data, "--hours", "0.001") == 0
+    assert not trained
+    assert capsys.readouterr().out.endswith("0 of 5 runs; the time is over, and the same command goes on\n")
+    assert make(spec_file, data, "--hours", "1") == 0
+    assert len(trained) == 5
+    assert make(spec_file, data, "--hours", "0") == 2
+
+
+def test_a_run_that_is_stopped_in_time_goes_on(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It ends with the bytes of one that was never stopped, from a folder that was moved meanwhile."""
+    spec, log = tmp_path / "spec.toml", Path("toys", "grid4d", "seed5", "log.jsonl")
+    spec.write_text(SPEC.replace("schedule.steps = 3", "schedule.steps = 300").replace("seeds = [3, 5]", "seeds = [5]"))
+    spec.write_text(spec.read_text().replace('static = { field.kind = "static" }\n', ""))
+    assert make(spec, data) == 0
+    (tmp_path / "out").rename(tmp_path / "whole")
+
+    class Soon(threading.Timer):
+        """Is over as soon as the training has begun."""
+
+        def run(self) -> None:
+            while not ((tmp_path / "out" / log).exists() and (tmp_path / "out" / log).stat().st_size):
+                time.sleep(0.01)
+            monkeypatch.setattr(table.Launch, "seconds_left", -1.0)
+            self.function(*self.args)
+
+    capsys.readouterr()
+    with monkeypatch.context() as patched:
+        patched.setattr(table.threading, "Timer", Soon)
+        assert make(spec, data, "--hours", "1") == 0
+    monkeypatch.undo()
+    assert "0 of 1 runs; the time is over" in capsys.readouterr().out
+    steps = [json.loads(line)["step"] for line in (tmp_path / "out" / log).read_text().splitlines()]
+    assert 50 <= steps[-1] < 300
+    elsewhere = data.parent / "moved"
+    shutil.copytree(data, elsewhere)
+    assert make(spec, elsewhere) == 0
+    assert capsys.readouterr().out.endswith("1 of 1 runs\n")
+    after = [json.loads(line)["step"] for line in (tmp_path / "out" / log).read_text().splitlines()]
+    assert after[: len(steps)] == steps
+    first, second = ((tmp_path / name / log).with_name("checkpoint.ply") for name in ("whole", "out"))
+    assert first.read_bytes() == second.read_bytes()
+
+
 def test_the_table_is_written_after_every_run(
     spec_file: Path,
     data: Path,
@@ -330,11 +408,11 @@ def test_the_table_is_written_after_every_run(
 ) -> None:
     original, seen = table._train_in_process, []
 
-    def look(run: Run, data: Path, out: Path, device: str | None) -> str | None:
+    def look(run: Run, data: Path, out: Path, launch: table.Launch) -> str | None:
         seen.append(len(read_results(spec_file.parent / "out" / "results.json").runs))
         if len(seen) == 4:
             raise KeyboardInterrupt
-        return original(run, data, out, device)
+        return original(run, data, out, launch)
 
     monkeypatch.setattr(table, "_train_in_process", look)
     assert make(spec_file, data) == command.INTERRUPTED

@@ -33,6 +33,7 @@ from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.run import train
+from lapgs_wgpu.train.step_result import StepResult
 from lapgs_wgpu.train.trainer import Trainer
 
 
@@ -59,9 +60,9 @@ def test_pictures_improve(kind: str, dataset: Dataset, device: Device, tmp_path:
     psnrs: list[float] = []
     original = Log.step
 
-    def note(self: Log, step: int, loss: float, psnr: float, *rest: Any) -> None:
-        psnrs.append(psnr)
-        original(self, step, loss, psnr, *rest)
+    def note(self: Log, result: StepResult, *rest: Any) -> None:
+        psnrs.append(result.psnr)
+        original(self, result, *rest)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Log, "step", note)
@@ -76,13 +77,21 @@ def test_a_run_is_whole(run: Path, dataset: Dataset) -> None:
     assert {file.name for file in run.iterdir()} == {
         "config.toml", "log.jsonl", "metrics.json", "metrics.csv", "checkpoint.ply", "eval",
     }  # fmt: skip
-    assert load_config(str(run / "config.toml")) == dataclasses.replace(configure(), decoder="torch")
+    expected = trainer.suited(configure(), dataset)
+    assert expected.field.components == 5  # of 8 times
+    assert load_config(str(run / "config.toml")) == dataclasses.replace(expected, decoder="torch")
     record = (run / "config.toml").read_text().split("[record]")[1]
     assert all(f"\n{key} = " in record for key in ("lapgs_wgpu", "torch", "adapter", "driver"))
     (last,) = lines(run)
-    assert set(last) == {"step", "loss", "psnr", "gaussians", "frequencies", "amplitudes", "timing"}
-    assert len(last["frequencies"]) == len(last["amplitudes"]) == 16
-    assert last["frequencies"] != list(range(16))  # they are learnt
+    assert set(last) == {
+        "step", "loss", "psnr", "terms", "gaussians", "dead_scales", "frequencies", "amplitudes", "memory", "timing",
+    }  # fmt: skip
+    assert set(last["terms"]) == {"l1", "ssim", "pyramid", "ncc", "smoothness", "dynamics"}
+    assert sum(last["terms"].values()) == pytest.approx(last["loss"], rel=1e-5)
+    assert 0 <= last["dead_scales"] <= 1
+    assert all(last["memory"][name] > 1e5 for name in ("host_bytes", "device_bytes"))
+    assert len(last["frequencies"]) == len(last["amplitudes"]) == 5
+    assert last["frequencies"] != list(range(5))  # they are learnt
     assert max(last["frequencies"]) <= 4  # the Nyquist frequency of 8 pictures
     assert last["step"] == STEPS
     metrics = json.loads((run / "metrics.json").read_text())
@@ -177,7 +186,7 @@ def test_a_training_repeats_to_the_last_byte(run: Path, dataset: Dataset, device
     assert (tmp_path / "second" / "checkpoint.ply").read_bytes() == (run / "checkpoint.ply").read_bytes()
     first, second = lines(run), lines(tmp_path / "second")
     for line in first + second:
-        del line["timing"]
+        del line["timing"], line["memory"]
     assert first == second
 
 
@@ -196,7 +205,7 @@ def test_the_decoder_on_the_device_trains_as_well_and_repeats(
     config = configure(decoder="device")
     for name in ("first", "again"):
         train(config, dataset, tmp_path / name, device=device)
-    assert load_config(str(tmp_path / "first/config.toml")) == config
+    assert load_config(str(tmp_path / "first/config.toml")) == trainer.suited(config, dataset)
     assert (tmp_path / "first/checkpoint.ply").read_bytes() == (tmp_path / "again/checkpoint.ply").read_bytes()
     psnrs = [json.loads((folder / "metrics.json").read_text())["psnr"] for folder in (tmp_path / "first", run)]
     assert psnrs[0] == pytest.approx(psnrs[1], abs=0.5)
@@ -284,7 +293,8 @@ def test_another_seed_gives_another_model(run: Path, dataset: Dataset, device: D
 def test_nothing_moves_during_the_warm_up(dataset: Dataset, device: Device, tmp_path: Path) -> None:
     config = configure(schedule__steps="4")
     scene = train(config, dataset, tmp_path / "run", device=device)
-    fresh = Scene4D.from_points(*trainer.initial_points(config.points, dataset, 0), config.field, device=device)
+    field = trainer.suited(config, dataset).field
+    fresh = Scene4D.from_points(*trainer.initial_points(config.points, dataset, 0), field, device=device)
     assert scene.field is not None
     assert fresh.field is not None
     for ours, initial in zip(scene.field.parameters(), fresh.field.parameters(), strict=True):
@@ -339,9 +349,9 @@ def test_ctrl_c_leaves_a_whole_checkpoint(
 ) -> None:
     original = Log.step
 
-    def interrupt(self: Log, step: int, *rest: Any) -> None:
-        original(self, step, *rest)
-        if step == 5:
+    def interrupt(self: Log, result: StepResult, *rest: Any) -> None:
+        original(self, result, *rest)
+        if result.step == 5:
             signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr(Log, "step", interrupt)
@@ -419,11 +429,12 @@ def test_log_lines_and_the_progress_line(tmp_path: Path) -> None:
     for stream in (io.StringIO(), Terminal()):
         with Log(tmp_path / "log.jsonl", 120, terminal=stream) as log:
             for step in range(1, 121):
-                log.step(step, 0.5 + step, 20.0, 1000)
+                log.step(StepResult(step, 120, 0.5 + step, 20.0, terms={"l1": 0.25, "ssim": 0.25 + step}), 1000)
         text = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
         assert [line["step"] for line in text] == [50, 100, 120]
         assert text[0]["loss"] == pytest.approx(0.5 + np.mean(range(1, 51)))
         assert text[2]["loss"] == pytest.approx(0.5 + np.mean(range(71, 121)))
+        assert all(sum(line["terms"].values()) == pytest.approx(line["loss"]) for line in text)
         shown = stream.getvalue()
         assert "step 120/120  20.00 dB  1000 Gaussians" in shown
         assert shown.endswith("0:00 left\n")

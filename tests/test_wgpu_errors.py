@@ -31,6 +31,7 @@ from lapgs_wgpu.train.dataloader import Pictures
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.run import resume, train
 from lapgs_wgpu.train.run_folder import STATE, load_state
+from lapgs_wgpu.train.step_result import StepResult
 
 NO_MEMORY = "Validation Error\n\nCaused by:\n  In wgpuDeviceCreateBuffer\n    Not enough memory left.\n"
 
@@ -57,9 +58,9 @@ def doomed(configuration: str) -> Device:
 def after_step(at: int, what: Callable[[], None], monkeypatch: pytest.MonkeyPatch) -> None:
     original = Log.step
 
-    def step(self: Log, number: int, *rest: Any) -> None:
-        original(self, number, *rest)
-        if number == at:
+    def step(self: Log, result: StepResult, *rest: Any) -> None:
+        original(self, result, *rest)
+        if result.step == at:
             what()
 
     monkeypatch.setattr(Log, "step", step)

@@ -6,6 +6,7 @@ file in `readers` and a line in READERS.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -33,13 +34,17 @@ DENSE = 4096  # points; a smaller cloud is filled up: Gaussians multiply too slo
 NEAREST, FURTHEST = 0.25, 2.0  # depths relative to the distance of the focus, for own footage without a cloud
 
 
-def load_dataset(folder: str | Path, *, image_size: int | None = None, normalize: bool = True) -> Dataset:
+def load_dataset(
+    folder: str | Path, *, image_size: int | None = None, normalize: bool = True, undistort: bool = True
+) -> Dataset:
     """Open a capture; its files determine the format (docs/data.md). Images are decoded later, view by view.
 
     Args:
         folder: of the capture.
         image_size: longer side in pixels, 1 or more, to which larger images are shrunk; None keeps their size.
         normalize: False keeps the coordinates of a D-NeRF scene of any size; other formats are always normalized.
+        undistort: False takes images as they are, and cameras as pinholes that look at the center of the image,
+            whatever the files say of distortion, skew and principal point, as published code on HyperNeRF does.
 
     Raises:
         InputError: not a capture, or one that cannot be trained on as it is; names file and field.
@@ -50,7 +55,8 @@ def load_dataset(folder: str | Path, *, image_size: int | None = None, normalize
         raise InputError(f"{folder} {problem}; give the folder of a scene.")
     matching = [reader for reader in READERS if reader.matches(folder)]
     if len(matching) == 1:
-        return _dataset(folder, matching[0].read(folder, image_size), image_size, normalize)
+        capture = matching[0].read(folder, image_size)
+        return _dataset(folder, capture if undistort else _idealized(capture), image_size, normalize)
     if matching:
         both = " and of ".join(f"{reader.name} ({reader.files})" for reader in matching)
         raise InputError(f"{folder} holds the files of {both}; keep one format's in it.")
@@ -118,9 +124,17 @@ def _dataset(folder: Path, capture: Capture, image_size: int | None, normalize: 
         cloud=cloud if cloud is None or fit is None else fit.cloud(cloud),
         depths=depths if depths is None or fit is None else (depths[0] * fit.scale, depths[1] * fit.scale),
         normalization=fit if fit is None or capture.moved is None else capture.moved.then(fit),
+        scale=1.0 if fit is None else fit.scale,
         warnings=tuple(warnings),
         time_source=time_source,
     )
+
+
+def _idealized(capture: Capture) -> Capture:
+    """The capture as if its lenses had neither distortion nor skew, and looked at the center of the image."""
+    lenses = {id(frame.lens): frame.lens.idealized for frame in capture.frames}
+    frames = [dataclasses.replace(frame, lens=lenses[id(frame.lens)]) for frame in capture.frames]
+    return dataclasses.replace(capture, frames=frames)
 
 
 def _times(folder: Path, capture: Capture, warnings: list[str]) -> tuple[list[float], str]:

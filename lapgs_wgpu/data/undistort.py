@@ -39,6 +39,12 @@ class Lens:
         """Whether the lens has neither distortion nor skew."""
         return not (any(self.radial) or any(self.tangential) or self.K[0, 1])
 
+    @property
+    def idealized(self) -> Lens:
+        """A pinhole of the same focal lengths that looks at the image's center, as much published code takes it."""
+        K = np.array([[self.K[0, 0], 0, self.width / 2], [0, self.K[1, 1], self.height / 2], [0, 0, 1]])
+        return Lens(K, self.width, self.height)
+
     def resized(self, width: int, height: int) -> Lens:
         """The same lens for images of another size."""
         scale = np.diag([width / self.width, height / self.height, 1.0])

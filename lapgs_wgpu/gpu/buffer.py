@@ -24,7 +24,8 @@ _MAPPABLE = wgpu.BufferUsage.MAP_READ | wgpu.BufferUsage.MAP_WRITE
 _numbers = itertools.count()
 
 
-def _forget(bound: weakref.WeakSet[BindGroup]) -> None:
+def _forget(bound: weakref.WeakSet[BindGroup], device: Device, nbytes: int) -> None:
+    device.allocated_bytes -= nbytes
     for group in list(bound):
         group.drop()
 
@@ -60,7 +61,8 @@ class Buffer:
         self.number = next(_numbers)  # unique, also among freed buffers
         # Bind groups keep device memory alive: they are dropped with the buffer.
         self.bound: weakref.WeakSet[BindGroup] = weakref.WeakSet()
-        weakref.finalize(self, _forget, self.bound).atexit = False
+        device.allocated_bytes += self.nbytes
+        weakref.finalize(self, _forget, self.bound, device, self.nbytes).atexit = False
         self.version = 0  # number of writes: tells whether a texture made from the buffer is out of date
         self._textures: dict[str, _Texture] = {}
         self._upload: Any = None

@@ -105,6 +105,7 @@ class Device:
     wgpu_device, queue: wgpu's objects.
     textures: whether tables are read through textures (gpu/shader), which is much faster on Mesa's software driver.
     mappable: whether buffers can be mapped without a staging copy (CPU and integrated devices).
+    allocated_bytes: of all buffers at present, without staging buffers and textures.
     max_loop_turns: number of iterations, of all loops of an invocation together, after which the driver ends it; None
         for no limit.
     """
@@ -136,6 +137,7 @@ class Device:
         self.textures = self.is_cpu and limits.get("max-storage-textures-per-shader-stage", 0) >= 8
         self.max_loop_turns = SOFTWARE_LOOP_TURNS if self.is_cpu else None
         self.kernel_cache: dict[Any, Any] = {}
+        self.allocated_bytes = 0
 
     @property
     def max_binding(self) -> int:

@@ -21,6 +21,7 @@ import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import resources
+from pathlib import Path
 
 Defines = Mapping[str, int]
 
@@ -69,9 +70,14 @@ class Binding:
     type: str  # of a texture its format
 
 
-@functools.cache
 def shader_text(name: str) -> str:
-    """The text of shaders/<name>.wgsl."""
+    """The text of shaders/<name>.wgsl, or of a file elsewhere, whose name is its absolute path without the suffix."""
+    elsewhere = Path(name + ".wgsl")
+    return elsewhere.read_text(encoding="utf-8") if elsewhere.is_absolute() else _package_text(name)
+
+
+@functools.cache
+def _package_text(name: str) -> str:
     file = resources.files("lapgs_wgpu.shaders").joinpath(*(name + ".wgsl").split("/"))
     if not file.is_file():
         raise ShaderError(f"there is no shader file shaders/{name}.wgsl")

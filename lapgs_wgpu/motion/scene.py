@@ -28,15 +28,28 @@ from .fields.grid_field import GridField
 from .fields.hexplane_field import HexPlaneField
 from .fields.laplacian import LaplacianMotion
 from .fields.mlp_field import MlpField
+from .fields.own_field import OwnField
 from .scene_file import SceneFile, read_scene, row_shapes
 
-Field = GridField | MlpField | HexPlaneField
+Field = GridField | MlpField | HexPlaneField | OwnField
 
 
-def make_field(config: FieldConfig, device: Device, seed: int = 0) -> Field | None:
-    """The field of this configuration; None for static scenes."""
+def make_field(config: FieldConfig, device: Device, seed: int = 0, own: nn.Module | None = None) -> Field | None:
+    """The field of this configuration; None for static scenes. own: the module of the field own.
+
+    Raises InputError where the field is own and no module is given, or the other way round.
+    """
+    if (config.kind == "own") != (own is not None):
+        raise InputError(
+            "the field own needs a module, which only Python can give, such as Trainer(config, parts=Parts(field=...)) "
+            "and load(path, field=...); docs/api.md says more."
+            if own is None
+            else f"the scene has the field {config.kind}, so no module can be given; leave out field=..."
+        )
     if config.kind == "static":
         return None
+    if own is not None:
+        return OwnField(own)
     if config.kind == "mlp":
         return MlpField(config, seed)
     if config.kind == "hexplane":
@@ -51,6 +64,7 @@ class Scene4D:
     log_scales (N, 3), quats (N, 4) wxyz of any length, opacity_logits (N,), sh_dc (N, 1, 3), sh_rest (N, 15, 3); for
     the field laplacian also dynamics (N, D) (paper eq. 8).
     field: None for static scenes. sh_degree: degree in use, 0 to 3. metadata: of the checkpoint.
+    own_field: a module in place of the configured field (docs/api.md).
     """
 
     def __init__(
@@ -61,6 +75,7 @@ class Scene4D:
         *,
         sh_degree: int = 0,
         seed: int = 0,
+        own_field: nn.Module | None = None,
     ) -> None:
         self.parameters = {
             name: nn.Parameter(parameters[name].detach().float().contiguous()) for name in row_shapes(field_config)
@@ -68,7 +83,7 @@ class Scene4D:
         self.field_config = field_config
         self.device = device
         self.sh_degree = sh_degree
-        self.field: Field | None = make_field(field_config, device, seed)
+        self.field: Field | None = make_field(field_config, device, seed, own_field)
         self.metadata: dict[str, str] = {}
 
     @staticmethod
@@ -81,6 +96,7 @@ class Scene4D:
         opacity: float = 0.1,
         device: Device | None = None,
         seed: int = 0,
+        own_field: nn.Module | None = None,
     ) -> Scene4D:
         """Isotropic Gaussians at points (N, 3), world units, with colors (N, 3) in [0, 1] and scales (N,)."""
         n = len(points)
@@ -93,7 +109,7 @@ class Scene4D:
             "sh_rest": torch.zeros(n, 15, 3),
             "dynamics": torch.zeros(n, field_config.dynamics_size),
         }
-        return Scene4D(parameters, field_config, device or open_device(), seed=seed)
+        return Scene4D(parameters, field_config, device or open_device(), seed=seed, own_field=own_field)
 
     def __len__(self) -> int:
         return len(self.parameters["means"])
@@ -130,21 +146,23 @@ class Scene4D:
             return still, None
         p = self.parameters
         move = self.field(p["means"], t, p.get("dynamics"), nearby)
-        means, sh, opacities = still.means, still.sh, still.opacities
+        means, quats, scales, sh, opacities = still.means, still.quats, still.scales, still.sh, still.opacities
         if move.rotation is not None:
             means = rotate(move.rotation, means)
+        if move.translation is not None:
+            means = means + move.translation
+        if move.d_quats is not None:
+            quats = nn.functional.normalize(quats + move.d_quats, dim=1)
+        if move.d_scales is not None:
+            scales = scales + move.d_scales
+            if self.field_config.negative_scales == "mirror":
+                scales = scales.abs()
+            scales = scales.clamp(min=MIN_SCALE)
         if move.d_dc is not None:
             sh = torch.cat([sh[:, :1] + move.d_dc[:, None], sh[:, 1:]], dim=1)
         if move.d_opacity is not None:
             opacities = (p["opacity_logits"] + move.d_opacity).sigmoid()
-        moved = Gaussians(
-            means + move.translation,
-            nn.functional.normalize(still.quats + move.d_quats, dim=1),
-            (still.scales + move.d_scales).clamp(min=MIN_SCALE),
-            opacities,
-            sh,
-        )
-        return moved, move.smoothness
+        return Gaussians(means, quats, scales, opacities, sh), move.smoothness
 
     def render(self, camera: Camera, t: float, background: Tensor | None = None, *, depth: bool = True) -> Rendering:
         """Render the scene at time t in [0, 1], without gradients. background: (3,), None for black.
@@ -188,25 +206,35 @@ class Scene4D:
         write_checkpoint(path, arrays, tensors, {**self.metadata, **(metadata or {}), **header})
 
 
-def load(path: str | os.PathLike[str], device: Device | None = None) -> Scene4D:
+def load(path: str | os.PathLike[str], device: Device | None = None, *, field: nn.Module | None = None) -> Scene4D:
     """Read a checkpoint, or any 3DGS .ply file as a static scene.
 
+    field: the module of a scene that was trained with a field of one's own, which takes the file's parameters.
     Raises InputError; also for a compact scene that moves, which lacks the static grid: `open_playback` shows it.
     """
-    return scene_of(read_scene(path), device)
+    return scene_of(read_scene(path), device, field)
 
 
-def scene_of(file: SceneFile, device: Device | None = None) -> Scene4D:
-    """The scene of a file that was read. Raises InputError for a compact scene that moves."""
+def scene_of(file: SceneFile, device: Device | None = None, own_field: nn.Module | None = None) -> Scene4D:
+    """The scene of a file that was read; own_field as in `load`. Raises InputError for a compact scene that moves."""
     if "static_features" in file.gaussians:
         raise InputError(
             f"{file.path}: is a compact scene, which lapgs-view shows, without the static grid that a Scene4D needs: "
             "load the checkpoint that it was made of"
         )
     parameters = {name: torch.from_numpy(array.copy()) for name, array in file.gaussians.items()}
-    scene = Scene4D(parameters, file.field_config, device or open_device(), sh_degree=file.sh_degree)
+    try:
+        scene = Scene4D(
+            parameters, file.field_config, device or open_device(), sh_degree=file.sh_degree, own_field=own_field
+        )
+    except InputError as error:
+        raise InputError(f"{file.path}: {error}") from error
     if scene.field is not None:
         # load_state_dict copies the arrays, which may be read-only.
-        scene.field.load_state_dict({name: torch.from_numpy(array) for name, array in file.field.items()})
+        values = {name: torch.from_numpy(array) for name, array in file.field.items()}
+        try:
+            scene.field.load_state_dict(values)
+        except RuntimeError as error:  # the others' shapes were checked
+            raise InputError(f"{file.path}: is of another field than the module that was given: {error}") from error
     scene.metadata = file.metadata
     return scene

@@ -60,7 +60,7 @@ def _seconds(scene: Scene4D, field: GridField, place: Where) -> float:
         for _ in range(1 + _ROUNDS):
             start = time.perf_counter()
             move = field(parameters["means"], 0.5, parameters.get("dynamics"))
-            (move.translation.sum() + move.d_scales.sum()).backward()
+            torch.cat([part for part in (move.translation, move.d_scales) if part is not None]).sum().backward()
             times.append(time.perf_counter() - start)
     finally:
         field.on_device = before

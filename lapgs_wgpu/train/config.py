@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -17,6 +18,7 @@ from lapgs_wgpu.motion.fields.config import DynamicsMode, FieldConfig
 Background = Literal["black", "white", "random"]
 Split = Literal["plain", "adaptive"]
 HeldOut = Literal["test", "val"]
+Units = Literal["world", "capture"]
 Precision = Literal["float32", "bfloat16"]
 DecoderPlace = Literal["auto", "torch", "device"]
 
@@ -37,6 +39,17 @@ class DataConfig(Options):
         "held-out views that are evaluated in the end; val: those of a D-NeRF scene's transforms_val.json, to choose "
         "settings without the test views",
         "test",
+    )
+    undistort: bool = option(
+        "resample images of lenses with distortion or skew to those of a pinhole camera; false: ignore distortion, "
+        "skew and principal point, as the published code that trains on HyperNeRF's captures does",
+        True,
+    )
+    units: Units = option(
+        "units of the lengths rates.means, smoothness.reach and field.bound; world: those of the scene in the presets' "
+        "cube; capture: those of the capture's files, in which published values stand: multiplied by the scale of the "
+        "cube at the start of a training",
+        "world",
     )
     path: str = option(
         'folder of the capture, or a built-in scene: "synthetic", or "motion:path=4,cycles=2"; a built-in '
@@ -80,10 +93,11 @@ class ScheduleConfig(Options):
 
 @dataclass(frozen=True)
 class Rate(Options):
-    """A learning rate that goes from start to end exponentially and then stays there."""
+    """A learning rate that goes from start to end exponentially, or in a straight line where one of them is 0, and then
+    stays there."""
 
-    start: float = option("initial value", above=0, below=math.inf)
-    end: float = option("final value", above=0, below=math.inf)
+    start: float = option("initial value; 0 freezes", at_least=0, below=math.inf)
+    end: float = option("final value; 0 freezes", at_least=0, below=math.inf)
     steps: int = option(
         "training step, counted from the start, at which the exponential decay reaches the final value; constant "
         "afterwards",
@@ -93,6 +107,8 @@ class Rate(Options):
     def at(self, step: int) -> float:
         """The rate of a step, which are counted from 1."""
         share = min(step / self.steps, 1.0)
+        if 0 in (self.start, self.end):  # which no exponential goes to
+            return self.start + share * (self.end - self.start)
         return self.start ** (1 - share) * self.end**share
 
 
@@ -101,14 +117,14 @@ class RatesConfig(Options):
     """Adam's learning rates, for each parameter of the Gaussians and for the field's hash tables and its MLP."""
 
     means: Rate = option("learning rate of the means, world units per step")
-    log_scales: float = option("learning rate of the log-scales", above=0)
-    quats: float = option("learning rate of the rotations (quaternions)", above=0)
-    opacity_logits: float = option("learning rate of the opacities (logits)", above=0)
-    sh_dc: float = option("learning rate of the base colors (spherical harmonics of degree 0)", above=0)
+    log_scales: float = option("learning rate of the log-scales", at_least=0)
+    quats: float = option("learning rate of the rotations (quaternions)", at_least=0)
+    opacity_logits: float = option("learning rate of the opacities (logits)", at_least=0)
+    sh_dc: float = option("learning rate of the base colors (spherical harmonics of degree 0)", at_least=0)
     sh_rest: float = option(
         "learning rate of the view-dependent colors (spherical harmonics of degree 1 to 3)", above=0
     )
-    dynamics: float = option("learning rate of the per-Gaussian dynamics attributes", above=0)
+    dynamics: float = option("learning rate of the per-Gaussian dynamics attributes", at_least=0)
     hash: Rate = option("learning rate of the field's hash tables or feature planes")
     mlp: Rate = option("learning rate of the field's MLP weights")
     frequencies: Rate = option("learning rate of the motion spectrum's frequencies, cycles per clip per step")
@@ -123,7 +139,7 @@ class RatesConfig(Options):
 class DensityConfig(Options):
     """Densification and pruning."""
 
-    start: int = option("densify and prune only after this step")
+    start: int = option("densify, prune and reset opacities only after this step")
     stop: int = option("densify, prune and reset opacities only before this step")
     interval: int = option("densify and prune every this many steps", at_least=1)
     gradient: float = option(
@@ -192,7 +208,7 @@ class DensityConfig(Options):
 
     def resets_at(self, step: int) -> bool:
         """Whether opacities are lowered after this step."""
-        return step < self.stop and step % self.reset_interval == 0
+        return self.start < step < self.stop and step % self.reset_interval == 0
 
 
 class LossWeights(NamedTuple):
@@ -245,6 +261,7 @@ class SmoothnessConfig(Options):
     )
     reach: float = option("largest offset between the two sampled positions along each axis, world units")
     time_reach: float = option("largest offset between the two sampled times, as a fraction of the clip")
+    start: int = option("compute the smoothness loss only after this step, such as density.stop", 0)
 
 
 @dataclass(frozen=True)
@@ -286,11 +303,35 @@ class EvalConfig(Options):
     """Evaluation during the training. Has defaults, since older config.toml files lack it."""
 
     interval: int = option(
-        "every this many steps, measure the PSNR of the validation views (a D-NeRF scene's transforms_val.json) or, if "
-        "there are none, of 8 training views, and write it to log.jsonl; 0: off",
+        "every this many steps, measure the PSNR of some views (eval.views) and write it to log.jsonl; 0: off",
         0,
         at_least=0,
     )
+    views: str = option(
+        "views for eval.interval; auto: the validation views (a D-NeRF scene's transforms_val.json) or, if there are "
+        "none, 8 training views; val; train: 8 training views; or names, comma-separated, such as train_003,train_010",
+        "auto",
+    )
+    snapshots: str = option(
+        "steps, comma-separated, such as 500,1000, after which the scene is saved to snapshots/step_NNNNNN.ply in the "
+        "run folder",
+        "",
+    )
+    tensorboard: bool = option(
+        "also write the figures of log.jsonl for TensorBoard, to the folder tensorboard of the run (needs the extra "
+        "tensorboard)",
+        False,
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not re.fullmatch(r"\s*(\d{1,9}(\s*,\s*\d{1,9})*)?\s*", self.snapshots, re.ASCII):
+            raise ValueError(f"snapshots must be whole numbers, separated by commas, got {self.snapshots!r}")
+
+    @property
+    def snapshot_steps(self) -> set[int]:
+        """The steps of `snapshots`."""
+        return {int(step) for step in self.snapshots.split(",") if step.strip()}
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ are looked at, and dynamics by the adaptive split; whatever else a Gaussian carr
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -80,6 +80,46 @@ class Change(NamedTuple):
 
     keep: Tensor
     added: dict[str, Tensor]
+
+
+class DensityState(NamedTuple):
+    """What density control decides on, after a step (counted from 1).
+
+    rows: name -> (N, ...) parameters of the Gaussians, without gradients: means (N, 3) world units, log_scales (N, 3),
+    quats (N, 4) wxyz of any length, opacity_logits (N,), sh_dc (N, 1, 3), sh_rest (N, 15, 3), and dynamics (N, D) where
+    the field has them. statistics: what was seen of them since the last change. extent: of the cameras, world units.
+    generator: for random numbers, on the CPU; with any other a training does not repeat.
+    """
+
+    step: int
+    rows: Rows
+    statistics: Statistics
+    config: DensityConfig
+    extent: float
+    generator: torch.Generator
+
+
+DensityRule = Callable[[DensityState], Change]
+
+
+def published_rule(state: DensityState) -> Change:
+    """Density control as configured: 3DGS's, with the paper's adaptive split."""
+    bound_sizes = state.step > state.config.reset_interval
+    return densify(state.rows, state.statistics, state.config, state.extent, state.generator, bound_sizes=bound_sizes)
+
+
+def check_change(change: Change, rows: Rows) -> None:
+    """Raises ValueError where a rule's result does not fit the Gaussians."""
+    count = len(rows["means"])
+    if change.keep.dtype != torch.bool or tuple(change.keep.shape) != (count,):
+        raise ValueError(f"keep must be bool of shape ({count},), got {change.keep.dtype} {tuple(change.keep.shape)}")
+    if change.added.keys() != rows.keys():
+        raise ValueError(f"added must have the rows {', '.join(rows)}, got {', '.join(change.added)}")
+    born = len(change.added["means"])
+    for name, row in change.added.items():
+        if row.shape != (born, *rows[name].shape[1:]) or row.dtype != rows[name].dtype:
+            expected = (born, *rows[name].shape[1:])
+            raise ValueError(f"added[{name!r}] must be float32 of shape {expected}, got {row.dtype} {tuple(row.shape)}")
 
 
 @torch.no_grad()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,13 +19,14 @@ from ..splat.rasterize import gradient_tensors, radii_and_centres, rasterizer_of
 from .config import LossWeights
 from .exposure import ExposurePasses
 from .image_loss import ImageLoss
+from .loss_terms import TorchLoss, WgslLoss, torch_loss
 from .losses import LEAST_ERROR
 
 
 class RenderLoss(NamedTuple):
     """loss: a scalar, differentiable in the Gaussians' tensors and in the correction. terms: l1, mse (mean squared
-    error), ssim, pyramid and ncc (losses), as far as they were computed. radii (N,) and means2d (N, 2): as those of
-    splat.rasterize.Rendering."""
+    error), ssim, pyramid and ncc (losses), as far as they were computed, and the terms of one's own by name. radii (N,)
+    and means2d (N, 2): as those of splat.rasterize.Rendering."""
 
     loss: Tensor
     terms: dict[str, float]
@@ -49,12 +51,14 @@ def render_loss(
     weights: LossWeights,
     device: Device,
     correction: Tensor | None = None,
+    own: Sequence[tuple[TorchLoss | WgslLoss, float]] = (),
 ) -> RenderLoss:
     """The weighted sum of the image losses of the rendered Gaussians, computed on the device from end to end.
 
     gaussians: activated, float32, with harmonics. truth: (H, W) as `upload_rgba` leaves it, of the camera's size.
     background: (3,) in [0, 1], under both; not differentiable. weights: of the terms. correction: (3, 4), of the
-    image's colors before they are compared (train/exposure); none where None.
+    image's colors before they are compared (train/exposure); none where None. own: further terms of the image, with
+    their weights.
     The same bits on every run of one adapter and driver. Under torch.no_grad(), or where no tensor wants a gradient,
     none is computed.
     """
@@ -63,12 +67,12 @@ def render_loss(
     probe = gaussians.means.new_zeros((len(gaussians), 2)).requires_grad_(wanted)
     red, green, blue = background.tolist()
     loss, computed, radii, centres = _FusedLoss.apply(
-        *tensors, probe, camera, truth, (red, green, blue), weights, device, wanted
+        *tensors, probe, camera, truth, (red, green, blue), weights, device, wanted, own
     )
     with torch.no_grad():
         probe.copy_(centres)
-    names = ("l1", "mse", "ssim", "pyramid", "ncc")
-    used = (True, True, weights.ssim, weights.pyramid, weights.ncc)
+    names = ("l1", "mse", "ssim", "pyramid", "ncc", *(term.name for term, _ in own))
+    used = (True, True, weights.ssim, weights.pyramid, weights.ncc, *[True] * len(own))
     terms = {name: value for name, value, use in zip(names, computed.tolist(), used, strict=True) if use}
     if "ssim" in terms:
         terms["ssim"] = 1.0 - terms["ssim"]
@@ -81,7 +85,7 @@ class _FusedLoss(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
-        *tensors, correction, probe, camera, truth, background, weights, device, wanted = arguments
+        *tensors, correction, probe, camera, truth, background, weights, device, wanted, own = arguments
         rasterizer, losses, exposing = rasterizer_of(device), image_loss_of(device), exposure_of(device)
         gaussians = upload_gaussians(rasterizer.pool, Gaussians(*tensors))
         while True:
@@ -90,30 +94,57 @@ class _FusedLoss(torch.autograd.Function):
             with Commands(device) as commands:
                 image = drawing.image if correction is None else exposing.record(commands, drawing.image, correction)
                 terms, d_image = losses.record(commands, image, truth, background, weights, gradient=wanted)
-                if d_image is not None and correction is not None:
+            own_values, pixels = _own_terms(own, image, truth, background, losses, d_image)
+            if d_image is not None and correction is not None:
+                with Commands(device) as commands:
                     d_image, d_correction = exposing.record_bwd(commands, drawing.image, d_image, correction)
                     d_rows = [d_correction]
             if d_image is not None:
                 d_gaussians = rasterizer.backward(drawing, d_image).arrays()
-            found = iter(read_all([terms, drawing.splats, *d_gaussians, *d_rows, *drawing.needed]))
+            found = iter(read_all([terms, drawing.splats, *d_gaussians, *d_rows, *pixels.values(), *drawing.needed]))
             values, splats, gradients, rows = next(found), next(found), [next(found) for _ in d_gaussians], None
             if d_rows:
                 rows = next(found)
+            own_values |= {name: float(next(found).mean(dtype=np.float64)) for name in pixels}
             # Where the intersections did not fit, none of this is right, and all of it is done again.
             if not rasterizer.grow_on_overflow(drawing, list(found)):
                 break
         ctx.gradients = None
         if gradients:
             by_gaussians, d_means2d = gradient_tensors(gradients, probe.device)
-            own = None if rows is None else correction.new_tensor(rows.sum(axis=0, dtype=np.float64))
-            ctx.gradients = (*by_gaussians, own, d_means2d)
-        computed = torch.from_numpy(values)
+            by_correction = None if rows is None else correction.new_tensor(rows.sum(axis=0, dtype=np.float64))
+            ctx.gradients = (*by_gaussians, by_correction, d_means2d)
+        computed = torch.from_numpy(np.append(values.astype(np.float64), [own_values[t.name] for t, _ in own]))
         radii, centres = radii_and_centres(splats, probe.device)
         ctx.mark_non_differentiable(computed, radii, centres)
-        factors = [weights.l1, 0, weights.ssim, weights.pyramid, weights.ncc]
-        return probe.new_tensor(float(np.dot(values.astype(np.float64), factors))), computed, radii, centres
+        factors = [weights.l1, 0, weights.ssim, weights.pyramid, weights.ncc, *(weight for _, weight in own)]
+        return probe.new_tensor(float(np.dot(computed.numpy(), factors))), computed, radii, centres
 
     @staticmethod
     def backward(ctx: Any, *d_outputs: Any) -> tuple[Tensor | None, ...]:
         scaled = (None if gradient is None else d_outputs[0] * gradient for gradient in ctx.gradients)
-        return (*scaled, *[None] * 6)
+        return (*scaled, *[None] * 7)
+
+
+def _own_terms(
+    own: Sequence[tuple[TorchLoss | WgslLoss, float]],
+    image: DeviceArray,
+    truth: DeviceArray,
+    background: tuple[float, float, float],
+    losses: ImageLoss,
+    d_image: DeviceArray | None,
+) -> tuple[dict[str, float], dict[str, DeviceArray]]:
+    """By name of each further term of an image its value, or the values of the pixels, whose mean it is, on the device.
+    Their weighted gradients are added to d_image (4, H, W)."""
+    values: dict[str, float] = {}
+    pixels: dict[str, DeviceArray] = {}
+    for term, weight in own:
+        if isinstance(term, WgslLoss):
+            gradient = d_image or losses.pool.array("d_image", image.shape)  # where nobody wants it
+            with Commands(losses.device) as commands:
+                pixels[term.name] = term.record(commands, image, truth, background, weight, gradient)
+        else:
+            values[term.name], gradients = torch_loss(term, image, truth, background, weight)
+            if d_image is not None:
+                d_image.write(d_image.read() + gradients)
+    return values, pixels

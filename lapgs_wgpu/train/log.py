@@ -4,34 +4,46 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import platform
 import subprocess
+import sys
 import time
-from collections import deque
+from collections import Counter, deque
+from collections.abc import Callable
 from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
 from types import TracebackType
-from typing import BinaryIO, TextIO
+from typing import Any, BinaryIO, Protocol, TextIO
 
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.atomic import atomic_write
-from lapgs_wgpu.motion.fields.laplacian import LaplacianMotion
+from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.progress import Progress, duration
+from lapgs_wgpu.train.step_result import StepResult
 
 INTERVAL = 50  # steps from one line of log.jsonl to the next, over which loss and PSNR are averaged
 _MOST_SECONDS = 1e9  # that a training takes
 
 
+class Watched(Protocol):
+    """A training, as `Trainer` is one."""
+
+    scene: Scene4D
+
+    @property
+    def dead_scales(self) -> float: ...
+
+
 class Log:
     """Progress of a training, step by step. A context manager.
 
-    path: log.jsonl, written anew, or continued after the step `done`. Each line holds step, loss, psnr (dB, training
-    views) and gaussians, and the frequencies and amplitudes of the motion's spectrum where there is one, all of which
-    repeat from run to run, but for the first line after a resumption, which averages what came since; and under
-    "timing" seconds and steps_per_second, which do not. An evaluation during the training has a line of its own: step,
-    val_psnr, val_views ("val" or "train") and "timing". Its time does not count as time of the training.
+    path: log.jsonl, written anew, or continued after the step `done`. docs/metrics.md describes its lines. What
+    stands under "timing" and "memory" differs from run to run, all else repeats, but for the first line after a
+    resumption, which averages what came since. The time of an evaluation does not count as time of the training.
+    listeners: called with each line.
     """
 
     def __init__(self, path: Path, steps: int, *, done: int = 0, terminal: TextIO | None = None) -> None:
@@ -39,7 +51,8 @@ class Log:
         self._progress = Progress(steps, "steps", terminal)
         self._path = path
         self._file, before = _continued(path, done)
-        self._recent: deque[tuple[float, float]] = deque(maxlen=INTERVAL)
+        self._recent: deque[StepResult] = deque(maxlen=INTERVAL)
+        self.listeners: list[Callable[[dict[str, Any]], None]] = []
         now = time.perf_counter()
         self._start = now - before
         self._times: deque[float] = deque([now], maxlen=INTERVAL + 1)
@@ -58,31 +71,41 @@ class Log:
         """Since the start."""
         return time.perf_counter() - self._start
 
-    def step(
-        self, step: int, loss: float, psnr: float, gaussians: int, spectrum: LaplacianMotion | None = None
-    ) -> None:
-        """Take in a step that is done (counted from 1); the loss of one that was skipped does not count."""
-        now = time.perf_counter()
-        if math.isfinite(loss) and math.isfinite(psnr):
-            self._recent.append((loss, psnr))
-        self._times.append(now)
+    def after_step(self, trainer: Watched, result: StepResult, /) -> None:
+        """Take in a step that is done; the loss of one that was skipped does not count. A callback of `Trainer`."""
+        if result.skipped is not None:
+            self.tell(str(result.skipped))
+        self.step(result, len(trainer.scene), lambda: _now(trainer))
+
+    def step(self, result: StepResult, gaussians: int, now: Callable[[], dict[str, Any]] = dict) -> None:
+        """Take in a step that is done. now: what a line says of the moment, asked only where a line is written."""
+        time_now, step = time.perf_counter(), result.step
+        if math.isfinite(result.loss) and math.isfinite(result.psnr):
+            self._recent.append(result)
+        self._times.append(time_now)
         if not self._recent:
             return
-        rate = (len(self._times) - 1) / max(now - self._times[0], 1e-9)
+        rate = (len(self._times) - 1) / max(time_now - self._times[0], 1e-9)
         if step % INTERVAL == 0 or step == self._steps:
-            mean_loss, mean_psnr = (sum(values) / len(self._recent) for values in zip(*self._recent, strict=True))
-            line = {
-                "step": step,
-                "loss": round(mean_loss, 7),
-                "psnr": round(mean_psnr, 4),
-                "gaussians": gaussians,
-                **(_spectrum(spectrum) if spectrum else {}),
-                "timing": {"seconds": round(now - self._start, 3), "steps_per_second": round(rate, 3)},
-            }
-            self._write(json.dumps(line) + "\n")
+            count = len(self._recent)
+            terms = Counter[str]()
+            for each in self._recent:
+                terms.update({name: value / count for name, value in each.terms.items()})
+            timing = {"seconds": round(time_now - self._start, 3), "steps_per_second": round(rate, 3)}
+            self._write(
+                {
+                    "step": step,
+                    "loss": round(sum(each.loss for each in self._recent) / count, 7),
+                    "psnr": round(sum(each.psnr for each in self._recent) / count, 4),
+                    "terms": {name: round(value, 9) for name, value in terms.items()},
+                    "gaussians": gaussians,
+                    **now(),
+                    "timing": timing,
+                }
+            )
 
         def text() -> str:
-            smooth = sum(psnr for _, psnr in self._recent) / len(self._recent)
+            smooth = sum(each.psnr for each in self._recent) / len(self._recent)
             left = duration((self._steps - step) / rate)
             return (
                 f"step {step}/{self._steps}  {smooth:5.2f} dB  {gaussians} Gaussians  {rate:.1f} steps/s  {left} left"
@@ -95,12 +118,15 @@ class Log:
         self._start += seconds
         self._times = deque((at + seconds for at in self._times), maxlen=self._times.maxlen)
         timing = {"seconds": round(self.seconds, 3)}
-        self._write(json.dumps({"step": step, "val_psnr": round(psnr, 4), "val_views": views, "timing": timing}) + "\n")
-        self.tell(f"step {step}: {psnr:.2f} dB on the {'validation' if views == 'val' else 'training'} views")
+        self._write({"step": step, "val_psnr": round(psnr, 4), "val_views": views, "timing": timing})
+        shown = {"val": "the validation views", "train": "the training views"}.get(views, views)
+        self.tell(f"step {step}: {psnr:.2f} dB on {shown}")
 
-    def _write(self, line: str) -> None:
+    def _write(self, line: dict[str, Any]) -> None:
+        for listener in self.listeners:
+            listener(line)
         try:
-            self._file.write(line.encode())
+            self._file.write((json.dumps(line) + "\n").encode())
         except OSError as error:
             raise InputError(
                 f"{self._path}: not written ({error.strerror or error}); free some space or check the disk, then "
@@ -129,9 +155,31 @@ def _continued(path: Path, done: int) -> tuple[BinaryIO, float]:
     return path.open("ab", buffering=0), seconds  # a line is one write, and none waits for a later one to fail
 
 
-def _spectrum(motion: LaplacianMotion) -> dict[str, list[float]]:
-    values = {"frequencies": motion.frequencies.detach(), "amplitudes": motion.amplitudes()}
-    return {name: [round(value, 6) for value in tensor.tolist()] for name, tensor in values.items()}
+def _now(trainer: Watched) -> dict[str, Any]:
+    """Of the scene after a step: the share of dead scales, the motion's spectrum where there is one, and memory."""
+    values = {}
+    if (motion := trainer.scene.spectrum) is not None:
+        values = {"frequencies": motion.frequencies.detach(), "amplitudes": motion.amplitudes()}
+    spectrum = {name: [round(value, 6) for value in tensor.tolist()] for name, tensor in values.items()}
+    memory = {"host_bytes": resident_bytes(), "device_bytes": trainer.scene.device.allocated_bytes}
+    return {
+        "dead_scales": round(trainer.dead_scales, 6),
+        **spectrum,
+        "memory": {name: value for name, value in memory.items() if value is not None},
+    }
+
+
+def resident_bytes() -> int | None:
+    """Memory of this process at present; where the system does not tell, the most so far; None where it tells
+    neither."""
+    with suppress(OSError, ValueError):
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    with suppress(ImportError):
+        import resource
+
+        most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        return most if sys.platform == "darwin" else 1024 * most
+    return None
 
 
 def environment(device: Device) -> dict[str, str]:

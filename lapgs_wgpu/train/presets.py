@@ -44,24 +44,25 @@ def preset_names() -> list[str]:
 
 def load_config(
     preset: str,
-    overrides: Mapping[str, str | list[str]] | None = None,
+    overrides: Mapping[str, Any] | None = None,
     *,
     method: str | None = None,
     ablate: Iterable[str] = (),
 ) -> Config:
     """A preset by name, or a .toml file by path (such as an earlier run's config.toml), with some values overridden.
 
-    overrides: dotted key -> text, or texts of a tuple's entries, as they stand on a command line.
+    overrides: dotted key, such as schedule.steps -> value, or as on a command line text, or texts of a tuple's entries.
     method: a field's kind, without what belongs to the paper's method only (PAPER_ONLY). ablate: parts of the paper's
     method that are left out (ABLATIONS). Overrides come last.
     Raises InputError where the preset, a key or a value is not valid.
     """
     known = {key.name: key.kind for key in config_keys()}
     table: Table = {}
-    for key, text in (overrides or {}).items():
+    for key, value in (overrides or {}).items():
         if key not in known:
             raise InputError(f"there is no option --{key}{did_you_mean(key, known)}")
-        _set(table, key, checked(known[key], from_text(text, known[key]), f"--{key}"))
+        texts = isinstance(value, str) or (isinstance(value, list) and all(isinstance(each, str) for each in value))
+        _set(table, key, checked(known[key], from_text(value, known[key]) if texts else value, f"--{key}"))
     return build_config(preset, table, preset, method=method, ablate=ablate)
 
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-import os
 import signal
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
+from functools import partial
 from pathlib import Path
 from types import FrameType
 
@@ -25,12 +24,13 @@ from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.autotune import Choice
 from lapgs_wgpu.train.config import Background, Config
-from lapgs_wgpu.train.discovery.discover import discover
 from lapgs_wgpu.train.distributed import SINGLE_PROCESS, Ranks
-from lapgs_wgpu.train.evaluate import evaluate, mean_psnr, write_metrics
+from lapgs_wgpu.train.evaluate import evaluate, write_metrics
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.lpips import Lpips
 from lapgs_wgpu.train.malloc import keep_freed_memory, return_freed_memory
+from lapgs_wgpu.train.monitor import Monitor, Snapshots, monitored_views
+from lapgs_wgpu.train.parts import Callback, Parts
 from lapgs_wgpu.train.run_folder import (
     STATE,
     check_run_folder,
@@ -41,10 +41,11 @@ from lapgs_wgpu.train.run_folder import (
     save_state,
     start_run_folder,
 )
-from lapgs_wgpu.train.trainer import StepResult, Trainer
+from lapgs_wgpu.train.step_result import StepResult
+from lapgs_wgpu.train.tensorboard import TensorBoard, check_tensorboard
+from lapgs_wgpu.train.trainer import Trainer
 
 PROBES = 2048  # points of the scene that say whether a camera sees it
-MONITORED = 8  # training views that eval.interval measures if there are no validation views
 OUTSIDE = 0.05  # warn if this share of the Gaussians, or more, is outside the encoder's box
 
 # Takes over a training's steps, such as a viewer does: called with the scene, where to look at it from, and the steps,
@@ -61,19 +62,25 @@ def train(
     overwrite: bool = False,
     watch: Watch | None = None,
     ranks: Ranks = SINGLE_PROCESS,
+    parts: Parts | None = None,
+    lpips: Lpips | None = None,
 ) -> Scene4D:
     """Train on a dataset, evaluate on its test views, and leave config.toml, log.jsonl, metrics.json, checkpoint.ply
     and eval/ in the folder `out`, which must be new or empty, or hold an earlier run when `overwrite` is set.
 
     device: the default adapter where None. ranks: this process among those that train together; only the first one
-    writes. The same configuration, pictures, adapter and driver give the same
-    checkpoint to the last byte, watched or not, interrupted and resumed or not. Raises InputError before anything is
-    written where the input is not usable, and KeyboardInterrupt after Ctrl-C or SIGTERM, when checkpoint and state of
-    the last whole step have been written. DeviceError, NumericalError and whatever else ends a step go on to the caller
-    when that state has been written.
+    writes. parts: what Python gives the training (docs/api.md). lpips: of the evaluation. The same configuration,
+    pictures, adapter and driver give the same checkpoint to the last byte, watched or not, interrupted and resumed or
+    not. Raises InputError before anything is written where the input is not usable, and KeyboardInterrupt after Ctrl-C
+    or SIGTERM, when checkpoint and state of the last whole step have been written. DeviceError, NumericalError and
+    whatever else ends a step go on to the caller when that state has been written.
     """
     out = Path(out)
     found = check_times(dataset, moving=config.field.kind != "static")
+    if config.eval.interval:
+        monitored_views(dataset, config.eval.views)
+    if config.eval.tensorboard:
+        check_tensorboard()
     found += check_in_view(dataset, first_points(dataset, PROBES, config.points.box, config.seed)[0])
     if ranks.first:
         check_run_folder(out, overwrite=overwrite)
@@ -83,14 +90,16 @@ def train(
             print(f"placement: {dataset.normalization}", flush=True)
     keep_freed_memory()
     device = device or open_device()
-    training = Trainer(config, dataset, device, ranks, _discovered(config, dataset, device, ranks))
+    training = Trainer(config, dataset, device, ranks, parts=parts)
     if not ranks.first:
         return _assist(training)
     with locked_run_folder(out):
         start_run_folder(out, training.config, training.scene.device, dataset)
+        if training.discovery is not None:
+            print(training.discovery, flush=True)
         if training.decoder.seconds:
             print(_told(training.decoder), flush=True)
-        return _run(training, dataset, out, watch)
+        return _run(training, out, watch, lpips)
 
 
 def resume(
@@ -101,6 +110,8 @@ def resume(
     device: Device | None = None,
     watch: Watch | None = None,
     ranks: Ranks = SINGLE_PROCESS,
+    parts: Parts | None = None,
+    lpips: Lpips | None = None,
 ) -> Scene4D:
     """Go on with an interrupted training of this configuration and dataset in its run folder, from its last saved
     state, or from the start where it has none. Otherwise as `train`."""
@@ -111,8 +122,7 @@ def resume(
     device = device or open_device()
     with locked_run_folder(out) if ranks.first else nullcontext():
         state = load_state(out)
-        scene = _discovered(config, dataset, device, ranks) if state is None else None
-        training = Trainer(config, dataset, device, ranks, scene)
+        training = Trainer(config, dataset, device, ranks, parts=parts, resumed=state is not None)
         if state is not None:
             try:
                 check_state(state, views=len(dataset.train), steps=config.schedule.steps)
@@ -120,19 +130,7 @@ def resume(
             except (IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
                 reason = f"{type(error).__name__}: {error}".splitlines()[0]
                 raise InputError(f"{out}: its state and its config.toml do not belong together ({reason}).") from error
-        return _run(training, dataset, out, watch) if ranks.first else _assist(training)
-
-
-def _discovered(config: Config, dataset: Dataset, device: Device, ranks: Ranks) -> Scene4D | None:
-    """The scene that discovery starts a training with; None where it is off or out of proportion."""
-    wanted = config.discovery.enabled and config.field.kind != "static"
-    if not wanted or config.schedule.steps <= config.discovery.steps:
-        return None
-    with open(os.devnull, "w") as nowhere:
-        found = discover(config, dataset, device, None if ranks.first else nowhere)
-    if ranks.first:
-        print(found.summary, flush=True)
-    return found.scene
+        return _run(training, out, watch, lpips) if ranks.first else _assist(training)
 
 
 def _precision_warnings(config: Config) -> list[str]:
@@ -183,13 +181,16 @@ def _goes_on(training: Trainer, interrupted: threading.Event) -> bool:
     return training.done < training.config.schedule.steps and not training.ranks.any(interrupted.is_set())
 
 
-def _run(training: Trainer, dataset: Dataset, out: Path, watch: Watch | None) -> Scene4D:
+def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None) -> Scene4D:
+    """The steps that are left, with all that a run folder receives."""
     config, scene = training.config, training.scene
-    look = InitialView((dataset.test or dataset.train)[0].camera, dataset.focus, dataset.up, len(dataset.times))
     with Log(out / "log.jsonl", config.schedule.steps, done=training.done) as log, _interruptible() as interrupted:
-        steps = _steps(training, dataset, log, out, interrupted)
+        training.callbacks += [log.after_step, *_monitors(training, log, out)]
+        if config.schedule.save_interval:
+            training.callbacks.append(partial(_save_now_and_then, out))
+        steps = _steps(training, out, interrupted)
         if watch is not None:
-            watch(scene, look, steps)
+            watch(scene, training.initial_view, steps)
         for _ in steps:
             pass
         seconds = log.seconds
@@ -200,36 +201,41 @@ def _run(training: Trainer, dataset: Dataset, out: Path, watch: Watch | None) ->
     done, all_steps = training.done, config.schedule.steps
     if done < all_steps or config.schedule.save_interval:
         save_state(out, training.state())
-    metadata = {"scene": dataset.name, "background": config.data.background, "step": str(done), "view": look.to_json()}
-    if dataset.normalization is not None:
-        metadata["placement"] = dataset.normalization.to_json()
-    scene.save(out / "checkpoint.ply", metadata)
+    training.save(out / "checkpoint.ply")
     if done < all_steps:
         raise KeyboardInterrupt(
             f"stopped after step {done} of {all_steps}; {out / 'checkpoint.ply'} holds it, and "
             f"lapgs-train --resume {out} goes on."
         )
-    evaluate_run(out, scene, dataset, config.data.background, {"steps": done, "seconds": round(seconds, 3)})
+    measured = {"steps": done, "seconds": round(seconds, 3)}
+    evaluate_run(out, scene, training.dataset, config.data.background, measured, lpips)
     drop_states(out)
     return scene
 
 
-def _steps(
-    training: Trainer, dataset: Dataset, log: Log, out: Path, interrupted: threading.Event
-) -> Iterator[StepResult]:
-    """The steps that are left, each logged, and the state saved now and then, until `interrupted` is set."""
-    schedule = training.config.schedule
+def _monitors(training: Trainer, log: Log, out: Path) -> list[Callback]:
+    """The callbacks that the table eval of the configuration asks for. Raises InputError."""
+    config = training.config.eval
+    found: list[Callback] = []
+    if config.tensorboard:
+        log.listeners.append(TensorBoard(out / "tensorboard", done=training.done))
+    if config.interval:
+        found.append(Monitor(monitored_views(training.dataset, config.views), log))
+    if config.snapshots:
+        found.append(Snapshots(out / "snapshots"))
+    return found
+
+
+def _save_now_and_then(out: Path, training: Trainer, result: StepResult) -> None:
+    if result.step % training.config.schedule.save_interval == 0 and result.step < result.steps:
+        save_state(out, training.state())
+
+
+def _steps(training: Trainer, out: Path, interrupted: threading.Event) -> Iterator[StepResult]:
+    """The steps that are left, until `interrupted` is set."""
     try:
         while _goes_on(training, interrupted):
-            progress = training.step()
-            if progress.skipped is not None:
-                log.tell(str(progress.skipped))
-            log.step(progress.step, progress.loss, progress.psnr, len(training.scene), training.scene.spectrum)
-            if training.config.eval.interval and training.done % training.config.eval.interval == 0:
-                _log_validation(training, dataset, log)
-            yield progress
-            if schedule.save_interval and training.done % schedule.save_interval == 0 < schedule.steps - training.done:
-                save_state(out, training.state())
+            yield training.step()
     except (DeviceError, NumericalError, MemoryError) as error:
         kind = MemoryError if not isinstance(error, DeviceError | NumericalError) else type(error)  # numpy has its own
         raise kind(f"{error}{_saved(training, out)}") from error
@@ -238,15 +244,6 @@ def _steps(
         raise
     finally:
         training.close()
-
-
-def _log_validation(training: Trainer, dataset: Dataset, log: Log) -> None:
-    """Log the PSNR of the validation views or, without any, of some training views."""
-    started = time.perf_counter()
-    count = min(MONITORED, len(dataset.train))
-    views = dataset.val or [dataset.train[i * len(dataset.train) // count] for i in range(count)]
-    psnr = mean_psnr(training.scene, views, training.config.data.background)
-    log.evaluated(training.done, psnr, "val" if dataset.val else "train", time.perf_counter() - started)
 
 
 def _saved(training: Trainer, out: Path) -> str:

@@ -25,7 +25,10 @@ from lapgs_wgpu.train.log import environment
 from lapgs_wgpu.train.presets import write_toml
 
 STATE, STATE_BEFORE, LOCK = "state.safetensors", "state.before.safetensors", ".lock"
-RUN_FILES = ("config.toml", "log.jsonl", "metrics.json", "metrics.csv", "checkpoint.ply", "eval", STATE, STATE_BEFORE)
+RUN_FILES = (
+    "config.toml", "log.jsonl", "metrics.json", "metrics.csv", "checkpoint.ply", "eval", "snapshots", "tensorboard",
+    STATE, STATE_BEFORE,
+)  # fmt: skip
 
 State = Mapping[str, NDArray[Any]]
 

@@ -6,24 +6,51 @@ A process a run: the device's memory is all free again for the next one, and a r
 from __future__ import annotations
 
 import dataclasses
+import math
 import shutil
 import signal
 import subprocess
 import sys
 import tempfile
+import threading
+import time
 from collections.abc import Mapping, Sequence
 from datetime import timedelta
 from pathlib import Path
 from statistics import mean
+from typing import NamedTuple
 
 from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.data.builtin import is_builtin, write_builtin
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import open_device
 from lapgs_wgpu.io.atomic import atomic_write
-from lapgs_wgpu.train.presets import write_toml
+from lapgs_wgpu.train.presets import load_config, write_toml
+from lapgs_wgpu.train.run_folder import STATE, STATE_BEFORE
 from lapgs_wgpu.train.table_results import Result, Results, read_results, read_run, write_results
-from lapgs_wgpu.train.table_spec import Run, RunKey, Spec
+from lapgs_wgpu.train.table_spec import Run, RunKey, Spec, fingerprint
+
+SAVING = 30.0  # seconds that a run has to save its state when it is stopped
+
+
+class Outcome(NamedTuple):
+    """finished: how many runs. failed: those that did, each with the reason. stopped: whether the time was over."""
+
+    finished: int
+    failed: dict[RunKey, str]
+    stopped: bool
+
+
+class Launch(NamedTuple):
+    """How runs are started. lpips: weights for it. until: of time.monotonic, when the one under way is stopped."""
+
+    device: str | None = None
+    lpips: Path | None = None
+    until: float | None = None
+
+    @property
+    def seconds_left(self) -> float:
+        return math.inf if self.until is None else self.until - time.monotonic()
 
 
 def make_table(
@@ -34,13 +61,17 @@ def make_table(
     known: Sequence[Results] = (),
     device: str | None = None,
     slim: bool = False,
-) -> dict[RunKey, str]:
+    lpips: Path | None = None,
+    hours: float | None = None,
+) -> Outcome:
     """Train what is not finished; results.json and table.md in `out` are written anew after every run.
 
     data: the folder in which the scenes lie. known: finished runs from elsewhere, beside those of out/results.json and
-    of the run folders out/SCENE/ROW/seedN. slim: drop checkpoint and pictures of each run that is done.
-    Returns the runs that failed, each with the reason. Raises InputError before the first training starts.
+    of the run folders out/SCENE/ROW/seedN. slim: drop checkpoint and pictures of each run that is done. lpips: weights
+    for it. hours: after which the run under way is stopped, so that the next call goes on with it.
+    An interrupted run goes on from its last saved state. Raises InputError before the first training starts.
     """
+    launch = Launch(device, lpips, None if hours is None else time.monotonic() + 3600 * hours - SAVING)
     if out.exists() and not out.is_dir():
         raise InputError(f"{out} is a file; name a folder for the table with --out.")
     stored = [read_results(out / "results.json")] if (out / "results.json").exists() else []
@@ -55,16 +86,20 @@ def make_table(
     _write(spec, out, finished)
     failed: dict[RunKey, str] = {}
     for run in pending:
+        if launch.seconds_left <= 0:
+            return Outcome(len(finished), failed, stopped=True)
         number = len(finished) + len(failed) + 1
         print(
             f"run {number} of {len(spec.runs)}: {run.key} ({_time_left(spec.runs, finished, failed)})", file=sys.stderr
         )
         folder = run_folder(out, run.key)
         try:
-            reason = _train_in_process(run, folders[run.folder], folder, device)
+            reason = _train_in_process(run, folders[run.folder], folder, launch)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(f"stopped in run {number} of {len(spec.runs)}; the same command goes on.") from None
         result = read_run(folder, run)
+        if result is None and launch.seconds_left <= 0:
+            return Outcome(len(finished), failed, stopped=True)
         if reason or result is None:
             failed[run.key] = reason or f"{folder} holds no finished run"
             print(f"run {number} failed: {failed[run.key]}", file=sys.stderr)
@@ -74,7 +109,7 @@ def make_table(
         if slim:
             (folder / "checkpoint.ply").unlink(missing_ok=True)
             shutil.rmtree(folder / "eval", ignore_errors=True)
-    return failed
+    return Outcome(len(finished), failed, stopped=False)
 
 
 def run_folder(out: Path, key: RunKey) -> Path:
@@ -137,23 +172,53 @@ def _time_left(runs: Sequence[Run], finished: Mapping[RunKey, Result], failed: M
     return f"about {timedelta(seconds=round(left))} left"
 
 
-def _train_in_process(run: Run, data: Path, out: Path, device: str | None) -> str | None:
+def _goes_on(run: Run, out: Path) -> bool:
+    """Whether the folder holds this very run, interrupted, with a state from which it goes on."""
+    try:
+        made = fingerprint(load_config(str(out / "config.toml")))
+    except InputError:  # not there, or damaged
+        return False
+    saved = any((out / name).is_file() for name in (STATE, STATE_BEFORE))
+    return saved and made == run.fingerprint and not (out / "metrics.json").exists()
+
+
+def _train_in_process(run: Run, data: Path, out: Path, launch: Launch) -> str | None:
     """lapgs-train with this configuration; what it tells goes to stderr. Returns why it failed, None if it did not."""
     with tempfile.TemporaryDirectory() as work:
         preset = Path(work) / "config.toml"
         preset.write_text(write_toml(dataclasses.asdict(run.config)), encoding="utf-8")
-        command = [sys.executable, "-m", "lapgs_wgpu.cli", str(preset), f"--data={data}", f"--out={out.resolve()}"]
-        command += ["--overwrite", *([f"--device={device}"] if device else [])]
+        command = [sys.executable, "-m", "lapgs_wgpu.cli", f"--data={data}"]
+        if _goes_on(run, out):
+            command += ["--resume", str(out.resolve())]
+        else:
+            command += [str(preset), f"--out={out.resolve()}", "--overwrite"]
+        command += [f"--device={launch.device}"] if launch.device else []
+        command += [f"--lpips-weights={launch.lpips}"] if launch.lpips else []
         process = subprocess.Popen(
-            command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, errors="replace"
+            command,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+            errors="replace",
+            # Ctrl-C is for this process, which then asks the other one, once, to save its state.
+            process_group=0 if sys.platform != "win32" else None,
         )
+        timer = threading.Timer(min(launch.seconds_left, threading.TIMEOUT_MAX), process.terminate)
+        timer.daemon = True
+        timer.start()
         try:
             last = _pass_on(process)
             code = process.wait()
-        except BaseException:  # Ctrl-C: the run starts again with the next call, so nothing of it need be saved
-            process.kill()
-            process.wait()
+        except BaseException:
+            process.terminate()
+            try:
+                process.wait(SAVING)
+            finally:
+                process.kill()
+                process.wait()
             raise
+        finally:
+            timer.cancel()
     if code < 0:
         return f"ended by {signal.Signals(-code).name}"
     return (last.removeprefix("lapgs-train: ") or f"exit code {code}") if code else None

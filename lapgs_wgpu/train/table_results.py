@@ -19,7 +19,8 @@ from lapgs_wgpu.train.presets import Table, load_config
 from lapgs_wgpu.train.table_spec import Run, RunKey, fingerprint
 
 FORMAT = "lapgs-table 1"
-MOTION = ("psnr_moving", "found", "track_error")  # the figures that a run may lack
+# The figures that a run may lack.
+OPTIONAL = ("ms_ssim", "lpips", "lpips_unscaled", "psnr_moving", "found", "track_error")
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,9 @@ class Result(Options):
     views: int = option("number of test views")
     overrides: Table = option("what the configuration changed of the preset")
     environment: dict[str, str] = option("versions, adapter and driver")
+    ms_ssim: float | None = option("mean over the test views; None where it was not measured", None)
+    lpips: float | None = option("mean over the test views; None where it was not measured", None)
+    lpips_unscaled: float | None = option("the same of inputs in [0, 1]; None where it was not measured", None)
     psnr_moving: float | None = option("docs/metrics.md; None where it was not measured", None)
     found: float | None = option("docs/metrics.md; None where it was not measured", None)
     track_error: float | None = option("docs/metrics.md; None where it was not measured", None)
@@ -83,7 +87,7 @@ def read_run(folder: Path, run: Run) -> Result | None:
             "views": len(metrics["views"]),
             "overrides": run.overrides,
             "environment": record,
-            **{name: metrics[name] for name in MOTION if isinstance(metrics.get(name), int | float)},
+            **{name: metrics[name] for name in OPTIONAL if isinstance(metrics.get(name), int | float)},
         }
         return build_dataclass(Result, entry, str(folder))
     except (OSError, ValueError, KeyError, TypeError):  # missing or damaged: it is trained again
@@ -162,6 +166,9 @@ def markdown(results: Results) -> str:
 _FORMATS = {
     "psnr": ("PSNR", "{:.2f}"),
     "ssim": ("SSIM", "{:.4f}"),
+    "ms_ssim": ("MS-SSIM", "{:.4f}"),
+    "lpips": ("LPIPS", "{:.4f}"),
+    "lpips_unscaled": ("LPIPS [0, 1]", "{:.4f}"),
     "gaussians": ("Gaussians", "{:,.0f}"),
     "steps_per_second": ("steps/s", "{:.1f}"),
     "seconds": ("training, s", "{:,.0f}"),

@@ -132,6 +132,14 @@ def fingerprint(config: Config) -> str:
         del values["density"]["min_contribution"], values["density"]["contribution_interval"]
     if config.data.split == "test":
         del values["data"]["split"]
+    if config.field.negative_scales == "floor":
+        del values["field"]["negative_scales"]
+    if config.smoothness.start == 0:
+        del values["smoothness"]["start"]
+    if config.data.units == "world":
+        del values["data"]["units"]
+    if config.data.undistort:
+        del values["data"]["undistort"]
     if config.precision == "float32":
         del values["precision"]
     if config.decoder != "device":

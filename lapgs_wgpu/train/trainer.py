@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
-from typing import NamedTuple
+import os
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -15,7 +18,9 @@ from torch import Tensor
 from lapgs_wgpu.data.initial_gaussians import first_points, initial_scales, limit_optical_depth
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.errors import InputError
-from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.device import Device, open_device
+from lapgs_wgpu.io.initial_view import InitialView
+from lapgs_wgpu.motion.fields.config import MIN_SCALE
 from lapgs_wgpu.motion.fields.deformation import Nearby
 from lapgs_wgpu.motion.fields.dynamics import dynamics_loss
 from lapgs_wgpu.motion.fields.grid_field import GridField
@@ -25,25 +30,28 @@ from lapgs_wgpu.train.autotune import choose_decoder
 from lapgs_wgpu.train.config import Config, PointsConfig, SmoothnessConfig
 from lapgs_wgpu.train.contribution import contributions, spread_over_time
 from lapgs_wgpu.train.dataloader import Pictures
-from lapgs_wgpu.train.densify import LEAST_KEPT, Statistics, densify, largest, reset_opacities
+from lapgs_wgpu.train.densify import (
+    LEAST_KEPT,
+    DensityState,
+    Statistics,
+    check_change,
+    largest,
+    reset_opacities,
+)
+from lapgs_wgpu.train.discovery.discover import discover
 from lapgs_wgpu.train.distributed import SINGLE_PROCESS, Ranks
+from lapgs_wgpu.train.evaluate import evaluate
 from lapgs_wgpu.train.exposure import Exposures
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
+from lapgs_wgpu.train.loss_terms import Regularizer, check_terms, weight_at
 from lapgs_wgpu.train.nonfinite import Health, Skipped, check_parameters, describe, finite
+from lapgs_wgpu.train.open_dataset import open_dataset, with_folder
 from lapgs_wgpu.train.optimizer import FrequencyOptimizer, Optimizer
+from lapgs_wgpu.train.parts import Parts
+from lapgs_wgpu.train.step_result import StepResult
 
 MAX_SH_DEGREE = 3
-
-
-class StepResult(NamedTuple):
-    """A step that is done, of how many in all; loss, and PSNR in dB, means over its views. skipped: where its values
-    were not finite, so that it moved nothing."""
-
-    step: int
-    steps: int
-    loss: float
-    psnr: float
-    skipped: Skipped | None = None
+TERMS = frozenset({"l1", "mse", "ssim", "pyramid", "ncc", "smoothness", "dynamics"})  # of the configuration
 
 
 class _Look(NamedTuple):
@@ -55,21 +63,54 @@ class _Look(NamedTuple):
 
 
 class Trainer:
-    """A training between two of its steps.
+    """A training, step by step: what lapgs-train runs.
 
-    scene: to start from, as `discover` gives it, and to move from the first step on; made of `initial_points` where
-    None. config: with the decoder's place chosen. done: the steps so far. whole: whether `state` is that of a whole
-    step, which it also is where `step` raised an error before anything that lasts had changed.
+    A context manager, and an iterator of the steps that are left.
+
+    scene: the Scene4D, as the last step left it. config: with the decoder's place chosen. dataset: its test views are
+    not touched by any step. done: the steps so far. callbacks: called after each step. discovery: what motion discovery
+    found, a line, where it was done. whole: whether `state` is that of a whole step, which it also is where `step`
+    raised an error before anything that lasts had changed.
     """
 
     def __init__(
         self,
         config: Config,
-        dataset: Dataset,
-        device: Device,
+        dataset: Dataset | None = None,
+        device: Device | None = None,
         ranks: Ranks = SINGLE_PROCESS,
         scene: Scene4D | None = None,
+        *,
+        parts: Parts | None = None,
+        resumed: bool = False,
     ) -> None:
+        """Open the data, do motion discovery as the configuration says, and make the first Gaussians.
+
+        Args:
+            config: as `load_config` gives it.
+            dataset: None for the one that config.data names; a built-in scene is then written into the folder runs.
+            device: None for the default adapter.
+            ranks: this process among those that train together.
+            scene: to start from, and to move from the first step on, in place of discovery and initial points.
+            parts: own field, losses, density control, learning rates and callbacks.
+            resumed: leave out discovery, since `restore` follows.
+
+        Raises:
+            InputError: the configuration, the data and the parts do not fit each other.
+        """
+        parts = parts or Parts()
+        if dataset is None:
+            config = with_folder(config, Path("runs"))
+            dataset = open_dataset(config)
+        device = device or open_device()
+        check_terms(tuple(parts.losses), TERMS)
+        if parts.field is not None:
+            try:
+                config = dataclasses.replace(config, field=dataclasses.replace(config.field, kind="own"))
+            except ValueError as error:
+                raise InputError(f"{error}.") from None
+        config = suited(config, dataset)
+        self.dataset, self.parts, self.callbacks = dataset, parts, list(parts.callbacks)
         if config.schedule.batch % ranks.count:
             raise InputError(
                 f"{ranks.count} processes cannot share {config.schedule.batch} views a step evenly; give --batch "
@@ -77,6 +118,11 @@ class Trainer:
             )
         self.ranks = ranks
         self.done = 0
+        self.discovery: str | None = None
+        if scene is None and not resumed and _discovers(config):
+            with open(os.devnull, "w") as nowhere:
+                found = discover(config, dataset, device, Trainer, None if ranks.first else nowhere, parts.field)
+            scene, self.discovery = found.scene, found.summary
         self._generator = torch.Generator().manual_seed(config.seed)
         # What discovery found moves from the first step on, at rates that rise: Adam's first steps, all of the size of
         # the rate, would shake off what the field knows.
@@ -87,19 +133,29 @@ class Trainer:
             opacity=config.points.opacity,
             device=device,
             seed=config.seed,
+            own_field=parts.field,
         )
         self.decoder = choose_decoder(config, self.scene, device, ranks)
         self.config = dataclasses.replace(config, decoder=self.decoder.place)
-        self._start(dataset)
+        self._start()
         self.whole = True
 
-    def _start(self, dataset: Dataset) -> None:
-        config, scene = self.config, self.scene
+    def _start(self) -> None:
+        config, scene, dataset = self.config, self.scene, self.dataset
         if isinstance(scene.field, GridField):
             scene.field.precision = getattr(torch, config.precision)
             scene.field.on_device = self.decoder.place == "device"
         groups = scene.field.parameter_groups() if scene.field else {}
-        self._optimizer = Optimizer(scene.parameters, groups, config.rates.schedules())
+        rates = config.rates.schedules() | self.parts.schedules()
+        for name in (*groups, *self.parts.rates):
+            if name not in rates or (name in self.parts.rates and name not in {*scene.parameters, *groups}):
+                known = ", ".join([*scene.parameters, *groups])
+                raise InputError(
+                    f"the field's group {name} has no learning rate; give Parts(rates={{{name!r}: ...}})."
+                    if name not in rates
+                    else f"Parts(rates=...) names {name}, which is no group of parameters; there are {known}."
+                )
+        self._optimizer = Optimizer(scene.parameters, groups, rates)
         self._frequencies = None
         if scene.spectrum is not None:
             limit = len(dataset.times) / 2
@@ -111,6 +167,7 @@ class Trainer:
         # Cameras that all stand at one place have no extent; the scene's own size must serve.
         self._extent = dataset.extent or config.points.box
         self._statistics = Statistics.zeros(len(scene), scene.parameters["means"].device)
+        self._scales = scene.parameters["log_scales"].detach().exp()
         self._health = Health()
         data = config.data
         self._pictures = Pictures(dataset.train, data.background, data.cache_gb, self._generator, scene.device)
@@ -119,8 +176,43 @@ class Trainer:
         """End what goes on beside the steps."""
         self._pictures.close()
 
+    def __enter__(self) -> Trainer:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def __iter__(self) -> Iterator[StepResult]:
+        """Take the steps that are left, one at a time."""
+        while self.done < self.config.schedule.steps:
+            yield self.step()
+
+    @property
+    def dead_scales(self) -> float:
+        """Of the last view that was rendered, the share of the Gaussians' scales that are at the floor, where they get
+        no gradient."""
+        return float((self._scales <= MIN_SCALE).float().mean())
+
+    def evaluate(self, views: Sequence[View] | None = None) -> dict[str, Any]:
+        """Measure the scene on views, the test views where None: the content of metrics.json (docs/metrics.md)."""
+        return evaluate(self.scene, self.dataset.test if views is None else views, self.config.data.background)
+
+    @property
+    def initial_view(self) -> InitialView:
+        """Where a viewer begins."""
+        data = self.dataset
+        return InitialView((data.test or data.train)[0].camera, data.focus, data.up, len(data.times))
+
+    def save(self, path: str | Path) -> None:
+        """Write the scene as a checkpoint (docs/format.md), which lapgs-view and `load` open. Raises InputError."""
+        data, view = self.dataset, self.initial_view.to_json()
+        metadata = {"scene": data.name, "background": self.config.data.background, "step": str(self.done), "view": view}
+        if data.normalization is not None:
+            metadata["placement"] = data.normalization.to_json()
+        self.scene.save(path, metadata)
+
     def step(self) -> StepResult:
-        """One step of the optimiser, on `schedule.batch` pictures, whose losses count as their mean.
+        """One step of the optimiser, on `schedule.batch` pictures, whose losses count as their mean; then callbacks.
 
         A step whose loss or gradients are not finite moves nothing: parameters, the optimisers' and the density
         control's state stay as they were; what the schedule plans for this step is done. Raises NumericalError where
@@ -128,12 +220,15 @@ class Trainer:
         """
         random, order = self._generator.get_state(), list(self._pictures.order)
         try:
-            return self._step()
+            result = self._step()
         except Exception:
             if self.whole:  # the device gave out: as if the step had not begun
                 self._generator.set_state(random)
                 self._pictures.order = order
             raise
+        for callback in self.callbacks:
+            callback(self, result)
+        return result
 
     def _step(self) -> StepResult:
         config, scene, ranks = self.config, self.scene, self.ranks
@@ -146,17 +241,17 @@ class Trainer:
 
         self._zero_grad()
         seen = Statistics.zeros(len(scene), scene.parameters["means"].device)
-        renderings, totals = [], torch.zeros(2, dtype=torch.float64)
+        renderings, totals = [], Counter[str]()
         for look in looks[ranks.rank :: ranks.count]:
-            loss, rendering = self._loss(look, moving)
+            loss, rendering, terms = self._loss(look, moving)
             (loss / len(looks)).backward()
             seen.add(rendering, look.view.camera, scale=len(looks))
             renderings.append(rendering)
-            totals += torch.tensor([loss.item(), rendering.psnr], dtype=torch.float64)
+            totals.update({"loss": loss.item(), "psnr": rendering.psnr, **terms})
         if ranks.count > 1:
             self._put_together()
-        loss_sum, psnr_sum = ranks.sums([totals])[0].tolist()
-        value, psnr = loss_sum / len(looks), psnr_sum / len(looks)
+        sums = ranks.sums([torch.tensor(list(totals.values()), dtype=torch.float64)])[0] / len(looks)
+        value, psnr, *of_terms = sums.tolist()
 
         names = ", ".join(look.view.name for look in looks)
         skipped = self._examine(renderings, value, step, names)
@@ -178,13 +273,16 @@ class Trainer:
         self.done = step
         self.whole = True
         self._health.note(skipped)
-        return StepResult(step, config.schedule.steps, value, psnr, skipped)
+        terms = dict(zip(list(totals)[2:], of_terms, strict=True))
+        return StepResult(step, config.schedule.steps, value, psnr, skipped, terms)
 
     def _nearby(self, view: View) -> Nearby | None:
+        if self.done < self.config.smoothness.start:
+            return None
         return draw_nearby(self.config.smoothness, len(self.scene), view.time, self._generator)
 
-    def _loss(self, look: _Look, moving: bool) -> tuple[Tensor, RenderLoss]:
-        """The loss of a view, all terms together, and its rendering."""
+    def _loss(self, look: _Look, moving: bool) -> tuple[Tensor, RenderLoss, dict[str, float]]:
+        """The loss of a view, all terms together, its rendering, and what each term adds."""
         config, scene, view = self.config, self.scene, look.view
         if moving:
             gaussians, smoothness = scene.deformed(view.time, look.nearby)
@@ -193,14 +291,27 @@ class Trainer:
         weights = config.loss.weights(warm=moving)
         truth = self._pictures.on_device(view)
         correction = None if self._exposures is None else self._exposures.values[self._numbers[view.name]]
-        rendering = render_loss(gaussians, view.camera, truth, look.background, weights, scene.device, correction)
-        loss = rendering.loss
+        weighted = [(term, weight_at(term, self.done + 1)) for term in self.parts.losses]
+        own = [(term, weight) for term, weight in weighted if weight and not isinstance(term, Regularizer)]
+        rendering = render_loss(gaussians, view.camera, truth, look.background, weights, scene.device, correction, own)
+        self._scales = gaussians.scales.detach()
+        beside: dict[str, Tensor] = {}
         if smoothness is not None:
-            loss = loss + smoothness
+            beside["smoothness"] = smoothness
         if moving and "dynamics" in scene.parameters:
             spread = dynamics_loss(scene.parameters["dynamics"], config.loss.dynamics_mode)
-            loss = loss + config.loss.dynamics * spread
-        return loss, rendering
+            beside["dynamics"] = config.loss.dynamics * spread
+        for term, weight in weighted:
+            if weight and isinstance(term, Regularizer):
+                beside[term.name] = weight * term.function(scene, gaussians, view.time)
+        loss = rendering.loss
+        for value in beside.values():
+            loss = loss + value
+        factors = {**weights._asdict(), **{term.name: weight for term, weight in own}}
+        terms = {name: factors[name] * value for name, value in rendering.terms.items() if name in factors}
+        if "ssim" in terms:
+            terms["ssim"] = factors["ssim"] - terms["ssim"]
+        return loss, rendering, terms | {name: value.item() for name, value in beside.items()}
 
     def _gradients(self) -> dict[str, list[Tensor]]:
         """By group, of all parameters that have one."""
@@ -248,14 +359,11 @@ class Trainer:
         if density.prunes_at(step, self.config.schedule.steps):
             self._prune_hidden(step)
         if density.changes_at(step):
-            change = densify(
-                scene.parameters,
-                self._statistics,
-                density,
-                self._extent,
-                self._generator,
-                bound_sizes=step > density.reset_interval,
+            rows = {name: row.detach() for name, row in scene.parameters.items()}
+            change = self.parts.density(
+                DensityState(step, rows, self._statistics, density, self._extent, self._generator)
             )
+            check_change(change, rows)
             if not change.keep.any() and len(change.added["means"]) == 0:
                 raise InputError(
                     f"density control leaves no Gaussian at step {step}; raise density.max_world_size or "
@@ -326,6 +434,31 @@ class Trainer:
         self._warm_up = int(own.get("warm_up", self._warm_up))  # older states lack it
         self._generator.set_state(own["random"])
         self._pictures.order = own["order"].tolist()
+
+
+def suited(config: Config, dataset: Dataset) -> Config:
+    """The configuration with lengths in world units, and no more frequencies than the training times can tell apart."""
+    field = config.field
+    if config.data.units == "capture":
+        scale, means = dataset.scale, config.rates.means
+        field = dataclasses.replace(field, bound=scale * field.bound)
+        config = dataclasses.replace(
+            config,
+            data=dataclasses.replace(config.data, units="world"),
+            rates=dataclasses.replace(
+                config.rates, means=dataclasses.replace(means, start=scale * means.start, end=scale * means.end)
+            ),
+            smoothness=dataclasses.replace(config.smoothness, reach=scale * config.smoothness.reach),
+        )
+    # The Nyquist frequency is half the number of times; all frequencies above it would end there.
+    most = 1 + math.floor(len(dataset.times) / 2 / field.frequency_step)
+    return dataclasses.replace(config, field=dataclasses.replace(field, components=min(field.components, max(1, most))))
+
+
+def _discovers(config: Config) -> bool:
+    """Whether a training of this configuration starts with motion discovery."""
+    wanted = config.discovery.enabled and config.field.kind != "static"
+    return wanted and config.schedule.steps > config.discovery.steps
 
 
 def initial_points(

@@ -8,14 +8,15 @@ from typing import Any
 import pytest
 
 from lapgs_wgpu.train.log import Log
+from lapgs_wgpu.train.step_result import StepResult
 
 
 def interrupt_at(at: int, monkeypatch: pytest.MonkeyPatch, number: signal.Signals = signal.SIGINT) -> None:
     original = Log.step
 
-    def interrupt(self: Log, step: int, *rest: Any) -> None:
-        original(self, step, *rest)
-        if step == at:
+    def interrupt(self: Log, result: StepResult, *rest: Any) -> None:
+        original(self, result, *rest)
+        if result.step == at:
             signal.raise_signal(number)
 
     monkeypatch.setattr(Log, "step", interrupt)

@@ -68,6 +68,7 @@ export class Playback {
             still[at + 3] = gaussians.opacity_logits[i];
             copy(still, at + 4, active.quats, i, 4);
             copy(still, at + 8, active.scales, i, 3);
+            still[at + 11] = field.mirrorsScales ? 1 : 0;
             still.set(active.sh.subarray(3 * coefficients * i, 3 * coefficients * i + 3), at + 12);
             copy(still, at + CANONICAL, gaussians.static_features, i, field.staticFeatures);
             if (field.dynamics) copy(moving, movingRow * n, gaussians.dynamics, i, field.dynamics);

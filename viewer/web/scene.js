@@ -55,7 +55,8 @@ function readField(text) {
     const laplacian = kind === "laplacian";
     const appearance = laplacian ? APPEARANCES.get(field.appearance) : 0;
     if (!(laplacian || kind === "grid4d") || field.depth !== 0 || (laplacian && field.motion !== "laplacian")
-        || appearance === undefined || typeof field.temporal_hash !== "boolean") {
+        || appearance === undefined || typeof field.temporal_hash !== "boolean"
+        || !["floor", "mirror", undefined].includes(field.negative_scales)) {
         throw damaged(`its field ${quoted(kind)} is none that this page can evaluate`);
     }
     const temporal = field.temporal;
@@ -69,6 +70,7 @@ function readField(text) {
         appearance,
         temporal,
         temporal_hash: field.temporal_hash,
+        mirrorsScales: field.negative_scales === "mirror", // older files lack it
         bound: real(field.bound, "bound", 1e6),
         timeScale: real(field.time_scale, "time_scale", 1),
         width: whole(field.width, "width", 1, 4096),

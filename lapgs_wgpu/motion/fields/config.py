@@ -9,8 +9,9 @@ from ...io.dataclass_table import Options, option
 from ...splat.constants import CONSTANTS
 from .hash_grid_config import TIME, GridShape, HashConfig
 
-FieldKind = Literal["static", "mlp", "hexplane", "grid4d", "laplacian"]
+FieldKind = Literal["static", "mlp", "hexplane", "grid4d", "laplacian", "own"]
 Motion = Literal["laplacian", "mlp"]
+NegativeScales = Literal["floor", "mirror"]
 Appearance = Literal["none", "color", "color+opacity"]
 DynamicsMode = Literal[
     "literal", "promote", "off"
@@ -45,9 +46,9 @@ class FieldConfig(Options):
     """The shape of a field."""
 
     kind: FieldKind = option(
-        "deformation field: static (no motion), mlp (deformable 3DGS), hexplane (4D-GS), grid4d (Grid4D) or "
-        "laplacian (the paper's); changes the field only, whereas --field also turns off the paper's other "
-        "parts for the other methods",
+        "deformation field: static (no motion), mlp (deformable 3DGS), hexplane (4D-GS), grid4d (Grid4D), "
+        "laplacian (the paper's) or own (a module that Python gives, docs/api.md); changes the field only, whereas "
+        "--field also turns off the paper's other parts for the other methods",
         "laplacian",
     )
     bound: float = option(
@@ -103,17 +104,23 @@ class FieldConfig(Options):
         below=1e6,
     )
     dynamics: int = option(
-        "field laplacian: number of values in each Gaussian's dynamics attribute, a learned motion code; 0: none",
+        "fields laplacian and own: number of values in each Gaussian's dynamics attribute, a learned motion code; "
+        "0: none",
         16,
         at_least=0,
         at_most=256,
+    )
+    negative_scales: NegativeScales = option(
+        "scales that the field changes to below zero; mirror: count as their magnitude and keep their gradient, as in "
+        "Grid4D; floor: become 1e-7 and lose it",
+        "floor",
     )
     appearance: Appearance = option("field laplacian: what the field changes over time besides geometry", "color")
 
     @property
     def dynamics_size(self) -> int:
         """Length of a Gaussian's dynamics attribute; 0 for fields without it."""
-        return self.dynamics if self.kind == "laplacian" else 0
+        return self.dynamics if self.kind in ("laplacian", "own") else 0
 
     @property
     def appearance_size(self) -> int:

@@ -3,7 +3,7 @@
 A field is an nn.Module with the call field(means, t, dynamics, nearby) -> Deformation. means: (N, 3) canonical, world
 units; the field gives them no gradient. t: in [0, 1]. dynamics: (N, D) or None. nearby: a Nearby or None.
 A new field is the identity. parameter_groups() returns its parameters by learning rate: "hash" (tables and planes) and
-"mlp".
+"mlp". `OwnField` makes a field of any nn.Module.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ class Deformation(NamedTuple):
     a scalar; None if it was not requested.
     """
 
-    rotation: Tensor | None
-    translation: Tensor
-    d_quats: Tensor
-    d_scales: Tensor
+    rotation: Tensor | None = None
+    translation: Tensor | None = None
+    d_quats: Tensor | None = None
+    d_scales: Tensor | None = None
     d_dc: Tensor | None = None
     d_opacity: Tensor | None = None
     smoothness: Tensor | None = None

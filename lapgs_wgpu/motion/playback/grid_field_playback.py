@@ -116,6 +116,7 @@ class GridFieldPlayback:
         still = np.zeros((count, _CANONICAL + 4 * self._sizes.still_quads), np.float32)
         still[:, :3], still[:, 3], still[:, 4:8] = g["means"], g["opacity_logits"], g["quats"]
         still[:, 8:11], still[:, 12:15] = g["scales"], g["colors"][:, 0]
+        still[:, 11] = self._config.negative_scales == "mirror"
         if "static_features" in g:
             still[:, _CANONICAL : _CANONICAL + self._sizes.static] = g["static_features"]
         moving = np.zeros((count, max(4, 4 * self._sizes.moving_quads)), np.float32)

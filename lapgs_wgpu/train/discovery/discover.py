@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from torch import nn
 
 from lapgs_wgpu.data.initial_gaussians import initial_scales
 from lapgs_wgpu.data.views import Dataset
@@ -22,7 +23,7 @@ from lapgs_wgpu.train.config import Config
 
 from .field_fit import fit_field
 from .residual import Floats
-from .static_fit import static_fit
+from .static_fit import MakeTrainer, static_fit
 from .surface_points import PointClouds, surface_points
 from .tracks import Tracks, find_tracks
 
@@ -43,11 +44,18 @@ class Discovery(NamedTuple):
     summary: str
 
 
-def discover(config: Config, dataset: Dataset, device: Device, terminal: TextIO | None = None) -> Discovery:
+def discover(
+    config: Config,
+    dataset: Dataset,
+    device: Device,
+    trainer: MakeTrainer,
+    terminal: TextIO | None = None,
+    own_field: nn.Module | None = None,
+) -> Discovery:
     """Find what moves, and build the scene that a training starts from.
 
     It holds the Gaussians of the static fit and those of the tracks, if there are any, and a field that moves the
-    latter.
+    latter. trainer: makes the training of the static fit. own_field: of Scene4D.
 
     The same configuration and capture give the same scene. Raises InputError where the images show nothing at all.
     """
@@ -55,7 +63,7 @@ def discover(config: Config, dataset: Dataset, device: Device, terminal: TextIO 
     steps = config.discovery.steps
     fit_steps = config.discovery.field_steps
     meter = Progress(steps + fit_steps, "steps of motion discovery", terminal)
-    static, images = static_fit(config, dataset, device, meter.at)
+    static, images = static_fit(config, dataset, device, trainer, meter.at)
     background = 1.0 if config.data.background == "white" else 0.0
     if all(float(np.abs(image.image - background).max()) < SHOWN for image in images):
         raise InputError(
@@ -70,7 +78,7 @@ def discover(config: Config, dataset: Dataset, device: Device, terminal: TextIO 
     if share < config.discovery.least:
         tracks = None
     generator = torch.Generator().manual_seed(config.seed)
-    scene = scene_with(static, tracks, config, device, generator)
+    scene = scene_with(static, tracks, config, device, generator, own_field)
     found = f"{share:.1%} of what it lacks can be followed: nothing is added"
     if tracks is not None:
         error = fit_field(scene, tracks, clouds.times, len(static), fit_steps, generator, lambda s: meter.at(steps + s))
@@ -120,7 +128,12 @@ def explained_share(clouds: PointClouds, tracks: Tracks, half_side: float) -> fl
 
 
 def scene_with(
-    static: Scene4D, tracks: Tracks | None, config: Config, device: Device, generator: torch.Generator
+    static: Scene4D,
+    tracks: Tracks | None,
+    config: Config,
+    device: Device,
+    generator: torch.Generator,
+    own_field: nn.Module | None = None,
 ) -> Scene4D:
     """The static fit's Gaussians, then one for each track; the field does not move them yet."""
     size = config.field.dynamics_size
@@ -140,4 +153,4 @@ def scene_with(
             "dynamics": of_part[torch.from_numpy(tracks.part)],
         }
         rows = {name: torch.cat([rows[name], values.float()]) for name, values in new.items()}
-    return Scene4D(rows, config.field, device, sh_degree=static.sh_degree, seed=config.seed)
+    return Scene4D(rows, config.field, device, sh_degree=static.sh_degree, seed=config.seed, own_field=own_field)

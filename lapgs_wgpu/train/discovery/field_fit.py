@@ -37,7 +37,7 @@ def fit_field(
     field = scene.field
     assert field is not None
     groups = field.parameter_groups()
-    rates = {"hash": HASH_RATE, "mlp": MLP_RATE}
+    rates = {name: HASH_RATE if name == "hash" else MLP_RATE for name in groups}
     optimizer = torch.optim.Adam(
         [{"params": parameters, "lr": rates[name]} for name, parameters in groups.items()], eps=ADAM_EPS, fused=True
     )
@@ -54,11 +54,14 @@ def fit_field(
         means = scene.parameters["means"].detach()[rows]
         dynamics = scene.parameters["dynamics"].detach()[rows] if "dynamics" in scene.parameters else None
         move = field(means, float(times[at]), dynamics, None)
-        moved = (means if move.rotation is None else rotate(move.rotation, means)) + move.translation
+        moved = means if move.rotation is None else rotate(move.rotation, means)
+        moved = moved if move.translation is None else moved + move.translation
         weights = torch.cat([supported[at].float(), torch.ones(len(staying), device=device)])
         squared = (moved - torch.cat([paths[at], means[len(moving) :]])).square().sum(dim=1)
         loss = (weights * (squared + SOFTENING**2).sqrt()).mean()
-        loss = loss + SHAPE_WEIGHT * (move.d_scales.abs().mean() + move.d_quats.abs().mean())
+        loss = loss + SHAPE_WEIGHT * sum(
+            change.abs().mean() for change in (move.d_scales, move.d_quats) if change is not None
+        )
         for group, name in zip(optimizer.param_groups, groups, strict=True):
             group["lr"] = rates[name] * max(LAST, min(1.0, 2.0 * (steps - step) / steps))
         optimizer.zero_grad()

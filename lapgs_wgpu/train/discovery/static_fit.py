@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from functools import partial
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -16,7 +17,6 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.config import Config, Rate
 from lapgs_wgpu.train.evaluate import BACKGROUND_LEVELS
-from lapgs_wgpu.train.trainer import Trainer
 
 from .residual import Residual
 
@@ -27,8 +27,20 @@ SH_INTERVAL = 0.375
 GRADIENT = 5e-4  # density.gradient
 
 
+class StaticTrainer(Protocol):
+    """A training, as `Trainer` is one, which starts with a discovery itself and therefore is no import of this file."""
+
+    scene: Scene4D
+
+    def step(self) -> object: ...
+    def close(self) -> None: ...
+
+
+MakeTrainer = Callable[[Config, Dataset, Device], StaticTrainer]
+
+
 def static_fit(
-    config: Config, dataset: Dataset, device: Device, progress: Callable[[int], None]
+    config: Config, dataset: Dataset, device: Device, trainer: MakeTrainer, progress: Callable[[int], None]
 ) -> tuple[Scene4D, list[Residual]]:
     """The static scene, and the training images of the clip, by time, with their differences from it.
 
@@ -38,7 +50,7 @@ def static_fit(
     views = sorted(dataset.train, key=lambda view: (view.time, view.name))
     chosen = np.linspace(0, len(views) - 1, min(len(views), MOST_VIEWS)).astype(np.int64)
     small = [small_view(views[i], config.discovery.size) for i in dict.fromkeys(chosen.tolist())]
-    training = Trainer(static_config(config), dataclasses.replace(dataset, train=tuple(small)), device)
+    training = trainer(static_config(config), dataclasses.replace(dataset, train=tuple(small)), device)
     try:
         for step in range(config.discovery.steps):
             training.step()

@@ -1,0 +1,55 @@
+"""The field own: an nn.Module from outside the package, behind the interface of all fields (`deformation`)."""
+
+from __future__ import annotations
+
+import inspect
+
+from torch import Tensor, nn
+
+from .deformation import Deformation, Nearby
+
+_ROWS = {"rotation": (4,), "translation": (3,), "d_quats": (4,), "d_scales": (3,), "d_dc": (3,), "d_opacity": ()}
+
+
+class OwnField(nn.Module):
+    """A deformation field of any module that answers time and means.
+
+    module: called as module(means, t), with the arguments dynamics and nearby where its forward names them. It returns
+    a translation (N, 3), or a Deformation. Its method parameter_groups(), if it has one, returns its parameters by
+    learning rate; without it all of them learn at the rate "mlp".
+    """
+
+    def __init__(self, module: nn.Module) -> None:
+        super().__init__()
+        self.module = module
+        named = inspect.signature(module.forward).parameters
+        self._takes = [name for name in ("dynamics", "nearby") if name in named]
+
+    def forward(
+        self, means: Tensor, t: float, dynamics: Tensor | None = None, nearby: Nearby | None = None
+    ) -> Deformation:
+        """See motion/fields/deformation.py. Raises TypeError and ValueError for results of another form."""
+        beside = {"dynamics": dynamics, "nearby": nearby}
+        move = self.module(means, t, **{name: beside[name] for name in self._takes})
+        if isinstance(move, Tensor):
+            move = Deformation(translation=move)
+        name = type(self.module).__name__
+        if not isinstance(move, Deformation):
+            raise TypeError(f"the field {name} must return a Tensor or a Deformation, got {type(move).__name__}")
+        for part, row in _ROWS.items():
+            values = getattr(move, part)
+            if values is not None and tuple(values.shape) != (len(means), *row):
+                raise ValueError(
+                    f"the field {name} must return {part} of shape {(len(means), *row)}, got {tuple(values.shape)}"
+                )
+        return move
+
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        """See motion/fields/deformation.py."""
+        grouped = getattr(self.module, "parameter_groups", None)
+        groups: dict[str, list[nn.Parameter]] = grouped() if grouped else {"mlp": list(self.parameters())}
+        listed = {id(parameter) for group in groups.values() for parameter in group}
+        missing = [name for name, each in self.module.named_parameters() if id(each) not in listed]
+        if missing:
+            raise ValueError(f"parameter_groups() of {type(self.module).__name__} lacks {', '.join(missing)}")
+        return {name: group for name, group in groups.items() if group}

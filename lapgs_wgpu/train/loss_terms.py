@@ -1,0 +1,150 @@
+"""Loss terms of one's own, beside those of the configuration (docs/api.md)."""
+
+from __future__ import annotations
+
+import re
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lapgs_wgpu.data.views import composite
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.gpu.array import DeviceArray, read_all
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.kernel import Commands, Kernel
+from lapgs_wgpu.gpu.pool import BufferPool
+from lapgs_wgpu.motion.scene import Scene4D
+from lapgs_wgpu.splat.gaussians import Gaussians
+
+SIDE = 8  # pixels; a workgroup of a WGSL loss is a square
+
+Weight = float | Callable[[int], float]
+
+
+@dataclass(frozen=True)
+class Regularizer:
+    """A term of the Gaussians, in torch.
+
+    function: of the scene, its Gaussians at the view's time (activated, differentiable in the scene's parameters) and
+    that time in [0, 1]; returns a scalar. weight: of the term, or a function of the step, counted from 1; at 0 it is
+    not computed.
+    """
+
+    name: str
+    function: Callable[[Scene4D, Gaussians[Tensor], float], Tensor]
+    weight: Weight = 1.0
+
+
+@dataclass(frozen=True)
+class TorchLoss:
+    """A term of the image, in torch. The image and its gradient then go through the host's memory in each step.
+
+    function: of the image (H, W, 3), differentiable, and the ground truth (H, W, 3) in [0, 1]; returns a scalar.
+    weight: as in Regularizer.
+    """
+
+    name: str
+    function: Callable[[Tensor, Tensor], Tensor]
+    weight: Weight = 1.0
+
+
+@dataclass(frozen=True)
+class WgslLoss:
+    """A term of the image, as a compute shader on the device: the mean over the pixels of what it leaves.
+
+    file: of WGSL that imports common/loss_term, which says what it gets and leaves. weight: as in Regularizer.
+    """
+
+    name: str
+    file: str | Path
+    weight: Weight = 1.0
+    _pools: dict[Device, BufferPool] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        """Raises InputError where the file is none, or of another workgroup size."""
+        path = Path(self.file)
+        if path.suffix != ".wgsl" or not path.is_file():
+            raise InputError(f"{path}: a loss needs a file of WGSL whose name ends with .wgsl.")
+        sizes = re.findall(r"@workgroup_size\(([^)]*)\)", path.read_text(encoding="utf-8"))
+        if [size.replace(" ", "") for size in sizes] != [f"{SIDE},{SIDE}"]:
+            found = f"@workgroup_size({sizes[0]})" if sizes else "no entry point"
+            raise InputError(f"{path}: needs one entry point with @workgroup_size({SIDE}, {SIDE}), got {found}.")
+
+    @cached_property
+    def _kernel(self) -> tuple[str, dict[str, int]]:
+        """Name and defines: a file that was edited since another term was made of it is another kernel."""
+        path = Path(self.file).resolve()
+        return str(path.with_suffix("")), {"EDITION": zlib.crc32(path.read_bytes())}
+
+    def record(
+        self,
+        commands: Commands,
+        image: DeviceArray,
+        truth: DeviceArray,
+        background: tuple[float, float, float],
+        weight: float,
+        d_image: DeviceArray,
+    ) -> DeviceArray:
+        """Add the weighted gradient to d_image (4, H, W); returns (H, W) values of the pixels. Others: `ImageLoss`."""
+        height, width = truth.shape
+        pool = self._pools.setdefault(commands.device, BufferPool(commands.device))
+        name, defines = self._kernel
+        kernel = Kernel.get(commands.device, name, **defines)
+        own = pool.array("truth", truth.shape, "uint32")
+        commands.copy(truth, own)  # so that all images of a training go through one bind group
+        values = pool.array("values", (height, width))
+        commands.clear(values)
+        share = weight / (height * width)
+        uniform = kernel.uniform("Term", size=(width, height), share=share, padding=0.0, background=background)
+        groups = -(-width // SIDE), -(-height // SIDE)
+        arrays = {"image": image, "rgba": own, "d_image": d_image, "values": values}
+        commands.dispatch_grid(kernel, groups, term=pool.constant("term", uniform), **arrays)
+        return values
+
+
+LossTerm = Regularizer | TorchLoss | WgslLoss
+
+
+def weight_at(term: LossTerm, step: int) -> float:
+    """The weight of a term in a step, counted from 1."""
+    return float(term.weight(step) if callable(term.weight) else term.weight)
+
+
+def check_terms(terms: tuple[LossTerm, ...], taken: frozenset[str]) -> None:
+    """Raises InputError where two terms have one name. taken: names of the configuration's terms."""
+    names = [term.name for term in terms]
+    for name in names:
+        if name in taken or names.count(name) > 1:
+            raise InputError(f"there are two loss terms named {name!r}; give each a name of its own.")
+
+
+def torch_loss(
+    term: TorchLoss, image: DeviceArray, truth: DeviceArray, background: tuple[float, float, float], weight: float
+) -> tuple[float, np.ndarray]:
+    """The value of a term in torch, and its weighted gradient (4, H, W) by the image. Others as `WgslLoss.record`.
+
+    Raises ValueError for a result that is no scalar.
+    """
+    planes, texels = read_all([image, truth])
+    rgba = texels.view(np.uint8).reshape(*truth.shape, 4)
+    target = torch.from_numpy(composite(rgba, np.array(background)).astype(np.float32) / 255)
+    with torch.enable_grad():
+        shown = torch.from_numpy(planes[:3]).permute(1, 2, 0).requires_grad_()
+        value = term.function(shown, target)
+        if not isinstance(value, Tensor) or value.ndim:
+            raise ValueError(
+                f"the loss {term.name!r} must return a scalar tensor, got {getattr(value, 'shape', value)}"
+            )
+        gradient = torch.zeros_like(shown)
+        if value.requires_grad:
+            (found,) = torch.autograd.grad(value, shown, allow_unused=True)
+            gradient = gradient if found is None else found
+    d_image = np.zeros(planes.shape[1:], np.float32)[None].repeat(4, axis=0)
+    d_image[:3] = weight * gradient.permute(2, 0, 1).numpy()
+    return float(value.detach()), d_image

@@ -1,0 +1,495 @@
+"""Training from Python (docs/api.md): the trainer, its parts, and that they are what lapgs-train runs."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from helpers.image_losses import BACKGROUND, CAMERA, TRUTH, gaussians, gradients
+from helpers.training import STEPS, configure
+from torch import Tensor, nn
+
+import lapgs_wgpu
+from lapgs_wgpu import Change, Deformation, Parts, Regularizer, Scene4D, StepResult, TorchLoss, Trainer, WgslLoss, load
+from lapgs_wgpu.data import Dataset, load_dataset
+from lapgs_wgpu.data.synthetic import write_synthetic
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.kernel import Commands
+from lapgs_wgpu.io.checkpoint import read_checkpoint
+from lapgs_wgpu.motion.playback.playback import open_playback
+from lapgs_wgpu.train.config import LossWeights, Rate
+from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
+from lapgs_wgpu.train.loss_terms import LossTerm
+from lapgs_wgpu.train.presets import load_config
+from lapgs_wgpu.train.run import resume, train
+from lapgs_wgpu.train.tensorboard import scalars
+from lapgs_wgpu.train.truth_cache import upload_rgba
+
+ROOT = Path(__file__).parents[1]
+PAGE = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
+CHARBONNIER = ROOT / "examples" / "own_loss.wgsl"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_synthetic(tmp_path_factory.mktemp("data") / "scene", size=32, train_views=8, test_views=2)
+
+
+@pytest.fixture(scope="module")
+def dataset(folder: Path) -> Dataset:
+    return load_dataset(folder)
+
+
+class Drift(nn.Module):
+    """Moves everything alike, and takes whatever else a field is given."""
+
+    def __init__(self, rows: int = 3) -> None:
+        super().__init__()
+        self.velocity = nn.Parameter(torch.zeros(rows))
+        self.seen: set[str] = set()
+
+    def forward(self, means: Tensor, t: float, dynamics: Tensor | None = None) -> Tensor:
+        self.seen.add("no codes" if dynamics is None else f"{dynamics.shape[1]} codes")
+        return (t * self.velocity).expand(len(means), -1)
+
+
+def saved(trainer: Trainer, path: Path) -> dict[str, np.ndarray]:
+    trainer.save(path)
+    return dict(read_checkpoint(path).tensors)
+
+
+def equal(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> bool:
+    return a.keys() == b.keys() and all(np.array_equal(a[name], b[name]) for name in a)
+
+
+# The trainer
+
+
+def test_steps_by_hand_are_those_of_a_run(dataset: Dataset, device: Device, tmp_path: Path) -> None:
+    train(configure(), dataset, tmp_path / "run", device=device)
+    called: list[int] = []
+
+    def note(trainer: Trainer, result: StepResult) -> None:
+        assert trainer.done == result.step
+        called.append(result.step)
+
+    with Trainer(configure(), dataset, device, parts=Parts(callbacks=[note])) as trainer:
+        first = trainer.step()
+        rest = list(trainer)
+        found = saved(trainer, tmp_path / "scene.ply")
+        metrics = trainer.evaluate()
+    assert [first.step, *(result.step for result in rest)] == called == list(range(1, STEPS + 1))
+    assert equal(found, dict(read_checkpoint(tmp_path / "run" / "checkpoint.ply").tensors))
+    written, mine = (read_checkpoint(p).metadata for p in (tmp_path / "run" / "checkpoint.ply", tmp_path / "scene.ply"))
+    assert written == mine
+    assert metrics["psnr"] == json.loads((tmp_path / "run" / "metrics.json").read_text())["psnr"]
+
+
+def test_a_trainer_opens_what_its_configuration_names(folder: Path, device: Device) -> None:
+    config = load_config("tiny", {"data.path": str(folder), "points.count": 50, "schedule.steps": 2})
+    with Trainer(config, device=device) as trainer:
+        assert trainer.dataset.name == "scene"
+        assert len(list(trainer)) == 2
+    with pytest.raises(InputError, match="names no data"):
+        Trainer(load_config("tiny"), device=device)
+
+
+def test_values_of_python_are_overrides() -> None:
+    given = {"schedule.steps": 7, "rates.sh_dc": 1e-3, "discovery.enabled": False, "field.static.base": [4, 4, 4]}
+    config = load_config("tiny", given)
+    assert (config.schedule.steps, config.rates.sh_dc, config.discovery.enabled) == (7, 1e-3, False)
+    assert config.field.static.base == (4, 4, 4)
+    with pytest.raises(InputError, match=r"schedule.steps must be a whole number, got 1\.5"):
+        load_config("tiny", {"schedule.steps": 1.5})
+
+
+def test_terms_add_up_to_the_loss(dataset: Dataset, device: Device) -> None:
+    with Trainer(configure(schedule__batch="2"), dataset, device) as trainer:
+        results = list(trainer)
+    for result in results:
+        assert sum(result.terms.values()) == pytest.approx(result.loss, rel=1e-5)
+    assert set(results[0].terms) == {"l1", "ssim", "pyramid"}
+    assert set(results[-1].terms) == {"l1", "ssim", "pyramid", "ncc", "smoothness", "dynamics"}
+
+
+def test_an_error_of_a_callback_leaves_the_step_done(dataset: Dataset, device: Device, tmp_path: Path) -> None:
+    def fail(trainer: Trainer, result: StepResult) -> None:
+        if result.step == 3:
+            raise RuntimeError("enough")
+
+    with Trainer(configure(), dataset, device, parts=Parts(callbacks=[fail])) as trainer:
+        with pytest.raises(RuntimeError, match="enough"):
+            list(trainer)
+        assert trainer.done == 3
+        list(trainer)
+        found = saved(trainer, tmp_path / "stopped.ply")
+    with Trainer(configure(), dataset, device) as trainer:
+        list(trainer)
+        assert equal(found, saved(trainer, tmp_path / "whole.ply"))
+
+
+# A field of one's own
+
+
+def test_a_field_of_ones_own_learns_repeats_and_resumes(dataset: Dataset, device: Device, tmp_path: Path) -> None:
+    config, states = configure(), []
+    for _ in range(2):
+        with Trainer(config, dataset, device, parts=Parts(field=Drift())) as trainer:
+            assert trainer.config.field.kind == "own"
+            for result in trainer:
+                if result.step == 20:
+                    middle = {name: value.copy() for name, value in trainer.state().items()}
+            states.append(saved(trainer, tmp_path / "own.ply"))
+    assert equal(*states)
+    assert states[0]["field.module.velocity"].any()
+    resumed = Drift()
+    with Trainer(config, dataset, device, parts=Parts(field=resumed), resumed=True) as trainer:
+        trainer.restore(middle)
+        list(trainer)
+        assert equal(states[0], saved(trainer, tmp_path / "resumed.ply"))
+    assert resumed.seen == {"16 codes"}
+
+
+def test_a_checkpoint_of_ones_own_field_needs_its_module(dataset: Dataset, device: Device, tmp_path: Path) -> None:
+    path, module = tmp_path / "own.ply", Drift()
+    with Trainer(configure(field__dynamics="0"), dataset, device, parts=Parts(field=module)) as trainer:
+        list(trainer)
+        trainer.save(path)
+        expected = trainer.scene.at(0.7).means.detach()
+    scene = load(path, device, field=Drift())
+    assert torch.equal(scene.at(0.7).means, expected)
+    assert module.seen == {"no codes"}
+    for opened in (lambda: load(path, device), lambda: open_playback(path, device)):
+        with pytest.raises(InputError, match=r"own\.ply: the field own needs a module.*load\(path, field=\.\.\.\)"):
+            opened()
+    with pytest.raises(InputError, match=r"own\.ply: is of another field than the module"):
+        load(path, device, field=nn.Linear(3, 3))
+    trainer.scene.field_config = dataclasses.replace(trainer.scene.field_config, kind="mlp")
+    with Trainer(configure("mlp"), dataset, device) as other:
+        other.save(path)
+    with pytest.raises(InputError, match="has the field mlp, so no module can be given"):
+        load(path, device, field=Drift())
+
+
+def test_a_whole_run_with_ones_own_field(dataset: Dataset, device: Device, tmp_path: Path) -> None:
+    def stop(trainer: Trainer, result: StepResult) -> None:
+        if result.step == 15:
+            raise MemoryError("stopped")
+
+    train(configure(), dataset, tmp_path / "whole", device=device, parts=Parts(field=Drift()))
+    with pytest.raises(MemoryError, match="stopped after step 15"):
+        train(configure(), dataset, tmp_path / "run", device=device, parts=Parts(field=Drift(), callbacks=[stop]))
+    config = load_config(str(tmp_path / "run" / "config.toml"))
+    assert config.field.kind == "own"
+    with pytest.raises(InputError, match="the field own needs a module"):
+        resume(config, dataset, tmp_path / "run", device=device)
+    resume(config, dataset, tmp_path / "run", device=device, parts=Parts(field=Drift()))
+    one, other = (tmp_path / name / "checkpoint.ply" for name in ("whole", "run"))
+    assert one.read_bytes() == other.read_bytes()
+
+
+class Rows(nn.Module):
+    """Returns what it is told, whatever it is."""
+
+    def __init__(self, value: Any) -> None:
+        super().__init__()
+        self.value = value
+        self.weight = nn.Parameter(torch.zeros(()))
+
+    def forward(self, means: Tensor, t: float) -> Any:
+        return self.value(len(means))
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        (lambda n: torch.zeros(n, 4), r"Rows must return translation of shape \(300, 3\), got \(300, 4\)"),
+        (lambda n: Deformation(d_opacity=torch.zeros(n, 1)), r"d_opacity of shape \(300,\), got \(300, 1\)"),
+        (lambda n: [1], "must return a Tensor or a Deformation, got list"),
+    ],
+)
+def test_results_of_another_form_are_named(value: Any, message: str, dataset: Dataset, device: Device) -> None:
+    config = configure(schedule__warm_up="0")
+    with (
+        Trainer(config, dataset, device, parts=Parts(field=Rows(value))) as trainer,
+        pytest.raises((TypeError, ValueError), match=message),
+    ):
+        trainer.step()
+
+
+def test_all_parts_of_a_deformation_are_optional(dataset: Dataset, device: Device) -> None:
+    with Trainer(configure(), dataset, device, parts=Parts(field=Rows(lambda n: Deformation()))) as trainer:
+        still, now = trainer.scene.canonical(), trainer.scene.at(0.3)
+    assert all(torch.equal(a, b) for a, b in zip(vars(still).values(), vars(now).values(), strict=True))
+
+
+def test_groups_of_ones_own_field_have_rates_of_their_own(dataset: Dataset, device: Device) -> None:
+    class Grouped(Drift):
+        def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+            return {"drift": [self.velocity]}
+
+    with pytest.raises(InputError, match=r"group drift has no learning rate; give Parts\(rates=\{'drift': "):
+        Trainer(configure(), dataset, device, parts=Parts(field=Grouped()))
+    with pytest.raises(InputError, match="names drft, which is no group of parameters; there are means"):
+        Trainer(configure(), dataset, device, parts=Parts(field=Grouped(), rates={"drift": 1.0, "drft": 1.0}))
+    module = Grouped()
+    parts = Parts(field=module, rates={"drift": Rate(1e-3, 1e-3, 1), "means": 1e-9})
+    with Trainer(configure(schedule__warm_up="0"), dataset, device, parts=parts) as trainer:
+        before = trainer.scene.parameters["means"].detach().clone()
+        trainer.step()
+        assert module.velocity.abs().max().item() == pytest.approx(1e-3, rel=1e-3)  # Adam's first step
+        assert (trainer.scene.parameters["means"] - before).abs().max() < 2e-7
+
+    class Forgetful(Grouped):
+        def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+            return {}
+
+    with pytest.raises(ValueError, match=r"parameter_groups\(\) of Forgetful lacks velocity"):
+        Trainer(configure(), dataset, device, parts=Parts(field=Forgetful()))
+
+
+# Losses of one's own
+
+
+def lossy(device: Device, *own: tuple[LossTerm, float], weights: LossWeights) -> tuple[RenderLoss, dict[str, Tensor]]:
+    scene = gaussians()
+    truth = upload_rgba(device, TRUTH)
+    done = render_loss(scene, CAMERA, truth, BACKGROUND, weights, device, None, own)  # type: ignore[arg-type]
+    done.loss.backward()
+    return done, gradients(scene, done)
+
+
+def test_a_term_in_torch_has_the_gradient_of_the_fused_one(device: Device) -> None:
+    own = TorchLoss("mine", lambda image, truth: (image - truth).abs().mean())
+    fused, expected = lossy(device, weights=LossWeights(0.9, 0.1))
+    mixed, found = lossy(device, (own, 0.5), weights=LossWeights(0.4, 0.1))
+    assert mixed.terms["mine"] == pytest.approx(fused.terms["l1"], rel=1e-5)
+    assert mixed.loss.item() == pytest.approx(fused.loss.item(), rel=1e-5)
+    for name, value in expected.items():
+        torch.testing.assert_close(found[name], value, rtol=1e-3, atol=1e-6)
+
+
+def charbonnier(image: Tensor, truth: Tensor) -> Tensor:
+    return ((image - truth).square() + 1e-4).sqrt().sum(dim=2).mean()
+
+
+@pytest.mark.kernels
+def test_a_wgsl_term_is_that_of_its_reference(device: Device) -> None:
+    """Values and gradient, of an image over transparent ground truth, in float64."""
+    rng, (height, width) = np.random.default_rng(0), (13, 21)
+    planes = rng.random((4, height, width)).astype(np.float32)
+    rgba = rng.integers(0, 256, (height, width, 4), np.uint8)
+    background, weight = (0.25, 0.5, 1.0), 0.3
+    laid = lapgs_wgpu.data.views.composite(rgba, np.array(background))
+    image = torch.from_numpy(planes[:3]).permute(1, 2, 0).double().requires_grad_()
+    expected = charbonnier(image, torch.from_numpy(laid).double() / 255)
+    (weight * expected).backward()
+    assert image.grad is not None
+    d_image = DeviceArray.upload(device, "d", np.ones((4, height, width), np.float32))
+    with Commands(device) as commands:
+        shown, truth = DeviceArray.upload(device, "image", planes), upload_rgba(device, rgba)
+        values = WgslLoss("mine", CHARBONNIER).record(commands, shown, truth, background, weight, d_image)
+    assert values.read().mean(dtype=np.float64) == pytest.approx(expected.item(), rel=1e-5)
+    found = torch.from_numpy(d_image.read())
+    torch.testing.assert_close(found[:3] - 1, image.grad.permute(2, 0, 1).float(), rtol=1e-4, atol=2e-7)
+    assert (found[3] == 1).all()
+
+
+def test_a_wgsl_term_and_one_in_torch_train_alike(dataset: Dataset, device: Device) -> None:
+    results = []
+    for term in (WgslLoss("mine", CHARBONNIER, 0.5), TorchLoss("mine", charbonnier, 0.5)):
+        parts = Parts(losses=[term])
+        with Trainer(configure(data__background="random"), dataset, device, parts=parts) as trainer:
+            results.append([trainer.step() for _ in range(4)])
+    for a, b in zip(*results, strict=True):
+        assert a.loss == pytest.approx(b.loss, rel=1e-4)
+        assert a.terms["mine"] == pytest.approx(b.terms["mine"], rel=1e-4) != 0
+
+
+def test_terms_of_the_gaussians_and_weights_by_step(dataset: Dataset, device: Device) -> None:
+    times: list[float] = []
+
+    def spread(scene: Scene4D, now: lapgs_wgpu.Gaussians, t: float) -> Tensor:
+        times.append(t)
+        return now.means.square().mean()
+
+    losses = [Regularizer("spread", spread, weight=lambda step: 1e3 if step > 2 else 0.0)]
+    with Trainer(configure(), dataset, device, parts=Parts(losses=losses)) as trainer:
+        results = [trainer.step() for _ in range(4)]
+    assert ["spread" in result.terms for result in results] == [False, False, True, True]
+    assert len(times) == 2
+    assert results[3].terms["spread"] < results[2].terms["spread"]
+    assert sum(results[2].terms.values()) == pytest.approx(results[2].loss, rel=1e-5)
+
+
+def test_a_term_that_is_not_finite_is_named(dataset: Dataset, device: Device) -> None:
+    own = TorchLoss("mine", lambda image, truth: (image * float("nan")).mean())
+    with Trainer(configure(), dataset, device, parts=Parts(losses=[own])) as trainer:
+        result = trainer.step()
+    assert result.skipped is not None
+    assert "the loss term mine is nan" in str(result.skipped)
+
+
+def test_losses_that_cannot_be_are_refused(dataset: Dataset, device: Device, tmp_path: Path) -> None:
+    twice = [TorchLoss("mine", charbonnier), TorchLoss("mine", charbonnier)]
+    for losses, name in ((twice, "mine"), ([TorchLoss("l1", charbonnier)], "l1")):
+        with pytest.raises(InputError, match=f"two loss terms named '{name}'"):
+            Trainer(configure(), dataset, device, parts=Parts(losses=losses))
+    with pytest.raises(InputError, match=r"nothing\.wgsl: a loss needs a file of WGSL"):
+        WgslLoss("mine", tmp_path / "nothing.wgsl")
+    (tmp_path / "odd.wgsl").write_text("@compute @workgroup_size(64) fn main() {}")
+    with pytest.raises(
+        InputError, match=r"odd\.wgsl: needs one entry point with @workgroup_size\(8, 8\), got .*\(64\)"
+    ):
+        WgslLoss("mine", tmp_path / "odd.wgsl")
+    rows = TorchLoss("mine", lambda image, truth: image.mean(dim=0))
+    with (
+        Trainer(configure(), dataset, device, parts=Parts(losses=[rows])) as trainer,
+        pytest.raises(ValueError, match=r"the loss 'mine' must return a scalar tensor, got torch.Size\(\[32, 3\]\)"),
+    ):
+        trainer.step()
+
+
+def test_an_edited_shader_is_compiled_again(dataset: Dataset, device: Device, tmp_path: Path) -> None:
+    file, values = tmp_path / "own.wgsl", []
+    for factor in ("1.0", "2.0"):
+        file.write_text(CHARBONNIER.read_text().replace("leave(id.xy, root.x", f"leave(id.xy, {factor} * root.x"))
+        with Trainer(configure(), dataset, device, parts=Parts(losses=[WgslLoss("mine", file)])) as trainer:
+            values.append(trainer.step().terms["mine"])
+    assert values[1] > 1.1 * values[0]
+
+
+# A density rule of one's own
+
+
+def test_a_rule_may_do_anything_with_the_gaussians(dataset: Dataset, device: Device) -> None:
+    steps: list[int] = []
+
+    def halve(state: lapgs_wgpu.DensityState) -> Change:
+        steps.append(state.step)
+        assert state.statistics.views.max() > 0
+        assert not any(row.requires_grad for row in state.rows.values())
+        keep = torch.arange(len(state.rows["means"])) % 2 == 0
+        return Change(keep, {name: row[:1] for name, row in state.rows.items()})
+
+    config = configure(density__min_contribution="0")
+    with Trainer(config, dataset, device, parts=Parts(density=halve)) as trainer:
+        list(trainer)
+        assert steps == [10, 20, 30]
+        assert len(trainer.scene) == 40  # 300, 151, 77, 40: half of each and one more
+    assert trainer.scene.parameters["means"].isfinite().all()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda rows: Change(torch.ones(3), dict(rows)), r"keep must be bool of shape \(300,\)"),
+        (lambda rows: Change(torch.ones(300, dtype=torch.bool), {}), "added must have the rows means, "),
+        (
+            lambda rows: Change(torch.ones(300, dtype=torch.bool), {**rows, "quats": rows["means"]}),
+            r"added\['quats'\] must be float32 of shape \(300, 4\)",
+        ),
+    ],
+)
+def test_changes_that_cannot_be_are_named(change: Any, message: str, dataset: Dataset, device: Device) -> None:
+    parts = Parts(density=lambda state: change(state.rows))
+    with (
+        Trainer(configure(), dataset, device, parts=parts) as trainer,
+        pytest.raises(ValueError, match=message),
+    ):
+        list(trainer)
+
+
+# The page, and the measures of a run
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", PAGE, re.S)
+
+
+@pytest.mark.parametrize("number", range(len(blocks("python"))))
+def test_the_code_of_the_page_runs(
+    number: int, folder: Path, dataset: Dataset, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    code = blocks("python")[number]
+    code = code.replace('"synthetic", "schedule.steps": 300', f'"{folder}", "schedule.steps": 60')
+    code = code.replace('{"data.path": "DIR"}', f'{{"data.path": "{folder}", "schedule.steps": 5}}')
+    names: dict[str, Any] = {}
+    exec(code.replace('"DIR"', f'"{folder}"'), names)
+    if "parts" in names:
+        with closing(Trainer(configure(), dataset, device, parts=names["parts"])) as trainer:
+            assert len(list(trainer)) == STEPS
+
+
+def test_the_wgsl_of_the_page_is_the_mean_squared_error(device: Device, tmp_path: Path) -> None:
+    (source,) = blocks("wgsl")
+    (tmp_path / "own.wgsl").write_text(source)
+    done, found = lossy(device, (WgslLoss("own", tmp_path / "own.wgsl"), 1.0), weights=LossWeights(0.0, 0.0))
+    assert done.terms["own"] == pytest.approx(3 * done.terms["mse"], rel=1e-5)
+    square = TorchLoss("own", lambda image, truth: (image - truth).square().sum(dim=2).mean())
+    _, expected = lossy(device, (square, 1.0), weights=LossWeights(0.0, 0.0))
+    for name, value in expected.items():
+        torch.testing.assert_close(found[name], value, rtol=1e-3, atol=1e-6)
+
+
+def test_the_page_names_all_that_is_public() -> None:
+    training = set(lapgs_wgpu.__all__) - {"Camera", "Gaussians", "Rendering", "rasterize"}
+    assert all(f"`{name}" in PAGE for name in training), training
+
+
+def test_snapshots_and_monitored_views(dataset: Dataset, device: Device, tmp_path: Path) -> None:
+    config = configure(eval__snapshots="5, 20", eval__interval="18", eval__views="train_001,train_00003")
+    names = [view.name for view in dataset.train]
+    with pytest.raises(InputError, match=r"eval\.views names 'train_00003', which is no .* did you mean train_"):
+        train(config, dataset, tmp_path / "run", device=device)
+    assert not (tmp_path / "run").exists()
+    config = configure(eval__snapshots="5, 20", eval__interval="18", eval__views=f"{names[1]},{names[3]}")
+    train(config, dataset, tmp_path / "run", device=device)
+    assert sorted(p.name for p in (tmp_path / "run/snapshots").iterdir()) == ["step_000005.ply", "step_000020.ply"]
+    for step in (5, 20):
+        scene = open_playback(tmp_path / f"run/snapshots/step_{step:06d}.ply", device)
+        assert scene.metadata["step"] == str(step)
+        assert scene.moves
+    lines = [json.loads(line) for line in (tmp_path / "run/log.jsonl").read_text().splitlines()]
+    assert [(x["step"], x["val_views"]) for x in lines if "val_psnr" in x] == [
+        (step, f"{names[1]},{names[3]}") for step in (18, 36)
+    ]
+    blind = dataclasses.replace(dataset, val=())
+    with pytest.raises(InputError, match="no views for validation"):
+        train(configure(eval__interval="1", eval__views="val"), blind, tmp_path / "other", device=device)
+    with pytest.raises(InputError, match="snapshots must be whole numbers, separated by commas, got '5;7'"):
+        configure(eval__snapshots="5;7")
+
+
+def test_tensorboard_gets_the_figures_of_the_log(dataset: Dataset, device: Device, tmp_path: Path) -> None:
+    pytest.importorskip("tensorboard")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    train(configure(eval__tensorboard="true", eval__interval="36"), dataset, tmp_path / "run", device=device)
+    events = EventAccumulator(str(tmp_path / "run/tensorboard"))
+    events.Reload()
+    for text in (tmp_path / "run/log.jsonl").read_text().splitlines():
+        line = {name: value for name, value in json.loads(text).items() if name != "timing"}
+        for name, value in scalars(line):
+            (found,) = (each for each in events.Scalars(name) if each.step == STEPS)
+            assert found.value == pytest.approx(value, rel=1e-5)
+    assert {"loss", "terms/ssim", "val_psnr", "memory/host_bytes", "dead_scales"} <= set(events.Tags()["scalars"])
+
+
+def test_without_tensorboard_a_run_that_asks_for_it_does_not_start(
+    dataset: Dataset, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "torch.utils.tensorboard", None)
+    with pytest.raises(InputError, match=r"pip install 'lapgs-wgpu\[tensorboard\]'"):
+        train(configure(eval__tensorboard="true"), dataset, tmp_path / "run", device=device)
+    assert not (tmp_path / "run").exists()
