@@ -21,10 +21,12 @@ from lapgs_wgpu.train.evaluate import BACKGROUND_LEVELS
 from .residual import Residual
 
 MOST_VIEWS = 400  # of a capture, evenly chosen over the clip
-# The schedule, in shares of its steps, is that of the preset demo, which is of about the same length.
+# The schedule, in shares of its steps, and the rates are its own: what the static fit is sure of decides what is found.
 DENSIFY = (0.375, 0.875)
+DENSITY_INTERVAL, CONTRIBUTION_INTERVAL = 0.125, 0.3125
 SH_INTERVAL = 0.375
 GRADIENT = 5e-4  # density.gradient
+LOG_SCALES, QUATS, SH_DC, SH_REST = 5e-3, 1e-3, 2.5e-3, 1.25e-4  # learning rates, those of 3DGS
 
 
 class StaticTrainer(Protocol):
@@ -44,8 +46,8 @@ def static_fit(
 ) -> tuple[Scene4D, list[Residual]]:
     """The static scene, and the training images of the clip, by time, with their differences from it.
 
-    config: `discovery` says how many steps and at which size; learning rates and losses are those of the training, but
-    for the terms that compare the field. progress: called with each step.
+    config: `discovery` says how many steps and at which size; the learning rate of the means and the losses are those
+    of the training, but for the terms that compare the field. progress: called with each step.
     """
     views = sorted(dataset.train, key=lambda view: (view.time, view.name))
     chosen = np.linspace(0, len(views) - 1, min(len(views), MOST_VIEWS)).astype(np.int64)
@@ -75,11 +77,21 @@ def static_config(config: Config) -> Config:
         schedule=dataclasses.replace(
             config.schedule, steps=steps, batch=1, warm_up=steps, sh_interval=max(1, round(SH_INTERVAL * steps))
         ),
-        rates=dataclasses.replace(config.rates, means=Rate(config.rates.means.start, config.rates.means.end, steps)),
+        rates=dataclasses.replace(
+            config.rates,
+            means=Rate(config.rates.means.start, config.rates.means.end, steps),
+            log_scales=LOG_SCALES,
+            quats=QUATS,
+            sh_dc=SH_DC,
+            sh_rest=SH_REST,
+        ),
         density=dataclasses.replace(
             config.density,
             start=round(DENSIFY[0] * steps),
             stop=round(DENSIFY[1] * steps),
+            interval=max(1, round(DENSITY_INTERVAL * steps)),
+            contribution_interval=max(1, round(CONTRIBUTION_INTERVAL * steps)),
+            reset_interval=steps,
             gradient=GRADIENT,
             split="plain",
         ),
