@@ -249,6 +249,48 @@ def test_orbit_zoom_and_reset(browser: Browser, desktop: Desktop) -> None:
     assert same(browser, desktop, 0.0)
 
 
+def test_focus(browser: Browser, page: Path, device: Device) -> None:
+    """A double click, and F where the pointer is, turn about what lies there, as on the desktop."""
+    desktop = Desktop(page, device)
+    for place, act in (((190, 130), "double click"), ((176, 136), "f")):
+        browser.key("r")
+        page_picture(browser)
+        if act == "f":
+            browser.mouse("mouseMoved", *place)
+            browser.key("f")
+        else:
+            for kind, down in (("mousePressed", True), ("mouseReleased", False)):
+                browser.mouse(kind, *place, down=down, clicks=2)
+
+        def focus(camera: ViewCamera, place: tuple[int, int] = place) -> None:
+            depth = desktop.depth(camera, place)
+            K, T = (seen := camera.camera(*SIZE)).K, seen.T_cam_world
+            ray = [(place[0] + 0.5 - K[0, 2]) / K[0, 0], (place[1] + 0.5 - K[1, 2]) / K[1, 1], 1.0]
+            camera.focus_on(camera.position + depth * (T[:3, :3].T @ ray))
+
+        wait_for(lambda focus=focus: same(browser, desktop, 0.0, focus), 30, act)  # type: ignore[misc]
+        assert psnr(desktop.picture(0.0), desktop.picture(0.0, focus)) < 40
+
+
+def test_panels(browser: Browser) -> None:
+    """The overlay, the button for the help, and all of them hidden."""
+    hidden = "document.getElementById('{}').checkVisibility()"
+    browser.key("o")
+    call(browser, "setTime", 0.3)
+    page_picture(browser)
+    said = browser.value("document.getElementById('overlay').innerText")
+    assert f"300 Gaussians\n{SIZE[0]}x{SIZE[1]}" in said
+    browser.value("document.getElementById('more').click()")
+    assert "turn about what lies there" in browser.value("document.getElementById('help').innerText")
+    browser.key("h")
+    assert not any(browser.value(hidden.format(name)) for name in ("overlay", "help", "bar"))
+    for key in ("h", "?", "o", "t"):
+        browser.key(key)
+    assert not any(browser.value(hidden.format(name)) for name in ("overlay", "help", "bar"))
+    browser.key("t")
+    assert browser.value(hidden.format("bar"))
+
+
 def test_fingers(browser: Browser, desktop: Desktop) -> None:
     """One turns the scene; two, moved apart, come nearer."""
 
@@ -276,7 +318,9 @@ def test_fingers(browser: Browser, desktop: Desktop) -> None:
 def test_resize_and_density(browser: Browser, desktop: Desktop) -> None:
     browser.resize((250, 311))
     wait_for(lambda: browser.value("document.getElementById('canvas').width") == 250, 20, "the canvas")
-    assert same(browser, desktop, 0.0, size=(250, 311))
+    # In a narrow window the width has the field of view that the height has in a wide one: nothing is cut off.
+    narrow = 2 * np.arctan(311 / 250 * np.tan(0.5 * desktop.scene.camera().fov_y))
+    assert same(browser, desktop, 0.0, lambda camera: setattr(camera, "fov_y", narrow), size=(250, 311))
     browser.call("Emulation.setDeviceMetricsOverride", width=200, height=150, deviceScaleFactor=2, mobile=False)
     wait_for(lambda: browser.value("document.getElementById('canvas').width") == 400, 20, "the canvas")
     assert same(browser, desktop, 0.0, size=(400, 300))
