@@ -7,6 +7,7 @@ import functools
 import http.server
 import os
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -396,6 +397,72 @@ def test_what_cannot_be_fetched(window: Browser, page: Path, server: str) -> Non
     ):
         window.open(address)
         wait_for(lambda reason=reason: reason in window.note(), 60, reason)  # type: ignore[misc]
+
+
+def test_a_poor_server(window: Browser, page: Path, device: Device, folder: Path) -> None:
+    """One that knows no ranges, calls a scene a text, is slow, and does not say how long it is: with progress, it is shown."""
+    made = export_scene(trained(device, CONFIGS["color"], 200), folder, device, "slow")
+    files = {f"/{page.name}": page.read_bytes(), "/slow.lapgs": made.with_suffix(".lapgs").read_bytes()}
+    seen = threading.Event()
+
+    class Poor(http.server.BaseHTTPRequestHandler):
+        def do_GET(self) -> None:  # noqa: N802
+            data = files[self.path.split("?")[0]]
+            self.send_response(200)
+            self.send_header("Content-Type", "text/html" if self.path.startswith(f"/{page.name}") else "text/plain")
+            self.end_headers()
+            half = len(data) // 2
+            self.wfile.write(data[:half])
+            self.wfile.flush()
+            if self.path.startswith("/slow"):
+                seen.wait(60)
+            self.wfile.write(data[half:])
+
+        def log_message(self, *_: object) -> None:
+            pass
+
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Poor) as running:
+        threading.Thread(target=running.serve_forever, daemon=True).start()
+        window.open(f"http://127.0.0.1:{running.server_port}/{page.name}?src=slow.lapgs")
+        wait_for(lambda: window.note().startswith("Loading 0."), 60, "the progress")
+        assert window.value("document.getElementById('poster').checkVisibility()")
+        seen.set()
+        wait_for(lambda: shown(window), 120, "the scene")
+        assert same(window, Desktop(made, device), 0.0)
+        running.shutdown()
+
+
+def test_in_a_frame(window: Browser, page: Path, server: str, folder: Path) -> None:
+    """Of another page, whose scripts find it in the frame's window."""
+    (folder / "outer.html").write_text(f"<!doctype html><iframe src='{page.name}#t=0.3&speed=0.1&play'></iframe>")
+    window.open(f"{server}/outer.html")
+    inner = "document.querySelector('iframe').contentWindow.lapgs"
+    wait_for(lambda: window.value(f"Boolean({inner})"), 120, "the scene")
+    wait_for(lambda: window.value(f"{inner}.time") > 0.32, 60, "time goes on")
+    window.value(f"{inner}.setTime(0.9)")
+    assert window.value(f"[{inner}.time, {inner}.playing]") == [0.9, False]
+
+
+def test_a_tab_in_the_background(browser: Browser) -> None:
+    """Time stands still in it, instead of leaping when it comes back."""
+    browser.value("location.hash = '#t=0&speed=0.1&play'")  # 10 seconds
+    wait_for(lambda: browser.value("lapgs.time") > 0, 60, "time goes on")
+    before = browser.value("lapgs.time")
+    browser.call("Page.setWebLifecycleState", state="frozen")
+    time.sleep(6)
+    browser.call("Page.setWebLifecycleState", state="active")
+    wait_for(lambda: browser.value("lapgs.time") > before, 60, "time goes on again")
+    assert browser.value("lapgs.time") < before + 0.3
+    browser.value("lapgs.pause()")
+
+
+def test_a_device_that_is_refused(window: Browser, page: Path) -> None:
+    script = "GPUAdapter.prototype.requestDevice = async () => { throw new TypeError('too few\\nbindings'); };"
+    made = window.call("Page.addScriptToEvaluateOnNewDocument", source=script)
+    window.open(page.as_uri() + "?refused")
+    wait_for(lambda: "cannot be shown on this adapter (too few)" in window.note(), 60, "the sentence")
+    assert window.value("document.getElementById('poster').checkVisibility()")
+    window.call("Page.removeScriptToEvaluateOnNewDocument", identifier=made["identifier"])
 
 
 def test_a_lost_device(window: Browser, page: Path) -> None:
