@@ -7,9 +7,9 @@ import functools
 import http.server
 import os
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
+from time import sleep
 from typing import Any
 
 import numpy as np
@@ -400,13 +400,13 @@ def test_what_cannot_be_fetched(window: Browser, page: Path, server: str) -> Non
 
 
 def test_a_poor_server(window: Browser, page: Path, device: Device, folder: Path) -> None:
-    """One that knows no ranges, calls a scene a text, is slow, and does not say how long it is: with progress, it is shown."""
+    """One that knows no ranges, calls a scene a text, is slow and does not say how long it is."""
     made = export_scene(trained(device, CONFIGS["color"], 200), folder, device, "slow")
     files = {f"/{page.name}": page.read_bytes(), "/slow.lapgs": made.with_suffix(".lapgs").read_bytes()}
     seen = threading.Event()
 
     class Poor(http.server.BaseHTTPRequestHandler):
-        def do_GET(self) -> None:  # noqa: N802
+        def do_GET(self) -> None:
             data = files[self.path.split("?")[0]]
             self.send_response(200)
             self.send_header("Content-Type", "text/html" if self.path.startswith(f"/{page.name}") else "text/plain")
@@ -449,7 +449,7 @@ def test_a_tab_in_the_background(browser: Browser) -> None:
     wait_for(lambda: browser.value("lapgs.time") > 0, 60, "time goes on")
     before = browser.value("lapgs.time")
     browser.call("Page.setWebLifecycleState", state="frozen")
-    time.sleep(6)
+    sleep(6)
     browser.call("Page.setWebLifecycleState", state="active")
     wait_for(lambda: browser.value("lapgs.time") > before, 60, "time goes on again")
     assert browser.value("lapgs.time") < before + 0.3
