@@ -186,12 +186,17 @@ def test_200_000_gaussians(window: Browser, folder: Path, device: Device) -> Non
     """With grids as those of the preset dnerf: rows of features are more than a binding holds, hence two blocks."""
     config = dataclasses.replace(OURS, temporal=dataclasses.replace(OURS.temporal, levels=32))
     scene = trained(device, config, 200_000)
+    assert scene.field is not None
     with torch.no_grad():
         scene.parameters["log_scales"] -= 3
+        # Not needles, 350 pixels long and thinner than one, whose rims depend on the last bits (docs/results.md).
+        dict(scene.field.named_parameters())["heads.weight"][-3:] *= 0.1
     made = export_scene(scene, folder, device, "many")
     open_page(window, made.as_uri(), seconds=300)
-    call(window, "setTime", 0.2)
-    assert same(window, Desktop(made, device), 0.2)
+    desktop = Desktop(made, device)
+    for time in TIMES:
+        call(window, "setTime", time)
+        assert same(window, desktop, time)
     assert sum(name.startswith("deform") for name, *_ in call(window, "passes", 0.5)) == 2
 
 
