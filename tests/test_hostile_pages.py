@@ -93,6 +93,16 @@ def test_damaged_files(page: Browser, files: list[bytes], damage: CompactDamage)
     assert len(said) < 500
 
 
+def test_a_later_version_and_a_foreign_file(page: Browser, files: list[bytes]) -> None:
+    later = files[0][:8] + (2).to_bytes(4, "little") + files[0][12:]
+    assert read(page, later) == (
+        "The scene has version 2 of its format, and this page reads version 1: "
+        "export the page again with a newer lapgs-view."
+    )
+    for data in (b"", b"ply\nformat", files[0][:100], files[0] + b"more"):
+        assert "The scene cannot be read: " in read(page, data)
+
+
 def test_names_that_every_object_has(page: Browser, files: list[bytes]) -> None:
     """What JavaScript finds on the prototype of a table is not in the table."""
     for name, value in (("appearance", "constructor"), ("kind", "toString"), ("appearance", "__proto__")):

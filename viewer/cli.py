@@ -170,16 +170,28 @@ def _export(given: Any, scene: LoadedScene) -> None:
     from .export import export_compact, export_frames, export_still
 
     overwrite = bool(given.overwrite)
-    if given.export.lower().endswith((".lapgs", ".html")):
+    ending = Path(given.export).suffix.lower()
+    if given.max_error is not None and ending != ".4dgs":
+        raise InputError(f"--max-error has no use with --export {given.export}: only a .4dgs file needs it.")
+    if ending in (".lapgs", ".html", ".4dgs"):
         for name in ("time", "frames"):
             if getattr(given, name) is not None:
                 raise InputError(f"--{name} has no use with --export {given.export}, which holds the whole clip.")
         file = Path(given.export)
+        if ending == ".4dgs":
+            from .export_4dgs import MAX_ERROR, export_4dgs
+
+            baked = export_4dgs(scene, file, given.max_error or MAX_ERROR, overwrite=overwrite)
+            print(
+                f"{file}: {baked.gaussians} Gaussians as {baked.pieces} pieces, at most {baked.error:.2f} pixels of "
+                f"the captured images from the learned motion, {file.stat().st_size / 1e6:.2f} MB"
+            )
+            return
         export_compact(scene, file, overwrite=overwrite)
         print(f"{file}: {scene.playback.count} Gaussians, {file.stat().st_size / 1e6:.2f} MB")
         return
     if given.frames is None:
-        more = ", .lapgs or .html; a sequence of frames in a folder needs --frames"
+        more = ", .lapgs, .html or .4dgs; a sequence of frames in a folder needs --frames"
         file = _named(given.export, ".ply", "--export", more)
         export_still(scene, file, given.time or 0.0, overwrite=overwrite)
         print(f"{file}: {scene.playback.count} Gaussians at time {given.time or 0.0:g}")

@@ -32,7 +32,7 @@ def export_still(scene: LoadedScene, file: Path, time: float, *, overwrite: bool
     """
     if scene.path is not None and file.exists() and file.samefile(scene.path):
         raise InputError(f"{file}: is the opened file, and a still holds no motion; take another name.")
-    _check_free(file, overwrite)
+    check_free(file, overwrite)
     write_ply(file, scene.playback.still(time))
 
 
@@ -45,7 +45,7 @@ def export_compact(scene: LoadedScene, file: Path, *, overwrite: bool = False) -
     assert scene.path is not None
     if file.exists() and file.samefile(scene.path):
         raise InputError(f"{file}: is the opened file; take another name.")
-    _check_free(file, overwrite)
+    check_free(file, overwrite)
     stored = read_scene(scene.path)
     features = scene.playback.static_features() if isinstance(scene.playback, DevicePlayback) else None
     metadata = stored.metadata | {"view": scene.look.to_json()}
@@ -58,7 +58,7 @@ def export_compact(scene: LoadedScene, file: Path, *, overwrite: bool = False) -
         target.write(content)
 
 
-def _check_free(file: Path, overwrite: bool) -> None:
+def check_free(file: Path, overwrite: bool) -> None:
     if file.exists() and not overwrite:
         raise InputError(f"{file}: is there already; --overwrite replaces it.")
 

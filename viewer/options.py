@@ -30,6 +30,7 @@ Without a display:
   lapgs-view CHECKPOINT.ply --export frames --frames 60               sequence of static .ply files for SuperSplat
   lapgs-view CHECKPOINT.ply --export scene.html                       web page that plays the scene on the visitor's GPU
   lapgs-view CHECKPOINT.ply --export scene.lapgs                      compact scene for such a page, or for lapgs-view
+  lapgs-view CHECKPOINT.ply --export scene.4dgs                       motion as straight lines, for players of .4dgs
 
 [Values in brackets] are defaults.
 """
@@ -41,7 +42,7 @@ _TAKES = {
     "list_devices": set[str](),
     "screenshot": _PICTURE,
     "video": _PICTURE | {"path", "fps", "seconds"},
-    "export": _COMMON | {"time", "frames", "overwrite"},
+    "export": _COMMON | {"time", "frames", "max_error", "overwrite"},
     "window": _PICTURE | {"time_slider", "play", "fps", "speed", "loop", "backend", "host", "port", "token"},
 }
 NEW_TOKEN = ""  # value of --token without a text
@@ -124,9 +125,12 @@ def _parse(arguments: Sequence[str]) -> Any:
         "or of the camera path; 6 for view]")
 
     add = parser.add_argument_group("export (no window)").add_argument
-    add("--export", metavar="FILE.ply|.lapgs|.html|DIR", help="write a static 3DGS .ply file of the Gaussians at "
-        "--time; .lapgs: a compact scene with its motion; .html: a web page that plays it; with --frames: a "
-        "sequence of static files in the folder DIR")
+    add("--export", metavar="FILE.ply|.lapgs|.html|.4dgs|DIR", help="write a static 3DGS .ply file of the "
+        "Gaussians at --time; .lapgs: a compact scene with its motion; .html: a web page that plays it; .4dgs: the "
+        "motion as straight lines, for players without the deformation field; with --frames: a sequence of static "
+        "files in the folder DIR")
+    add("--max-error", type=_number(0.01, 100.0), metavar="PX", help="with --export FILE.4dgs: largest displacement "
+        "of a Gaussian, pixels of the captured images; less makes the file larger [0.5]")
     add("--frames", type=_count, metavar="N", help="with --export DIR: number of files, at equally spaced times from "
         "0 to 1")
     add("--overwrite", action="store_const", const=True, help="allow --export to replace existing files")

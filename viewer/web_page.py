@@ -8,6 +8,7 @@ import html
 import io
 import json
 import re
+from collections.abc import Iterable
 from importlib import resources
 from typing import Any
 
@@ -22,7 +23,7 @@ from lapgs_wgpu.splat.raster_config import gpu_config
 
 from .clock import LOOPS, SPEEDS
 from .controls import FLY_REACH, LOOK, ORBIT, ZOOM
-from .key_bindings import FLY, KEYS, MOUSE
+from .key_bindings import FLY, KEYS, MOUSE, KeyBinding
 from .render_modes import BACKGROUNDS
 from .viewport import SETTLED, SMALLEST_SCALE, TARGET_SECONDS
 
@@ -45,6 +46,7 @@ PASSES: dict[str, tuple[str, Defines]] = {
     "rasterize SUBGROUPS": ("rasterize", _SUBGROUPS.raster_defines(depth=False)),
     **{f"{name}{suffix}": (name, _SCAN | flag) for name in ("scan_reduce", "scan_apply")
        for suffix, flag in (("", {}), (" FLAGS", {"FLAGS": 1}), (" GATHER", {"GATHER": 1}))},
+    "rasterize DEPTH": ("rasterize", _PLAIN.raster_defines(depth=True)),
     "scan_blocks": ("scan_blocks", _SCAN),
     "scan_blocks SATURATING": ("scan_blocks", _SCAN | {"SATURATING": 1}),
     "sort_count": ("sort_count", {}),
@@ -59,6 +61,7 @@ PASSES: dict[str, tuple[str, Defines]] = {
 }  # fmt: skip
 _FIELD = ("hashgrid_slice", "hashgrid SLICED ROWS", "hashgrid ROWS")  # beside one of deform
 _CHOSEN = ("color", "rasterize", "deform")  # one of each
+_DESKTOP_ACTIONS = ("next_mode", "next_view", "next_compare", "add_key_frame", "toggle_pause", "step_training")
 
 
 def player_data() -> dict[str, Any]:
@@ -72,12 +75,18 @@ def player_data() -> dict[str, Any]:
             "tile": [_PLAIN.tile_width, _PLAIN.tile_height],
             "plain": "rasterize",
             "subgroups": "rasterize SUBGROUPS",
+            "depth": "rasterize DEPTH",
         },
         "present": _shader(compose("present", {})),
         "minScale": MIN_SCALE,
-        "keys": [key._asdict() for key in KEYS],
-        "mouse": MOUSE[:3],
-        "controls": {"fly": FLY, "orbit": ORBIT, "look": LOOK, "zoom": ZOOM, "reach": FLY_REACH},
+        "controls": {
+            "keys": {key.key: key.action for key in page_keys()},
+            "fly": FLY,
+            "orbit": ORBIT,
+            "look": LOOK,
+            "zoom": ZOOM,
+            "reach": FLY_REACH,
+        },
         "viewport": {"settled": SETTLED, "target": TARGET_SECONDS, "smallest": SMALLEST_SCALE},
         "loops": LOOPS,
         "speeds": SPEEDS,
@@ -103,7 +112,8 @@ def _uniform(source: str, binding: Binding) -> dict[str, Any]:
 
 def page_html(scene: bytes, title: str, poster: NDArray[np.uint8]) -> str:
     """The page. scene: a scene.lapgs. poster: (H, W, 3), shown until the first frame, and where WebGPU is missing."""
-    script, style = _script(), _file("player.css")
+    edge = "#" + bytes(np.median(poster[0], axis=0).astype(np.uint8)).hex()
+    script, style = _script(), _file("player.css").replace("{{background}}", edge)
     policy = "; ".join([
         "default-src 'none'",
         f"script-src '{_digest(script)}'",
@@ -123,8 +133,29 @@ def page_html(scene: bytes, title: str, poster: NDArray[np.uint8]) -> str:
         "player": json.dumps(player_data(), separators=(",", ":")).replace("<", "\\u003c"),
         "scene": base64.b64encode(scene).decode(),
         "script": script,
+        "help": "".join(f"<dt>{html.escape(shown)}</dt><dd>{html.escape(what)}</dd>" for shown, what in _gestures()),
+        "speeds": _options(f"{speed:g}x" for speed in SPEEDS),
+        "loops": _options(LOOPS),
     }
     return re.sub(r"\{\{(\w+)\}\}", lambda match: values[match[1]], _file("player.html"))
+
+
+def page_keys() -> list[KeyBinding]:
+    """The keys of lapgs-view that a page has a use for: it shows no capture, no training and no camera path."""
+    return [key for key in KEYS if key.action not in _DESKTOP_ACTIONS]
+
+
+def _gestures() -> list[tuple[str, str]]:
+    """What to press or move, and what it does."""
+    return [
+        *((key.shown, key.help) for key in page_keys()),
+        *MOUSE,
+        ("two fingers", "move sideways, nearer or farther"),
+    ]
+
+
+def _options(texts: Iterable[str]) -> str:
+    return "".join(f"<option>{html.escape(text)}</option>" for text in texts)
 
 
 def _script() -> str:

@@ -93,6 +93,13 @@ class Desktop:
         planes: NDArray[np.float32] = frame.placed.planes.read()
         return planes[:3].transpose(1, 2, 0)
 
+    def depth(self, camera: ViewCamera, place: tuple[int, int]) -> float:
+        """Along the camera's axis, of what a pixel (column, row) shows at time 0."""
+        frame = self.renderer.draw(FrameRequest(camera.camera(*SIZE), 0.0, "rgb", BACKGROUNDS["grey"]))
+        depth = self.renderer.depth_at(frame, *place)
+        assert depth is not None
+        return depth
+
 
 def psnr(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
     """dB, of colours in [0, 1]."""

@@ -11,23 +11,19 @@ const turned = (v, axis, angle) => { // a row times the rotation about a unit ax
 };
 
 export class ViewCamera {
-    // view: {camera: {rotation, position, fovY}, focus, up} where the scene begins.
-    constructor({ rotation, position, fovY, focus, up }) {
-        this.up = unit(up);
-        this.start = () => {
+    // Where the scene begins. narrowest: width by height of a picture; in a narrower one fovY grows, so that no side is cut.
+    constructor({ rotation, position, fovY, focus, up, narrowest }) {
+        Object.assign(this, { up: unit(up), narrowest });
+        this.reset = () => {
             const far = Math.hypot(...add(focus, position, -1));
             const ahead = Math.max(dot(add(focus, position, -1), rotation[2]), 1e-3 * far, 1e-6);
             Object.assign(this, { rotation, position, fovY, focus: add(position, rotation[2], ahead) });
         };
-        this.start();
+        this.reset();
     }
 
     get distance() {
         return Math.hypot(...add(this.focus, this.position, -1));
-    }
-
-    reset() {
-        this.start();
     }
 
     // Stand at a position and look at a focus; fovY in radians.
@@ -90,7 +86,7 @@ export class ViewCamera {
     // What the rasteriser takes for a picture of this size; view is column by column.
     camera(width, height) {
         const [x, y, z] = this.rotation;
-        const f = 0.5 * height / Math.tan(0.5 * this.fovY);
+        const f = 0.5 * Math.min(height, width / this.narrowest) / Math.tan(0.5 * this.fovY);
         const shift = [x, y, z].map(row => -dot(row, this.position));
         const view = [0, 1, 2].flatMap(i => [x[i], y[i], z[i], 0]).concat(shift, 1);
         return { view, focal: [f, f], center: [width / 2, height / 2], position: this.position, width, height };
@@ -107,7 +103,8 @@ export function firstView(text, means) {
         const values = [...rotation.flat(), ...position, fovY, ...focus, ...up];
         const square = [0, 1, 2].every(i => Math.abs(dot(rotation[i], rotation[i]) - 1) < 1e-3);
         if (values.length === 19 && values.every(Number.isFinite) && square && fovY > 0 && Math.hypot(...up) > 1e-3) {
-            return { rotation, position, fovY, focus, up, frames: Math.min(Math.max(Math.round(frames) || 1, 1), 1e6) };
+            const narrowest = Math.min(Math.max(size[0] / size[1], 0.1), 1);
+            return { rotation, position, fovY, focus, up, narrowest, frames: Math.min(Math.max(Math.round(frames) || 1, 1), 1e6) };
         }
     } catch {
         // as without one
@@ -116,5 +113,5 @@ export function firstView(text, means) {
     const focus = axes.map(values => values[values.length >> 1]);
     const radius = Math.max(1e-3, ...axes.map(values => 0.5 * (values.at(-1) - values[0])));
     const rotation = [[1, 0, 0], [0, 0, -1], [0, 1, 0]];
-    return { rotation, position: add(focus, rotation[2], -3.6 * radius), fovY: 0.7, focus, up: [0, 0, 1], frames: 150 };
+    return { rotation, position: add(focus, rotation[2], -3.6 * radius), fovY: 0.7, focus, up: [0, 0, 1], narrowest: 1, frames: 150 };
 }

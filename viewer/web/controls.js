@@ -3,7 +3,8 @@ export class Controls {
     // actions: name -> function. wake: something may have changed. signal: ends it.
     constructor(canvas, state, { keys, fly, orbit, look, zoom, reach }, actions, wake, signal) {
         Object.assign(this, { canvas, state, fly, orbit, look, zoom, reach, actions, wake });
-        this.keys = new Map(keys.map(({ key, action }) => [key, action])).set("/", "toggle_help");
+        this.keys = new Map(Object.entries(keys)).set("/", "toggle_help");
+        this.pointer = [0, 0]; // where it was last
         this.pointers = new Map(); // that are down, by number: where each is
         this.held = new Set(); // keys that fly, and those that say how fast
         this.flying = false;
@@ -16,6 +17,7 @@ export class Controls {
         listen("pointermove", this.pointerMove);
         for (const name of ["pointerup", "pointercancel"]) listen(name, this.pointerUp);
         listen("wheel", this.wheel, { passive: false });
+        listen("dblclick", event => this.actions.focus(event.clientX, event.clientY));
         listen("contextmenu", event => event.preventDefault());
         addEventListener("keydown", event => this.keyDown(event), { signal });
         addEventListener("keyup", event => this.held.delete(event.code), { signal });
@@ -31,6 +33,7 @@ export class Controls {
     }
 
     pointerMove(event) {
+        this.pointer = [event.clientX, event.clientY];
         const last = this.pointers.get(event.pointerId);
         if (!last) return;
         const { camera } = this.state;
@@ -72,7 +75,7 @@ export class Controls {
         } else {
             const action = this.actions[this.keys.get(event.key) ?? this.keys.get(key)];
             if (!action) return;
-            action();
+            action(...this.pointer);
         }
         event.preventDefault();
         this.wake();

@@ -6,19 +6,17 @@ const RAISED = ["maxStorageBufferBindingSize", "maxBufferSize"];
 const KINDS = { uniform: "uniform", read: "read-only-storage", read_write: "storage" };
 
 export async function openGpu(kernels) {
-    if (!navigator.gpu) throw new Refusal(withoutWebGpu());
+    if (!isSecureContext) throw new Refusal("WebGPU needs a page that came by https, from this machine, or as a file.");
+    if (!navigator.gpu) throw new Refusal(`This browser shows no WebGPU. ${advice()}`);
     const adapter = await navigator.gpu.requestAdapter({ powerPreference: "high-performance" });
-    if (!adapter) throw new Refusal(`This browser knows WebGPU, but offers no graphics adapter for it. ${advice()}`);
+    if (!adapter) throw new Refusal(`This browser knows WebGPU, but offers no graphics adapter for it: switch on graphics acceleration in its settings`
+        + `${/Chrom/.test(navigator.userAgent) ? ", or chrome://flags/#enable-unsafe-webgpu" : ""}, or install a newer graphics driver.`);
     const requiredLimits = Object.fromEntries(RAISED.map(name => [name, adapter.limits[name]]));
     // Where a workgroup of 32 lanes is one subgroup; the raster pass says whether it is so indeed.
     const shuffles = adapter.features.has("subgroups") && adapter.info?.subgroupMinSize >= 32;
     const device = await adapter.requestDevice({ requiredFeatures: shuffles ? ["subgroups"] : [], requiredLimits });
-    return new Gpu(device, kernels, device.features.has("subgroups"));
-}
-
-function withoutWebGpu() {
-    if (!isSecureContext) return "WebGPU needs a page that came by https, from this machine, or as a file.";
-    return `This browser shows no WebGPU. ${advice()}`;
+    const { description, vendor = "", architecture = "" } = adapter.info ?? {};
+    return new Gpu(device, kernels, device.features.has("subgroups"), description || `${vendor} ${architecture}`);
 }
 
 function advice() {
@@ -30,8 +28,9 @@ function advice() {
 }
 
 export class Gpu {
-    constructor(device, kernels, subgroups) {
+    constructor(device, kernels, subgroups, name) {
         this.device = device;
+        this.name = name; // of the adapter
         this.subgroups = subgroups;
         this.maxBinding = device.limits.maxStorageBufferBindingSize;
         this.kernelData = kernels;
@@ -62,9 +61,7 @@ class Kernel {
 
     async compile() {
         const { device } = this.gpu;
-        const entries = Object.values(this.bindings).map(([binding, kind]) => (
-            { binding, visibility: GPUShaderStage.COMPUTE, buffer: { type: KINDS[kind] } }));
-        this.layout = device.createBindGroupLayout({ entries });
+        this.layout = bindGroupLayout(device, this.bindings, GPUShaderStage.COMPUTE);
         this.pipeline = await device.createComputePipelineAsync({
             label: this.key,
             layout: device.createPipelineLayout({ bindGroupLayouts: [this.layout] }),
@@ -90,6 +87,11 @@ class Kernel {
         }
         return group;
     }
+}
+
+export function bindGroupLayout(device, bindings, visibility) {
+    return device.createBindGroupLayout({ entries: Object.values(bindings).map(([binding, kind]) => (
+        { binding, visibility, buffer: { type: KINDS[kind] } })) });
 }
 
 export const bound = bytes => Math.max(16, Math.ceil(bytes / 16) * 16); // of an array of so many bytes
@@ -185,9 +187,21 @@ export class Commands {
         this.encoder.clearBuffer(array.buffer, array.offset, array.bytes);
     }
 
-    copy(from, to, at) {
+    // Submit, and what arrays then hold, one after another.
+    async read(arrays) {
+        const size = arrays.reduce((sum, { bytes }) => sum + bytes, 0);
+        const staging = this.gpu.device.createBuffer({ size, usage: GPUBufferUsage.MAP_READ | GPUBufferUsage.COPY_DST });
         this.endPass();
-        this.encoder.copyBufferToBuffer(from.buffer, from.offset, to, at, from.bytes);
+        let at = 0;
+        for (const { buffer, offset, bytes } of arrays) {
+            this.encoder.copyBufferToBuffer(buffer, offset, staging, at, bytes);
+            at += bytes;
+        }
+        this.submit();
+        await staging.mapAsync(GPUMapMode.READ);
+        const content = staging.getMappedRange().slice(0);
+        staging.destroy();
+        return content;
     }
 
     endPass() {

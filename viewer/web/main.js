@@ -121,6 +121,7 @@ function start(gpu, { scene, playback, rasterizer }, state, data) {
         find("poster").hidden = false;
         say(sentence(error));
     };
+    const toggle = name => (find(name).hidden = !find(name).hidden);
     const setBackground = color => (state.background = color);
     const actions = {
         toggle_playing: () => scene.field && clock.toggle(),
@@ -132,14 +133,16 @@ function start(gpu, { scene, playback, rasterizer }, state, data) {
         faster: () => clock.faster(),
         next_loop: () => clock.nextLoop(),
         next_background: () => setBackground(after(Object.values(data.backgrounds), state.background)),
+        focus: (x, y) => viewport.focus(x, y).catch(fail),
         reset_camera: () => camera.reset(),
         toggle_flying: () => controls.toggleFlying(),
-        toggle_transport: () => transport.toggle(),
-        toggle_help: () => transport.toggleHelp(),
+        toggle_overlay: () => toggle("overlay"),
+        toggle_transport: () => scene.field && toggle("bar"),
+        toggle_panels: () => toggle("panels"),
+        toggle_help: () => toggle("help"),
     };
-    const keys = data.keys.filter(({ action }) => action in actions);
-    const transport = new Transport(document, state, { actions, keys, mouse: data.mouse, wake, signal });
-    const controls = new Controls(canvas, state, { keys, ...data.controls }, actions, wake, signal);
+    const transport = new Transport(document, state, { actions, wake, signal });
+    const controls = new Controls(canvas, state, data.controls, actions, wake, signal);
     transport.bar.hidden = !scene.field;
     const address = () => {
         applyAddress(location.hash, { clock, backgrounds: data.backgrounds, setBackground });
@@ -165,7 +168,6 @@ function start(gpu, { scene, playback, rasterizer }, state, data) {
         if (signal.aborted) return;
         const seconds = Math.min((now - last) / 1000, LONGEST_STEP);
         last = now;
-        const before = viewport.frames;
         try {
             controls.advance(seconds);
             if (clock.playing) {
@@ -173,14 +175,16 @@ function start(gpu, { scene, playback, rasterizer }, state, data) {
                 wake();
             }
             resize();
-            await viewport.draw(now);
+            if (!await viewport.draw(now)) return;
         } catch (error) {
             fail(error);
             return;
         }
-        if (viewport.frames === before) return;
         if (viewport.scale === 1 && !clock.playing) canvas.toBlob(keep); // now: a canvas holds its picture for this task
         find("poster").hidden = true;
+        const { width, height } = viewport.frame.camera;
+        find("overlay").textContent = `${(1 / viewport.seconds).toFixed(1)} frames a second\n${Math.round(1000 * viewport.seconds)} ms `
+            + `a frame\n${scene.count} Gaussians\n${width}x${height}\n${gpu.name}`;
         api.onframe?.(clock.time);
     }
     (function loop(now) {

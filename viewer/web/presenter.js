@@ -1,7 +1,5 @@
 // Puts a drawn image on the canvas (shaders/present.wgsl), enlarged where it was drawn smaller.
-import { Pool, resource } from "./gpu.js";
-
-const KINDS = { uniform: "uniform", read: "read-only-storage" };
+import { Pool, bindGroupLayout, resource } from "./gpu.js";
 
 export class Presenter {
     constructor(gpu, canvas, shader) {
@@ -10,9 +8,7 @@ export class Presenter {
         this.context = canvas.getContext("webgpu");
         const format = navigator.gpu.getPreferredCanvasFormat();
         this.context.configure({ device, format, alphaMode: "opaque" });
-        const entries = Object.values(shader.bindings).map(([binding, kind]) => (
-            { binding, visibility: GPUShaderStage.FRAGMENT, buffer: { type: KINDS[kind] } }));
-        this.layout = device.createBindGroupLayout({ entries });
+        this.layout = bindGroupLayout(device, shader.bindings, GPUShaderStage.FRAGMENT);
         const module = device.createShaderModule({ code: shader.source });
         this.pipeline = device.createRenderPipeline({
             layout: device.createPipelineLayout({ bindGroupLayouts: [this.layout] }),

@@ -19,6 +19,7 @@ export class Rasterizer {
         this.tile = raster.tile;
         this.rasterize = gpu.subgroups ? raster.subgroups : raster.plain;
         this.plain = raster.plain;
+        this.depth = raster.depth;
         this.pool = new Pool(gpu);
         this.plan = { capacity: FIRST_CAPACITY, bands: 1 };
         this.maxCapacity = Math.floor(gpu.maxBinding / RECORD_BYTES);
@@ -30,50 +31,37 @@ export class Rasterizer {
     }
 
     // Submit the passes that draw an image. It is valid once `valid` says so of what `counts` reads.
-    // gaussians: {count, degree, means, quats, scales, opacities, sh}. camera: see camera.js.
-    draw(gaussians, camera, background, log = null) {
+    // gaussians: {count, degree, means, quats, scales, opacities, sh}. camera: see camera.js. depth: as a fifth plane.
+    draw(gaussians, camera, background, log = null, depth = false) {
         if (this.size !== `${camera.width}x${camera.height}`) { // what another size needed would slow this one down
             this.plan = { capacity: this.plan.capacity, bands: 1 };
             this.size = `${camera.width}x${camera.height}`;
         }
         const { bands } = this.plan;
         const drawing = {
-            gaussians, camera, background, plan: this.plan,
-            image: this.pool.array("image", 16 * camera.width * camera.height),
+            gaussians, camera, background, plan: this.plan, rasterize: depth ? this.depth : this.rasterize,
+            image: this.pool.array("image", (depth ? 20 : 16) * camera.width * camera.height),
             splats: this.pool.array("splats", SPLAT_BYTES * gaussians.count),
         };
-        const staging = this.staging(16 * (bands + 1));
+        const counts = [];
         for (let band = 0; band < bands; band++) {
             const commands = new Commands(this.gpu, log);
             const { needed, flags } = this.drawBand(commands, drawing, band);
-            commands.copy(needed, staging, 16 * band);
-            if (band === bands - 1) commands.copy(flags, staging, 16 * bands);
-            commands.submit();
+            counts.push(needed);
+            if (band < bands - 1) commands.submit();
+            else drawing.counts = commands.read([...counts, flags]).then(bytes => new Uint32Array(bytes));
         }
-        drawing.counts = staging.mapAsync(GPUMapMode.READ).then(() => {
-            const counts = new Uint32Array(staging.getMappedRange().slice(0));
-            staging.unmap();
-            return counts;
-        });
         return drawing;
-    }
-
-    staging(bytes) {
-        if (!this.readback || this.readback.size < bytes) {
-            this.readback?.destroy();
-            this.readback = this.gpu.device.createBuffer({ size: bytes, usage: GPUBufferUsage.MAP_READ | GPUBufferUsage.COPY_DST });
-        }
-        return this.readback;
     }
 
     // Whether the drawing is whole. If not it has to be drawn again, with larger buffers, more bands or without subgroups.
     valid(drawing, counts) {
         const { plan } = drawing;
-        if (counts[4 * plan.bands + 2] && this.rasterize !== this.plain) { // its workgroups are no subgroups
+        if (counts[3 * plan.bands + 2] && this.rasterize !== this.plain) { // its workgroups are no subgroups
             this.rasterize = this.plain;
             return false;
         }
-        const totals = Array.from({ length: plan.bands }, (_, band) => counts[4 * band]);
+        const totals = Array.from({ length: plan.bands }, (_, band) => counts[3 * band]);
         const most = Math.max(...totals);
         if (most <= plan.capacity) return true;
         let { bands } = plan;
@@ -95,7 +83,7 @@ export class Rasterizer {
         return [Math.ceil(camera.height / this.tile[1]), Math.ceil(camera.width / this.tile[0])];
     }
 
-    drawBand(commands, { gaussians, camera, background, plan, image, splats }, band) {
+    drawBand(commands, { gaussians, camera, background, plan, rasterize, image, splats }, band) {
         const { gpu, pool } = this;
         const { count: n, means, quats, scales, opacities } = gaussians;
         const { capacity } = plan;
@@ -128,7 +116,7 @@ export class Rasterizer {
             commands, { length: needed, capacity, bits, keys: tileKeys, payload: null });
         commands.clear(ranges);
         commands.dispatch("tile_ranges", groups(Math.ceil(capacity / 4)), { frame, needed, tile_keys: sortedKeys, ranges });
-        commands.dispatch(this.rasterize, tiles, { frame, ranges, slots, slot_ids: slotIds, splats, image });
+        commands.dispatch(rasterize, tiles, { frame, ranges, slots, slot_ids: slotIds, splats, image });
         return { needed, flags: part(ranges, 16 * tiles, 16) };
     }
 

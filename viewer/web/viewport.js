@@ -1,5 +1,6 @@
 // Frames: drawn where something changed, at the resolution that keeps up, one at a time (viewer/viewport.py).
-import { Commands } from "./gpu.js";
+import { add } from "./camera.js";
+import { Commands, part } from "./gpu.js";
 
 export class Viewport {
     // state: {camera, clock, background}. numbers: settled and target seconds, smallest scale.
@@ -11,7 +12,6 @@ export class Viewport {
         this.movedAt = 0;
         this.busy = false;
         this.frame = null; // on show
-        this.frames = 0;
         this.seconds = NaN; // that the last one took
         this.log = null;
     }
@@ -26,31 +26,31 @@ export class Viewport {
         return [position, rotation, fovY, clock.time, background, this.canvas.width, this.canvas.height].join();
     }
 
-    // Draw where something changed. now: milliseconds of performance.now().
+    // Draw where something changed; whether it did. now: milliseconds of performance.now().
     async draw(now) {
-        if (this.busy) return;
+        if (this.busy) return false;
         const key = this.key();
         const moving = key !== this.drawn && this.frame !== null;
         if (key !== this.drawn) this.movedAt = now;
-        else if (this.scale === 1 || now - this.movedAt < 1000 * this.settled) return;
+        else if (this.scale === 1 || now - this.movedAt < 1000 * this.settled) return false;
         this.busy = true;
         try {
             const scale = moving ? this.movingScale : 1;
             const start = performance.now();
             this.frame = await this.drawWhole(scale);
             this.presenter.present(this.frame);
-            this.frames++;
             this.scale = scale;
             this.drawn = key;
             this.seconds = (performance.now() - start) / 1000;
             if (moving) this.adapt(scale, this.seconds);
+            return true;
         } finally {
             this.busy = false;
         }
     }
 
     // An image whose lists all fitted.
-    async drawWhole(scale) {
+    async drawWhole(scale, depth = false) {
         const { canvas, state, rasterizer } = this;
         const [width, height] = [canvas.width, canvas.height].map(size => Math.max(1, Math.round(scale * size)));
         const gaussians = this.playback.at(state.clock.time, this.log);
@@ -58,7 +58,7 @@ export class Viewport {
         const image = { ...camera, width, height, focal: scaled(camera.focal, canvas, width, height),
             center: scaled(camera.center, canvas, width, height) };
         for (;;) {
-            const drawing = rasterizer.draw(gaussians, image, state.background, this.log);
+            const drawing = rasterizer.draw(gaussians, image, state.background, this.log, depth);
             const counts = await drawing.counts;
             if (rasterizer.valid(drawing, counts)) return drawing;
         }
@@ -69,18 +69,32 @@ export class Viewport {
         this.movingScale = Math.min(Math.max(Math.floor(16 * ideal) / 16, this.smallest), 1);
     }
 
+    // Turn about the surface under a point of the canvas from now on; x and y are CSS pixels.
+    async focus(x, y) {
+        while (this.busy) await new Promise(requestAnimationFrame);
+        if (!this.frame) return;
+        this.busy = true;
+        try {
+            const { playback: { gpu }, rasterizer, canvas, state: { camera } } = this;
+            await gpu.compile([rasterizer.depth]);
+            const { image, camera: { width, height, focal, center } } = await this.drawWhole(1, true);
+            const [column, row] = [x * width / canvas.clientWidth, y * height / canvas.clientHeight].map(Math.floor);
+            const pixel = [3, 4].map(plane => part(image, 4 * ((plane * height + row) * width + column), 4));
+            const [rest, depth] = new Float32Array(await new Commands(gpu).read(pixel));
+            if (!(rest < 0.9)) return; // next to nothing is there
+            const ray = [(column + 0.5 - center[0]) / focal[0], (row + 0.5 - center[1]) / focal[1], 1];
+            const along = ray.reduce((sum, length, axis) => add(sum, camera.rotation[axis], length), [0, 0, 0]);
+            camera.place({ focus: add(camera.position, along, depth / (1 - rest)) });
+        } finally {
+            this.drawn = ""; // the image's buffer holds the depth now
+            this.busy = false;
+        }
+    }
+
     // The image on show as float planes: red, green, blue, transmittance, row by row.
     async planes() {
-        const { image, camera } = this.frame;
-        const { device } = this.playback.gpu;
-        const staging = device.createBuffer({ size: image.bytes, usage: GPUBufferUsage.MAP_READ | GPUBufferUsage.COPY_DST });
-        const commands = new Commands(this.playback.gpu);
-        commands.copy(image, staging, 0);
-        commands.submit();
-        await staging.mapAsync(GPUMapMode.READ);
-        const values = new Float32Array(staging.getMappedRange().slice(0));
-        staging.destroy();
-        return { width: camera.width, height: camera.height, values };
+        const { image, camera: { width, height } } = this.frame;
+        return { width, height, values: new Float32Array(await new Commands(this.playback.gpu).read([image])) };
     }
 }
 

@@ -1,0 +1,182 @@
+"""The motion of a playback as pieces of straight lines, for files that hold no field.
+
+A piece is halved until a line and one shape, colour and opacity are near enough to all that the field says of it.
+Shapes are compared by the square roots of their covariances, whose columns lie on the ellipsoid of one standard
+deviation: unlike quaternions they do not turn where the ellipsoid looks the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...gpu.array import read_all
+from ...splat.constants import CONSTANTS
+from .playback import Playback
+
+Floats = NDArray[np.floating]
+
+SAMPLES = 128  # of the clip at least; a field's spectrum has up to 16 cycles
+_PIECE_SAMPLES = 8  # of a piece at least
+_SHORTEST = 2.0**-9  # of the clip: shorter pieces are not halved
+_BLOCK = 1 << 14  # Gaussians at once: 0.1 GB of samples
+_CHECKS = 97  # moments at which finished pieces are compared; none but a few is one of those they were made of
+_REPAIRS = 4  # times that what is still too far is baked again, twice as finely
+_MEAN, _ROOT, _REST = slice(0, 3), slice(3, 9), slice(9, 13)  # columns of a state: mean, root; opacity and colour
+_ROWS, _COLUMNS = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]  # entries of a root
+_WEIGHTS = np.array([1, 1, 1, 2, 2, 2]) ** 0.5  # so that the norm of the six is that of the matrix
+
+
+class Pieces(NamedTuple):
+    """P pieces, in ascending order of (source, begin).
+
+    source: (P,) number of the Gaussian. begin, end: (P,) in [0, 1] of the clip. means: (P, 3) at the middle, world
+    units. slopes: (P, 3) world units a clip. scales: (P, 3). quats: (P, 4) xyzw. opacities: (P,). dc: (P, 3)
+    harmonics of degree 0.
+    """
+
+    source: NDArray[np.integer]
+    begin: Floats
+    end: Floats
+    means: Floats
+    slopes: Floats
+    scales: Floats
+    quats: Floats
+    opacities: Floats
+    dc: Floats
+
+
+def linear_pieces(
+    playback: Playback, farthest: float, shade: float, done: Callable[[float], object] = lambda share: None
+) -> Pieces:
+    """Bake a playback.
+
+    farthest: largest distance of a point of an ellipsoid of one standard deviation from where it should be, world
+    units. shade: largest change of opacity and colour, both in [0, 1]. Gaussians that no pass draws during a piece are
+    left out of it. done: called with the share that is done, now and then.
+    """
+    pieces = _bake(playback, np.arange(playback.count), farthest, shade, done)
+    for repair in range(1, _REPAIRS + 1):
+        wrong = np.unique(pieces.source[piece_errors(playback, pieces) > farthest])
+        if not len(wrong):
+            break
+        right = ~np.isin(pieces.source, wrong)
+        again = _bake(playback, wrong, 0.5**repair * farthest, shade, lambda share: None)
+        joined = [np.concatenate([old[right], new]) for old, new in zip(pieces, again, strict=True)]
+        order = np.lexsort((joined[1], joined[0]))
+        pieces = Pieces(*(each[order] for each in joined))
+    return pieces
+
+
+def _bake(
+    playback: Playback, rows: NDArray[np.integer], farthest: float, shade: float, done: Callable[[float], object]
+) -> Pieces:
+    """The pieces of some Gaussians, near enough at the samples."""
+    found: list[tuple[Floats, ...]] = []
+    for first in range(0, len(rows), _BLOCK):
+        block = rows[first : first + _BLOCK]
+        values = np.stack([state(playback, t, block) for t in np.linspace(0, 1, SAMPLES + 1).tolist()])
+        for piece in _halve(playback, values, block, 0.0, 1.0, farthest, shade):
+            found.append(piece)
+            done((first + len(block) * float(piece[1].max(initial=0))) / len(rows))
+    source, begin, end, middle, slopes = (np.concatenate(each) for each in zip(*found, strict=True))
+    order = np.lexsort((begin, source))
+    middle = middle[order].astype(np.float64)
+    scales, quats = _ellipsoids(middle[:, _ROOT])
+    return Pieces(
+        source[order], begin[order], end[order], middle[:, _MEAN], slopes[order], scales, quats,
+        middle[:, 9], middle[:, 10:] / CONSTANTS["SH_C0"],
+    )  # fmt: skip
+
+
+def piece_errors(playback: Playback, pieces: Pieces) -> Floats:
+    """(P,) largest displacement of each piece from the playback, world units, at _CHECKS moments of the clip."""
+    worst = np.zeros(len(pieces.source))
+    for t in np.linspace(0, 1, _CHECKS).tolist():
+        shown = np.flatnonzero((pieces.begin <= t) & ((t < pieces.end) | (pieces.end == 1.0)))
+        way = (t - 0.5 * (pieces.begin + pieces.end)[shown])[:, None] * pieces.slopes[shown]
+        moved = np.concatenate([pieces.means[shown] + way, roots_of(pieces.scales[shown], pieces.quats[shown])], axis=1)
+        error = displacement(moved, state(playback, t, pieces.source[shown]))
+        worst[shown] = np.maximum(worst[shown], error)
+    return worst
+
+
+def state(playback: Playback, t: float, rows: NDArray[np.integer]) -> Floats:
+    """(rows, 13) of Gaussians at a time: mean, root of the covariance, opacity, colour of degree 0."""
+    now = playback.at(t)
+    arrays = read_all([now.means, now.quats, now.scales, now.opacities, now.sh])
+    means, quats, scales, opacities, sh = (values[rows] for values in arrays)
+    roots = roots_of(scales, np.roll(quats, -1, axis=1))
+    return np.concatenate([means, roots, opacities[:, None], CONSTANTS["SH_C0"] * sh[:, 0]], axis=1)
+
+
+def roots_of(scales: Floats, quats: Floats) -> Floats:
+    """(N, 6) weighted entries of the square roots of covariances. quats: (N, 4) xyzw, of any length."""
+    x, y, z, w = (quats / np.linalg.norm(quats, axis=1, keepdims=True)).T
+    axes = np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ])  # fmt: skip
+    return np.einsum("ikn,ikn,nk->ni", axes[_ROWS], axes[_COLUMNS], scales) * _WEIGHTS
+
+
+def displacement(moved: Floats, true: Floats) -> Floats:
+    """At most how far points of ellipsoids of one standard deviation are apart, world units: (...,) of states."""
+    means = np.linalg.norm(moved[..., _MEAN] - true[..., _MEAN], axis=-1)
+    return means + np.linalg.norm(moved[..., _ROOT] - true[..., _ROOT], axis=-1)
+
+
+def _ellipsoids(roots: Floats) -> tuple[Floats, Floats]:
+    """Scales (N, 3) and quaternions (N, 4) xyzw of roots."""
+    from scipy.spatial.transform import Rotation
+
+    matrices = np.empty((len(roots), 3, 3))
+    matrices[:, _ROWS, _COLUMNS] = matrices[:, _COLUMNS, _ROWS] = roots / _WEIGHTS
+    scales, axes = np.linalg.eigh(matrices)
+    axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]
+    return np.maximum(scales, CONSTANTS["MIN_SCALE"]), Rotation.from_matrix(axes).as_quat()
+
+
+def _halve(
+    playback: Playback,
+    values: Floats,
+    rows: NDArray[np.integer],
+    begin: float,
+    end: float,
+    farthest: float,
+    shade: float,
+) -> Iterator[tuple[Floats, ...]]:
+    """(source, begin, end, state at the middle, slope) of pieces. values: (samples, rows, 13), evenly."""
+    at = np.linspace(-0.5, 0.5, len(values), dtype=np.float32)[:, None, None]
+    middle = values.mean(axis=0)
+    slope = (at * values[..., _MEAN]).sum(axis=0) / (at**2).sum()
+    guess = np.broadcast_to(middle, values.shape).copy()
+    guess[..., _MEAN] += at * slope
+    near = (displacement(guess, values) <= farthest).all(axis=0)
+    near &= (np.abs(guess - values)[..., _REST] <= shade).all(axis=(0, 2))
+    near |= end - begin <= _SHORTEST
+    seen = near & (values[..., 9].max(axis=0) >= CONSTANTS["ALPHA_MIN"])
+    count = int(seen.sum())
+    yield rows[seen], np.full(count, begin), np.full(count, end), middle[seen], slope[seen] / (end - begin)
+    if near.all():
+        return
+    values, rows, half = values[:, ~near], rows[~near], len(values) // 2
+    cut = 0.5 * (begin + end)
+    for part, (first, last) in ((values[: half + 1], (begin, cut)), (values[half:], (cut, end))):
+        yield from _halve(playback, _sampled(playback, part, rows, first, last), rows, first, last, farthest, shade)
+
+
+def _sampled(playback: Playback, values: Floats, rows: NDArray[np.integer], begin: float, end: float) -> Floats:
+    """The samples of a piece, with those in between where they are too few."""
+    if len(values) > _PIECE_SAMPLES:
+        return values
+    fine = np.empty((2 * len(values) - 1, *values.shape[1:]), values.dtype)
+    fine[::2] = values
+    for number, t in enumerate(np.linspace(begin, end, len(fine)).tolist()):
+        if number % 2:
+            fine[number] = state(playback, t, rows)
+    return fine

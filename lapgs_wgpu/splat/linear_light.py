@@ -1,0 +1,60 @@
+"""Spherical harmonics of linear light, fitted over all directions to those of displayed colours (sRGB)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .constants import CONSTANTS
+
+Floats = NDArray[np.floating]
+
+_BLOCK = 1 << 13
+
+
+def sh_basis(directions: Floats, degree: int) -> Floats:
+    """(D, (degree + 1)^2) real spherical harmonics of unit vectors (D, 3), in the order and signs of 3DGS."""
+    c = CONSTANTS
+    x, y, z = directions.T
+    xx, yy, zz = x * x, y * y, z * z
+    basis = [np.full_like(x, c["SH_C0"]), -c["SH_C1"] * y, c["SH_C1"] * z, -c["SH_C1"] * x]
+    basis += [c["SH_C2_0"] * x * y, -c["SH_C2_0"] * y * z, c["SH_C2_1"] * (2 * zz - xx - yy)]
+    basis += [-c["SH_C2_0"] * x * z, c["SH_C2_2"] * (xx - yy)]
+    basis += [-c["SH_C3_0"] * y * (3 * xx - yy), c["SH_C3_1"] * x * y * z, -c["SH_C3_2"] * y * (4 * zz - xx - yy)]
+    basis += [c["SH_C3_3"] * z * (2 * zz - 3 * xx - 3 * yy), -c["SH_C3_2"] * x * (4 * zz - xx - yy)]
+    basis += [c["SH_C3_4"] * z * (xx - yy), -c["SH_C3_0"] * x * (xx - 3 * yy)]
+    return np.stack(basis[: (degree + 1) ** 2], axis=1)
+
+
+def directions(count: int) -> Floats:
+    """(count, 3) unit vectors, spread evenly (Fibonacci's spiral)."""
+    z = 1 - (2 * np.arange(count) + 1) / count
+    angle = np.pi * (3 - 5**0.5) * np.arange(count)
+    radius = np.sqrt(1 - z * z)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
+
+
+def display_colors(sh: Floats, basis: Floats) -> Floats:
+    """(N, D, 3) colours in [0, 1] of harmonics (N, K, 3) in the directions of a basis (D, K)."""
+    return np.clip(np.einsum("dk,nkc->ndc", basis, sh) + CONSTANTS["SH_OFFSET"], 0, 1)
+
+
+def to_linear(display: Floats) -> Floats:
+    """Linear light of sRGB (IEC 61966-2-1), both in [0, 1]."""
+    return np.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4)
+
+
+def to_display(linear: Floats) -> Floats:
+    """sRGB of linear light, both in [0, 1]."""
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0.003) ** (1 / 2.4) - 0.055)
+
+
+def linear_harmonics(sh: Floats, degree: int) -> Floats:
+    """(N, (degree + 1)^2, 3) harmonics of linear light, without an offset, that fit the colours of sh (N, K, 3)."""
+    around = directions(64)
+    seen, fit = sh_basis(around, int(sh.shape[1] ** 0.5) - 1), np.linalg.pinv(sh_basis(around, degree))
+    found = [
+        np.einsum("kd,ndc->nkc", fit, to_linear(display_colors(sh[first : first + _BLOCK], seen)))
+        for first in range(0, len(sh), _BLOCK)
+    ]
+    return np.concatenate(found)
