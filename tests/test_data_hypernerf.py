@@ -17,6 +17,8 @@ from scipy.ndimage import binary_erosion
 from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.train.open_dataset import open_dataset
+from lapgs_wgpu.train.presets import load_config
 
 SHARED = Path(__file__).parents[2] / "shared" / "data"
 ID = "left_000001"
@@ -76,6 +78,20 @@ def test_a_bent_picture_keeps_its_size_and_loses_as_little_as_can_be(device: Dev
         focal[name] = camera.K[0, 0] * math.tan(0.45) / (WIDTH / 2)
     assert focal["barrel"] == pytest.approx(1)  # the picture shows more than its frame: nothing is missing
     assert 1 < focal["radial"] < 1.2
+
+
+def test_lenses_are_ignored_as_published_where_asked(device: Device, tmp_path: Path) -> None:
+    folder = write_nerfies(tmp_path / "toy", device, count=3, lens=LENSES["all"])
+    plain, honoured = load_dataset(folder, undistort=False), load_dataset(folder)
+    for view, other in zip(plain.train, honoured.train, strict=True):
+        K = view.camera.K
+        assert (K[0, 2], K[1, 2], K[0, 1]) == (WIDTH / 2, HEIGHT / 2, 0)
+        assert K[0, 0] * math.tan(0.45) == pytest.approx(WIDTH / 2)
+        file = Path(view.source)
+        np.testing.assert_array_equal(view.load(), np.asarray(Image.open(file)))
+        assert not np.array_equal(view.load(), other.load())
+    config = load_config("hypernerf-broom", {"data.path": str(folder), "data.size": 0})
+    assert np.array_equal(open_dataset(config).train[0].camera.K, plain.train[0].camera.K)
 
 
 def test_a_straight_picture_is_not_touched(toy: Path) -> None:

@@ -120,7 +120,9 @@ def test_the_canvas_shows_it(browser: Browser, desktop: Desktop) -> None:
     assert np.abs(screen - expected).max() < 2.5
 
 
-@pytest.mark.parametrize("name", ["grid4d", "grid4d without time", "no appearance", "odd width", "odd levels"])
+@pytest.mark.parametrize(
+    "name", ["grid4d", "grid4d without time", "no appearance", "mirrored scales", "odd width", "odd levels"]
+)
 def test_every_field(window: Browser, folder: Path, device: Device, name: str) -> None:
     made = export_scene(trained(device, CONFIGS[name], 300), folder, device, name.replace(" ", "-"))
     open_page(window, made.as_uri())
