@@ -306,12 +306,12 @@ class CamerasConfig(Options):
     refine: RefineCameras = option(
         "correct the training cameras while training; auto: those of own footage, whose poses were estimated (COLMAP, "
         "nerfstudio); never the cameras of test views",
-        "auto",
+        "off",
     )
     rate: Rate = option(
-        "learning rate of the corrections: radians, and parts of the cameras' extent", Rate(1e-3, 1e-5, 3_000)
+        "learning rate of the corrections: radians, and parts of the cameras' extent", Rate(2e-3, 5e-5, 3_000)
     )
-    pull: float = option("how strongly corrections are pulled back to zero, relative to the rate", 0.5, at_least=0)
+    pull: float = option("how strongly corrections are pulled back to zero, relative to the rate", 0.1, at_least=0)
     focal: bool = option("correct the focal length, too: one factor for all cameras", True)
     start: int = option("first step that moves cameras, when the scene has formed", 300, at_least=1)
 

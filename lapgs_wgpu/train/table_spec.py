@@ -30,7 +30,7 @@ from lapgs_wgpu.data.builtin import builtin_folder, is_builtin
 from lapgs_wgpu.errors import InputError, shown
 from lapgs_wgpu.io.dataclass_table import did_you_mean
 from lapgs_wgpu.io.safe_json_toml import read_toml
-from lapgs_wgpu.train.config import CamerasConfig, Config
+from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.presets import Table, build_config, merge
 
 MOST_RUNS = 10_000
@@ -124,7 +124,7 @@ def fingerprint(config: Config) -> str:
         del values["schedule"]["batch"]
     if not config.exposure.enabled:
         del values["exposure"]
-    if config.cameras == CamerasConfig():
+    if config.cameras.refine != "on":
         del values["cameras"]
     if not config.discovery.enabled:
         del values["discovery"]
