@@ -127,6 +127,7 @@ def _dataset(folder: Path, capture: Capture, image_size: int | None, normalize: 
         scale=1.0 if fit is None else fit.scale,
         warnings=tuple(warnings),
         time_source=time_source,
+        own_footage=capture.own_footage,
     )
 
 

@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ..gpu.array import DeviceArray
 from .camera import Camera
 from .gaussians import Gaussians
@@ -72,7 +75,8 @@ class GaussianGradients(NamedTuple):
     """Gradients with respect to the Gaussians.
 
     splats: projected ones, (N, SPLAT_FLOATS), see splat_layout. means (N, 3), quats (N, 4), scales (N, 3). sh:
-    (N, K, 3); None for Gaussians with colors, whose gradient is a column of `splats`.
+    (N, K, 3); None for Gaussians with colors, whose gradient is a column of `splats`. camera: (2, G, 4), what
+    `camera_gradient` takes; None where it was not asked for.
     """
 
     splats: DeviceArray
@@ -80,7 +84,26 @@ class GaussianGradients(NamedTuple):
     quats: DeviceArray
     scales: DeviceArray
     sh: DeviceArray | None
+    camera: DeviceArray | None = None
 
     def arrays(self) -> list[DeviceArray]:
-        """The arrays in this order, for `read_all`."""
-        return [array for array in self if array is not None]
+        """The arrays of the Gaussians in this order, for `read_all`."""
+        return [array for array in self[:5] if array is not None]
+
+
+class CameraGradient(NamedTuple):
+    """Gradients with respect to a camera.
+
+    rotation: (3,) by a small rotation of the camera about its own center, a vector along the world's axes, radians.
+    position: (3,) by the center, world units. log_focal: by the logarithm of both focal lengths.
+    """
+
+    rotation: NDArray[np.float64]
+    position: NDArray[np.float64]
+    log_focal: float
+
+
+def camera_gradient(sums: NDArray[np.float32]) -> CameraGradient:
+    """The gradient by the camera from the content of `GaussianGradients.camera`."""
+    turn, shift = sums.sum(axis=1, dtype=np.float64)
+    return CameraGradient(-turn[:3], -shift[:3], float(turn[3]))

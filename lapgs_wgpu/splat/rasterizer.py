@@ -232,10 +232,13 @@ class Rasterizer:
 
     # Backward --------------------------------------------------------------------------------------------------------
 
-    def backward(self, drawing: Drawing, d_image: DeviceArray, *, profile: Profile | None = None) -> GaussianGradients:
+    def backward(
+        self, drawing: Drawing, d_image: DeviceArray, *, camera: bool = False, profile: Profile | None = None
+    ) -> GaussianGradients:
         """Submit the backward passes of a drawing.
 
-        d_image: gradient of the image's planes, with that of alpha instead of the transmittance.
+        d_image: gradient of the image's planes, with that of alpha instead of the transmittance. camera: whether the
+        gradient by the camera is wanted, too.
         Raises RuntimeError if another image was drawn since, which has overwritten the drawing's arrays.
         """
         if not self.holds(drawing):
@@ -252,16 +255,27 @@ class Rasterizer:
                     drawing.lists = self._draw_band(commands, drawing, band)
                 self._backward_band(commands, drawing, band, d_image, d_splats)
         if self._subgroup_mismatch("rasterize_bwd", drawing):
-            return self.backward(drawing, d_image, profile=profile)
-        d_sh = None
+            return self.backward(drawing, d_image, camera=camera, profile=profile)
+        d_sh, d_camera = None, self._camera_sums(n) if camera else None
         arrays = vars(gaussians) | {"frame": self._frame(drawing, 0), "d_splats": d_splats}
         arrays |= {"d_means": d_means, "d_quats": d_quats, "d_scales": d_scales}
         with Commands(self.device, profile) as commands:
             commands.run(Kernel.get(self.device, "project_bwd"), _groups(n), arrays)
+            if d_camera is not None:
+                commands.clear(d_camera)  # the last rows pad it
+                turned = arrays | {"d_camera": d_camera.rows(0, 1)}
+                commands.run(Kernel.get(self.device, "camera_bwd"), _groups(n), turned)
             if gaussians.sh_degree is not None:
                 d_sh = self.pool.array("d_sh", gaussians.sh.shape)
                 self._color_bwd(commands, drawing, d_splats, d_means, d_sh)
-        return GaussianGradients(d_splats, d_means, d_quats, d_scales, d_sh)
+            if d_camera is not None:
+                shifted = {"frame": arrays["frame"], "d_means": d_means, "d_camera": d_camera.rows(1, 1)}
+                commands.run(Kernel.get(self.device, "camera_bwd", FORCE=True), _groups(n), shifted)
+        return GaussianGradients(d_splats, d_means, d_quats, d_scales, d_sh, d_camera)
+
+    def _camera_sums(self, n: int) -> DeviceArray:
+        """A row for each workgroup of camera_bwd, twice; each half begins at a multiple of 256 bytes."""
+        return self.pool.array("d_camera", (2, (_groups(n) + 15) // 16 * 16, 4))
 
     def _backward_band(
         self, commands: Commands, drawing: Drawing, band: int, d_image: DeviceArray, d_splats: DeviceArray

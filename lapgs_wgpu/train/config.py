@@ -21,6 +21,7 @@ HeldOut = Literal["test", "val"]
 Units = Literal["world", "capture"]
 Precision = Literal["float32", "bfloat16"]
 DecoderPlace = Literal["auto", "torch", "device"]
+RefineCameras = Literal["auto", "on", "off"]
 
 
 @dataclass(frozen=True)
@@ -299,6 +300,23 @@ class ExposureConfig(Options):
 
 
 @dataclass(frozen=True)
+class CamerasConfig(Options):
+    """Correction of the training cameras. Has defaults, since older config.toml files lack it."""
+
+    refine: RefineCameras = option(
+        "correct the training cameras while training; auto: those of own footage, whose poses were estimated (COLMAP, "
+        "nerfstudio); never the cameras of test views",
+        "off",
+    )
+    rate: Rate = option(
+        "learning rate of the corrections: radians, and parts of the cameras' extent", Rate(2e-3, 5e-5, 3_000)
+    )
+    pull: float = option("how strongly corrections are pulled back to zero, relative to the rate", 0.1, at_least=0)
+    focal: bool = option("correct the focal length, too: one factor for all cameras", True)
+    start: int = option("first step that moves cameras, when the scene has formed", 300, at_least=1)
+
+
+@dataclass(frozen=True)
 class EvalConfig(Options):
     """Evaluation during the training. Has defaults, since older config.toml files lack it."""
 
@@ -348,6 +366,7 @@ class Config(Options):
     smoothness: SmoothnessConfig
     seed: int = option("seed of all random numbers")
     exposure: ExposureConfig = option("", ExposureConfig())
+    cameras: CamerasConfig = option("", CamerasConfig())
     discovery: DiscoveryConfig = option("", DiscoveryConfig())
     eval: EvalConfig = option("", EvalConfig())
     precision: Precision = option(

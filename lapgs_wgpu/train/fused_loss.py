@@ -14,6 +14,7 @@ from ..gpu.array import DeviceArray, read_all
 from ..gpu.device import Device
 from ..gpu.kernel import Commands
 from ..splat.camera import Camera
+from ..splat.drawing import camera_gradient
 from ..splat.gaussians import Gaussians
 from ..splat.rasterize import gradient_tensors, radii_and_centres, rasterizer_of, upload_gaussians
 from .config import LossWeights
@@ -52,6 +53,8 @@ def render_loss(
     device: Device,
     correction: Tensor | None = None,
     own: Sequence[tuple[TorchLoss | WgslLoss, float]] = (),
+    camera_change: Tensor | None = None,
+    camera_unit: float = 1.0,
 ) -> RenderLoss:
     """The weighted sum of the image losses of the rendered Gaussians, computed on the device from end to end.
 
@@ -59,15 +62,25 @@ def render_loss(
     background: (3,) in [0, 1], under both; not differentiable. weights: of the terms. correction: (3, 4), of the
     image's colors before they are compared (train/exposure); none where None. own: further terms of the image, with
     their weights.
+    camera_change: (7,) zeros, which get the gradient by a small change of the camera: rotation, shift in units of
+    `camera_unit`, log of the focal lengths (splat.drawing.CameraGradient); none where None.
     The same bits on every run of one adapter and driver. Under torch.no_grad(), or where no tensor wants a gradient,
     none is computed.
     """
-    tensors = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh, correction)
+    tensors = (
+        gaussians.means,
+        gaussians.quats,
+        gaussians.scales,
+        gaussians.opacities,
+        gaussians.sh,
+        correction,
+        camera_change,
+    )
     wanted = torch.is_grad_enabled() and any(tensor is not None and tensor.requires_grad for tensor in tensors)
     probe = gaussians.means.new_zeros((len(gaussians), 2)).requires_grad_(wanted)
     red, green, blue = background.tolist()
     loss, computed, radii, centres = _FusedLoss.apply(
-        *tensors, probe, camera, truth, (red, green, blue), weights, device, wanted, own
+        *tensors, probe, camera, camera_unit, truth, (red, green, blue), weights, device, wanted, own
     )
     with torch.no_grad():
         probe.copy_(centres)
@@ -85,7 +98,7 @@ class _FusedLoss(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
-        *tensors, correction, probe, camera, truth, background, weights, device, wanted, own = arguments
+        *tensors, correction, change, probe, camera, unit, truth, background, weights, device, wanted, own = arguments
         rasterizer, losses, exposing = rasterizer_of(device), image_loss_of(device), exposure_of(device)
         gaussians = upload_gaussians(rasterizer.pool, Gaussians(*tensors))
         while True:
@@ -100,11 +113,12 @@ class _FusedLoss(torch.autograd.Function):
                     d_image, d_correction = exposing.record_bwd(commands, drawing.image, d_image, correction)
                     d_rows = [d_correction]
             if d_image is not None:
-                d_gaussians = rasterizer.backward(drawing, d_image).arrays()
+                back = rasterizer.backward(drawing, d_image, camera=change is not None)
+                d_gaussians = back.arrays()
+                d_rows += [] if back.camera is None else [back.camera]
             found = iter(read_all([terms, drawing.splats, *d_gaussians, *d_rows, *pixels.values(), *drawing.needed]))
-            values, splats, gradients, rows = next(found), next(found), [next(found) for _ in d_gaussians], None
-            if d_rows:
-                rows = next(found)
+            values, splats, gradients = next(found), next(found), [next(found) for _ in d_gaussians]
+            rows = [next(found) for _ in d_rows]
             own_values |= {name: float(next(found).mean(dtype=np.float64)) for name in pixels}
             # Where the intersections did not fit, none of this is right, and all of it is done again.
             if not rasterizer.grow_on_overflow(drawing, list(found)):
@@ -112,8 +126,12 @@ class _FusedLoss(torch.autograd.Function):
         ctx.gradients = None
         if gradients:
             by_gaussians, d_means2d = gradient_tensors(gradients, probe.device)
-            by_correction = None if rows is None else correction.new_tensor(rows.sum(axis=0, dtype=np.float64))
-            ctx.gradients = (*by_gaussians, by_correction, d_means2d)
+            by_correction = None if correction is None else correction.new_tensor(rows[0].sum(axis=0, dtype=np.float64))
+            by_camera = None
+            if change is not None:
+                by = camera_gradient(rows[-1])
+                by_camera = change.new_tensor([*by.rotation, *(unit * by.position), by.log_focal])
+            ctx.gradients = (*by_gaussians, by_correction, by_camera, d_means2d)
         computed = torch.from_numpy(np.append(values.astype(np.float64), [own_values[t.name] for t, _ in own]))
         radii, centres = radii_and_centres(splats, probe.device)
         ctx.mark_non_differentiable(computed, radii, centres)
@@ -123,7 +141,7 @@ class _FusedLoss(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *d_outputs: Any) -> tuple[Tensor | None, ...]:
         scaled = (None if gradient is None else d_outputs[0] * gradient for gradient in ctx.gradients)
-        return (*scaled, *[None] * 7)
+        return (*scaled, *[None] * 8)
 
 
 def _own_terms(

@@ -11,6 +11,7 @@ from contextlib import contextmanager, nullcontext, suppress
 from functools import partial
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 import torch
 
@@ -196,6 +197,8 @@ def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None)
         seconds = log.seconds
         if training.done == config.schedule.steps and (outside := _outside(scene)):
             log.tell(outside)
+        if (moved := training.camera_report()) is not None:
+            log.tell(_moved(moved))
 
     return_freed_memory()
     done, all_steps = training.done, config.schedule.steps
@@ -207,7 +210,9 @@ def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None)
             f"stopped after step {done} of {all_steps}; {out / 'checkpoint.ply'} holds it, and "
             f"lapgs-train --resume {out} goes on."
         )
-    measured = {"steps": done, "seconds": round(seconds, 3)}
+    measured: dict[str, Any] = {"steps": done, "seconds": round(seconds, 3)}
+    if (moved := training.camera_report()) is not None:
+        measured["cameras"] = moved
     evaluate_run(out, scene, training.dataset, config.data.background, measured, lpips)
     drop_states(out)
     return scene
@@ -259,12 +264,22 @@ def _saved(training: Trainer, out: Path) -> str:
     return "; nothing was saved yet."
 
 
+def _moved(report: dict[str, Any]) -> str:
+    """How far the cameras went, in a sentence."""
+    turn, shift = report["rotation_degrees"], report["shift_percent"]
+    return (
+        f"the training cameras were corrected by {turn['median']:.2f} degrees and {shift['median']:.2f} % of their "
+        f"extent (medians; at most {turn['largest']:.2f} and {shift['largest']:.2f} %), their focal length by "
+        f"{report['focal_percent']:+.2f} %."
+    )
+
+
 def evaluate_run(
     out: Path,
     scene: Scene4D,
     dataset: Dataset,
     background: Background,
-    training: dict[str, float],
+    training: dict[str, Any],
     lpips: Lpips | None = None,
     static: Scene4D | None = None,
 ) -> dict[str, object]:

@@ -124,6 +124,8 @@ def fingerprint(config: Config) -> str:
         del values["schedule"]["batch"]
     if not config.exposure.enabled:
         del values["exposure"]
+    if config.cameras.refine != "on":
+        del values["cameras"]
     if not config.discovery.enabled:
         del values["discovery"]
     if config.density.limit == 0:

@@ -27,6 +27,7 @@ from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.morton import morton_order
 from lapgs_wgpu.train.autotune import choose_decoder
+from lapgs_wgpu.train.camera_refinement import CameraRefinement
 from lapgs_wgpu.train.config import Config, PointsConfig, SmoothnessConfig
 from lapgs_wgpu.train.contribution import contributions, spread_over_time
 from lapgs_wgpu.train.dataloader import Pictures
@@ -161,11 +162,15 @@ class Trainer:
             limit = len(dataset.times) / 2
             self._frequencies = FrequencyOptimizer(scene.spectrum, config.rates.frequencies, limit)
         self._exposures = Exposures(len(dataset.train), config.exposure.rate) if config.exposure.enabled else None
-        self._beside = [each for each in (self._frequencies, self._exposures) if each is not None]
-        self._scored = spread_over_time(dataset.train)
-        self._numbers = {view.name: number for number, view in enumerate(dataset.train)}
         # Cameras that all stand at one place have no extent; the scene's own size must serve.
         self._extent = dataset.extent or config.points.box
+        self._cameras = None
+        if config.cameras.refine == "on" or (config.cameras.refine == "auto" and dataset.own_footage):
+            self._cameras = CameraRefinement(dataset.cameras, self._extent, config.cameras)
+        beside = (self._frequencies, self._exposures, self._cameras)
+        self._beside = [each for each in beside if each is not None]
+        self._scored = spread_over_time(dataset.train)
+        self._numbers = {view.name: number for number, view in enumerate(dataset.train)}
         self._statistics = Statistics.zeros(len(scene), scene.parameters["means"].device)
         self._scales = scene.parameters["log_scales"].detach().exp()
         self._health = Health()
@@ -293,7 +298,12 @@ class Trainer:
         correction = None if self._exposures is None else self._exposures.values[self._numbers[view.name]]
         weighted = [(term, weight_at(term, self.done + 1)) for term in self.parts.losses]
         own = [(term, weight) for term, weight in weighted if weight and not isinstance(term, Regularizer)]
-        rendering = render_loss(gaussians, view.camera, truth, look.background, weights, scene.device, correction, own)
+        camera, change = view.camera, None
+        if self._cameras is not None:
+            camera, change = self._cameras.refined(camera)
+        rendering = render_loss(
+            gaussians, camera, truth, look.background, weights, scene.device, correction, own, change, self._extent
+        )
         self._scales = gaussians.scales.detach()
         beside: dict[str, Tensor] = {}
         if smoothness is not None:
@@ -385,6 +395,10 @@ class Trainer:
             self._optimizer.edit_rows(keep, {name: row[:0] for name, row in scene.parameters.items()})
             self._statistics = self._statistics.of(keep)
 
+    def camera_report(self) -> dict[str, Any] | None:
+        """How far the training cameras were moved (`CameraRefinement.report`); None where they are kept."""
+        return None if self._cameras is None else self._cameras.report()
+
     # The state between two steps -------------------------------------------------------------------------------------
 
     def state(self) -> dict[str, NDArray[np.generic]]:
@@ -396,6 +410,7 @@ class Trainer:
             "adam": self._optimizer.state(),
             "frequencies": self._frequencies.state() if self._frequencies else {},
             "exposure": self._exposures.state() if self._exposures else {},
+            "cameras": self._cameras.state() if self._cameras else {},
             "statistics": vars(self._statistics),
             "training": {
                 "done": torch.tensor(self.done),
@@ -428,6 +443,8 @@ class Trainer:
             self._frequencies.restore(parts["frequencies"])
         if self._exposures is not None:
             self._exposures.restore(parts["exposure"])
+        if self._cameras is not None:
+            self._cameras.restore(parts["cameras"])
         self._statistics = Statistics(**parts["statistics"])
         own = parts["training"]
         self.done, scene.sh_degree = int(own["done"]), int(own["sh_degree"])

@@ -44,6 +44,7 @@ def _with_rounds(*names: str) -> Choices:
 
 
 SHAPES: dict[str, Choices] = {
+    "camera_bwd": _all(*_flags("FORCE")),
     "color": [{}, *_SH],
     "color_bwd": _SH,
     "compact": [{}],

@@ -1,0 +1,162 @@
+"""Cameras corrected while training: of each training camera its rotation and its place, of all together the zoom.
+
+Poses of own footage come from structure from motion and are a little off, which a training answers with blur. The
+gradient is that of the rasterizer's backward pass (`camera_bwd`). What all cameras could do together without any image
+changing (shift, turn and scale of the whole scene) is taken out, and corrections are pulled back to zero.
+Views that are measured keep their cameras.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from lapgs_wgpu.splat.camera import Camera
+
+from .config import CamerasConfig
+
+MEAN_DECAY, SQUARE_DECAY = 0.9, 0.99  # Adam's; a camera is seen a few dozen times
+TINY = 1e-15  # keeps 0 / 0 away
+Array = NDArray[np.float64]
+
+
+class RefinedCamera(NamedTuple):
+    """A corrected camera; and `change` (7,), zeros whose gradient is that by a further change of it: a rotation about
+    its center along the world's axes, radians; a shift in units of the cameras' extent; the logarithm of the zoom."""
+
+    camera: Camera
+    change: Tensor
+
+
+class CameraRefinement:
+    """The corrections of all training cameras, and how they learn.
+
+    cameras: distinct ones. extent: distance that counts as 1 in shifts, world units.
+    Adam, but a camera's moments and step count stand still while other cameras are trained on.
+    """
+
+    name = "cameras"
+
+    def __init__(self, cameras: Sequence[Camera], extent: float, config: CamerasConfig) -> None:
+        self._cameras, self._extent, self._config = list(cameras), extent, config
+        self._numbers = {id(camera): number for number, camera in enumerate(self._cameras)}
+        count = len(self._cameras)
+        self.values = nn.Parameter(torch.zeros(count, 7))  # always zeros: what has been learnt lies in `_learnt`
+        self._learnt = torch.zeros(count, 6, dtype=torch.float64)  # rotation vectors, shifts
+        self._zoom = torch.zeros(1, dtype=torch.float64)
+        self._mean, self._square = torch.zeros(count, 7), torch.zeros(count, 7)
+        self._steps = torch.zeros(count, 1)
+        self._common = torch.from_numpy(_common_motions(self._cameras, extent))
+
+    def refined(self, camera: Camera) -> RefinedCamera:
+        """The corrected form of one of the cameras (the same object)."""
+        number = self._numbers[id(camera)]
+        return RefinedCamera(self.camera(number), self.values[number])
+
+    def camera(self, number: int) -> Camera:
+        """The corrected form of a camera, by its number."""
+        camera = self._cameras[number]
+        turn, shift = self._learnt[number].numpy().reshape(2, 3)
+        T, K = camera.T_cam_world.copy(), camera.K.copy()
+        T[:3, :3] = T[:3, :3] @ rotation_of(turn).T
+        T[:3, 3] = -T[:3, :3] @ (camera.position + self._extent * shift)
+        K[:2, :2] *= np.exp(float(self._zoom))
+        return Camera(K, T, camera.width, camera.height)
+
+    @torch.no_grad()
+    def step(self, step: int) -> None:
+        """Move the cameras that have a gradient, at the rate of this step (counted from 1), and forget it."""
+        gradient, self.values.grad = self.values.grad, None
+        if gradient is None or step < self._config.start:
+            return
+        rows = gradient.any(dim=1).nonzero()[:, 0]
+        gradient = gradient[rows]
+        self._steps[rows] += 1
+        self._mean[rows] = MEAN_DECAY * self._mean[rows] + (1 - MEAN_DECAY) * gradient
+        self._square[rows] = SQUARE_DECAY * self._square[rows] + (1 - SQUARE_DECAY) * gradient.square()
+        mean = self._mean[rows] / (1 - MEAN_DECAY ** self._steps[rows])
+        size = (self._square[rows] / (1 - SQUARE_DECAY ** self._steps[rows])).sqrt()
+        rate = self._config.rate.at(step)
+        change = (-rate * mean / (size + TINY)).double()
+        for row, turn in zip(rows.tolist(), change[:, :3].numpy(), strict=True):
+            before = rotation_of(self._learnt[row, :3].numpy())
+            self._learnt[row, :3] = torch.from_numpy(rotation_vector(rotation_of(turn) @ before))
+        self._learnt[rows, 3:] += change[:, 3:6]
+        if self._config.focal:
+            self._zoom += change[:, 6].sum() / len(self._cameras)  # each camera has its share
+        self._learnt[rows] *= 1 - rate * self._config.pull
+        self._zoom *= 1 - rate * self._config.pull
+        flat = self._learnt.view(-1)
+        flat -= self._common @ (self._common.T @ flat)
+
+    def report(self) -> dict[str, Any]:
+        """How far the cameras went: degrees, per cent of their extent, per cent of the focal length."""
+        turns = np.degrees(self._learnt[:, :3].norm(dim=1).numpy())
+        shifts = 100 * self._learnt[:, 3:].norm(dim=1).numpy()
+        return {
+            "rotation_degrees": _summary(turns),
+            "shift_percent": _summary(shifts),
+            "focal_percent": 100 * float(np.expm1(float(self._zoom))),
+            "cameras": [
+                {"rotation_degrees": round(float(turn), 4), "shift_percent": round(float(shift), 4)}
+                for turn, shift in zip(turns, shifts, strict=True)
+            ],
+        }
+
+    def state(self) -> dict[str, Tensor]:
+        """Everything that the next step depends on, besides the gradient."""
+        return {
+            "learnt": self._learnt,
+            "zoom": self._zoom,
+            "mean": self._mean,
+            "square": self._square,
+            "steps": self._steps,
+        }
+
+    def restore(self, state: Mapping[str, Tensor]) -> None:
+        """Go on from what `state` gave. Raises ValueError where it is of other cameras."""
+        for name, mine in self.state().items():
+            value = state[name]
+            if value.shape != mine.shape or value.dtype != mine.dtype or not bool(value.isfinite().all()):
+                raise ValueError(f"its camera {name} is {value.dtype} of shape {tuple(value.shape)}, or not finite")
+        if bool((state["square"] < 0).any() or (state["steps"] < 0).any()):
+            raise ValueError("its cameras' moments are negative")
+        for name, mine in self.state().items():
+            mine.copy_(state[name])
+
+
+def rotation_of(vector: Array) -> Array:
+    """(3, 3) rotation by a vector's length, radians, about its direction (Rodrigues)."""
+    angle = float(np.sqrt(vector @ vector))
+    x, y, z = vector
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sinc(angle / np.pi) * cross + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * cross @ cross
+
+
+def rotation_vector(R: Array) -> Array:
+    """(3,) of a rotation by less than a right angle."""
+    axis = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])  # its length is the angle's sine
+    sine = min(float(np.sqrt(axis @ axis)), 1.0)
+    return axis * (np.arcsin(sine) / sine if sine > 1e-12 else 1.0)
+
+
+def _common_motions(cameras: Sequence[Camera], extent: float) -> Array:
+    """(6 C, r) orthonormal: changes of all cameras that are a small shift, turn or scaling of the whole scene."""
+    arms = np.stack([camera.position for camera in cameras])
+    arms = (arms - arms.mean(axis=0)) / extent
+    zero = np.zeros_like(arms)
+    columns = [np.concatenate([zero, arms], axis=1)]
+    for axis in np.eye(3):
+        columns.append(np.concatenate([zero, np.broadcast_to(axis, arms.shape)], axis=1))
+        columns.append(np.concatenate([np.broadcast_to(axis, arms.shape), np.cross(axis, arms)], axis=1))
+    basis, sizes, _ = np.linalg.svd(np.stack([column.ravel() for column in columns], axis=1), full_matrices=False)
+    return np.ascontiguousarray(basis[:, sizes > 1e-9 * sizes[0]])
+
+
+def _summary(values: Array) -> dict[str, float]:
+    return {"median": float(np.median(values)), "largest": float(values.max())}

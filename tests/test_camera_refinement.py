@@ -1,0 +1,198 @@
+"""Cameras corrected while training: the corrections themselves, the step's gradient, and what they are for."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from helpers.image_losses import BACKGROUND, CAMERA, TRUTH, WEIGHTS, gaussians, gradients, step
+from helpers.interrupts import interrupt_at
+from helpers.loss_reference import total
+from helpers.scenes import relative
+from helpers.training import configure
+from scipy.spatial.transform import Rotation
+
+from lapgs_wgpu.data import Dataset, load_dataset
+from lapgs_wgpu.data.synthetic import write_synthetic
+from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.splat.drawing import camera_gradient
+from lapgs_wgpu.splat.rasterize import upload_gaussians
+from lapgs_wgpu.splat.rasterizer import Rasterizer
+from lapgs_wgpu.train.camera_refinement import CameraRefinement, rotation_of, rotation_vector
+from lapgs_wgpu.train.config import CamerasConfig, Rate
+from lapgs_wgpu.train.fused_loss import render_loss
+from lapgs_wgpu.train.run import resume, train
+from lapgs_wgpu.train.trainer import Trainer
+from lapgs_wgpu.train.truth_cache import upload_rgba
+
+CONFIG = CamerasConfig("on", Rate(1e-2, 1e-2, 1), 0.0, True, 1)
+
+
+def cameras(count: int = 5) -> list[Camera]:
+    places = np.random.default_rng(0).uniform([-3, -11, -3], [3, -5, 3], (count, 3))
+    return [Camera.looking_at(p, [0, 0, 0], up=[0, 0, 1], fov_x=0.7, width=40, height=30) for p in places]
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    folder = tmp_path_factory.mktemp("data") / "scene"
+    return load_dataset(write_synthetic(folder, size=32, train_views=8, test_views=2))
+
+
+def test_rotations() -> None:
+    rng = np.random.default_rng(0)
+    for vector in (*rng.normal(scale=0.3, size=(20, 3)), np.zeros(3), np.array([1e-9, 0, 0])):
+        R = rotation_of(vector)
+        np.testing.assert_allclose(R, Rotation.from_rotvec(vector).as_matrix(), atol=1e-14)
+        np.testing.assert_allclose(rotation_vector(R), vector, atol=1e-14)
+
+
+def test_cameras_without_corrections_are_the_files() -> None:
+    given = cameras()
+    refinement = CameraRefinement(given, 2.0, CONFIG)
+    for camera in given:
+        refined = refinement.refined(camera).camera
+        np.testing.assert_allclose(refined.T_cam_world, camera.T_cam_world, atol=1e-14)
+        assert np.array_equal(refined.K, camera.K)
+
+
+def test_the_change_of_a_camera_is_that_of_the_gradient() -> None:
+    """Against the gradient of a rotation about z and of a shift along x, in units of the extent."""
+    given = cameras()
+    refinement = CameraRefinement(given, 2.0, CONFIG)
+    refinement._common = torch.zeros(30, 0, dtype=torch.float64)
+    gradient = torch.zeros(5, 7)
+    gradient[1, 2], gradient[1, 3] = -0.3, 20.0
+    refinement.values.grad = gradient
+    refinement.step(1)
+    moved = refinement.refined(given[1]).camera
+    np.testing.assert_allclose(moved.position - given[1].position, [-2.0 * 0.01, 0, 0], atol=1e-7)
+    turn = Rotation.from_matrix(moved.T_cam_world[:3, :3].T @ given[1].T_cam_world[:3, :3]).as_rotvec()
+    np.testing.assert_allclose(turn, [0, 0, 0.01], atol=1e-7)
+    for number in (0, 2, 3, 4):
+        np.testing.assert_allclose(refinement.camera(number).T_cam_world, given[number].T_cam_world, atol=1e-14)
+    assert refinement.values.grad is None
+    assert not refinement.values.any()
+    report = refinement.report()
+    assert report["rotation_degrees"]["largest"] == pytest.approx(np.degrees(0.01))
+    assert report["shift_percent"]["largest"] == pytest.approx(1.0)
+
+
+def test_what_moves_all_cameras_alike_is_taken_out() -> None:
+    """A shift, a turn and a scaling of the whole scene change no image."""
+    given = cameras()
+    arms = np.stack([c.position for c in given])
+    arms = (arms - arms.mean(axis=0)) / 2.0
+    axis = np.array([0.2, -0.5, 0.4])
+    for change in (
+        np.concatenate([np.zeros((5, 3)), np.tile(axis, (5, 1))], axis=1),
+        np.concatenate([np.tile(axis, (5, 1)), np.cross(axis, arms)], axis=1),
+        np.concatenate([np.zeros((5, 3)), arms], axis=1),
+    ):
+        refinement = CameraRefinement(given, 2.0, CONFIG)
+        refinement._learnt += torch.from_numpy(0.01 * change)
+        refinement.values.grad = torch.zeros(5, 7)
+        refinement.step(1)
+        assert refinement._learnt.abs().max() < 1e-12
+    refinement._learnt[2] += 0.01
+    refinement.values.grad = torch.zeros(5, 7)
+    refinement.step(2)
+    assert refinement._learnt[2].abs().max() > 1e-3
+
+
+def test_corrections_are_pulled_back() -> None:
+    refinement = CameraRefinement(cameras(), 2.0, dataclasses.replace(CONFIG, pull=0.5))
+    gradient = torch.zeros(5, 7)
+    gradient[0, 0] = 1e-30
+    sizes = []
+    refinement._learnt[0, 0], refinement._learnt[1, 0] = 0.02, -0.02
+    for number in range(3):
+        refinement.values.grad = gradient.clone()
+        refinement._mean.zero_()
+        refinement.step(number + 1)
+        sizes.append(float(refinement._learnt.norm()))
+    assert sizes[0] > sizes[1] > sizes[2]
+
+
+def test_cameras_stay_before_the_first_step() -> None:
+    refinement = CameraRefinement(cameras(), 2.0, dataclasses.replace(CONFIG, start=10))
+    for number, moved in ((9, False), (10, True)):
+        refinement.values.grad = torch.randn(5, 7, generator=torch.Generator().manual_seed(0))
+        refinement.step(number)
+        assert bool(refinement._learnt.any()) == moved
+
+
+@pytest.mark.kernels
+def test_a_step_has_the_gradient_of_its_camera(device: Device) -> None:
+    """That of the rasterizer for the gradient of the reference's loss; and it changes no other gradient."""
+    scene, other = gaussians(), gaussians()
+    change = torch.zeros(7, requires_grad=True)
+    truth = upload_rgba(device, TRUTH)
+    done = render_loss(scene, CAMERA, truth, BACKGROUND, WEIGHTS["all"], device, camera_change=change, camera_unit=2.0)
+    (3 * done.loss).backward()
+    plain = step(device, other)
+    (3 * plain.loss).backward()
+    assert done.loss.item() == plain.loss.item()
+    assert change.grad is not None
+    for name, gradient in gradients(scene, done).items():
+        assert torch.equal(gradient, gradients(other, plain)[name]), name
+
+    rasterizer = Rasterizer(device)
+    drawing = rasterizer.draw(upload_gaussians(rasterizer.pool, gaussians()), CAMERA, tuple(BACKGROUND.tolist()))
+    assert not rasterizer.grow_on_overflow(drawing)
+    image = torch.from_numpy(drawing.image.read()[:3]).permute(1, 2, 0).double().requires_grad_()
+    total(image, torch.from_numpy(TRUTH.astype(np.float32) / 255).double(), WEIGHTS["all"]).backward()
+    assert image.grad is not None
+    d_image = np.zeros((4, CAMERA.height, CAMERA.width), np.float32)
+    d_image[:3] = 3 * image.grad.permute(2, 0, 1).numpy()
+    sums = rasterizer.backward(drawing, DeviceArray.upload(device, "d_image", d_image), camera=True).camera
+    assert sums is not None
+    rotation, position, log_focal = camera_gradient(sums.read())
+    expected = torch.tensor([*rotation, *(2.0 * position), log_focal])
+    assert relative(change.grad, expected.float()) < 1e-4
+
+
+def test_byte_equal_repeat_and_resume(
+    device: Device, dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = configure(cameras__refine="on", cameras__start="5", schedule__save_interval="12")
+    train(config, dataset, tmp_path / "one", device=device)
+    train(config, dataset, tmp_path / "two", device=device)
+    with monkeypatch.context() as patched:
+        interrupt_at(20, patched)
+        with pytest.raises(KeyboardInterrupt):
+            train(config, dataset, tmp_path / "three", device=device)
+    resume(config, dataset, tmp_path / "three", device=device)
+    bytes_of = [(tmp_path / name / "checkpoint.ply").read_bytes() for name in ("one", "two", "three")]
+    assert bytes_of[0] == bytes_of[1] == bytes_of[2]
+    cameras = json.loads((tmp_path / "one/metrics.json").read_text())["training"]["cameras"]
+    assert 0 < cameras["rotation_degrees"]["median"] < 5
+    assert len(cameras["cameras"]) == len(dataset.cameras)
+    kept = configure(cameras__refine="off", schedule__save_interval="12")
+    train(kept, dataset, tmp_path / "kept", device=device)
+    assert (tmp_path / "kept/checkpoint.ply").read_bytes() != bytes_of[0]
+    assert "cameras" not in json.loads((tmp_path / "kept/metrics.json").read_text())["training"]
+
+
+@pytest.mark.parametrize(("refine", "own", "refined"), [("auto", True, True), ("auto", False, False),
+                                                        ("on", False, True), ("off", True, False)])  # fmt: skip
+def test_own_footage_is_refined(device: Device, dataset: Dataset, refine: str, own: bool, refined: bool) -> None:
+    data = dataclasses.replace(dataset, own_footage=own)
+    training = Trainer(configure("static", cameras__refine=refine), data, device)
+    assert (training.camera_report() is not None) == refined
+    training.close()
+
+
+def test_state_of_other_cameras_is_refused() -> None:
+    state = CameraRefinement(cameras(4), 2.0, CONFIG).state()
+    with pytest.raises(ValueError, match="camera learnt"):
+        CameraRefinement(cameras(5), 2.0, CONFIG).restore(state)
+    state["square"] -= 1
+    with pytest.raises(ValueError, match="negative"):
+        CameraRefinement(cameras(4), 2.0, CONFIG).restore(state)
