@@ -40,8 +40,8 @@ def test_rate_is_exponential_and_then_constant() -> None:
     assert rate.at(17_500) == pytest.approx(8e-5)
     assert rate.at(35_000) == pytest.approx(8e-6)
     assert rate.at(50_000) == pytest.approx(8e-6)
-    with pytest.raises(ValueError, match="above 0"):
-        Rate(0, 1e-3, 10)
+    with pytest.raises(ValueError, match="at least 0"):
+        Rate(-1e-3, 1e-3, 10)
 
 
 def test_step_is_adam_at_the_rate_of_the_step() -> None:

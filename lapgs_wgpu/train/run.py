@@ -95,7 +95,7 @@ def train(
     if not ranks.first:
         return _assist(training)
     with locked_run_folder(out):
-        start_run_folder(out, training.config, training.scene.device, dataset)
+        start_run_folder(out, training.given, training.scene.device, dataset)
         if training.discovery is not None:
             print(training.discovery, flush=True)
         if training.decoder.seconds:

@@ -68,10 +68,11 @@ class Trainer:
 
     A context manager, and an iterator of the steps that are left.
 
-    scene: the Scene4D, as the last step left it. config: with the decoder's place chosen. dataset: its test views are
-    not touched by any step. done: the steps so far. callbacks: called after each step. discovery: what motion discovery
-    found, a line, where it was done. whole: whether `state` is that of a whole step, which it also is where `step`
-    raised an error before anything that lasts had changed.
+    scene: the Scene4D, as the last step left it. config: with the decoder's place chosen. given: the same before it was
+    suited to the data, which config.toml holds. dataset: its test views are not touched by any step. done: the steps so
+    far. callbacks: called after each step. discovery: what motion discovery found, a line, where it was done. whole:
+    whether `state` is that of a whole step, which it also is where `step` raised an error before anything that lasts
+    had changed.
     """
 
     def __init__(
@@ -110,7 +111,8 @@ class Trainer:
                 config = dataclasses.replace(config, field=dataclasses.replace(config.field, kind="own"))
             except ValueError as error:
                 raise InputError(f"{error}.") from None
-        config = suited(config, dataset)
+        given = config
+        config = suited(given, dataset)
         self.dataset, self.parts, self.callbacks = dataset, parts, list(parts.callbacks)
         if config.schedule.batch % ranks.count:
             raise InputError(
@@ -138,6 +140,7 @@ class Trainer:
         )
         self.decoder = choose_decoder(config, self.scene, device, ranks)
         self.config = dataclasses.replace(config, decoder=self.decoder.place)
+        self.given = dataclasses.replace(given, decoder=self.decoder.place)
         self._start()
         self.whole = True
 
