@@ -28,16 +28,16 @@ Picture = NDArray[np.uint8]
 
 MOVING_SIZE, FRAMES, FPS = (400, 300), 96, 16
 SWING = math.radians(40)  # of the camera, to each side
-CLOSER = 0.86  # of the distance from which the viewer begins
+DISTANCE = 1.1  # in distances from which the viewer begins
 MOST_BYTES = 2_000_000  # of the moving picture
 MODES: tuple[Mode, ...] = ("rgb", "depth", "motion", "dynamics")
 WINDOW = (1000, 640)
 
 
 def camera_at(scene: LoadedScene, azimuth: float, size: tuple[int, int]) -> Camera:
-    """The camera from which the viewer begins, turned about the focus by an azimuth in radians, and a little nearer."""
+    """The camera from which the viewer begins, a little farther away and turned about the focus by radians."""
     view = scene.camera()
-    view.position = view.focus + CLOSER * (view.position - view.focus)
+    view.position = view.focus + DISTANCE * (view.position - view.focus)
     view.orbit(azimuth, 0.0)
     return framed(view.camera(*size), *size)
 
