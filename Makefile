@@ -3,6 +3,7 @@
 #   make test-all  all tests, with all kernels in every configuration of the device (CI: every night)
 #   make test-swiftshader  all kernel tests on a second Vulkan driver, SwiftShader, which comes with Chromium
 #   make soak   what takes hours: 10,000 hostile files a format, failing disks, 20 kills, large scenes, 30 minutes of training
+#   make docs   the site of docs/ in build/site     make pictures   the pictures of README and docs/, from a trained demo
 #   make bench  times the kernels, beside what the device can do; options go into ARGS, for example:
 #               make bench ARGS="--scenes 50k@400x400 --parts raster --json new.json"
 #               make bench ARGS="--compare old.json new.json"
@@ -12,7 +13,7 @@ READY := .venv/.ready
 PYTEST = $(BIN)/pytest
 export XDG_RUNTIME_DIR ?= /tmp
 
-.PHONY: setup demo test test-shapes test-all test-swiftshader soak bench lint
+.PHONY: setup demo test test-shapes test-all test-swiftshader soak bench lint pictures docs
 setup: $(READY)
 
 # torch first: where there is no CUDA device, by exact version, so that an index with CPU builds can offer its own
@@ -62,6 +63,15 @@ soak: $(READY)
 
 bench: $(READY)
 	$(BIN)/python benchmarks $(ARGS)
+
+# Of `make demo`, which is trained first where runs/demo is not there.
+pictures: $(READY)
+	[ -e runs/demo/checkpoint.ply ] || $(MAKE) demo
+	$(BIN)/python docs/tools/pictures.py runs/demo docs/pictures
+
+docs: $(READY)
+	@$(BIN)/python -c 'import mkdocs, material, mkdocstrings' 2>/dev/null || $(BIN)/pip install --quiet --editable '.[docs]'
+	$(BIN)/python -m mkdocs build --strict
 
 lint: $(READY)
 	$(BIN)/ruff check

@@ -1,8 +1,14 @@
-"""The documents: the README's Python runs as it stands, links lead somewhere, the list of passes is whole."""
+"""The documents: Python in them runs as it stands, links and anchors lead somewhere, commands name options, goals and
+files that are there, and those that take a moment are run."""
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import re
+import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +20,12 @@ from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.fields.hash_grid_config import HashConfig
 
 ROOT = Path(__file__).parents[1]
-README = (ROOT / "README.md").read_text(encoding="utf-8")
-EXAMPLES = re.findall(r"```python\n(.*?)```", README, re.S)
+DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+EXAMPLES = [
+    example
+    for file in ("README.md", "docs/training.md")
+    for example in re.findall(r"```python\n(.*?)```", (ROOT / file).read_text(encoding="utf-8"), re.S)
+]
 
 
 @pytest.fixture
@@ -39,12 +49,93 @@ def test_example(example: str) -> None:
     assert names["picture" if "picture" in names else "image"].shape == (240, 320, 3)
 
 
-@pytest.mark.parametrize(
-    "file", [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))], ids=lambda file: file.name
-)
-def test_linked_files_exist(file: Path) -> None:
-    for link in re.findall(r"\]\((?!https?://)([^)#]+)\)", file.read_text(encoding="utf-8")):
-        assert (file.parent / link).is_file(), link
+def anchors(file: Path) -> set[str]:
+    """Of the headings, as GitHub and MkDocs make them."""
+    headings = re.findall(r"^#+ (.+)$", file.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("file", DOCUMENTS, ids=lambda file: file.name)
+def test_links_lead_somewhere(file: Path) -> None:
+    for link in re.findall(r"\]\((?!https?://)([^) ]+)\)", file.read_text(encoding="utf-8")):
+        path, _, anchor = link.partition("#")
+        target = file.parent / path if path else file
+        assert target.is_file(), link
+        if anchor:
+            assert anchor in anchors(target), link
+
+
+PROGRAMS = {
+    "lapgs-train": "lapgs_wgpu.cli",
+    "lapgs-table": "lapgs_wgpu.table_cli",
+    "lapgs-prepare": "lapgs_wgpu.prepare_cli",
+    "lapgs-doctor": "lapgs_wgpu.doctor_cli",
+    "lapgs-view": "lapgs_wgpu.viewer.cli",
+}
+
+
+def commands() -> list[tuple[str, list[str]]]:
+    """Every command line of the documents: file and words."""
+    found = []
+    for file in DOCUMENTS:
+        for block in re.findall(r"^```(?:sh|bash)?\n(.*?)^```", file.read_text(encoding="utf-8"), re.S | re.M):
+            for line in block.replace("\\\n", " ").splitlines():
+                with contextlib.suppress(ValueError):  # a quotation mark that is no shell's
+                    words = shlex.split(line, comments=True)
+                    for part in " ".join(words).split(" && "):
+                        found.append((file.name, part.split()))
+    return [(file, words) for file, words in found if words]
+
+
+@functools.cache
+def help_of(program: str) -> str:
+    command = [sys.executable, "-c", f"from {PROGRAMS[program]} import *; {FUNCTIONS[program]}(['--help'])"]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+
+
+FUNCTIONS = {name: f"{name.removeprefix('lapgs-')}_command" for name in PROGRAMS}
+
+
+def test_commands_name_options_that_exist() -> None:
+    seen = set()
+    for file, words in commands():
+        program = words[0].rpartition("/")[2]
+        if program not in PROGRAMS:
+            continue
+        seen.add(program)
+        for option in (word.split("=")[0] for word in words if word.startswith("--")):
+            assert re.search(rf"(?<![\w-]){re.escape(option)}(?![\w-])", help_of(program)), f"{file}: {' '.join(words)}"
+    assert seen == set(PROGRAMS)
+
+
+def test_commands_name_goals_and_files_that_exist() -> None:
+    goals = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
+    for file, words in commands():
+        if words[0] == "make":
+            assert {word for word in words[1:2] if "=" not in word} <= goals, f"{file}: {' '.join(words)}"
+        for word in words:
+            if (
+                re.fullmatch(r"(docs/tables|benchmarks|examples|tests|configs|\.ci)/[\w./-]+", word)
+                and "NAME" not in word
+            ):
+                assert (ROOT / word).exists(), f"{file}: {word}"
+
+
+@pytest.mark.usefixtures("demo")
+def test_commands_that_take_a_moment_run() -> None:
+    """Those of the viewer on the demo's checkpoint that open no window."""
+    from lapgs_wgpu.viewer.cli import view_command
+
+    done = 0
+    for file, words in commands():
+        if words[0] == ".venv/bin/lapgs-view" and words[1] == "runs/demo/checkpoint.ply":
+            if not {"--screenshot", "--export"} & set(words):
+                continue
+            assert view_command([*words[1:], *(["--overwrite"] if "--export" in words else [])]) == 0, (
+                f"{file}: {words}"
+            )
+            done += 1
+    assert done >= 2
 
 
 def test_the_list_of_passes_names_every_shader() -> None:

@@ -1,0 +1,102 @@
+"""Pages of the site that are made from the code, and files of the repository to which pages link.
+
+MkDocs calls the functions below by their names.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+from mkdocs.structure.files import File, Files
+
+import lapgs_wgpu
+from lapgs_wgpu.train.presets import config_keys, load_config, preset_names
+
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+_OUTSIDE = re.compile(r"\]\(\.\./([\w./-]+)(#[\w-]+)?\)")  # links from docs/ to the rest of the repository
+
+
+def on_files(files: Files, config: Any) -> Files:
+    """Add the generated pages, and every file outside docs/ to which a page links."""
+    files.append(File.generated(config, "presets.md", content=presets_page()))
+    files.append(File.generated(config, "reference.md", content=reference_page()))
+    linked = set()
+    for page in DOCS.glob("*.md"):
+        linked |= {match[1] for match in _OUTSIDE.finditer(page.read_text(encoding="utf-8"))}
+    for path in sorted(linked):
+        files.append(File.generated(config, f"repository/{path}{_suffix(path)}", abs_src_path=str(ROOT / path)))
+    return files
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Links out of docs/ lead to the copies that `on_files` has added."""
+    return _OUTSIDE.sub(lambda match: f"](repository/{match[1]}{_suffix(match[1])}{match[2] or ''})", markdown)
+
+
+def _suffix(path: str) -> str:
+    return ".txt" if path.endswith(".md") else ""  # MkDocs would make a page of it, whose own links lead nowhere
+
+
+_ABOUT_PRESETS = (
+    "`lapgs-train PRESET --data DIR --KEY VALUE`: a preset is a set of values; any key can follow on the command line. "
+    "This page is made from the configuration."
+)
+
+
+def presets_page() -> str:
+    """Every preset, and every key with its help text and its value in each preset."""
+    names = preset_names()
+    presets = {name: load_config(name) for name in names}
+    lines = ["# Presets and keys", "", _ABOUT_PRESETS, "", "## Presets", ""]
+    for name in names:
+        text = (ROOT / "configs" / f"{name}.toml").read_text(encoding="utf-8")
+        about = " ".join(line.lstrip("# ") for line in _head(text))
+        lines.append(f"- `{name}`: {about}")
+    section = ""
+    for key in config_keys():
+        part = key.name.split(".")[0] if "." in key.name else "general"
+        if part != section:
+            section = part
+            lines += [
+                "",
+                f"## {part}",
+                "",
+                "| key | | " + " | ".join(names) + " |",
+                "|---|---" + "|---" * len(names) + "|",
+            ]
+        values = [_value(preset, key.name) for preset in presets.values()]
+        about = key.help.replace("|", "\\|").replace("<", "&lt;")
+        lines.append(f"| `{key.name}` | {about} | " + " | ".join(values) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def _head(text: str) -> list[str]:
+    """The comment at the head of a file."""
+    lines = []
+    for line in text.splitlines():
+        if not line.startswith("#"):
+            break
+        lines.append(line)
+    return lines
+
+
+def _value(config: Any, name: str) -> str:
+    for part in name.split("."):
+        config = getattr(config, part)
+    if isinstance(config, tuple):
+        return ", ".join(map(str, config))
+    return (
+        f"{config:g}" if isinstance(config, float) else str(config).lower() if isinstance(config, bool) else str(config)
+    )
+
+
+def reference_page() -> str:
+    """The public names, by their docstrings."""
+    lines = ["# Reference", "", "All public names, made from their docstrings: `from lapgs_wgpu import NAME`.", ""]
+    for name in lapgs_wgpu.__all__:
+        home = f"lapgs_wgpu.{lapgs_wgpu._HOMES[name]}.{name}"
+        lines += [f"::: {home}", ""]
+    return "\n".join(lines)
