@@ -164,7 +164,7 @@ def test_a_video_with_fewer_frames_than_it_announces(clip: Path) -> None:
 
 def test_without_pyav(clip: Path, toy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(InputError, match=r"cam00\.mp4 needs PyAV.*pip install 'lapgs-wgpu\[video\]'.*images/\*\.png"):
+    with pytest.raises(InputError, match=r"cam00\.mp4 needs PyAV.*pip install 'lapgs-wgpu\[prepare\]'.*images/\*\.png"):
         load_dataset(clip)
     assert len(load_dataset(toy).train) == 9
 

@@ -16,7 +16,7 @@ from lapgs_wgpu.train.config import DensityConfig
 from lapgs_wgpu.train.densify import Change, Statistics, densify, prunable, reset_opacities, split_rows
 from lapgs_wgpu.train.presets import load_config
 
-CONFIG = load_config("dnerf").density
+CONFIG = dataclasses.replace(load_config("dnerf").density, max_screen_radius=20)
 EXTENT = 4.0
 SMALL, LARGE = 0.02, 0.2  # standard deviations on either side of split_size times the extent
 
