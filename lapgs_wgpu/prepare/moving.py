@@ -1,7 +1,7 @@
 """Masks of what moves, from the film itself: tracks of features that no single point explains, seen by the cameras.
 
 A reconstruction follows whatever its features agree on most. That may be the thing that moves, if it is rich in
-texture and always in the image. So the world is told by area: of what agrees with a reconstruction and what does not,
+texture and always in the image. So area decides: of what agrees with a reconstruction and what does not,
 the part that covers more of the images stands still. The rest is masked, and the cameras are solved again.
 """
 
@@ -239,7 +239,7 @@ def tolerance(size: Size) -> float:
 
 
 def rim(size: Size) -> Mask:
-    """Mask of the middle of an image: what is left is seldom what a film is about."""
+    """Mask of the middle of an image. Its rim seldom shows what moves."""
     height, width = (max(1, round(side * GRID / max(size))) for side in (size[1], size[0]))
     mask = np.zeros((height, width), bool)
     rows, columns = (round(side * (1 - MIDDLE) / 2) for side in mask.shape)

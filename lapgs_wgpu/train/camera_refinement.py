@@ -46,7 +46,7 @@ class CameraRefinement:
         self._cameras, self._extent, self._config = list(cameras), extent, config
         self._numbers = {id(camera): number for number, camera in enumerate(self._cameras)}
         count = len(self._cameras)
-        self.values = nn.Parameter(torch.zeros(count, 7))  # always zeros: what has been learnt lies in `_learnt`
+        self.values = nn.Parameter(torch.zeros(count, 7))  # zeros that get the gradient
         self._learnt = torch.zeros(count, 6, dtype=torch.float64)  # rotation vectors, shifts
         self._zoom = torch.zeros(1, dtype=torch.float64)
         self._mean, self._square = torch.zeros(count, 7), torch.zeros(count, 7)
