@@ -13,7 +13,7 @@ import pytest
 
 from lapgs_wgpu.train.config import Config, Rate
 from lapgs_wgpu.train.presets import load_config
-from lapgs_wgpu.train.trainer import suited
+from lapgs_wgpu.train.suited import suited
 
 POSITION_RATE = (8e-4, 8e-6)  # 1.6e-4 to 1.6e-6, times Grid4D's spatial_lr_scale of 5
 SCALES = (0.09, 1.0, 2.4)  # world units per unit of a capture

@@ -15,7 +15,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lapgs_wgpu.data.initial_gaussians import first_points, initial_scales, limit_optical_depth
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device, open_device
@@ -28,7 +27,7 @@ from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.morton import morton_order
 from lapgs_wgpu.train.autotune import choose_decoder
 from lapgs_wgpu.train.camera_refinement import CameraRefinement
-from lapgs_wgpu.train.config import Config, PointsConfig, SmoothnessConfig
+from lapgs_wgpu.train.config import Config, SmoothnessConfig
 from lapgs_wgpu.train.contribution import contributions, spread_over_time
 from lapgs_wgpu.train.dataloader import Pictures
 from lapgs_wgpu.train.densify import (
@@ -44,12 +43,14 @@ from lapgs_wgpu.train.distributed import SINGLE_PROCESS, Ranks
 from lapgs_wgpu.train.evaluate import evaluate
 from lapgs_wgpu.train.exposure import Exposures
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
+from lapgs_wgpu.train.initial_points import initial_points
 from lapgs_wgpu.train.loss_terms import Regularizer, check_terms, weight_at
 from lapgs_wgpu.train.nonfinite import Health, Skipped, check_parameters, describe, finite
 from lapgs_wgpu.train.open_dataset import open_dataset, with_folder
 from lapgs_wgpu.train.optimizer import FrequencyOptimizer, Optimizer
 from lapgs_wgpu.train.parts import Parts
 from lapgs_wgpu.train.step_result import StepResult
+from lapgs_wgpu.train.suited import suited
 
 MAX_SH_DEGREE = 3
 TERMS = frozenset({"l1", "mse", "ssim", "pyramid", "ncc", "smoothness", "dynamics"})  # of the configuration
@@ -456,42 +457,10 @@ class Trainer:
         self._pictures.order = own["order"].tolist()
 
 
-def suited(config: Config, dataset: Dataset) -> Config:
-    """The configuration with lengths in world units, and no more frequencies than the training times can tell apart."""
-    field = config.field
-    if config.data.units == "capture":
-        scale, means = dataset.scale, config.rates.means
-        field = dataclasses.replace(field, bound=scale * field.bound)
-        config = dataclasses.replace(
-            config,
-            data=dataclasses.replace(config.data, units="world"),
-            rates=dataclasses.replace(
-                config.rates, means=dataclasses.replace(means, start=scale * means.start, end=scale * means.end)
-            ),
-            smoothness=dataclasses.replace(config.smoothness, reach=scale * config.smoothness.reach),
-        )
-    # The Nyquist frequency is half the number of times; all frequencies above it would end there.
-    most = 1 + math.floor(len(dataset.times) / 2 / field.frequency_step)
-    return dataclasses.replace(config, field=dataclasses.replace(field, components=min(field.components, max(1, most))))
-
-
 def _discovers(config: Config) -> bool:
     """Whether a training of this configuration starts with motion discovery."""
     wanted = config.discovery.enabled and config.field.kind != "static"
     return wanted and config.schedule.steps > config.discovery.steps
-
-
-def initial_points(
-    config: PointsConfig, dataset: Dataset, seed: int
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """The first Gaussians (data/initial_gaussians): points (N, 3), colors (N, 3) and scales (N,)."""
-    points, colors = first_points(dataset, config.count, config.box, seed)
-    scales = initial_scales(points)
-    # Published figures of D-NeRF start from a fog, which the empty background there soon lifts.
-    if dataset.cloud is not None or dataset.depths is not None:
-        scales = limit_optical_depth(points, scales, config.opacity, dataset.cameras)
-    order = morton_order(torch.from_numpy(points)).numpy()
-    return points[order], colors[order], scales[order]
 
 
 def draw_nearby(config: SmoothnessConfig, count: int, t: float, generator: torch.Generator) -> Nearby | None:

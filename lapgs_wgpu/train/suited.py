@@ -1,0 +1,28 @@
+"""The configuration, suited to the data."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+from lapgs_wgpu.data.views import Dataset
+from lapgs_wgpu.train.config import Config
+
+
+def suited(config: Config, dataset: Dataset) -> Config:
+    """The configuration with lengths in world units, and no more frequencies than the training times can tell apart."""
+    field = config.field
+    if config.data.units == "capture":
+        scale, means = dataset.scale, config.rates.means
+        field = dataclasses.replace(field, bound=scale * field.bound)
+        config = dataclasses.replace(
+            config,
+            data=dataclasses.replace(config.data, units="world"),
+            rates=dataclasses.replace(
+                config.rates, means=dataclasses.replace(means, start=scale * means.start, end=scale * means.end)
+            ),
+            smoothness=dataclasses.replace(config.smoothness, reach=scale * config.smoothness.reach),
+        )
+    # The Nyquist frequency is half the number of times; all frequencies above it would end there.
+    most = 1 + math.floor(len(dataset.times) / 2 / field.frequency_step)
+    return dataclasses.replace(config, field=dataclasses.replace(field, components=min(field.components, max(1, most))))
