@@ -31,7 +31,7 @@ OPACITY = 0.3  # of a discovered Gaussian
 SCALE = 0.8  # of it, in mean distances to its nearest neighbours
 DYNAMICS = 0.5  # standard deviation of its dynamics attribute, which it shares with its part
 EMPTY = 0.1  # opacity of the static fit, below which a place counts as empty
-LOST = 0.9  # share of the times at which a part is seen that it is where the static fit is empty, at least
+LOST = 0.5  # share of the times at which a part is seen that it is where the static fit is empty, at least
 OPAQUE = 0.1  # least opacity of a Gaussian of the static fit that is looked at
 NEAR = 0.1  # box half sides; distance within which a track explains a surface point
 SHOWN = 2.0 / 255  # least difference from the background of an image that shows something
@@ -95,7 +95,7 @@ def discover(
 
 
 def lost_tracks(tracks: Tracks, static: Scene4D) -> Tracks | None:
-    """The parts that are, nearly always, where the static fit is empty; None where there are none."""
+    """The parts that are, mostly, where the static fit is empty; None where there are none."""
     empty = density_at(static, tracks.paths.reshape(-1, 3)).reshape(tracks.supported.shape) < EMPTY
     seen = np.maximum(np.bincount(tracks.part, tracks.supported.sum(axis=0)), 1)
     share = np.bincount(tracks.part, (empty & tracks.supported).sum(axis=0)) / seen

@@ -25,7 +25,8 @@ PROBES = 300  # points of a time by which parts are counted, at most
 VOXEL = 0.045  # spacing of a track's points
 REACH = 0.07  # distance within which a track explains a point
 CALM = 0.02  # jitter of a part's center that is no leaping
-LEAST_SEEN = 0.2  # share of the times at which a part must be seen
+LEAST_SEEN = 0.4  # share of the times at which a part must be seen
+LEAST_VISIT = 0.2  # the same of a part that comes, stays and goes once
 LEAPS = 1.7  # jitter of a part's center that is leaping, in steps of its smoothed path
 LEAP_SIZE = 0.28  # and in sizes of the part
 EXPLAINED = 0.3  # weight of points that an earlier key time's tracks explain
@@ -176,14 +177,16 @@ def _supported(paths: Floats, part: NDArray[np.int64], clouds: list[Points], hal
 def _steady(tracks: Tracks, paths: Floats, half_side: float) -> NDArray[np.bool_]:
     """(p,) whether a part is seen for long enough, and moves more from time to time than it jitters, or not at all.
 
-    Patches of a thing that the static fit only blurs come and go; what is followed there leaps from one to the next.
+    Patches of a thing that the static fit only blurs come and go; what is followed there leaps from one to the next, or
+    waits for the next.
     paths: (T, n, 3), before they were smoothed.
     """
     steady = np.zeros(int(tracks.part.max()) + 1, bool)
     for k in range(len(steady)):
         members = tracks.part == k
         seen = tracks.supported[:, members][:, 0]
-        if seen.mean() < LEAST_SEEN:
+        visits = np.count_nonzero(np.diff(seen, prepend=False) & seen)
+        if seen.mean() < (LEAST_VISIT if visits == 1 else LEAST_SEEN):
             continue
         center = tracks.paths[:, members].mean(axis=1)
         jitter = np.linalg.norm(paths[:, members].mean(axis=1) - center, axis=1)[seen].mean()
