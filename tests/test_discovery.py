@@ -13,7 +13,7 @@ import torch
 from lapgs_wgpu.data import Dataset, load_dataset
 from lapgs_wgpu.data.motion_scenes import MotionScene
 from lapgs_wgpu.data.motion_writer import write_motion
-from lapgs_wgpu.data.synthetic import cameras
+from lapgs_wgpu.data.synthetic import camera_at, cameras
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.config import FieldConfig
@@ -114,6 +114,25 @@ def test_surface_points_lie_on_the_ball_at_every_time(residuals: list[Residual])
     assert np.median(distances) < 1.2 * RADIUS
     assert (distances < 1.6 * RADIUS).mean() > 0.95
     assert np.allclose(np.concatenate([c.colors for c in clouds.clouds]), (0.9, 0.5, 0.2), atol=1e-5)
+
+
+def test_a_camera_that_walks_slowly_sees_what_moves_in_the_middle_of_the_scene() -> None:
+    """Its images of neighbouring times agree on depths that the ball's own motion feigns."""
+    times = np.linspace(0, 1, 60)
+    walk = [camera_at(1.5 * t, 0.4, size=64, fov_x=0.69) for t in times]
+    black = np.zeros((64, 64, 3), np.float32)
+    views = zip(walk, times, path(times), strict=True)
+    images = [Residual(camera, float(t), disc(camera, center, (0.9, 0.5, 0.2)), black) for camera, t, center in views]
+    clouds = surface_points(images, BOX)
+    for camera, center, points in zip(walk, path(times), clouds.clouds, strict=True):
+        rays = points.positions - camera.position
+        depths = -rays @ camera.position / np.linalg.norm(camera.position) ** 2
+        assert np.abs(depths - 1.0).max() < 0.2  # the middle, where the ball is not: it moves by 0.2 around it
+        towards = center - camera.position
+        apart = np.linalg.norm(np.cross(rays, towards), axis=1) / np.linalg.norm(rays, axis=1)
+        assert apart.max() < 1.3 * RADIUS
+    tracks = find_tracks(clouds, BOX)
+    assert tracks is not None and tracks.supported.mean() > 0.95
 
 
 def test_what_is_residual_at_all_times_is_no_motion() -> None:

@@ -1,7 +1,9 @@
 """Points on the surfaces that move: rays of moving pixels, at depths on which images of neighbouring times agree.
 
 Cameras of neighbouring times see a moving object from other sides while it has hardly moved: its silhouettes meet in
-space. Places that differ at all times hold texture that the static fit blurs. They get no points.
+space. Where cameras move slowly, they meet at a depth that the object's own motion feigns. Such votes are blurred along
+the ray, until the middle of the scene is as good a place as any. Places that differ at all times hold texture that the
+static fit blurs. They get no points.
 """
 
 from __future__ import annotations
@@ -27,6 +29,8 @@ COLOR_SHARE = 0.7  # of a vote that depends on the colour
 GRID = 48  # cells along an axis of the grid of what is residual at all times
 ALWAYS, ALWAYS_WIDTH = 0.8, 0.25  # share of all images, above which a residual is no motion; width of the transition
 LEAST_SCORE = 0.5  # of a point
+MOTION = 0.05  # box half sides; way from one time to the next that a depth must allow for
+MIDDLE = 2.0  # box half sides; standard deviation of depths around that of the middle of the scene
 PLATEAU = 0.1  # scores within this share of the best one count as equal; their middle is taken
 LONELY = 0.12  # box half sides; a point is dropped whose fourth neighbour is further
 
@@ -68,17 +72,31 @@ def surface_points(images: Sequence[Residual], half_side: float) -> PointClouds:
     return PointClouds(times, tuple(clouds))
 
 
-def _neighbors(images: Sequence[Residual], of: int) -> list[tuple[Residual, float]]:
-    """The images of the nearest times, and the weights of their votes."""
+class _Neighbor(NamedTuple):
+    """An image of a near time. lapse: until then, in time steps. weight: of its vote."""
+
+    image: Residual
+    lapse: float
+    weight: float
+
+    def doubt(self, eye: Floats, half_side: float) -> float:
+        """Standard deviation of the depths, world units, at which things in the middle of the scene seem to be that
+        move while a camera goes from `eye` (3,) to this one."""
+        parallax = np.linalg.norm(self.image.camera.position - eye) / max(float(np.linalg.norm(eye)), 1e-6)
+        return MOTION * half_side * self.lapse / max(float(parallax), 1e-6)
+
+
+def _neighbors(images: Sequence[Residual], of: int) -> list[_Neighbor]:
+    """The images of the nearest times."""
     times = np.array([image.time for image in images])
     distinct = np.unique(times)
     step = float(np.diff(distinct).mean()) if len(distinct) > 1 else 1.0
-    distances = np.abs(times - times[of])
-    order = [i for i in np.lexsort((np.arange(len(times)), distances)) if i != of][:NEIGHBORS]
-    return [(images[i], float(1.0 / (1.0 + (distances[i] / (SPAN * step)) ** 2))) for i in order]
+    lapses = np.abs(times - times[of]) / step
+    order = [i for i in np.lexsort((np.arange(len(times)), lapses)) if i != of][:NEIGHBORS]
+    return [_Neighbor(images[i], float(lapses[i]), float(1.0 / (1.0 + (lapses[i] / SPAN) ** 2))) for i in order]
 
 
-def _points(image: Residual, neighbors: list[tuple[Residual, float]], always: _Always, half_side: float) -> Points:
+def _points(image: Residual, neighbors: list[_Neighbor], always: _Always, half_side: float) -> Points:
     rays = image.rays(RAYS)
     if len(rays.directions) == 0 or not neighbors:
         empty = np.zeros((0, 3), np.float32)
@@ -86,23 +104,37 @@ def _points(image: Residual, neighbors: list[tuple[Residual, float]], always: _A
     eye = image.camera.position.astype(np.float32)
     depths = _depths(eye, rays.directions, half_side)
     places = eye + depths[..., None] * rays.directions[:, None]
-    votes, weights = np.zeros(depths.shape), np.zeros(depths.shape)
-    for neighbor, weight in neighbors:
-        samples = neighbor.sample(places)
+    length = np.linalg.norm(rays.directions, axis=1, keepdims=True)
+    spacing = float(np.median(length[:, 0] * (depths[:, 1] - depths[:, 0])))
+    votes, blurred, weights = np.zeros(depths.shape), np.zeros(depths.shape), np.zeros(depths.shape)
+    for neighbor in neighbors:
+        samples = neighbor.image.sample(places)
         apart = ((samples.colors - rays.blurred[:, None]) ** 2).sum(axis=2)
         agreement = 1.0 - COLOR_SHARE + COLOR_SHARE * np.exp(-apart / (2 * COLOR_SPREAD**2))
-        votes += weight * samples.mask * agreement
-        weights += weight * samples.inside
-    scores = votes / np.maximum(weights, 1e-6)
-    scores[weights < 0.5 * sum(weight for _, weight in neighbors)] = 0.0  # hardly seen by others
-    scores *= np.clip((ALWAYS - always.at(places)) / ALWAYS_WIDTH, 0.0, 1.0)
+        vote = neighbor.weight * samples.mask * agreement
+        votes += vote
+        blurred += _blurred(vote, neighbor.doubt(eye, half_side) / spacing)
+        weights += neighbor.weight * samples.inside
+    known = np.clip((ALWAYS - always.at(places)) / ALWAYS_WIDTH, 0.0, 1.0) / np.maximum(weights, 1e-6)
+    known[weights < 0.5 * sum(neighbor.weight for neighbor in neighbors)] = 0.0  # hardly seen by others
+    scores = votes * known
+    past_middle = (places * rays.directions[:, None]).sum(axis=2) / length
+    middle = _middle_of_best(blurred * known * np.exp(-0.5 * (past_middle / (MIDDLE * half_side)) ** 2))
     row = np.arange(len(scores))
-    middle = _middle_of_best(scores)
     low = np.floor(middle).astype(np.int64)
     depth = depths[row, low] + (middle - low) * (depths[:, 1] - depths[:, 0])
     positions = eye + depth[:, None] * rays.directions
     kept = scores.max(axis=1) > LEAST_SCORE
     return Points(positions[kept].astype(np.float32), rays.colors[kept], scores.max(axis=1)[kept].astype(np.float32))
+
+
+def _blurred(votes: NDArray[np.floating], spread: float) -> NDArray[np.floating]:
+    """Votes (n, DEPTHS) along each ray, blurred by a Gaussian of this standard deviation, in depths."""
+    if spread < 0.1:
+        return votes
+    if spread > DEPTHS:
+        return np.broadcast_to(votes.mean(axis=1, keepdims=True), votes.shape)
+    return ndimage.gaussian_filter1d(votes, spread, axis=1, mode="nearest", truncate=3.0)
 
 
 def _depths(eye: Floats, directions: Floats, half_side: float) -> Floats:

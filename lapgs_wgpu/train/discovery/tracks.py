@@ -20,6 +20,7 @@ from .trajectories import Trajectory, find_trajectories, time_step
 KEY_TIMES = 4  # from which is tracked, at most
 LEAST_REST = 0.05  # share of the points without a track that is worth another key time
 ROUGH, FINE = 150, 300  # points of a key time: when first followed, and with the points of all times brought there
+MANY = 0.75  # quantile, over the times, of how many parts are apart
 PROBES = 300  # points of a time by which parts are counted, at most
 # In half sides of the box, 1.3 in the presets:
 VOXEL = 0.045  # spacing of a track's points
@@ -97,15 +98,15 @@ def find_tracks(clouds: PointClouds, half_side: float) -> Tracks | None:
 
 
 def _key_time(clouds: list[Points], half_side: float) -> int | None:
-    """The time of most points among those at which no fewer parts than usual are apart."""
+    """The time of most points among those at which as many parts are apart as nearly ever."""
     some = [points.thinned(PROBES) for points in clouds]
     parts = np.array([_count_parts(_merged(some, i), half_side) for i in range(len(clouds))])
     if not parts.any():
         return None
-    usual = int(np.median(parts[parts > 0]))
+    many = int(np.quantile(parts[parts > 0], MANY))
     mass = np.convolve([points.scores.sum() for points in clouds], np.ones(5), "same")[: len(clouds)]
     least = np.minimum(parts, np.minimum(np.append(parts[1:], parts[-1]), np.append(parts[0], parts[:-1])))
-    apart = (least >= usual) & (parts <= usual + 1)
+    apart = (least >= many) & (parts <= many + 1)
     return int(np.lexsort((mass, apart))[-1])
 
 
