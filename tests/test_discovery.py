@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from contextlib import closing
 from pathlib import Path
 
@@ -132,7 +133,8 @@ def test_a_camera_that_walks_slowly_sees_what_moves_in_the_middle_of_the_scene()
         apart = np.linalg.norm(np.cross(rays, towards), axis=1) / np.linalg.norm(rays, axis=1)
         assert apart.max() < 1.3 * RADIUS
     tracks = find_tracks(clouds, BOX)
-    assert tracks is not None and tracks.supported.mean() > 0.95
+    assert tracks is not None
+    assert tracks.supported.mean() > 0.95
 
 
 def test_what_is_residual_at_all_times_is_no_motion() -> None:
@@ -312,6 +314,18 @@ def test_density_is_that_of_the_static_fit(device: Device) -> None:
     density = density_at(still_scene(device), np.array([[0, 0, 0], [1, 0, 0]], np.float32))
     assert density[0] > 0.5
     assert density[1] < 1e-6
+
+
+def test_above_a_flat_gaussian_is_no_density(device: Device) -> None:
+    """A floor is made of such; what rolls on it is not where the static fit already is."""
+    scene = still_scene(device)
+    with torch.no_grad():
+        scene.parameters["means"][:, 1] = 0.0
+        scene.parameters["log_scales"][:] = torch.tensor([0.5, 0.5, 0.005]).log()
+        scene.parameters["quats"][:] = torch.tensor([math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0])  # z to -y
+    density = density_at(scene, np.array([[0.2, 0, 0], [0, 0, 0.2], [0, 0.2, 0]], np.float32))
+    assert density[:2].min() > 0.5
+    assert density[2] < 1e-6
 
 
 def test_only_parts_in_empty_places_are_lost(device: Device) -> None:

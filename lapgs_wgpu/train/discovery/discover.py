@@ -19,6 +19,7 @@ from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.progress import Progress
 from lapgs_wgpu.splat.constants import CONSTANTS
 from lapgs_wgpu.splat.morton import morton_order
+from lapgs_wgpu.splat.rotation import rotation_matrices
 from lapgs_wgpu.train.config import Config
 
 from .field_fit import fit_field
@@ -32,6 +33,8 @@ SCALE = 0.8  # of it, in mean distances to its nearest neighbours
 DYNAMICS = 0.5  # standard deviation of its dynamics attribute, which it shares with its part
 EMPTY = 0.1  # opacity of the static fit, below which a place counts as empty
 LOST = 0.5  # share of the times at which a part is seen that it is where the static fit is empty, at least
+PROBES = 24  # of a part's points that are looked at, about
+BLOCK = 256  # points whose densities are computed together
 OPAQUE = 0.1  # least opacity of a Gaussian of the static fit that is looked at
 NEAR = 0.1  # box half sides; distance within which a track explains a surface point
 SHOWN = 2.0 / 255  # least difference from the background of an image that shows something
@@ -96,26 +99,31 @@ def discover(
 
 def lost_tracks(tracks: Tracks, static: Scene4D) -> Tracks | None:
     """The parts that are, mostly, where the static fit is empty; None where there are none."""
-    empty = density_at(static, tracks.paths.reshape(-1, 3)).reshape(tracks.supported.shape) < EMPTY
-    seen = np.maximum(np.bincount(tracks.part, tracks.supported.sum(axis=0)), 1)
-    share = np.bincount(tracks.part, (empty & tracks.supported).sum(axis=0)) / seen
-    return tracks.of_parts(share > LOST)
+    lost = np.zeros(int(tracks.part.max()) + 1, bool)
+    for k in range(len(lost)):
+        members = np.flatnonzero(tracks.part == k)
+        probes = members[:: -(-len(members) // PROBES)]
+        seen = tracks.paths[:, probes][tracks.supported[:, probes]]
+        lost[k] = (density_at(static, seen) < EMPTY).mean() > LOST if len(seen) else False
+    return tracks.of_parts(lost)
 
 
-def density_at(static: Scene4D, points: Floats) -> NDArray[np.float64]:
-    """(n,) opacity of the static fit at points (n, 3): the sum over the eight nearest Gaussians, as if round."""
+def density_at(static: Scene4D, points: Floats) -> NDArray[np.float32]:
+    """(n,) density of the static fit at points (n, 3): the sum over its Gaussians of opacity times falloff."""
     with torch.no_grad():
         gaussians = static.canonical()
-        means, opacities = gaussians.means.numpy(force=True), gaussians.opacities.numpy(force=True)
-        scales = gaussians.scales.amax(dim=1).numpy(force=True)
-    opaque = opacities > OPAQUE
-    count = min(8, int(opaque.sum()))
-    if count == 0:
-        return np.zeros(len(points))
-    distances, of = cKDTree(means[opaque]).query(points, k=range(1, count + 1))
-    falloff = np.exp(-0.5 * (distances / np.maximum(scales[opaque][of], 1e-6)) ** 2)
-    total: NDArray[np.float64] = (opacities[opaque][of] * falloff).sum(axis=1)
-    return total
+        opaque = gaussians.opacities.cpu() > OPAQUE
+        means, opacities = gaussians.means.cpu()[opaque], gaussians.opacities.cpu()[opaque]
+        # Gaussian axes in columns, divided by the scales: a point times these is its distance in standard deviations.
+        axes = rotation_matrices(gaussians.quats.cpu()[opaque]) / gaussians.scales.cpu()[opaque, None]
+        at_means = torch.einsum("gi,gij->gj", means, axes)
+        total = [
+            (
+                opacities * torch.exp(-0.5 * (torch.einsum("ni,gij->ngj", some, axes) - at_means).square().sum(dim=2))
+            ).sum(dim=1)
+            for some in torch.from_numpy(points).float().split(BLOCK)
+        ]
+    return torch.cat(total).numpy()
 
 
 def explained_share(clouds: PointClouds, tracks: Tracks, half_side: float) -> float:
