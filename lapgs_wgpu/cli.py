@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 import typing
 from collections.abc import Iterable, Sequence
@@ -42,7 +41,7 @@ def _train(arguments: list[str]) -> None:
     from lapgs_wgpu.gpu.device import open_device  # what follows needs torch, which takes seconds to import
     from lapgs_wgpu.train.distributed import join_ranks
     from lapgs_wgpu.train.run import train
-    from lapgs_wgpu.train.run_folder import check_run_folder
+    from lapgs_wgpu.train.run_folder import check_run_folder, result_text
 
     overrides = {key.name: given[key.name] for key in config_keys() if key.name in given}
     if given["eval"]:
@@ -71,7 +70,7 @@ def _train(arguments: list[str]) -> None:
     config, dataset = _open_data(config, out.parent, ranks)
     train(config, dataset, out, device=device, overwrite=given["overwrite"], watch=watch, ranks=ranks, lpips=lpips)
     if ranks.first:
-        _report(out)
+        print(result_text(out))
 
 
 def _resume(
@@ -85,7 +84,7 @@ def _resume(
     from lapgs_wgpu.gpu.device import open_device
     from lapgs_wgpu.train.presets import load_config
     from lapgs_wgpu.train.run import resume
-    from lapgs_wgpu.train.run_folder import changes_since
+    from lapgs_wgpu.train.run_folder import changes_since, result_text
 
     names = ("preset", "field", "ablate", "out", "overwrite")
     others = _others(given, names, [key for key in overrides if key not in RESUME_KEYS])
@@ -99,7 +98,7 @@ def _resume(
         print(f"lapgs-train: {what} was {before} when {run} began and is {now}: bits may differ.", file=sys.stderr)
     resume(config, dataset, run, device=device, watch=watch, ranks=ranks, lpips=lpips)
     if ranks.first:
-        _report(run)
+        print(result_text(run))
 
 
 def _others(given: dict[str, typing.Any], names: Sequence[str], keys: Iterable[str]) -> list[str]:
@@ -116,6 +115,7 @@ def _evaluate(run: Path, given: dict[str, typing.Any], overrides: dict[str, str 
     from lapgs_wgpu.train.distributed import SINGLE_PROCESS
     from lapgs_wgpu.train.presets import load_config
     from lapgs_wgpu.train.run import evaluate_run
+    from lapgs_wgpu.train.run_folder import result_text
 
     names = ("preset", "field", "ablate", "out", "resume", "overwrite", "view")
     others = _others(given, names, [key for key in overrides if key not in EVAL_KEYS])
@@ -144,7 +144,7 @@ def _evaluate(run: Path, given: dict[str, typing.Any], overrides: dict[str, str 
         plots.plot_run(run, scene)
     else:
         print(f"no plots: pip install 'lapgs-wgpu[plots]' adds them to {run / 'eval'}.", file=sys.stderr)
-    _report(run)
+    print(result_text(run))
 
 
 def _lpips(given: dict[str, typing.Any]) -> Lpips | None:
@@ -171,15 +171,6 @@ def _check_files(option: str, what: str, *files: Path) -> None:
     for file in files:
         if not file.is_file():
             raise InputError(f"{file} does not exist; {option} needs the folder of {what}.")
-
-
-def _report(run: Path) -> None:
-    metrics = json.loads((run / "metrics.json").read_text())
-    views, size = len(metrics["views"]), metrics["size"]
-    print(
-        f"{run}: {metrics['psnr']:.2f} dB PSNR, {metrics['ssim']:.4f} SSIM on {views} test views of "
-        f"{size[0]}x{size[1]}, {metrics['gaussians']} Gaussians"
-    )
 
 
 def _scene_name(config: Config) -> str:

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from lapgs_wgpu.command import HelpFormatter, Parser, guarded
+from lapgs_wgpu.errors import InputError
+
+if TYPE_CHECKING:
+    from lapgs_wgpu.prepare.diagnosis import Diagnosis
 
 DESCRIPTION = """\
 Convert films to a capture for lapgs-train: choose images, find out where the cameras stood. Needs no other programs:
@@ -15,8 +21,10 @@ pip install 'lapgs-wgpu[prepare]'.
   lapgs-prepare walk.mp4 --out DIR              one moving camera: a pose for each image
   lapgs-prepare a.mp4 b.mp4 c.mp4 --out DIR     several static cameras: a pose for each film; all films must start at
                                                 the same moment
+  lapgs-prepare walk.mp4 --out DIR --train      the same, then train a model that suits this machine and the film
+  lapgs-prepare --check DIR                     measure what a capture is worth, and what to film differently
 
-Then train: lapgs-train hypernerf-tiny --data DIR (one camera) or neu3d-tiny (several). See docs/own-data.md."""
+DIR/report.html shows what was found. See docs/own-data.md."""
 
 
 def prepare_command(arguments: Sequence[str] | None = None) -> int:
@@ -24,33 +32,103 @@ def prepare_command(arguments: Sequence[str] | None = None) -> int:
     return guarded("lapgs-prepare", _prepare, list(sys.argv[1:] if arguments is None else arguments))
 
 
-def _prepare(arguments: list[str]) -> None:
+def _options() -> Parser:
     parser = Parser("lapgs-prepare", description=DESCRIPTION, formatter_class=HelpFormatter, allow_abbrev=False)
     # fmt: off
     add = parser.add_argument
-    add("films", nargs="+", metavar="FILM", help="films, one per camera, all of the same size in pixels")
-    add("--out", required=True, metavar="DIR", help="output folder for the capture; must be new or empty")
+    add("films", nargs="*", metavar="FILM", help="films, one per camera, all of the same size in pixels")
+    add("--out", metavar="DIR", help="output folder for the capture; must be new or empty")
     add("--fps", type=float, help="maximum number of images per second of film [10 of a moving camera, 30 of static "
         "ones, less where a film would give more than 300 images]")
-    add("--size", type=int, default=1920, metavar="PIXELS", help="longer side of the images; larger frames are shrunk "
-        "[1920]")
+    add("--size", type=int, metavar="PIXELS", help="longer side of the images; larger frames are shrunk [1920]")
     add("--masks", metavar="DIR", help="PNG images of one moving camera, white where something moves, named as the "
         "images of an earlier run: used instead of the masks that are found in the film")
+    add("--check", metavar="DIR", help="instead of films: measure the existing capture in DIR, of any format that "
+        "lapgs-train reads, print parallax, motion, coverage, blur, exposure and time gaps, and write DIR/report.html. "
+        "Can be combined with --train and --minutes only")
+    add("--train", action="store_true", help="then train. Preset, image size and number of steps are chosen from the "
+        "graphics adapter, the capture and a short measurement; the run folder is runs/NAME, NAME that of the capture")
+    add("--minutes", type=float, metavar="M", help="with --train: how long the training may take, evaluation included "
+        "[the preset's whole schedule; on a graphics card at most an hour]")
     # fmt: on
-    given = parser.parse_args(arguments)
+    return parser
+
+
+def _prepare(arguments: list[str]) -> None:
+    given = _options().parse_args(arguments)
+    _check_options(given)
+    capture = Path(given.check or given.out)
+    run = Path("runs", capture.resolve().name)
+    if given.train:
+        from lapgs_wgpu.train.run_folder import check_run_folder
+
+        check_run_folder(run, overwrite=False)  # not after minutes of other work
+    diagnosis = _check(capture) if given.check else _convert(given, capture)
+    if given.train:
+        _train(capture, run, given.minutes, diagnosis)
+
+
+def _check_options(given: argparse.Namespace) -> None:
+    """Raises InputError for options that do not go together."""
+    if given.check:
+        others = [name for name in ("out", "fps", "size", "masks") if getattr(given, name) is not None]
+        if given.films or others:
+            word = given.films[0] if given.films else f"--{others[0]}"
+            raise InputError(f"--check measures a capture that exists, so {word} cannot be given.")
+    elif not given.films:
+        raise InputError("name the films to convert, or a capture with --check; lapgs-prepare --help says more.")
+    elif given.out is None:
+        raise InputError("name the folder for the capture with --out.")
+    if given.minutes is not None and not given.train:
+        raise InputError("--minutes goes with --train.")
+    if given.minutes is not None and not 0 < given.minutes <= 1e5:
+        raise InputError(f"--minutes must be above 0 and at most 100000, got {given.minutes:g}.")
+
+
+def _convert(given: argparse.Namespace, out: Path) -> Diagnosis:
     from lapgs_wgpu.prepare.capture import prepare  # after --help: numpy and Pillow take a moment
+    from lapgs_wgpu.prepare.extract import LONGER_SIDE
 
     done = prepare(
         [Path(film) for film in given.films],
-        Path(given.out),
+        out,
         fps=given.fps,
-        longer_side=given.size,
+        longer_side=LONGER_SIDE if given.size is None else given.size,
         masks=Path(given.masks) if given.masks else None,
     )
-    print(
-        f"{done.folder}: {done.images} images, {done.placed} of {done.cameras} cameras placed; "
-        f"lapgs-train {done.preset} --data {done.folder}"
-    )
+    for measure in done.diagnosis.measures:
+        if measure.good is False:
+            print(measure, file=sys.stderr)
+    then = "" if given.train else f"; lapgs-train {done.preset} --data {done.folder}"
+    print(f"{done.folder}: {done.images} images, {done.placed} of {done.cameras} cameras placed{then}", flush=True)
+    return done.diagnosis
+
+
+def _check(folder: Path) -> Diagnosis:
+    from lapgs_wgpu.prepare.diagnosis import diagnose
+    from lapgs_wgpu.prepare.report import REPORT, write_report
+
+    diagnosis = diagnose(folder)
+    print(diagnosis, flush=True)
+    write_report(diagnosis, folder / REPORT, folder.resolve().name)
+    print(f"{folder / REPORT} shows it with pictures", flush=True)
+    return diagnosis
+
+
+def _train(capture: Path, run: Path, minutes: float | None, diagnosis: Diagnosis) -> None:
+    from lapgs_wgpu.gpu.device import open_device
+    from lapgs_wgpu.train.plan import plan_training
+    from lapgs_wgpu.train.run import train
+    from lapgs_wgpu.train.run_folder import result_text
+
+    device = open_device()
+    exposure = diagnosis.measure("exposure").good is False
+    print("measuring some steps on this machine ...", file=sys.stderr, flush=True)
+    plan = plan_training(capture, diagnosis.dataset, device, minutes=minutes, exposure=exposure)
+    print(plan.text, flush=True)
+    train(plan.config, plan.dataset, run, device=device)
+    print(result_text(run))
+    print(f"lapgs-view {run / 'checkpoint.ply'}")
 
 
 if __name__ == "__main__":

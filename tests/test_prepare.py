@@ -180,7 +180,7 @@ def test_one_film(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     assert "10 images of 10 frames" in said.err
     times = json.loads((out / "times.json").read_text())
     assert times == {f"{100 * i:08d}.jpg": i / 10 for i in range(COUNT)}
-    assert sorted(child.name for child in out.iterdir()) == ["images", "sparse", "times.json"]
+    assert sorted(child.name for child in out.iterdir()) == ["images", "masks", "report.html", "sparse", "times.json"]
     data = load_dataset(out)
     found = {f"{round(view.time * (COUNT - 1))}": view.camera.position for view in (*data.train, *data.test)}
     errors = pose_errors(found, {f"{i}": camera.position for i, camera in enumerate(cameras)})

@@ -6,20 +6,24 @@ import shutil
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from lapgs_wgpu.data.images import check_image
 from lapgs_wgpu.data.readers.colmap import IMAGES, SPARSE
 from lapgs_wgpu.data.timestamps import write_times
 from lapgs_wgpu.errors import InputError
 
+from .diagnosis import Diagnosis, diagnose
 from .extract import LONGER_SIDE, Extraction, aligned, extract, images_per_second, shortened
 from .film import Film
 from .masks import MASKS, read_masks, write_masks
-from .moving import World, area, remove_matches, solve_world
+from .moving import World, area, remove_matches, rim, solve_world
 from .reconstruct import Reconstruction, all_pairs, import_pycolmap, merged, neighbouring_pairs
+from .report import REPORT, write_report
 
 MOMENTS = 8  # at which still cameras are compared
 # Square pixels: a lens with more freedom bends until things that move seem to stand still.
@@ -37,6 +41,7 @@ class Prepared:
     placed: int
     cameras: int
     preset: str
+    diagnosis: Diagnosis
 
 
 def prepare(
@@ -49,7 +54,8 @@ def prepare(
 ) -> Prepared:
     """Make a capture of one film of a moving camera, or of the films of several cameras that stand still.
 
-    out: a new or empty folder for images/, times.json, sparse/0 and masks/; it appears when all of it is there.
+    out: a new or empty folder for images/, times.json, sparse/0, masks/ and report.html; it appears when all of it is
+    there.
     fps: images a second, at most; None lets the length of the films decide. longer_side: of the images, pixels.
     masks: folder with a mask of what moves for each image of a moving camera; None to find them in the film.
     Raises InputError.
@@ -71,7 +77,8 @@ def prepare(
             model = _still_cameras(folder, extractions)
         else:
             model, moving, _ = _moving_camera(folder, extractions[0], masks)
-            write_masks(folder / MASKS, moving)
+            nothing = np.zeros(rim(films[0].size).shape, bool)  # moves
+            write_masks(folder / MASKS, moving or dict.fromkeys((picture.name for picture in pictures), nothing))
         wanted = len(films) if still else len(pictures)
         placed = 0 if model is None else model.num_reg_images()
         if placed < max(2, FEWEST * wanted):
@@ -81,7 +88,12 @@ def prepare(
             )
         (folder / SPARSE / "0").mkdir(parents=True)
         model.write_binary(str(folder / SPARSE / "0"))
-    return Prepared(out, len(pictures), placed, wanted, "neu3d-tiny" if still else "hypernerf-tiny")
+        diagnosis = diagnose(folder)
+        told = tuple(warning.replace(str(folder), str(out)) for warning in diagnosis.dataset.warnings)
+        diagnosis = replace(diagnosis, folder=out, dataset=replace(diagnosis.dataset, warnings=told))
+        write_report(diagnosis, folder / REPORT, out.resolve().name)
+    preset = "neu3d-tiny" if still else "hypernerf-tiny"
+    return Prepared(out, len(pictures), placed, wanted, preset, diagnosis)
 
 
 def extract_all(films: Sequence[Film], images: Path, fps: float | None, longer_side: int) -> list[Extraction]:
@@ -152,6 +164,8 @@ def _appearing(out: Path) -> Iterator[Path]:
         if out.exists():
             out.rmdir()
         partial.rename(out)
+    except InputError as error:
+        raise InputError(str(error).replace(str(partial), str(out))) from None
     finally:
         shutil.rmtree(partial, ignore_errors=True)
 

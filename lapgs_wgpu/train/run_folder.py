@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
 import shutil
 import sys
@@ -97,6 +98,16 @@ def changes_since(out: Path, device: Device, dataset: Dataset) -> list[tuple[str
     now = _record(device, dataset)
     then = {name: text for name, text in record.items() if isinstance(text, str) and text.isprintable()}
     return [(name, then[name][:200], now[name]) for name in now if then.get(name, now[name]) != now[name]]
+
+
+def result_text(run: Path) -> str:
+    """What metrics.json of a finished run says, in a line."""
+    metrics = json.loads((run / "metrics.json").read_text())
+    views, size = len(metrics["views"]), metrics["size"]
+    return (
+        f"{run}: {metrics['psnr']:.2f} dB PSNR, {metrics['ssim']:.4f} SSIM on {views} test views of "
+        f"{size[0]}x{size[1]}, {metrics['gaussians']} Gaussians"
+    )
 
 
 def _record(device: Device, dataset: Dataset) -> dict[str, str]:

@@ -1,0 +1,161 @@
+"""report.html: a diagnosis as one page that needs no other file: measures, camera positions, thumbnails, masks."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from lapgs_wgpu.data import Dataset, View
+from lapgs_wgpu.data.images import Pixels
+
+from .diagnosis import Diagnosis, Look, Measure
+from .masks import Mask
+
+REPORT = "report.html"
+THUMBNAILS = 24  # evenly chosen from the views that were looked at
+_WIDTH = 220  # pixels of a thumbnail
+_MOST_POINTS = 1200  # of the cloud, in the drawing
+_DRAWING = 420  # pixels: width of the drawing
+_TINT, _STRENGTH = np.array([235.0, 60.0, 40.0]), 0.45  # color over what moves
+
+_STYLE = """
+:root { color-scheme: light dark; --line: #8884; --good: #1a7f37; --poor: #c9372c; --soft: #777; }
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 72rem; margin: 2rem auto; padding: 0 1rem; }
+h1 { font-size: 1.5rem; margin-bottom: 0; } h2 { font-size: 1.1rem; margin-top: 2rem; }
+.soft, figcaption { color: var(--soft); } .scroll { overflow-x: auto; }
+table { border-collapse: collapse; width: 100%; } th { text-align: left; font-weight: 600; }
+td, th { padding: .45rem .8rem .45rem 0; border-bottom: 1px solid var(--line); vertical-align: top; }
+.mark { font-weight: 700; white-space: nowrap; } .good .mark { color: var(--good); } .poor .mark { color: var(--poor); }
+.grid { display: grid; gap: .8rem; grid-template-columns: repeat(auto-fill, minmax(11rem, 1fr)); }
+figure { margin: 0; } figure img { width: 100%; display: block; border-radius: 4px; }
+figcaption { font-size: .8rem; overflow-wrap: anywhere; }
+.drawings { display: flex; flex-wrap: wrap; gap: 2rem; } svg { max-width: 100%; height: auto; }
+@media (prefers-color-scheme: dark) { :root { --good: #56d364; --poor: #ff7b72; --soft: #aaa; } }
+"""
+
+
+def write_report(diagnosis: Diagnosis, path: Path, title: str) -> None:
+    """Write the page. title: name of the capture."""
+    path.write_text(_page(diagnosis, title), encoding="utf-8")
+
+
+def _page(diagnosis: Diagnosis, title: str) -> str:
+    dataset = diagnosis.dataset
+    poor = [measure for measure in diagnosis.measures if measure.good is False]
+    verdict = f"{len(poor)} of {len(diagnosis.measures)} properties are poor" if poor else "nothing speaks against it"
+    chosen = [
+        diagnosis.looks[i]
+        for i in sorted(set(np.linspace(0, len(diagnosis.looks) - 1, THUMBNAILS).round().astype(int).tolist()))
+    ]
+    masked = any(look.mask is not None and look.mask.any() for look in chosen)
+    count = len(dataset.train) + len(dataset.test)
+    layout = "cameras that stand still" if diagnosis.still else "one camera that moves"
+    notes = "".join(f"<li>{escape(note)}</li>" for note in dataset.warnings)
+    body = [
+        f"<h1>{escape(title)}</h1>",
+        f'<p class="soft">{count} images, {layout}; {verdict}.</p>',
+        '<div class="scroll"><table><tr><th></th><th>property</th><th>measured</th><th>wanted</th>'
+        f"<th>what to film differently</th></tr>{''.join(map(_row, diagnosis.measures))}</table></div>",
+        f"<h2>Also noticed</h2><ul>{notes}</ul>" if notes else "",
+        "<h2>Where the cameras stood</h2>",
+        '<p class="soft">Cameras from dark (first) to light (last), each with the direction that it looks in; gray: '
+        'points of the scene.</p><div class="drawings">',
+        *(_drawing(dataset, name) for name in ("from above", "as the cameras look")),
+        f"</div><h2>Images{', what moves in red' if masked else ''}</h2>",
+        f'<div class="grid">{"".join(map(_figure, chosen))}</div>',
+    ]
+    return (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{escape(title)}: diagnosis</title><style>{_STYLE}</style></head><body>{''.join(body)}</body></html>\n"
+    )
+
+
+def _row(measure: Measure) -> str:
+    name, mark = {True: ("good", "good"), False: ("poor", "poor"), None: ("", "not known")}[measure.good]
+    advice = "" if measure.good else escape(measure.advice)
+    cells = (escape(measure.name), escape(measure.value), escape(measure.threshold), advice)
+    return f'<tr class="{name}"><td class="mark">{mark}</td>{"".join(f"<td>{cell}</td>" for cell in cells)}</tr>'
+
+
+def _figure(look: Look) -> str:
+    name = Path(look.view.source)
+    label = f"{name.parent.name}/{name.name}, time {look.view.time:.3f}"
+    source = base64.b64encode(_jpeg(look.image, look.mask)).decode()
+    return (
+        f'<figure><img alt="{escape(label)}" src="data:image/jpeg;base64,{source}">'
+        f"<figcaption>{escape(label)}</figcaption></figure>"
+    )
+
+
+def _jpeg(image: Pixels, mask: Mask | None) -> bytes:
+    """A thumbnail, with a tint over what moves."""
+    height, width = image.shape[:2]
+    size = (_WIDTH, max(1, round(_WIDTH * height / width)))
+    small = np.asarray(Image.fromarray(image).resize(size, Image.Resampling.BOX), dtype=np.float64)
+    if mask is not None:
+        over = Image.fromarray(mask.astype(np.uint8) * 255).resize(size, Image.Resampling.BILINEAR)
+        weight = _STRENGTH * np.asarray(over, dtype=np.float64)[..., None] / 255
+        small = (1 - weight) * small + weight * _TINT
+    file = io.BytesIO()
+    Image.fromarray(small.round().astype(np.uint8)).save(file, "JPEG", quality=80)
+    return file.getvalue()
+
+
+def _drawing(dataset: Dataset, name: str) -> str:
+    """Cameras and points as an SVG, along the images' up direction or across it."""
+    views = sorted((*dataset.train, *dataset.test), key=lambda view: view.time)
+    right, deep, up = _axes(dataset.up, views)
+    plane = np.stack([right, deep if name == "from above" else up])
+    centers = np.stack([view.camera.position for view in views]) @ plane.T
+    ahead = np.stack([view.camera.T_cam_world[2, :3] for view in views]) @ plane.T
+    points = np.zeros((0, 2))
+    if dataset.cloud is not None:
+        points = dataset.cloud.at_most(_MOST_POINTS, 0).points.astype(np.float64) @ plane.T
+    kept = np.concatenate([centers, points])
+    low, high = np.percentile(points, [2, 98], axis=0) if len(points) else (centers.min(0), centers.max(0))
+    low, high = np.minimum(low, centers.min(axis=0)), np.maximum(high, centers.max(axis=0))
+    length = 0.06 * float(np.max(high - low)) or 1.0
+    low, high = low - 2 * length, high + 2 * length
+    scale = _DRAWING / float(np.max(high - low))
+    size = np.maximum((high - low) * scale, 60)
+
+    def at(places: NDArray[np.float64]) -> NDArray[np.float64]:
+        middle = (places - (low + high) / 2) * scale
+        return np.round(middle * [1, -1] + size / 2, 1)
+
+    inside = ((kept[len(centers) :] >= low) & (kept[len(centers) :] <= high)).all(axis=1)
+    dots = "".join(f'<circle cx="{x}" cy="{y}" r="1"/>' for x, y in at(points[inside]))
+    cameras = []
+    for view, (x, y), (x1, y1) in zip(views, at(centers), at(centers + length * ahead), strict=True):
+        color = f"hsl(265 70% {25 + 50 * view.time:.0f}%)"
+        cameras.append(
+            f'<g stroke="{color}" fill="{color}"><line x1="{x}" y1="{y}" x2="{x1}" y2="{y1}" stroke-width="1.5"/>'
+            f'<circle cx="{x}" cy="{y}" r="3"/></g>'
+        )
+    width, height = size.round()
+    return (
+        f'<figure><svg width="{width:.0f}" height="{height:.0f}" viewBox="0 0 {width:.0f} {height:.0f}" role="img" '
+        f'aria-label="cameras {name}"><g fill="#999" opacity="0.6">{dots}</g>{"".join(cameras)}</svg>'
+        f"<figcaption>{name}</figcaption></figure>"
+    )
+
+
+def _axes(up: NDArray[np.float64], views: Sequence[View]) -> tuple[NDArray[np.float64], ...]:
+    """Right, forward and up of the cameras' mean, unit vectors (3,)."""
+    ahead = np.mean([view.camera.T_cam_world[2, :3] for view in views], axis=0)
+    right = np.cross(ahead, up)
+    if np.linalg.norm(right) < 1e-6:  # cameras that look all around, or straight down
+        right = np.mean([view.camera.T_cam_world[0, :3] for view in views], axis=0)
+        right = right - up * (right @ up)
+    if np.linalg.norm(right) < 1e-6:
+        right = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
+    right = right / np.linalg.norm(right)
+    return right, np.cross(up, right), up

@@ -1,0 +1,241 @@
+"""What lapgs-prepare --check says of captures: each measure of one that has the fault and of one that has not."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.films import Board, drawn, walk
+from PIL import Image, ImageFilter
+
+from lapgs_wgpu.prepare.diagnosis import Measure, blur, diagnose
+from lapgs_wgpu.prepare.report import write_report
+from lapgs_wgpu.prepare_cli import prepare_command
+from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.train import plan
+from lapgs_wgpu.train.presets import load_config
+from lapgs_wgpu.train.step_costs import Costs
+
+COUNT, SIZE = 12, (160, 120)
+GL = np.diag([1.0, -1.0, -1.0, 1.0])
+ROOM = np.array([[x, y, z] for x in np.linspace(-1.8, 1.8, 13) for y in (1.0, 2.0) for z in np.linspace(-0.9, 1.8, 9)])
+
+
+def write_capture(
+    folder: Path,
+    cameras: list[Camera],
+    images: list[np.ndarray],
+    times: list[float] | None = None,
+    names: list[str] | None = None,
+) -> Path:
+    """A capture in nerfstudio's form, with points on the room's walls."""
+    names = names or [f"{i:03d}.png" for i in range(len(cameras))]
+    frames = []
+    for i, (camera, image, name) in enumerate(zip(cameras, images, names, strict=True)):
+        path = folder / "images" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(image).save(path)
+        pose = np.linalg.inv(camera.T_cam_world) @ GL
+        time = i / len(cameras) if times is None else times[i]
+        frames.append({"file_path": f"images/{name}", "transform_matrix": pose.tolist(), "time": time})
+    K = cameras[0].K
+    lens = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "w": SIZE[0], "h": SIZE[1]}
+    (folder / "transforms.json").write_text(json.dumps(lens | {"frames": frames, "ply_file_path": "points.ply"}))
+    rows = "\n".join(f"{x} {y} {z} 90 90 90" for x, y, z in ROOM)
+    head = ["ply", "format ascii 1.0", f"element vertex {len(ROOM)}", *(f"property float {a}" for a in "xyz")]
+    head += [f"property uchar {color}" for color in ("red", "green", "blue")]
+    (folder / "points.ply").write_text("\n".join([*head, "end_header", rows]) + "\n")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def pictures() -> tuple[list[Camera], list[np.ndarray], np.ndarray]:
+    """Of a walk past a board: cameras, images, and true masks of the board."""
+    cameras = walk(COUNT, *SIZE)
+    taken = [drawn(camera, i / (COUNT - 1), Board(0.4, 0.3, 1.0)) for i, camera in enumerate(cameras)]
+    return cameras, [image for image, _ in taken], np.stack([mask for _, mask in taken])
+
+
+def write_masks(folder: Path, masks: np.ndarray) -> None:
+    (folder / "masks").mkdir()
+    for i, mask in enumerate(masks):
+        Image.fromarray(mask.astype(np.uint8) * 255).save(folder / "masks" / f"{i:03d}.png")
+
+
+def measured(folder: Path, name: str) -> Measure:
+    return diagnose(folder).measure(name)
+
+
+def test_a_good_walk(pictures, tmp_path: Path) -> None:
+    cameras, images, masks = pictures
+    write_masks(write_capture(tmp_path, cameras, images), masks)
+    found = diagnose(tmp_path)
+    assert not found.still
+    assert [m.name for m in found.measures if not m.good] == []
+    assert found.measure("moving share").number == pytest.approx(masks.mean(), abs=0.005)
+    assert 40 < found.measure("coverage").number < 65  # walk() turns by 1 radian
+    assert 20 < found.measure("parallax").number <= 65
+    assert found.measure("exposure").number < 0.1
+    assert str(found.measure("parallax")).startswith(" good  parallax: ")
+
+
+def test_a_camera_that_turns_on_the_spot(pictures, tmp_path: Path) -> None:
+    _, images, _ = pictures
+    width, height = SIZE
+    cameras = [
+        Camera.looking_at([0.01 * i, -4.2, 0.7], [x, 0, 0], up=[0, 0, 1], fov_x=0.9, width=width, height=height)
+        for i, x in enumerate(np.linspace(-0.5, 0.5, COUNT))
+    ]
+    write_capture(tmp_path, cameras, images)
+    parallax = measured(tmp_path, "parallax")
+    assert parallax.good is False
+    assert parallax.number == pytest.approx(np.degrees(0.11 / 5.5), rel=0.4)
+    assert "Walk around" in str(parallax)
+    assert measured(tmp_path, "coverage").good is False
+
+
+def test_share_that_moves(pictures, tmp_path: Path) -> None:
+    cameras, images, masks = pictures
+    folder = write_capture(tmp_path, cameras, images)
+    unknown = measured(folder, "moving share")
+    assert unknown.good is None
+    assert "masks" in str(unknown)
+    write_masks(folder, np.zeros_like(masks))
+    assert "ardly anything moves" in str(measured(folder, "moving share"))
+    for path in (folder / "masks").iterdir():
+        Image.fromarray(np.pad(np.full((60, 120), 255, np.uint8), ((60, 0), (40, 0)))).save(path)
+    assert measured(folder, "moving share").good is True
+    assert measured(folder, "cut off").number == 1.0
+    assert measured(folder, "cut off").good is False
+    for path in (folder / "masks").iterdir():
+        Image.fromarray(np.full((9, 12), 255, np.uint8)).save(path)
+    assert "ore of what stands still" in str(measured(folder, "moving share"))
+
+
+def test_blur(pictures, tmp_path: Path) -> None:
+    cameras, images, _ = pictures
+    soft = [np.asarray(Image.fromarray(image).filter(ImageFilter.GaussianBlur(2))) for image in images]
+    sharp, blurred = blur(images[0].mean(axis=2)), blur(soft[0].mean(axis=2))
+    assert 0 < sharp < 0.4 < 0.5 < blurred < 1
+    assert blur(np.full((20, 20), 7.0)) == 1.0
+    found = measured(write_capture(tmp_path, cameras, soft), "blur")
+    assert found.good is False
+    assert "ore slowly" in str(found)
+
+
+def test_exposure_is_told_from_what_the_camera_sees(pictures, tmp_path: Path) -> None:
+    """The same walls, brighter by a stop in the second half."""
+    cameras, images, _ = pictures
+    brighter = [
+        np.clip(image * (2 ** (1 / 2.2) if i >= COUNT // 2 else 1), 0, 255).astype(np.uint8)
+        for i, image in enumerate(images)
+    ]
+    found = measured(write_capture(tmp_path, cameras, brighter), "exposure")
+    assert found.number == pytest.approx(1, abs=0.2)
+    assert found.good is False
+    assert "exposure.enabled" in str(found)
+
+
+def test_time_gaps(pictures, tmp_path: Path) -> None:
+    cameras, images, _ = pictures
+    times = [0.0, 1, 2, 3, 4, 5, 15, 16, 17, 18, 19, 20]
+    found = measured(write_capture(tmp_path, cameras, images, times), "time gaps")
+    assert found.number == pytest.approx(0.5)
+    assert found.good is False
+    assert "10.0 usual steps, from 25% on" in found.value
+
+
+@pytest.mark.parametrize("seeing", [1, 4])
+def test_still_cameras(tmp_path: Path, seeing: int) -> None:
+    """The board moves where `seeing` of four cameras look."""
+    cameras = walk(4, *SIZE)
+    used, images, times, names = [], [], [], []
+    for number, camera in enumerate(cameras):
+        for moment in range(5):
+            t = moment / 4 if number < seeing else 0.0
+            used.append(camera)
+            images.append(drawn(camera, t, Board(0.4))[0])
+            times.append(moment / 4)
+            names.append(f"cam{number}/{moment}.png")
+    found = diagnose(write_capture(tmp_path, used, images, times, names))
+    assert found.still
+    assert found.measure("coverage").number == seeing
+    assert found.measure("coverage").good is (seeing >= 3)
+    assert found.measure("moving share").number > 0.003 * seeing
+    assert found.measure("exposure").number < 0.1
+    assert "4 cameras that stand still" in str(found)
+
+
+def test_the_report_needs_no_other_file(pictures, tmp_path: Path) -> None:
+    cameras, images, masks = pictures
+    folder = write_capture(tmp_path / "x", cameras, images)
+    write_masks(folder, masks)
+    write_report(diagnose(folder), tmp_path / "report.html", "<walk> & more")
+    page = (tmp_path / "report.html").read_text()
+    assert "&lt;walk&gt; &amp; more" in page
+    assert "<walk>" not in page
+    assert page.count("data:image/jpeg;base64,") == COUNT
+    assert page.count("<svg") == 2
+    assert len(re.findall(r'<circle cx="[\d.]+" cy="[\d.]+" r="3"/>', page)) == 2 * COUNT
+    assert not re.findall(r'(?:src|href)="(?!data:)', page)
+    assert "what moves in red" in page
+    for name in ("parallax", "moving share", "coverage", "cut off", "blur", "exposure", "time gaps"):
+        assert f"<td>{name}</td>" in page
+
+
+def test_check_prints_and_writes(pictures, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    cameras, images, _ = pictures
+    folder = write_capture(tmp_path, cameras, images)
+    assert prepare_command(["--check", str(folder)]) == 0
+    said = capsys.readouterr().out
+    assert "12 images, a camera that moves" in said
+    assert said.count("(wanted: ") == 7
+    assert (folder / "report.html").is_file()
+    assert prepare_command(["--check", str(folder / "images")]) == 2
+    assert "is no scene in a known format" in capsys.readouterr().err
+
+
+def test_train_goes_on_to_a_scene(
+    pictures, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    """With so little time that a few steps are left; the line that ends it opens the scene."""
+    cameras, images, masks = pictures
+    dark = [(image * (0.6 if i >= COUNT // 2 else 1)).astype(np.uint8) for i, image in enumerate(images)]
+    write_masks(write_capture(tmp_path / "walk", cameras, dark), masks)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(plan, "LEAST_STEPS", 10)
+    monkeypatch.setitem(plan.plan_training.__kwdefaults__, "measure", lambda *_: Costs(0.1, 0.1, 0.01, 0.1))
+    assert prepare_command(["--check", "walk", "--train", "--minutes", "0.04"]) == 0
+    said = capsys.readouterr().out.splitlines()
+    (chosen,) = [line for line in said if line.startswith("training: ")]
+    assert "hypernerf-tiny (one camera that moves" in chosen
+    assert "colors of each image corrected" in chosen
+    assert "what the time allows" in chosen
+    assert said[-2].startswith(f"{Path('runs', 'walk')}: ")
+    assert said[-1] == f"lapgs-view {Path('runs', 'walk', 'checkpoint.ply')}"
+    assert Path(said[-1].split()[1]).is_file()
+    config = load_config("runs/walk/config.toml")
+    assert 10 <= config.schedule.steps <= 24
+    assert config.exposure.enabled
+    assert prepare_command(["--check", "walk", "--train"]) == 2  # before anything is measured
+    assert "runs/walk" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["film.mp4", "--check", "DIR"], "film.mp4 cannot be given"),
+        (["--check", "DIR", "--fps", "3"], "--fps cannot be given"),
+        (["--out", "DIR"], "name the films"),
+        (["film.mp4"], "with --out"),
+        (["film.mp4", "--out", "DIR", "--minutes", "3"], "--minutes goes with --train"),
+        (["film.mp4", "--out", "DIR", "--train", "--minutes", "-3"], "--minutes must be above 0"),
+        (["film.mp4", "--out", "DIR", "--train", "--minutes", "nan"], "--minutes must be above 0"),
+    ],
+)
+def test_options_that_do_not_go_together(arguments: list[str], words: str, capsys: pytest.CaptureFixture) -> None:
+    assert prepare_command(arguments) == 2
+    assert words in capsys.readouterr().err
