@@ -274,7 +274,6 @@ BAD: dict[str, tuple[Spoil, list[str]]] = {
     "translation NaN": (words("images.txt", 1, 5, "nan"), ["line 2", "nan"]),
     "point of text": (words("points3D.txt", 1, 1, "x"), ["points3D.txt, line 2", "'x' is not a number"]),
     "point NaN": (words("points3D.txt", 3, 1, "nan"), ["points3D.txt", "1 of 40 points", "first 2"]),
-    "no points": (lambda f: (f / "sparse/0/points3D.txt").write_text("#\n"), ["points3D.txt", "0 points"]),
     "no images in it": (lambda f: (f / "sparse/0/images.txt").write_text("#\n"), ["sparse/0", "no image"]),
     "not text": (lambda f: (f / "sparse/0/images.txt").write_bytes(b"\xff\xfe"), ["images.txt", "not text"]),
     "sizes mixed": (picture((32, 24)), ["frame_0002.png", "32x24", "64x48"]),

@@ -18,7 +18,7 @@ from lapgs_wgpu.data.covisible import read_mask
 from lapgs_wgpu.data.frames import Capture, Frame, ImageSource, Reader, Split
 from lapgs_wgpu.data.images import Pixels, Size, shrink, shrunk_size
 from lapgs_wgpu.data.normalize import BOX, Cube, cube_in_view, cube_of_points
-from lapgs_wgpu.data.readers import colmap, dnerf, hypernerf, nerfstudio, neu3d
+from lapgs_wgpu.data.readers import colmap, dnerf, endonerf, hypernerf, nerfstudio, neu3d, polycam, record3d
 from lapgs_wgpu.data.split import held_out
 from lapgs_wgpu.data.timestamps import disorder, natural_key, read_times, to_unit_range
 from lapgs_wgpu.data.undistort import Undistortion
@@ -27,7 +27,9 @@ from lapgs_wgpu.data.views import Dataset, View, focus_of
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
 
-READERS: tuple[Reader, ...] = (dnerf.READER, hypernerf.READER, neu3d.READER, nerfstudio.READER, colmap.READER)
+READERS: tuple[Reader, ...] = tuple(
+    module.READER for module in (dnerf, hypernerf, neu3d, nerfstudio, colmap, record3d, polycam, endonerf)
+)
 
 PROBES = 4096  # points that determine the normalization of a capture without a cloud
 DENSE = 4096  # points; a smaller cloud is filled up: Gaussians multiply too slowly to fill what it leaves empty

@@ -2,10 +2,13 @@
 
 Each folder below images/ is a camera. If the model holds exactly one image of each of several cameras, these cameras do
 not move, and all images of a camera have the pose of the one. docs/own-data.md says how to make such a capture.
+
+The models that VGGT (a camera for each image) and MegaSaM (no points, a cropped size) export are read, too.
 """
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
@@ -14,7 +17,7 @@ import numpy as np
 
 from lapgs_wgpu.data.cloud import Cloud
 from lapgs_wgpu.data.frames import Capture, Frame, Reader
-from lapgs_wgpu.data.images import SUFFIXES, check_image
+from lapgs_wgpu.data.images import SUFFIXES, Size, check_image
 from lapgs_wgpu.data.poses import check_rotation
 from lapgs_wgpu.data.timestamps import ImageName, natural_key
 from lapgs_wgpu.data.undistort import Lens
@@ -23,6 +26,7 @@ from lapgs_wgpu.errors import InputError
 from .colmap_model import ColmapCamera, ColmapImage, ColmapModel, count_images, is_model, read_model
 
 IMAGES, SPARSE = "images", "sparse"
+MEGASAM_PIXELS = 384 * 512
 AXES = "the model is damaged, since COLMAP keeps only points in front of its cameras"
 
 
@@ -48,8 +52,12 @@ def _read(folder: Path, image_size: int | None) -> Capture:
     if len(models) > 1:
         sizes = ", ".join(f"{path.name} with {count}" for path, count in models.items())
         warnings.append(f"{folder / SPARSE} holds {len(models)} models ({sizes} images): {chosen.name} is taken.")
-    if not len(model.points):
-        raise InputError(f"{model.points_file} holds 0 points; run COLMAP's mapper, which finds points with the poses.")
+    if not len(model.points):  # MegaSaM's export has none
+        warnings.append(
+            f"{model.points_file} holds 0 points, so Gaussians start at random depths before the cameras; a model with "
+            "points trains better."
+        )
+        return Capture(frames, None, model.points_file, warnings=warnings, own_footage=True, axes_hint=AXES)
     bad = np.flatnonzero(~(np.abs(model.points) <= 1e9).all(axis=1))
     if len(bad):
         raise InputError(
@@ -80,7 +88,7 @@ def _files(images: Path) -> dict[str, Path]:
 
 def _frames(model: ColmapModel, images: Path, files: dict[str, Path], where: Path) -> tuple[list[Frame], list[str]]:
     """The images with a pose, their own or that of their static camera, and a warning about those without one."""
-    lenses = {identity: _lens(camera) for identity, camera in model.cameras.items()}
+    lenses: dict[tuple[int, Size], Lens] = {}
     by_name = {image.name: image for image in model.images}
     by_camera: dict[str, list[ColmapImage]] = {}
     for image in model.images:
@@ -97,8 +105,10 @@ def _frames(model: ColmapModel, images: Path, files: dict[str, Path], where: Pat
             missing.append(name)
             continue
         entry = f"{where}, camera {found.camera},"
-        lens = lenses[found.camera]
-        frames.append(Frame(check_image(path), lens, poses[found.name], entry, ImageName(name, camera)))
+        checked = check_image(path)
+        if (key := (found.camera, checked.size)) not in lenses:
+            lenses[key] = _lens(model.cameras[found.camera], checked.size)
+        frames.append(Frame(checked, lenses[key], poses[found.name], entry, ImageName(name, camera)))
     warnings = []
     if missing:
         warnings.append(
@@ -113,12 +123,21 @@ def _camera_of(name: str) -> str:
     return str(PurePosixPath(name).parent)
 
 
-def _lens(camera: ColmapCamera) -> Lens:
+def _lens(camera: ColmapCamera, image: Size) -> Lens:
+    """The lens of a camera for images of (width, height)."""
     p = camera.parameters
     f = p.get("f", 0.0)
     K = np.array([[p.get("fx", f), 0, p["cx"]], [0, p.get("fy", f), p["cy"]], [0, 0, 1]])
     radial, tangential = (p.get("k1", 0.0), p.get("k2", 0.0), 0.0), (p.get("p1", 0.0), p.get("p2", 0.0))
-    return Lens(K, camera.width, camera.height, radial, tangential)
+    return Lens(K, *_uncropped((camera.width, camera.height), image), radial, tangential)
+
+
+def _uncropped(stated: Size, image: Size) -> Size:
+    """The size at which a camera's parameters hold: the stated one, but with MegaSaM, which shrinks images to some
+    384x512 pixels and then cuts off what is left of 8 at the right and at the bottom; its models state what remains."""
+    scale = math.sqrt(MEGASAM_PIXELS / (image[0] * image[1]))
+    width, height = int(image[0] * scale), int(image[1] * scale)
+    return (width, height) if stated == (width - width % 8, height - height % 8) else stated
 
 
 def _pose(image: ColmapImage) -> np.ndarray:

@@ -1,7 +1,8 @@
 """Reader of the nerfstudio format: one transforms.json with intrinsics, pose and time of each image.
 
 docs/data.md lists the fields. The cloud of ply_file_path is in the coordinates of transform_matrix: applied_transform
-was applied to both.
+was applied to both. Apps that write ARKit's or ARCore's poses in this form state `timestamp` instead of `time`, and
+some leave out the images' suffix .png (NeRFCapture).
 """
 
 from __future__ import annotations
@@ -40,13 +41,16 @@ def _read(folder: Path, image_size: int | None) -> Capture:
     frames: list[Frame] = []
     lenses: dict[tuple[tuple[str, float], ...], Lens] = {}
     poses: dict[bytes, np.ndarray] = {}
-    for entry, where, stated in frame_entries(data, path, NEEDED):
-        name_in_file, file = image_path(entry, folder, where, NEEDED)
+    entries = data.get("frames")
+    timed = isinstance(entries, list) and any(isinstance(entry, dict) and "time" in entry for entry in entries)
+    field = "time" if timed else "timestamp"
+    for entry, where, stated in frame_entries(data, path, NEEDED, field):
+        name_in_file, file = image_path(entry, folder, where, NEEDED, suffix=".png")
         values = _intrinsics(entry, data, where, path)
         lens = lenses.setdefault(tuple(values.items()), _lens(values))
         T_cam_world = opengl_pose(required(entry, "transform_matrix", where, NEEDED), where)
         T_cam_world = poses.setdefault(T_cam_world.tobytes(), T_cam_world)  # equal poses share the camera
-        time = None if stated is None else finite(stated, "time", where)
+        time = None if stated is None else finite(stated, field, where)
         normal = PurePosixPath(name_in_file)
         name = ImageName(str(normal), str(normal.parent))
         frames.append(Frame(check_image(file), lens, T_cam_world, where, name, time))
@@ -64,7 +68,7 @@ def _read(folder: Path, image_size: int | None) -> Capture:
         frames,
         None if cloud is None else read_cloud(cloud),
         source=cloud or path,
-        time_source=f"time in {path}",
+        time_source=f"{field} in {path}",
         own_footage=True,
         axes_hint=AXES,
     )

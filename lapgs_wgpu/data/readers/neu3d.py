@@ -40,7 +40,7 @@ class _Pose(NamedTuple):
 
 
 def _matches(folder: Path) -> bool:
-    return (folder / "poses_bounds.npy").is_file()
+    return (folder / "poses_bounds.npy").is_file() and not (folder / "images").is_dir()  # EndoNeRF's
 
 
 def _read(folder: Path, image_size: int | None) -> Capture:

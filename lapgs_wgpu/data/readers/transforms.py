@@ -14,21 +14,24 @@ LARGEST = 1e6  # of them
 LIMITS = {"w": (1, 1e5), "h": (1, 1e5), "fl_x": (1e-9, LARGEST), "fl_y": (1e-9, LARGEST)}
 
 
-def frame_entries(data: dict[str, Any], path: Path, needed: str) -> Iterator[tuple[dict[str, Any], str, Any]]:
+def frame_entries(
+    data: dict[str, Any], path: Path, needed: str, field: str = "time"
+) -> Iterator[tuple[dict[str, Any], str, Any]]:
     """Yield the entry of each frame, its place for errors, and its time as stated; None if no frame has one.
 
-    needed: reason for the field frames, for errors. Raises InputError, also if only some frames have a time.
+    needed: reason for the field frames, for errors. field: that states the time. Raises InputError, also if only some
+    frames have a time.
     """
     entries = required(data, "frames", path, needed)
     if not isinstance(entries, list) or not entries:
         raise InputError(f"{path}: frames must be a list of at least one frame, got {kind(entries)}.")
-    timed = sum(isinstance(entry, dict) and "time" in entry for entry in entries)
+    timed = sum(isinstance(entry, dict) and field in entry for entry in entries)
     hint = f"though {timed} of {len(entries)} frames have it; give it for all frames or for none"
     for index, entry in enumerate(entries):
         where = f"{path}, frame {index}"
         if not isinstance(entry, dict):
             raise InputError(f"{where} must be a JSON object, got {kind(entry)}.")
-        yield entry, where, required(entry, "time", where, hint) if timed else None
+        yield entry, where, required(entry, field, where, hint) if timed else None
 
 
 def intrinsics(entry: dict[str, Any], shared: dict[str, Any], where: str, path: Path) -> dict[str, float]:

@@ -1,0 +1,336 @@
+"""Captures of other programs: Record3D, Polycam, ARKit's poses in nerfstudio's form, MegaSaM, VGGT, EndoNeRF.
+
+Each sample is what cameras see of blobs. The reader's cameras must see the same, and a short training get closer to it.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from helpers.captures import HEIGHT, NEAR, WIDTH, Blobs, agreement, cameras, film, moved, quaternion, write_colmap
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from lapgs_wgpu.data import load_dataset
+from lapgs_wgpu.data.readers.colmap import _uncropped
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.train.presets import load_config
+from lapgs_wgpu.train.trainer import Trainer
+
+COUNT = 6
+GL = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def opengl(camera: Camera) -> np.ndarray:
+    """(4, 4) camera to world, ARKit's axes."""
+    return np.linalg.inv(camera.T_cam_world) @ GL
+
+
+def write_record3d(folder: Path, device: Device, *, unpacked: bool = False, each: bool = True) -> Path:
+    """unpacked: an .r3d. each: with intrinsics of each frame and times; without, K and fps."""
+    images = folder / ("rgbd" if unpacked else "rgb")
+    images.mkdir(parents=True)
+    poses, coefficients = [], []
+    for i, (camera, picture) in enumerate(film(device, COUNT, principal=(3, -2))):
+        Image.fromarray(picture).save(images / f"{i}.jpg", quality=98, subsampling=0)
+        pose, K = opengl(camera), camera.K
+        poses.append([*Rotation.from_matrix(pose[:3, :3]).as_quat().tolist(), *pose[:3, 3].tolist()])
+        coefficients.append([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])
+    data: dict[str, Any] = {"w": WIDTH, "h": HEIGHT, "fps": 60, "K": K.T.ravel().tolist(), "poses": poses}
+    if each:
+        data |= {"perFrameIntrinsicCoeffs": coefficients, "frameTimestamps": [0.0, 0.1, 0.2, 0.3, 0.4, 0.6]}
+    (folder / ("metadata" if unpacked else "metadata.json")).write_text(json.dumps(data))
+    return folder
+
+
+def write_polycam(folder: Path, device: Device, *, corrected: bool = True) -> Path:
+    """corrected: with cameras of its optimizer; the others are wrong then."""
+    for i, (camera, picture) in enumerate(film(device, COUNT, principal=(-2, 4))):
+        name, K = str(9_900_000 + 125_000 * i), camera.K
+        for kind in ("cameras", "corrected_cameras") if corrected else ("cameras",):
+            pose = opengl(camera) if kind == "corrected_cameras" or not corrected else np.eye(4)
+            data = {f"t_{row}{column}": pose[row, column] for row in range(3) for column in range(4)}
+            data |= {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "width": WIDTH, "height": HEIGHT}
+            (folder / "keyframes" / kind).mkdir(parents=True, exist_ok=True)
+            data |= {"timestamp": int(name), "blur_score": 120.0}
+            (folder / "keyframes" / kind / f"{name}.json").write_text(json.dumps(data))
+        (folder / "keyframes/images").mkdir(exist_ok=True)
+        Image.fromarray(picture).save(folder / f"keyframes/images/{name}.jpg", quality=98, subsampling=0)
+    (folder / "mesh_info.json").write_text("{}")
+    return folder
+
+
+def write_arkit(folder: Path, device: Device) -> Path:
+    """As NeRFCapture: intrinsics of each frame, no suffixes, timestamps since the phone was started."""
+    (folder / "images").mkdir(parents=True)
+    frames = []
+    for i, (camera, picture) in enumerate(film(device, COUNT, principal=(3, 3))):
+        Image.fromarray(picture).save(folder / f"images/{i}.png")
+        K = camera.K
+        frame = {
+            "file_path": f"images/{i}",
+            "timestamp": 81234.5 + 0.2 * i,
+            "transform_matrix": opengl(camera).tolist(),
+        }
+        frame |= {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "w": WIDTH, "h": HEIGHT}
+        frames.append(frame | {"depth_path": f"images/{i}.depth.png"})
+    head = {"fl_x": 1.0, "fl_y": 1.0, "cx": 320.0, "cy": 240.0, "w": WIDTH, "h": HEIGHT, "depth_integer_scale": 1.0}
+    (folder / "transforms.json").write_text(json.dumps(head | {"frames": frames}))
+    return folder
+
+
+def write_megasam(folder: Path, device: Device) -> Path:
+    """A text model in sparse/ without points or features; its camera states images that were shrunk and cropped."""
+    taken = film(device, COUNT)
+    scale = np.sqrt(384 * 512 / (WIDTH * HEIGHT))
+    width, height = int(WIDTH * scale), int(HEIGHT * scale)
+    (folder / "images").mkdir(parents=True)
+    (folder / "sparse").mkdir()
+    K = taken[0][0].resized(width, height).K
+    size = f"{width - width % 8} {height - height % 8}"
+    line = f"# a camera\n1 PINHOLE {size} {K[0, 0]} {K[1, 1]} {K[0, 2]} {K[1, 2]}\n"
+    (folder / "sparse/cameras.txt").write_text(line)
+    lines = ["# images"]
+    for i, (camera, picture) in enumerate(taken):
+        Image.fromarray(picture).save(folder / f"images/{i:05d}.png")
+        pose = [*quaternion(camera.T_cam_world[:3, :3]), *camera.T_cam_world[:3, 3]]
+        lines += [f"{i + 1} {' '.join(map(str, pose))} 1 {i:05d}.png", ""]
+    (folder / "sparse/images.txt").write_text("\n".join(lines) + "\n")
+    (folder / "sparse/points3D.txt").write_text("# Empty point cloud\n")
+    return folder
+
+
+def write_vggt(folder: Path, device: Device) -> Path:
+    """A binary model in sparse/ with a PINHOLE camera for each image, and a cloud for viewers beside it."""
+    write_colmap(folder, device, count=COUNT, model="PINHOLE", name="frame_{:03d}.png")
+    shutil.move(folder / "sparse/0", folder / "moved")
+    (folder / "sparse").rmdir()
+    shutil.move(folder / "moved", folder / "sparse")
+    data = (folder / "sparse/cameras.bin").read_bytes()
+    one = data[8:]
+    rows = b"".join(struct.pack("<I", 1 + i) + one[4:] for i in range(COUNT))
+    (folder / "sparse/cameras.bin").write_bytes(struct.pack("<Q", COUNT) + rows)
+    images = (folder / "sparse/images.bin").read_bytes()
+    size = (len(images) - 8) // COUNT
+    found = bytearray(images)
+    for i in range(COUNT):
+        struct.pack_into("<I", found, 8 + i * size + 4 + 56, 1 + i)
+    (folder / "sparse/images.bin").write_bytes(bytes(found))
+    (folder / "sparse/points.ply").write_bytes(b"ply\n")
+    return folder
+
+
+def write_endonerf(folder: Path, device: Device, *, depth: bool = True) -> Path:
+    """A camera at the origin, before it the blobs, which move. With depth maps of 16 bits, in hundredths of a unit."""
+    camera = cameras(1)[0]
+    for name in ("images", "depth", "masks"):
+        (folder / name).mkdir(parents=True)
+    for i in range(10):
+        blobs = moved(i)
+        Image.fromarray(blobs.drawn(camera, device)).save(folder / f"images/frame-{i:06d}.color.png")
+        z = float((blobs.means.double().numpy() @ camera.T_cam_world[2, :3] + camera.T_cam_world[2, 3]).mean())
+        Image.fromarray(np.full((HEIGHT, WIDTH), round(100 * z), np.uint16)).save(folder / f"depth/{i:06d}.png")
+    row = np.concatenate([np.eye(3, 4), [[HEIGHT], [WIDTH], [camera.K[0, 0]]]], axis=1)
+    np.save(folder / "poses_bounds.npy", np.tile([*row.ravel(), 100 * NEAR, 1000 * NEAR], (10, 1)))
+    if not depth:
+        shutil.rmtree(folder / "depth")
+    return folder
+
+
+DOORS: dict[str, Callable[[Path, Device], Path]] = {
+    "Record3D": write_record3d,
+    "Polycam": write_polycam,
+    "ARKit": write_arkit,
+    "MegaSaM": write_megasam,
+    "VGGT": write_vggt,
+}
+
+
+@pytest.mark.parametrize("door", DOORS)
+def test_cameras_see_what_the_images_show(door: str, device: Device, tmp_path: Path) -> None:
+    """In JPEG, or PNG."""
+    data = load_dataset(DOORS[door](tmp_path / "toy", device))
+    assert len(data.train) + len(data.test) == COUNT
+    assert data.own_footage
+    assert agreement(data, Blobs.random(), device) > (30 if door in ("Record3D", "Polycam") else 45)
+    times = sorted(view.time for view in (*data.train, *data.test))
+    np.testing.assert_allclose(times, [0, 1 / 6, 1 / 3, 0.5, 2 / 3, 1] if door == "Record3D" else np.linspace(0, 1, 6))
+
+
+@pytest.mark.parametrize("door", [*DOORS, "EndoNeRF"])
+def test_a_training_gets_closer(door: str, device: Device, tmp_path: Path) -> None:
+    """In 50 steps."""
+    folder = (DOORS | {"EndoNeRF": write_endonerf})[door](tmp_path / "toy", device)
+    small = {
+        "data.path": str(folder),
+        "data.size": 64,
+        "points.count": 800,
+        "schedule.steps": 50,
+        "schedule.warm_up": 20,
+    }
+    with Trainer(load_config("hypernerf-tiny", small), device=device) as trainer:
+        results = [trainer.step() for _ in range(50)]
+    first, last = (np.mean([result.psnr for result in some]) for some in (results[:10], results[-10:]))
+    assert last > first + 1.5
+    assert not any(result.skipped for result in results)
+
+
+def test_other_forms_of_the_same_exports(device: Device, tmp_path: Path) -> None:
+    data = load_dataset(write_record3d(tmp_path / "r3d", device, unpacked=True, each=False))
+    assert agreement(data, Blobs.random(), device) > 30
+    assert data.time_source.startswith("fps in ")
+    data = load_dataset(write_polycam(tmp_path / "polycam", device, corrected=False))
+    assert agreement(data, Blobs.random(), device) > 30
+
+
+def test_without_points_gaussians_start_before_the_cameras(device: Device, tmp_path: Path) -> None:
+    data = load_dataset(write_megasam(tmp_path / "toy", device))
+    assert data.cloud is None
+    assert data.depths is not None
+    assert "holds 0 points" in data.warnings[0]
+
+
+def test_megasams_crop() -> None:
+    assert _uncropped((584, 328), (854, 480)) == (591, 332)
+    assert _uncropped((854, 480), (854, 480)) == (854, 480)
+    assert _uncropped((427, 240), (854, 480)) == (427, 240)
+
+
+@pytest.mark.parametrize("depth", [True, False])
+def test_a_camera_that_stands_still(depth: bool, device: Device, tmp_path: Path) -> None:
+    """What to expect is said; depths are those of the maps, or lie between the bounds."""
+    data = load_dataset(write_endonerf(tmp_path / "toy", device, depth=depth))
+    assert [view.name for view in data.test] == ["test_00000", "test_00001"]
+    assert [Path(view.source).name for view in data.test] == [f"frame-{i:06d}.color.png" for i in (1, 9)]
+    assert len(data.cameras) == 1
+    (warning,) = data.warnings
+    assert "no parallax" in warning
+    assert ("depths are those of" if depth else "depths are a guess") in warning
+    if not depth:
+        assert data.cloud is None
+        return
+    assert data.cloud is not None
+    assert data.normalization is not None
+    points = data.cloud.points / data.normalization.scale + data.normalization.center
+    expected = np.asarray(Image.open(tmp_path / "toy/depth/000000.png")).astype(float).mean()
+    assert np.abs(points[:, 2] - expected).max() < 0.2 * expected
+    # Each point lies on the ray of its pixel: seen from the camera, the cloud is the image.
+    camera = data.train[0].camera
+    local = data.cloud.points @ camera.T_cam_world[:3, :3].T + camera.T_cam_world[:3, 3]
+    places = (local @ camera.K.T)[:, :2] / local[:, 2:]
+    image = torch.from_numpy(data.train[0].load()[..., :3].astype(np.float32) / 255)
+    column, row = np.clip(places[:4000].astype(int), 0, [WIDTH - 1, HEIGHT - 1]).T
+    assert np.abs(image[row, column].numpy() - data.cloud.colors[:4000]).mean() < 0.02
+
+
+def edit(path: str, change: Callable[[Any], Any]) -> Callable[[Path], None]:
+    def spoil(folder: Path) -> None:
+        file = next(folder.glob(path))
+        data = json.loads(file.read_text())
+        change(data)
+        file.write_text(json.dumps(data))
+
+    return spoil
+
+
+def bounds(change: Callable[[np.ndarray], Any]) -> Callable[[Path], None]:
+    def spoil(folder: Path) -> None:
+        rows = np.load(folder / "poses_bounds.npy")
+        np.save(folder / "poses_bounds.npy", change(rows))
+
+    return spoil
+
+
+def with_value(row: int, column: int, value: float) -> Callable[[np.ndarray], np.ndarray]:
+    def change(rows: np.ndarray) -> np.ndarray:
+        rows[row, column] = value
+        return rows
+
+    return change
+
+
+REFUSED: dict[str, tuple[Callable[[Path, Device], Path], Callable[[Path], Any], list[str]]] = {
+    "a pose too few": (write_record3d, edit("metadata.json", lambda d: d["poses"].pop()), ["5 poses", "5.jpg"]),
+    "a quaternion too long": (
+        write_record3d,
+        edit("metadata.json", lambda d: d["poses"].__setitem__(2, [1, 1, 0, 0, 0, 0, 0])),
+        ["frame 2", "length 1.414"],
+    ),
+    "an intrinsic is text": (
+        write_record3d,
+        edit("metadata.json", lambda d: d["perFrameIntrinsicCoeffs"][1].__setitem__(0, "x")),
+        ["frame 1", "perFrameIntrinsicCoeffs"],
+    ),
+    "times are too few": (
+        write_record3d,
+        edit("metadata.json", lambda d: d["frameTimestamps"].pop()),
+        ["frameTimestamps", "list of 5"],
+    ),
+    "no size": (write_record3d, edit("metadata.json", lambda d: d.pop("w")), ["no field w"]),
+    "a camera without an image": (
+        write_polycam,
+        lambda folder: (folder / "keyframes/images/9900000.jpg").unlink(),
+        ["9900000.jpg does not exist", "9900000.json"],
+    ),
+    "no focal length": (write_polycam, edit("keyframes/corrected_cameras/*.json", lambda d: d.pop("fx")), ["field fx"]),
+    "a matrix with scale": (
+        write_polycam,
+        edit("keyframes/corrected_cameras/*.json", lambda d: d.update(t_00=3.0)),
+        ["is not a rotation"],
+    ),
+    "no cameras": (
+        write_polycam,
+        lambda folder: [file.unlink() for file in (folder / "keyframes/corrected_cameras").iterdir()],
+        ["holds no camera"],
+    ),
+    "a timestamp is missing": (
+        write_arkit,
+        edit("transforms.json", lambda d: d["frames"][1].pop("timestamp")),
+        ["frame 1 has no field timestamp"],
+    ),
+    "a row too few": (write_endonerf, bounds(lambda rows: rows[:-1]), ["each of 10 images", "(9, 17)"]),
+    "depth bounds of 0": (write_endonerf, bounds(with_value(3, 15, 0.0)), ["row 3", "0 < near < far", "got 0"]),
+    "not a number": (write_endonerf, bounds(with_value(2, 4, np.nan)), ["row 2", "column 4"]),
+    "a depth map too few": (
+        write_endonerf,
+        lambda folder: (folder / "depth/000003.png").unlink(),
+        ["9 depth maps", "10 images"],
+    ),
+    "a depth map of another size": (
+        write_endonerf,
+        lambda folder: Image.fromarray(np.ones((5, 5), np.uint16)).save(folder / "depth/000000.png"),
+        ["000000.png is 5x5 pixels"],
+    ),
+    "a depth map in color": (
+        write_endonerf,
+        lambda folder: Image.fromarray(np.ones((HEIGHT, WIDTH, 3), np.uint8)).save(folder / "depth/000000.png"),
+        ["mode RGB", "gray"],
+    ),
+    "a depth map that is none": (
+        write_endonerf,
+        lambda folder: (folder / "depth/000000.png").write_text("hello"),
+        ["not a readable depth map"],
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("mistake", REFUSED)
+def test_mistakes_end_in_one_sentence(mistake: str, device: Device, tmp_path: Path) -> None:
+    write, spoil, words = REFUSED[mistake]
+    folder = write(tmp_path / "toy", device)
+    spoil(folder)
+    with pytest.raises(InputError) as error:
+        load_dataset(folder)
+    for word in words:
+        assert word in str(error.value)
+    assert str(error.value).count("\n") == 0
