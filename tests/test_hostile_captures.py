@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.captures import write_colmap, write_nerfies, write_nerfstudio, write_neu3d
+from helpers.doors import write_endonerf, write_polycam, write_record3d
 from helpers.hostile import (
     ByteEdits,
     TreeEdits,
@@ -46,6 +47,9 @@ def captures(device: Device, tmp_path_factory: pytest.TempPathFactory) -> dict[s
         "films": write_neu3d(folder / "films", device, count=3, video=True),
         "nerfies": write_nerfies(folder / "nerfies", device),
         "nerfstudio": write_nerfstudio(folder / "nerfstudio", device),
+        "record3d": write_record3d(folder / "record3d", device),
+        "polycam": write_polycam(folder / "polycam", device),
+        "endonerf": write_endonerf(folder / "endonerf", device),
     }
 
 
@@ -79,9 +83,10 @@ def test_sparse_models(captures: dict[str, Path], suffix: str, name: str, edits:
         [b"'<f8'", b"'|O'", b"'<U9'", b"'|V9'", b"(4, 17)", b"(99999999999, 17)", b"(0, 17)", b"True", b"\x93NUMPY\3"]
     )
 )
-def test_arrays(captures: dict[str, Path], edits: ByteEdits) -> None:
-    file = captures["neu3d"] / "poses_bounds.npy"
-    opened(captures["neu3d"], file, edit_bytes(file.read_bytes(), edits, head=130))
+@pytest.mark.parametrize("layout", ["neu3d", "endonerf"])
+def test_arrays(captures: dict[str, Path], layout: str, edits: ByteEdits) -> None:
+    file = captures[layout] / "poses_bounds.npy"
+    opened(captures[layout], file, edit_bytes(file.read_bytes(), edits, head=130))
 
 
 @fuzzed()
@@ -89,6 +94,13 @@ def test_arrays(captures: dict[str, Path], edits: ByteEdits) -> None:
 def test_masks(captures: dict[str, Path], edits: ByteEdits) -> None:
     file = captures["nerfies"] / "covisible/1x/val/left_000004.png"
     opened(captures["nerfies"], file, edit_bytes(file.read_bytes(), edits, head=60))
+
+
+@fuzzed()
+@given(byte_edits([b"IHDR", b"IDAT", b"PLTE", b"tRNS", b"\0\0\xff\xff"]))
+def test_depth_maps(captures: dict[str, Path], edits: ByteEdits) -> None:
+    file = captures["endonerf"] / "depth/000000.png"
+    opened(captures["endonerf"], file, edit_bytes(file.read_bytes(), edits, head=60))
 
 
 @fuzzed()
@@ -108,7 +120,7 @@ def test_videos(captures: dict[str, Path], tmp_path_factory: pytest.TempPathFact
 
 @fuzzed()
 @given(st.data(), tree_edits, byte_edits([b"[", b"{", b'"', b",", b":"], least=0).filter(lambda edits: len(edits) < 2))
-@pytest.mark.parametrize("layout", ["nerfies", "nerfstudio"])
+@pytest.mark.parametrize("layout", ["nerfies", "nerfstudio", "record3d", "polycam"])
 def test_descriptions(
     captures: dict[str, Path], layout: str, data: st.DataObject, changes: TreeEdits, edits: ByteEdits
 ) -> None:
