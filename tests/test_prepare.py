@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import sys
 from pathlib import Path
@@ -10,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.films import Board, drawn, pose_errors, turn_film, walk, write_film
+from PIL import Image
 
 from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.errors import InputError
@@ -19,6 +21,7 @@ from lapgs_wgpu.prepare.film import Film
 from lapgs_wgpu.prepare.hdr import to_sdr
 from lapgs_wgpu.prepare.reconstruct import neighbouring_pairs
 from lapgs_wgpu.prepare_cli import prepare_command
+from lapgs_wgpu.train.log import resident_bytes
 
 av = pytest.importorskip("av")
 pytest.importorskip("pycolmap")
@@ -116,6 +119,48 @@ def test_the_larger_of_two_streams_is_used(tmp_path: Path) -> None:
     assert [frame.pixels(1000).shape for frame in film.frames()] == [(48, 64, 3)] * 5
     assert "2 video streams; number 2" in film.notes[0]
     assert len(film.notes) == 1
+
+
+def test_a_film_of_8k(tmp_path: Path) -> None:
+    """Its images are shrunk; a frame larger than the decoder may hold is refused by its header."""
+    path = write_film(tmp_path / "film.mp4", [np.full((4320, 7680, 3), level, np.uint8) for level in (90, 160)],
+                      options={"preset": "ultrafast", "crf": "40"})  # fmt: skip
+    found = extract(Film(path), tmp_path / "images", "", 30, 1920, still=False)
+    for picture in found.pictures:
+        with Image.open(tmp_path / "images" / picture.name) as image:
+            assert image.size == (1920, 1080)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("lapgs_wgpu.prepare.film.LARGEST_FRAME", 4096 * 4096)
+        with pytest.raises(InputError, match="frames of 7680x4320 pixels; 1 to 16,777,216 pixels a frame are allowed"):
+            Film(path)
+
+
+@pytest.mark.parametrize("suffix", ["mkv", "mp4"])
+def test_a_film_of_more_than_4_gb(tmp_path: Path, suffix: str) -> None:
+    """Of which a hole is most, where the system has such files: the film before it is read, and not all into memory."""
+    path = write_film(tmp_path / f"film.{suffix}", noise(6))
+    try:
+        os.truncate(path, (1 << 32) + (1 << 20))
+    except OSError as error:
+        pytest.skip(f"this disk has no holes: {error}")
+    if path.stat().st_blocks * 512 > 1 << 30:
+        pytest.skip("this disk has no holes")
+    before = resident_bytes()
+    assert len(list(Film(path).frames())) == 6
+    assert before is None or resident_bytes() - before < 200e6
+
+
+def test_a_film_that_is_cut_gives_a_whole_capture_or_none(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """The first half of a walk, cut in the middle of a packet."""
+    pictures = [drawn(camera, 0, Board())[0] for camera in walk(2 * COUNT, WIDTH, HEIGHT)]
+    path = write_film(tmp_path / "walk.mkv", pictures, rate=10, options={"g": "2"})
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2 + 5])
+    assert prepare_command([str(path), "--out", str(tmp_path / "out")]) == 0
+    said = capsys.readouterr().err
+    assert "is damaged after" in said or "ends after" in said
+    data = load_dataset(tmp_path / "out")
+    assert COUNT - 3 <= len(data.train) + len(data.test) <= COUNT + 1
 
 
 # Frames worth having
@@ -265,8 +310,6 @@ def test_nothing_is_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture) -
 
 
 def test_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
-    from PIL import Image
-
     def full(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device", "image.jpg")
 

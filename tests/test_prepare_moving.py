@@ -10,7 +10,7 @@ from helpers.films import Board, drawn, pose_errors, walk, write_film
 from PIL import Image
 
 from lapgs_wgpu.data.images import encode_png
-from lapgs_wgpu.prepare.moving import Tracks, agreement, in_mask, rim, track_errors
+from lapgs_wgpu.prepare.moving import Tracks, agreement, in_mask, rim, standing_share, track_errors
 from lapgs_wgpu.prepare_cli import prepare_command
 
 pycolmap = pytest.importorskip("pycolmap")
@@ -83,6 +83,34 @@ def test_masks_need_a_folder_and_one_camera(
     assert "none is not a folder" in capsys.readouterr().err
     assert prepare_command([str(film[0]), str(film[0]), *options]) == 2
     assert "--masks goes with one moving camera" in capsys.readouterr().err
+
+
+def test_a_camera_that_stands_still(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """Alone before a board that wanders."""
+    camera = walk(3, *SIZE)[1]
+    pictures = [drawn(camera, i / 9, Board(0.5, 0.35, 0.7))[0] for i in range(10)]
+    path = write_film(tmp_path / "film.mp4", pictures, rate=10)
+    assert prepare_command([str(path), "--out", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert said.startswith("lapgs-prepare: the camera stands still: ")
+    assert "(at most 30% may)" in said
+    assert "several cameras" in said
+    assert [child.name for child in tmp_path.iterdir()] == ["film.mp4"]
+
+
+def test_features_that_stay_in_their_place() -> None:
+    """Of 4 tracks through 6 images, one stays, one stays too shortly, one drifts, one walks."""
+    tracks = Tracks(
+        tuple("012345"),
+        np.array([*range(6), 0, 1, *range(6), *range(6)]),
+        np.array([*[[50.0, 50]] * 6, *[[9.0, 9]] * 2, *([v * i, 9] for v in (0.5, 9.0) for i in range(6))]),
+        np.array([0, 6, 8, 14]),
+    )  # fmt: skip
+    assert standing_share(tracks, (320, 240)) == 0.25
+    assert standing_share(tracks, (1920, 1440)) == 0.5  # where 2.5 pixels are little
+    nothing = Tracks((), np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, np.int64))
+    assert standing_share(nothing, (320, 240)) == 0.0
+    assert standing_share(synthetic(0.0)[0], (320, 240)) < 0.1  # of a camera that walks
 
 
 def synthetic(noise: float) -> tuple[Tracks, object]:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.data.images import Size
+from lapgs_wgpu.errors import InputError
 
 from .reconstruct import Reconstruction, import_pycolmap
 
@@ -30,6 +31,7 @@ REACH = 0.025  # of the longer side: standard deviation of the weight with which
 LEAST_WEIGHT = 0.2  # of the features around a place, in features next to it: emptier places are not masked
 MIDDLE = 0.7  # of width and height, that the second reconstruction leaves out
 LITTLE, MUCH = 0.01, 0.1  # share of the images: less motion needs no masks; more may have led the reconstruction astray
+LONG, STANDING = 0.5, 0.3  # a camera stands still: this share of the tracks stay in place for that share of the film
 BEHIND = 1e6  # pixels: error of a point behind its camera
 
 
@@ -46,10 +48,17 @@ def solve_world(matched: Reconstruction, size: Size, say: Callable[[str], None])
     """Place the cameras by what stands still. matched: with verified matches; size: (width, height) of its images.
 
     Where much disagrees with a first reconstruction, a second one is made of the images' rims alone. The one that
-    explains more of the images' area tells what moves.
+    explains more of the images' area tells what moves. Raises InputError for a camera that stands still.
     """
     with matched.database() as database:
         tracks = find_tracks(database)
+    standing = standing_share(tracks, size)
+    if standing > STANDING:
+        raise InputError(
+            f"the camera stands still: {standing:.0%} of the features that are followed stay within "
+            f"{tolerance(size):.1f} pixels for half of the film or longer (at most {STANDING:.0%} may), so nothing "
+            "tells how far away anything is; walk around what moves, or film it with several cameras at once."
+        )
     best = _judged(matched.solve(), tracks, size)
     if best.moving > MUCH:
         say(f"{best.moving:.0%} of the image area disagrees with the first cameras: trying the images' rims alone.")
@@ -155,6 +164,19 @@ def find_tracks(database: Any) -> Tracks:
     starts = np.flatnonzero(np.diff(labels[order], prepend=-1))
     places = np.concatenate(keypoints) if keypoints else np.zeros((0, 2))
     return Tracks(tuple(image.name for image in images), image[order], places[order], starts)
+
+
+def standing_share(tracks: Tracks, size: Size) -> float:
+    """Share of the tracks that stay in their place while LONG of the film passes. size: (width, height) of images."""
+    if len(tracks) == 0:
+        return 0.0
+    spread = np.zeros(len(tracks))
+    for column in tracks.place.T:
+        both = np.maximum.reduceat(column, tracks.starts) - np.minimum.reduceat(column, tracks.starts)
+        spread = np.maximum(spread, both)
+    last = np.append(tracks.starts[1:], len(tracks.image)) - 1
+    long = tracks.image[last] - tracks.image[tracks.starts] >= LONG * (len(tracks.names) - 1)
+    return float((long & (spread < tolerance(size))).mean())
 
 
 def track_errors(tracks: Tracks, model: Any) -> Floats:
