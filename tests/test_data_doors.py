@@ -29,6 +29,8 @@ from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.data.readers.colmap import _uncropped
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.prepare.diagnosis import diagnose
+from lapgs_wgpu.prepare.report import write_report
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.trainer import Trainer
 
@@ -116,6 +118,17 @@ def test_a_camera_that_stands_still(depth: bool, device: Device, tmp_path: Path)
     image = torch.from_numpy(data.train[0].load()[..., :3].astype(np.float32) / 255)
     column, row = np.clip(places[:4000].astype(int), 0, [WIDTH - 1, HEIGHT - 1]).T
     assert np.abs(image[row, column].numpy() - data.cloud.colors[:4000]).mean() < 0.02
+
+
+@pytest.mark.parametrize("door", [*DOORS, "EndoNeRF"])
+def test_their_worth_is_measured(door: str, device: Device, tmp_path: Path) -> None:
+    found = diagnose((DOORS | {"EndoNeRF": write_endonerf})[door](tmp_path / "toy", device))
+    parallax = found.measure("parallax")
+    assert found.still is (door == "EndoNeRF")
+    assert parallax.good is not (door == "EndoNeRF")
+    assert (parallax.number > 10) is (door != "EndoNeRF")
+    write_report(found, tmp_path / "report.html", door)
+    assert (tmp_path / "report.html").read_text().count("<svg") == 2
 
 
 def edit(path: str, change: Callable[[Any], Any]) -> Callable[[Path], None]:

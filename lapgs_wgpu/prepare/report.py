@@ -57,6 +57,7 @@ def _page(diagnosis: Diagnosis, title: str) -> str:
     masked = any(look.mask is not None and look.mask.any() for look in chosen)
     count = len(dataset.train) + len(dataset.test)
     layout = "cameras that stand still" if diagnosis.still else "one camera that moves"
+    cameras = "Cameras" if diagnosis.still else "Cameras from dark (first) to light (last)"
     notes = "".join(f"<li>{escape(note)}</li>" for note in dataset.warnings)
     body = [
         f"<h1>{escape(title)}</h1>",
@@ -65,8 +66,8 @@ def _page(diagnosis: Diagnosis, title: str) -> str:
         f"<th>what to film differently</th></tr>{''.join(map(_row, diagnosis.measures))}</table></div>",
         f"<h2>Also noticed</h2><ul>{notes}</ul>" if notes else "",
         "<h2>Where the cameras stood</h2>",
-        '<p class="soft">Cameras from dark (first) to light (last), each with the direction that it looks in; gray: '
-        'points of the scene.</p><div class="drawings">',
+        f'<p class="soft">{cameras}, each with the direction that it looks in; gray: points of the scene.</p>'
+        '<div class="drawings">',
         *(_drawing(dataset, name) for name in ("from above", "as the cameras look")),
         f"</div><h2>Images{', what moves in red' if masked else ''}</h2>",
         f'<div class="grid">{"".join(map(_figure, chosen))}</div>',
@@ -112,6 +113,7 @@ def _jpeg(image: Pixels, mask: Mask | None) -> bytes:
 def _drawing(dataset: Dataset, name: str) -> str:
     """Cameras and points as an SVG, along the images' up direction or across it."""
     views = sorted((*dataset.train, *dataset.test), key=lambda view: view.time)
+    views = list({id(view.camera): view for view in reversed(views)}.values())[::-1]  # each camera once
     right, deep, up = _axes(dataset.up, views)
     plane = np.stack([right, deep if name == "from above" else up])
     centers = np.stack([view.camera.position for view in views]) @ plane.T
@@ -135,7 +137,7 @@ def _drawing(dataset: Dataset, name: str) -> str:
     dots = "".join(f'<circle cx="{x}" cy="{y}" r="1"/>' for x, y in at(points[inside]))
     cameras = []
     for view, (x, y), (x1, y1) in zip(views, at(centers), at(centers + length * ahead), strict=True):
-        color = f"hsl(265 70% {25 + 50 * view.time:.0f}%)"
+        color = f"hsl(265 70% {35 + 40 * view.time:.0f}%)"
         cameras.append(
             f'<g stroke="{color}" fill="{color}"><line x1="{x}" y1="{y}" x2="{x1}" y2="{y1}" stroke-width="1.5"/>'
             f'<circle cx="{x}" cy="{y}" r="3"/></g>'
