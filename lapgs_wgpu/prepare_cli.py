@@ -48,8 +48,9 @@ def _options() -> Parser:
         "Can be combined with --train and --minutes only")
     add("--train", action="store_true", help="then train. Preset, image size and number of steps are chosen from the "
         "graphics adapter, the capture and a short measurement; the run folder is runs/NAME, NAME that of the capture")
-    add("--minutes", type=float, metavar="M", help="with --train: how long the training may take, evaluation included "
-        "[the preset's whole schedule; on a graphics card at most an hour]")
+    add("--minutes", type=float, metavar="M", help="with --train: how long the training takes, about, evaluation "
+        "included; a machine that is busy later takes longer [the preset's whole schedule; on a graphics card at most "
+        "an hour]")
     # fmt: on
     return parser
 
@@ -59,10 +60,8 @@ def _prepare(arguments: list[str]) -> None:
     _check_options(given)
     capture = Path(given.check or given.out)
     run = Path("runs", capture.resolve().name)
-    if given.train:
-        from lapgs_wgpu.train.run_folder import check_run_folder
-
-        check_run_folder(run, overwrite=False)  # not after minutes of other work
+    if given.train and run.exists() and (not run.is_dir() or any(run.iterdir())):  # now, not after minutes of work
+        raise InputError(f"{run} is there already, and the training would be written to it; move or remove it.")
     diagnosis = _check(capture) if given.check else _convert(given, capture)
     if given.train:
         _train(capture, run, given.minutes, diagnosis)
