@@ -53,7 +53,7 @@ def load_config(
 
     Args:
         preset: name or path.
-        overrides: values by dotted key, such as `schedule.steps`; texts are read as on the command line. They come last.
+        overrides: values by dotted key, such as `schedule.steps`; texts are read as on the command line. Applied last.
         method: a field's kind (`--field`); the losses and the split of the paper's method are then left out.
         ablate: parts of the paper's method that are left out (`--ablate`).
 
