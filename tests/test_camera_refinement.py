@@ -114,7 +114,7 @@ def test_corrections_are_pulled_back() -> None:
     refinement._learnt[0, 0], refinement._learnt[1, 0] = 0.02, -0.02
     for number in range(3):
         refinement.values.grad = gradient.clone()
-        refinement._mean.zero_()
+        refinement._adam._mean.zero_()
         refinement.step(number + 1)
         sizes.append(float(refinement._learnt.norm()))
     assert sizes[0] > sizes[1] > sizes[2]
