@@ -64,7 +64,7 @@ soak: $(READY)
 bench: $(READY)
 	$(BIN)/python benchmarks $(ARGS)
 
-# Of `make demo`, which is trained first where runs/demo is not there.
+# Of `make demo`, which is trained first where runs/demo is not there; then discovery is run once more.
 pictures: $(READY)
 	[ -e runs/demo/checkpoint.ply ] || $(MAKE) demo
 	$(BIN)/python docs/tools/pictures.py runs/demo docs/pictures

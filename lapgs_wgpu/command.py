@@ -15,7 +15,7 @@ from lapgs_wgpu.gpu.device import list_devices
 
 DEVICE_HELP = (
     "graphics adapter: cpu, integrated or discrete, or part of the adapter's name [environment variable LAPGS_DEVICE, "
-    "otherwise the first of --list-devices]"
+    "otherwise the first in the list of lapgs-train --list-devices]"
 )
 LIST_DEVICES_HELP = "list the graphics adapters and exit; the default one comes first"
 OUT_OF_DEVICE, NOT_FINITE = 4, 5

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from lapgs_wgpu.prepare.diagnosis import Diagnosis
 
 DESCRIPTION = """\
-Convert films to a capture for lapgs-train: choose images, find out where the cameras stood. Needs no other programs:
-pip install 'lapgs-wgpu[prepare]'.
+Convert films to a capture for lapgs-train: choose images and reconstruct the cameras. Needs no other programs, but the
+extra prepare: pip install 'lapgs-wgpu[prepare]'.
 
   lapgs-prepare walk.mp4 --out DIR              one moving camera: a pose for each image
   lapgs-prepare a.mp4 b.mp4 c.mp4 --out DIR     several static cameras: a pose for each film; all films must start at
@@ -38,11 +38,11 @@ def _options() -> Parser:
     add = parser.add_argument
     add("films", nargs="*", metavar="FILM", help="films, one per camera, all of the same size in pixels")
     add("--out", metavar="DIR", help="output folder for the capture; must be new or empty")
-    add("--fps", type=float, help="maximum number of images per second of film [10 of a moving camera, 30 of static "
-        "ones, less where a film would give more than 300 images]")
+    add("--fps", type=float, help="maximum number of images per second of film [10 for a moving camera, 30 for "
+        "static ones; less if a film would give more than 300 images]")
     add("--size", type=int, metavar="PIXELS", help="longer side of the images; larger frames are shrunk [1920]")
-    add("--masks", metavar="DIR", help="PNG images of one moving camera, white where something moves, named as the "
-        "images of an earlier run: used instead of the masks that are found in the film")
+    add("--masks", metavar="DIR", help="for one moving camera: folder of PNG masks, white where something moves, "
+        "with the file names of the images that an earlier run wrote; replaces the masks that are otherwise detected")
     add("--check", metavar="DIR", help="instead of films: measure the existing capture in DIR, of any format that "
         "lapgs-train reads, print parallax, motion, coverage, blur, exposure and time gaps, and write DIR/report.html. "
         "Can be combined with --train and --minutes only")

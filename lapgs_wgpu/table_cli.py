@@ -10,10 +10,11 @@ from lapgs_wgpu.command import DEVICE_HELP, HelpFormatter, Parser, guarded
 from lapgs_wgpu.errors import InputError
 
 DESCRIPTION = """\
-Train all runs of a table (scenes x rows x seeds, defined in SPEC.toml), and write their metrics as a table.
+Train all runs of a table (scenes x rows x seeds, defined in SPEC.toml), and write their metrics as a table. A row is a
+method, or the preset with some options changed.
 
   lapgs-table docs/tables/demo.toml --out runs/demo-table       built-in scene
-  lapgs-table SPEC.toml --data DIR --out OUT                    the same again after an interruption: remaining runs
+  lapgs-table SPEC.toml --data DIR --out OUT                    your own table; repeated: trains the remaining runs
   lapgs-table --from A/results.json B/results.json              print a table of finished runs, without training
 
 Each run has its own run folder, OUT/SCENE/ROW/seedN. OUT/results.json and OUT/table.md are updated after each run. A
@@ -38,8 +39,8 @@ def _table(arguments: list[str]) -> int:
     add("--device", metavar="NAME", help=DEVICE_HELP)
     add("--lpips-weights", metavar="FILE", help="also compute LPIPS (VGG) with the weights in FILE, a .safetensors "
         "file (docs/metrics.md)")
-    add("--hours", type=float, metavar="H", help="stop after H hours: the run under way saves its state, and the same "
-        "command goes on with it, also on another machine that OUT was copied to")
+    add("--hours", type=float, metavar="H", help="stop after H hours; the current run saves its state, and the same "
+        "command continues it, also on another machine to which OUT was copied")
     add("--slim", action="store_true", help="delete checkpoint.ply and eval/ of each finished run, to save disk space")
     # fmt: on
     given = parser.parse_args(arguments)

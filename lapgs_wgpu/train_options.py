@@ -21,12 +21,12 @@ DESCRIPTION = """\
 Train a 4D Gaussian splatting model of a moving scene on a folder of images. Runs on any Vulkan adapter.
 
   lapgs-train demo --data synthetic             built-in scene; takes minutes on a CPU
-  lapgs-train tiny --data motion:path=4,cycles=2   built-in scene that measures motion (docs/metrics.md)
+  lapgs-train tiny --data motion:path=4         built-in scene that measures motion (docs/metrics.md)
   lapgs-train tiny --data DIR                   D-NeRF scene at 200x200 pixels, with settings for a CPU
   lapgs-train dnerf --data DIR --out RUN        D-NeRF scene at the paper's resolution and schedule
   lapgs-train hypernerf --data DIR              Nerfies or HyperNeRF capture; for a CPU: hypernerf-tiny
   lapgs-train neu3d --data DIR                  several static cameras; for a CPU: neu3d-tiny
-  lapgs-train tiny --data DIR                   your own videos, converted by lapgs-prepare (see its --help)
+  lapgs-train hypernerf-tiny --data DIR         your own film, converted by lapgs-prepare (see its --help)
   lapgs-train RUN/config.toml --out RUN2        repeat a run
   lapgs-train --resume RUN                      continue an interrupted training
   lapgs-train --eval RUN                        evaluate RUN/checkpoint.ply on the test views again
@@ -82,6 +82,7 @@ def parse_options(arguments: list[str]) -> dict[str, typing.Any]:
         entries = len(typing.get_args(kind)) if typing.get_origin(kind) is tuple else None
         value = functools.reduce(getattr, name.split("."), preset)
         text = " ".join(map(str, value)) if isinstance(value, tuple) else str(value)
+        text = text.lower() if kind is bool else text
         groups[section].add_argument(
             *([SHORTCUTS[name]] if name in SHORTCUTS else []),
             f"--{name}",

@@ -13,10 +13,13 @@ import lapgs_wgpu  # noqa: F401
 import dataclasses
 import os
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 import torch
 
+from lapgs_wgpu.data import Dataset, load_dataset
+from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.gpu.device import Device, _adapters, _matches
 from lapgs_wgpu.splat import rasterize as rasterize_module
 from lapgs_wgpu.splat.rasterizer import Rasterizer
@@ -64,6 +67,17 @@ def configuration() -> str:
 def device(configuration: str) -> Device:
     """One for all tests, so that each kernel is compiled once."""
     return open_test_device(configuration)
+
+
+@pytest.fixture(scope="session")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the built-in scene, small. No test changes it."""
+    return write_synthetic(tmp_path_factory.mktemp("data") / "scene", size=32, train_views=8, test_views=2)
+
+
+@pytest.fixture(scope="session")
+def dataset(data: Path) -> Dataset:
+    return load_dataset(data)
 
 
 @pytest.fixture

@@ -18,8 +18,7 @@ from torch import Tensor, nn
 
 import lapgs_wgpu
 from lapgs_wgpu import Change, Deformation, Parts, Regularizer, Scene4D, StepResult, TorchLoss, Trainer, WgslLoss, load
-from lapgs_wgpu.data import Dataset, load_dataset
-from lapgs_wgpu.data.synthetic import write_synthetic
+from lapgs_wgpu.data import Dataset
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
@@ -37,16 +36,6 @@ from lapgs_wgpu.train.truth_cache import upload_rgba
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
 CHARBONNIER = ROOT / "examples" / "own_loss.wgsl"
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_synthetic(tmp_path_factory.mktemp("data") / "scene", size=32, train_views=8, test_views=2)
-
-
-@pytest.fixture(scope="module")
-def dataset(folder: Path) -> Dataset:
-    return load_dataset(folder)
 
 
 class Drift(nn.Module):
@@ -94,8 +83,8 @@ def test_steps_by_hand_are_those_of_a_run(dataset: Dataset, device: Device, tmp_
     assert metrics["psnr"] == json.loads((tmp_path / "run" / "metrics.json").read_text())["psnr"]
 
 
-def test_a_trainer_opens_what_its_configuration_names(folder: Path, device: Device) -> None:
-    config = load_config("tiny", {"data.path": str(folder), "points.count": 50, "schedule.steps": 2})
+def test_a_trainer_opens_what_its_configuration_names(data: Path, device: Device) -> None:
+    config = load_config("tiny", {"data.path": str(data), "points.count": 50, "schedule.steps": 2})
     with Trainer(config, device=device) as trainer:
         assert trainer.dataset.name == "scene"
         assert len(list(trainer)) == 2
@@ -418,14 +407,14 @@ def blocks(language: str) -> list[str]:
 
 @pytest.mark.parametrize("number", range(len(blocks("python"))))
 def test_the_code_of_the_page_runs(
-    number: int, folder: Path, dataset: Dataset, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    number: int, data: Path, dataset: Dataset, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     code = blocks("python")[number]
-    code = code.replace('"synthetic", "schedule.steps": 300', f'"{folder}", "schedule.steps": 60')
-    code = code.replace('{"data.path": "DIR"}', f'{{"data.path": "{folder}", "schedule.steps": 5}}')
+    code = code.replace('"synthetic", "schedule.steps": 300', f'"{data}", "schedule.steps": 60')
+    code = code.replace('{"data.path": "DIR"}', f'{{"data.path": "{data}", "schedule.steps": 5}}')
     names: dict[str, Any] = {}
-    exec(code.replace('"DIR"', f'"{folder}"'), names)
+    exec(code.replace('"DIR"', f'"{data}"'), names)
     if "parts" in names:
         with closing(Trainer(configure(), dataset, device, parts=names["parts"])) as trainer:
             assert len(list(trainer)) == STEPS

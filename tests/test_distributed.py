@@ -15,7 +15,6 @@ from helpers.training import configure
 from lapgs_wgpu.data import Dataset, load_dataset
 from lapgs_wgpu.data.motion_scenes import MotionScene
 from lapgs_wgpu.data.motion_writer import write_motion
-from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.scene import load
@@ -26,16 +25,6 @@ from lapgs_wgpu.train.distributed import Ranks
 from lapgs_wgpu.train.presets import write_toml
 from lapgs_wgpu.train.run import train
 from lapgs_wgpu.train.trainer import Trainer
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_synthetic(tmp_path_factory.mktemp("data") / "scene", size=32, train_views=8, test_views=2)
-
-
-@pytest.fixture(scope="module")
-def dataset(data: Path) -> Dataset:
-    return load_dataset(data)
 
 
 def test_gradients_of_a_step_are_the_mean_over_its_views(

@@ -9,8 +9,6 @@ from typing import Any
 
 import pytest
 
-from lapgs_wgpu.data.synthetic import write_synthetic
-
 EXAMPLES = Path(__file__).parents[1] / "examples"
 ARGUMENTS = {
     "train": ["--steps", "60"],
@@ -20,14 +18,9 @@ ARGUMENTS = {
 }
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_synthetic(tmp_path_factory.mktemp("data") / "scene", size=32, train_views=8, test_views=2)
-
-
-def run(name: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+def run(name: str, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", [f"{name}.py", "--data", str(folder), *ARGUMENTS[name]])
+    monkeypatch.setattr(sys, "argv", [f"{name}.py", "--data", str(data), *ARGUMENTS[name]])
     return runpy.run_path(str(EXAMPLES / f"{name}.py"))["main"]()
 
 
@@ -35,24 +28,24 @@ def test_all_examples_are_tested() -> None:
     assert {file.stem for file in EXAMPLES.glob("*.py")} == set(ARGUMENTS)
 
 
-def test_train(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    metrics = run("train", folder, tmp_path, monkeypatch)
+def test_train(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    metrics = run("train", data, tmp_path, monkeypatch)
     assert metrics["psnr"] > 10
     assert (tmp_path / "scene.ply").stat().st_size > 1e5
 
 
 def test_own_field(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
-    assert run("own_field", folder, tmp_path, monkeypatch) > 10
+    assert run("own_field", data, tmp_path, monkeypatch) > 10
     moved = float(capsys.readouterr().out.split("moves by ")[1].split()[0])
     assert 0 < moved < 5
 
 
-def test_own_loss(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    terms = run("own_loss", folder, tmp_path, monkeypatch)
+def test_own_loss(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    terms = run("own_loss", data, tmp_path, monkeypatch)
     assert all(terms[name] > 0 for name in ("edges", "charbonnier", "needles"))
 
 
-def test_own_density(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert run("own_density", folder, tmp_path, monkeypatch) <= 4000
+def test_own_density(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert run("own_density", data, tmp_path, monkeypatch) <= 4000

@@ -39,12 +39,6 @@ IDENTITY = torch.eye(3, 4)
 RATE = Rate(2e-2, 2e-3, 100)
 
 
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    folder = tmp_path_factory.mktemp("data") / "scene"
-    return load_dataset(write_synthetic(folder, size=32, train_views=8, test_views=2))
-
-
 # The passes
 
 

@@ -15,8 +15,7 @@ from helpers.training import configure
 
 from lapgs_wgpu import cli
 from lapgs_wgpu.command import NOT_FINITE, guarded
-from lapgs_wgpu.data import Dataset, load_dataset
-from lapgs_wgpu.data.synthetic import write_synthetic
+from lapgs_wgpu.data import Dataset
 from lapgs_wgpu.errors import NumericalError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.train import trainer as training_module
@@ -29,16 +28,6 @@ from lapgs_wgpu.train.run_folder import STATE, load_state
 from lapgs_wgpu.train.trainer import Trainer
 
 BAD = Skipped(3, "r_003", "1 of 9 values")
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_synthetic(tmp_path_factory.mktemp("data") / "scene", size=32, train_views=8, test_views=2)
-
-
-@pytest.fixture(scope="module")
-def dataset(data: Path) -> Dataset:
-    return load_dataset(data)
 
 
 class Spoiled(torch.autograd.Function):

@@ -20,8 +20,7 @@ from helpers.interrupts import interrupt_at
 from helpers.training import STEPS, configure
 
 from lapgs_wgpu import cli
-from lapgs_wgpu.data import Dataset, load_dataset
-from lapgs_wgpu.data.synthetic import write_synthetic
+from lapgs_wgpu.data import Dataset
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io import atomic
@@ -33,16 +32,6 @@ from lapgs_wgpu.train.run_folder import STATE, STATE_BEFORE, load_state, locked_
 from lapgs_wgpu.train.trainer import Trainer
 
 KILLS = int(os.environ.get("LAPGS_SOAK_KILLS", "3"))
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_synthetic(tmp_path_factory.mktemp("data") / "scene", size=32, train_views=8, test_views=2)
-
-
-@pytest.fixture(scope="module")
-def dataset(data: Path) -> Dataset:
-    return load_dataset(data)
 
 
 @pytest.fixture(scope="module")

@@ -17,9 +17,8 @@ import torch
 from helpers.training import STEPS, configure
 from PIL import Image
 
-from lapgs_wgpu.data import Dataset, load_dataset
+from lapgs_wgpu.data import Dataset
 from lapgs_wgpu.data.normalize import Normalization
-from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.errors import DeviceMemoryError, InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.checkpoint import read_checkpoint
@@ -35,12 +34,6 @@ from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.run import train
 from lapgs_wgpu.train.step_result import StepResult
 from lapgs_wgpu.train.trainer import Trainer
-
-
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    folder = tmp_path_factory.mktemp("data") / "scene"
-    return load_dataset(write_synthetic(folder, size=32, train_views=8, test_views=2))
 
 
 @pytest.fixture(scope="module")

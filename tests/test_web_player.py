@@ -191,7 +191,7 @@ def test_200_000_gaussians(window: Browser, folder: Path, device: Device) -> Non
     assert scene.field is not None
     with torch.no_grad():
         scene.parameters["log_scales"] -= 3
-        # Not needles, 350 pixels long and thinner than one, whose rims depend on the last bits (docs/results.md).
+        # Not needles, 350 pixels long and thinner than one, whose rims depend on the last bits (docs/notes/web.md).
         dict(scene.field.named_parameters())["heads.weight"][-3:] *= 0.1
     made = export_scene(scene, folder, device, "many")
     open_page(window, made.as_uri(), seconds=300)

@@ -18,8 +18,7 @@ from conftest import open_test_device
 from helpers.training import configure
 
 from lapgs_wgpu.command import OUT_OF_DEVICE, guarded
-from lapgs_wgpu.data import Dataset, load_dataset
-from lapgs_wgpu.data.synthetic import write_synthetic
+from lapgs_wgpu.data import Dataset
 from lapgs_wgpu.errors import DeviceError, DeviceLostError, DeviceMemoryError, NoAdapterError
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.buffer import Buffer
@@ -34,12 +33,6 @@ from lapgs_wgpu.train.run_folder import STATE, load_state
 from lapgs_wgpu.train.step_result import StepResult
 
 NO_MEMORY = "Validation Error\n\nCaused by:\n  In wgpuDeviceCreateBuffer\n    Not enough memory left.\n"
-
-
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    folder = tmp_path_factory.mktemp("data") / "scene"
-    return load_dataset(write_synthetic(folder, size=32, train_views=8, test_views=2))
 
 
 @pytest.fixture(scope="module")

@@ -85,23 +85,23 @@ def _parse(arguments: Sequence[str]) -> Any:
     add("--list-devices", action="store_const", const=True, help=LIST_DEVICES_HELP)
 
     add = parser.add_argument_group("content of the window, screenshot or video").add_argument
-    add("--time", type=_number(0.0, 1.0), metavar="T", help="time in the clip that is shown (first, in a window): 0 is "
-        "its start, 1 its end; not for videos in which the clip plays [0, or the time of --view]")
+    add("--time", type=_number(0.0, 1.0), metavar="T", help="time in the clip: 0 is its start, 1 its end; a window "
+        "opens at this time; not for videos in which the clip plays [0, or the time of --view]")
     modes = "; ".join(f"{mode}: {about}" for mode, about in MODES.items())
     add("--mode", choices=list(MODES), help=f"what to render; {modes} [rgb]")
     add("--background", choices=list(BACKGROUNDS), help="color behind the Gaussians [the training's, otherwise black]")
     add("--size", type=_size, metavar="WxH", help="width and height of the window, screenshot or video, pixels "
         "[1280x720, or that of --view or of the camera path]")
-    add("--view", metavar="N|NAME", help="use a camera of the capture that the config.toml beside FILE.ply names, by "
-        "name or by number from 0; test views come first [a camera stored in the file, otherwise one that shows the "
+    add("--view", metavar="N|NAME", help="camera of the capture (config.toml beside FILE.ply says where that is), by "
+        "name, or by number from 0; test views come first [a camera stored in the file, otherwise one that shows the "
         "whole scene]")
 
     add = parser.add_argument_group("window").add_argument
     add("--time-slider", action=argparse.BooleanOptionalAction, help="show or hide the time slider [shown if the "
         "scene moves]")
     add("--play", action="store_const", const=True, help="start playing at once [paused]")
-    add("--fps", type=_number(0.1, 1000.0), metavar="F", help="frames of the clip per second at speed 1, and images "
-        "per second of --video; more make the clip shorter [30, or that of the camera path]")
+    add("--fps", type=_number(0.1, 1000.0), metavar="F", help="frames of the clip per second at speed 1, and of "
+        "--video; the clip has a fixed number of frames, so more make it shorter [30, or that of the camera path]")
     add("--speed", type=_number(0.01, 100.0), metavar="X", help="playback speed in the window, a factor [1]")
     add("--loop", choices=list(LOOPS), help="at the end of the clip; loop: start again; bounce: play backwards; "
         "once: stop [loop]")

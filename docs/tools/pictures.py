@@ -13,8 +13,10 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from passes import SIZE, blending, discovery, motion, projected, tiles
 from PIL import Image
 
+from lapgs_wgpu import load
 from lapgs_wgpu.gpu.device import open_device
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.splat.camera import Camera
@@ -82,7 +84,10 @@ def window(scene: LoadedScene) -> Picture:
 def main(run: Path, folder: Path) -> None:
     scene = load_scene(run / "checkpoint.ply", open_device)
     folder.mkdir(parents=True, exist_ok=True)
-    for name, picture in (("modes.png", modes(scene)), ("viewer.png", window(scene))):
+    trained, camera = load(run / "checkpoint.ply"), camera_at(scene, 0.0, (SIZE, SIZE))
+    stills = {"modes.png": modes(scene), "viewer.png": window(scene), "discovery.png": discovery(run.parent)}
+    stills |= {f"{draw.__name__}.png": draw(trained, camera) for draw in (projected, tiles, blending, motion)}
+    for name, picture in stills.items():
         Image.fromarray(picture).save(folder / name, optimize=True)
     with atomic_write(folder / "demo.webp") as file:
         file.write(moving(scene))

@@ -14,9 +14,9 @@ from mkdocs.structure.files import File, Files
 import lapgs_wgpu
 from lapgs_wgpu.train.presets import config_keys, load_config, preset_names
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
-_OUTSIDE = re.compile(r"\]\(\.\./([\w./-]+)(#[\w-]+)?\)")  # links from docs/ to the rest of the repository
+_UPWARD = re.compile(r"\]\(((?:\.\./)+[\w./-]+)(#[\w-]+)?\)")  # links that may lead out of docs/
 
 
 def on_files(files: Files, config: Any) -> Files:
@@ -24,16 +24,28 @@ def on_files(files: Files, config: Any) -> Files:
     files.append(File.generated(config, "presets.md", content=presets_page()))
     files.append(File.generated(config, "reference.md", content=reference_page()))
     linked = set()
-    for page in DOCS.glob("*.md"):
-        linked |= {match[1] for match in _OUTSIDE.finditer(page.read_text(encoding="utf-8"))}
-    for path in sorted(linked):
+    for page in DOCS.rglob("*.md"):
+        linked |= {_outside(page, match[1]) for match in _UPWARD.finditer(page.read_text(encoding="utf-8"))}
+    for path in sorted(linked - {""}):
         files.append(File.generated(config, f"repository/{path}{_suffix(path)}", abs_src_path=str(ROOT / path)))
     return files
 
 
-def on_page_markdown(markdown: str, **_: Any) -> str:
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Links out of docs/ lead to the copies that `on_files` has added."""
-    return _OUTSIDE.sub(lambda match: f"](repository/{match[1]}{_suffix(match[1])}{match[2] or ''})", markdown)
+    upward = "../" * page.file.src_uri.count("/")
+
+    def link(match: re.Match[str]) -> str:
+        path = _outside(DOCS / page.file.src_uri, match[1])
+        return f"]({upward}repository/{path}{_suffix(path)}{match[2] or ''})" if path else match[0]
+
+    return _UPWARD.sub(link, markdown)
+
+
+def _outside(page: Path, link: str) -> str:
+    """The path in the repository to which a page's link leads; empty for files in docs/."""
+    target = (page.parent / link).resolve()
+    return "" if target.is_relative_to(DOCS) else target.relative_to(ROOT).as_posix()
 
 
 def _suffix(path: str) -> str:

@@ -48,6 +48,9 @@ def load_dataset(
         undistort: False takes images as they are, and cameras as pinholes that look at the center of the image,
             whatever the files say of distortion, skew and principal point, as published code on HyperNeRF does.
 
+    Returns:
+        A dataset, whose `train`, `test` and `val` are tuples of views (`name`, `camera`, `time`, `load()`).
+
     Raises:
         InputError: not a capture, or one that cannot be trained on as it is; names file and field.
     """

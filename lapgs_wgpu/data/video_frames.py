@@ -1,7 +1,8 @@
 """Read frames of videos. Each video is unpacked once into lossless images outside the capture, and read from there.
 
 Frames depend on each other: decoding one in the middle of a clip takes seconds, since all frames from the last keyframe
-on are decoded first (docs/results.md has the times), and a training reads frames in random order, again and again.
+on are decoded first (docs/notes/captures.md has the times), and a training reads frames in random order, again and
+again.
 """
 
 from __future__ import annotations

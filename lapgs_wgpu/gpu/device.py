@@ -84,7 +84,11 @@ def _adapters() -> list[tuple[DeviceInfo, Any]]:
 
 
 def list_devices() -> list[DeviceInfo]:
-    """The adapters of this machine; the default one comes first."""
+    """Find the adapters of this machine.
+
+    Returns:
+        Their names, kinds (cpu, integrated, discrete or other), backends and drivers; the default one comes first.
+    """
     return [info for info, _ in _adapters()]
 
 
@@ -156,6 +160,9 @@ def open_device(name: str | None = None, *, number: int = 0) -> Device:
         name: part of the adapter's name, or its kind (cpu, integrated, discrete). None: the environment variable
             LAPGS_DEVICE, otherwise the best adapter.
         number: index among the adapters that match and are of the best one's kind, modulo their number.
+
+    Returns:
+        The opened adapter.
 
     Raises:
         NoAdapterError: no adapter, or none that matches.

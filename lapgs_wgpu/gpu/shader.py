@@ -10,7 +10,7 @@ Loops are unrolled here because naga adds a counter to each loop, which prevents
 
 A table is a storage buffer or, with the define TEXTURES, a storage texture with rows of TABLE_WIDTH texels: on many
 processors, Mesa's software driver reads a texel of four words ten times faster than one word of a buffer
-(docs/results.md).
+(docs/notes/speed.md).
 """
 
 from __future__ import annotations

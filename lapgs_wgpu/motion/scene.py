@@ -60,11 +60,15 @@ def make_field(config: FieldConfig, device: Device, seed: int = 0, own: nn.Modul
 class Scene4D:
     """A moving scene.
 
-    parameters: canonical Gaussians as they are optimized, each an nn.Parameter of float32: means (N, 3) world units,
-    log_scales (N, 3), quats (N, 4) wxyz of any length, opacity_logits (N,), sh_dc (N, 1, 3), sh_rest (N, 15, 3); for
-    the field laplacian also dynamics (N, D) (paper eq. 8).
-    field: None for static scenes. sh_degree: degree in use, 0 to 3. metadata: of the checkpoint.
-    own_field: a module in place of the configured field (docs/api.md).
+    Attributes:
+        parameters: canonical Gaussians as they are optimized, each an nn.Parameter of float32: means (N, 3) world
+            units, log_scales (N, 3), quats (N, 4) wxyz of any length, opacity_logits (N,), sh_dc (N, 1, 3), sh_rest
+            (N, 15, 3); for the field laplacian also dynamics (N, D) (paper eq. 8).
+        field_config: configuration of the field.
+        field: the module that moves the Gaussians; None for static scenes.
+        device: that renders.
+        sh_degree: degree of the harmonics in use, 0 to 3.
+        metadata: texts by name that the checkpoint holds.
     """
 
     def __init__(
@@ -77,6 +81,19 @@ class Scene4D:
         seed: int = 0,
         own_field: nn.Module | None = None,
     ) -> None:
+        """Make a scene of Gaussians and a field that is new.
+
+        Args:
+            parameters: as the attribute; tensors are copied where they are not float32 and contiguous.
+            field_config: configuration of the field.
+            device: that renders.
+            sh_degree: degree of the harmonics in use, 0 to 3.
+            seed: of the field's initial parameters.
+            own_field: a module in place of the configured field (docs/api.md).
+
+        Raises:
+            InputError: own_field is missing or superfluous for field_config.kind.
+        """
         self.parameters = {
             name: nn.Parameter(parameters[name].detach().float().contiguous()) for name in row_shapes(field_config)
         }
@@ -98,7 +115,21 @@ class Scene4D:
         seed: int = 0,
         own_field: nn.Module | None = None,
     ) -> Scene4D:
-        """Isotropic Gaussians at points (N, 3), world units, with colors (N, 3) in [0, 1] and scales (N,)."""
+        """A scene of isotropic Gaussians.
+
+        Args:
+            points: (N, 3) means, world units.
+            colors: (N, 3) in [0, 1].
+            scales: (N,) standard deviations, world units.
+            field_config: configuration of the field.
+            opacity: of all Gaussians, in (0, 1).
+            device: None for the default adapter.
+            seed: of the field's initial parameters.
+            own_field: a module in place of the configured field (docs/api.md).
+
+        Returns:
+            The scene.
+        """
         n = len(points)
         parameters = {
             "means": torch.as_tensor(np.asarray(points, np.float32)),
@@ -140,7 +171,7 @@ class Scene4D:
         return self.deformed(t)[0]
 
     def deformed(self, t: float, nearby: Nearby | None = None) -> tuple[Gaussians, Tensor | None]:
-        """The Gaussians at time t, and the weighted smoothness loss for `nearby`, None without it."""
+        """The Gaussians at time t in [0, 1], and the weighted smoothness loss for `nearby`, None without it."""
         still = self.canonical()
         if self.field is None or len(self) == 0:
             return still, None
@@ -165,9 +196,16 @@ class Scene4D:
         return Gaussians(means, quats, scales, opacities, sh), move.smoothness
 
     def render(self, camera: Camera, t: float, background: Tensor | None = None, *, depth: bool = True) -> Rendering:
-        """Render the scene at time t in [0, 1], without gradients. background: (3,), None for black.
+        """Render the scene, without gradients.
 
-        depth: whether to render depth, see `rasterize`.
+        Args:
+            camera: which renders the image.
+            t: time in [0, 1].
+            background: (3,); None for black.
+            depth: whether to render depth, see `rasterize`.
+
+        Returns:
+            Rendering, on the CPU.
         """
         with torch.no_grad():
             now = self.at(t)
@@ -195,8 +233,12 @@ class Scene4D:
     def save(self, path: str | os.PathLike[str], metadata: Mapping[str, str] | None = None) -> None:
         """Write the scene to one file, which 3DGS viewers open as a static scene at time 0 (docs/format.md). Atomic.
 
-        Raises InputError for errors of the file system and for values that cannot be stored; an older file is then
-        unchanged.
+        Args:
+            path: of the file, .ply.
+            metadata: further texts by name.
+
+        Raises:
+            InputError: the file system failed, or a value cannot be stored; an older file is then unchanged.
         """
         arrays = self.still(0.0)
         tensors = {f"gaussians.{name}": value.numpy(force=True) for name, value in self.parameters.items()}
@@ -209,8 +251,16 @@ class Scene4D:
 def load(path: str | os.PathLike[str], device: Device | None = None, *, field: nn.Module | None = None) -> Scene4D:
     """Read a checkpoint, or any 3DGS .ply file as a static scene.
 
-    field: the module of a scene that was trained with a field of one's own, which takes the file's parameters.
-    Raises InputError; also for a compact scene that moves, which lacks the static grid: `open_playback` shows it.
+    Args:
+        path: of the file.
+        device: None for the default adapter.
+        field: the module of a scene that was trained with a field of one's own, which takes the file's parameters.
+
+    Returns:
+        The scene.
+
+    Raises:
+        InputError: not such a file; or a compact scene that moves, which lacks the static grid (`lapgs-view` shows it).
     """
     return scene_of(read_scene(path), device, field)
 

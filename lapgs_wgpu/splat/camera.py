@@ -13,9 +13,14 @@ from numpy.typing import NDArray
 class Camera:
     """A pinhole camera in OpenCV axes: x right, y down, z forward.
 
-    K: (3, 3) float64 intrinsics in pixels; the center of pixel (column, row) is (column + 0.5, row + 0.5).
-    T_cam_world: (4, 4) float64 rigid transform from world to camera coordinates.
-    width, height: image size in pixels.
+    Attributes:
+        K: (3, 3) float64 intrinsics in pixels; the center of pixel (column, row) is (column + 0.5, row + 0.5).
+        T_cam_world: (4, 4) float64 rigid transform from world to camera coordinates.
+        width: of the image, pixels.
+        height: of the image, pixels.
+
+    Raises:
+        ValueError: a shape or a size is wrong, or a value is not finite.
     """
 
     K: NDArray[np.float64]
@@ -42,7 +47,7 @@ class Camera:
         return -R.T @ t
 
     def resized(self, width: int, height: int) -> Camera:
-        """The same camera for an image of another size."""
+        """The same camera for an image of another size: width and height in pixels."""
         scale = np.diag([width / self.width, height / self.height, 1.0])
         return Camera(scale @ self.K, self.T_cam_world, width, height)
 
@@ -56,9 +61,18 @@ class Camera:
         width: int,
         height: int,
     ) -> Camera:
-        """A camera at `position` that looks at `target`, with square pixels.
+        """A camera with square pixels that looks at a point.
 
-        up: world direction that points up in the image. fov_x: horizontal field of view, radians.
+        Args:
+            position: (3,) of the camera, world units.
+            target: (3,) point at the center of the image, world units.
+            up: (3,) world direction that points up in the image.
+            fov_x: horizontal field of view, radians.
+            width: of the image, pixels.
+            height: of the image, pixels.
+
+        Returns:
+            The camera.
         """
         eye = np.asarray(position, dtype=np.float64)
         forward = np.asarray(target, dtype=np.float64) - eye

@@ -12,9 +12,13 @@ Array = TypeVar("Array")
 class Gaussians(Generic[Array]):
     """N Gaussians with their activations applied, float32: torch tensors, numpy arrays or DeviceArrays.
 
-    means: (N, 3) world units. quats: (N, 4) wxyz, any non-zero length. scales: (N, 3) standard deviations, world units.
-    opacities: (N,) in [0, 1]. sh: (N, K, 3) spherical harmonics with K = (degree + 1)^2 coefficients, degree 0 to 3;
-    or view-independent colors (N, 3).
+    Attributes:
+        means: (N, 3) world units.
+        quats: (N, 4) wxyz, any non-zero length.
+        scales: (N, 3) standard deviations, world units.
+        opacities: (N,) in [0, 1].
+        sh: (N, K, 3) spherical harmonics with K = (degree + 1)^2 coefficients, degree 0 to 3; or view-independent
+            colors (N, 3).
     """
 
     means: Array

@@ -1,7 +1,7 @@
 """Order Gaussians along a Morton curve, so that neighbors in space are neighbors in memory.
 
 Passes over the splats of a tile, and over the cells of hash grids, then use fewer cache lines: on a CPU device, the
-rasterizer takes a seventh less time (docs/results.md).
+rasterizer takes a seventh less time (docs/notes/speed.md).
 """
 
 from __future__ import annotations

@@ -24,9 +24,12 @@ from .splat_layout import COLOR, MEAN, OPACITY, RADIUS
 class Rendering(NamedTuple):
     """A rendered image and the projected Gaussians.
 
-    image: (H, W, 3). alpha: (H, W). depth: (H, W) sum of weight times camera depth, not divided by alpha. radii: (N,)
-    int32 in pixels, 0 for invisible Gaussians. means2d: (N, 2) in pixels; after backward(), its .grad is the gradient
-    of the loss, which density control needs.
+    Attributes:
+        image: (H, W, 3).
+        alpha: (H, W).
+        depth: (H, W) sum of weight times camera depth, not divided by alpha.
+        radii: (N,) int32 in pixels, 0 for invisible Gaussians.
+        means2d: (N, 2) in pixels; after backward(), its .grad is the gradient of the loss, which density control needs.
     """
 
     image: Tensor
@@ -65,6 +68,7 @@ def rasterize(
         colors: (N, 3); with sh_degree: (N, K, 3) spherical harmonics, K >= (sh_degree + 1)^2.
         sh_degree: 0 to 3.
         background: (3,); None for black.
+        camera: which renders the image.
         depth: whether to render depth, which takes a tenth of the time; otherwise it is zero.
         device: None for the default adapter.
 

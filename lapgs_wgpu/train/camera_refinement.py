@@ -19,9 +19,9 @@ from torch import Tensor, nn
 from lapgs_wgpu.splat.camera import Camera
 
 from .config import CamerasConfig
+from .row_adam import RowAdam, restore_rows
 
-MEAN_DECAY, SQUARE_DECAY = 0.9, 0.99  # Adam's; a camera is seen a few dozen times
-TINY = 1e-15  # keeps 0 / 0 away
+SQUARE_DECAY = 0.99  # Adam's; a camera is seen a few dozen times
 Array = NDArray[np.float64]
 
 
@@ -37,7 +37,6 @@ class CameraRefinement:
     """The corrections of all training cameras, and how they learn.
 
     cameras: distinct ones. extent: distance that counts as 1 in shifts, world units.
-    Adam, but a camera's moments and step count stand still while other cameras are trained on.
     """
 
     name = "cameras"
@@ -49,8 +48,7 @@ class CameraRefinement:
         self.values = nn.Parameter(torch.zeros(count, 7))  # zeros that get the gradient
         self._learnt = torch.zeros(count, 6, dtype=torch.float64)  # rotation vectors, shifts
         self._zoom = torch.zeros(1, dtype=torch.float64)
-        self._mean, self._square = torch.zeros(count, 7), torch.zeros(count, 7)
-        self._steps = torch.zeros(count, 1)
+        self._adam = RowAdam((count, 7), SQUARE_DECAY)
         self._common = torch.from_numpy(_common_motions(self._cameras, extent))
 
     def refined(self, camera: Camera) -> RefinedCamera:
@@ -74,15 +72,9 @@ class CameraRefinement:
         gradient, self.values.grad = self.values.grad, None
         if gradient is None or step < self._config.start:
             return
-        rows = gradient.any(dim=1).nonzero()[:, 0]
-        gradient = gradient[rows]
-        self._steps[rows] += 1
-        self._mean[rows] = MEAN_DECAY * self._mean[rows] + (1 - MEAN_DECAY) * gradient
-        self._square[rows] = SQUARE_DECAY * self._square[rows] + (1 - SQUARE_DECAY) * gradient.square()
-        mean = self._mean[rows] / (1 - MEAN_DECAY ** self._steps[rows])
-        size = (self._square[rows] / (1 - SQUARE_DECAY ** self._steps[rows])).sqrt()
         rate = self._config.rate.at(step)
-        change = (-rate * mean / (size + TINY)).double()
+        rows, move = self._adam.descend(gradient, rate)
+        change = -move.double()
         for row, turn in zip(rows.tolist(), change[:, :3].numpy(), strict=True):
             before = rotation_of(self._learnt[row, :3].numpy())
             self._learnt[row, :3] = torch.from_numpy(rotation_vector(rotation_of(turn) @ before))
@@ -110,24 +102,11 @@ class CameraRefinement:
 
     def state(self) -> dict[str, Tensor]:
         """Everything that the next step depends on, besides the gradient."""
-        return {
-            "learnt": self._learnt,
-            "zoom": self._zoom,
-            "mean": self._mean,
-            "square": self._square,
-            "steps": self._steps,
-        }
+        return {"learnt": self._learnt, "zoom": self._zoom, **self._adam.state()}
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
         """Go on from what `state` gave. Raises ValueError where it is of other cameras."""
-        for name, mine in self.state().items():
-            value = state[name]
-            if value.shape != mine.shape or value.dtype != mine.dtype or not bool(value.isfinite().all()):
-                raise ValueError(f"its camera {name} is {value.dtype} of shape {tuple(value.shape)}, or not finite")
-        if bool((state["square"] < 0).any() or (state["steps"] < 0).any()):
-            raise ValueError("its cameras' moments are negative")
-        for name, mine in self.state().items():
-            mine.copy_(state[name])
+        restore_rows(self.state(), state, "camera")
 
 
 def rotation_of(vector: Array) -> Array:

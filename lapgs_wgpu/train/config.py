@@ -37,8 +37,8 @@ class DataConfig(Options):
         "and one for device memory; a single limit for both where the device shares host memory"
     )
     split: HeldOut = option(
-        "held-out views that are evaluated in the end; val: those of a D-NeRF scene's transforms_val.json, to choose "
-        "settings without the test views",
+        "held-out views that are evaluated at the end; val: those of a D-NeRF scene's transforms_val.json, for "
+        "choosing settings without looking at the test views",
         "test",
     )
     undistort: bool = option(
@@ -47,9 +47,9 @@ class DataConfig(Options):
         True,
     )
     units: Units = option(
-        "units of the lengths rates.means, smoothness.reach and field.bound; world: those of the scene in the presets' "
-        "cube; capture: those of the capture's files, in which published values stand: multiplied by the scale of the "
-        "cube at the start of a training",
+        "units of rates.means, smoothness.reach and field.bound; world: those of the scene in the presets' cube; "
+        "capture: those of the capture's files, as in published settings; the training multiplies these values by the "
+        "scale of the cube when it starts",
         "world",
     )
     path: str = option(
@@ -311,9 +311,9 @@ class CamerasConfig(Options):
     rate: Rate = option(
         "learning rate of the corrections: radians, and parts of the cameras' extent", Rate(2e-3, 5e-5, 3_000)
     )
-    pull: float = option("how strongly corrections are pulled back to zero, relative to the rate", 0.1, at_least=0)
+    pull: float = option("each step shrinks the corrections by this fraction of the learning rate", 0.1, at_least=0)
     focal: bool = option("correct the focal length, too: one factor for all cameras", True)
-    start: int = option("first step that moves cameras, when the scene has formed", 300, at_least=1)
+    start: int = option("first step that moves cameras; the scene forms before it", 300, at_least=1)
 
 
 @dataclass(frozen=True)

@@ -76,19 +76,31 @@ class Statistics:
 
 
 class Change(NamedTuple):
-    """keep: (N,) bool, which Gaussians stay. added: rows (M, ...) to append."""
+    """What becomes of N Gaussians.
+
+    Attributes:
+        keep: (N,) bool, which Gaussians stay, with their state of the optimizer.
+        added: rows (M, ...) to append, with a fresh state; under the same names as `DensityState.rows`, all of them.
+    """
 
     keep: Tensor
     added: dict[str, Tensor]
 
 
 class DensityState(NamedTuple):
-    """What density control decides on, after a step (counted from 1).
+    """What density control decides on, after a step.
 
-    rows: name -> (N, ...) parameters of the Gaussians, without gradients: means (N, 3) world units, log_scales (N, 3),
-    quats (N, 4) wxyz of any length, opacity_logits (N,), sh_dc (N, 1, 3), sh_rest (N, 15, 3), and dynamics (N, D) where
-    the field has them. statistics: what was seen of them since the last change. extent: of the cameras, world units.
-    generator: for random numbers, on the CPU; with any other a training does not repeat.
+    Attributes:
+        step: counted from 1.
+        rows: parameters of the Gaussians by name, without gradients: means (N, 3) world units, log_scales (N, 3), quats
+            (N, 4) wxyz of any length, opacity_logits (N,), sh_dc (N, 1, 3), sh_rest (N, 15, 3), and dynamics (N, D)
+            where the field has them.
+        statistics: since the last change: mean_gradients (N,), mean length of the gradient of the projected mean, in
+            normalized device coordinates; views (N,), the number of images in which each was visible; radii (N,), the
+            largest in pixels.
+        config: the table `density` of the configuration.
+        extent: of the cameras, world units.
+        generator: seeded, for random numbers, on the CPU; with any other a training does not repeat.
     """
 
     step: int
@@ -103,7 +115,14 @@ DensityRule = Callable[[DensityState], Change]
 
 
 def published_rule(state: DensityState) -> Change:
-    """Density control as configured: 3DGS's, with the paper's adaptive split."""
+    """Density control as configured: 3DGS's, with the paper's adaptive split.
+
+    Args:
+        state: after a step.
+
+    Returns:
+        Which Gaussians stay, and which are added.
+    """
     bound_sizes = state.step > state.config.reset_interval
     return densify(state.rows, state.statistics, state.config, state.extent, state.generator, bound_sizes=bound_sizes)
 

@@ -17,9 +17,9 @@ from ..gpu.device import Device
 from ..gpu.kernel import Commands, Kernel
 from ..gpu.pool import BufferPool
 from .config import Rate
+from .row_adam import RowAdam, restore_rows
 
-MEAN_DECAY, SQUARE_DECAY = 0.9, 0.999  # Adam's
-TINY = 1e-15  # keeps 0 / 0 away
+SQUARE_DECAY = 0.999  # Adam's
 
 
 class Exposed(NamedTuple):
@@ -64,8 +64,8 @@ class ExposurePasses:
 class Exposures:
     """The corrections of all training pictures, (V, 3, 4), the identity at first, and how they learn.
 
-    Adam, but a picture's moments and step count stand still while other pictures are trained on. Colors that all
-    corrections share belong to the scene, which is measured without any: the mean of all stays the identity.
+    Colors that all corrections share belong to the scene, which is measured without any: the mean of all stays the
+    identity.
     """
 
     name = "exposures"
@@ -74,38 +74,22 @@ class Exposures:
         self._identity = torch.eye(3, 4)
         self._rate = rate
         self.values = nn.Parameter(self._identity.repeat(count, 1, 1))
-        self._mean = torch.zeros(count, 3, 4)
-        self._square = torch.zeros(count, 3, 4)
-        self._steps = torch.zeros(count, 1, 1)
+        self._adam = RowAdam((count, 3, 4), SQUARE_DECAY)
 
     @torch.no_grad()
     def step(self, step: int) -> None:
         """Move the corrections that have a gradient, at the rate of this step (counted from 1), and forget it."""
         if self.values.grad is None:
             return
-        rows = self.values.grad.flatten(1).any(dim=1).nonzero()[:, 0]
-        gradient = self.values.grad[rows]
-        self._steps[rows] += 1
-        self._mean[rows] = MEAN_DECAY * self._mean[rows] + (1 - MEAN_DECAY) * gradient
-        self._square[rows] = SQUARE_DECAY * self._square[rows] + (1 - SQUARE_DECAY) * gradient.square()
-        mean = self._mean[rows] / (1 - MEAN_DECAY ** self._steps[rows])
-        size = (self._square[rows] / (1 - SQUARE_DECAY ** self._steps[rows])).sqrt()
-        self.values[rows] -= self._rate.at(step) * mean / (size + TINY)
+        rows, move = self._adam.descend(self.values.grad, self._rate.at(step))
+        self.values[rows] -= move
         self.values.sub_(self.values.mean(dim=0) - self._identity)
         self.values.grad = None
 
     def state(self) -> dict[str, Tensor]:
         """Everything that the next step depends on, besides the gradient."""
-        return {"values": self.values, "mean": self._mean, "square": self._square, "steps": self._steps}
+        return {"values": self.values, **self._adam.state()}
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
         """Go on from what `state` gave. Raises ValueError where it is of other pictures."""
-        for name, mine in self.state().items():
-            value = state[name]
-            if value.shape != mine.shape or value.dtype != mine.dtype or not bool(value.isfinite().all()):
-                raise ValueError(f"its exposure {name} is {value.dtype} of shape {tuple(value.shape)}, or not finite")
-        if bool((state["square"] < 0).any() or (state["steps"] < 0).any()):
-            raise ValueError("its exposures' moments are negative")
-        with torch.no_grad():
-            for name, mine in self.state().items():
-                mine.copy_(state[name])
+        restore_rows(self.state(), state, "exposure")

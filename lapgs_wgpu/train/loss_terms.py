@@ -31,9 +31,11 @@ Weight = float | Callable[[int], float]
 class Regularizer:
     """A term of the Gaussians, in torch.
 
-    function: of the scene, its Gaussians at the view's time (activated, differentiable in the scene's parameters) and
-    that time in [0, 1]; returns a scalar. weight: of the term, or a function of the step, counted from 1; at 0 it is
-    not computed.
+    Attributes:
+        name: in `StepResult.terms` and log.jsonl.
+        function: of the scene, its Gaussians at the view's time (activated, differentiable in the scene's parameters)
+            and that time in [0, 1]; returns a scalar.
+        weight: of the term, or a function of the step, counted from 1; at 0 it is not computed.
     """
 
     name: str
@@ -45,8 +47,10 @@ class Regularizer:
 class TorchLoss:
     """A term of the image, in torch. The image and its gradient then go through the host's memory in each step.
 
-    function: of the image (H, W, 3), differentiable, and the ground truth (H, W, 3) in [0, 1]; returns a scalar.
-    weight: as in Regularizer.
+    Attributes:
+        name: in `StepResult.terms` and log.jsonl.
+        function: of the image (H, W, 3), differentiable, and the ground truth (H, W, 3) in [0, 1]; returns a scalar.
+        weight: as in `Regularizer`.
     """
 
     name: str
@@ -58,7 +62,13 @@ class TorchLoss:
 class WgslLoss:
     """A term of the image, as a compute shader on the device: the mean over the pixels of what it leaves.
 
-    file: of WGSL that imports common/loss_term, which says what it gets and leaves. weight: as in Regularizer.
+    Attributes:
+        name: in `StepResult.terms` and log.jsonl.
+        file: of WGSL that imports common/loss_term, which says what it gets and leaves.
+        weight: as in `Regularizer`.
+
+    Raises:
+        InputError: no such file, or another workgroup size than 8 x 8.
     """
 
     name: str
@@ -91,7 +101,19 @@ class WgslLoss:
         weight: float,
         d_image: DeviceArray,
     ) -> DeviceArray:
-        """Add the weighted gradient to d_image (4, H, W); returns (H, W) values of the pixels. Others: `ImageLoss`."""
+        """Record the passes of this term into a command buffer.
+
+        Args:
+            commands: to record into.
+            image: (4, H, W) red, green, blue, transmittance.
+            truth: (H, W) uint32 RGBA of the ground truth.
+            background: behind transparent pixels of the ground truth.
+            weight: of the term.
+            d_image: (4, H, W), to which the weighted gradient is added.
+
+        Returns:
+            (H, W) values of the pixels.
+        """
         height, width = truth.shape
         pool = self._pools.setdefault(commands.device, BufferPool(commands.device))
         name, defines = self._kernel

@@ -26,10 +26,12 @@ class Callback(Protocol):
 class Parts:
     """Parts of a training that are Python objects.
 
-    field: a module that moves the Gaussians, in place of the configured field. losses: further terms of the loss.
-    density: the rule of density control, asked at the steps that the configuration plans for it. rates: learning rates
-    of the field's own groups of parameters, and of configured ones that are to be others. callbacks: called after each
-    step, in this order.
+    Attributes:
+        field: a module that moves the Gaussians, in place of the configured field.
+        losses: further terms of the loss.
+        density: the rule of density control, called at the steps that the configuration plans for it.
+        rates: learning rates by group of parameters: of the field's own groups, and in place of configured ones.
+        callbacks: called after each step, in this order.
     """
 
     field: nn.Module | None = None

@@ -51,10 +51,17 @@ def load_config(
 ) -> Config:
     """A preset by name, or a .toml file by path (such as an earlier run's config.toml), with some values overridden.
 
-    overrides: dotted key, such as schedule.steps -> value, or as on a command line text, or texts of a tuple's entries.
-    method: a field's kind, without what belongs to the paper's method only (PAPER_ONLY). ablate: parts of the paper's
-    method that are left out (ABLATIONS). Overrides come last.
-    Raises InputError where the preset, a key or a value is not valid.
+    Args:
+        preset: name or path.
+        overrides: values by dotted key, such as `schedule.steps`; texts are read as on the command line. Applied last.
+        method: a field's kind (`--field`); the losses and the split of the paper's method are then left out.
+        ablate: parts of the paper's method that are left out (`--ablate`).
+
+    Returns:
+        A frozen dataclass: `config.schedule.steps`. `dataclasses.replace` changes it.
+
+    Raises:
+        InputError: the preset, a key or a value is not valid.
     """
     known = {key.name: key.kind for key in config_keys()}
     table: Table = {}

@@ -10,11 +10,16 @@ from lapgs_wgpu.train.nonfinite import Skipped
 
 
 class StepResult(NamedTuple):
-    """A step that is done, of how many in all.
+    """A step that is done.
 
-    loss, and psnr in dB: means over the step's views. skipped: where its values were not finite, so that it moved
-    nothing. terms: what each term, times its weight, adds to the loss: l1, ssim (of 1 - SSIM), pyramid, ncc,
-    smoothness and dynamics, as far as they were computed, and each term of one's own by its name.
+    Attributes:
+        step: its number, counted from 1.
+        steps: the number of all steps.
+        loss: mean over the step's views.
+        psnr: mean over the step's views, dB.
+        skipped: None, or why the step changed nothing: values that were not finite.
+        terms: what each term of the loss adds to it, weight included, by name: `l1`, `ssim` (of 1 - SSIM), `pyramid`,
+            `ncc`, `smoothness` and `dynamics`, as far as they were computed, and each term of one's own.
     """
 
     step: int

@@ -69,11 +69,19 @@ class Trainer:
 
     A context manager, and an iterator of the steps that are left.
 
-    scene: the Scene4D, as the last step left it. config: with the decoder's place chosen. given: the same before it was
-    suited to the data, which config.toml holds. dataset: its test views are not touched by any step. done: the steps so
-    far. callbacks: called after each step. discovery: what motion discovery found, a line, where it was done. whole:
-    whether `state` is that of a whole step, which it also is where `step` raised an error before anything that lasts
-    had changed.
+    Attributes:
+        scene: as the last step left it.
+        config: the configuration, suited to the data, with the decoder's place chosen.
+        given: the same before it was suited to the data, which config.toml holds.
+        dataset: its test views are not touched by any step.
+        parts: own field, losses, density control, learning rates and callbacks.
+        done: number of the steps so far.
+        callbacks: a list of functions of the trainer and the StepResult, called after each step.
+        discovery: what motion discovery found, a line; None where it was not done.
+        decoder: where the field's decoder runs, and why.
+        ranks: this process among those that train together.
+        whole: whether `state` is that of a whole step, which it also is where `step` raised an error before anything
+            that lasts had changed.
     """
 
     def __init__(
@@ -213,7 +221,7 @@ class Trainer:
         return InitialView((data.test or data.train)[0].camera, data.focus, data.up, len(data.times))
 
     def save(self, path: str | Path) -> None:
-        """Write the scene as a checkpoint (docs/format.md), which lapgs-view and `load` open. Raises InputError."""
+        """Write a checkpoint (docs/format.md) to `path`, which lapgs-view and `load` open. Raises InputError."""
         data, view = self.dataset, self.initial_view.to_json()
         metadata = {"scene": data.name, "background": self.config.data.background, "step": str(self.done), "view": view}
         if data.normalization is not None:

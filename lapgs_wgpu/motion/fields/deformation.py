@@ -30,10 +30,14 @@ class Nearby(NamedTuple):
 class Deformation(NamedTuple):
     """Changes of N Gaussians at a time. None: no change.
 
-    rotation: (N, 4) unit quaternions wxyz, which rotate the means about the origin. translation: (N, 3), added to the
-    rotated means. d_quats (N, 4), d_scales (N, 3): added to unit quaternions and to scales. d_dc: (N, 3), added to the
-    constant part of the colors. d_opacity: (N,), added to the opacity logits. smoothness: the weighted smoothness loss,
-    a scalar; None if it was not requested.
+    Attributes:
+        rotation: (N, 4) unit quaternions wxyz, which rotate the means about the origin.
+        translation: (N, 3) added to the rotated means, world units.
+        d_quats: (N, 4) added to the Gaussians' unit quaternions, which are normalized again.
+        d_scales: (N, 3) added to the scales (standard deviations, world units).
+        d_dc: (N, 3) added to the constant part of the colors (spherical harmonics, degree 0).
+        d_opacity: (N,) added to the opacity logits.
+        smoothness: scalar, the weighted smoothness loss; None if it was not requested.
     """
 
     rotation: Tensor | None = None
