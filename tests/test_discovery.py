@@ -22,7 +22,7 @@ from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.discovery.discover import density_at, discover, explained_share, lost_tracks
-from lapgs_wgpu.train.discovery.field_fit import fit_field
+from lapgs_wgpu.train.discovery.field_fit import fit_field, keeping_rates
 from lapgs_wgpu.train.discovery.residual import Residual, moving_pixels
 from lapgs_wgpu.train.discovery.static_fit import small_view, static_config, static_fit
 from lapgs_wgpu.train.discovery.surface_points import PointClouds, Points, surface_points
@@ -378,6 +378,20 @@ def test_discovery_starts_a_training_with_what_moves(dataset: Dataset, device: D
     with closing(Trainer(config, dataset, device, resumed=True)) as resumed:
         resumed.restore(state)
         assert int(resumed.state()["training.warm_up"]) == 0
+
+
+def test_a_field_that_knows_the_tracks_learns_slowly_also_when_resumed(dataset: Dataset, device: Device) -> None:
+    config = configure()
+    assert config.rates.mlp.start > keeping_rates(["mlp"])["mlp"]
+    with closing(Trainer(config, dataset, device)) as training:
+        assert training._optimizer.highest == keeping_rates(["hash", "mlp"])
+        state = training.state()
+    with closing(Trainer(config, dataset, device, resumed=True)) as resumed:
+        assert resumed._optimizer.highest == {}
+        resumed.restore(state)
+        assert resumed._optimizer.highest == keeping_rates(["hash", "mlp"])
+    with closing(Trainer(configure(discovery__least="1"), dataset, device)) as training:
+        assert training._optimizer.highest == {}  # nothing was added
 
 
 def test_without_parts_to_follow_the_static_fit_starts_a_training(dataset: Dataset, device: Device) -> None:

@@ -53,6 +53,15 @@ def test_step_is_adam_at_the_rate_of_the_step() -> None:
     assert torch.allclose(gaussians["means"], expected, atol=1e-7)
 
 
+def test_no_rate_exceeds_the_highest_one_of_its_group() -> None:
+    gaussians, mlp, optimiser = make()
+    optimiser.highest = {"mlp": 0.1 * RATES["mlp"].at(1)}
+    means, weights = gaussians["means"].detach().clone(), mlp.detach().clone()
+    run(optimiser, gaussians, mlp, range(1, 2), torch.arange(6.0))
+    assert torch.allclose(gaussians["means"], means - RATES["means"].at(1) * means.sign(), atol=1e-7)
+    assert torch.allclose(mlp, weights - 0.1 * RATES["mlp"].at(1) * weights.sign(), atol=1e-7)
+
+
 def test_what_a_step_writes_is_counted() -> None:
     """By which a viewer sees that a parameter has changed."""
     gaussians, mlp, optimiser = make()

@@ -39,6 +39,7 @@ from lapgs_wgpu.train.densify import (
     reset_opacities,
 )
 from lapgs_wgpu.train.discovery.discover import discover
+from lapgs_wgpu.train.discovery.field_fit import keeping_rates
 from lapgs_wgpu.train.distributed import SINGLE_PROCESS, Ranks
 from lapgs_wgpu.train.evaluate import evaluate
 from lapgs_wgpu.train.exposure import Exposures
@@ -131,10 +132,11 @@ class Trainer:
         self.ranks = ranks
         self.done = 0
         self.discovery: str | None = None
+        self._field_fitted = False  # by discovery
         if scene is None and not resumed and _discovers(config):
             with open(os.devnull, "w") as nowhere:
                 found = discover(config, dataset, device, Trainer, None if ranks.first else nowhere, parts.field)
-            scene, self.discovery = found.scene, found.summary
+            scene, self._field_fitted, self.discovery = found
         self._generator = torch.Generator().manual_seed(config.seed)
         # What discovery found moves from the first step on, at rates that rise: Adam's first steps, all of the size of
         # the rate, would shake off what the field knows.
@@ -169,6 +171,7 @@ class Trainer:
                     else f"Parts(rates=...) names {name}, which is no group of parameters; there are {known}."
                 )
         self._optimizer = Optimizer(scene.parameters, groups, rates)
+        self._keep_field(fitted=self._field_fitted)
         self._frequencies = None
         if scene.spectrum is not None:
             limit = len(dataset.times) / 2
@@ -188,6 +191,12 @@ class Trainer:
         self._health = Health()
         data = config.data
         self._pictures = Pictures(dataset.train, data.background, data.cache_gb, self._generator, scene.device)
+
+    def _keep_field(self, *, fitted: bool) -> None:
+        """Hold the field's learning rates low where discovery has fitted it to tracks."""
+        self._field_fitted = fitted
+        field = self.scene.field
+        self._optimizer.highest = keeping_rates(field.parameter_groups()) if fitted and field else {}
 
     def close(self) -> None:
         """End what goes on beside the steps."""
@@ -427,6 +436,7 @@ class Trainer:
             "training": {
                 "done": torch.tensor(self.done),
                 "warm_up": torch.tensor(self._warm_up),
+                "field_fitted": torch.tensor(int(self._field_fitted)),
                 "sh_degree": torch.tensor(scene.sh_degree),
                 "random": self._generator.get_state(),
                 "order": torch.tensor(self._pictures.order, dtype=torch.int64),
@@ -461,6 +471,7 @@ class Trainer:
         own = parts["training"]
         self.done, scene.sh_degree = int(own["done"]), int(own["sh_degree"])
         self._warm_up = int(own.get("warm_up", self._warm_up))  # older states lack it
+        self._keep_field(fitted=bool(own.get("field_fitted", False)))
         self._generator.set_state(own["random"])
         self._pictures.order = own["order"].tolist()
 

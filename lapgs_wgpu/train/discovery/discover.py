@@ -41,9 +41,10 @@ SHOWN = 2.0 / 255  # least difference from the background of an image that shows
 
 
 class Discovery(NamedTuple):
-    """scene: to start from. summary: what was found, a line."""
+    """scene: to start from. moving: whether its field moves Gaussians. summary: what was found, a line."""
 
     scene: Scene4D
+    moving: bool
     summary: str
 
 
@@ -94,7 +95,9 @@ def discover(
         scene.parameters[name] = torch.nn.Parameter(values.detach()[order])
     meter.clear()
     seconds = time.perf_counter() - started
-    return Discovery(scene, f"discovery: a static fit of {len(static)} Gaussians; {found}; {seconds:.0f} s")
+    return Discovery(
+        scene, tracks is not None, f"discovery: a static fit of {len(static)} Gaussians; {found}; {seconds:.0f} s"
+    )
 
 
 def lost_tracks(tracks: Tracks, static: Scene4D) -> Tracks | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 import torch
@@ -16,6 +16,7 @@ from .tracks import Tracks
 
 STILL = 300  # Gaussians of the static fit that a step asks to stay where they are
 HASH_RATE, MLP_RATE = 1e-2, 2e-3  # learning rates, as in the preset tiny
+KEEPING = 0.25  # of these rates, at most, at which a training goes on; at higher ones Adam's noise undoes the fit
 LAST = 0.05  # of the learning rates, in the end; they fall over the second half
 SHAPE_WEIGHT = 0.1  # of changes of scales and quaternions, which the tracks do not know
 SOFTENING = 1e-2  # world units; distances below count as squares
@@ -37,7 +38,7 @@ def fit_field(
     field = scene.field
     assert field is not None
     groups = field.parameter_groups()
-    rates = {name: HASH_RATE if name == "hash" else MLP_RATE for name in groups}
+    rates = _rates(groups)
     optimizer = torch.optim.Adam(
         [{"params": parameters, "lr": rates[name]} for name, parameters in groups.items()], eps=ADAM_EPS, fused=True
     )
@@ -72,6 +73,15 @@ def fit_field(
     optimizer.zero_grad()
     last = errors[-max(1, len(errors) // 10) :]
     return float(np.mean(last)) if last else 0.0
+
+
+def keeping_rates(groups: Iterable[str]) -> dict[str, float]:
+    """The highest learning rate of each group of a field's parameters at which it keeps what it learned here."""
+    return {name: KEEPING * rate for name, rate in _rates(groups).items()}
+
+
+def _rates(groups: Iterable[str]) -> dict[str, float]:
+    return {name: HASH_RATE if name == "hash" else MLP_RATE for name in groups}
 
 
 def _mean_distance(squared: Tensor, weights: Tensor) -> float:
