@@ -39,7 +39,7 @@ def test_gradients_of_a_step_are_the_mean_over_its_views(
         monkeypatch.setattr(training._optimizer, "step", lambda step, share: None)
         training.step()
         gradients = {name: [g.clone() for g in group] for name, group in training._gradients().items()}
-        found.append((gradients, training._statistics.gradients.clone()))
+        found.append((gradients, training._density.statistics.gradients.clone()))
         training.close()
     (first, seen_first), (second, seen_second), (both, seen_both) = found
     for name, group in both.items():

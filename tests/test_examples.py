@@ -34,9 +34,7 @@ def test_train(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     assert (tmp_path / "scene.ply").stat().st_size > 1e5
 
 
-def test_own_field(
-    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
+def test_own_field(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
     assert run("own_field", data, tmp_path, monkeypatch) > 10
     moved = float(capsys.readouterr().out.split("moves by ")[1].split()[0])
     assert 0 < moved < 5
