@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import subprocess
 import sys
@@ -196,7 +197,10 @@ def test_results_compare_with_themselves(results: dict, file: Path) -> None:
     assert "*" not in table.split("\n", 1)[1]
 
 
-def test_a_comparison_tells_what_is_worse(tmp_path: Path) -> None:
+def test_a_comparison_tells_what_is_worse(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(BENCH)
+    compare = importlib.import_module("compare").compare
+
     def write(name: str, adapter: str, **medians: tuple[float, float, float]) -> Path:
         times = {key: dict(zip(("low", "median", "high"), values, strict=True)) for key, values in medians.items()}
         passes = {shader: {"milliseconds": time} for shader, time in times.items()}
@@ -208,7 +212,7 @@ def test_a_comparison_tells_what_is_worse(tmp_path: Path) -> None:
         "old.json", "one", sort=(1, 2, 3), duplicate_with_keys=(1.9, 2, 2.1), tile_ranges=(1, 1, 1), gone=(1, 1, 1)
     )
     new = write("new.json", "two", sort=(2, 3, 4), duplicate_with_keys=(3.8, 4, 4.2), tile_ranges=(0.4, 0.5, 0.6))
-    lines = bench("--compare", old, new).splitlines()
+    lines = compare(old, new).splitlines()
     assert lines[0] == "adapter: one -> two"
     assert [line.split()[:3] for line in lines[2:5]] == [["raster", "/", "a"]] * 3
     assert [line.split()[4:] for line in lines[2:5]] == [

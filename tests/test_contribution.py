@@ -14,7 +14,7 @@ from helpers.scene_files import moving_scene
 
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.train import trainer
+from lapgs_wgpu.train import density_control, trainer
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.contribution import MOST_VIEWS, contributions, spread_over_time
 from lapgs_wgpu.train.presets import load_config
@@ -61,14 +61,14 @@ def pruning_config(**changes: float) -> Config:
 
 
 def test_training_prunes_what_hardly_shows(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(trainer, "LEAST_KEPT", 1)
+    monkeypatch.setattr(density_control, "LEAST_KEPT", 1)
     found: list[torch.Tensor] = []
 
     def noted(*arguments: Any, **options: Any) -> torch.Tensor:
         found.append(contributions(*arguments, **options))
         return found[-1]
 
-    monkeypatch.setattr(trainer, "contributions", noted)
+    monkeypatch.setattr(density_control, "contributions", noted)
     dataset = Dataset("made up", tuple(views(4)), ())
 
     def trained(least: float) -> int:

@@ -3,6 +3,7 @@ put together in the order of their numbers, so that all take the same step, and 
 
 from __future__ import annotations
 
+import atexit
 import functools
 import os
 from collections.abc import Sequence
@@ -62,4 +63,6 @@ def join_ranks() -> Ranks:
         raise InputError("this torch lacks torch.distributed, so several processes cannot train together.")
     if not distributed.is_initialized():
         distributed.init_process_group("gloo")
+        # Otherwise gloo's threads may still run when Python ends, and abort the process.
+        atexit.register(distributed.destroy_process_group)
     return Ranks(distributed.get_rank(), distributed.get_world_size(), int(os.environ["LOCAL_RANK"]))

@@ -53,6 +53,13 @@ def describe(kind: str, group: Tensors) -> list[str]:
     return found
 
 
+def cause(loss: float, terms: Sequence[Mapping[str, float]], gradients: Tensors) -> str:
+    """What is not finite in a step: of its loss, of the terms of each view's loss, of its gradients."""
+    bad = [f"the loss term {name} is {value}" for of in terms for name, value in of.items() if not math.isfinite(value)]
+    bad = bad or ([] if math.isfinite(loss) else [f"the loss is {loss}"])
+    return "; ".join([*bad, *describe("gradient", gradients)] or ["the gradients together are too large"])
+
+
 class Health:
     """Counts the steps that were skipped."""
 

@@ -24,20 +24,12 @@ from lapgs_wgpu.motion.fields.deformation import Nearby
 from lapgs_wgpu.motion.fields.dynamics import dynamics_loss
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.scene import Scene4D
-from lapgs_wgpu.splat.morton import morton_order
 from lapgs_wgpu.train.autotune import choose_decoder
 from lapgs_wgpu.train.camera_refinement import CameraRefinement
-from lapgs_wgpu.train.config import Config, SmoothnessConfig
-from lapgs_wgpu.train.contribution import contributions, spread_over_time
+from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.dataloader import Pictures
-from lapgs_wgpu.train.densify import (
-    LEAST_KEPT,
-    DensityState,
-    Statistics,
-    check_change,
-    largest,
-    reset_opacities,
-)
+from lapgs_wgpu.train.densify import Statistics
+from lapgs_wgpu.train.density_control import DensityControl
 from lapgs_wgpu.train.discovery.discover import discover
 from lapgs_wgpu.train.discovery.field_fit import keeping_rates
 from lapgs_wgpu.train.distributed import SINGLE_PROCESS, Ranks
@@ -46,10 +38,11 @@ from lapgs_wgpu.train.exposure import Exposures
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
 from lapgs_wgpu.train.initial_points import initial_points
 from lapgs_wgpu.train.loss_terms import Regularizer, check_terms, weight_at
-from lapgs_wgpu.train.nonfinite import Health, Skipped, check_parameters, describe, finite
+from lapgs_wgpu.train.nonfinite import Health, Skipped, cause, check_parameters, finite
 from lapgs_wgpu.train.open_dataset import open_dataset, with_folder
 from lapgs_wgpu.train.optimizer import FrequencyOptimizer, Optimizer
 from lapgs_wgpu.train.parts import Parts
+from lapgs_wgpu.train.smoothness import draw_nearby
 from lapgs_wgpu.train.step_result import StepResult
 from lapgs_wgpu.train.suited import suited
 
@@ -184,9 +177,10 @@ class Trainer:
             self._cameras = CameraRefinement(dataset.cameras, self._extent, config.cameras)
         beside = (self._frequencies, self._exposures, self._cameras)
         self._beside = [each for each in beside if each is not None]
-        self._scored = spread_over_time(dataset.train)
+        self._density = DensityControl(
+            config, scene, self._optimizer, self.parts.density, dataset.train, self._extent, self._generator
+        )
         self._numbers = {view.name: number for number, view in enumerate(dataset.train)}
-        self._statistics = Statistics.zeros(len(scene), scene.parameters["means"].device)
         self._scales = scene.parameters["log_scales"].detach().exp()
         self._health = Health()
         data = config.data
@@ -266,7 +260,7 @@ class Trainer:
         looks = [_Look(*each, self._nearby(each[0]) if moving else None) for each in chosen]
 
         self._zero_grad()
-        seen = Statistics.zeros(len(scene), scene.parameters["means"].device)
+        seen = self._density.nothing_seen()
         renderings, totals = [], Counter[str]()
         for look in looks[ranks.rank :: ranks.count]:
             loss, rendering, terms = self._loss(look, moving)
@@ -289,11 +283,11 @@ class Trainer:
                 beside.step(step)
             # After the optimiser's step, so that no gradient is lost with the rows that change.
             if step < config.density.stop:
-                self._statistics.merge(self._seen_by_all(seen))
+                self._density.statistics.merge(self._seen_by_all(seen))
         else:
             self._generator.set_state(drawn)
             self._zero_grad()
-        self._change_density(step)
+        self._density.change(step, moving=moving)
         if step % config.schedule.sh_interval == 0:
             scene.sh_degree = min(scene.sh_degree + 1, MAX_SH_DEGREE)
         self.done = step
@@ -375,46 +369,7 @@ class Trainer:
         self.whole = False
         check_parameters(parameters)
         self.whole = True
-        terms = [
-            f"the loss term {name} is {value}"
-            for each in renderings
-            for name, value in each.terms.items()
-            if value - value != 0
-        ]
-        terms = terms or ([] if math.isfinite(loss) else [f"the loss is {loss}"])
-        what = [*terms, *describe("gradient", gradients)] or ["the gradients together are too large"]
-        return Skipped(step, views, "; ".join(what))
-
-    def _change_density(self, step: int) -> None:
-        density, scene = self.config.density, self.scene
-        if density.prunes_at(step, self.config.schedule.steps):
-            self._prune_hidden(step)
-        if density.changes_at(step):
-            rows = {name: row.detach() for name, row in scene.parameters.items()}
-            change = self.parts.density(
-                DensityState(step, rows, self._statistics, density, self._extent, self._generator)
-            )
-            check_change(change, rows)
-            if not change.keep.any() and len(change.added["means"]) == 0:
-                raise InputError(
-                    f"density control leaves no Gaussian at step {step}; raise density.max_world_size or "
-                    "density.max_screen_radius (0 switches these two off)."
-                )
-            self._optimizer.edit_rows(change.keep, change.added)
-            self._optimizer.reorder(morton_order(scene.parameters["means"].detach()))
-            self._statistics = Statistics.zeros(len(scene), scene.parameters["means"].device)
-        if density.resets_at(step):
-            logits = reset_opacities(scene.parameters["opacity_logits"], density.reset_opacity)
-            self._optimizer.reset("opacity_logits", logits)
-
-    def _prune_hidden(self, step: int) -> None:
-        """Prune the Gaussians that contribute too little to all images."""
-        scene = self.scene
-        most = contributions(scene, self._scored, moving=step > self._warm_up)
-        keep = (most >= self.config.density.min_contribution) | largest(most, LEAST_KEPT)
-        if not keep.all():
-            self._optimizer.edit_rows(keep, {name: row[:0] for name, row in scene.parameters.items()})
-            self._statistics = self._statistics.of(keep)
+        return Skipped(step, views, cause(loss, [each.terms for each in renderings], gradients))
 
     def camera_report(self) -> dict[str, Any] | None:
         """How far the training cameras were moved (`CameraRefinement.report`); None where they are kept."""
@@ -432,7 +387,7 @@ class Trainer:
             "frequencies": self._frequencies.state() if self._frequencies else {},
             "exposure": self._exposures.state() if self._exposures else {},
             "cameras": self._cameras.state() if self._cameras else {},
-            "statistics": vars(self._statistics),
+            "statistics": vars(self._density.statistics),
             "training": {
                 "done": torch.tensor(self.done),
                 "warm_up": torch.tensor(self._warm_up),
@@ -467,7 +422,7 @@ class Trainer:
             self._exposures.restore(parts["exposure"])
         if self._cameras is not None:
             self._cameras.restore(parts["cameras"])
-        self._statistics = Statistics(**parts["statistics"])
+        self._density.statistics = Statistics(**parts["statistics"])
         own = parts["training"]
         self.done, scene.sh_degree = int(own["done"]), int(own["sh_degree"])
         self._warm_up = int(own.get("warm_up", self._warm_up))  # older states lack it
@@ -480,14 +435,3 @@ def _discovers(config: Config) -> bool:
     """Whether a training of this configuration starts with motion discovery."""
     wanted = config.discovery.enabled and config.field.kind != "static"
     return wanted and config.schedule.steps > config.discovery.steps
-
-
-def draw_nearby(config: SmoothnessConfig, count: int, t: float, generator: torch.Generator) -> Nearby | None:
-    """Where the field of `count` Gaussians is compared with itself in a step at time t; None where it is not."""
-    chosen = round(config.share * count)
-    if chosen == 0 or config.static == config.temporal == 0:
-        return None
-    rows = torch.randint(count, (chosen,), generator=generator)
-    offsets = config.reach * (2 * torch.rand(chosen, 3, generator=generator) - 1)
-    other = t + config.time_reach * (2 * float(torch.rand((), generator=generator)) - 1)
-    return Nearby(rows, offsets, min(max(other, 0.0), 1.0), config.static, config.temporal)

@@ -1,0 +1,86 @@
+"""Density control of a training: the statistics that it gathers, and the changes that it makes after steps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+
+from lapgs_wgpu.data.views import View
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.motion.scene import Scene4D
+from lapgs_wgpu.splat.morton import morton_order
+from lapgs_wgpu.train.config import Config
+from lapgs_wgpu.train.contribution import contributions, spread_over_time
+from lapgs_wgpu.train.densify import (
+    LEAST_KEPT,
+    DensityRule,
+    DensityState,
+    Statistics,
+    check_change,
+    largest,
+    reset_opacities,
+)
+from lapgs_wgpu.train.optimizer import Optimizer
+
+
+class DensityControl:
+    """Clones, splits, prunes and dims the Gaussians of a scene at the steps that the configuration plans.
+
+    statistics: of the Gaussians since the last change of their number.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        scene: Scene4D,
+        optimizer: Optimizer,
+        rule: DensityRule,
+        views: Sequence[View],
+        extent: float,
+        generator: torch.Generator,
+    ) -> None:
+        self._config, self._last = config.density, config.schedule.steps
+        self._scene, self._optimizer, self._rule = scene, optimizer, rule
+        self._views, self._extent, self._generator = spread_over_time(views), extent, generator
+        self.statistics = self.nothing_seen()
+
+    def nothing_seen(self) -> Statistics:
+        """Statistics of the Gaussians as they are now, before any view."""
+        return Statistics.zeros(len(self._scene), self._scene.parameters["means"].device)
+
+    def change(self, step: int, *, moving: bool) -> None:
+        """Make the changes that are planned after this step (counted from 1), with the optimizer's state.
+
+        moving: whether the field moves the Gaussians. Raises InputError where no Gaussian would be left.
+        """
+        if self._config.prunes_at(step, self._last):
+            self._prune_hidden(moving)
+        if self._config.changes_at(step):
+            self._apply_rule(step)
+        if self._config.resets_at(step):
+            logits = reset_opacities(self._scene.parameters["opacity_logits"], self._config.reset_opacity)
+            self._optimizer.reset("opacity_logits", logits)
+
+    def _apply_rule(self, step: int) -> None:
+        scene = self._scene
+        rows = {name: row.detach() for name, row in scene.parameters.items()}
+        state = DensityState(step, rows, self.statistics, self._config, self._extent, self._generator)
+        change = self._rule(state)
+        check_change(change, rows)
+        if not change.keep.any() and len(change.added["means"]) == 0:
+            raise InputError(
+                f"density control leaves no Gaussian at step {step}; raise density.max_world_size or "
+                "density.max_screen_radius (0 switches these two off)."
+            )
+        self._optimizer.edit_rows(change.keep, change.added)
+        self._optimizer.reorder(morton_order(scene.parameters["means"].detach()))
+        self.statistics = self.nothing_seen()
+
+    def _prune_hidden(self, moving: bool) -> None:
+        """Prune the Gaussians that contribute too little to all images."""
+        most = contributions(self._scene, self._views, moving=moving)
+        keep = (most >= self._config.min_contribution) | largest(most, LEAST_KEPT)
+        if not keep.all():
+            self._optimizer.edit_rows(keep, {name: row[:0] for name, row in self._scene.parameters.items()})
+            self.statistics = self.statistics.of(keep)
