@@ -20,7 +20,8 @@ from .trajectories import Trajectory, find_trajectories, time_step
 KEY_TIMES = 4  # from which is tracked, at most
 LEAST_REST = 0.05  # share of the points without a track that is worth another key time
 ROUGH, FINE = 150, 300  # points of a key time: when first followed, and with the points of all times brought there
-MANY = 0.75  # quantile, over the times, of how many parts are apart
+MANY = 0.65  # quantile, over the times, of how many parts are apart
+LARGE = 0.1  # share of a time's points, from which on a part counts among them
 PROBES = 300  # points of a time by which parts are counted, at most
 # In half sides of the box, 1.3 in the presets:
 VOXEL = 0.045  # spacing of a track's points
@@ -98,7 +99,7 @@ def find_tracks(clouds: PointClouds, half_side: float) -> Tracks | None:
 
 
 def _key_time(clouds: list[Points], half_side: float) -> int | None:
-    """The time of most points among those at which as many parts are apart as nearly ever."""
+    """The time of most points among those at which many parts are apart."""
     some = [points.thinned(PROBES) for points in clouds]
     parts = np.array([_count_parts(_merged(some, i), half_side) for i in range(len(clouds))])
     if not parts.any():
@@ -119,7 +120,8 @@ def _merged(clouds: list[Points], i: int) -> Points:
 def _count_parts(points: Points, half_side: float) -> int:
     if len(points.scores) < LEAST_PART:
         return 0
-    return int((np.bincount(parts_of(points.positions, LINK * half_side)) >= LEAST_PART).sum())
+    sizes = np.bincount(parts_of(points.positions, LINK * half_side))
+    return int((sizes >= max(LEAST_PART, LARGE * len(points.scores))).sum())
 
 
 def _voxels(points: Points, size: float, least: int) -> Points:
