@@ -187,7 +187,7 @@ class Trainer:
         self._pictures = Pictures(dataset.train, data.background, data.cache_gb, self._generator, scene.device)
 
     def _keep_field(self, *, fitted: bool) -> None:
-        """Hold the field's learning rates low where discovery has fitted it to tracks."""
+        """Hold the field's learning rates low where discovery has fitted it to nearly all that moves."""
         self._field_fitted = fitted
         field = self.scene.field
         self._optimizer.highest = keeping_rates(field.parameter_groups()) if fitted and field else {}

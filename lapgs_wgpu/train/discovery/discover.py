@@ -37,14 +37,15 @@ PROBES = 24  # of a part's points that are looked at, about
 BLOCK = 256  # points whose densities are computed together
 OPAQUE = 0.1  # least opacity of a Gaussian of the static fit that is looked at
 NEAR = 0.1  # box half sides; distance within which a track explains a surface point
+NEARLY_ALL = 0.8  # share of the surface points that tracks explain, above which the field has little left to learn
 SHOWN = 2.0 / 255  # least difference from the background of an image that shows something
 
 
 class Discovery(NamedTuple):
-    """scene: to start from. moving: whether its field moves Gaussians. summary: what was found, a line."""
+    """scene: to start from. fitted: whether its field knows nearly all that moves. summary: what was found, a line."""
 
     scene: Scene4D
-    moving: bool
+    fitted: bool
     summary: str
 
 
