@@ -351,9 +351,12 @@ def test_address_and_script(window: Browser, page: Path, desktop: Desktop) -> No
     wait_for(lambda: window.value("lapgs.time") == 1 and not window.value("lapgs.playing"), 60, "the end")
     seen = window.value("seen")
     assert seen == sorted(seen)
+    window.value("lapgs.play()")  # again, from the start
+    wait_for(lambda: 0 < window.value("lapgs.time") < 1, 60, "the clip's start")
     window.value("location.hash = '#t=0.5'")
     wait_for(lambda: window.value("lapgs.time") == 0.5, 20, "the new address")
-    assert "Error" in window.value("(() => { try { lapgs.setTime('x') } catch (error) { return String(error) } })()")
+    for act in ("lapgs.setTime('x')", "lapgs.setCamera({ fovY: 4 })", "lapgs.setCamera({ position: [0, 1] })"):
+        assert "Error" in window.value(f"(() => {{ try {{ {act} }} catch (error) {{ return String(error) }} }})()")
 
 
 # Served, dropped, refused

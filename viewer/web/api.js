@@ -11,7 +11,7 @@ export function applyAddress(hash, { clock, backgrounds, setBackground }) {
     clock.fps = number("fps", 0.1, 1000) ?? clock.fps;
     if (clock.loops.includes(given.get("loop"))) clock.loop = given.get("loop");
     if (Object.hasOwn(backgrounds, given.get("background"))) setBackground(backgrounds[given.get("background")]);
-    clock.playing = given.has("play");
+    given.has("play") ? clock.play() : (clock.playing = false);
 }
 
 // What window.lapgs becomes once the scene is shown.
@@ -40,11 +40,12 @@ export function makeApi(state, viewport, wake) {
         },
         // World units, and the vertical field of view in radians; what is left out stays.
         setCamera({ position = state.camera.position, focus = state.camera.focus, fovY = state.camera.fovY }) {
-            state.camera.place({ position: finite(position, 3), focus: finite(focus, 3), fovY: finite([fovY], 1)[0] });
+            if (!(fovY > 0 && fovY < Math.PI)) throw new TypeError(`expected fovY between 0 and pi, got ${JSON.stringify(fovY)}`);
+            state.camera.place({ position: finite(position, 3), focus: finite(focus, 3), fovY });
             wake();
         },
         play() {
-            state.clock.playing = true;
+            state.clock.play();
             wake();
         },
         pause() {

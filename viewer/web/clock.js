@@ -16,9 +16,14 @@ export class Clock {
         this.time = Math.min(Math.max(time, 0), 1);
     }
 
-    toggle() {
-        this.playing = !this.playing;
+    // Play, from the start where the clip has ended; what has one moment only does not play.
+    play() {
+        this.playing = this.frames > 1;
         if (this.playing && this.loop === "once" && this.time >= 1) this.time = 0;
+    }
+
+    toggle() {
+        return this.playing ? (this.playing = false) : this.play();
     }
 
     step(frames) {

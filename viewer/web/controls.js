@@ -39,15 +39,12 @@ export class Controls {
         const { camera } = this.state;
         const [right, down] = [event.clientX - last[0], event.clientY - last[1]];
         const height = this.canvas.clientHeight;
-        if (this.pointers.size === 2) { // two fingers: pan by their middle, zoom by their distance
-            const before = this.spread();
-            this.pointers.set(event.pointerId, [event.clientX, event.clientY]);
-            camera.pan(0.5 * right / height, 0.5 * down / height);
-            camera.zoom(before / Math.max(this.spread(), 1));
-            return;
-        }
+        const before = this.pointers.size === 2 && this.spread();
         this.pointers.set(event.pointerId, [event.clientX, event.clientY]);
-        if (this.dragging === "orbit") camera.orbit(this.orbit * right, this.orbit * down);
+        if (before) { // two fingers: pan by their middle, zoom by their distance
+            camera.pan(0.5 * right / height, 0.5 * down / height);
+            camera.zoom(before / this.spread());
+        } else if (this.dragging === "orbit") camera.orbit(this.orbit * right, this.orbit * down);
         else if (this.dragging === "look") camera.look(this.look * right, this.look * down);
         else camera.pan(right / height, down / height);
     }

@@ -71,13 +71,10 @@ async function open(load, data) {
     let gpu;
     try {
         say("Loading");
+        gpu = await openGpu(data.kernels); // first: without WebGPU there is nothing to wait for
         const scene = await readScene(await load());
-        gpu = await openGpu(data.kernels);
         const next = await prepare(gpu, scene, data);
-        if (number !== wanted) {
-            gpu.device.destroy();
-            return;
-        }
+        if (number !== wanted) return gpu.device.destroy();
         shown?.();
         const { api, stop } = next();
         shown = stop;
@@ -124,7 +121,7 @@ function start(gpu, { scene, playback, rasterizer }, state, data) {
     const toggle = name => (find(name).hidden = !find(name).hidden);
     const setBackground = color => (state.background = color);
     const actions = {
-        toggle_playing: () => scene.field && clock.toggle(),
+        toggle_playing: () => clock.toggle(),
         previous_frame: () => clock.step(-1),
         next_frame: () => clock.step(1),
         first_frame: () => clock.seek(0),
@@ -166,7 +163,7 @@ function start(gpu, { scene, playback, rasterizer }, state, data) {
 
     async function tick(now) {
         if (signal.aborted) return;
-        const seconds = Math.min((now - last) / 1000, LONGEST_STEP);
+        const seconds = Math.min(Math.max(now - last, 0) / 1000, LONGEST_STEP); // the first frame may have begun earlier
         last = now;
         try {
             controls.advance(seconds);

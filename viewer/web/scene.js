@@ -63,7 +63,8 @@ function readField(text) {
     whole(temporal?.levels, "temporal.levels", 1, 64);
     whole(temporal.table_log2, "temporal.table_log2", 1, 24);
     for (const name of ["base", "finest"]) {
-        for (const axis of [0, 1, 2]) whole(temporal[name]?.[axis], `temporal.${name}`, 2, 65536);
+        if (!Array.isArray(temporal[name]) || temporal[name].length !== 3) throw damaged(`its temporal.${name} is no list of 3`);
+        for (const resolution of temporal[name]) whole(resolution, `temporal.${name}`, 2, 65536);
     }
     return {
         laplacian,

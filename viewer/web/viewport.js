@@ -78,7 +78,8 @@ export class Viewport {
             const { playback: { gpu }, rasterizer, canvas, state: { camera } } = this;
             await gpu.compile([rasterizer.depth]);
             const { image, camera: { width, height, focal, center } } = await this.drawWhole(1, true);
-            const [column, row] = [x * width / canvas.clientWidth, y * height / canvas.clientHeight].map(Math.floor);
+            const [column, row] = [[x / canvas.clientWidth, width], [y / canvas.clientHeight, height]] // a drag may end outside
+                .map(([share, size]) => Math.min(Math.max(Math.floor(share * size), 0), size - 1));
             const pixel = [3, 4].map(plane => part(image, 4 * ((plane * height + row) * width + column), 4));
             const [rest, depth] = new Float32Array(await new Commands(gpu).read(pixel));
             if (!(rest < 0.9)) return; // next to nothing is there
