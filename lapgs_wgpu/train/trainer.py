@@ -164,7 +164,7 @@ class Trainer:
                     else f"Parts(rates=...) names {name}, which is no group of parameters; there are {known}."
                 )
         self._optimizer = Optimizer(scene.parameters, groups, rates)
-        self._keep_field(fitted=self._field_fitted)
+        self._limit_field_rates(fitted=self._field_fitted)
         self._frequencies = None
         if scene.spectrum is not None:
             limit = len(dataset.times) / 2
@@ -186,7 +186,7 @@ class Trainer:
         data = config.data
         self._pictures = Pictures(dataset.train, data.background, data.cache_gb, self._generator, scene.device)
 
-    def _keep_field(self, *, fitted: bool) -> None:
+    def _limit_field_rates(self, *, fitted: bool) -> None:
         """Hold the field's learning rates low where discovery has fitted it to nearly all that moves."""
         self._field_fitted = fitted
         field = self.scene.field
@@ -426,7 +426,7 @@ class Trainer:
         own = parts["training"]
         self.done, scene.sh_degree = int(own["done"]), int(own["sh_degree"])
         self._warm_up = int(own.get("warm_up", self._warm_up))  # older states lack it
-        self._keep_field(fitted=bool(own.get("field_fitted", False)))
+        self._limit_field_rates(fitted=bool(own.get("field_fitted", False)))
         self._generator.set_state(own["random"])
         self._pictures.order = own["order"].tolist()
 

@@ -106,20 +106,20 @@ def _points(image: Residual, neighbors: list[_Neighbor], always: _Always, half_s
     places = eye + depths[..., None] * rays.directions[:, None]
     length = np.linalg.norm(rays.directions, axis=1, keepdims=True)
     spacing = float(np.median(length[:, 0] * (depths[:, 1] - depths[:, 0])))
-    votes, blurred, weights = np.zeros(depths.shape), np.zeros(depths.shape), np.zeros(depths.shape)
+    votes, tolerant, weights = np.zeros(depths.shape), np.zeros(depths.shape), np.zeros(depths.shape)
     for neighbor in neighbors:
         samples = neighbor.image.sample(places)
         apart = ((samples.colors - rays.blurred[:, None]) ** 2).sum(axis=2)
         agreement = 1.0 - COLOR_SHARE + COLOR_SHARE * np.exp(-apart / (2 * COLOR_SPREAD**2))
         vote = neighbor.weight * samples.mask * agreement
         votes += vote
-        blurred += _blurred(vote, neighbor.doubt(eye, half_side) / spacing)
+        tolerant += _blur_along_rays(vote, neighbor.doubt(eye, half_side) / spacing)
         weights += neighbor.weight * samples.inside
     known = np.clip((ALWAYS - always.at(places)) / ALWAYS_WIDTH, 0.0, 1.0) / np.maximum(weights, 1e-6)
     known[weights < 0.5 * sum(neighbor.weight for neighbor in neighbors)] = 0.0  # hardly seen by others
     scores = votes * known
     past_middle = (places * rays.directions[:, None]).sum(axis=2) / length
-    middle = _middle_of_best(blurred * known * np.exp(-0.5 * (past_middle / (MIDDLE * half_side)) ** 2))
+    middle = _middle_of_best(tolerant * known * np.exp(-0.5 * (past_middle / (MIDDLE * half_side)) ** 2))
     row = np.arange(len(scores))
     low = np.floor(middle).astype(np.int64)
     depth = depths[row, low] + (middle - low) * (depths[:, 1] - depths[:, 0])
@@ -128,7 +128,7 @@ def _points(image: Residual, neighbors: list[_Neighbor], always: _Always, half_s
     return Points(positions[kept].astype(np.float32), rays.colors[kept], scores.max(axis=1)[kept].astype(np.float32))
 
 
-def _blurred(votes: NDArray[np.floating], spread: float) -> NDArray[np.floating]:
+def _blur_along_rays(votes: NDArray[np.floating], spread: float) -> NDArray[np.floating]:
     """Votes (n, DEPTHS) along each ray, blurred by a Gaussian of this standard deviation, in depths."""
     if spread < 0.1:
         return votes
