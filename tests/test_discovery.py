@@ -405,6 +405,16 @@ def test_a_field_that_knows_the_tracks_learns_slowly_also_when_resumed(dataset: 
         assert training._optimizer.highest == {}  # nothing was added
 
 
+@pytest.mark.parametrize("nearly_all", [0.0, 1.01])
+def test_a_field_that_knows_nearly_all_that_moves_keeps_it(
+    dataset: Dataset, device: Device, monkeypatch: pytest.MonkeyPatch, nearly_all: float
+) -> None:
+    monkeypatch.setattr("lapgs_wgpu.train.discovery.discover.NEARLY_ALL", nearly_all)
+    found = discover(configure(discovery__field_steps="20"), dataset, device, Trainer)
+    assert "moving parts" in found.summary
+    assert found.fitted == (nearly_all == 0)
+
+
 def test_without_parts_to_follow_the_static_fit_starts_a_training(dataset: Dataset, device: Device) -> None:
     config = configure(discovery__least="1")
     static, _ = static_fit(config, dataset, device, Trainer, lambda step: None)

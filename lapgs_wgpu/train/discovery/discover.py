@@ -96,9 +96,8 @@ def discover(
         scene.parameters[name] = torch.nn.Parameter(values.detach()[order])
     meter.clear()
     seconds = time.perf_counter() - started
-    return Discovery(
-        scene, tracks is not None, f"discovery: a static fit of {len(static)} Gaussians; {found}; {seconds:.0f} s"
-    )
+    summary = f"discovery: a static fit of {len(static)} Gaussians; {found}; {seconds:.0f} s"
+    return Discovery(scene, tracks is not None and share >= NEARLY_ALL, summary)
 
 
 def lost_tracks(tracks: Tracks, static: Scene4D) -> Tracks | None:
