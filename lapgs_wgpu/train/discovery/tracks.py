@@ -20,12 +20,12 @@ from .trajectories import Trajectory, find_trajectories, time_step
 KEY_TIMES = 4  # from which is tracked, at most
 LEAST_REST = 0.05  # share of the points without a track that is worth another key time
 ROUGH, FINE = 150, 300  # points of a key time: when first followed, and with the points of all times brought there
-MANY = 0.65  # quantile, over the times, of how many parts are apart
-LARGE = 0.1  # share of a time's points, from which on a part counts among them
+MANY = (0.5, 0.75)  # quantiles, over the times, of how many parts are apart; each gives key times of its own
 PROBES = 300  # points of a time by which parts are counted, at most
 # In half sides of the box, 1.3 in the presets:
 VOXEL = 0.045  # spacing of a track's points
 REACH = 0.07  # distance within which a track explains a point
+CLOSE = 0.03  # standard deviation of the distance from a track, by which two sets of tracks are compared
 CALM = 0.02  # jitter of a part's center that is no leaping
 LEAST_SEEN = 0.4  # share of the times at which a part must be seen
 LEAST_VISIT = 0.2  # the same of a part that comes, stays and goes once
@@ -63,14 +63,36 @@ class Tracks(NamedTuple):
 
 def find_tracks(clouds: PointClouds, half_side: float) -> Tracks | None:
     """Tracks of the surface points of a clip; None where nothing can be followed. half_side: of the box that the
-    points lie in, world units."""
-    free = [np.ones(len(cloud.scores), bool) for cloud in clouds.clouds]
+    points lie in, world units.
+
+    Many parts are apart where things part, and also where one thing falls to patches. Which it is shows in how close
+    to all points the tracks come that start there.
+    """
     trajectories = find_trajectories(clouds, LINK * half_side, half_side)
+    found = [_tracks_by(many, clouds, trajectories, half_side) for many in MANY]
+    return max(found, key=lambda tracks: _closeness(clouds, tracks, half_side))
+
+
+def _closeness(clouds: PointClouds, tracks: Tracks | None, half_side: float) -> float:
+    """Of all points, how close they lie to the tracks, from 0 to their number."""
+    if tracks is None:
+        return 0.0
+    close = 0.0
+    for points, path in zip(clouds.clouds, tracks.paths, strict=True):
+        if len(points.scores):
+            distances = cKDTree(path).query(points.positions)[0]
+            close += float(np.exp(-0.5 * (distances / (CLOSE * half_side)) ** 2).sum())
+    return close
+
+
+def _tracks_by(many: float, clouds: PointClouds, trajectories: list[Trajectory], half_side: float) -> Tracks | None:
+    """The tracks from key times at which as many parts are apart as this quantile of all times has."""
+    free = [np.ones(len(cloud.scores), bool) for cloud in clouds.clouds]
     found: list[Tracks] = []
     steady: list[NDArray[np.bool_]] = []
     for _ in range(KEY_TIMES):
         rest = [Points(*(values[mask] for values in cloud)) for cloud, mask in zip(clouds.clouds, free, strict=True)]
-        key = _key_time(rest, half_side)
+        key = _key_time(rest, many, half_side)
         if sum(len(points.scores) for points in rest) < LEAST_REST * clouds.total or key is None:
             break
         weighted = [
@@ -98,16 +120,16 @@ def find_tracks(clouds: PointClouds, half_side: float) -> Tracks | None:
     return tracks.of_parts(np.concatenate(steady))
 
 
-def _key_time(clouds: list[Points], half_side: float) -> int | None:
+def _key_time(clouds: list[Points], many: float, half_side: float) -> int | None:
     """The time of most points among those at which many parts are apart."""
     some = [points.thinned(PROBES) for points in clouds]
     parts = np.array([_count_parts(_merged(some, i), half_side) for i in range(len(clouds))])
     if not parts.any():
         return None
-    many = int(np.quantile(parts[parts > 0], MANY))
+    usual = int(np.quantile(parts[parts > 0], many))
     mass = np.convolve([points.scores.sum() for points in clouds], np.ones(5), "same")[: len(clouds)]
     least = np.minimum(parts, np.minimum(np.append(parts[1:], parts[-1]), np.append(parts[0], parts[:-1])))
-    apart = (least >= many) & (parts <= many + 1)
+    apart = (least >= usual) & (parts <= usual + 1)
     return int(np.lexsort((mass, apart))[-1])
 
 
@@ -121,7 +143,7 @@ def _count_parts(points: Points, half_side: float) -> int:
     if len(points.scores) < LEAST_PART:
         return 0
     sizes = np.bincount(parts_of(points.positions, LINK * half_side))
-    return int((sizes >= max(LEAST_PART, LARGE * len(points.scores))).sum())
+    return int((sizes >= LEAST_PART).sum())
 
 
 def _voxels(points: Points, size: float, least: int) -> Points:
