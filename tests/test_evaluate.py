@@ -13,12 +13,13 @@ import torch
 from PIL import Image
 from scipy.signal import convolve2d
 
-from lapgs_wgpu.data.views import View
+from lapgs_wgpu import cli
+from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.safetensors_file import pack_tensors
 from lapgs_wgpu.motion.fields.config import FieldConfig
-from lapgs_wgpu.motion.scene import Scene4D
+from lapgs_wgpu.motion.scene import Scene4D, load
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.drawing import Drawing
 from lapgs_wgpu.splat.rasterizer import Rasterizer
@@ -314,3 +315,17 @@ def test_lpips_is_measured_where_there_are_weights(
     shown = View("a", large, 0.5, "a", lambda: 255 - drawn)
     metrics = evaluate(scene, [shown], "black", lpips=Lpips(network[0]))
     assert 0 < metrics["lpips"] != metrics["lpips_unscaled"] > 0
+
+
+def test_a_training_with_weights_measures_lpips_of_its_test_views(
+    data: Path, dataset: Dataset, device: Device, tmp_path: Path, network: tuple[Path, torch.nn.Sequential, Any]
+) -> None:
+    fast = ["--steps", "2", "--points.count", "50", "--field", "static"]
+    out = tmp_path / "run"
+    command = ["tiny", "--data", str(data), "--out", str(out), "--lpips-weights", str(network[0]), *fast]
+    assert cli.train_command(command) == 0
+    found = json.loads((out / "metrics.json").read_text())
+    expected = evaluate(load(out / "checkpoint.ply", device), dataset.test, "black", lpips=Lpips(network[0]))
+    for name in ("lpips", "lpips_unscaled"):
+        assert found[name] == pytest.approx(expected[name], rel=1e-4)
+        assert 0 < found["views"][0][name] != found["views"][1][name]
