@@ -283,6 +283,17 @@ def test_patches_that_come_and_go_are_not_followed() -> None:
     assert find_tracks(balls(leaping), BOX) is None
 
 
+def test_a_slow_ball_is_followed_though_its_points_jitter(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It jitters by more than it moves from time to time, as what leaps does, but always explains as many points."""
+    center = np.linspace([-0.5, 0, 0], [0.5, 0, 0], 120)
+    clouds = balls(center + 0.03 * np.random.default_rng(4).normal(size=center.shape))
+    tracks = find_tracks(clouds, BOX)
+    assert tracks is not None
+    assert errors(tracks, center).max() < 0.5
+    monkeypatch.setattr("lapgs_wgpu.train.discovery.tracks.EVEN", 0.0)
+    assert find_tracks(clouds, BOX) is None
+
+
 def test_the_same_points_give_the_same_tracks() -> None:
     clouds = balls(path(np.linspace(0, 1, 30)))
     one, other = find_tracks(clouds, BOX), find_tracks(clouds, BOX)

@@ -6,6 +6,7 @@ Points of a key time, at which things are apart, form parts. Each part is follow
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -31,6 +32,7 @@ LEAST_SEEN = 0.4  # share of the times at which a part must be seen
 LEAST_VISIT = 0.2  # the same of a part that comes, stays and goes once
 LEAPS = 1.7  # jitter of a part's center that is leaping, in steps of its smoothed path
 LEAP_SIZE = 0.28  # and in sizes of the part
+EVEN = 0.35  # variation of the number of points that a part explains, relative to their mean, of one thing
 EXPLAINED = 0.3  # weight of points that an earlier key time's tracks explain
 SMOOTHING = 2.0  # times; standard deviation of the weights by which paths are smoothed
 RIDGE = 1e-2  # of slope and curvature, which few times do not determine
@@ -103,7 +105,7 @@ def _tracks_by(many: float, clouds: PointClouds, trajectories: list[Trajectory],
         if followed is None:
             break
         found.append(followed[0])
-        steady.append(_steady(*followed, half_side))
+        steady.append(_steady(*followed, clouds.clouds, half_side))
         for mask, points, path in zip(free, clouds.clouds, followed[1], strict=True):
             if len(points.scores):
                 mask &= cKDTree(path).query(points.positions)[0] >= REACH * half_side
@@ -199,14 +201,16 @@ def _supported(paths: Floats, part: NDArray[np.int64], clouds: list[Points], hal
     return supported
 
 
-def _steady(tracks: Tracks, paths: Floats, half_side: float) -> NDArray[np.bool_]:
-    """(p,) whether a part is seen for long enough, and moves more from time to time than it jitters, or not at all.
+def _steady(tracks: Tracks, paths: Floats, clouds: Sequence[Points], half_side: float) -> NDArray[np.bool_]:
+    """(p,) whether a part is seen for long enough, and is one thing: it moves more from time to time than it jitters,
+    or not at all, or explains as many points at one time as at another.
 
     Patches of a thing that the static fit only blurs come and go; what is followed there leaps from one to the next, or
     waits for the next.
     paths: (T, n, 3), before they were smoothed.
     """
-    steady = np.zeros(int(tracks.part.max()) + 1, bool)
+    explained = _explained(paths, tracks.part, clouds, half_side)
+    steady = np.zeros(explained.shape[1], bool)
     for k in range(len(steady)):
         members = tracks.part == k
         seen = tracks.supported[:, members][:, 0]
@@ -219,8 +223,20 @@ def _steady(tracks: Tracks, paths: Floats, half_side: float) -> NDArray[np.bool_
         step = np.median(steps) if len(steps) else 0.0
         size = np.ptp(tracks.positions[members], axis=0).max()
         still = np.ptp(center[seen], axis=0).max() < 0.5 * size
-        steady[k] = still or jitter < max(min(LEAPS * step, LEAP_SIZE * size), CALM * half_side)
+        even = explained[seen, k].std() < EVEN * explained[seen, k].mean()
+        leaps = LEAP_SIZE * size if even else min(LEAPS * step, LEAP_SIZE * size)
+        steady[k] = still or jitter < max(leaps, CALM * half_side)
     return steady
+
+
+def _explained(paths: Floats, part: NDArray[np.int64], clouds: Sequence[Points], half_side: float) -> NDArray[np.int64]:
+    """(T, p) how many of the points of a time each part is the nearest to, and explains."""
+    counts = np.zeros((len(paths), int(part.max()) + 1), np.int64)
+    for count, path, points in zip(counts, paths, clouds, strict=True):
+        if len(points.scores):
+            distances, of = cKDTree(path).query(points.positions)
+            count += np.bincount(part[of[distances < REACH * half_side]], minlength=len(count))
+    return counts
 
 
 def _smoothed(
