@@ -142,6 +142,15 @@ def test_containers_that_are_refused(
         read_scene(path)
 
 
+def test_equal_values(tmp_path: Path) -> None:
+    """What deflate alone would shorten more than readers accept is stored in more bytes."""
+    values = np.zeros(10**6, np.uint8)
+    data = pack_lapgs({"a": values}, {})
+    assert 10**6 / 64 < len(data) < 10**6 / 4
+    (tmp_path / "a.lapgs").write_bytes(data)
+    assert (read_lapgs(tmp_path / "a.lapgs")[0]["a"] == values).all()
+
+
 def test_a_truncated_file(tmp_path: Path) -> None:
     data = pack_lapgs({"a": np.arange(1000, dtype=np.uint16)}, {"b": "c"})
     path = tmp_path / "a.lapgs"

@@ -39,11 +39,11 @@ function report(error, doing) {
     const reason = error instanceof Refusal ? error.message : `${doing} failed (${String(error.message).split("\n")[0].slice(0, 200)}): `
         + (graphics ? "try another browser or a newer driver." : "load the page again, or report this error.");
     say(reason);
-    tell("failed", reason);
+    tell({ lapgs: "failed", reason });
 }
 
 // The page in whose frame this one is.
-const tell = (lapgs, reason = "") => parent !== window && parent.postMessage({ lapgs, reason }, "*");
+const tell = message => parent !== window && parent.postMessage(message, "*");
 
 async function embedded() {
     const text = find("scene").textContent.trim();
@@ -83,7 +83,7 @@ async function open(load, data) {
         shown = stop;
         window.lapgs = api;
         say("");
-        tell("ready");
+        tell({ lapgs: "ready" });
     } catch (error) {
         gpu?.device.destroy();
         if (number === wanted) report(error, doing);
