@@ -32,7 +32,7 @@ def prepare_command(arguments: Sequence[str] | None = None) -> int:
     return guarded("lapgs-prepare", _prepare, list(sys.argv[1:] if arguments is None else arguments))
 
 
-def _options() -> Parser:
+def options() -> Parser:
     parser = Parser("lapgs-prepare", description=DESCRIPTION, formatter_class=HelpFormatter, allow_abbrev=False)
     # fmt: off
     add = parser.add_argument
@@ -56,8 +56,8 @@ def _options() -> Parser:
 
 
 def _prepare(arguments: list[str]) -> None:
-    given = _options().parse_args(arguments)
-    _check_options(given)
+    given = options().parse_args(arguments)
+    check_options(given)
     capture = Path(given.check or given.out)
     run = Path("runs", capture.resolve().name)
     if given.train and run.exists() and (not run.is_dir() or any(run.iterdir())):  # now, not after minutes of work
@@ -67,7 +67,7 @@ def _prepare(arguments: list[str]) -> None:
         _train(capture, run, given.minutes, diagnosis)
 
 
-def _check_options(given: argparse.Namespace) -> None:
+def check_options(given: argparse.Namespace) -> None:
     """Raises InputError for options that do not go together."""
     if given.check:
         others = [name for name in ("out", "fps", "size", "masks") if getattr(given, name) is not None]
