@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lapgs_wgpu.command import HelpFormatter, Parser, guarded
+from lapgs_wgpu.command import HelpFormatter, Parser, beside, guarded
 from lapgs_wgpu.errors import InputError
 
 if TYPE_CHECKING:
@@ -98,7 +98,7 @@ def _convert(given: argparse.Namespace, out: Path) -> Diagnosis:
     for measure in done.diagnosis.measures:
         if measure.good is False:
             print(measure, file=sys.stderr)
-    then = "" if given.train else f"; lapgs-train {done.preset} --data {done.folder}"
+    then = "" if given.train else f"; {beside('lapgs-train')} {done.preset} --data {done.folder}"
     print(f"{done.folder}: {done.images} images, {done.placed} of {done.cameras} cameras placed{then}", flush=True)
     return done.diagnosis
 
@@ -127,7 +127,7 @@ def _train(capture: Path, run: Path, minutes: float | None, diagnosis: Diagnosis
     print(plan.text, flush=True)
     train(plan.config, plan.dataset, run, device=device)
     print(result_text(run))
-    print(f"lapgs-view {run / 'checkpoint.ply'}")
+    print(f"{beside('lapgs-view')} {run / 'checkpoint.ply'}")
 
 
 if __name__ == "__main__":
