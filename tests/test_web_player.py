@@ -120,8 +120,8 @@ def test_three_times_and_two_cameras(browser: Browser, desktop: Desktop) -> None
 
 
 def test_a_trained_scene(window: Browser, folder: Path, device: Device) -> None:
-    """The preset demo: its first steps alone, unless LAPGS_SOAK is set. Where two of its Gaussians lie at one depth, the
-    last bit decides which is drawn first: that may be seen in a picture, not in many (docs/notes/web.md)."""
+    """The preset demo: its first steps alone, unless LAPGS_SOAK is set. Where two Gaussians lie at one depth, the last
+    bit decides which is drawn first: that may be seen in a picture, not in many (docs/notes/web.md)."""
     overrides = {} if "LAPGS_SOAK" in os.environ else {"schedule.steps": "200", "discovery.enabled": "false"}
     run = folder / "demo"
     config = with_folder(load_config("demo", {"data.path": "synthetic", **overrides}), folder)
