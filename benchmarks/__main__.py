@@ -41,7 +41,7 @@ from viewer import bench_viewer, print_viewer
 PARTS = ("raster", "encoder", "decoder", "losses", "step", "shares", "viewer")
 
 
-def main() -> None:
+def options() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python benchmarks", description=__doc__)
     parser.add_argument(
         "--scenes",
@@ -71,13 +71,18 @@ def main() -> None:
     parser.add_argument(
         "--save-scene", type=Path, metavar="FILE", help="write the first scene as .npz for other rasterisers, and stop"
     )
-    options = parser.parse_args()
-    if options.compare:
-        print(compare(*options.compare))
-    elif options.save_scene:
-        save_scene(options.save_scene, *options.scenes[0].make())
+    return parser
+
+
+def main() -> None:
+    parser = options()
+    given = parser.parse_args()
+    if given.compare:
+        print(compare(*given.compare))
+    elif given.save_scene:
+        save_scene(given.save_scene, *given.scenes[0].make())
     else:
-        run(options, parser)
+        run(given, parser)
 
 
 def run(options: argparse.Namespace, parser: argparse.ArgumentParser) -> None:

@@ -6,8 +6,10 @@
 from __future__ import annotations
 
 import argparse
+import shutil
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import NoReturn
 
 from lapgs_wgpu.errors import DeviceError, InputError, NoAdapterError, NumericalError
@@ -47,6 +49,11 @@ def guarded(name: str, command: Callable[[list[str]], int | None], arguments: li
         text, code = str(error) or "interrupted.", INTERRUPTED
     print(f"{name}: {text}", file=sys.stderr)
     return code
+
+
+def beside(name: str) -> str:
+    """How another of the commands is called: by its name where the shell finds it, otherwise as this one was."""
+    return name if shutil.which(name) else str(Path(sys.argv[0]).with_name(name))
 
 
 def print_devices() -> None:

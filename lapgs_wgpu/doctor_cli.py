@@ -23,10 +23,15 @@ def doctor_command(arguments: Sequence[str] | None = None) -> int:
     return guarded("lapgs-doctor", _doctor, list(sys.argv[1:] if arguments is None else arguments))
 
 
-def _doctor(arguments: list[str]) -> int:
+def options() -> Parser:
+    """The parser of the command line."""
     parser = Parser("lapgs-doctor", description=DESCRIPTION, formatter_class=HelpFormatter, allow_abbrev=False)
     parser.add_argument("--device", metavar="NAME", help=DEVICE_HELP)
-    given = parser.parse_args(arguments)
+    return parser
+
+
+def _doctor(arguments: list[str]) -> int:
+    given = options().parse_args(arguments)
     from lapgs_wgpu.doctor.report import Report
 
     report = Report(given.device)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lapgs_wgpu.command import HelpFormatter, Parser, guarded
+from lapgs_wgpu.command import HelpFormatter, Parser, beside, guarded
 from lapgs_wgpu.errors import InputError
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ def prepare_command(arguments: Sequence[str] | None = None) -> int:
     return guarded("lapgs-prepare", _prepare, list(sys.argv[1:] if arguments is None else arguments))
 
 
-def _options() -> Parser:
+def options() -> Parser:
     parser = Parser("lapgs-prepare", description=DESCRIPTION, formatter_class=HelpFormatter, allow_abbrev=False)
     # fmt: off
     add = parser.add_argument
@@ -56,8 +56,8 @@ def _options() -> Parser:
 
 
 def _prepare(arguments: list[str]) -> None:
-    given = _options().parse_args(arguments)
-    _check_options(given)
+    given = options().parse_args(arguments)
+    check_options(given)
     capture = Path(given.check or given.out)
     run = Path("runs", capture.resolve().name)
     if given.train and run.exists() and (not run.is_dir() or any(run.iterdir())):  # now, not after minutes of work
@@ -67,7 +67,7 @@ def _prepare(arguments: list[str]) -> None:
         _train(capture, run, given.minutes, diagnosis)
 
 
-def _check_options(given: argparse.Namespace) -> None:
+def check_options(given: argparse.Namespace) -> None:
     """Raises InputError for options that do not go together."""
     if given.check:
         others = [name for name in ("out", "fps", "size", "masks") if getattr(given, name) is not None]
@@ -98,7 +98,7 @@ def _convert(given: argparse.Namespace, out: Path) -> Diagnosis:
     for measure in done.diagnosis.measures:
         if measure.good is False:
             print(measure, file=sys.stderr)
-    then = "" if given.train else f"; lapgs-train {done.preset} --data {done.folder}"
+    then = "" if given.train else f"; {beside('lapgs-train')} {done.preset} --data {done.folder}"
     print(f"{done.folder}: {done.images} images, {done.placed} of {done.cameras} cameras placed{then}", flush=True)
     return done.diagnosis
 
@@ -127,7 +127,7 @@ def _train(capture: Path, run: Path, minutes: float | None, diagnosis: Diagnosis
     print(plan.text, flush=True)
     train(plan.config, plan.dataset, run, device=device)
     print(result_text(run))
-    print(f"lapgs-view {run / 'checkpoint.ply'}")
+    print(f"{beside('lapgs-view')} {run / 'checkpoint.ply'}")
 
 
 if __name__ == "__main__":

@@ -27,7 +27,8 @@ def table_command(arguments: Sequence[str] | None = None) -> int:
     return guarded("lapgs-table", _table, list(sys.argv[1:] if arguments is None else arguments))
 
 
-def _table(arguments: list[str]) -> int:
+def options() -> Parser:
+    """The parser of the command line."""
     parser = Parser("lapgs-table", description=DESCRIPTION, formatter_class=HelpFormatter, allow_abbrev=False)
     # fmt: off
     add = parser.add_argument
@@ -43,7 +44,11 @@ def _table(arguments: list[str]) -> int:
         "command continues it, also on another machine to which OUT was copied")
     add("--slim", action="store_true", help="delete checkpoint.ply and eval/ of each finished run, to save disk space")
     # fmt: on
-    given = parser.parse_args(arguments)
+    return parser
+
+
+def _table(arguments: list[str]) -> int:
+    given = options().parse_args(arguments)
     if given.spec and not given.out:
         raise InputError("name a folder for the runs and the table with --out.")
     if not given.spec and not given.known:

@@ -249,6 +249,14 @@ def test_ctrl_c_ends_with_130(
     assert capsys.readouterr().err == "lapgs-train: stopped after step 1 of 2.\n"
 
 
+def test_other_commands_are_named_so_that_they_can_be_called(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr(sys, "argv", [".venv/bin/lapgs-prepare"])
+    assert command.beside("lapgs-view") == str(Path(".venv/bin/lapgs-view"))
+    (tmp_path / "lapgs-view").touch(mode=0o755)
+    assert command.beside("lapgs-view") == "lapgs-view"
+
+
 def test_the_installed_command() -> None:
     command = [sys.executable, "-c", "import sys; from lapgs_wgpu.cli import train_command; sys.exit(train_command())"]
     done = subprocess.run([*command, "tinny", "--data", "x"], capture_output=True, text=True, timeout=120)

@@ -7,7 +7,12 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from helpers.scene_files import moving_scene
+
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.motion.fields.config import FieldConfig
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 ARGUMENTS = {
@@ -15,12 +20,16 @@ ARGUMENTS = {
     "own_field": ["--steps", "60"],
     "own_loss": ["--steps", "60"],
     "own_density": ["--steps", "230", "--budget", "4000"],
+    "render_path": ["--frames", "4", "--size", "48"],
+    "fit_image": ["--steps", "60", "--gaussians", "400", "--size", "48"],
+    "export_web": [],
 }
 
 
-def run(name: str, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+def run(name: str, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, option: str = "--data") -> Any:
+    """What an example's main returns. option: before `data`, a capture, an image or a checkpoint."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", [f"{name}.py", "--data", str(data), *ARGUMENTS[name]])
+    monkeypatch.setattr(sys, "argv", [f"{name}.py", *([option] if option else []), str(data), *ARGUMENTS[name]])
     return runpy.run_path(str(EXAMPLES / f"{name}.py"))["main"]()
 
 
@@ -47,3 +56,28 @@ def test_own_loss(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 def test_own_density(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert run("own_density", data, tmp_path, monkeypatch) <= 4000
+
+
+@pytest.fixture
+def checkpoint(device: Device, tmp_path: Path) -> Path:
+    moving_scene(device, FieldConfig(kind="grid4d", width=8)).save(tmp_path / "a.ply")
+    return tmp_path / "a.ply"
+
+
+def test_render_path(checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    frames = run("render_path", checkpoint, tmp_path, monkeypatch, option="")
+    assert [frame.size for frame in frames] == [(48, 48)] * 4
+    assert np.std(frames[0]) > 5
+    assert np.any(np.asarray(frames[0]) != frames[2])
+    assert (tmp_path / "path.webp").read_bytes()[:4] == b"RIFF"
+
+
+def test_fit_image(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    image = next((data / "train").glob("*.png"))
+    assert run("fit_image", image, tmp_path, monkeypatch, option="--image") > 20
+    assert (tmp_path / "fitted.png").is_file()
+
+
+def test_export_web(checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run("export_web", checkpoint, tmp_path, monkeypatch, option="")
+    assert "<title>scene</title>" in (tmp_path / "scene.html").read_text(encoding="utf-8")

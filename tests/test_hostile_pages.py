@@ -23,6 +23,7 @@ from hypothesis import given
 
 from lapgs_wgpu import Scene4D
 from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.io.lapgs_file import MAGIC, pack_lapgs
 from lapgs_wgpu.motion.playback.playback import DevicePlayback, open_playback
 from lapgs_wgpu.motion.scene_file import compact_bytes, read_scene
 from lapgs_wgpu.viewer.web_page import module_script
@@ -114,3 +115,22 @@ def test_names_that_every_object_has(page: Browser, files: list[bytes]) -> None:
         content = len(text).to_bytes(8, "little") + text + content[8 + length :]
         said = read(page, struct.pack("<8sIQ", files[2][:8], 1, len(content)) + zlib.compress(content))
         assert "is none that this page can evaluate" in said
+
+
+def test_files_that_unpack_to_too_much(page: Browser) -> None:
+    """A small file cannot fill the memory of who opens it."""
+    zeros = zlib.compress(bytes(2**26))
+    for size, packed, reason in (
+        (2**26, zeros, f"it declares {2**26} bytes in {len(zeros)} packed ones, which hold 64 times their number"),
+        (2**21, zeros, f"it unpacks to more than the {2**21} bytes that it declares"),
+        (1000, zeros, f"it has {20 + len(zeros)} bytes, more than the 1000 that it declares are packed into"),
+        (2**30 + 1, zeros, f"The scene unpacks to {2**30 + 1} bytes, and a page takes {2**30} at most"),
+    ):
+        assert reason in read(page, struct.pack("<8sIQ", MAGIC, 1, size) + packed)
+
+
+def test_a_scene_of_equal_values(page: Browser) -> None:
+    """Which deflate alone would shorten more than readers accept."""
+    data = pack_lapgs({"a": np.zeros(10**6, np.uint8)}, {"field": '{"kind": "static"}', "sh_degree": "0"})
+    assert len(data) > 10**6 / 64
+    assert "it holds no Gaussians" in read(page, data)  # and so was unpacked

@@ -11,6 +11,7 @@ import pytest
 from helpers.films import Board, drawn, walk
 from PIL import Image, ImageFilter
 
+from lapgs_wgpu.command import beside
 from lapgs_wgpu.prepare.diagnosis import Measure, blur, diagnose
 from lapgs_wgpu.prepare.report import write_report
 from lapgs_wgpu.prepare_cli import prepare_command
@@ -215,7 +216,7 @@ def test_train_goes_on_to_a_scene(
     assert "colors of each image corrected" in chosen
     assert "what the time allows" in chosen
     assert said[-2].startswith(f"{Path('runs', 'walk')}: ")
-    assert said[-1] == f"lapgs-view {Path('runs', 'walk', 'checkpoint.ply')}"
+    assert said[-1] == f"{beside('lapgs-view')} {Path('runs', 'walk', 'checkpoint.ply')}"
     assert Path(said[-1].split()[1]).is_file()
     config = load_config("runs/walk/config.toml")
     assert 10 <= config.schedule.steps <= 24

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from helpers.interrupts import interrupt_at
 from helpers.training import STEPS, configure
 
@@ -168,11 +169,14 @@ def test_what_has_changed_since_the_run_began_is_told(
     config = configure(data__path=str(data), schedule__steps="3", schedule__save_interval="0")
     run_folder.start_run_folder(tmp_path, config, device, dataset)
     text = (tmp_path / "config.toml").read_text()
+    threads = torch.get_num_threads()
+    text = text.replace(f'torch_threads = "{threads}"', 'torch_threads = "99"')
     (tmp_path / "config.toml").write_text(text.replace(f'driver = "{device.info.driver}"', 'driver = "another"'))
     assert cli.train_command(["--resume", str(tmp_path)]) == 0
     error = capfd.readouterr().err
     assert f"driver was another when {tmp_path} began and is {device.info.driver}: bits may differ." in error
-    assert error.count("bits may differ") == 1
+    assert f"torch_threads was 99 when {tmp_path} began and is {threads}: bits may differ." in error
+    assert error.count("bits may differ") == 2
 
 
 @pytest.fixture

@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import http.server
 import os
+import struct
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -33,6 +34,7 @@ from helpers.web_pages import (
 from lapgs_wgpu.gpu.device import Device, _adapters
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.shader import browser_source
+from lapgs_wgpu.io.lapgs_file import MAGIC
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.train.open_dataset import open_dataset, with_folder
 from lapgs_wgpu.train.presets import load_config
@@ -48,6 +50,7 @@ pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt-ge
 SAME = 90.0  # dB: less is another picture
 TIMES = (0.0, 0.37, 1.0)
 OWN_DEVICE = "const own = GPUAdapter.prototype.requestDevice;"
+LARGE = 20 * 2**30  # bytes, more than a page can hold
 POSITION, FOCUS = [3.0, 1.0, 2.0], [0.2, 0.0, -0.1]
 
 
@@ -117,8 +120,8 @@ def test_three_times_and_two_cameras(browser: Browser, desktop: Desktop) -> None
 
 
 def test_a_trained_scene(window: Browser, folder: Path, device: Device) -> None:
-    """The preset demo: its first steps alone, unless LAPGS_SOAK is set. Where two of its Gaussians lie at one depth, the
-    last bit decides which is drawn first: that may be seen in a picture, not in many (docs/notes/web.md)."""
+    """The preset demo: its first steps alone, unless LAPGS_SOAK is set. Where two Gaussians lie at one depth, the last
+    bit decides which is drawn first: that may be seen in a picture, not in many (docs/notes/web.md)."""
     overrides = {} if "LAPGS_SOAK" in os.environ else {"schedule.steps": "200", "discovery.enabled": "false"}
     run = folder / "demo"
     config = with_folder(load_config("demo", {"data.path": "synthetic", **overrides}), folder)
@@ -324,6 +327,28 @@ def test_focus(browser: Browser, page: Path, device: Device) -> None:
         assert psnr(desktop.picture(0.0), desktop.picture(0.0, focus)) < 40
 
 
+def test_pictures_while_it_plays(browser: Browser, desktop: Desktop) -> None:
+    """Each is the frame on show, and says of which time; in between, frames go on."""
+    browser.value("(window.seen = [], lapgs.onframe = time => seen.push(time))")
+    browser.value("location.hash = '#t=0.1&speed=0.02&play'")
+    wait_for(lambda: browser.value("seen.at(-1) > 0.1"), 60, "time goes on")
+    times = []
+    for _ in range(3):
+        width, height, time, values = browser.value(
+            "Promise.all([lapgs.picture(), lapgs.picture()])"
+            ".then(([{width, height, time, values}]) => [width, height, time, Array.from(values)])"
+        )
+        found = np.array(values, np.float32).reshape(4, height, width)[:3].transpose(1, 2, 0)
+        assert psnr(found, desktop.picture(time, size=(width, height))) >= SAME
+        times.append(time)
+        frames = len(browser.value("seen"))
+        wait_for(lambda frames=frames: len(browser.value("seen")) > frames + 1, 60, "frames")  # type: ignore[misc]
+    assert browser.value("lapgs.playing")
+    assert 0.1 < times[0] < times[1] < times[2]
+    assert set(times) <= set(browser.value("seen"))
+    assert psnr(desktop.picture(times[0]), desktop.picture(times[2])) < SAME
+
+
 def test_panels(browser: Browser) -> None:
     """The overlay, the button for the help, and all of them hidden."""
     hidden = "document.getElementById('{}').checkVisibility()"
@@ -398,6 +423,11 @@ def test_address_and_script(window: Browser, page: Path, desktop: Desktop) -> No
 # Served, dropped, refused
 
 
+def header(size: int) -> bytes:
+    """Of a compact scene that declares so many bytes."""
+    return struct.pack("<8sIQ", MAGIC, 1, size)
+
+
 @pytest.fixture(scope="module")
 def server(folder: Path) -> Iterator[str]:
     handler = functools.partial(http.server.SimpleHTTPRequestHandler, directory=str(folder))
@@ -425,6 +455,18 @@ def test_a_dropped_file(browser: Browser, device: Device, folder: Path, desktop:
 
     drop(folder / "scene.ply")
     wait_for(lambda: "do not begin as a scene does" in browser.note(), 60, "the sentence")
+    assert same(browser, desktop, 0.0)
+    for head, reason in (
+        (b"", f"its {LARGE} bytes do not begin as a scene does"),
+        (header(1000), f"it has {LARGE} bytes, more than the 1000 that it declares"),
+        (header(LARGE), f"The scene unpacks to {LARGE} bytes, and a page takes {2**30} at most"),
+    ):  # judged by their first bytes: none is read whole
+        with (folder / "large.lapgs").open("wb") as file:
+            file.write(head)
+            file.truncate(LARGE)
+        drop(folder / "large.lapgs")
+        wait_for(lambda reason=reason: reason in browser.note(), 60, reason)  # type: ignore[misc]
+        (folder / "large.lapgs").unlink()
     assert same(browser, desktop, 0.0)
     made = export_scene(trained(device, CONFIGS["no dynamics"], 200), folder, device, "dropped")
     drop(made.with_suffix(".lapgs"))
@@ -486,15 +528,61 @@ def test_a_poor_server(window: Browser, page: Path, device: Device, folder: Path
         running.shutdown()
 
 
+def test_servers_that_send_too_much_or_too_little(window: Browser, page: Path) -> None:
+    """What cannot be a scene is not read on: by the length that is announced, or by what has come."""
+    ended = threading.Event()
+
+    class Server(http.server.BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            announced = {"/large.lapgs": LARGE, "/broken.lapgs": 1000}.get(self.path)
+            self.send_response(200)
+            if announced:
+                self.send_header("Content-Length", str(announced))
+            self.end_headers()
+            if self.path.startswith(f"/{page.name}"):
+                self.wfile.write(page.read_bytes())
+                return
+            try:
+                self.wfile.write(header(1000))
+                while self.path != "/broken.lapgs":
+                    self.wfile.write(bytes(1000))
+            except OSError:  # the page has hung up
+                ended.set()
+
+        def log_message(self, *_: object) -> None:
+            pass
+
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Server) as running:
+        threading.Thread(target=running.serve_forever, daemon=True).start()
+        for name, reason in (
+            ("large", f"it has {LARGE} bytes, more than the 1000 that it declares"),
+            ("endless", "more than the 1000 that it declares"),
+            ("broken", "Reading the scene failed (network error): load the page again, or report this error."),
+        ):
+            ended.clear()
+            window.open(f"http://127.0.0.1:{running.server_port}/{page.name}?src={name}.lapgs")
+            wait_for(lambda reason=reason: reason in window.note(), 60, reason)  # type: ignore[misc]
+            assert name == "broken" or ended.wait(30)
+        running.shutdown()
+
+
 def test_in_a_frame(window: Browser, page: Path, server: str, folder: Path) -> None:
     """Of another page, whose scripts find it in the frame's window."""
-    (folder / "outer.html").write_text(f"<!doctype html><iframe src='{page.name}#t=0.3&speed=0.1&play'></iframe>")
+    listen = "<script>window.told = []; addEventListener('message', ({ data }) => told.push(data))</script>"
+    (folder / "outer.html").write_text(
+        f"<!doctype html>{listen}<iframe src='{page.name}#t=0.3&speed=0.1&play'></iframe>"
+    )
     window.open(f"{server}/outer.html")
     inner = "document.querySelector('iframe').contentWindow.lapgs"
-    wait_for(lambda: window.value("Boolean(document.querySelector('iframe')?.contentWindow?.lapgs)"), 120, "the scene")
+    wait_for(lambda: window.value("window.told?.length"), 120, "the scene")
+    assert window.value("told") == [{"lapgs": "ready"}]
     wait_for(lambda: window.value(f"{inner}.time") > 0.32, 60, "time goes on")
     window.value(f"{inner}.setTime(0.9)")
     assert window.value(f"[{inner}.time, {inner}.playing]") == [0.9, False]
+    window.value("document.querySelector('iframe').src = 'scene.html?src=missing.lapgs'")
+    wait_for(lambda: window.value("told.length > 1"), 60, "the message")
+    reason = "missing.lapgs cannot be fetched: the server says 404; check the address."
+    assert window.value("told[1]") == {"lapgs": "failed", "reason": reason}
 
 
 def test_a_page_that_is_held_up(browser: Browser) -> None:
@@ -516,8 +604,38 @@ def test_a_device_that_is_refused(window: Browser, page: Path) -> None:
     script = "GPUAdapter.prototype.requestDevice = async () => { throw new TypeError('too few\\nbindings'); };"
     made = window.call("Page.addScriptToEvaluateOnNewDocument", source=script)
     window.open(page.as_uri() + "?refused")
-    wait_for(lambda: "cannot be shown on this adapter (too few)" in window.note(), 60, "the sentence")
+    expected = "Opening the graphics adapter failed (too few): try another browser or a newer driver."
+    wait_for(lambda: window.note() == expected, 60, "the sentence")
     assert window.value("document.getElementById('poster').checkVisibility()")
+    window.call("Page.removeScriptToEvaluateOnNewDocument", identifier=made["identifier"])
+
+
+@pytest.mark.parametrize(
+    ("script", "doing", "advice"),
+    [
+        (
+            "GPUDevice.prototype.createComputePipelineAsync = async () => { throw new GPUPipelineError('no stack',"
+            " { reason: 'internal' }); };",
+            "Preparing the scene failed (no stack)",
+            "try another browser or a newer driver.",
+        ),
+        (
+            "Map.prototype.get = function () { throw new TypeError('no map'); };",
+            "Reading the scene failed (no map)",
+            "load the page again, or report this error.",
+        ),
+        (
+            "GPUQueue.prototype.submit = () => { throw new TypeError('no queue'); };",
+            "Drawing the scene failed (no queue)",
+            "load the page again, or report this error.",
+        ),
+    ],
+)
+def test_what_failed_is_told(window: Browser, page: Path, script: str, doing: str, advice: str) -> None:
+    """The adapter is to blame only for its own errors."""
+    made = window.call("Page.addScriptToEvaluateOnNewDocument", source=script)
+    window.open(page.as_uri() + "?failing")
+    wait_for(lambda: window.note() == f"{doing}: {advice}", 60, doing)
     window.call("Page.removeScriptToEvaluateOnNewDocument", identifier=made["identifier"])
 
 

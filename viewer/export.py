@@ -53,7 +53,7 @@ def export_compact(scene: LoadedScene, file: Path, *, overwrite: bool = False) -
     if file.suffix.lower() == ".html":
         camera = scene.camera().camera(*_POSTER_SIZE)
         poster = OffscreenRenderer(scene)(camera, 0.0)
-        content = page_html(content, scene.path.stem, poster).encode()
+        content = page_html(content, file.stem, poster).encode()
     with atomic_write(file) as target:
         target.write(content)
 

@@ -1,4 +1,4 @@
-"""The pictures of the README and of docs/, made from a run of the built-in scene: `make pictures`.
+"""The pictures of the README and of docs/, one of them a page with the scene: `make pictures`, of the built-in scene.
 
 python docs/tools/pictures.py RUN DIR
 """
@@ -21,6 +21,7 @@ from lapgs_wgpu.gpu.device import open_device
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.viewer.app import App
+from lapgs_wgpu.viewer.export import export_compact
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene, load_scene
 from lapgs_wgpu.viewer.offscreen import OffscreenRenderer, framed
 from lapgs_wgpu.viewer.render_modes import Mode
@@ -91,6 +92,7 @@ def main(run: Path, folder: Path) -> None:
         Image.fromarray(picture).save(folder / name, optimize=True)
     with atomic_write(folder / "demo.webp") as file:
         file.write(moving(scene))
+    export_compact(scene, folder / "demo.html", overwrite=True)
     for file in sorted(folder.iterdir()):
         print(f"{file}: {file.stat().st_size:,} bytes")
 

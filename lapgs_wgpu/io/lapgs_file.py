@@ -24,7 +24,7 @@ MAGIC = b"lapgs4d\n"
 VERSION = 1
 MAX_BYTES = 1 << 30  # unpacked: 1.5 million Gaussians with the field of the preset dnerf
 _HEADER = struct.Struct("<8sIQ")  # magic, version, bytes once unpacked
-_MOST_RATIO = 1032  # of deflate
+_MOST_RATIO = 64  # of unpacked bytes to packed ones: a small file cannot fill the memory of who opens it
 
 
 def is_lapgs(path: PathLike) -> bool:
@@ -46,7 +46,11 @@ def pack_lapgs(tensors: Mapping[str, NDArray[Any]], metadata: Mapping[str, str])
     content = b"".join(bytes(part) for part in pack_tensors(tensors, metadata))
     if len(content) > MAX_BYTES:
         raise InputError(f"a compact scene holds at most {MAX_BYTES} bytes, and this one needs {len(content)}")
-    return _HEADER.pack(MAGIC, VERSION, len(content)) + zlib.compress(content, 9)
+    packed = zlib.compress(content, 9)
+    if len(content) > _MOST_RATIO * len(packed):  # no repeats then, so that a byte takes a bit or more
+        packer = zlib.compressobj(9, strategy=zlib.Z_HUFFMAN_ONLY)
+        packed = packer.compress(content) + packer.flush()
+    return _HEADER.pack(MAGIC, VERSION, len(content)) + packed
 
 
 def read_lapgs(path: PathLike) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
@@ -75,10 +79,12 @@ def unpack_lapgs(data: bytes, where: str) -> tuple[dict[str, NDArray[Any]], dict
             f"{where}: has version {version} of the compact scene, and this program reads version {VERSION}; "
             "export the scene again, or use the program that wrote it"
         )
-    most = min(MAX_BYTES, _MOST_RATIO * packed)
-    if size > most:
+    if size > MAX_BYTES:
+        raise InputError(f"{where}: unpacks to {size} bytes, and a compact scene has at most {MAX_BYTES}")
+    if size > _MOST_RATIO * packed:
         raise InputError(
-            f"{where}: declares {size} bytes in {packed} packed ones, of at most {most}; the file is damaged"
+            f"{where}: declares {size} bytes in {packed} packed ones, which hold {_MOST_RATIO} times their number at "
+            "most; the file is damaged"
         )
     unpacker = zlib.decompressobj()
     try:

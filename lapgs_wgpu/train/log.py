@@ -17,6 +17,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO, Protocol, TextIO
 
+import torch
+
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.atomic import atomic_write
@@ -183,11 +185,12 @@ def resident_bytes() -> int | None:
 
 
 def environment(device: Device) -> dict[str, str]:
-    """With what a run was made: versions, adapter and driver, and the git revision where the code is a checkout."""
+    """With what a run was made: versions, adapter, driver, torch's threads, the git revision of a checkout."""
     packages = ("lapgs-wgpu", "torch", "wgpu", "numpy")
     found = {name.replace("-", "_"): metadata.version(name) for name in packages}
     found |= {"python": platform.python_version(), "system": f"{platform.system()} {platform.machine()}"}
     found |= {"adapter": device.info.name, "backend": device.info.backend, "driver": device.info.driver}
+    found["torch_threads"] = str(torch.get_num_threads())
     checkout = Path(__file__).parents[2]
     if (checkout / ".git").exists():
         command = ["git", "-C", str(checkout), "describe", "--always", "--dirty", "--abbrev=12"]

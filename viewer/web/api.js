@@ -23,15 +23,9 @@ export function makeApi(state, viewport, wake) {
         return values;
     };
     return {
-        get time() {
-            return state.clock.time;
-        },
-        get playing() {
-            return state.clock.playing;
-        },
-        get seconds() { // that the last frame took
-            return viewport.seconds;
-        },
+        get time() { return state.clock.time; },
+        get playing() { return state.clock.playing; },
+        get seconds() { return viewport.seconds; }, // that the last frame took
         onframe: null, // called with the time after each frame
         setTime(t) { // in [0, 1]; pauses
             state.clock.playing = false;
@@ -52,11 +46,8 @@ export function makeApi(state, viewport, wake) {
             state.clock.playing = false;
             wake();
         },
-        // The picture on show once it is final: {width, height, values}, float planes red, green, blue, transmittance.
-        async picture() {
-            while (!viewport.atRest) await new Promise(requestAnimationFrame);
-            return viewport.planes();
-        },
+        // {width, height, time, values}: of the frame on show while the clip plays, else of the final one.
+        picture: () => viewport.planes(),
         // The dispatches of the final picture of a time: [pass, columns, rows, {binding: [offset, bytes]}] each.
         async passes(t) {
             await this.picture();

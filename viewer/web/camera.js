@@ -22,9 +22,7 @@ export class ViewCamera {
         this.reset();
     }
 
-    get distance() {
-        return Math.hypot(...add(this.focus, this.position, -1));
-    }
+    get distance() { return Math.hypot(...add(this.focus, this.position, -1)); }
 
     // Stand at a position and look at a focus; fovY in radians.
     place({ position = this.position, focus = this.focus, fovY = this.fovY }) {

@@ -4,13 +4,9 @@ export class Clock {
         Object.assign(this, { frames, loops, speeds, time: 0, playing: false, fps: 30, speed: 1, loop: loops[0], forward: true });
     }
 
-    get frame() {
-        return Math.round(this.time * (this.frames - 1));
-    }
+    get frame() { return Math.round(this.time * (this.frames - 1)); }
 
-    get seconds() {
-        return Math.max(1, this.frames - 1) / this.fps;
-    }
+    get seconds() { return Math.max(1, this.frames - 1) / this.fps; }
 
     seek(time) {
         this.time = Math.min(Math.max(time, 0), 1);

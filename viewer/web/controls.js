@@ -83,13 +83,12 @@ export class Controls {
         this.held.clear();
     }
 
-    // Move the camera by what the held keys say; whether it moved.
+    // Move the camera by what the held keys say.
     advance(seconds) {
         const moves = [...this.held].map(code => this.fly[code.replace("Key", "").toLowerCase()]).filter(Boolean);
-        if (!moves.length) return false;
+        if (!moves.length) return;
         const held = name => this.held.has(`${name}Left`) || this.held.has(`${name}Right`);
         const far = seconds * this.reach * (held("Shift") ? 4 : held("Alt") ? 0.25 : 1) * this.state.camera.distance;
         this.state.camera.fly(...[0, 1, 2].map(axis => far * moves.reduce((sum, move) => sum + move[axis], 0)));
-        return true;
     }
 }

@@ -4,18 +4,47 @@ import { Refusal, quoted } from "./refusal.js";
 const MAGIC = "lapgs4d\n";
 const HEADER = 20; // magic, version, bytes once unpacked
 const VERSION = 1;
-const MOST_BYTES = 2 ** 30;
-const MOST_RATIO = 1032; // of deflate
+const MOST_BYTES = 2 ** 30; // once unpacked
+const MOST_RATIO = 64; // of unpacked bytes to packed ones
 const MOST_TABLE = 2 ** 20; // of the safetensors file's table
 const ARRAYS = { F32: Float32Array, F16: Uint16Array, U16: Uint16Array, U8: Uint8Array };
 
 const damaged = reason => new Refusal(`The scene cannot be read: ${reason}; the file is damaged, or not a scene.lapgs.`);
 
-// {tensors: name -> {dtype, shape, data}, metadata: name -> text}. Raises Refusal.
-export async function readContainer(bytes) {
-    const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
-    if (bytes.length < HEADER || String.fromCharCode(...bytes.subarray(0, MAGIC.length)) !== MAGIC) {
-        throw damaged(`its ${bytes.length} bytes do not begin as a scene does`);
+// The bytes of a stream that is a scene, which has `length` bytes or more. What cannot be one is not read on. Raises Refusal.
+export async function readStream(stream, length, progress) {
+    let head = new Uint8Array(0);
+    return collect(stream, (size, chunk) => {
+        if (head.length < HEADER) head = Uint8Array.of(...head, ...chunk.subarray(0, HEADER - head.length));
+        if (head.length === HEADER) unpackedSize(head, Math.max(size, length));
+        progress(size);
+    });
+}
+
+// All bytes of a stream. check: called with their number so far and each chunk; ends the stream where it throws.
+async function collect(stream, check) {
+    const reader = stream.getReader();
+    const chunks = [];
+    let size = 0;
+    try {
+        for (let next; !(next = await reader.read()).done;) {
+            chunks.push(next.value);
+            size += next.value.length;
+            check(size, next.value);
+        }
+    } finally {
+        reader.cancel().catch(() => {});
+    }
+    const bytes = new Uint8Array(size);
+    for (const chunk of chunks.reverse()) bytes.set(chunk, size -= chunk.length);
+    return bytes;
+}
+
+// What the header declares, of a file of `length` bytes. Raises Refusal.
+function unpackedSize(head, length) {
+    const view = new DataView(head.buffer, head.byteOffset, head.byteLength);
+    if (head.length < HEADER || String.fromCharCode(...head.subarray(0, MAGIC.length)) !== MAGIC) {
+        throw damaged(`its ${length} bytes do not begin as a scene does`);
     }
     const version = view.getUint32(8, true);
     if (version !== VERSION) {
@@ -23,36 +52,26 @@ export async function readContainer(bytes) {
             + "export the page again with a newer lapgs-view.");
     }
     const size = Number(view.getBigUint64(12, true));
-    const packed = bytes.length - HEADER;
-    if (size > Math.min(MOST_BYTES, MOST_RATIO * packed)) {
-        throw damaged(`it declares ${size} bytes in ${packed} packed ones`);
-    }
-    return readTensors(await inflate(bytes.subarray(HEADER), size));
+    if (size > MOST_BYTES) throw new Refusal(`The scene unpacks to ${size} bytes, and a page takes ${MOST_BYTES} at most: export fewer Gaussians.`);
+    if (length > HEADER + 1.01 * size + 1024) throw damaged(`it has ${length} bytes, more than the ${size} that it declares are packed into`);
+    return size;
 }
 
-async function inflate(packed, size) {
-    let content;
-    try {
-        content = new Uint8Array(size);
-    } catch {
-        throw new Refusal(`The scene needs ${size} bytes of memory, which this browser does not give.`);
+// {tensors: name -> {dtype, shape, data}, metadata: name -> text}. Raises Refusal.
+export async function readContainer(bytes) {
+    const size = unpackedSize(bytes, bytes.length);
+    const packed = bytes.subarray(HEADER);
+    if (size > MOST_RATIO * packed.length) {
+        throw damaged(`it declares ${size} bytes in ${packed.length} packed ones, which hold ${MOST_RATIO} times their number at most`);
     }
-    const reader = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate")).getReader();
-    let at = 0;
-    for (;;) {
-        const { done, value } = await reader.read().catch(() => {
-            throw damaged("it cannot be unpacked");
-        });
-        if (done) break;
-        if (at + value.length > size) {
-            reader.cancel().catch(() => {});
-            throw damaged(`it unpacks to more than the ${size} bytes that it declares`);
-        }
-        content.set(value, at);
-        at += value.length;
-    }
-    if (at !== size) throw damaged(`it unpacks to ${at} of the ${size} bytes that it declares`);
-    return content;
+    const unpacked = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"));
+    const content = await collect(unpacked, at => {
+        if (at > size) throw damaged(`it unpacks to more than the ${size} bytes that it declares`);
+    }).catch(error => {
+        throw error instanceof Refusal ? error : damaged("it cannot be unpacked");
+    });
+    if (content.length !== size) throw damaged(`it unpacks to ${content.length} of the ${size} bytes that it declares`);
+    return readTensors(content);
 }
 
 function readTensors(content) {

@@ -5,6 +5,7 @@ import { Clock } from "./clock.js";
 import { Controls } from "./controls.js";
 import { Playback } from "./field.js";
 import { openGpu } from "./gpu.js";
+import { readStream } from "./lapgs_file.js";
 import { Presenter } from "./presenter.js";
 import { Rasterizer } from "./rasterizer.js";
 import { Refusal } from "./refusal.js";
@@ -14,6 +15,7 @@ import { Viewport } from "./viewport.js";
 
 const find = name => document.getElementById(name);
 const LONGEST_STEP = 0.25; // seconds that the clock goes on at once, after a tab was in the background
+const OPENING = "Opening the graphics adapter";
 let shown = null; // ends what is on the page
 let wanted = 0; // number of the scene that was asked for last
 
@@ -31,11 +33,17 @@ function say(text) {
     find("note").hidden = !text;
 }
 
-function sentence(error) {
-    if (error instanceof Refusal) return error.message;
-    const reason = String(error?.message ?? error).split("\n")[0].slice(0, 200);
-    return `The scene cannot be shown on this adapter (${reason}): try another browser or a newer driver.`;
+// What went wrong while the page did what: one sentence over the picture, and a message to the page around it.
+function report(error, doing) {
+    const graphics = doing === OPENING || /^GPU/.test(error.constructor.name);
+    const reason = error instanceof Refusal ? error.message : `${doing} failed (${String(error.message).split("\n")[0].slice(0, 200)}): `
+        + (graphics ? "try another browser or a newer driver." : "load the page again, or report this error.");
+    say(reason);
+    tell({ lapgs: "failed", reason });
 }
+
+// The page in whose frame this one is.
+const tell = message => parent !== window && parent.postMessage(message, "*");
 
 async function embedded() {
     const text = find("scene").textContent.trim();
@@ -45,34 +53,29 @@ async function embedded() {
 }
 
 async function fetched(address) {
-    let answer;
-    try {
-        answer = await fetch(address);
-    } catch {
+    const answer = await fetch(address).catch(() => {
         throw new Refusal(`${address} cannot be fetched: only files beside this page on its own server can, and none from file://.`);
-    }
+    });
     if (!answer.ok) throw new Refusal(`${address} cannot be fetched: the server says ${answer.status}; check the address.`);
-    const total = Number(answer.headers.get("Content-Length")) || 0;
-    const chunks = [];
-    let size = 0;
-    for (const reader = answer.body.getReader(); ;) {
-        const { done, value } = await reader.read();
-        if (done) break;
-        chunks.push(value);
-        size += value.length;
-        say(`Loading ${(size / 1e6).toFixed(1)}${total ? ` of ${(total / 1e6).toFixed(1)}` : ""} MB`);
-    }
-    return new Uint8Array(await new Blob(chunks).arrayBuffer());
+    return streamed(answer.body, Number(answer.headers.get("Content-Length")) || 0);
+}
+
+function streamed(stream, length) {
+    const total = length ? ` of ${(length / 1e6).toFixed(1)}` : "";
+    return readStream(stream, length, size => say(`Loading ${(size / 1e6).toFixed(1)}${total} MB`));
 }
 
 // Show the scene whose bytes `load` gives, in place of the present one; where it fails the present one stays.
 async function open(load, data) {
     const number = ++wanted;
     let gpu;
+    let doing = OPENING;
     try {
         say("Loading");
         gpu = await openGpu(data.kernels); // first: without WebGPU there is nothing to wait for
+        doing = "Reading the scene";
         const scene = await readScene(await load());
+        doing = "Preparing the scene";
         const next = await prepare(gpu, scene, data);
         if (number !== wanted) return gpu.device.destroy();
         shown?.();
@@ -80,9 +83,10 @@ async function open(load, data) {
         shown = stop;
         window.lapgs = api;
         say("");
+        tell({ lapgs: "ready" });
     } catch (error) {
         gpu?.device.destroy();
-        if (number === wanted) say(sentence(error));
+        if (number === wanted) report(error, doing);
     }
 }
 
@@ -116,7 +120,7 @@ function start(gpu, { scene, playback, rasterizer }, state, data) {
         if (signal.aborted) return;
         ended.abort();
         find("poster").hidden = false;
-        say(sentence(error));
+        report(error, "Drawing the scene");
     };
     const toggle = name => (find(name).hidden = !find(name).hidden);
     const setBackground = color => (state.background = color);
@@ -182,7 +186,7 @@ function start(gpu, { scene, playback, rasterizer }, state, data) {
         const { width, height } = viewport.frame.camera;
         find("overlay").textContent = `${(1 / viewport.seconds).toFixed(1)} frames a second\n${Math.round(1000 * viewport.seconds)} ms `
             + `a frame\n${scene.count} Gaussians\n${width}x${height}\n${gpu.name}`;
-        api.onframe?.(clock.time);
+        api.onframe?.(viewport.time);
     }
     (function loop(now) {
         if (signal.aborted) return;
@@ -205,7 +209,7 @@ function run() {
     addEventListener("drop", event => {
         event.preventDefault();
         const [file] = event.dataTransfer.files;
-        if (file) open(async () => new Uint8Array(await file.arrayBuffer()), data);
+        if (file) open(() => streamed(file.stream(), file.size), data);
     });
     return open(source ? () => fetched(source) : embedded, data);
 }

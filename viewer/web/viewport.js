@@ -11,15 +11,18 @@ export class Viewport {
         this.drawn = ""; // all that the last frame depends on
         this.movedAt = 0;
         this.busy = false;
+        this.held = 0; // pictures that are waited for
         this.frame = null; // on show
+        this.time = NaN; // in the clip, of the frame on show
         this.seconds = NaN; // that the last one took
         this.log = null;
     }
 
     // Whether the picture on show is that of the state, in full resolution.
-    get atRest() {
-        return !this.busy && this.scale === 1 && this.drawn === this.key();
-    }
+    get atRest() { return !this.busy && this.scale === 1 && this.drawn === this.key(); }
+
+    // Whether the picture on show may be read: the final one, or any while the clip plays.
+    get readable() { return this.state.clock.playing ? !this.busy && this.drawn !== "" : this.atRest; }
 
     key() {
         const { camera: { position, rotation, fovY }, clock, background } = this.state;
@@ -28,7 +31,7 @@ export class Viewport {
 
     // Draw where something changed; whether it did. now: milliseconds of performance.now().
     async draw(now) {
-        if (this.busy) return false;
+        if (this.busy || this.held && this.readable) return false;
         const key = this.key();
         const moving = key !== this.drawn && this.frame !== null;
         if (key !== this.drawn) this.movedAt = now;
@@ -37,10 +40,10 @@ export class Viewport {
         try {
             const scale = moving ? this.movingScale : 1;
             const start = performance.now();
+            const { time } = this.state.clock; // goes on meanwhile
             this.frame = await this.drawWhole(scale);
             this.presenter.present(this.frame);
-            this.scale = scale;
-            this.drawn = key;
+            Object.assign(this, { scale, time, drawn: key });
             this.seconds = (performance.now() - start) / 1000;
             if (moving) this.adapt(scale, this.seconds);
             return true;
@@ -92,10 +95,13 @@ export class Viewport {
         }
     }
 
-    // The image on show as float planes: red, green, blue, transmittance, row by row.
+    // The picture on show as float planes: red, green, blue, transmittance, row by row.
     async planes() {
-        const { image, camera: { width, height } } = this.frame;
-        return { width, height, values: new Float32Array(await new Commands(this.playback.gpu).read([image])) };
+        this.held++; // no other frame begins: while the clip plays there is no pause between them
+        while (!this.readable) await new Promise(requestAnimationFrame);
+        this.held--;
+        const { time, frame: { image, camera: { width, height } } } = this;
+        return { width, height, time, values: new Float32Array(await new Commands(this.playback.gpu).read([image])) };
     }
 }
 
