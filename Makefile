@@ -83,6 +83,7 @@ lint: $(READY)
 # WebGPU's default limits at once: tests/conftest.py), and the two passes that use subgroups without them and, on Mesa's
 # software driver, in the two widths that are not this processor's own (its shader cache ignores the width).
 # Both run side by side: compiling shaders, torch and Python take one core each. The suite's closing line comes last.
+# What runs in the background ignores Ctrl-C, so the whole group is ended.
 # `test-all` runs all kernels in every configuration, each alone; CI does so every night.
 WIDTHS = $(shell $(BIN)/python -c 'from lapgs_wgpu import list_devices; name = list_devices()[0].name; \
   print(*(w for w in (128, 256, 512) if "llvmpipe" in name and f" {w} bits" not in name))')
@@ -91,7 +92,7 @@ widths = echo "== $(1) tests, vectors of $$width bits"; \
   LP_NATIVE_VECTOR_WIDTH=$$width MESA_SHADER_CACHE_DISABLE=true $(PYTEST) -m $(1)
 
 test: $(READY)
-	@logs=$$(mktemp -d); trap 'kill $$shapes 2>/dev/null; rm -rf "$$logs"' EXIT; \
+	@logs=$$(mktemp -d); trap 'rm -rf "$$logs"' EXIT; trap 'rm -rf "$$logs"; trap - TERM; kill 0' INT TERM; \
 	$(MAKE) --no-print-directory test-shapes > "$$logs/shapes" 2>&1 & shapes=$$!; \
 	echo "== all tests"; { $(PYTEST); echo $$? > "$$logs/code"; } 2>&1 | tee "$$logs/suite"; \
 	wait $$shapes; code=$$?; cat "$$logs/shapes"; tail -n 1 "$$logs/suite"; exit $$((code || $$(cat "$$logs/code")))
