@@ -25,6 +25,7 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands
 from lapgs_wgpu.io.checkpoint import read_checkpoint
 from lapgs_wgpu.motion.playback.playback import open_playback
+from lapgs_wgpu.splat.rotation import rotate, rotation_matrices
 from lapgs_wgpu.train.config import LossWeights, Rate
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
 from lapgs_wgpu.train.loss_terms import LossTerm
@@ -160,8 +161,13 @@ def test_a_checkpoint_of_ones_own_field_needs_its_module(dataset: Dataset, devic
     for opened in (lambda: load(path, device), lambda: open_playback(path, device)):
         with pytest.raises(InputError, match=r"own\.ply: the field own needs a module.*load\(path, field=\.\.\.\)"):
             opened()
-    with pytest.raises(InputError, match=r"own\.ply: is of another field than the module"):
+    with pytest.raises(InputError, match=r"own\.ply: is of another field than the module Linear") as caught:
         load(path, device, field=nn.Linear(3, 3))
+    assert "bias is missing in the file, (3,) in the module" in str(caught.value)
+    assert "velocity is (3,) in the file, missing in the module" in str(caught.value)
+    assert "\\" not in str(caught.value)
+    with pytest.raises(InputError, match=r"velocity is \(3,\) in the file, \(4,\) in the module\. Give a module"):
+        load(path, device, field=Drift(4))
     trainer.scene.field_config = dataclasses.replace(trainer.scene.field_config, kind="mlp")
     with Trainer(configure("mlp"), dataset, device) as other:
         other.save(path)
@@ -203,14 +209,17 @@ class Rows(nn.Module):
     [
         (lambda n: torch.zeros(n, 4), r"Rows must return translation of shape \(300, 3\), got \(300, 4\)"),
         (lambda n: Deformation(d_opacity=torch.zeros(n, 1)), r"d_opacity of shape \(300,\), got \(300, 1\)"),
+        (lambda n: Deformation(orientation=torch.zeros(n, 3)), r"orientation of shape \(300, 4\), got \(300, 3\)"),
+        (lambda n: Deformation(translation=0.5), "must return a Tensor as translation, got float"),  # type: ignore[arg-type]
         (lambda n: [1], "must return a Tensor or a Deformation, got list"),
+        (lambda n: None, "must return a Tensor or a Deformation, got NoneType"),
     ],
 )
 def test_results_of_another_form_are_named(value: Any, message: str, dataset: Dataset, device: Device) -> None:
     config = configure(schedule__warm_up="0")
     with (
         Trainer(config, dataset, device, parts=Parts(field=Rows(value))) as trainer,
-        pytest.raises((TypeError, ValueError), match=message),
+        pytest.raises(InputError, match=message),
     ):
         trainer.step()
 
@@ -219,6 +228,51 @@ def test_all_parts_of_a_deformation_are_optional(dataset: Dataset, device: Devic
     with Trainer(configure(), dataset, device, parts=Parts(field=Rows(lambda n: Deformation()))) as trainer:
         still, now = trainer.scene.canonical(), trainer.scene.at(0.3)
     assert all(torch.equal(a, b) for a, b in zip(vars(still).values(), vars(now).values(), strict=True))
+
+
+class Pivoted(nn.Module):
+    """A quarter turn about the z axis through a pivot."""
+
+    pivot = torch.tensor([[1.0, 2.0, 3.0]])
+
+    def forward(self, means: Tensor, t: float) -> Deformation:
+        turn = torch.tensor([[0.5**0.5, 0.0, 0.0, 0.5**0.5]]).expand(len(means), 4)
+        return Deformation(rotation=turn, orientation=turn, translation=self.pivot - rotate(turn, self.pivot))
+
+
+def test_a_field_can_move_the_scene_rigidly(dataset: Dataset, device: Device) -> None:
+    with Trainer(configure(), dataset, device, parts=Parts(field=Pivoted())) as trainer, torch.no_grad():
+        scene, matrix = trainer.scene, torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+        generator = torch.Generator().manual_seed(0)
+        for name in ("quats", "log_scales"):  # of no symmetry
+            scene.parameters[name] += torch.randn(scene.parameters[name].shape, generator=generator)
+        still, now = scene.canonical(), scene.at(0.3)
+        before, after = (rotation_matrices(each.quats) * each.scales[:, None] for each in (still, now))
+        d_quats = torch.randn(len(scene), 4, generator=generator)
+        module = Rows(lambda n: Deformation(orientation=torch.tensor([[0.0, 0.0, 0.0, 1.0]] * n), d_quats=d_quats))
+        both = Scene4D(scene.parameters, trainer.config.field, device, own_field=module).at(0.3)
+    torch.testing.assert_close(now.means, Pivoted.pivot + (still.means - Pivoted.pivot) @ matrix.T)
+    torch.testing.assert_close(after @ after.mT, matrix @ (before @ before.mT) @ matrix.T)
+    w, x, y, z = still.quats.unbind(1)
+    half_turn = torch.stack([-z, -y, x, w], dim=1)  # k (w + x i + y j + z k)
+    torch.testing.assert_close(both.quats, nn.functional.normalize(half_turn + d_quats, dim=1))
+
+
+def test_a_training_says_why_it_leaves_out_discovery(
+    dataset: Dataset, device: Device, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def told(parts: Parts | None = None, method: str = "laplacian", **overrides: str) -> str:
+        with Trainer(configure(method, **overrides), dataset, device, parts=parts) as trainer:
+            assert trainer.discovery is None
+            assert len(list(trainer)) == STEPS
+        return capsys.readouterr().err
+
+    note = "note: motion discovery is left out: "
+    assert told() == f"{note}schedule.steps (36) must be larger than discovery.steps (800).\n"
+    assert told(discovery__steps="36").startswith(note)
+    own = told(Parts(field=Pivoted()), discovery__steps="35")
+    assert own == f"{note}the field Pivoted has no parameters that could learn what it finds.\n"
+    assert told(discovery__enabled="false") == told(method="static") == ""
 
 
 def test_groups_of_ones_own_field_have_rates_of_their_own(dataset: Dataset, device: Device) -> None:
@@ -242,7 +296,7 @@ def test_groups_of_ones_own_field_have_rates_of_their_own(dataset: Dataset, devi
         def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
             return {}
 
-    with pytest.raises(ValueError, match=r"parameter_groups\(\) of Forgetful lacks velocity"):
+    with pytest.raises(InputError, match=r"parameter_groups\(\) of Forgetful lacks velocity"):
         Trainer(configure(), dataset, device, parts=Parts(field=Forgetful()))
 
 
@@ -343,7 +397,7 @@ def test_losses_that_cannot_be_are_refused(dataset: Dataset, device: Device, tmp
     rows = TorchLoss("mine", lambda image, truth: image.mean(dim=0))
     with (
         Trainer(configure(), dataset, device, parts=Parts(losses=[rows])) as trainer,
-        pytest.raises(ValueError, match=r"the loss 'mine' must return a scalar tensor, got torch.Size\(\[32, 3\]\)"),
+        pytest.raises(InputError, match=r"the loss 'mine' must return a scalar tensor, got torch.Size\(\[32, 3\]\)"),
     ):
         trainer.step()
 
@@ -393,7 +447,7 @@ def test_changes_that_cannot_be_are_named(change: Any, message: str, dataset: Da
     parts = Parts(density=lambda state: change(state.rows))
     with (
         Trainer(configure(), dataset, device, parts=parts) as trainer,
-        pytest.raises(ValueError, match=message),
+        pytest.raises(InputError, match=message),
     ):
         list(trainer)
 

@@ -147,7 +147,7 @@ def test_help_lists_every_key_with_the_presets_value(capsys: pytest.CaptureFixtu
         "--density.gradient",
     ):
         assert option in text
-    assert "half side length of the cube around the origin in which initial Gaussians are placed" in " ".join(
+    assert "half side length of the cube around the origin that discovery searches, world units" in " ".join(
         text.split()
     )
 

@@ -116,6 +116,12 @@ def test_overrides() -> None:
     )
 
 
+def test_each_learning_rate_can_be_0_and_goes_from_or_to_0_in_a_line() -> None:
+    zero = {key.name: 0.0 for key in config_keys() if key.name.startswith("rates.") and not key.name.endswith(".steps")}
+    assert all(rate.at(1) == rate.at(10**6) == 0 for rate in load_config("dnerf", zero).rates.schedules().values())
+    assert Rate(0, 1e-3, 10).at(5) == Rate(1e-3, 0, 10).at(5) == 5e-4
+
+
 def test_base_gives_what_a_file_leaves_out(tmp_path: Path) -> None:
     config = load_config(write(tmp_path / "mine.toml", 'base = "tiny"\n[schedule]\nsteps = 9\n'))
     tiny = load_config("tiny")

@@ -456,4 +456,6 @@ def test_short_trainings_go_without(
     dataset: Dataset, device: Device, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     train(configure(schedule__steps="3", schedule__warm_up="1"), dataset, tmp_path / "run", device=device)
-    assert "discovery" not in capsys.readouterr().out
+    told = capsys.readouterr()
+    assert "discovery" not in told.out
+    assert "motion discovery is left out" in told.err

@@ -86,12 +86,13 @@ def _parse(arguments: Sequence[str]) -> Any:
 
     add = parser.add_argument_group("content of the window, screenshot or video").add_argument
     add("--time", type=_number(0.0, 1.0), metavar="T", help="time in the clip: 0 is its start, 1 its end; a window "
-        "opens at this time; not for videos in which the clip plays [0, or the time of --view]")
+        "opens at this time; also of --export FILE.ply; not for videos in which the clip plays [0, or the time of "
+        "--view]")
     modes = "; ".join(f"{mode}: {about}" for mode, about in MODES.items())
     add("--mode", choices=list(MODES), help=f"what to render; {modes} [rgb]")
     add("--background", choices=list(BACKGROUNDS), help="color behind the Gaussians [the training's, otherwise black]")
-    add("--size", type=_size, metavar="WxH", help="width and height of the window, screenshot or video, pixels "
-        "[1280x720, or that of --view or of the camera path]")
+    add("--size", type=_size, metavar="WxH", help="width and height of the window, screenshot or video, pixels; not "
+        "with --backend http [window: 1280x720; otherwise that of --view or of the camera path, or 1280x720]")
     add("--view", metavar="N|NAME", help="camera of the capture (config.toml beside FILE.ply says where that is), by "
         "name, or by number from 0; test views come first [a camera stored in the file, otherwise one that shows the "
         "whole scene]")
@@ -116,8 +117,9 @@ def _parse(arguments: Sequence[str]) -> Any:
         "letters, digits, - or _; without TEXT a random token is generated and printed [no token]")
 
     add = parser.add_argument_group("screenshot and video (no window)").add_argument
-    add("--screenshot", metavar="FILE.png", help="render one image to a PNG file")
-    add("--video", metavar="FILE.mp4", help="render a video to an MP4 file (H.264)")
+    add("--screenshot", metavar="FILE.png", help="render one image to a PNG file; replaces an existing file")
+    add("--video", metavar="FILE.mp4", help="render a video to an MP4 file (H.264); needs PyAV; replaces "
+        "an existing file")
     add("--path", metavar="time|view|both|CAMERAS.json", help="camera motion of --video; time: static camera while "
         "the clip plays; view: one orbit around the focus point at --time; both: one orbit while the clip "
         "plays; CAMERAS.json: camera path in nerfstudio's format [time, or view if the scene does not move]")
@@ -131,9 +133,10 @@ def _parse(arguments: Sequence[str]) -> Any:
         "files in the folder DIR")
     add("--max-error", type=_number(0.01, 100.0), metavar="PX", help="with --export FILE.4dgs: largest displacement "
         "of a Gaussian, pixels of the captured images; less makes the file larger [0.5]")
-    add("--frames", type=_count, metavar="N", help="with --export DIR: number of files, at equally spaced times from "
-        "0 to 1")
-    add("--overwrite", action="store_const", const=True, help="allow --export to replace existing files")
+    add("--frames", type=_count, metavar="N", help="number of files in --export DIR, at equally spaced times from "
+        "0 to 1; required for DIR, no default")
+    add("--overwrite", action="store_const", const=True, help="allow --export to replace an existing file; "
+        "with --frames: delete all frame_*.ply in DIR first")
     # fmt: on
     return parser.parse_args(arguments)
 

@@ -21,7 +21,7 @@ from ..splat.camera import Camera
 from ..splat.constants import CONSTANTS
 from ..splat.gaussians import Gaussians
 from ..splat.rasterize import Rendering, rasterize
-from ..splat.rotation import rotate
+from ..splat.rotation import multiply, rotate
 from .fields.config import MIN_SCALE, FieldConfig
 from .fields.deformation import Nearby
 from .fields.grid_field import GridField
@@ -182,6 +182,8 @@ class Scene4D:
             means = rotate(move.rotation, means)
         if move.translation is not None:
             means = means + move.translation
+        if move.orientation is not None:
+            quats = multiply(move.orientation, quats)
         if move.d_quats is not None:
             quats = nn.functional.normalize(quats + move.d_quats, dim=1)
         if move.d_scales is not None:
@@ -284,7 +286,7 @@ def scene_of(file: SceneFile, device: Device | None = None, own_field: nn.Module
         values = {name: torch.from_numpy(array) for name, array in file.field.items()}
         try:
             scene.field.load_state_dict(values)
-        except RuntimeError as error:  # the others' shapes were checked
-            raise InputError(f"{file.path}: is of another field than the module that was given: {error}") from error
+        except InputError as error:  # of a field of one's own: the shapes of the others were checked
+            raise InputError(f"{file.path}: {error}") from error
     scene.metadata = file.metadata
     return scene

@@ -17,6 +17,14 @@ def rotation_matrices(quats: Tensor) -> Tensor:
     return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
 
 
+def multiply(first: Tensor, second: Tensor) -> Tensor:
+    """Products (N, 4) of quaternions wxyz (N, 4): the rotation `second`, followed by the rotation `first`."""
+    w, axis = first[:, :1], first[:, 1:]
+    v, other = second[:, :1], second[:, 1:]
+    real = w * v - (axis * other).sum(dim=1, keepdim=True)
+    return torch.cat([real, w * other + v * axis + torch.linalg.cross(axis, other)], dim=1)
+
+
 def rotate(quats: Tensor, vectors: Tensor) -> Tensor:
     """Rotate vectors (N, 3) by unit quaternions (N, 4) wxyz."""
     w, axis = quats[:, :1], quats[:, 1:]

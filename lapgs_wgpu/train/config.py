@@ -64,32 +64,42 @@ class PointsConfig(Options):
     """The initial Gaussians."""
 
     count: int = option(
-        "number of initial Gaussians; if the capture has a point cloud, the maximum number taken from it", at_least=1
+        "number of initial Gaussians; if the capture has a point cloud, the maximum number taken from it; with "
+        "discovery, of the Gaussians that its static model starts from",
+        at_least=1,
     )
     box: float = option(
-        "half side length of the cube around the origin in which initial Gaussians are placed at random, "
-        "world units; used only if the capture has neither a point cloud nor depth bounds",
+        "half side length of the cube around the origin that discovery searches, world units; initial Gaussians are "
+        "placed in it at random if the capture has neither a point cloud nor depth bounds",
         above=0,
     )
-    opacity: float = option("initial opacity of each Gaussian, between 0 and 1", above=0, below=1)
+    opacity: float = option(
+        "initial opacity of each Gaussian, between 0 and 1; with discovery, of those that its static model starts from",
+        above=0,
+        below=1,
+    )
 
 
 @dataclass(frozen=True)
 class ScheduleConfig(Options):
     """Lengths and intervals, in steps."""
 
-    steps: int = option("number of training steps", at_least=1)
+    steps: int = option(
+        "number of training steps; rates.*.steps, schedule.warm_up and density.* do not change with it", at_least=1
+    )
     batch: int = option("images per step; their gradients are averaged", at_least=1)
     warm_up: int = option(
-        "number of initial steps without motion: the deformation field is off, and only the static Gaussians "
-        "are trained; if discovery.enabled, whose static model replaces them: number of initial steps over which the "
-        "learning rates rise linearly to their values"
+        "number of initial steps without motion: the deformation field is off, and only the static Gaussians are "
+        "trained; with discovery: number of initial steps over which the learning rates rise linearly from 0"
     )
     sh_interval: int = option(
-        "the degree of the spherical harmonics starts at 0 and increases by one every this many steps, up to 3",
+        "the degree of the spherical harmonics increases by one every this many steps, up to 3; it starts at 0, with "
+        "discovery at the degree of the static model",
         at_least=1,
     )
-    save_interval: int = option("save the training state every this many steps, for --resume; 0: never")
+    save_interval: int = option(
+        "save the training state every this many steps, for --resume; 0: only if the training is interrupted or fails"
+    )
 
 
 @dataclass(frozen=True)
@@ -97,13 +107,13 @@ class Rate(Options):
     """A learning rate that goes from start to end exponentially, or in a straight line where one of them is 0, and then
     stays there."""
 
-    start: float = option("initial value; 0 freezes", at_least=0, below=math.inf)
-    end: float = option("final value; 0 freezes", at_least=0, below=math.inf)
-    steps: int = option(
-        "training step, counted from the start, at which the exponential decay reaches the final value; constant "
-        "afterwards",
-        at_least=1,
+    start: float = option(
+        "initial value; it changes to .end exponentially, or linearly if one of the two is 0; both 0: frozen",
+        at_least=0,
+        below=math.inf,
     )
+    end: float = option("final value, reached at .steps and kept", at_least=0, below=math.inf)
+    steps: int = option("training step, counted from the start, at which .end is reached", at_least=1)
 
     def at(self, step: int) -> float:
         """The rate of a step, which are counted from 1."""
@@ -118,14 +128,17 @@ class RatesConfig(Options):
     """Adam's learning rates, for each parameter of the Gaussians and for the field's hash tables and its MLP."""
 
     means: Rate = option("learning rate of the means, world units per step")
-    log_scales: float = option("learning rate of the log-scales", at_least=0)
-    quats: float = option("learning rate of the rotations (quaternions)", at_least=0)
-    opacity_logits: float = option("learning rate of the opacities (logits)", at_least=0)
-    sh_dc: float = option("learning rate of the base colors (spherical harmonics of degree 0)", at_least=0)
-    sh_rest: float = option(
-        "learning rate of the view-dependent colors (spherical harmonics of degree 1 to 3)", above=0
+    log_scales: float = option("learning rate of the log-scales, constant; 0: frozen", at_least=0)
+    quats: float = option("learning rate of the rotations (quaternions), constant; 0: frozen", at_least=0)
+    opacity_logits: float = option("learning rate of the opacities (logits), constant; 0: frozen", at_least=0)
+    sh_dc: float = option(
+        "learning rate of the base colors (spherical harmonics of degree 0), constant; 0: frozen", at_least=0
     )
-    dynamics: float = option("learning rate of the per-Gaussian dynamics attributes", at_least=0)
+    sh_rest: float = option(
+        "learning rate of the view-dependent colors (spherical harmonics of degree 1 to 3), constant; 0: frozen",
+        at_least=0,
+    )
+    dynamics: float = option("learning rate of the per-Gaussian dynamics attributes, constant; 0: frozen", at_least=0)
     hash: Rate = option("learning rate of the field's hash tables or feature planes")
     mlp: Rate = option("learning rate of the field's MLP weights")
     frequencies: Rate = option("learning rate of the motion spectrum's frequencies, cycles per clip per step")
@@ -171,7 +184,10 @@ class DensityConfig(Options):
         at_most=1,
     )
     min_opacity: float = option(
-        "prune Gaussians with an opacity below this value; the 256 most opaque ones always stay", at_least=0, below=1
+        "prune Gaussians with an opacity below this value, between 0 and 1; the most opaque ones stay: 256, or a "
+        "quarter of all if that is fewer, unless max_screen_radius or max_world_size prunes them",
+        at_least=0,
+        below=1,
     )
     max_screen_radius: float = option(
         "prune Gaussians that had a larger radius (to where alpha falls to 1/255) in an image since the last "
@@ -189,7 +205,8 @@ class DensityConfig(Options):
     )
     min_contribution: float = option(
         "prune Gaussians whose blending weights sum to less than this in every training image that is tried, pixels; "
-        "at most 50 images are tried, evenly chosen over the clip; 0: no such pruning",
+        "at most 50 images are tried, evenly chosen over the clip; the 256 Gaussians with the largest sums stay; 0: no "
+        "such pruning",
         0.0,
         at_least=0,
     )
@@ -236,7 +253,8 @@ class LossConfig(Options):
         "loss; 0: off"
     )
     ncc: float = option(
-        "weight of 1 - local normalized cross-correlation, added to the image loss after the warm-up; 0: off"
+        "weight of 1 - local normalized cross-correlation, added to the image loss after schedule.warm_up, with "
+        "discovery from step 1; 0: off"
     )
     dynamics: float = option("weight of the regularization of the dynamics attributes (paper eq. 12)")
     dynamics_mode: DynamicsMode = option(
@@ -254,11 +272,14 @@ class SmoothnessConfig(Options):
     """The smoothness loss: squared differences of the field's features at nearby points (Grid4D)."""
 
     static: float = option(
-        "weight of the smoothness loss (squared differences between features at nearby points), spatial grid"
+        "fields grid4d and laplacian: weight of the smoothness loss (squared differences between features at nearby "
+        "points), spatial grid"
     )
-    temporal: float = option("weight of the smoothness loss, space-time grids")
+    temporal: float = option("fields grid4d and laplacian: weight of the smoothness loss, space-time grids")
     share: float = option(
-        "fraction of the Gaussians that the smoothness loss samples in each step, between 0 and 1; 0: off", at_most=1
+        "fraction of the Gaussians that the smoothness loss samples in each step, between 0 and 1; 0: off, which also "
+        "turns off the field hexplane's own smoothness loss of fixed weights",
+        at_most=1,
     )
     reach: float = option("largest offset between the two sampled positions along each axis, world units")
     time_reach: float = option("largest offset between the two sampled times, as a fraction of the clip")
@@ -280,8 +301,8 @@ class DiscoveryConfig(Options):
     size: int = option("longer side of the images for the static model and the search, pixels", 100, at_least=16)
     field_steps: int = option("steps that fit the deformation field to the motion that was found", 1500, at_least=1)
     least: float = option(
-        "add Gaussians only if the objects that were found, and that the static model lacks, explain at least this "
-        "fraction of all places where the images differ from the static model",
+        "add moving Gaussians only if their tracks explain at least this fraction, between 0 and 1, of the surface "
+        "points at which images differ from the static model",
         0.05,
         at_most=1,
     )
@@ -304,8 +325,8 @@ class CamerasConfig(Options):
     """Correction of the training cameras. Has defaults, since older config.toml files lack it."""
 
     refine: RefineCameras = option(
-        "correct the training cameras while training; auto: those of own footage, whose poses were estimated (COLMAP, "
-        "nerfstudio); never the cameras of test views",
+        "correct the training cameras while training, never those of test views; auto: only captures with estimated "
+        "poses (COLMAP, nerfstudio, Polycam, Record3D)",
         "off",
     )
     rate: Rate = option(
@@ -370,14 +391,15 @@ class Config(Options):
     discovery: DiscoveryConfig = option("", DiscoveryConfig())
     eval: EvalConfig = option("", EvalConfig())
     precision: Precision = option(
-        "data type of the field's features and of its decoder's matrix products and their gradients; bfloat16 "
-        "is faster on processors with bfloat16 instructions; everything else is float32",
+        "data type of the field's features and of its decoder's matrix products and their gradients; bfloat16: "
+        "only fields grid4d and laplacian, faster on processors with bfloat16 instructions; all else is float32",
         "float32",
     )
     decoder: DecoderPlace = option(
         "where the decoder of the fields grid4d and laplacian runs during training; torch: on the CPU; "
-        "device: as kernels on the device, which changes the last bits; auto: torch on CPU devices, otherwise "
-        "the faster of the two in a trial at the start, recorded in config.toml",
+        "device: as kernels on the device, which changes the last bits and needs precision float32, field.depth 0 and "
+        "field.motion laplacian; auto: torch on CPU devices, otherwise the faster of the two in a trial at the start, "
+        "recorded in config.toml",
         "torch",
     )
 

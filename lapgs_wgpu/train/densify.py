@@ -14,6 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.rasterize import Rendering
 from lapgs_wgpu.splat.rotation import rotation_matrices
@@ -128,17 +129,19 @@ def published_rule(state: DensityState) -> Change:
 
 
 def check_change(change: Change, rows: Rows) -> None:
-    """Raises ValueError where a rule's result does not fit the Gaussians."""
+    """Raises InputError where a rule's result does not fit the Gaussians."""
     count = len(rows["means"])
     if change.keep.dtype != torch.bool or tuple(change.keep.shape) != (count,):
-        raise ValueError(f"keep must be bool of shape ({count},), got {change.keep.dtype} {tuple(change.keep.shape)}")
+        raise InputError(f"keep must be bool of shape ({count},), got {change.keep.dtype} {tuple(change.keep.shape)}.")
     if change.added.keys() != rows.keys():
-        raise ValueError(f"added must have the rows {', '.join(rows)}, got {', '.join(change.added)}")
+        raise InputError(f"added must have the rows {', '.join(rows)}, got {', '.join(change.added)}.")
     born = len(change.added["means"])
     for name, row in change.added.items():
         if row.shape != (born, *rows[name].shape[1:]) or row.dtype != rows[name].dtype:
             expected = (born, *rows[name].shape[1:])
-            raise ValueError(f"added[{name!r}] must be float32 of shape {expected}, got {row.dtype} {tuple(row.shape)}")
+            raise InputError(
+                f"added[{name!r}] must be float32 of shape {expected}, got {row.dtype} {tuple(row.shape)}."
+            )
 
 
 @torch.no_grad()

@@ -151,7 +151,7 @@ def torch_loss(
 ) -> tuple[float, np.ndarray]:
     """The value of a term in torch, and its weighted gradient (4, H, W) by the image. Others as `WgslLoss.record`.
 
-    Raises ValueError for a result that is no scalar.
+    Raises InputError for a result that is no scalar.
     """
     planes, texels = read_all([image, truth])
     rgba = texels.view(np.uint8).reshape(*truth.shape, 4)
@@ -160,8 +160,8 @@ def torch_loss(
         shown = torch.from_numpy(planes[:3]).permute(1, 2, 0).requires_grad_()
         value = term.function(shown, target)
         if not isinstance(value, Tensor) or value.ndim:
-            raise ValueError(
-                f"the loss {term.name!r} must return a scalar tensor, got {getattr(value, 'shape', value)}"
+            raise InputError(
+                f"the loss {term.name!r} must return a scalar tensor, got {getattr(value, 'shape', value)}."
             )
         gradient = torch.zeros_like(shown)
         if value.requires_grad:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
+import sys
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -13,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.errors import InputError
@@ -71,7 +72,7 @@ class Trainer:
         parts: own field, losses, density control, learning rates and callbacks.
         done: number of the steps so far.
         callbacks: a list of functions of the trainer and the StepResult, called after each step.
-        discovery: what motion discovery found, a line; None where it was not done.
+        discovery: what motion discovery found, a line; None where it was left out.
         decoder: where the field's decoder runs, and why.
         ranks: this process among those that train together.
         whole: whether `state` is that of a whole step, which it also is where `step` raised an error before anything
@@ -126,7 +127,11 @@ class Trainer:
         self.done = 0
         self.discovery: str | None = None
         self._field_fitted = False  # by discovery
-        if scene is None and not resumed and _discovers(config):
+        wanted = config.discovery.enabled and config.field.kind != "static" and scene is None and not resumed
+        reason = _no_discovery(config, parts.field)
+        if wanted and reason and ranks.first:
+            print(f"note: motion discovery is left out: {reason}", file=sys.stderr, flush=True)
+        if wanted and not reason:
             with open(os.devnull, "w") as nowhere:
                 found = discover(config, dataset, device, Trainer, None if ranks.first else nowhere, parts.field)
             scene, self._field_fitted, self.discovery = found
@@ -431,7 +436,11 @@ class Trainer:
         self._pictures.order = own["order"].tolist()
 
 
-def _discovers(config: Config) -> bool:
-    """Whether a training of this configuration starts with motion discovery."""
-    wanted = config.discovery.enabled and config.field.kind != "static"
-    return wanted and config.schedule.steps > config.discovery.steps
+def _no_discovery(config: Config, own_field: nn.Module | None) -> str:
+    """Why motion discovery is left out although it is enabled, a sentence; empty where it is done."""
+    steps, needed = config.schedule.steps, config.discovery.steps
+    if steps <= needed:
+        return f"schedule.steps ({steps}) must be larger than discovery.steps ({needed})."
+    if own_field is not None and not any(each.requires_grad for each in own_field.parameters()):
+        return f"the field {type(own_field).__name__} has no parameters that could learn what it finds."
+    return ""

@@ -52,7 +52,8 @@ class FieldConfig(Options):
         "laplacian",
     )
     bound: float = option(
-        "half side length of the cube that the encoder covers, world units; outside it the features are zero",
+        "half side length of the field's cube, world units; outside it, features are zero (grid4d, laplacian) or those "
+        "of the border (hexplane); mlp divides positions by it",
         1.6,
         above=0,
         below=1e6,
@@ -88,7 +89,11 @@ class FieldConfig(Options):
         "laplacian",
     )
     components: int = option(
-        "field laplacian: number of frequencies in the motion spectrum", 16, at_least=1, at_most=256
+        "field laplacian: number of frequencies in the motion spectrum; at most 1 + training times / (2 x "
+        "frequency_step), rounded down, are used",
+        16,
+        at_least=1,
+        at_most=256,
     )
     frequency_step: float = option(
         "field laplacian: initial spacing of the spectrum's frequencies, which start at 0; cycles per clip",

@@ -31,13 +31,15 @@ class Deformation(NamedTuple):
     """Changes of N Gaussians at a time. None: no change.
 
     Attributes:
-        rotation: (N, 4) unit quaternions wxyz, which rotate the means about the origin.
+        rotation: (N, 4) unit quaternions wxyz, which rotate the means about the origin, but not the orientations.
         translation: (N, 3) added to the rotated means, world units.
-        d_quats: (N, 4) added to the Gaussians' unit quaternions, which are normalized again.
+        d_quats: (N, 4) added to the Gaussians' unit quaternions, after orientation; the sums are normalized.
         d_scales: (N, 3) added to the scales (standard deviations, world units).
         d_dc: (N, 3) added to the constant part of the colors (spherical harmonics, degree 0).
         d_opacity: (N,) added to the opacity logits.
         smoothness: scalar, the weighted smoothness loss; None if it was not requested.
+        orientation: (N, 4) unit quaternions wxyz, which rotate the Gaussians' orientations; in rigid motion the same as
+            rotation. No built-in field uses it.
     """
 
     rotation: Tensor | None = None
@@ -47,3 +49,4 @@ class Deformation(NamedTuple):
     d_dc: Tensor | None = None
     d_opacity: Tensor | None = None
     smoothness: Tensor | None = None
+    orientation: Tensor | None = None

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import inspect
+from collections.abc import Mapping
+from typing import Any
 
 from torch import Tensor, nn
 
+from ...errors import InputError
 from .deformation import Deformation, Nearby
 
-_ROWS = {"rotation": (4,), "translation": (3,), "d_quats": (4,), "d_scales": (3,), "d_dc": (3,), "d_opacity": ()}
+_ROWS = {
+    "rotation": (4,), "orientation": (4,), "translation": (3,), "d_quats": (4,), "d_scales": (3,), "d_dc": (3,),
+    "d_opacity": (),
+}  # fmt: skip
 
 
 class OwnField(nn.Module):
@@ -28,28 +34,48 @@ class OwnField(nn.Module):
     def forward(
         self, means: Tensor, t: float, dynamics: Tensor | None = None, nearby: Nearby | None = None
     ) -> Deformation:
-        """See motion/fields/deformation.py. Raises TypeError and ValueError for results of another form."""
+        """See motion/fields/deformation.py. Raises InputError for results of another form."""
         beside = {"dynamics": dynamics, "nearby": nearby}
         move = self.module(means, t, **{name: beside[name] for name in self._takes})
         if isinstance(move, Tensor):
             move = Deformation(translation=move)
         name = type(self.module).__name__
         if not isinstance(move, Deformation):
-            raise TypeError(f"the field {name} must return a Tensor or a Deformation, got {type(move).__name__}")
+            raise InputError(f"the field {name} must return a Tensor or a Deformation, got {type(move).__name__}.")
         for part, row in _ROWS.items():
             values = getattr(move, part)
+            if values is not None and not isinstance(values, Tensor):
+                raise InputError(f"the field {name} must return a Tensor as {part}, got {type(values).__name__}.")
             if values is not None and tuple(values.shape) != (len(means), *row):
-                raise ValueError(
-                    f"the field {name} must return {part} of shape {(len(means), *row)}, got {tuple(values.shape)}"
+                raise InputError(
+                    f"the field {name} must return {part} of shape {(len(means), *row)}, got {tuple(values.shape)}."
                 )
         return move
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        """See motion/fields/deformation.py."""
+        """See motion/fields/deformation.py. Raises InputError where a parameter is in no group."""
         grouped = getattr(self.module, "parameter_groups", None)
         groups: dict[str, list[nn.Parameter]] = grouped() if grouped else {"mlp": list(self.parameters())}
         listed = {id(parameter) for group in groups.values() for parameter in group}
         missing = [name for name, each in self.module.named_parameters() if id(each) not in listed]
         if missing:
-            raise ValueError(f"parameter_groups() of {type(self.module).__name__} lacks {', '.join(missing)}")
+            raise InputError(f"parameter_groups() of {type(self.module).__name__} lacks {', '.join(missing)}.")
         return {name: group for name, group in groups.items() if group}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
+        """As of nn.Module. Raises InputError where names or shapes are not those of the module."""
+        mine, given = (
+            {name.removeprefix("module."): tuple(value.shape) for name, value in each.items()}
+            for each in (self.state_dict(), state_dict)
+        )
+        wrong = [
+            f"{name} is {given.get(name, 'missing')} in the file, {mine.get(name, 'missing')} in the module"
+            for name in sorted(mine.keys() | given.keys())
+            if mine.get(name) != given.get(name)
+        ]
+        if wrong:
+            raise InputError(
+                f"is of another field than the module {type(self.module).__name__} that was given: {'; '.join(wrong)}. "
+                "Give a module of the class and the sizes that it was trained with."
+            )
+        return super().load_state_dict(state_dict, strict, assign)
