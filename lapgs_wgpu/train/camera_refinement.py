@@ -1,14 +1,14 @@
 """Cameras corrected while training: of each training camera its rotation and its place, of all together the zoom.
 
 Poses of own footage come from structure from motion and are a little off, which a training answers with blur. The
-gradient is that of the rasterizer's backward pass (`camera_bwd`). What all cameras could do together without any image
-changing (shift, turn and scale of the whole scene) is taken out, and corrections are pulled back to zero.
-Views that are measured keep their cameras.
+gradient is that of the rasterizer's backward pass (`camera_bwd`), the steps are those of `camera_descent`. What all
+cameras could do together without any image changing (shift, turn and scale of the whole scene) is taken out, and
+corrections are pulled back to zero. Views that are measured keep their cameras.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,10 +18,11 @@ from torch import Tensor, nn
 
 from lapgs_wgpu.splat.camera import Camera
 
+from .camera_descent import CameraDescent, ScenePoints, image_motion, whitening
 from .config import CamerasConfig
 from .row_adam import RowAdam, restore_rows
 
-SQUARE_DECAY = 0.99  # Adam's; a camera is seen a few dozen times
+ZOOM_DECAY = 0.99  # of Adam's second moment
 Array = NDArray[np.float64]
 
 
@@ -33,23 +34,53 @@ class RefinedCamera(NamedTuple):
     change: Tensor
 
 
+class Corrections(NamedTuple):
+    """What cameras were corrected by, as far as it is known.
+
+    of_cameras: by the number of a camera, (6,) rotation vector and shift, world units. zoom: logarithm of the factor of
+    all focal lengths.
+    """
+
+    of_cameras: Mapping[int, Array]
+    zoom: float
+
+
 class CameraRefinement:
     """The corrections of all training cameras, and how they learn.
 
-    cameras: distinct ones. extent: distance that counts as 1 in shifts, world units.
+    Args:
+        cameras: distinct ones.
+        extent: distance that counts as 1 in shifts, world units.
+        config: of the refinement.
+        points: the scene as it is, asked at each step: what moves how far in the image when a camera moves.
+        before: corrections to go on from, at the final learning rate and from the first step on.
     """
 
     name = "cameras"
 
-    def __init__(self, cameras: Sequence[Camera], extent: float, config: CamerasConfig) -> None:
-        self._cameras, self._extent, self._config = list(cameras), extent, config
+    def __init__(
+        self,
+        cameras: Sequence[Camera],
+        extent: float,
+        config: CamerasConfig,
+        points: Callable[[], ScenePoints],
+        before: Corrections | None = None,
+    ) -> None:
+        self._cameras, self._extent, self._config, self._points = list(cameras), extent, config, points
         self._numbers = {id(camera): number for number, camera in enumerate(self._cameras)}
         count = len(self._cameras)
         self.values = nn.Parameter(torch.zeros(count, 7))  # zeros that get the gradient
         self._learnt = torch.zeros(count, 6, dtype=torch.float64)  # rotation vectors, shifts
         self._zoom = torch.zeros(1, dtype=torch.float64)
-        self._adam = RowAdam((count, 7), SQUARE_DECAY)
+        self._descent = CameraDescent(count)
+        self._zoom_adam = RowAdam((1, 1), ZOOM_DECAY)
         self._common = torch.from_numpy(_common_motions(self._cameras, extent))
+        self._settled = torch.zeros(1)
+        if before is not None:
+            self._settled += 1
+            self._zoom += before.zoom
+            for number, correction in before.of_cameras.items():
+                self._learnt[number] = torch.from_numpy(correction * _units(1 / extent))
 
     def refined(self, camera: Camera) -> RefinedCamera:
         """The corrected form of one of the cameras (the same object)."""
@@ -58,31 +89,37 @@ class CameraRefinement:
 
     def camera(self, number: int) -> Camera:
         """The corrected form of a camera, by its number."""
-        camera = self._cameras[number]
-        turn, shift = self._learnt[number].numpy().reshape(2, 3)
-        T, K = camera.T_cam_world.copy(), camera.K.copy()
-        T[:3, :3] = T[:3, :3] @ rotation_of(turn).T
-        T[:3, 3] = -T[:3, :3] @ (camera.position + self._extent * shift)
-        K[:2, :2] *= np.exp(float(self._zoom))
-        return Camera(K, T, camera.width, camera.height)
+        return changed_camera(
+            self._cameras[number], self._learnt[number].numpy() * _units(self._extent), float(self._zoom)
+        )
+
+    def corrections_of(self, cameras: Mapping[int, Camera]) -> Corrections:
+        """What the cameras (the same objects) are corrected by, under the given numbers."""
+        learnt = self._learnt.numpy() * _units(self._extent)
+        return Corrections({n: learnt[self._numbers[id(c)]] for n, c in cameras.items()}, float(self._zoom))
 
     @torch.no_grad()
     def step(self, step: int) -> None:
         """Move the cameras that have a gradient, at the rate of this step (counted from 1), and forget it."""
-        gradient, self.values.grad = self.values.grad, None
-        if gradient is None or step < self._config.start:
+        config, gradient = self._config, self.values.grad
+        self.values.grad = None
+        if gradient is None or not (self._settled or step >= config.start):
             return
-        rate = self._config.rate.at(step)
-        rows, move = self._adam.descend(gradient, rate)
-        change = -move.double()
-        for row, turn in zip(rows.tolist(), change[:, :3].numpy(), strict=True):
+        rate = config.rate.end if self._settled else config.rate.at(step)
+        # A scene that is still blurred says nothing of what only parallax tells: the damping falls with the rate.
+        damping = (rate / config.rate.start) ** 2 if config.rate.start else 1.0
+        rows, points = gradient.any(dim=1).nonzero()[:, 0].tolist(), self._points()
+        for row in rows:
+            whiten = whitening(image_motion(self.camera(row), points, self._extent), damping)
+            change = self._descent.change(row, gradient[row, :6].double().numpy(), whiten, rate)
             before = rotation_of(self._learnt[row, :3].numpy())
-            self._learnt[row, :3] = torch.from_numpy(rotation_vector(rotation_of(turn) @ before))
-        self._learnt[rows, 3:] += change[:, 3:6]
-        if self._config.focal:
-            self._zoom += change[:, 6].sum() / len(self._cameras)  # each camera has its share
-        self._learnt[rows] *= 1 - rate * self._config.pull
-        self._zoom *= 1 - rate * self._config.pull
+            self._learnt[row, :3] = torch.from_numpy(rotation_vector(rotation_of(change[:3]) @ before))
+            self._learnt[row, 3:] += torch.from_numpy(change[3:])
+        if config.focal and rows:
+            _, move = self._zoom_adam.descend(gradient[rows, 6].mean()[None, None], rate)
+            self._zoom -= move.sum() * len(rows) / len(self._cameras)  # each camera has its share
+        self._learnt[rows] *= 1 - rate * config.pull
+        self._zoom *= 1 - rate * config.pull
         flat = self._learnt.view(-1)
         flat -= self._common @ (self._common.T @ flat)
 
@@ -102,11 +139,26 @@ class CameraRefinement:
 
     def state(self) -> dict[str, Tensor]:
         """Everything that the next step depends on, besides the gradient."""
-        return {"learnt": self._learnt, "zoom": self._zoom, **self._adam.state()}
+        zoom = {f"zoom_{name}": value for name, value in self._zoom_adam.state().items()}
+        mine = {"learnt": self._learnt, "zoom": self._zoom, "settled": self._settled}
+        return {**mine, **zoom, **self._descent.state()}
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
         """Go on from what `state` gave. Raises ValueError where it is of other cameras."""
         restore_rows(self.state(), state, "camera")
+
+
+def changed_camera(camera: Camera, change: Array, zoom: float = 0.0) -> Camera:
+    """A camera after a rotation about its center and a shift.
+
+    change: (6,) rotation vector along the world's axes, radians, and shift, world units. zoom: logarithm of the factor
+    of the focal lengths.
+    """
+    T, K = camera.T_cam_world.copy(), camera.K.copy()
+    T[:3, :3] = T[:3, :3] @ rotation_of(change[:3]).T
+    T[:3, 3] = -T[:3, :3] @ (camera.position + change[3:])
+    K[:2, :2] *= np.exp(zoom)
+    return Camera(K, T, camera.width, camera.height)
 
 
 def rotation_of(vector: Array) -> Array:
@@ -135,6 +187,11 @@ def _common_motions(cameras: Sequence[Camera], extent: float) -> Array:
         columns.append(np.concatenate([np.broadcast_to(axis, arms.shape), np.cross(axis, arms)], axis=1))
     basis, sizes, _ = np.linalg.svd(np.stack([column.ravel() for column in columns], axis=1), full_matrices=False)
     return np.ascontiguousarray(basis[:, sizes > 1e-9 * sizes[0]])
+
+
+def _units(length: float) -> Array:
+    """(6,) factors of a rotation vector and a shift that change the unit of the shift."""
+    return np.repeat([1.0, length], 3)
 
 
 def _summary(values: Array) -> dict[str, float]:

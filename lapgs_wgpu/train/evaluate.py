@@ -23,16 +23,20 @@ from lapgs_wgpu.data.images import encode_png
 from lapgs_wgpu.data.views import View, composite
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.motion.scene import Scene4D
+from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.train.camera_refinement import rotation_vector
 from lapgs_wgpu.train.log import environment
 from lapgs_wgpu.train.losses import MS_SSIM_SMALLEST, SSIM_WINDOW, masked_ssim, ms_ssim, psnr, ssim
 from lapgs_wgpu.train.lpips import SMALLEST, Lpips
 from lapgs_wgpu.train.motion_masks import differs_from_median, differs_from_static, still_backgrounds
 from lapgs_wgpu.train.object_metrics import masked_psnr, measure_objects, summarise
+from lapgs_wgpu.train.test_alignment import aligned_view
 
 ERROR_GAIN = 4  # of the error pictures
 MEASURES = ("psnr", "ssim", "ms_ssim", "lpips", "lpips_unscaled", "masked_psnr", "masked_ssim")
 MOTION_MEASURES = ("psnr_moving", "psnr_still")  # of views of which motion masks are known
 NOT_AVAILABLE = "not available"
+ALIGNED = "test-time alignment: the camera of each test view was fitted to its image, the scene fixed"
 BACKGROUND_LEVELS = {"black": 0.0, "white": 1.0, "random": 0.0}  # of the background under test views
 
 
@@ -44,6 +48,7 @@ def evaluate(
     *,
     lpips: Lpips | None = None,
     static: Scene4D | None = None,
+    camera_unit: float | None = None,
 ) -> dict[str, Any]:
     """Render every view and compare: the content of metrics.json.
 
@@ -57,12 +62,15 @@ def evaluate(
     psnr_moving is that of moving pixels. They belong to the objects of a generated scene, with found and track_error
     (`object_metrics`); otherwise they differ from the static fit or, without one, from the median of a test camera that
     stands still, and psnr_still is that of the other pixels. Absent where no moving pixel is known.
+    camera_unit: extent of the cameras, world units, where training cameras were refined. `aligned` then holds the
+    measures once more, after test-time alignment (`test_alignment`), labelled as such; the others stay without it.
     Raises InputError where a picture or a mask cannot be read.
     """
     start = time.perf_counter()
     color = torch.full((3,), BACKGROUND_LEVELS[background])
     rows = []
     frames = []
+    fitted: list[dict[str, Any]] = []
     listed = any(view.objects for view in views)
     medians = still_backgrounds(views, partial(_on, color)) if not listed and static is None else [None] * len(views)
     for view, still in zip(views, medians, strict=True):
@@ -77,6 +85,10 @@ def evaluate(
             elif still is not None:
                 row |= _moving(image, truth, differs_from_median(truth, still))
         rows.append(row)
+        if camera_unit is not None:
+            near = aligned_view(scene, view, color, camera_unit)
+            moved = _measures(_unit(_render(scene, near, color)), _unit(truth), view.load_mask(), lpips)
+            fitted.append({"view": view.name} | moved | _apart(view.camera, near.camera, camera_unit))
         if folder is not None:
             with atomic_write(folder / f"{view.name}.png") as file:
                 file.write(encode_png(side_by_side(truth, image)))
@@ -88,6 +100,7 @@ def evaluate(
     return {
         **{name: _mean([row[name] for row in rows]) for name in MEASURES},
         **motion,
+        **({"aligned": _aligned(fitted)} if fitted else {}),
         "gaussians": len(scene),
         "field": scene.field_config.kind,
         "size": [views[0].camera.width, views[0].camera.height],
@@ -95,6 +108,21 @@ def evaluate(
         "views": rows,
         "seconds": round(time.perf_counter() - start, 3),
         "environment": environment(scene.device),
+    }
+
+
+def _aligned(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """The means over the views after test-time alignment, and each view."""
+    names = (*MEASURES, "rotation_degrees", "shift_percent")
+    return {"protocol": ALIGNED} | {name: _mean([row[name] for row in rows]) for name in names} | {"views": rows}
+
+
+def _apart(given: Camera, fitted: Camera, unit: float) -> dict[str, float]:
+    """How far the alignment moved a camera: degrees, and per cent of the cameras' extent."""
+    turn = rotation_vector(fitted.T_cam_world[:3, :3].T @ given.T_cam_world[:3, :3])
+    return {
+        "rotation_degrees": float(np.degrees(np.linalg.norm(turn))),
+        "shift_percent": 100 * float(np.linalg.norm(fitted.position - given.position)) / unit,
     }
 
 

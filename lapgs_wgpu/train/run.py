@@ -291,7 +291,8 @@ def evaluate_run(
         if folder.is_symlink():
             raise InputError(f"{folder} is a link, and pictures are written into the run's own folder only; remove it.")
     (out / "eval").mkdir(exist_ok=True)
-    metrics = evaluate(scene, dataset.test, background, out / "eval", lpips=lpips, static=static)
+    unit = (dataset.extent or 1.0) if "cameras" in training else None  # they were refined
+    metrics = evaluate(scene, dataset.test, background, out / "eval", lpips=lpips, static=static, camera_unit=unit)
     metrics["training"] = training
     write_metrics(out, metrics)
     return metrics

@@ -12,7 +12,7 @@ from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.config import Config
-from lapgs_wgpu.train.discovery.static_fit import small_view, static_config
+from lapgs_wgpu.train.discovery.static_fit import small_views, static_config
 from lapgs_wgpu.train.evaluate import evaluate
 from lapgs_wgpu.train.initial_points import initial_points
 from lapgs_wgpu.train.trainer import Trainer
@@ -42,7 +42,7 @@ class Costs(NamedTuple):
 
 def measure_costs(config: Config, dataset: Dataset, device: Device) -> Costs:
     """Time some steps of a training on a dataset. Nothing is written. Raises InputError and DeviceError."""
-    small = [small_view(view, config.discovery.size) for view in dataset.train[:MOST_STEPS]]
+    small = small_views(dataset.train[:MOST_STEPS], config.discovery.size)
     still, _ = _timed(static_config(config), dataclasses.replace(dataset, train=tuple(small)), device, USUAL)
     few, _ = _timed(config, dataset, device, USUAL)
     many, scene = _timed(config, dataset, device, GROWTH)

@@ -26,7 +26,8 @@ from lapgs_wgpu.motion.fields.dynamics import dynamics_loss
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.autotune import choose_decoder
-from lapgs_wgpu.train.camera_refinement import CameraRefinement
+from lapgs_wgpu.train.camera_descent import scene_points
+from lapgs_wgpu.train.camera_refinement import CameraRefinement, Corrections
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.dataloader import Pictures
 from lapgs_wgpu.train.densify import Statistics
@@ -73,6 +74,7 @@ class Trainer:
         done: number of the steps so far.
         callbacks: a list of functions of the trainer and the StepResult, called after each step.
         discovery: what motion discovery found, a line; None where it was left out.
+        cameras: the corrections of the training cameras; None where they are kept.
         decoder: where the field's decoder runs, and why.
         ranks: this process among those that train together.
         whole: whether `state` is that of a whole step, which it also is where `step` raised an error before anything
@@ -127,6 +129,7 @@ class Trainer:
         self.done = 0
         self.discovery: str | None = None
         self._field_fitted = False  # by discovery
+        corrections: Corrections | None = None
         wanted = config.discovery.enabled and config.field.kind != "static" and scene is None and not resumed
         reason = _no_discovery(config, parts.field)
         if wanted and reason and ranks.first:
@@ -134,7 +137,7 @@ class Trainer:
         if wanted and not reason:
             with open(os.devnull, "w") as nowhere:
                 found = discover(config, dataset, device, Trainer, None if ranks.first else nowhere, parts.field)
-            scene, self._field_fitted, self.discovery = found
+            scene, self._field_fitted, self.discovery, corrections = found
         self._generator = torch.Generator().manual_seed(config.seed)
         # What discovery found moves from the first step on, at rates that rise: Adam's first steps, all of the size of
         # the rate, would shake off what the field knows.
@@ -150,10 +153,10 @@ class Trainer:
         self.decoder = choose_decoder(config, self.scene, device, ranks)
         self.config = dataclasses.replace(config, decoder=self.decoder.place)
         self.given = dataclasses.replace(given, decoder=self.decoder.place)
-        self._start()
+        self._start(corrections)
         self.whole = True
 
-    def _start(self) -> None:
+    def _start(self, corrections: Corrections | None) -> None:
         config, scene, dataset = self.config, self.scene, self.dataset
         if isinstance(scene.field, GridField):
             scene.field.precision = getattr(torch, config.precision)
@@ -177,10 +180,16 @@ class Trainer:
         self._exposures = Exposures(len(dataset.train), config.exposure.rate) if config.exposure.enabled else None
         # Cameras that all stand at one place have no extent; the scene's own size must serve.
         self._extent = dataset.extent or config.points.box
-        self._cameras = None
+        self.cameras = None
         if config.cameras.refine == "on" or (config.cameras.refine == "auto" and dataset.own_footage):
-            self._cameras = CameraRefinement(dataset.cameras, self._extent, config.cameras)
-        beside = (self._frequencies, self._exposures, self._cameras)
+            self.cameras = CameraRefinement(
+                dataset.cameras,
+                self._extent,
+                config.cameras,
+                lambda: scene_points(scene.parameters["means"], scene.parameters["opacity_logits"].sigmoid()),
+                corrections,
+            )
+        beside = (self._frequencies, self._exposures, self.cameras)
         self._beside = [each for each in beside if each is not None]
         self._density = DensityControl(
             config, scene, self._optimizer, self.parts.density, dataset.train, self._extent, self._generator
@@ -319,8 +328,8 @@ class Trainer:
         weighted = [(term, weight_at(term, self.done + 1)) for term in self.parts.losses]
         own = [(term, weight) for term, weight in weighted if weight and not isinstance(term, Regularizer)]
         camera, change = view.camera, None
-        if self._cameras is not None:
-            camera, change = self._cameras.refined(camera)
+        if self.cameras is not None:
+            camera, change = self.cameras.refined(camera)
         rendering = render_loss(
             gaussians, camera, truth, look.background, weights, scene.device, correction, own, change, self._extent
         )
@@ -378,7 +387,7 @@ class Trainer:
 
     def camera_report(self) -> dict[str, Any] | None:
         """How far the training cameras were moved (`CameraRefinement.report`); None where they are kept."""
-        return None if self._cameras is None else self._cameras.report()
+        return None if self.cameras is None else self.cameras.report()
 
     # The state between two steps -------------------------------------------------------------------------------------
 
@@ -391,7 +400,7 @@ class Trainer:
             "adam": self._optimizer.state(),
             "frequencies": self._frequencies.state() if self._frequencies else {},
             "exposure": self._exposures.state() if self._exposures else {},
-            "cameras": self._cameras.state() if self._cameras else {},
+            "cameras": self.cameras.state() if self.cameras else {},
             "statistics": vars(self._density.statistics),
             "training": {
                 "done": torch.tensor(self.done),
@@ -425,8 +434,8 @@ class Trainer:
             self._frequencies.restore(parts["frequencies"])
         if self._exposures is not None:
             self._exposures.restore(parts["exposure"])
-        if self._cameras is not None:
-            self._cameras.restore(parts["cameras"])
+        if self.cameras is not None:
+            self.cameras.restore(parts["cameras"])
         self._density.statistics = Statistics(**parts["statistics"])
         own = parts["training"]
         self.done, scene.sh_degree = int(own["done"]), int(own["sh_degree"])

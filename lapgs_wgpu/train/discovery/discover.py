@@ -20,6 +20,7 @@ from lapgs_wgpu.progress import Progress
 from lapgs_wgpu.splat.constants import CONSTANTS
 from lapgs_wgpu.splat.morton import morton_order
 from lapgs_wgpu.splat.rotation import rotation_matrices
+from lapgs_wgpu.train.camera_refinement import Corrections
 from lapgs_wgpu.train.config import Config
 
 from .field_fit import fit_field
@@ -42,11 +43,13 @@ SHOWN = 2.0 / 255  # least difference from the background of an image that shows
 
 
 class Discovery(NamedTuple):
-    """scene: to start from. fitted: whether its field knows nearly all that moves. summary: what was found, a line."""
+    """scene: to start from. fitted: whether its field knows nearly all that moves. summary: what was found, a line.
+    corrections: of the dataset's cameras; None where they are kept."""
 
     scene: Scene4D
     fitted: bool
     summary: str
+    corrections: Corrections | None
 
 
 def discover(
@@ -68,7 +71,7 @@ def discover(
     steps = config.discovery.steps
     fit_steps = config.discovery.field_steps
     meter = Progress(steps + fit_steps, "steps of motion discovery", terminal)
-    static, images = static_fit(config, dataset, device, trainer, meter.at)
+    static, images, corrections = static_fit(config, dataset, device, trainer, meter.at)
     background = 1.0 if config.data.background == "white" else 0.0
     if all(float(np.abs(image.image - background).max()) < SHOWN for image in images):
         raise InputError(
@@ -97,7 +100,7 @@ def discover(
     meter.clear()
     seconds = time.perf_counter() - started
     summary = f"discovery: a static fit of {len(static)} Gaussians; {found}; {seconds:.0f} s"
-    return Discovery(scene, tracks is not None and share >= NEARLY_ALL, summary)
+    return Discovery(scene, tracks is not None and share >= NEARLY_ALL, summary, corrections)
 
 
 def lost_tracks(tracks: Tracks, static: Scene4D) -> Tracks | None:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -15,6 +15,8 @@ from lapgs_wgpu.data.images import shrink
 from lapgs_wgpu.data.views import Dataset, View, composite
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.scene import Scene4D
+from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.train.camera_refinement import CameraRefinement, Corrections
 from lapgs_wgpu.train.config import Config, Rate
 from lapgs_wgpu.train.evaluate import BACKGROUND_LEVELS
 
@@ -25,6 +27,7 @@ MOST_VIEWS = 400  # of a capture, evenly chosen over the clip
 DENSIFY = (0.375, 0.875)
 DENSITY_INTERVAL, CONTRIBUTION_INTERVAL = 0.125, 0.3125
 SH_INTERVAL = 0.375
+REFINE = 0.125  # from when on cameras move, at the latest
 GRADIENT = 5e-4  # density.gradient
 LOG_SCALES, QUATS, SH_DC, SH_REST = 5e-3, 1e-3, 2.5e-3, 1.25e-4  # learning rates, those of 3DGS
 
@@ -33,6 +36,7 @@ class StaticTrainer(Protocol):
     """A training, as `Trainer` is one, which starts with a discovery itself and therefore is no import of this file."""
 
     scene: Scene4D
+    cameras: CameraRefinement | None
 
     def step(self) -> object: ...
     def close(self) -> None: ...
@@ -41,17 +45,27 @@ class StaticTrainer(Protocol):
 MakeTrainer = Callable[[Config, Dataset, Device], StaticTrainer]
 
 
+class StaticFit(NamedTuple):
+    """scene: what stands still. images: the training images of the clip, by time, with their differences from it.
+    corrections: of the dataset's cameras; None where they are kept."""
+
+    scene: Scene4D
+    images: list[Residual]
+    corrections: Corrections | None
+
+
 def static_fit(
     config: Config, dataset: Dataset, device: Device, trainer: MakeTrainer, progress: Callable[[int], None]
-) -> tuple[Scene4D, list[Residual]]:
-    """The static scene, and the training images of the clip, by time, with their differences from it.
+) -> StaticFit:
+    """Fit the static scene, and the training cameras where they are refined.
 
     config: `discovery` says how many steps and at which size; the learning rate of the means and the losses are those
     of the training, but for the terms that compare the field. progress: called with each step.
     """
     views = sorted(dataset.train, key=lambda view: (view.time, view.name))
     chosen = np.linspace(0, len(views) - 1, min(len(views), MOST_VIEWS)).astype(np.int64)
-    small = [small_view(views[i], config.discovery.size) for i in dict.fromkeys(chosen.tolist())]
+    picked = [views[i] for i in dict.fromkeys(chosen.tolist())]
+    small = small_views(picked, config.discovery.size)
     training = trainer(static_config(config), dataclasses.replace(dataset, train=tuple(small)), device)
     try:
         for step in range(config.discovery.steps):
@@ -59,13 +73,19 @@ def static_fit(
             progress(step + 1)
     finally:
         training.close()
-    background = torch.full((3,), BACKGROUND_LEVELS[config.data.background])
+    background, refinement = torch.full((3,), BACKGROUND_LEVELS[config.data.background]), training.cameras
     images = []
     for view in small:
         image = (composite(view.load(), background.numpy()) / 255).astype(np.float32)
-        still = training.scene.render(view.camera, view.time, background, depth=False).image.numpy(force=True)
-        images.append(Residual(view.camera, view.time, image, still))
-    return training.scene, images
+        camera = view.camera if refinement is None else refinement.refined(view.camera).camera
+        still = training.scene.render(camera, view.time, background, depth=False).image.numpy(force=True)
+        images.append(Residual(camera, view.time, image, still))
+    corrections = None
+    if refinement is not None:
+        known = {id(before.camera): after.camera for before, after in zip(picked, small, strict=True)}
+        numbers = {n: known[id(camera)] for n, camera in enumerate(dataset.cameras) if id(camera) in known}
+        corrections = refinement.corrections_of(numbers)
+    return StaticFit(training.scene, images, corrections)
 
 
 def static_config(config: Config) -> Config:
@@ -95,6 +115,11 @@ def static_config(config: Config) -> Config:
             gradient=GRADIENT,
             split="plain",
         ),
+        cameras=dataclasses.replace(
+            config.cameras,
+            rate=dataclasses.replace(config.cameras.rate, steps=steps),
+            start=min(config.cameras.start, max(1, round(REFINE * steps))),
+        ),
         loss=dataclasses.replace(config.loss, pyramid=0.0, ncc=0.0, dynamics_mode="off"),
         smoothness=dataclasses.replace(config.smoothness, share=0.0),
         precision="float32",
@@ -102,14 +127,21 @@ def static_config(config: Config) -> Config:
     )
 
 
-def small_view(view: View, size: int) -> View:
-    """The view with its longer side shrunk to `size` pixels; the view itself where it is no larger."""
-    width, height = view.camera.width, view.camera.height
-    scale = size / max(width, height)
-    if scale >= 1:
-        return view
-    small = max(1, round(scale * width)), max(1, round(scale * height))
-    return dataclasses.replace(view, camera=view.camera.resized(*small), pixels=partial(_shrunk, view, small))
+def small_views(views: Sequence[View], size: int) -> list[View]:
+    """The views with their longer side shrunk to `size` pixels, smaller ones as they are. Views that share a camera
+    still share one."""
+    cameras: dict[int, Camera] = {}
+    found = []
+    for view in views:
+        width, height = view.camera.width, view.camera.height
+        scale = size / max(width, height)
+        if scale >= 1:
+            found.append(view)
+            continue
+        small = max(1, round(scale * width)), max(1, round(scale * height))
+        camera = cameras.setdefault(id(view.camera), view.camera.resized(*small))
+        found.append(dataclasses.replace(view, camera=camera, pixels=partial(_shrunk, view, small)))
+    return found
 
 
 def _shrunk(view: View, size: tuple[int, int]) -> NDArray[np.uint8]:
