@@ -66,7 +66,7 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) g
             d += select(select(band.z, band.y, channel == 1u), band.x, channel == 0u);
 #endif
             let at = u32(row) * width + id.x;
-            d_image[channel * count + at] = d;
+            d_image[channel * count + at] = select(d, 0.0, (pixel.w & IGNORED) != 0u);
             if (channel == 0u) {
                 d_image[3u * count + at] = 0.0;
             }

@@ -24,7 +24,10 @@ fn main(
         let i = row * picture.size.x + column;
         let laid = composite(rgba_at(i), picture.background);
         let bits = bitcast<vec3<u32>>(vec3(image_at(i), image_at(count + i), image_at(2u * count + i)));
-        let pixel = vec4(bits, laid.x | (laid.y << 8u) | (laid.z << 16u));
+        var pixel = vec4(bits, laid.x | (laid.y << 8u) | (laid.z << 16u));
+        if (is_ignored(rgba_at(i))) {
+            pixel = vec4(bitcast<vec3<u32>>(share(laid)), pixel.w | IGNORED);
+        }
         pixels[place(column, row, picture)] = pixel;
         let difference = seen(pixel) - truth(pixel);
         absolute += dot(abs(difference), vec3(1.0));

@@ -24,7 +24,7 @@ from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.discovery.discover import density_at, discover, explained_share, lost_tracks
 from lapgs_wgpu.train.discovery.field_fit import fit_field, keeping_rates
 from lapgs_wgpu.train.discovery.residual import Residual, moving_pixels
-from lapgs_wgpu.train.discovery.static_fit import small_view, static_config, static_fit
+from lapgs_wgpu.train.discovery.static_fit import small_views, static_config, static_fit
 from lapgs_wgpu.train.discovery.surface_points import PointClouds, Points, surface_points
 from lapgs_wgpu.train.discovery.tracks import Tracks, find_tracks
 from lapgs_wgpu.train.discovery.trajectories import find_trajectories
@@ -351,10 +351,13 @@ def test_only_parts_in_empty_places_are_lost(device: Device) -> None:
 def test_the_static_fit_has_no_motion_and_small_images(dataset: Dataset) -> None:
     config = static_config(configure())
     assert (config.field.kind, config.schedule.steps, config.schedule.warm_up) == ("static", 60, 60)
-    view = small_view(dataset.train[0], 32)
+    view, other = small_views(
+        [dataset.train[0], dataclasses.replace(dataset.train[1], camera=dataset.train[0].camera)], 32
+    )
+    assert view.camera is other.camera  # a camera that stands still remains one
     assert (view.camera.width, view.camera.height) == (32, 32)
     assert view.load().shape == (32, 32, 4)
-    assert small_view(dataset.train[0], 48) is dataset.train[0]
+    assert small_views(dataset.train[:1], 48) == [dataset.train[0]]
 
 
 # The field, and all together -----------------------------------------------------------------------------------------
@@ -428,7 +431,7 @@ def test_a_field_that_knows_nearly_all_that_moves_keeps_it(
 
 def test_without_parts_to_follow_the_static_fit_starts_a_training(dataset: Dataset, device: Device) -> None:
     config = configure(discovery__least="1")
-    static, _ = static_fit(config, dataset, device, Trainer, lambda step: None)
+    static, _, _ = static_fit(config, dataset, device, Trainer, lambda step: None)
     found = discover(config, dataset, device, Trainer)
     assert "nothing is added" in found.summary
     assert found.scene.parameters["dynamics"].abs().sum() == 0

@@ -16,6 +16,7 @@ import numpy as np
 from lapgs_wgpu.data.cloud import Cloud, points_in_view
 from lapgs_wgpu.data.covisible import read_mask
 from lapgs_wgpu.data.frames import Capture, Frame, ImageSource, Reader, Split
+from lapgs_wgpu.data.ignored import find_masks, read_ignored
 from lapgs_wgpu.data.images import Pixels, Size, shrink, shrunk_size
 from lapgs_wgpu.data.normalize import BOX, Cube, cube_in_view, cube_of_points
 from lapgs_wgpu.data.readers import colmap, dnerf, endonerf, hypernerf, nerfstudio, neu3d, polycam, record3d
@@ -37,7 +38,12 @@ NEAREST, FURTHEST = 0.25, 2.0  # depths relative to the distance of the focus, f
 
 
 def load_dataset(
-    folder: str | Path, *, image_size: int | None = None, normalize: bool = True, undistort: bool = True
+    folder: str | Path,
+    *,
+    image_size: int | None = None,
+    normalize: bool = True,
+    undistort: bool = True,
+    masks: str | Path | None = None,
 ) -> Dataset:
     """Open a capture; its files determine the format (docs/data.md). Images are decoded later, view by view.
 
@@ -47,6 +53,7 @@ def load_dataset(
         normalize: False keeps the coordinates of a D-NeRF scene of any size; other formats are always normalized.
         undistort: False takes images as they are, and cameras as pinholes that look at the center of the image,
             whatever the files say of distortion, skew and principal point, as published code on HyperNeRF does.
+        masks: folder with a PNG for each training image, under its name, white where the training loss ignores it.
 
     Returns:
         A dataset, whose `train`, `test` and `val` are tuples of views (`name`, `camera`, `time`, `load()`).
@@ -61,7 +68,8 @@ def load_dataset(
     matching = [reader for reader in READERS if reader.matches(folder)]
     if len(matching) == 1:
         capture = matching[0].read(folder, image_size)
-        return _dataset(folder, capture if undistort else _idealized(capture), image_size, normalize)
+        masks = None if masks is None else Path(masks)
+        return _dataset(folder, capture if undistort else _idealized(capture), image_size, normalize, masks)
     if matching:
         both = " and of ".join(f"{reader.name} ({reader.files})" for reader in matching)
         raise InputError(f"{folder} holds the files of {both}; keep one format's in it.")
@@ -72,7 +80,7 @@ def load_dataset(
     raise InputError(f"{folder} is no scene in a known format: expected {expected}{inside}.")
 
 
-def _dataset(folder: Path, capture: Capture, image_size: int | None, normalize: bool) -> Dataset:
+def _dataset(folder: Path, capture: Capture, image_size: int | None, normalize: bool, masks: Path | None) -> Dataset:
     """Turn what a reader returned into a dataset."""
     frames, cloud, warnings = capture.frames, capture.cloud, list(capture.warnings)
     times, time_source = _times(folder, capture, warnings)
@@ -102,6 +110,7 @@ def _dataset(folder: Path, capture: Capture, image_size: int | None, normalize: 
     if cloud is not None and capture.own_footage:
         cloud = _filled(cloud, training)
     order = _film_order(frames, times, warnings) if capture.own_footage else range(len(frames))
+    ignored = {} if masks is None else find_masks(masks, [frame.name.file for frame in frames], splits, stored)
     placed = {id(camera): camera if fit is None else fit.camera(camera) for camera in cameras}
 
     def views(split: Split) -> tuple[View, ...]:
@@ -117,6 +126,9 @@ def _dataset(folder: Path, capture: Capture, image_size: int | None, normalize: 
                 if (path := frames[i].mask) is None
                 else partial(read_mask, path, undistortions[i], stored, size),
                 objects=tuple(record.seen_by(cameras[i]) for record in frames[i].objects),
+                ignored=None
+                if (path := ignored.get(frames[i].name.file)) is None
+                else partial(read_ignored, path, undistortions[i], stored, size),
             )
             for index, i in enumerate(chosen)
         )

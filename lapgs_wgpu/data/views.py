@@ -34,6 +34,7 @@ class View:
     mask: decodes the mask of the masked metrics of a test view, such as DyCheck's covisibility masks: (height, width)
         bool. Raises InputError.
     objects: ground truth of moving objects in a test view of a generated scene (data/objects.py).
+    ignored: decodes the pixels of a training view that the loss leaves out: (height, width) bool. Raises InputError.
     """
 
     name: str
@@ -43,6 +44,7 @@ class View:
     pixels: Callable[[], NDArray[np.uint8]]
     mask: Callable[[], NDArray[np.bool_]] | None = None
     objects: tuple[ObjectTruth, ...] = ()
+    ignored: Callable[[], NDArray[np.bool_]] | None = None
 
     def load(self) -> NDArray[np.uint8]:
         """Decode the image: (H, W, 3) RGB or (H, W, 4) straight RGBA, uint8, read-only. Raises InputError."""
@@ -68,6 +70,10 @@ class View:
                 f"of {mask.shape} {mask.dtype} with {np.count_nonzero(mask)} set; make the mask again, or remove it."
             )
         return mask
+
+    def load_ignored(self) -> NDArray[np.bool_] | None:
+        """Decode the pixels that the training loss leaves out: (H, W) bool; None for none. Raises InputError."""
+        return None if self.ignored is None else self.ignored()
 
 
 @dataclass(frozen=True, eq=False)

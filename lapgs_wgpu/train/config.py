@@ -52,6 +52,11 @@ class DataConfig(Options):
         "scale of the cube when it starts",
         "world",
     )
+    masks: str = option(
+        "folder with a PNG for each training image, under its name, white where the training loss ignores the image, "
+        "such as the folder masks of lapgs-prepare; empty: none",
+        "",
+    )
     path: str = option(
         'folder of the capture, or a built-in scene: "synthetic", or "motion:path=4,cycles=2"; a built-in '
         "scene is generated next to the run folder",
@@ -330,7 +335,9 @@ class CamerasConfig(Options):
         "off",
     )
     rate: Rate = option(
-        "learning rate of the corrections: radians, and parts of the cameras' extent", Rate(2e-3, 5e-5, 3_000)
+        "learning rate of the corrections, radians by which the image moves; after motion discovery, which corrects "
+        "cameras, too, the training goes on at the final value",
+        Rate(4e-3, 2e-4, 3_000),
     )
     pull: float = option("each step shrinks the corrections by this fraction of the learning rate", 0.1, at_least=0)
     focal: bool = option("correct the focal length, too: one factor for all cameras", True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from functools import partial
 
 import numpy as np
 import torch
@@ -16,7 +15,7 @@ from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.train.config import Background
 from lapgs_wgpu.train.evaluate import BACKGROUND_LEVELS
-from lapgs_wgpu.train.truth_cache import TruthCache
+from lapgs_wgpu.train.truth_cache import TruthCache, without
 
 AHEAD = 8  # pictures that are decoded before they are needed
 DECODERS = min(4, os.cpu_count() or 1)  # threads that decode them
@@ -67,7 +66,7 @@ class Pictures:
 
     def on_device(self, view: View) -> DeviceArray:
         """The picture of a view that `choose` gave, for `render_loss`."""
-        return self._truths.get(view, partial(self._cache.get, view))
+        return self._truths.get(view, lambda: without(self._cache.get(view), view.load_ignored()))
 
 
 def _on_background(view: View, color: NDArray[np.float32]) -> View:

@@ -30,7 +30,7 @@ from lapgs_wgpu.train.losses import MS_SSIM_SMALLEST, SSIM_WINDOW, masked_ssim, 
 from lapgs_wgpu.train.lpips import SMALLEST, Lpips
 from lapgs_wgpu.train.motion_masks import differs_from_median, differs_from_static, still_backgrounds
 from lapgs_wgpu.train.object_metrics import masked_psnr, measure_objects, summarise
-from lapgs_wgpu.train.test_alignment import aligned_view
+from lapgs_wgpu.train.view_alignment import aligned_view
 
 ERROR_GAIN = 4  # of the error pictures
 MEASURES = ("psnr", "ssim", "ms_ssim", "lpips", "lpips_unscaled", "masked_psnr", "masked_ssim")
@@ -63,7 +63,7 @@ def evaluate(
     (`object_metrics`); otherwise they differ from the static fit or, without one, from the median of a test camera that
     stands still, and psnr_still is that of the other pixels. Absent where no moving pixel is known.
     camera_unit: extent of the cameras, world units, where training cameras were refined. `aligned` then holds the
-    measures once more, after test-time alignment (`test_alignment`), labelled as such; the others stay without it.
+    measures once more, after test-time alignment (`view_alignment`), labelled as such; the others stay without it.
     Raises InputError where a picture or a mask cannot be read.
     """
     start = time.perf_counter()

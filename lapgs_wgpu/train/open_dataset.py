@@ -12,7 +12,7 @@ from lapgs_wgpu.train.config import Config
 
 
 def with_folder(config: Config, scenes: Path) -> Config:
-    """The configuration with the absolute path of its data. scenes: folder into which built-in scenes are written,
+    """The configuration with the absolute paths of its data. scenes: folder into which built-in scenes are written,
     unless they are there. Raises InputError."""
     path = config.data.path
     if not path:
@@ -20,13 +20,20 @@ def with_folder(config: Config, scenes: Path) -> Config:
             f"the configuration names no data; give --data DIR (in Python data.path), or take {SYNTHETIC}."
         )
     folder = write_builtin(path, scenes) if is_builtin(path) else Path(path)
-    return dataclasses.replace(config, data=dataclasses.replace(config.data, path=str(folder.resolve())))
+    masks = str(Path(config.data.masks).resolve()) if config.data.masks else ""
+    return dataclasses.replace(config, data=dataclasses.replace(config.data, path=str(folder.resolve()), masks=masks))
 
 
 def open_dataset(config: Config, *, normalize: bool = True) -> Dataset:
     """The dataset of a configuration whose path is a folder's. normalize: of `load_dataset`. Raises InputError."""
     data = config.data
-    dataset = load_dataset(data.path, image_size=data.size or None, normalize=normalize, undistort=data.undistort)
+    dataset = load_dataset(
+        data.path,
+        image_size=data.size or None,
+        normalize=normalize,
+        undistort=data.undistort,
+        masks=data.masks or None,
+    )
     if data.split == "val":
         if not dataset.val:
             raise InputError(f"{data.path} has no validation views (transforms_val.json); leave out data.split.")

@@ -106,8 +106,13 @@ def result_text(run: Path) -> str:
     views, size = len(metrics["views"]), metrics["size"]
     return (
         f"{run}: {metrics['psnr']:.2f} dB PSNR, {metrics['ssim']:.4f} SSIM on {views} test views of "
-        f"{size[0]}x{size[1]}, {metrics['gaussians']} Gaussians"
+        f"{size[0]}x{size[1]}{_aligned(metrics)}, {metrics['gaussians']} Gaussians"
     )
+
+
+def _aligned(metrics: dict[str, Any]) -> str:
+    """The PSNR after test-time alignment, where it was measured."""
+    return f" ({metrics['aligned']['psnr']:.2f} dB after test-time alignment)" if "aligned" in metrics else ""
 
 
 def _record(device: Device, dataset: Dataset) -> dict[str, str]:

@@ -44,6 +44,20 @@ class TruthCache:
         return array
 
 
+def without(pixels: NDArray[np.uint8], ignored: NDArray[np.bool_] | None) -> NDArray[np.uint8]:
+    """A picture (H, W, 3) or (H, W, 4) with the pixels marked that the loss leaves out: (H, W) bool, None for none.
+
+    A transparent pixel has no color; with red 1 it is left out (shaders/common/composite.wgsl), with 0 it counts.
+    """
+    if ignored is None:
+        return pixels
+    rgba = np.full((*pixels.shape[:2], 4), 255, np.uint8)
+    rgba[..., : pixels.shape[2]] = pixels
+    rgba[rgba[..., 3] == 0] = 0
+    rgba[ignored] = (1, 0, 0, 0)
+    return rgba
+
+
 def upload_rgba(device: Device, pixels: NDArray[np.uint8]) -> DeviceArray:
     """(H, W) uint32 on the device, red in the lowest byte, of (H, W, 3) RGB or (H, W, 4) straight RGBA in 8 bits."""
     rgba = np.full((*pixels.shape[:2], 4), 255, np.uint8)

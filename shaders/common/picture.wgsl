@@ -29,7 +29,9 @@ fn places_across(picture: Picture) -> u32 {
     return ((picture.size.y + 7u) & ~7u) * picture.size.x;
 }
 
-// pixels: red, green, blue of the image, as bits; ground truth, 8 bits a channel.
+const IGNORED = 1u << 24u;   // in the ground truth of a pixel that the loss leaves out, whose image is the ground truth
+
+// pixels: red, green, blue of the image, as bits; ground truth, 8 bits a channel, and perhaps IGNORED.
 fn seen(pixel: vec4<u32>) -> vec3<f32> {
     return bitcast<vec3<f32>>(pixel.xyz);
 }

@@ -89,6 +89,21 @@ def drawn(camera: Camera, t: float, board: Board) -> tuple[NDArray[np.uint8], ND
     return image, pixel_means(owner == 0, camera) > 0.5
 
 
+def room_cloud(count: int, noise: float, seed: int = 0) -> tuple[Floats, Floats]:
+    """Points (3 count, 3) of floor and walls, off by `noise` (standard deviation along each axis), and their colors."""
+    rng = np.random.default_rng(seed)
+
+    def drawn_from(low: float, high: float) -> Floats:
+        return rng.uniform(low, high, count)
+
+    floor = drawn_from(-ROOM, 2 * ROOM), drawn_from(-ROOM, ROOM), np.full(count, -1.0)
+    left = np.full(count, -ROOM), drawn_from(-ROOM, ROOM), drawn_from(-1.0, 2.2)
+    back = drawn_from(-ROOM, 2 * ROOM), np.full(count, ROOM), drawn_from(-1.0, 2.2)
+    colors = [FLOOR(floor[0], floor[1]), LEFT(left[1], left[2]), BACK(back[0], back[2])]
+    points = np.concatenate([np.stack(surface, axis=1) for surface in (floor, left, back)])
+    return points + rng.normal(scale=noise, size=points.shape), np.concatenate(colors, axis=1).T
+
+
 def write_film(
     path: Path,
     pictures: Sequence[NDArray[np.uint8]],

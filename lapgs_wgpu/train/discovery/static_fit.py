@@ -79,6 +79,8 @@ def static_fit(
         image = (composite(view.load(), background.numpy()) / 255).astype(np.float32)
         camera = view.camera if refinement is None else refinement.refined(view.camera).camera
         still = training.scene.render(camera, view.time, background, depth=False).image.numpy(force=True)
+        if (ignored := view.load_ignored()) is not None:
+            image[ignored] = still[ignored]
         images.append(Residual(camera, view.time, image, still))
     corrections = None
     if refinement is not None:
@@ -140,9 +142,18 @@ def small_views(views: Sequence[View], size: int) -> list[View]:
             continue
         small = max(1, round(scale * width)), max(1, round(scale * height))
         camera = cameras.setdefault(id(view.camera), view.camera.resized(*small))
-        found.append(dataclasses.replace(view, camera=camera, pixels=partial(_shrunk, view, small)))
+        ignored = None if view.ignored is None else partial(_shrunk_mask, view, small)
+        pixels = partial(_shrunk, view, small)
+        found.append(dataclasses.replace(view, camera=camera, pixels=pixels, ignored=ignored))
     return found
 
 
 def _shrunk(view: View, size: tuple[int, int]) -> NDArray[np.uint8]:
     return shrink(view.load(), size)
+
+
+def _shrunk_mask(view: View, size: tuple[int, int]) -> NDArray[np.bool_]:
+    """A pixel is ignored where any of the pixels mixed into it is."""
+    ignored = view.load_ignored()
+    assert ignored is not None
+    return shrink(np.repeat(np.where(ignored, 255, 0).astype(np.uint8)[..., None], 3, axis=2), size)[..., 0] > 0

@@ -1,0 +1,132 @@
+"""Masks of a user's own in the training: what they cover has no influence."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from helpers.captures import HEIGHT, WIDTH, write_colmap
+from helpers.image_losses import BACKGROUND, CAMERA, TRUTH, WEIGHTS, gaussians, gradients
+from helpers.loss_reference import total
+from helpers.scenes import relative
+from helpers.training import configure
+from PIL import Image
+
+from lapgs_wgpu.data import Dataset, load_dataset
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.splat.rasterize import rasterize
+from lapgs_wgpu.train.discovery.static_fit import small_views
+from lapgs_wgpu.train.fused_loss import render_loss
+from lapgs_wgpu.train.run import train
+from lapgs_wgpu.train.truth_cache import upload_rgba, without
+
+IGNORED = np.zeros(TRUTH.shape[:2], np.bool_)
+IGNORED[10:30, 20:45] = True
+IGNORED[40, ::3] = True
+
+
+@pytest.mark.kernels
+@pytest.mark.parametrize("name", WEIGHTS)
+def test_the_loss_is_that_of_an_image_with_the_truth_in_the_ignored_pixels(device: Device, name: str) -> None:
+    scene, other = gaussians(), gaussians()
+    done = render_loss(scene, CAMERA, upload_rgba(device, without(TRUTH, IGNORED)), BACKGROUND, WEIGHTS[name], device)
+    done.loss.backward()
+    drawn = rasterize(
+        other.means, other.quats, other.scales, other.opacities, other.sh, CAMERA,
+        sh_degree=1, background=BACKGROUND, depth=False, device=device,
+    )  # fmt: skip
+    shown = TRUTH.copy()
+    shown[IGNORED] = (BACKGROUND.numpy() * 255 + 0.5).astype(np.uint8)
+    truth = torch.from_numpy(shown.astype(np.float32) / 255).double()
+    image = torch.where(torch.from_numpy(IGNORED)[..., None], truth, drawn.image.double())
+    loss = total(image, truth, WEIGHTS[name])
+    loss.backward()
+    assert done.loss.item() == pytest.approx(loss.item(), rel=2e-5)
+    assert relative(scene.means.grad, other.means.grad) < 1e-3
+    assert relative(scene.sh.grad, other.sh.grad) < 1e-3
+    assert all(bool(gradient.isfinite().all()) for gradient in gradients(scene, done).values())
+
+
+def test_transparent_pixels_still_count() -> None:
+    rgba = np.full((2, 3, 4), 7, np.uint8)
+    rgba[0, 0] = (1, 2, 3, 0)
+    ignored = np.zeros((2, 3), np.bool_)
+    ignored[1, 2] = True
+    marked = without(rgba, ignored)
+    assert marked[0, 0].tolist() == [0, 0, 0, 0]
+    assert marked[1, 2].tolist() == [1, 0, 0, 0]
+    assert marked[0, 1].tolist() == [7, 7, 7, 7]
+    assert without(rgba, None) is rgba
+
+
+def test_what_is_ignored_does_not_change_a_bit(device: Device, dataset: Dataset, tmp_path: Path) -> None:
+    """Two captures that differ in ignored pixels alone train to the same bytes, discovery included."""
+
+    def capture(level: int) -> Dataset:
+        views = []
+        for view in dataset.train:
+            ignored = np.zeros((view.camera.height, view.camera.width), np.bool_)
+            ignored[8:20, 12:30] = True
+            pixels = view.load().copy()
+            pixels[ignored] = level
+            views.append(dataclasses.replace(view, pixels=pixels.copy, ignored=ignored.copy))
+        return dataclasses.replace(dataset, train=tuple(views))
+
+    config = configure(discovery__steps="20", discovery__size="32")
+    for level in (10, 250):
+        train(config, capture(level), tmp_path / str(level), device=device)
+    train(config, dataset, tmp_path / "whole", device=device)
+    one, two, whole = ((tmp_path / name / "checkpoint.ply").read_bytes() for name in ("10", "250", "whole"))
+    assert one == two != whole
+
+
+def test_small_views_ignore_what_any_of_their_pixels_ignores(dataset: Dataset) -> None:
+    view = dataset.train[0]
+    ignored = np.zeros((view.camera.height, view.camera.width), np.bool_)
+    ignored[5, 7] = True
+    (small,) = small_views([dataclasses.replace(view, ignored=ignored.copy)], view.camera.width // 2)
+    assert np.argwhere(small.load_ignored()).tolist() == [[2, 3]]
+
+
+@pytest.fixture
+def masked(device: Device, tmp_path: Path) -> tuple[Path, Path]:
+    """A capture, and a folder of masks of half its size, white in a corner."""
+    capture, masks = tmp_path / "capture", tmp_path / "masks"
+    write_colmap(capture, device)
+    masks.mkdir()
+    mask = np.zeros((HEIGHT // 2, WIDTH // 2), np.uint8)
+    mask[:5, :7] = 255
+    for image in (capture / "images").iterdir():
+        Image.fromarray(mask).save(masks / f"{image.stem}.png")
+    return capture, masks
+
+
+def test_masks_of_a_folder(masked: tuple[Path, Path]) -> None:
+    capture, masks = masked
+    data = load_dataset(capture, masks=masks)
+    assert all(view.ignored is None for view in data.test)
+    for view in data.train:
+        ignored = view.load_ignored()
+        assert ignored is not None
+        assert ignored.shape == (view.camera.height, view.camera.width)
+        assert ignored[:10, :14].all()
+        assert ignored.sum() == 140
+    assert all(view.ignored is None for view in load_dataset(capture).train)
+
+
+def test_bad_masks_are_refused(masked: tuple[Path, Path], tmp_path: Path) -> None:
+    capture, masks = masked
+    trained = Path(load_dataset(capture).train[0].source)
+    path = masks / f"{trained.stem}.png"
+    Image.fromarray(np.zeros((30, 30), np.uint8)).save(path)
+    with pytest.raises(InputError, match=rf"30x30 pixels, and the images are {WIDTH}x{HEIGHT}"):
+        load_dataset(capture, masks=masks)
+    path.unlink()
+    with pytest.raises(InputError, match=rf"lacks 1 of \d+ masks of training images, such as that of {trained.name}"):
+        load_dataset(capture, masks=masks)
+    with pytest.raises(InputError, match=r"is not a folder; data\.masks"):
+        load_dataset(capture, masks=tmp_path / "none")
