@@ -15,8 +15,9 @@ from PIL import Image
 from lapgs_wgpu.data import Dataset, View
 from lapgs_wgpu.data.images import Pixels
 
-from .diagnosis import Diagnosis, Look, Measure
+from .diagnosis import Diagnosis
 from .masks import Mask
+from .measure import Look, Measure
 
 REPORT = "report.html"
 THUMBNAILS = 24  # evenly chosen from the views that were looked at

@@ -343,6 +343,10 @@ class CamerasConfig(Options):
     focal: bool = option("correct the focal length, too: one factor for all cameras", True)
     start: int = option("first step that moves cameras; the scene forms before it", 300, at_least=1)
 
+    def refines(self, *, own_footage: bool) -> bool:
+        """Whether the training cameras of such a capture are corrected."""
+        return self.refine == "on" or (self.refine == "auto" and own_footage)
+
 
 @dataclass(frozen=True)
 class EvalConfig(Options):

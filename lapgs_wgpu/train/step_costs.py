@@ -47,9 +47,10 @@ def measure_costs(config: Config, dataset: Dataset, device: Device) -> Costs:
     few, _ = _timed(config, dataset, device, USUAL)
     many, scene = _timed(config, dataset, device, GROWTH)
     views = dataset.test[: VIEWS + 1]
-    evaluate(scene, views[:1], config.data.background)  # not timed
+    unit = (dataset.extent or 1.0) if config.cameras.refines(own_footage=dataset.own_footage) else None
+    evaluate(scene, views[:1], config.data.background, camera_unit=unit)  # not timed
     begin = time.perf_counter()
-    evaluate(scene, views[-VIEWS:], config.data.background)
+    evaluate(scene, views[-VIEWS:], config.data.background, camera_unit=unit)
     taken = time.perf_counter() - begin
     return Costs(few, many, still, taken / len(views[-VIEWS:]))
 

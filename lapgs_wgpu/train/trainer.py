@@ -181,7 +181,7 @@ class Trainer:
         # Cameras that all stand at one place have no extent; the scene's own size must serve.
         self._extent = dataset.extent or config.points.box
         self.cameras = None
-        if config.cameras.refine == "on" or (config.cameras.refine == "auto" and dataset.own_footage):
+        if config.cameras.refines(own_footage=dataset.own_footage):
             self.cameras = CameraRefinement(
                 dataset.cameras,
                 self._extent,
