@@ -295,6 +295,18 @@ def test_own_footage_is_refined(device: Device, dataset: Dataset, refine: str, o
     training.close()
 
 
+def test_what_discovery_corrected_stays_corrected(device: Device, dataset: Dataset) -> None:
+    config = configure(cameras__refine="on", discovery__enabled="true", discovery__steps="20", discovery__size="32")
+    with Trainer(config, dataset, device) as training:
+        assert training.cameras is not None
+        start = [training.cameras.refined(camera).camera for camera in dataset.cameras]
+        moved = [np.abs(a.T_cam_world - b.T_cam_world).max() for a, b in zip(start, dataset.cameras, strict=True)]
+        assert np.count_nonzero(np.array(moved) > 1e-5) >= 10
+        training.step()  # at once, though cameras.start is later
+        later = [training.cameras.refined(camera).camera for camera in dataset.cameras]
+        assert any(np.abs(a.T_cam_world - b.T_cam_world).max() > 1e-7 for a, b in zip(start, later, strict=True))
+
+
 def test_state_of_other_cameras_is_refused() -> None:
     state = refinement_of(cameras(4)).state()
     with pytest.raises(ValueError, match="camera learnt"):
