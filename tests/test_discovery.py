@@ -21,7 +21,8 @@ from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train.config import Config
-from lapgs_wgpu.train.discovery.discover import density_at, discover, explained_share, lost_tracks
+from lapgs_wgpu.train.discovery.acceptance import density_at, explained_share, lost_tracks, tracks_in_images
+from lapgs_wgpu.train.discovery.discover import discover
 from lapgs_wgpu.train.discovery.field_fit import fit_field, keeping_rates
 from lapgs_wgpu.train.discovery.residual import Residual, moving_pixels
 from lapgs_wgpu.train.discovery.static_fit import small_views, static_config, static_fit
@@ -325,6 +326,24 @@ def test_density_is_that_of_the_static_fit(device: Device) -> None:
     density = density_at(still_scene(device), np.array([[0, 0, 0], [1, 0, 0]], np.float32))
     assert density[0] > 0.5
     assert density[1] < 1e-6
+
+
+def test_parts_must_bring_the_static_fit_nearer_to_the_images(device: Device) -> None:
+    static = still_scene(device)
+    camera = Camera.looking_at([0, -4, 0], [0, 0, 0], up=[0, 0, 1], fov_x=0.7, width=24, height=16)
+    still = static.render(camera, 0.5, torch.zeros(3)).image.numpy(force=True)
+    images = []
+    for i in range(3):
+        shown = still.copy()
+        shown[4:7, 3 + i : 6 + i] = 0.7
+        images.append(Residual(camera, i / 2, shown, still))
+        assert images[-1].error == images[-1].error_of(still) > 0
+    there = np.array([[-0.9 + 0.12 * i, 0.0, 0.3] for i in range(3)])
+    elsewhere = there * [-1, 1, 1]
+    kept = tracks_in_images(tracks_along(elsewhere, there), np.array([0.0, 0.5, 1.0]), images, static, 0.0)
+    assert kept is not None
+    assert np.array_equal(kept.paths, tracks_along(there).paths)
+    assert tracks_in_images(tracks_along(elsewhere), np.array([0.0, 0.5, 1.0]), images, static, 0.0) is None
 
 
 def test_above_a_flat_gaussian_is_no_density(device: Device) -> None:

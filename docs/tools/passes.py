@@ -19,7 +19,7 @@ from lapgs_wgpu.progress import Progress
 from lapgs_wgpu.splat.drawing import Drawing
 from lapgs_wgpu.splat.rasterize import rasterizer_of, upload_gaussians
 from lapgs_wgpu.splat.splat_layout import COLOR, MEAN, OPACITY, RADIUS
-from lapgs_wgpu.train.discovery.discover import lost_tracks
+from lapgs_wgpu.train.discovery.acceptance import lost_tracks
 from lapgs_wgpu.train.discovery.static_fit import static_fit
 from lapgs_wgpu.train.discovery.surface_points import surface_points
 from lapgs_wgpu.train.discovery.tracks import find_tracks

@@ -44,11 +44,20 @@ class Residual:
         time: in [0, 1].
         image: (H, W, 3) in [0, 1].
         still: (H, W, 3), the static fit's image of the same camera.
+
+    Attributes:
+        mask: (H, W), the moving pixels.
+        error: of the static fit.
     """
 
     def __init__(self, camera: Camera, time: float, image: Floats, still: Floats) -> None:
         self.camera, self.time, self.image = camera, time, image
         self.mask = moving_pixels(image, still)
+        self.error = self.error_of(still)
+
+    def error_of(self, rendered: Floats) -> float:
+        """Mean absolute difference of a rendering (H, W, 3) from the image."""
+        return float(np.abs(rendered - self.image).mean())
 
     @cached_property
     def _soft(self) -> Floats:

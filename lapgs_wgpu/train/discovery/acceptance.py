@@ -1,0 +1,112 @@
+"""Which of the parts that were followed a training starts with.
+
+A part must lie where the static fit lacks something, and bring it nearer to the images: patches of what the static fit
+only blurs do not, though they can be followed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from lapgs_wgpu.data.initial_gaussians import initial_scales
+from lapgs_wgpu.motion.scene import Scene4D
+from lapgs_wgpu.splat.constants import CONSTANTS
+from lapgs_wgpu.splat.rotation import rotation_matrices
+
+from .residual import Floats, Residual
+from .surface_points import PointClouds
+from .tracks import Tracks
+
+OPACITY = 0.3  # of the Gaussian of a track
+SCALE = 0.8  # of it, in mean distances to its nearest neighbours
+IMAGES = 60  # by which a part is judged, at most
+EMPTY = 0.1  # opacity of the static fit, below which a place counts as empty
+LOST = 0.5  # share of the times at which a part is seen that it is where the static fit is empty, at least
+PROBES = 24  # of a part's points that are looked at, about
+BLOCK = 256  # points whose densities are computed together
+OPAQUE = 0.1  # least opacity of a Gaussian of the static fit that is looked at
+NEAR = 0.1  # box half sides; distance within which a track explains a surface point
+
+
+def track_gaussians(tracks: Tracks) -> dict[str, Tensor]:
+    """A Gaussian for each track, at its place at the key time: the parameters of a scene without a field, float32."""
+    count = len(tracks.part)
+    scales = SCALE * initial_scales(tracks.positions)
+    rows = {
+        "means": torch.from_numpy(tracks.positions),
+        "log_scales": torch.from_numpy(np.log(scales))[:, None].repeat(1, 3),
+        "quats": torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
+        "opacity_logits": torch.full((count,), float(np.log(OPACITY / (1 - OPACITY)))),
+        "sh_dc": (torch.from_numpy(tracks.colors) - 0.5)[:, None] / CONSTANTS["SH_C0"],
+        "sh_rest": torch.zeros(count, 15, 3),
+    }
+    return {name: values.float() for name, values in rows.items()}
+
+
+def tracks_in_images(
+    tracks: Tracks, times: NDArray[np.float64], images: Sequence[Residual], static: Scene4D, background: float
+) -> Tracks | None:
+    """The parts that bring the static fit nearer to the images, each by itself; None where there are none. times: (T,),
+    of the tracks. background: level of its channels."""
+    kept = np.zeros(int(tracks.part.max()) + 1, bool)
+    judges = [images[i] for i in np.linspace(0, len(images) - 1, min(len(images), IMAGES)).astype(np.int64)]
+    level = torch.full((3,), background)
+    for k in range(len(kept)):
+        part = tracks.of_parts(np.arange(len(kept)) == k)
+        assert part is not None
+        new = track_gaussians(part)
+        rows = {name: torch.cat([static.parameters[name].detach().cpu(), values]) for name, values in new.items()}
+        scene = Scene4D(rows, static.field_config, static.device, sh_degree=static.sh_degree)
+        gain = 0.0
+        for image in judges:
+            with torch.no_grad():
+                path = torch.from_numpy(part.paths[np.searchsorted(times, image.time)])
+                scene.parameters["means"][len(static) :] = path
+                rendered = scene.render(image.camera, image.time, level, depth=False).image.numpy(force=True)
+            gain += image.error - image.error_of(rendered)
+        kept[k] = gain > 0
+    return tracks.of_parts(kept)
+
+
+def lost_tracks(tracks: Tracks, static: Scene4D) -> Tracks | None:
+    """The parts that are, mostly, where the static fit is empty; None where there are none."""
+    lost = np.zeros(int(tracks.part.max()) + 1, bool)
+    for k in range(len(lost)):
+        members = np.flatnonzero(tracks.part == k)
+        probes = members[:: -(-len(members) // PROBES)]
+        seen = tracks.paths[:, probes][tracks.supported[:, probes]]
+        lost[k] = (density_at(static, seen) < EMPTY).mean() > LOST if len(seen) else False
+    return tracks.of_parts(lost)
+
+
+def density_at(static: Scene4D, points: Floats) -> NDArray[np.float32]:
+    """(n,) density of the static fit at points (n, 3): the sum over its Gaussians of opacity times falloff."""
+    with torch.no_grad():
+        gaussians = static.canonical()
+        opaque = gaussians.opacities.cpu() > OPAQUE
+        means, opacities = gaussians.means.cpu()[opaque], gaussians.opacities.cpu()[opaque]
+        # Gaussian axes in columns, divided by the scales: a point times these is its distance in standard deviations.
+        axes = rotation_matrices(gaussians.quats.cpu()[opaque]) / gaussians.scales.cpu()[opaque, None]
+        at_means = torch.einsum("gi,gij->gj", means, axes)
+        total = [
+            (
+                opacities * torch.exp(-0.5 * (torch.einsum("ni,gij->ngj", some, axes) - at_means).square().sum(dim=2))
+            ).sum(dim=1)
+            for some in torch.from_numpy(points).float().split(BLOCK)
+        ]
+    return torch.cat(total).numpy()
+
+
+def explained_share(clouds: PointClouds, tracks: Tracks, half_side: float) -> float:
+    """Of the surface points, those that lie on a track."""
+    near = 0
+    for cloud, path in zip(clouds.clouds, tracks.paths, strict=True):
+        if len(cloud.scores):
+            near += int((cKDTree(path).query(cloud.positions)[0] < NEAR * half_side).sum())
+    return near / max(clouds.total, 1)
