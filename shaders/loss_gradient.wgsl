@@ -1,7 +1,7 @@
 // The loss's gradient by the image: all terms together, and the second half of the blur that carries SSIM back.
 // A lane takes a run of one column in one channel. Planes red, green, blue, and zeros for alpha.
 #import common/picture
-#import common/ssim
+#import common/ssim_window
 
 @group(0) @binding(0) var<uniform> picture: Picture;
 #table 1 pixels: vec4<u32>

@@ -1,7 +1,7 @@
 // Lays the ground truth on its background, puts it beside the image pixel by pixel, and sums up absolute and squared
 // differences. A workgroup takes a row.
 #import common/picture
-#import common/composite
+#import common/on_background
 
 @group(0) @binding(0) var<uniform> picture: Picture;
 #table 1 image: f32

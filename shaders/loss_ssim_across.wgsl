@@ -1,7 +1,7 @@
 // Structural similarity, second half: along the rows, then at each pixel the similarity and its derivatives, and of these
 // the first half of the blur that carries them back. A lane takes a run of one row in one channel.
 #import common/picture
-#import common/ssim
+#import common/ssim_window
 
 @group(0) @binding(0) var<uniform> picture: Picture;
 #table 1 moments: vec4<f32>

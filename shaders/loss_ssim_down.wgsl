@@ -2,7 +2,7 @@
 // the moments around the means, since E[x^2] - E[x]^2 would lose what a flat bright window has of variance.
 // A lane takes a run of one column in one channel.
 #import common/picture
-#import common/ssim
+#import common/ssim_window
 
 @group(0) @binding(0) var<uniform> picture: Picture;
 #table 1 pixels: vec4<u32>

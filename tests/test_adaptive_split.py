@@ -21,8 +21,8 @@ from lapgs_wgpu.train.adaptive_split import (
     shape_difference,
     split_scores,
 )
-from lapgs_wgpu.train.config import Rate
 from lapgs_wgpu.train.densify import Change, Statistics, densify
+from lapgs_wgpu.train.learning_rate import Rate
 from lapgs_wgpu.train.optimizer import Optimizer
 from lapgs_wgpu.train.presets import load_config
 

@@ -26,8 +26,9 @@ from lapgs_wgpu.gpu.kernel import Commands
 from lapgs_wgpu.io.checkpoint import read_checkpoint
 from lapgs_wgpu.motion.playback.playback import open_playback
 from lapgs_wgpu.splat.rotation import rotate, rotation_matrices
-from lapgs_wgpu.train.config import LossWeights, Rate
+from lapgs_wgpu.train.config import LossWeights
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
+from lapgs_wgpu.train.learning_rate import Rate
 from lapgs_wgpu.train.loss_terms import LossTerm
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.run import resume, train

@@ -26,10 +26,11 @@ from lapgs_wgpu.splat.rasterize import upload_gaussians
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 from lapgs_wgpu.train.camera_descent import ScenePoints, image_motion, whitening
 from lapgs_wgpu.train.camera_refinement import CameraRefinement, changed_camera, rotation_of, rotation_vector
-from lapgs_wgpu.train.config import CamerasConfig, Rate
+from lapgs_wgpu.train.config import CamerasConfig
 from lapgs_wgpu.train.discovery.static_fit import static_config
 from lapgs_wgpu.train.evaluate import evaluate
 from lapgs_wgpu.train.fused_loss import render_loss
+from lapgs_wgpu.train.learning_rate import Rate
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.run import resume, train
 from lapgs_wgpu.train.trainer import Trainer

@@ -9,7 +9,8 @@ import pytest
 
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.motion.fields.config import FieldConfig
-from lapgs_wgpu.train.config import CamerasConfig, Config, DiscoveryConfig, ExposureConfig, Rate
+from lapgs_wgpu.train.config import CamerasConfig, Config, DiscoveryConfig, ExposureConfig
+from lapgs_wgpu.train.learning_rate import Rate
 from lapgs_wgpu.train.presets import ABLATIONS, config_keys, load_config, preset_names, write_toml
 
 

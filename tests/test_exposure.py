@@ -27,9 +27,9 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands
 from lapgs_wgpu.splat.rasterize import rasterize
 from lapgs_wgpu.splat.rasterizer import Rasterizer
-from lapgs_wgpu.train.config import Rate
 from lapgs_wgpu.train.exposure import ExposurePasses, Exposures
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
+from lapgs_wgpu.train.learning_rate import Rate
 from lapgs_wgpu.train.run import resume, train
 from lapgs_wgpu.train.trainer import Trainer
 from lapgs_wgpu.train.truth_cache import upload_rgba

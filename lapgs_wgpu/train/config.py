@@ -6,7 +6,6 @@ Each key carries the text that lapgs-train --help shows of it. No torch here, wh
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import re
 from dataclasses import dataclass
@@ -14,6 +13,8 @@ from typing import Literal, NamedTuple
 
 from lapgs_wgpu.io.dataclass_table import Options, option
 from lapgs_wgpu.motion.fields.config import DynamicsMode, FieldConfig
+
+from .learning_rate import Rate, RatesConfig
 
 Background = Literal["black", "white", "random"]
 Split = Literal["plain", "adaptive"]
@@ -105,53 +106,6 @@ class ScheduleConfig(Options):
     save_interval: int = option(
         "save the training state every this many steps, for --resume; 0: only if the training is interrupted or fails"
     )
-
-
-@dataclass(frozen=True)
-class Rate(Options):
-    """A learning rate that goes from start to end exponentially, or in a straight line where one of them is 0, and then
-    stays there."""
-
-    start: float = option(
-        "initial value; it changes to .end exponentially, or linearly if one of the two is 0; both 0: frozen",
-        at_least=0,
-        below=math.inf,
-    )
-    end: float = option("final value, reached at .steps and kept", at_least=0, below=math.inf)
-    steps: int = option("training step, counted from the start, at which .end is reached", at_least=1)
-
-    def at(self, step: int) -> float:
-        """The rate of a step, which are counted from 1."""
-        share = min(step / self.steps, 1.0)
-        if 0 in (self.start, self.end):  # which no exponential goes to
-            return self.start + share * (self.end - self.start)
-        return self.start ** (1 - share) * self.end**share
-
-
-@dataclass(frozen=True)
-class RatesConfig(Options):
-    """Adam's learning rates, for each parameter of the Gaussians and for the field's hash tables and its MLP."""
-
-    means: Rate = option("learning rate of the means, world units per step")
-    log_scales: float = option("learning rate of the log-scales, constant; 0: frozen", at_least=0)
-    quats: float = option("learning rate of the rotations (quaternions), constant; 0: frozen", at_least=0)
-    opacity_logits: float = option("learning rate of the opacities (logits), constant; 0: frozen", at_least=0)
-    sh_dc: float = option(
-        "learning rate of the base colors (spherical harmonics of degree 0), constant; 0: frozen", at_least=0
-    )
-    sh_rest: float = option(
-        "learning rate of the view-dependent colors (spherical harmonics of degree 1 to 3), constant; 0: frozen",
-        at_least=0,
-    )
-    dynamics: float = option("learning rate of the per-Gaussian dynamics attributes, constant; 0: frozen", at_least=0)
-    hash: Rate = option("learning rate of the field's hash tables or feature planes")
-    mlp: Rate = option("learning rate of the field's MLP weights")
-    frequencies: Rate = option("learning rate of the motion spectrum's frequencies, cycles per clip per step")
-
-    def schedules(self) -> dict[str, Rate]:
-        """Parameter name, or group of the field -> schedule."""
-        rates = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        return {name: rate if isinstance(rate, Rate) else Rate(rate, rate, 1) for name, rate in rates.items()}
 
 
 @dataclass(frozen=True)

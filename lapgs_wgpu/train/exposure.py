@@ -16,7 +16,7 @@ from ..gpu.array import DeviceArray
 from ..gpu.device import Device
 from ..gpu.kernel import Commands, Kernel
 from ..gpu.pool import BufferPool
-from .config import Rate
+from .learning_rate import Rate
 from .row_adam import RowAdam, restore_rows
 
 SQUARE_DECAY = 0.999  # Adam's

@@ -47,7 +47,7 @@ class TruthCache:
 def without(pixels: NDArray[np.uint8], ignored: NDArray[np.bool_] | None) -> NDArray[np.uint8]:
     """A picture (H, W, 3) or (H, W, 4) with the pixels marked that the loss leaves out: (H, W) bool, None for none.
 
-    A transparent pixel has no color; with red 1 it is left out (shaders/common/composite.wgsl), with 0 it counts.
+    A transparent pixel has no color; with red 1 it is left out (shaders/common/on_background.wgsl), with 0 it counts.
     """
     if ignored is None:
         return pixels

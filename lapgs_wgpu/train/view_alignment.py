@@ -18,8 +18,9 @@ from lapgs_wgpu.splat.gaussians import Gaussians
 
 from .camera_descent import CameraDescent, image_motion, scene_points, whitening
 from .camera_refinement import changed_camera
-from .config import LossWeights, Rate
+from .config import LossWeights
 from .fused_loss import render_loss
+from .learning_rate import Rate
 from .truth_cache import upload_rgba
 
 STEPS = 24

@@ -1,6 +1,6 @@
 // What a loss term of one's own gets, and how it leaves its result (docs/api.md). The entry point has
 // @workgroup_size(8, 8), an invocation a pixel; those beyond term.size return at once.
-#import common/composite
+#import common/on_background
 
 struct Term {
     size: vec2<u32>,         // of the image, pixels

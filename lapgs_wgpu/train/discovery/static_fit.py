@@ -17,8 +17,9 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train.camera_refinement import CameraRefinement, Corrections
-from lapgs_wgpu.train.config import Config, Rate
+from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.evaluate import BACKGROUND_LEVELS
+from lapgs_wgpu.train.learning_rate import Rate
 
 from .residual import Residual
 
