@@ -54,7 +54,7 @@ def pose_errors(cameras: Sequence[Camera], true: Sequence[Camera]) -> tuple[NDAr
 
 
 def disturbed_walk(
-    width: int, count: int, degrees: float, percent: float, board: Board | None = None
+    width: int, count: int, degrees: float, percent: float, board: Board | None = None, *, seed: int = 1
 ) -> tuple[Dataset, list[Camera]]:
     """The dataset, with a noisy cloud and true test cameras, and the true training cameras. Images have 4:3."""
     board, placed = board or Board(), Normalization(CENTER, SCALE)
@@ -66,7 +66,7 @@ def disturbed_walk(
         return View(f"{split}_{number:03d}", camera, float(times[number]), "the rendered walk", pixels.copy)
 
     true = [placed.camera(camera) for camera in every[::2]]
-    training = [view("train", 2 * i, camera) for i, camera in enumerate(disturbed(true, degrees, percent))]
+    training = [view("train", 2 * i, camera) for i, camera in enumerate(disturbed(true, degrees, percent, seed))]
     test = [view("test", i, placed.camera(every[i])) for i in range(5, len(every), 8)]
     points, colors = room_cloud(2000, CLOUD_NOISE * extent_of(every))
     cloud = placed.cloud(Cloud(points.astype(np.float32), colors.astype(np.float32)))
