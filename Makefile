@@ -13,7 +13,7 @@ READY := .venv/.ready
 PYTEST = $(BIN)/pytest
 export XDG_RUNTIME_DIR ?= /tmp
 
-.PHONY: setup demo test test-shapes test-all test-swiftshader soak bench lint pictures docs
+.PHONY: setup demo test test-shapes test-viewer test-all test-swiftshader soak bench lint pictures docs
 setup: $(READY)
 
 # torch first: where there is no CUDA device, by exact version, so that an index with CPU builds can offer its own
@@ -58,6 +58,7 @@ soak: $(READY)
 	  tests/test_hostile_pages.py tests/test_full_disks.py
 	LAPGS_SOAK_KILLS=20 $(PYTEST) tests/test_resume.py
 	LAPGS_SOAK=1 $(PYTEST) -s tests/test_scale.py
+	LAPGS_SOAK=1 $(PYTEST) tests/test_prepare.py -k 4_gb
 	LAPGS_SOAK=1 $(PYTEST) tests/test_web_player.py -k '200_000 or trained_scene'
 	LAPGS_SOAK_MINUTES=$(LAPGS_SOAK_MINUTES) $(PYTEST) tests/soak
 
@@ -82,7 +83,8 @@ lint: $(READY)
 # runs each configuration that can fail alone once (test-shapes): all kernels as on a GPU (its shapes, staging and
 # WebGPU's default limits at once: tests/conftest.py), and the two passes that use subgroups without them and, on Mesa's
 # software driver, in the two widths that are not this processor's own (its shader cache ignores the width).
-# Both run side by side: compiling shaders, torch and Python take one core each. The suite's closing line comes last.
+# The viewer's tests follow these in one process, all others run in another: compiling shaders, torch and Python take one
+# core each. The closing line of each comes last.
 # What runs in the background ignores Ctrl-C, so the whole group is ended.
 # `test-all` runs all kernels in every configuration, each alone; CI does so every night.
 WIDTHS = $(shell $(BIN)/python -c 'from lapgs_wgpu import list_devices; name = list_devices()[0].name; \
@@ -91,11 +93,17 @@ kernels = echo "== $(2) tests, $(1)"; LAPGS_TEST_DEVICE=$(1) $(PYTEST) -m $(2)
 widths = echo "== $(1) tests, vectors of $$width bits"; \
   LP_NATIVE_VECTOR_WIDTH=$$width MESA_SHADER_CACHE_DISABLE=true $(PYTEST) -m $(1)
 
+VIEWER_TESTS = $(wildcard tests/test_viewer_*.py tests/test_web_*.py tests/test_hostile_pages.py)
 test: $(READY)
 	@logs=$$(mktemp -d); trap 'rm -rf "$$logs"' EXIT; trap 'rm -rf "$$logs"; trap - TERM; kill 0' INT TERM; \
-	$(MAKE) --no-print-directory test-shapes > "$$logs/shapes" 2>&1 & shapes=$$!; \
-	echo "== all tests"; { $(PYTEST); echo $$? > "$$logs/code"; } 2>&1 | tee "$$logs/suite"; \
-	wait $$shapes; code=$$?; cat "$$logs/shapes"; tail -n 1 "$$logs/suite"; exit $$((code || $$(cat "$$logs/code")))
+	$(MAKE) -k --no-print-directory test-shapes test-viewer > "$$logs/beside" 2>&1 & beside=$$!; \
+	echo "== all tests but the viewer's"; \
+	{ $(PYTEST) $(VIEWER_TESTS:%=--ignore=%); echo $$? > "$$logs/code"; } 2>&1 | tee "$$logs/suite"; \
+	wait $$beside; code=$$?; cat "$$logs/beside"; tail -n 1 "$$logs/suite"; exit $$((code || $$(cat "$$logs/code")))
+
+test-viewer: $(READY)
+	@echo "== the viewer's tests"
+	@$(PYTEST) $(VIEWER_TESTS)
 
 test-shapes: $(READY)
 	@$(call kernels,gpu,kernels)

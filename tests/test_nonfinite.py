@@ -157,9 +157,9 @@ def test_a_bad_parameter_stops_the_training_and_leaves_the_older_state(
     trainings: list[Trainer] = []
     start = Trainer._start
 
-    def note(self: Trainer) -> None:
+    def note(self: Trainer, *given: Any) -> None:
         trainings.append(self)
-        start(self)
+        start(self, *given)
 
     monkeypatch.setattr(Trainer, "_start", note)
     monkeypatch.setattr(training_module, "render_loss", render)

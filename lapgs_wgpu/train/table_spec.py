@@ -134,6 +134,8 @@ def fingerprint(config: Config) -> str:
         del values["density"]["min_contribution"], values["density"]["contribution_interval"]
     if config.data.split == "test":
         del values["data"]["split"]
+    if not config.data.masks:
+        del values["data"]["masks"]
     if config.field.negative_scales == "floor":
         del values["field"]["negative_scales"]
     if config.smoothness.start == 0:
