@@ -67,9 +67,9 @@ def parse_options(arguments: list[str]) -> dict[str, typing.Any]:
     add("--view", action="store_true", help="watch the training in a window; P pauses it, S takes a single step")
     add("--device", metavar="NAME", help=DEVICE_HELP)
     add("--list-devices", action="store_true", help=LIST_DEVICES_HELP)
-    add("--eval", metavar="RUN", help="evaluate the finished run in folder RUN again, without training; replaces its "
-        "metrics.json, metrics.csv and eval/. Can be combined with --data, --data.split, --data.background, "
-        "--cache-gb, --device, --lpips-weights and --motion-from only")
+    add("--eval", metavar="RUN", help="evaluate the finished run in folder RUN again, without training; overwrites "
+        "metrics.json, metrics.csv and the images in eval/. Can be combined with --data, --data.split, "
+        "--data.background, --cache-gb, --device, --lpips-weights and --motion-from only")
     add("--lpips-weights", metavar="FILE", help="also compute LPIPS (VGG) in the evaluation with the weights in FILE, "
         "a .safetensors file (docs/metrics.md)")
     add("--motion-from", metavar="RUN", help="with --eval: also compute metrics of the moving pixels, found by "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import imageio.v3 as iio
 import numpy as np
@@ -21,6 +22,7 @@ from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.rasterize import rasterize
 from lapgs_wgpu.train.evaluate import to_8_bit
 from lapgs_wgpu.viewer import offscreen as offscreen_module
+from lapgs_wgpu.viewer.capture import open_capture
 from lapgs_wgpu.viewer.cli import view_command
 from lapgs_wgpu.viewer.offscreen import framed
 from lapgs_wgpu.viewer.path import CameraPath, KeyFrame, Pose
@@ -387,3 +389,16 @@ def test_help_shows_examples(capsys: pytest.CaptureFixture[str]) -> None:
     out = capsys.readouterr().out
     for word in ("--screenshot a.png", "--path CAMERAS.json", "--frames 60"):
         assert word in out
+
+
+@pytest.mark.parametrize(("line", "expected"), [("undistort = false", False), ("", True)])
+def test_the_capture_opens_as_the_training_opened_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, line: str, expected: bool
+) -> None:
+    opened: list[dict[str, object]] = []
+    monkeypatch.setattr(
+        "lapgs_wgpu.data.load_dataset", lambda path, **given: opened.append(given) or SimpleNamespace(test=(), train=())
+    )
+    (tmp_path / "config.toml").write_text(f'[data]\npath = "{tmp_path}"\nsize = 200\n{line}\n')
+    assert open_capture(tmp_path / "checkpoint.ply", {}) is not None
+    assert opened == [{"image_size": 200, "normalize": True, "undistort": expected}]

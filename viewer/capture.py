@@ -52,7 +52,12 @@ def open_capture(checkpoint: Path, metadata: Mapping[str, str]) -> Capture | Non
         path, size = Path(data["path"]), int(data["size"])
         if str(path) == SYNTHETIC:
             path = checkpoint.parent.parent / SYNTHETIC
-        dataset = load_dataset(path, image_size=size or None, normalize=not metadata or "placement" in metadata)
+        dataset = load_dataset(
+            path,
+            image_size=size or None,
+            normalize=not metadata or "placement" in metadata,
+            undistort=bool(data.get("undistort", True)),
+        )
     except (OSError, ValueError, KeyError, TypeError, OverflowError):  # InputError is a ValueError
         return None
     return Capture((*dataset.test, *dataset.train))

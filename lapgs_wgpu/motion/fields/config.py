@@ -70,7 +70,7 @@ class FieldConfig(Options):
         "width of the layers of the field's decoder; field mlp: of all its layers", 256, at_least=1, at_most=4096
     )
     depth: int = option(
-        "number of hidden layers of the decoder before its output heads (fields hexplane, grid4d, laplacian)",
+        "number of further hidden layers of the decoder before its output heads (fields hexplane, grid4d, laplacian)",
         0,
         at_least=0,
         at_most=16,
