@@ -1,6 +1,6 @@
 """Cameras refined while training: python benchmarks/cameras.py [SEED...] prints a Markdown table (docs/data.md).
 
-A still training of 1,000 steps on a rendered walk past a room, 24 images of 100x75: with true poses, and with poses
+A still training of 1,500 steps on a rendered walk past a room, 24 images of 100x75: with true poses, and with poses
 that are off by 1 degree and 1 % of the cameras' extent, kept and refined. Errors are medians over the cameras. What a
 shift, a turn and a scaling of the whole scene explain does not count. Each SEED is a disturbance of its own.
 """
@@ -23,7 +23,7 @@ from lapgs_wgpu.train.evaluate import evaluate
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.trainer import Trainer
 
-SIZE, COUNT, STEPS, START = 100, 24, 1000, 100
+SIZE, COUNT, STEPS, START = 100, 24, 1500, 100
 
 
 def row(name: str, amount: float, seed: int, *, refine: bool) -> str:
