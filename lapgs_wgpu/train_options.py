@@ -23,7 +23,7 @@ Train a 4D Gaussian splatting model of a moving scene on a folder of images. Run
   lapgs-train demo --data synthetic             built-in scene; takes minutes on a CPU
   lapgs-train tiny --data motion:path=4         built-in scene that measures motion (docs/metrics.md)
   lapgs-train tiny --data DIR                   D-NeRF scene at 200x200 pixels, with settings for a CPU
-  lapgs-train dnerf --data DIR --out RUN        D-NeRF scene at the paper's resolution and schedule
+  lapgs-train dnerf --data DIR --out RUN        D-NeRF scene as in the paper (800x800 pixels); dnerf-400: 400x400
   lapgs-train hypernerf --data DIR              Nerfies or HyperNeRF capture; for a CPU: hypernerf-tiny
   lapgs-train neu3d --data DIR                  several static cameras; for a CPU: neu3d-tiny
   lapgs-train hypernerf-tiny --data DIR         your own film, converted by lapgs-prepare (see its --help)
@@ -32,9 +32,13 @@ Train a 4D Gaussian splatting model of a moving scene on a folder of images. Run
   lapgs-train --eval RUN                        evaluate RUN/checkpoint.ply on the test views again
 
 The run folder receives config.toml, log.jsonl, metrics.json, checkpoint.ply (any 3DGS viewer opens it as a static
-scene) and eval/ with images: ground truth | rendering | 4 x error. [Values in brackets] are defaults; with a preset on
-the command line, as in lapgs-train tiny --help, they are that preset's. World units are those of the scene after it was
-moved and scaled into the presets' cube. "The paper" is "Laplacian Analysis Meets Dynamics Modelling"."""
+scene) and eval/ with images: ground truth | rendering | 4 x error.
+
+[Values in brackets] are defaults: those of the built-in preset on the command line, as in lapgs-train tiny --help,
+otherwise those of dnerf. World units are those of the scene after it was moved and scaled into the presets' cube, from
+-1.3 to 1.3 along each axis; D-NeRF's own scenes keep their coordinates. "With discovery" means: if the training starts
+with motion discovery (discovery.enabled). Learning rates are those of Adam. "The paper" is "Laplacian Analysis Meets
+Dynamics Modelling"."""
 
 
 _METAVARS = {int: "INT", float: "FLOAT", str: "TEXT", bool: "true|false"}
@@ -54,17 +58,23 @@ def parse_options(arguments: list[str]) -> dict[str, typing.Any]:
     add = parser.add_argument
     names, parts = ", ".join(preset_names()), "; ".join(f"{name} ({text})" for name, (text, _, _) in ABLATIONS.items())
     add("preset", nargs="?", metavar="PRESET",
-        help=f"preset configuration: {names}, or the path of a .toml file, such as RUN/config.toml")
+        help=f"preset configuration: {names} (names with a scene, such as hypernerf-broom, have the settings published "
+        "for that scene), or the path of a .toml file: RUN/config.toml, or your own, which starts with base = "
+        '"dnerf" or another preset, and names what differs')
     add("--field", metavar="NAME", help="method: static (3DGS, no motion), mlp (deformable 3DGS), hexplane (4D-GS), "
-        "grid4d (Grid4D) or laplacian (the paper's). All but laplacian also turn off the paper's losses and its "
-        "adaptive split [the preset's]")
+        "grid4d (Grid4D) or laplacian (the paper's). All but laplacian also turn off the paper's losses (loss.pyramid, "
+        "loss.ncc) and its adaptive split (density.split); they have no dynamics attributes; all else stays as in the "
+        "preset [the preset's]")
     add("--ablate", metavar="PART[,PART]", help=f"turn off parts of the paper's method, comma-separated: {parts}")
-    add("--out", metavar="RUN", help="run folder for all output; must be new or empty [runs/SCENE-PRESET]")
+    add("--out", metavar="RUN", help="run folder for all output; must be new or empty, but for --overwrite "
+        "[runs/SCENE-PRESET in the current folder; SCENE: name of the capture's folder]")
     add("--resume", metavar="RUN", help="continue the interrupted training in run folder RUN from its last saved "
         "state, with its own configuration. Can be combined with --view, --device, --lpips-weights, --cache-gb and "
         "--data (where the capture is now) only")
-    add("--overwrite", action="store_true", help="replace an existing run in the run folder")
-    add("--view", action="store_true", help="watch the training in a window; P pauses it, S takes a single step")
+    add("--overwrite", action="store_true", help="replace an existing run in the run folder: its files are deleted, "
+        "other files stay")
+    add("--view", action="store_true", help="watch the training in a window; P pauses it, S takes a single step; the "
+        "training goes on when the window is closed")
     add("--device", metavar="NAME", help=DEVICE_HELP)
     add("--list-devices", action="store_true", help=LIST_DEVICES_HELP)
     add("--eval", metavar="RUN", help="evaluate the finished run in folder RUN again, without training; overwrites "

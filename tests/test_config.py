@@ -181,8 +181,8 @@ def test_unknown_preset(preset: str, message: str) -> None:
         ('base = "dnerf"\nprecision = "float16"', "precision must be float32 or bfloat16, got 'float16'"),
         (
             'base = "dnerf"\ndecoder = "device"\n[field]\ndepth = 1',
-            "decoder device is for the fields grid4d and laplacian with field.depth 0 and field.motion laplacian, "
-            "not for laplacian with depth 1 and motion laplacian",
+            "decoder device is for the fields grid4d and laplacian with field.depth 0, and for laplacian only with "
+            "field.motion laplacian, not for laplacian with depth 1 and motion laplacian",
         ),
         (
             'base = "dnerf"\ndecoder = "device"\nprecision = "bfloat16"',

@@ -31,7 +31,8 @@ class DataConfig(Options):
 
     size: int = option("longer side of the images, pixels; larger images are downscaled; 0 keeps the original size")
     background: Background = option(
-        "background behind transparent images; random: a new color in each step, black during evaluation"
+        "color behind the Gaussians and behind transparent images; random: a new color in each step, black during "
+        "evaluation"
     )
     cache_gb: float = option(
         "memory limit for decoded images, gigabytes, beyond which images are decoded again: one limit for host memory "
@@ -50,17 +51,18 @@ class DataConfig(Options):
     units: Units = option(
         "units of rates.means, smoothness.reach and field.bound; world: those of the scene in the presets' cube; "
         "capture: those of the capture's files, as in published settings; the training multiplies these values by the "
-        "scale of the cube when it starts",
+        "scale of the cube when it starts; all other lengths are in world units",
         "world",
     )
     masks: str = option(
-        "folder with a PNG for each training image, under its name, white where the training loss ignores the image, "
-        "such as the folder masks of lapgs-prepare; empty: none",
+        "folder with a mask for every training image (of a.jpg: a.png or a.jpg.png); the training loss ignores white "
+        "pixels; such as the folder masks of lapgs-prepare; empty: none",
         "",
     )
     path: str = option(
-        'folder of the capture, or a built-in scene: "synthetic", or "motion:path=4,cycles=2"; a built-in '
-        "scene is generated next to the run folder",
+        "folder of the capture (docs/data.md lists the formats), or a built-in scene, generated next to the run "
+        'folder: "synthetic", or "motion:path=4,cycles=2" (paths 4 object diameters wide, travelled twice; more keys: '
+        "docs/metrics.md)",
         "",
     )
 
@@ -95,13 +97,13 @@ class ScheduleConfig(Options):
     )
     batch: int = option("images per step; their gradients are averaged", at_least=1)
     warm_up: int = option(
-        "number of initial steps without motion: the deformation field is off, and only the static Gaussians are "
-        "trained; with discovery: number of initial steps over which the rates of Gaussians and field rise linearly "
-        "from 0"
+        "without discovery: number of initial steps without motion, in which the deformation field is off and only the "
+        "static Gaussians are trained; with discovery: number of initial steps over which rates.*, except "
+        "rates.frequencies, rise linearly from 0"
     )
     sh_interval: int = option(
         "the degree of the spherical harmonics increases by one every this many steps, up to 3; it starts at 0, with "
-        "discovery at the degree of the static model",
+        "discovery at the degree of its static model (2)",
         at_least=1,
     )
     save_interval: int = option(
@@ -113,12 +115,13 @@ class ScheduleConfig(Options):
 class DensityConfig(Options):
     """Densification and pruning."""
 
-    start: int = option("densify, prune and reset opacities only after this step")
+    start: int = option("densify, prune (by min_contribution, too) and reset opacities only after this step")
     stop: int = option("densify, prune and reset opacities only before this step; pruning by min_contribution goes on")
     interval: int = option("densify and prune every this many steps", at_least=1)
     gradient: float = option(
-        "densify (clone or split) Gaussians whose mean gradient norm of the 2-D mean exceeds this value; "
-        "normalized device coordinates, where the image is 2 units wide"
+        "densify (clone or split) Gaussians whose gradient norm reaches this value; the gradient is that of the whole "
+        "loss by the 2-D mean, in normalized device coordinates, where the image is 2 units wide; its norm is averaged "
+        "over the images that showed the Gaussian since the last densification"
     )
     split_size: float = option(
         "largest standard deviation of a Gaussian that is cloned; larger ones are split; relative to the "
@@ -139,7 +142,7 @@ class DensityConfig(Options):
     )
     split_quantile: float = option(
         "adaptive split: fraction of the candidates that are not split: those with the lowest score (difference in "
-        "shape plus divergence_weight times difference in dynamics), except outliers in dynamics",
+        "shape plus divergence_weight times difference in dynamics), except outliers in dynamics (loss.dynamics)",
         at_least=0,
         at_most=1,
     )
@@ -151,11 +154,11 @@ class DensityConfig(Options):
     )
     max_screen_radius: float = option(
         "prune Gaussians that had a larger radius (to where alpha falls to 1/255) in an image since the last "
-        "densification, pixels; applies after the first opacity reset; 0: no limit"
+        "densification, pixels; applies after the first opacity reset (step density.reset_interval); 0: no limit"
     )
     max_world_size: float = option(
         "prune Gaussians with a larger standard deviation, relative to the extent of the cameras; applies "
-        "after the first opacity reset; 0: no limit"
+        "after the first opacity reset (step density.reset_interval); 0: no limit"
     )
     reset_interval: int = option("reset the opacities every this many steps", at_least=1)
     reset_opacity: float = option("an opacity reset lowers all larger opacities to this value", above=0, below=1)
@@ -216,10 +219,15 @@ class LossConfig(Options):
         "weight of 1 - local normalized cross-correlation, added to the image loss after schedule.warm_up, with "
         "discovery from step 1; 0: off"
     )
-    dynamics: float = option("weight of the regularization of the dynamics attributes (paper eq. 12)")
+    dynamics: float = option(
+        "weight of the dynamics regularization: squared distance of outlying dynamics attributes from the mean "
+        "attribute, averaged over all Gaussians (paper eq. 12); outliers are more than one standard deviation farther "
+        "from it than the average Gaussian; added after schedule.warm_up, with discovery from step 1"
+    )
     dynamics_mode: DynamicsMode = option(
         "sign of the dynamics regularization; literal: pulls outliers towards the mean, as in the paper's "
-        "equation; promote: pushes outliers away, as in the paper's text; off: no regularization, as loss.dynamics 0"
+        "equation; promote: pushes outliers away, as in the paper's text, by -log(1 + squared distance / variance of "
+        "the distances) instead of the squared distance; off: no regularization, as loss.dynamics 0"
     )
 
     def weights(self, *, warm: bool) -> LossWeights:
@@ -235,15 +243,22 @@ class SmoothnessConfig(Options):
         "fields grid4d and laplacian: weight of the smoothness loss (squared differences between features at nearby "
         "points), spatial grid"
     )
-    temporal: float = option("fields grid4d and laplacian: weight of the smoothness loss, space-time grids")
+    temporal: float = option(
+        "fields grid4d and laplacian: weight of the smoothness loss, space-time grids; if both weights are 0, the "
+        "field hexplane's own smoothness loss, whose weights are fixed, is off, too"
+    )
     share: float = option(
         "fraction of the Gaussians that the smoothness loss samples in each step, between 0 and 1; 0: off, which also "
-        "turns off the field hexplane's own smoothness loss of fixed weights",
+        "turns off the field hexplane's own smoothness loss",
         at_most=1,
     )
     reach: float = option("largest offset between the two sampled positions along each axis, world units")
     time_reach: float = option("largest offset between the two sampled times, as a fraction of the clip")
-    start: int = option("compute the smoothness loss only after this step, such as density.stop", 0)
+    start: int = option(
+        "compute the smoothness loss (hexplane's, too) only after this step, such as density.stop; without discovery, "
+        "it begins after schedule.warm_up at the earliest",
+        0,
+    )
 
 
 @dataclass(frozen=True)
@@ -251,13 +266,13 @@ class DiscoveryConfig(Options):
     """Motion discovery before the training (train/discovery). Has defaults, since older config.toml files lack it."""
 
     enabled: bool = option(
-        "before training, fit a static model, search for objects that move far, and start from both; skipped for the "
-        "field static and if schedule.steps is at most discovery.steps. If it explains 80% of what moves, the field's "
-        "rates stay at 0.005 (hash) and 0.001 (mlp) or less",
+        "before training, fit a static model, search for objects that move farther than their own size, and start from "
+        "both; skipped for the field static and if schedule.steps is at most discovery.steps. If what it finds "
+        "explains at least 80% of what moves, the field's rates stay at 0.005 (hash) and 0.001 (mlp) or less",
         False,
     )
     steps: int = option(
-        "training steps of this static model, which also separates what moves from what does not", 800, at_least=1
+        "training steps of the static model, which also separates what moves from what does not", 800, at_least=1
     )
     size: int = option("longer side of the images for the static model and the search, pixels", 100, at_least=16)
     field_steps: int = option("steps that fit the deformation field to the motion that was found", 1500, at_least=1)
@@ -291,18 +306,22 @@ class CamerasConfig(Options):
         "off",
     )
     rate: Rate = option(
-        "learning rate of the corrections, radians by which the image moves; after motion discovery, which corrects "
-        "cameras, too, the training goes on at the final value",
+        "learning rate of the corrections, radians of image motion per step (with discovery, its static model goes "
+        "from .start to .end in discovery.steps, the training stays at .end, and .steps has no effect)",
         Rate(4e-3, 2e-4, 3_000),
     )
     pull: float = option(
-        "each step shrinks the corrections of the cameras it uses by this fraction of the learning rate",
+        "weight decay of the corrections: each step multiplies those of the cameras it uses by 1 - pull x learning "
+        "rate",
         0.1,
         at_least=0,
     )
-    focal: bool = option("correct the focal length, too: one factor for all cameras", True)
+    focal: bool = option("correct the focal length, too: one factor for all training cameras", True)
     start: int = option(
-        "first step that moves cameras; the scene forms before it; after motion discovery: 1", 300, at_least=1
+        "first step that moves cameras; the scene forms before it; with discovery: the first step of its static model "
+        "that does, an eighth of discovery.steps at the latest; the training then moves cameras from step 1 on",
+        300,
+        at_least=1,
     )
 
     def refines(self, *, own_footage: bool) -> bool:
@@ -326,12 +345,12 @@ class EvalConfig(Options):
     )
     snapshots: str = option(
         "steps, comma-separated, such as 500,1000, after which the scene is saved to snapshots/step_NNNNNN.ply in the "
-        "run folder",
+        "run folder, for lapgs-view; empty: none",
         "",
     )
     tensorboard: bool = option(
-        "also write the figures of log.jsonl for TensorBoard, to the folder tensorboard of the run (needs the extra "
-        "tensorboard)",
+        "also write the figures of log.jsonl for TensorBoard, to the folder tensorboard of the run (pip install "
+        "'lapgs-wgpu[tensorboard]')",
         False,
     )
 
@@ -370,9 +389,9 @@ class Config(Options):
     )
     decoder: DecoderPlace = option(
         "where the decoder of the fields grid4d and laplacian runs during training; torch: on the CPU; "
-        "device: as kernels on the device, which changes the last bits and needs precision float32, field.depth 0 and "
-        "field.motion laplacian; auto: torch on CPU devices, otherwise the faster of the two in a trial at the start, "
-        "recorded in config.toml",
+        "device: as kernels on the device, which changes the last bits and needs precision float32, field.depth 0 and, "
+        "for the field laplacian, field.motion laplacian; auto: torch on CPU devices, otherwise the faster of the two "
+        "in a trial at the start, recorded in config.toml",
         "torch",
     )
 
@@ -380,8 +399,9 @@ class Config(Options):
         super().__post_init__()
         if self.decoder == "device" and not self.field.decodes_on_device:
             raise ValueError(
-                "decoder device is for the fields grid4d and laplacian with field.depth 0 and field.motion laplacian, "
-                f"not for {self.field.kind} with depth {self.field.depth} and motion {self.field.motion}"
+                "decoder device is for the fields grid4d and laplacian with field.depth 0, and for laplacian only with "
+                f"field.motion laplacian, not for {self.field.kind} with depth {self.field.depth} and motion "
+                f"{self.field.motion}"
             )
         if self.decoder == "device" and self.precision != "float32":
             raise ValueError(f"decoder device works in float32: precision {self.precision} needs decoder torch")

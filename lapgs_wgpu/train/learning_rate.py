@@ -20,7 +20,7 @@ class Rate(Options):
         below=math.inf,
     )
     end: float = option("final value, reached at .steps and kept", at_least=0, below=math.inf)
-    steps: int = option("training step, counted from the start, at which .end is reached", at_least=1)
+    steps: int = option("training step at which .end is reached; steps of discovery do not count", at_least=1)
 
     def at(self, step: int) -> float:
         """The rate of a step, which are counted from 1."""
@@ -34,7 +34,9 @@ class Rate(Options):
 class RatesConfig(Options):
     """Adam's learning rates, for each parameter of the Gaussians and for the field's hash tables and its MLP."""
 
-    means: Rate = option("learning rate of the means, world units per step")
+    means: Rate = option(
+        "learning rate of the means, world units per step (unlike in 3DGS, not multiplied by the cameras' extent)"
+    )
     log_scales: float = option("learning rate of the log-scales, constant; 0: frozen", at_least=0)
     quats: float = option("learning rate of the rotations (quaternions), constant; 0: frozen", at_least=0)
     opacity_logits: float = option("learning rate of the opacities (logits), constant; 0: frozen", at_least=0)
@@ -47,7 +49,7 @@ class RatesConfig(Options):
     )
     dynamics: float = option("learning rate of the per-Gaussian dynamics attributes, constant; 0: frozen", at_least=0)
     hash: Rate = option("learning rate of the field's hash tables or feature planes")
-    mlp: Rate = option("learning rate of the field's MLP weights")
+    mlp: Rate = option("learning rate of the field's MLP weights and of the motion spectrum's coefficients")
     frequencies: Rate = option("learning rate of the motion spectrum's frequencies, cycles per clip per step")
 
     def schedules(self) -> dict[str, Rate]:

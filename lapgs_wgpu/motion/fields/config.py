@@ -33,7 +33,7 @@ APPEARANCE_SCALE = 0.1
 class PlaneConfig(Options):
     """The planes of the field hexplane."""
 
-    features: int = option("number of features per plane", 32, at_least=1, at_most=256)
+    features: int = option("number of features per plane and level", 32, at_least=1, at_most=256)
     space: int = option("resolution of the coarsest planes along each spatial axis", 64, at_least=2, at_most=4096)
     time: int = option("resolution along the time axis", 75, at_least=2, at_most=4096)
     levels: int = option(
@@ -79,8 +79,8 @@ class FieldConfig(Options):
         "fraction of the space-time grids' time axis that the clip occupies, in its middle", 0.9, above=0, at_most=1
     )
     temporal_hash: bool = option(
-        "fields grid4d and laplacian: use the three space-time hash grids; without them only the motion spectrum "
-        "depends on time",
+        "fields grid4d and laplacian: use the three space-time hash grids; without them, laplacian depends on time "
+        "only through field.motion, and grid4d does not move",
         True,
     )
     motion: Motion = option(
@@ -89,8 +89,8 @@ class FieldConfig(Options):
         "laplacian",
     )
     components: int = option(
-        "field laplacian: number of frequencies in the motion spectrum; at most 1 + training times / (2 x "
-        "frequency_step), rounded down, are used",
+        "field laplacian: number of frequencies in the motion spectrum; at most 1 + T / (2 x frequency_step), rounded "
+        "down, are used, where T is the number of distinct training times",
         16,
         at_least=1,
         at_most=256,
@@ -116,11 +116,15 @@ class FieldConfig(Options):
         at_most=256,
     )
     negative_scales: NegativeScales = option(
-        "scales that the field changes to below zero; mirror: count as their magnitude and keep their gradient, as in "
-        "Grid4D; floor: become 1e-7 and lose it",
+        "scales (standard deviations) that the field's additive change takes below zero; mirror: count as their "
+        "magnitude and keep their gradient, as in Grid4D; floor: become 1e-7 and lose it",
         "floor",
     )
-    appearance: Appearance = option("field laplacian: what the field changes over time besides geometry", "color")
+    appearance: Appearance = option(
+        "field laplacian: what the field changes over time besides geometry; color: base colors (spherical harmonics "
+        "of degree 0)",
+        "color",
+    )
 
     @property
     def dynamics_size(self) -> int:

@@ -15,7 +15,9 @@ TIME = 3  # the axis number of time
 class HashConfig(Options):
     """The shape of a grid."""
 
-    levels: int = option("number of resolution levels", 16, at_least=1, at_most=64)
+    levels: int = option(
+        "number of resolution levels, which grow geometrically from base to finest", 16, at_least=1, at_most=64
+    )
     base: tuple[int, int, int] = option(
         "resolution of the coarsest level along each axis", (16, 16, 16), at_least=2, at_most=1 << 16
     )
