@@ -19,7 +19,7 @@ DEVICE_HELP = (
     "graphics adapter: cpu, integrated or discrete, or part of the adapter's name [environment variable LAPGS_DEVICE, "
     "otherwise the first in the list of lapgs-train --list-devices]"
 )
-LIST_DEVICES_HELP = "list the graphics adapters and exit; the default one comes first"
+LIST_DEVICES_HELP = "list the graphics adapters and exit; the first one is the default unless LAPGS_DEVICE is set"
 OUT_OF_DEVICE, NOT_FINITE = 4, 5
 INTERRUPTED = 130  # the shell's code for a process that Ctrl-C ended
 

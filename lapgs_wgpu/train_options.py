@@ -82,8 +82,9 @@ def parse_options(arguments: list[str]) -> dict[str, typing.Any]:
         "--data.background, --cache-gb, --device, --lpips-weights and --motion-from only")
     add("--lpips-weights", metavar="FILE", help="also compute LPIPS (VGG) in the evaluation with the weights in FILE, "
         "a .safetensors file (docs/metrics.md)")
-    add("--motion-from", metavar="RUN", help="with --eval: also compute metrics of the moving pixels, found by "
-        "comparison with the images of RUN, a static model of the same capture (--field static; docs/metrics.md)")
+    add("--motion-from", metavar="RUN", help="with --eval: find the moving pixels, for their metrics, by comparing the "
+        "test images with the renderings of RUN, a static model of the same capture (--field static; docs/metrics.md), "
+        "in place of the median of still cameras")
     # fmt: on
     groups: dict[str, argparse._ArgumentGroup] = {}
     for name, kind, about in config_keys():

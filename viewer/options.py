@@ -142,7 +142,7 @@ def _parse(arguments: Sequence[str]) -> Any:
     add("--frames", type=_count, metavar="N", help="number of files in --export DIR, at equally spaced times from "
         "0 to 1; required for DIR, no default")
     add("--overwrite", action="store_const", const=True, help="allow --export to replace an existing file; "
-        "with --frames: delete all frame_*.ply in DIR first, other files stay")
+        "with --frames: allow a DIR that is not empty, and delete its frame_*.ply first")
     # fmt: on
     return parser.parse_args(arguments)
 

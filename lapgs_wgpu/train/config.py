@@ -130,19 +130,22 @@ class DensityConfig(Options):
     )
     split: Split = option(
         "which large Gaussians above the gradient threshold are split; plain: all; adaptive (the paper's): "
-        "those that differ most from their neighbors in shape and dynamics"
+        "those that differ most from their neighbors in shape, or most unevenly in dynamics, and outliers in dynamics "
+        "(loss.dynamics)"
     )
     neighbours: int = option(
         "adaptive split: number of nearest neighbors that each Gaussian is compared with", at_least=1
     )
     divergence_weight: float = option(
-        "adaptive split: weight of the difference in dynamics relative to the difference in shape",
+        "adaptive split: weight of the dynamics term relative to the difference in shape; the term, from 0 to 1, says "
+        "how unevenly the neighbors' dynamics attributes differ from the Gaussian's own; 0 if all differ alike; for "
+        "fields without dynamics attributes: distances of the means instead",
         at_least=0,
         below=math.inf,
     )
     split_quantile: float = option(
         "adaptive split: fraction of the candidates that are not split: those with the lowest score (difference in "
-        "shape plus divergence_weight times difference in dynamics), except outliers in dynamics (loss.dynamics)",
+        "shape plus divergence_weight times dynamics term), except outliers in dynamics (loss.dynamics)",
         at_least=0,
         at_most=1,
     )
@@ -160,7 +163,11 @@ class DensityConfig(Options):
         "prune Gaussians with a larger standard deviation, relative to the extent of the cameras; applies "
         "after the first opacity reset (step density.reset_interval); 0: no limit"
     )
-    reset_interval: int = option("reset the opacities every this many steps", at_least=1)
+    reset_interval: int = option(
+        "reset the opacities every this many steps; density.stop or more: never, which also turns off "
+        "max_screen_radius and max_world_size",
+        at_least=1,
+    )
     reset_opacity: float = option("an opacity reset lowers all larger opacities to this value", above=0, below=1)
     limit: int = option(
         "densification adds none beyond this number, and densifies those with the largest gradients first; 0: no limit",
