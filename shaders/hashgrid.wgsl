@@ -1,5 +1,6 @@
 // Encodes points: two features a level, interpolated between the corners of the cell in which a point lies.
 // ROWS: of some of the points only, into their own rows of the encoding.
+// LONG_LANES, for devices of few wide cores: a lane takes more points.
 #import common/bfloat16
 #import common/hashgrid
 #import common/index
@@ -21,7 +22,12 @@
 #endif
 
 const LANES = 64u;
-const LANE_POINTS = 8u;   // so that a level's description is loaded once for several points
+// so that a level's description is loaded once for several points
+#ifdef LONG_LANES
+const LANE_POINTS = 32u;
+#else
+const LANE_POINTS = 8u;
+#endif
 
 @compute @workgroup_size(64)
 fn main(

@@ -1,4 +1,5 @@
 // Spreads the gradient of a slice over the two planes of the table from which it was blended.
+// LONG_LANES, for devices of few wide cores: a lane takes several cells, so that a level's description is loaded once for all.
 #import common/hashgrid
 
 @group(0) @binding(0) var<uniform> grid: Grid;
@@ -6,19 +7,27 @@
 #table 2 d_slices: vec2<f32>
 @group(0) @binding(3) var<storage, read_write> d_features: array<vec2<f32>>;   // zero before
 
+const LANES = 64u;
+#ifdef LONG_LANES
+const LANE_CELLS = 16u;
+#else
+const LANE_CELLS = 1u;
+#endif
+
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
     let level = levels[group.y];
-    let cell = group.x * 64u + lane;
     let plane = level.resolution.x * level.resolution.y;
-    if (cell >= plane) {
-        return;
-    }
     let p = grid.time * level.scale.z;
     let up = smooth_weight(vec3(p - floor(p))).x;
     let low = u32(floor(p));
     let high = min(low + 1u, level.resolution.z - 1u);
-    let gradient = d_slices_at(level.first_sliced + cell);
-    d_features[level.first + low * plane + cell] += (1.0 - up) * gradient;
-    d_features[level.first + high * plane + cell] += up * gradient;
+    for (var k = 0u; k < LANE_CELLS; k++) {
+        let cell = (group.x * LANE_CELLS + k) * LANES + lane;
+        if (cell < plane) {
+            let gradient = d_slices_at(level.first_sliced + cell);
+            d_features[level.first + low * plane + cell] += (1.0 - up) * gradient;
+            d_features[level.first + high * plane + cell] += up * gradient;
+        }
+    }
 }

@@ -21,6 +21,7 @@ from ..fields.hash_grid_config import TIME, GridShape
 
 _ALIGNED = 64  # rows; a multiple of 256 bytes for every row size, at which a binding may begin
 _LEVEL_WORDS = 16  # common/hashgrid.wgsl: struct Level
+OWN_CELLS = 1024  # entries in a lane's own memory, of which WGSL allows 8192 bytes
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,8 @@ class _Levels:
 class HashEncoderPasses:
     """Records the passes that encode points with several grids. Axes and levels are fixed.
 
-    lane_levels: use the backward pass for CPU devices; otherwise fixed-point atomics.
+    lane_levels: use the shape for CPU devices: in the backward pass a lane owns a level, in the others it takes
+    many points or cells; otherwise the shape for GPUs, with fixed-point atomics.
     row, column: the encoding's rows have `row` floats; the grids' features are written one after another from `column`
     on. Both are even. By default the rows hold the features only.
     """
@@ -73,6 +75,8 @@ class HashEncoderPasses:
         self.device, self.grids, self.bound = device, list(grids), bound
         self.pool = BufferPool(device)
         self.lane_levels = device.is_cpu if lane_levels is None else lane_levels
+        self._long_lanes = {"LONG_LANES": 1} if self.lane_levels else {}
+        self._group_points, self._group_cells = (2048, 1024) if self.lane_levels else (512, 64)
         # If a lane loops over all points: at most half of the iterations that the driver allows.
         turns = SOFTWARE_LOOP_TURNS if self.lane_levels else None
         self._most_points = None if turns is None else (turns + 1) // 2
@@ -145,7 +149,7 @@ class HashEncoderPasses:
         uint32, the first `points.count` select the points; the encoding, which must then fit into a binding, keeps its
         other rows.
         """
-        options = _precision(encoding)
+        options = _precision(encoding) | self._long_lanes
         if rows is None:
             blocks = [
                 (
@@ -155,18 +159,18 @@ class HashEncoderPasses:
                 for first, count, grid in self._blocks(points, encoding)
             ]
         else:
-            options |= {"ROWS": 1}
+            options["ROWS"] = 1
             grid = self._uniform(points, 0, points.count, 0)
             blocks = [(points.count, {"grid": grid, "points": points.array, "encoding": encoding, "rows": rows})]
         slices = self.pool.array("slices", (self._slice_entries, 2))
         for number, cut in self._cuts.items():
-            kernel = Kernel.get(self.device, "hashgrid_slice", **cut.defines)
+            kernel = Kernel.get(self.device, "hashgrid_slice", **cut.defines, **self._long_lanes)
             arrays = {"levels": cut.array, "features": tables[number], "slices": slices, "grid": blocks[0][1]["grid"]}
-            commands.dispatch_grid(kernel, (-(-cut.cells // 64), cut.count), **arrays)
+            commands.dispatch_grid(kernel, (-(-cut.cells // self._group_cells), cut.count), **arrays)
         for count, of_block in blocks:
             for levels, features in self._lookups(slices, tables):
                 kernel = Kernel.get(self.device, "hashgrid", **levels.defines, **options)
-                groups = -(-count // 512) * levels.count
+                groups = -(-count // self._group_points) * levels.count
                 commands.dispatch(kernel, groups, levels=levels.array, features=features, **of_block)
 
     def add_gradient(
@@ -191,7 +195,10 @@ class HashEncoderPasses:
             arrays = {"points": points.array.rows(first, count), "d_encoding": d_encoding.rows(first, count)}
             arrays |= {"grid": grid, **largest}
             for levels, target in sums:
-                kernel = Kernel.get(self.device, "hashgrid_bwd", **levels.defines, **options)
+                own = (
+                    {"CELLS": levels.cells} if self.lane_levels and levels.sliced and levels.cells <= OWN_CELLS else {}
+                )
+                kernel = Kernel.get(self.device, "hashgrid_bwd", **levels.defines, **options, **own)
                 groups = _shared(levels.count) if self.lane_levels else -(-count // 64) * levels.count
                 commands.run(kernel, groups, arrays | {"levels": levels.array, "d_features": target, "d_fixed": target})
 
@@ -201,9 +208,9 @@ class HashEncoderPasses:
                 groups = -(-target.size // 64)
                 commands.dispatch(unfix, groups, grid=grid, d_fixed=fixed, d_features=target, **largest)
         for number, cut in self._cuts.items():
-            kernel = Kernel.get(self.device, "hashgrid_slice_bwd", **cut.defines)
+            kernel = Kernel.get(self.device, "hashgrid_slice_bwd", **cut.defines, **self._long_lanes)
             arrays = {"levels": cut.array, "d_slices": d_slices, "d_features": d_tables[number], "grid": grid}
-            commands.dispatch_grid(kernel, (-(-cut.cells // 64), cut.count), **arrays)
+            commands.dispatch_grid(kernel, (-(-cut.cells // self._group_cells), cut.count), **arrays)
 
     def _largest(
         self, commands: Commands, points: PointSet, d_encoding: DeviceArray, options: dict[str, int]
