@@ -52,6 +52,12 @@ class _Levels:
     def defines(self) -> dict[str, int]:
         return {"SLICED": 1, "CORNERS": 4} if self.sliced else {"CORNERS": 8}
 
+    @property
+    def lane_defines(self) -> dict[str, int]:
+        """Further ones of the backward pass whose lanes own levels."""
+        own_memory = self.sliced and self.cells <= OWN_CELLS
+        return {"LANE_LEVELS": 1, "CELLS": self.cells} if own_memory else {"LANE_LEVELS": 1}
+
 
 class HashEncoderPasses:
     """Records the passes that encode points with several grids. Axes and levels are fixed.
@@ -190,15 +196,12 @@ class HashEncoderPasses:
 
         options = _precision(d_encoding)
         largest = {} if self.lane_levels else {"largest": self._largest(commands, points, d_encoding, options)}
-        options |= {"LANE_LEVELS": 1} if self.lane_levels else {}
         for first, count, grid in self._blocks(points, d_encoding, self._most_points):
             arrays = {"points": points.array.rows(first, count), "d_encoding": d_encoding.rows(first, count)}
             arrays |= {"grid": grid, **largest}
             for levels, target in sums:
-                own = (
-                    {"CELLS": levels.cells} if self.lane_levels and levels.sliced and levels.cells <= OWN_CELLS else {}
-                )
-                kernel = Kernel.get(self.device, "hashgrid_bwd", **levels.defines, **options, **own)
+                shape = levels.lane_defines if self.lane_levels else {}
+                kernel = Kernel.get(self.device, "hashgrid_bwd", **levels.defines, **options, **shape)
                 groups = _shared(levels.count) if self.lane_levels else -(-count // 64) * levels.count
                 commands.run(kernel, groups, arrays | {"levels": levels.array, "d_features": target, "d_fixed": target})
 
