@@ -38,6 +38,7 @@ from lapgs_wgpu.train.distributed import SINGLE_PROCESS, Ranks
 from lapgs_wgpu.train.evaluate import evaluate
 from lapgs_wgpu.train.exposure import Exposures
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
+from lapgs_wgpu.train.host_threads import step_threads, torch_threads
 from lapgs_wgpu.train.initial_points import initial_points
 from lapgs_wgpu.train.loss_terms import Regularizer, check_terms, weight_at
 from lapgs_wgpu.train.nonfinite import Health, Skipped, cause, check_parameters, finite
@@ -135,7 +136,8 @@ class Trainer:
         if wanted and reason and ranks.first:
             print(f"note: motion discovery is left out: {reason}", file=sys.stderr, flush=True)
         if wanted and not reason:
-            with open(os.devnull, "w") as nowhere:
+            threads = step_threads(config.field, device)
+            with open(os.devnull, "w") as nowhere, torch_threads(threads):
                 found = discover(config, dataset, device, Trainer, None if ranks.first else nowhere, parts.field)
             scene, self._field_fitted, self.discovery, corrections = found
         self._generator = torch.Generator().manual_seed(config.seed)
@@ -158,6 +160,7 @@ class Trainer:
 
     def _start(self, corrections: Corrections | None) -> None:
         config, scene, dataset = self.config, self.scene, self.dataset
+        self._threads = step_threads(config.field, scene.device)
         if isinstance(scene.field, GridField):
             scene.field.precision = getattr(torch, config.precision)
             scene.field.on_device = self.decoder.place == "device"
@@ -254,7 +257,8 @@ class Trainer:
         """
         random, order = self._generator.get_state(), list(self._pictures.order)
         try:
-            result = self._step()
+            with torch_threads(self._threads):
+                result = self._step()
         except Exception:
             if self.whole:  # the device gave out: as if the step had not begun
                 self._generator.set_state(random)
