@@ -54,6 +54,11 @@ def options() -> argparse.ArgumentParser:
         f"[{_names(FIXED_SET)}]",
     )
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS, help=f"what is timed [{' '.join(PARTS)}]")
+    parser.add_argument(
+        "--preset",
+        default="dnerf",
+        help="configuration of the field in encoder and decoder, and of the step in shares [dnerf]",
+    )
     parser.add_argument("--repeat", type=int, default=15, metavar="R", help="timed runs of each [15]")
     parser.add_argument("--device", metavar="NAME", help="adapter: a part of its name, or its kind")
     parser.add_argument(
@@ -106,12 +111,12 @@ def run(options: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
             results["raster"][str(scene)] = raster
     if "encoder" in options.parts:
         means = first.make()[0]["means"]
-        results["encoder"] = bench_encoder(device, load_config("dnerf").field, means, meter, repeat)
+        results["encoder"] = bench_encoder(device, load_config(options.preset).field, means, meter, repeat)
         print_encoder(results["encoder"])
     if "decoder" in options.parts:
         means = first.make()[0]["means"]
-        results["decoder"] = bench_decoder(device, load_config("dnerf").field, means, repeat)
-        print_decoder(results["decoder"])
+        results["decoder"] = bench_decoder(device, load_config(options.preset).field, means, repeat)
+        print_decoder(results["decoder"], options.preset)
     if "losses" in options.parts:
         results["losses"] = bench_losses(device, first.height, meter, repeat)
         print_losses(results["losses"])
@@ -119,8 +124,9 @@ def run(options: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
         results["step"] = bench_step(device, repeat)
         print_step(results["step"])
     if "shares" in options.parts:
-        results["shares"] = bench_shares(device, max(1, repeat // 2), first.gaussians, first.height)
-        print_shares(results["shares"], first)
+        steps = max(1, repeat // 2)
+        results["shares"] = bench_shares(device, options.preset, steps, first.gaussians, first.height)
+        print_shares(results["shares"], first, options.preset)
     if "viewer" in options.parts:
         results["viewer"] = bench_viewer(device, repeat)
         for one in results["viewer"].values():
@@ -223,8 +229,8 @@ def print_encoder(report: EncoderReport) -> None:
     print(f"  {ratio:.1f} times as fast as the reference; gradients differ by {report.largest_difference:.1e} at most")
 
 
-def print_decoder(report: DecoderReport) -> None:
-    print_header(f"encoder and decoder, forward + backward: {report.gaussians:,} Gaussians, preset dnerf")
+def print_decoder(report: DecoderReport, preset: str) -> None:
+    print_header(f"encoder and decoder, forward + backward: {report.gaussians:,} Gaussians, preset {preset}")
     print_row("decoder in torch", report.torch)
     print_row("decoder on the device", report.device)
     ratio = report.torch.median / report.device.median
@@ -240,9 +246,9 @@ def print_losses(report: LossReport) -> None:
     print(f"  {ratio:.1f} times as fast as the references; gradients differ by {report.difference:.1e}")
 
 
-def print_shares(shares: dict[str, Timing], scene: SceneSize | TrainedScene) -> None:
+def print_shares(shares: dict[str, Timing], scene: SceneSize | TrainedScene, preset: str) -> None:
     size = f"{scene.height}x{scene.height}"
-    print(f"\ntraining step, preset dnerf: {scene.gaussians:,} Gaussians, {size}, everything moving")
+    print(f"\ntraining step, preset {preset}: {scene.gaussians:,} Gaussians, {size}, everything moving")
     print(f"  {'':46s}{'median':>8s}  milliseconds")
     for name, time in shares.items():
         print(f"  {name:46s}{time.median:8.2f}  {time.median / shares['step'].median:4.0%}")

@@ -1,4 +1,4 @@
-"""The field of the preset `dnerf`, forward and backward, with its decoder in torch and on the device."""
+"""The field of a preset, forward and backward, with its decoder in torch and on the device."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The hash encoder at the `dnerf` preset's sizes, against its torch reference in the same run."""
+"""The hash encoder at a preset's sizes, against its torch reference in the same run."""
 
 from __future__ import annotations
 

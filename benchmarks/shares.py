@@ -1,4 +1,4 @@
-"""Where a training step's time goes: the real loop with the preset `dnerf`, 50,000 Gaussians, 400x400 pixels."""
+"""Where a training step's time goes: the real loop with a preset, on the built-in scene."""
 
 from __future__ import annotations
 
@@ -27,22 +27,22 @@ from lapgs_wgpu.train.optimizer import FrequencyOptimizer, Optimizer
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.run import train
 
-WARM_UP = 2  # steps that are not counted
+VIEWS = 8
+WARM_UP = 10  # steps that are not counted: kernels are compiled, and each image is decoded
 RASTER, ENCODER, LOSSES = "rasteriser", "hash encoder", "image losses"
 TRANSFERS, OPTIMISER, REST = "transfers", "optimiser", "torch: decoder, activations, their gradients"
 ORDER = (RASTER, ENCODER, LOSSES, TRANSFERS, OPTIMISER, REST)
 
 
-def bench_shares(device: Device, repeat: int, gaussians: int = 50_000, size: int = 400) -> dict[str, Timing]:
-    """Milliseconds a step of each part, and under "step" of the whole.
+def bench_shares(device: Device, preset: str, repeat: int, gaussians: int, size: int) -> dict[str, Timing]:
+    """Milliseconds a step of each part, and under "step" of the whole. size: of the images, pixels.
 
     Kernels by the device's timestamps. Transfers are the host's copies, timed when the device has finished, and the
     device's own between buffers and textures.
     """
     steps = WARM_UP + repeat
-    config = load_config(
-        "dnerf", {"schedule.steps": str(steps), "schedule.warm_up": "0", "points.count": str(gaussians)}
-    )
+    schedule = {"schedule.steps": str(steps), "schedule.warm_up": "0", "density.start": str(steps)}
+    config = load_config(preset, schedule | {"points.count": str(gaussians)})
     clock = _Clock(device)
     log_step = Log.step
 
@@ -51,7 +51,7 @@ def bench_shares(device: Device, repeat: int, gaussians: int = 50_000, size: int
         clock.end_step()
 
     with TemporaryDirectory() as folder, clock.running(), mock.patch.object(Log, "step", end_of_step):
-        scene = write_synthetic(Path(folder) / "scene", size=size, train_views=8, test_views=1)
+        scene = write_synthetic(Path(folder) / "scene", size=size, train_views=VIEWS, test_views=1)
         train(config, load_dataset(scene), Path(folder) / "run", device=device)
     counted = clock.steps[WARM_UP:steps]
     return {name: summary([step[name] for step in counted]) for name in (*ORDER, "step")}
