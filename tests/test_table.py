@@ -16,9 +16,17 @@ from lapgs_wgpu.data import motion_writer, synthetic
 from lapgs_wgpu.data.motion_scenes import MotionScene
 from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.errors import InputError
-from lapgs_wgpu.train import table
+from lapgs_wgpu.train import plots, table
 from lapgs_wgpu.train.presets import load_config, write_toml
-from lapgs_wgpu.train.table_results import Result, Results, markdown, merge_results, read_results, write_results
+from lapgs_wgpu.train.table_results import (
+    Result,
+    Results,
+    markdown,
+    merge_results,
+    read_results,
+    seconds_to,
+    write_results,
+)
 from lapgs_wgpu.train.table_spec import Run, RunKey, fingerprint, read_spec
 
 ROOT = Path(__file__).parents[1]
@@ -207,8 +215,28 @@ def test_results_say_with_what_they_were_made() -> None:
     assert "2 test views of 24x24 (2 runs); 2 test views of 12x12 (1 runs)." in text
 
 
+CURVE = ((10.0, 24.0), (20.0, 34.0), (30.0, 33.5))
+
+
+def test_when_a_curve_reaches_a_quality() -> None:
+    assert seconds_to(CURVE, 20.0) == 10.0, "before its first measurement nothing is known"
+    assert seconds_to(CURVE, 30.0) == pytest.approx(16.0)
+    assert seconds_to(CURVE, 34.0) == 20.0
+    assert seconds_to(CURVE, 36.0) is None
+    assert seconds_to((), 30.0) is None
+
+
+def test_the_table_says_how_long_each_quality_took() -> None:
+    runs = (result(curve=CURVE), result(seed=1, curve=((10.0, 30.0), (20.0, 32.0))), result(row="y"))
+    lines = markdown(Results("name", "tiny", runs)).splitlines()
+    at = lines.index("| scene | model | 30 dB | 33 dB | 36 dB | best |")
+    assert lines[at + 2] == "| a | x | 13 | - | - | 33.00 dB |"
+    assert not lines[at + 3].startswith("|"), "a run without a curve has no line"
+    assert "33 dB" not in markdown(Results("name", "tiny", (result(),)))
+
+
 def test_results_survive_the_file(tmp_path: Path) -> None:
-    results = Results("name", "tiny", (result(), result("b", seconds=3)))
+    results = Results("name", "tiny", (result(curve=CURVE), result("b", seconds=3)))
     write_results(tmp_path, results)
     assert read_results(tmp_path / "results.json") == results
     assert (tmp_path / "table.md").read_text() == markdown(results)
@@ -255,7 +283,8 @@ def trained(monkeypatch: pytest.MonkeyPatch) -> list[RunKey]:
         done.append(run.key)
         (out / "eval").mkdir(parents=True, exist_ok=True)
         (out / "checkpoint.ply").write_text("large")
-        (out / "log.jsonl").write_text("")
+        line = {"step": 1, "val_psnr": 31.0, "val_views": "val", "timing": {"seconds": 2.5}}
+        (out / "log.jsonl").write_text('{"step": 1, "psnr": 20.0}\n' + json.dumps(line) + "\n")
         record = {"torch": "2", "adapter": "none"}
         (out / "config.toml").write_text(write_toml({**dataclasses.asdict(run.config), "record": record}))
         training = {"steps": run.config.schedule.steps, "seconds": 6.0}
@@ -282,6 +311,8 @@ def test_finished_runs_are_not_trained_again(
     assert shown.out == f"{out / 'table.md'}: 5 of 5 runs\n"
     assert (out / "toys" / "static" / "seed3" / "checkpoint.ply").exists()
     tables = {name: (out / name).read_bytes() for name in ("table.md", "results.json")}
+    assert read_results(out / "results.json").runs[0].curve == ((2.5, 31.0),)
+    assert (out / "curves.png").exists() == plots.available()
 
     assert make(spec_file, data) == 0
     (out / "results.json").unlink()

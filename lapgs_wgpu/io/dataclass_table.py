@@ -89,6 +89,10 @@ def checked(kind: Any, value: Any, where: str, least: float = 0) -> Any:
             return value
         hint = did_you_mean(value, parts) if isinstance(value, str) else "."
         raise InputError(f"{where} must be {' or '.join(parts)}, got {shown(value)}{hint}")
+    if origin is tuple and parts[-1] is Ellipsis:
+        if not isinstance(value, list | tuple):
+            raise InputError(f"{where} must be a list, got {shown(value)}.")
+        return tuple(checked(parts[0], entry, f"{where}[{n}]", least) for n, entry in enumerate(value))
     if origin is tuple:
         if not isinstance(value, list | tuple) or len(value) != len(parts):
             raise InputError(f"{where} must be {len(parts)} numbers, got {shown(value)}.")

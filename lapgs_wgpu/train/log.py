@@ -42,21 +42,24 @@ class Watched(Protocol):
 class Log:
     """Progress of a training, step by step. A context manager.
 
-    path: log.jsonl, written anew, or continued after the step `done`. docs/metrics.md describes its lines. What
+    path: log.jsonl, written anew, or continued after the step `done`. before: seconds that the training took before
+    the first step. docs/metrics.md describes its lines. What
     stands under "timing" and "memory" differs from run to run, all else repeats, but for the first line after a
     resumption, which averages what came since. The time of an evaluation does not count as time of the training.
     listeners: called with each line.
     """
 
-    def __init__(self, path: Path, steps: int, *, done: int = 0, terminal: TextIO | None = None) -> None:
+    def __init__(
+        self, path: Path, steps: int, *, done: int = 0, before: float = 0.0, terminal: TextIO | None = None
+    ) -> None:
         self._steps = steps
         self._progress = Progress(steps, "steps", terminal)
         self._path = path
-        self._file, before = _continued(path, done)
+        self._file, so_far = _continued(path, done)
         self._recent: deque[StepResult] = deque(maxlen=INTERVAL)
         self.listeners: list[Callable[[dict[str, Any]], None]] = []
         now = time.perf_counter()
-        self._start = now - before
+        self._start = now - (so_far or before)
         self._times: deque[float] = deque([now], maxlen=INTERVAL + 1)
 
     def __enter__(self) -> Log:
@@ -70,7 +73,7 @@ class Log:
 
     @property
     def seconds(self) -> float:
-        """Since the start."""
+        """Since the start, motion discovery included."""
         return time.perf_counter() - self._start
 
     def after_step(self, trainer: Watched, result: StepResult, /) -> None:

@@ -9,7 +9,7 @@ import importlib.util
 import json
 import math
 import typing
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -124,6 +124,19 @@ def training_curves(path: Path, steps: ArrayLike, loss: ArrayLike, psnr: ArrayLi
     panels[2].set_ylim(bottom=0)
     panels[2].set_xlabel("training step")
     _save(figure, path, "Training", panels)
+
+
+def quality_curves(path: Path, curves: Mapping[str, Sequence[tuple[float, float]]]) -> None:
+    """Name of a run -> seconds of training and PSNR of the validation views, dB."""
+    figure = _figure(7, 5)
+    axes = figure.subplots()
+    colors = _color_map(np.linspace(0, 0.9, len(curves)))
+    for (name, curve), color in zip(curves.items(), colors, strict=True):
+        axes.plot(*np.asarray(curve).T, color=color, marker=".", label=name)
+    axes.set_xlabel("training with motion discovery (s)")
+    axes.set_ylabel("PSNR, validation views (dB)")
+    axes.legend()
+    _save(figure, path, "Time to quality", [axes])
 
 
 def spectrum(path: Path, frequencies: ArrayLike, amplitudes: ArrayLike) -> None:

@@ -185,7 +185,8 @@ def _goes_on(training: Trainer, interrupted: threading.Event) -> bool:
 def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None) -> Scene4D:
     """The steps that are left, with all that a run folder receives."""
     config, scene = training.config, training.scene
-    with Log(out / "log.jsonl", config.schedule.steps, done=training.done) as log, _interruptible() as interrupted:
+    log = Log(out / "log.jsonl", config.schedule.steps, done=training.done, before=training.discovery_seconds)
+    with log, _interruptible() as interrupted:
         training.callbacks += [log.after_step, *_monitors(training, log, out)]
         if config.schedule.save_interval:
             training.callbacks.append(partial(_save_now_and_then, out))

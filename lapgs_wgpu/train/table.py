@@ -25,6 +25,7 @@ from lapgs_wgpu.data.builtin import is_builtin, write_builtin
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import open_device
 from lapgs_wgpu.io.atomic import atomic_write
+from lapgs_wgpu.train import plots
 from lapgs_wgpu.train.presets import load_config, write_toml
 from lapgs_wgpu.train.run_folder import STATE, STATE_BEFORE
 from lapgs_wgpu.train.table_results import Result, Results, read_results, read_run, write_results
@@ -64,7 +65,8 @@ def make_table(
     lpips: Path | None = None,
     hours: float | None = None,
 ) -> Outcome:
-    """Train what is not finished; results.json and table.md in `out` are written anew after every run.
+    """Train what is not finished; results.json and table.md in `out`, and curves.png where runs have a curve, are
+    written anew after every run.
 
     data: the folder in which the scenes lie. known: finished runs from elsewhere, beside those of out/results.json and
     of the run folders out/SCENE/ROW/seedN. slim: drop checkpoint and pictures of each run that is done. lpips: weights
@@ -156,6 +158,9 @@ def _keep_others(out: Path, stored: Sequence[Results], finished: Mapping[RunKey,
 def _write(spec: Spec, out: Path, finished: Mapping[RunKey, Result]) -> None:
     ordered = tuple(finished[run.key] for run in spec.runs if run.key in finished)
     write_results(out, Results(spec.name, spec.preset, ordered))
+    curves = {str(run.key): run.curve for run in ordered if run.curve}
+    if curves and plots.available():
+        plots.quality_curves(out / "curves.png", curves)
 
 
 def _time_left(runs: Sequence[Run], finished: Mapping[RunKey, Result], failed: Mapping[RunKey, str]) -> str:

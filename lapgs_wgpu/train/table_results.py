@@ -19,6 +19,7 @@ from lapgs_wgpu.train.presets import Table, load_config
 from lapgs_wgpu.train.table_spec import Run, RunKey, fingerprint
 
 FORMAT = "lapgs-table 1"
+QUALITIES = (30, 33, 36)  # dB
 # The figures that a run may lack.
 OPTIONAL = ("ms_ssim", "lpips", "lpips_unscaled", "psnr_moving", "found", "track_error")
 
@@ -35,7 +36,7 @@ class Result(Options):
     ssim: float = option("mean over the test views", at_least=-1, at_most=1)
     gaussians: int = option("number of Gaussians")
     steps: int = option("training steps")
-    seconds: float = option("time of the training alone")
+    seconds: float = option("time of the training, with motion discovery and without evaluation")
     size: tuple[int, int] = option("width and height of the images, pixels", at_least=1)
     views: int = option("number of test views")
     overrides: Table = option("what the configuration changed of the preset")
@@ -46,6 +47,9 @@ class Result(Options):
     psnr_moving: float | None = option("docs/metrics.md; None where it was not measured", None)
     found: float | None = option("docs/metrics.md; None where it was not measured", None)
     track_error: float | None = option("docs/metrics.md; None where it was not measured", None)
+    curve: tuple[tuple[float, float], ...] = option(
+        "seconds of training and PSNR of the validation views, dB, at each eval.interval; none where it is 0", ()
+    )
 
     @property
     def key(self) -> RunKey:
@@ -87,11 +91,29 @@ def read_run(folder: Path, run: Run) -> Result | None:
             "views": len(metrics["views"]),
             "overrides": run.overrides,
             "environment": record,
+            "curve": _curve(folder / "log.jsonl"),
             **{name: metrics[name] for name in OPTIONAL if isinstance(metrics.get(name), int | float)},
         }
         return build_dataclass(Result, entry, str(folder))
     except (OSError, ValueError, KeyError, TypeError):  # missing or damaged: it is trained again
         return None
+
+
+def _curve(log: Path) -> list[tuple[float, float]]:
+    """Seconds and PSNR of each measurement on validation views in a log.jsonl."""
+    lines = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()]
+    return [(line["timing"]["seconds"], line["val_psnr"]) for line in lines if "val_psnr" in line]
+
+
+def seconds_to(curve: Sequence[tuple[float, float]], psnr: float) -> float | None:
+    """When a curve first reaches a PSNR, on straight lines between its measurements; None where it never does."""
+    for k, (seconds, reached) in enumerate(curve):
+        if reached >= psnr:
+            if k == 0:
+                return seconds
+            earlier, lower = curve[k - 1]
+            return earlier + (seconds - earlier) * (psnr - lower) / (reached - lower)
+    return None
 
 
 def read_results(path: Path) -> Results:
@@ -131,7 +153,7 @@ def write_results(folder: Path, results: Results) -> None:
 def _content(results: Results) -> dict[str, Any]:
     """What a results.json holds; figures that a run lacks are left out."""
     content = dataclasses.asdict(results)
-    runs = [{name: value for name, value in run.items() if value is not None} for run in content["runs"]]
+    runs = [{name: value for name, value in run.items() if value not in (None, ())} for run in content["runs"]]
     return {"format": FORMAT, **content, "runs": runs}
 
 
@@ -159,7 +181,27 @@ def markdown(results: Results) -> str:
             means = {name: _mean([each[name] for each in of_scenes]) for name in formats}
             texts = (row, f"{len(parts)} of {len(scenes)}")
             lines.append(_line(formats, texts, _spread(_means_of_seeds(parts)), means))
+    if any(run.curve for run in results.runs):
+        lines += ["", *_times_to_quality(cells)]
     return "\n".join([*lines, "", *_environments(results), ""])
+
+
+def _times_to_quality(cells: Mapping[tuple[str, str], Sequence[Result]]) -> Iterable[str]:
+    """The table of the seconds that the runs of each scene and row took to reach each of QUALITIES, and of the best."""
+    yield (
+        "Seconds of training, motion discovery included, until the validation views reach a PSNR: means over the "
+        "seeds, - where a seed does not reach it."
+    )
+    yield ""
+    columns = [f"{psnr} dB" for psnr in QUALITIES]
+    yield f"| scene | model | {' | '.join(columns)} | best |"
+    yield f"|---|---|{'---:|' * (len(columns) + 1)}"
+    for (scene, row), runs in cells.items():
+        if all(run.curve for run in runs):
+            times = [_mean([seconds_to(run.curve, psnr) for run in runs]) for psnr in QUALITIES]
+            texts = ["-" if seconds is None else f"{seconds:,.0f}" for seconds in times]
+            best = mean(max(psnr for _, psnr in run.curve) for run in runs)
+            yield f"| {scene} | {row} | {' | '.join(texts)} | {best:.2f} dB |"
 
 
 # The figures that are averaged, in the order of their columns: the name of the column, and how each is shown.
@@ -225,7 +267,7 @@ def _environments(results: Results) -> Iterable[str]:
     """What the figures hold for: pictures, versions, adapter; and how many runs, where that is not the same for all."""
     yield (
         f"{len(results.runs)} runs of the preset `{results.preset}`. ± is the sample standard deviation of the PSNR "
-        "over the seeds; the training's time is without evaluation."
+        "over the seeds; the training's time is with motion discovery and without evaluation."
     )
     if any(run.psnr_moving is not None for run in results.runs):
         yield ""

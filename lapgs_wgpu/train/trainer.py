@@ -75,6 +75,7 @@ class Trainer:
         done: number of the steps so far.
         callbacks: a list of functions of the trainer and the StepResult, called after each step.
         discovery: what motion discovery found, a line; None where it was left out.
+        discovery_seconds: that it took; 0 where it was left out.
         cameras: the corrections of the training cameras; None where they are kept.
         decoder: where the field's decoder runs, and why.
         ranks: this process among those that train together.
@@ -129,6 +130,7 @@ class Trainer:
         self.ranks = ranks
         self.done = 0
         self.discovery: str | None = None
+        self.discovery_seconds = 0.0
         self._field_fitted = False  # by discovery
         corrections: Corrections | None = None
         wanted = config.discovery.enabled and config.field.kind != "static" and scene is None and not resumed
@@ -139,7 +141,7 @@ class Trainer:
             threads = step_threads(config.field, device)
             with open(os.devnull, "w") as nowhere, torch_threads(threads):
                 found = discover(config, dataset, device, Trainer, None if ranks.first else nowhere, parts.field)
-            scene, self._field_fitted, self.discovery, corrections = found
+            scene, self._field_fitted, self.discovery, corrections, self.discovery_seconds = found
         self._generator = torch.Generator().manual_seed(config.seed)
         # What discovery found moves from the first step on, at rates that rise: Adam's first steps, all of the size of
         # the rate, would shake off what the field knows.

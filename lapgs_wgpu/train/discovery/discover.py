@@ -31,12 +31,13 @@ SHOWN = 2.0 / 255  # least difference from the background of an image that shows
 
 class Discovery(NamedTuple):
     """scene: to start from. fitted: whether its field knows nearly all that moves. summary: what was found, a line.
-    corrections: of the dataset's cameras; None where they are kept."""
+    corrections: of the dataset's cameras; None where they are kept. seconds: that it took."""
 
     scene: Scene4D
     fitted: bool
     summary: str
     corrections: Corrections | None
+    seconds: float
 
 
 def discover(
@@ -88,7 +89,7 @@ def discover(
     meter.clear()
     seconds = time.perf_counter() - started
     summary = f"discovery: a static fit of {len(static)} Gaussians; {found}; {seconds:.0f} s"
-    return Discovery(scene, tracks is not None and share >= NEARLY_ALL, summary, corrections)
+    return Discovery(scene, tracks is not None and share >= NEARLY_ALL, summary, corrections, seconds)
 
 
 def scene_with(
