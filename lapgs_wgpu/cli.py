@@ -94,7 +94,7 @@ def _resume(
     config = load_config(str(run / "config.toml"), overrides)
     device = open_device(given["device"], number=ranks.on_machine)
     config, dataset = _open_data(config, run.parent, ranks)
-    for what, before, now in changes_since(run, device, dataset) if ranks.first else ():
+    for what, before, now in changes_since(run, config, device, dataset) if ranks.first else ():
         print(f"lapgs-train: {what} was {before} when {run} began and is {now}: bits may differ.", file=sys.stderr)
     resume(config, dataset, run, device=device, watch=watch, ranks=ranks, lpips=lpips)
     if ranks.first:

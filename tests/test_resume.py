@@ -27,6 +27,7 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io import atomic
 from lapgs_wgpu.train import run_folder
 from lapgs_wgpu.train.config import Config
+from lapgs_wgpu.train.host_threads import step_threads
 from lapgs_wgpu.train.presets import write_toml
 from lapgs_wgpu.train.run import resume, train
 from lapgs_wgpu.train.run_folder import STATE, STATE_BEFORE, load_state, locked_run_folder, save_state
@@ -169,7 +170,7 @@ def test_what_has_changed_since_the_run_began_is_told(
     config = configure(data__path=str(data), schedule__steps="3", schedule__save_interval="0")
     run_folder.start_run_folder(tmp_path, config, device, dataset)
     text = (tmp_path / "config.toml").read_text()
-    threads = torch.get_num_threads()
+    threads = step_threads(config.field, device) or torch.get_num_threads()
     text = text.replace(f'torch_threads = "{threads}"', 'torch_threads = "99"')
     (tmp_path / "config.toml").write_text(text.replace(f'driver = "{device.info.driver}"', 'driver = "another"'))
     assert cli.train_command(["--resume", str(tmp_path)]) == 0

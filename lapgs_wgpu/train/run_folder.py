@@ -22,6 +22,7 @@ from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.io.safe_json_toml import read_toml
 from lapgs_wgpu.io.safetensors_file import pack_tensors, unpack_tensors
 from lapgs_wgpu.train.config import Config
+from lapgs_wgpu.train.host_threads import step_threads
 from lapgs_wgpu.train.log import environment
 from lapgs_wgpu.train.presets import write_toml
 
@@ -82,12 +83,12 @@ def start_run_folder(out: Path, config: Config, device: Device, dataset: Dataset
             shutil.rmtree(out / name)
         else:
             (out / name).unlink(missing_ok=True)
-    table = {**dataclasses.asdict(config), "record": _record(device, dataset)}
+    table = {**dataclasses.asdict(config), "record": _record(config, device, dataset)}
     with atomic_write(out / "config.toml") as file:
         file.write(write_toml(table).encode())
 
 
-def changes_since(out: Path, device: Device, dataset: Dataset) -> list[tuple[str, str, str]]:
+def changes_since(out: Path, config: Config, device: Device, dataset: Dataset) -> list[tuple[str, str, str]]:
     """What is not as it was when the run in this folder began, though its bits may depend on it: name, then, now."""
     try:
         record = read_toml(out / "config.toml").get("record")
@@ -95,7 +96,7 @@ def changes_since(out: Path, device: Device, dataset: Dataset) -> list[tuple[str
         return []
     if not isinstance(record, dict):
         return []
-    now = _record(device, dataset)
+    now = _record(config, device, dataset)
     then = {name: text for name, text in record.items() if isinstance(text, str) and text.isprintable()}
     return [(name, then[name][:200], now[name]) for name in now if then.get(name, now[name]) != now[name]]
 
@@ -115,8 +116,11 @@ def _aligned(metrics: dict[str, Any]) -> str:
     return f" ({metrics['aligned']['psnr']:.2f} dB after test-time alignment)" if "aligned" in metrics else ""
 
 
-def _record(device: Device, dataset: Dataset) -> dict[str, str]:
-    return {**environment(device), "data": dataset.fingerprint}
+def _record(config: Config, device: Device, dataset: Dataset) -> dict[str, str]:
+    """What the bits of a run depend on besides its configuration."""
+    record = {**environment(device), "data": dataset.fingerprint}
+    threads = step_threads(config.field, device)
+    return record if threads is None else {**record, "torch_threads": str(threads)}
 
 
 def save_state(out: Path, state: State) -> None:

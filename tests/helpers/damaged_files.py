@@ -73,8 +73,8 @@ RESULTS = Results(
 def changes_since_without_device(folder: Path) -> Any:
     """`changes_since` with fixed words for what this machine is."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lapgs_wgpu.train.run_folder._record", lambda device, dataset: {"torch": "3"})
-        return changes_since(folder, None, None)  # type: ignore[arg-type]
+        patch.setattr("lapgs_wgpu.train.run_folder._record", lambda *_: {"torch": "3"})
+        return changes_since(folder, None, None, None)  # type: ignore[arg-type]
 
 
 SPEC = """
