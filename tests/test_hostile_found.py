@@ -223,7 +223,7 @@ def test_nothing_is_written_through_a_link(tmp_path: Path) -> None:
     for name in ("config.toml", "log.jsonl", STATE):
         (run / name).symlink_to(mine / "file")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lapgs_wgpu.train.run_folder._record", lambda device, dataset: {})
+        patch.setattr("lapgs_wgpu.train.run_folder._record", lambda *_: {})
         start_run_folder(run, load_config("tiny"), None, None)  # type: ignore[arg-type]
     save_state(run, {"training.done": np.array(1)})
     with Log(run / "log.jsonl", 1, terminal=io.StringIO()) as log:
