@@ -162,7 +162,7 @@ def contents(out: Gaussians[DeviceArray]) -> dict[str, np.ndarray]:
 
 
 def test_work_goes_with_the_number_of_those_moved(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    field, out = device_field(trained(device, GRID4D, 5000))
+    field, out = device_field(trained(device, GRID4D, 40_000))
     groups: dict[str, int] = {}
 
     def dispatch(self: Commands, kernel: Kernel, number: int, **buffers: object) -> None:
@@ -172,7 +172,7 @@ def test_work_goes_with_the_number_of_those_moved(device: Device, monkeypatch: p
     field.move(0.5, out)
     whole = groups.copy()
     groups.clear()
-    field.move(0.5, out, np.arange(0, 5000, 10))
+    field.move(0.5, out, np.arange(0, 40_000, 10))
     assert groups.keys() == whole.keys() == {"hashgrid", "deform"}
     for name in groups:
         assert groups[name] <= 0.11 * whole[name] + 1
