@@ -1,18 +1,11 @@
 // Cuts the levels of a temporal grid at one time: each entry of a slice is blended from the two planes around that time.
-// LONG_LANES, for devices of few wide cores: a lane takes several cells, so that a level's description is loaded once for all.
 #import common/hashgrid
+#import common/slice_lanes
 
 @group(0) @binding(0) var<uniform> grid: Grid;
 @group(0) @binding(1) var<storage, read> levels: array<Level>;
 #table 2 features: vec2<f32>
 @group(0) @binding(3) var<storage, read_write> slices: array<vec2<f32>>;
-
-const LANES = 64u;
-#ifdef LONG_LANES
-const LANE_CELLS = 16u;
-#else
-const LANE_CELLS = 1u;
-#endif
 
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
