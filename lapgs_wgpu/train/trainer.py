@@ -131,6 +131,7 @@ class Trainer:
         self.done = 0
         self.discovery: str | None = None
         self.discovery_seconds = 0.0
+        self._threads = step_threads(config.field, device)
         self._field_fitted = False  # by discovery
         corrections: Corrections | None = None
         wanted = config.discovery.enabled and config.field.kind != "static" and scene is None and not resumed
@@ -138,8 +139,7 @@ class Trainer:
         if wanted and reason and ranks.first:
             print(f"note: motion discovery is left out: {reason}", file=sys.stderr, flush=True)
         if wanted and not reason:
-            threads = step_threads(config.field, device)
-            with open(os.devnull, "w") as nowhere, torch_threads(threads):
+            with open(os.devnull, "w") as nowhere, torch_threads(self._threads):
                 found = discover(config, dataset, device, Trainer, None if ranks.first else nowhere, parts.field)
             scene, self._field_fitted, self.discovery, corrections, self.discovery_seconds = found
         self._generator = torch.Generator().manual_seed(config.seed)
@@ -162,7 +162,6 @@ class Trainer:
 
     def _start(self, corrections: Corrections | None) -> None:
         config, scene, dataset = self.config, self.scene, self.dataset
-        self._threads = step_threads(config.field, scene.device)
         if isinstance(scene.field, GridField):
             scene.field.precision = getattr(torch, config.precision)
             scene.field.on_device = self.decoder.place == "device"
