@@ -100,9 +100,9 @@ def read_run(folder: Path, run: Run) -> Result | None:
 
 
 def _curve(log: Path) -> list[tuple[float, float]]:
-    """Seconds and PSNR of each measurement on validation views in a log.jsonl."""
+    """Seconds and PSNR of each measurement in a log.jsonl on validation views, which not all captures have."""
     lines = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()]
-    return [(line["timing"]["seconds"], line["val_psnr"]) for line in lines if "val_psnr" in line]
+    return [(line["timing"]["seconds"], line["val_psnr"]) for line in lines if line.get("val_views") == "val"]
 
 
 def seconds_to(curve: Sequence[tuple[float, float]], psnr: float) -> float | None:
