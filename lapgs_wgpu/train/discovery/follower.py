@@ -180,12 +180,11 @@ class Follower:
         """(s,) how much of the points a part explains when it is moved by each of the shifts (s, 3), and (s, m) how
         near it then is to each of the points."""
         some = members[np.linspace(0, len(members) - 1, min(24, len(members))).astype(np.int64)]
-        squared = _squared((points.positions[None] - shifts[:, None]).reshape(-1, 3), positions[some])
-        nearest = squared.argmin(axis=1)
-        near = np.exp(-squared[np.arange(len(squared)), nearest] / (2 * (spread * self._unit) ** 2))
-        near = near.reshape(len(shifts), -1).astype(np.float32)
-        apart = ((points.colors[None] - self.colors[some][nearest].reshape(len(shifts), -1, 3)) ** 2).sum(axis=2)
-        alike = 0.3 + 0.7 * np.exp(-apart / (2 * 0.35**2))
+        moved = (points.positions[None] - shifts[:, None]).reshape(-1, 3)
+        nearest, squared = _nearest(moved, positions[some])
+        near = np.exp(-squared / (2 * (spread * self._unit) ** 2)).reshape(len(shifts), -1)
+        alike = 0.3 + 0.7 * np.exp(-_squared(points.colors, self.colors[some]) / (2 * 0.35**2))
+        alike = alike[np.arange(len(points.colors)), nearest.reshape(near.shape)]
         return (near * alike * free * points.scores).sum(axis=1), near
 
 
@@ -193,6 +192,15 @@ def _grid(half: float, step: float) -> Floats:
     """(n, 3) places of a cubic grid of this spacing, up to `half` from 0 along each axis."""
     axis = np.arange(-half, half + 1e-6, step, dtype=np.float32)
     return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def _nearest(a: Floats, b: Floats) -> tuple[NDArray[np.int64], Floats]:
+    """For each row of a (n, 3) the index of the nearest row of b (m, 3), and the squared distance from it."""
+    # Half of |a|² - |a - b|²: one product of matrices, largest where b is nearest.
+    closeness = np.column_stack([a, np.ones_like(a[:, 0])]) @ np.column_stack([b, -0.5 * (b**2).sum(axis=1)]).T
+    nearest = closeness.argmax(axis=1)
+    squared: Floats = (a**2).sum(axis=1) - 2 * closeness[np.arange(len(a)), nearest]
+    return nearest, np.maximum(squared, 0.0)
 
 
 def _squared(a: Floats, b: Floats) -> Floats:

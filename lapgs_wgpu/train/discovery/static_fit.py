@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import cache, partial
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -132,7 +132,7 @@ def static_config(config: Config) -> Config:
 
 def small_views(views: Sequence[View], size: int) -> list[View]:
     """The views with their longer side shrunk to `size` pixels, smaller ones as they are. Views that share a camera
-    still share one."""
+    still share one, and each image is read once."""
     cameras: dict[int, Camera] = {}
     found = []
     for view in views:
@@ -144,7 +144,7 @@ def small_views(views: Sequence[View], size: int) -> list[View]:
         small = max(1, round(scale * width)), max(1, round(scale * height))
         camera = cameras.setdefault(id(view.camera), view.camera.resized(*small))
         ignored = None if view.ignored is None else partial(_shrunk_mask, view, small)
-        pixels = partial(_shrunk, view, small)
+        pixels = cache(partial(_shrunk, view, small))
         found.append(dataclasses.replace(view, camera=camera, pixels=pixels, ignored=ignored))
     return found
 
