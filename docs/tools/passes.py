@@ -200,7 +200,8 @@ def discovery(scenes: Path) -> Picture:
     dataset = open_dataset(given)
     config, device = suited(given, dataset), open_device()
     meter = Progress(config.discovery.steps, "steps of the static fit", None)
-    static, images, _ = static_fit(config, dataset, device, Trainer, meter.at)
+    fit = static_fit(config, dataset, device, Trainer, meter.at)
+    static, images = fit.scene, fit.images
     meter.clear()
     clouds = surface_points(images, config.points.box)
     found = find_tracks(clouds, config.points.box)
