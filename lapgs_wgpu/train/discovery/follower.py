@@ -183,8 +183,8 @@ class Follower:
         moved = (points.positions[None] - shifts[:, None]).reshape(-1, 3)
         nearest, squared = _nearest(moved, positions[some])
         near = np.exp(-squared / (2 * (spread * self._unit) ** 2)).reshape(len(shifts), -1)
-        alike = 0.3 + 0.7 * np.exp(-_squared(points.colors, self.colors[some]) / (2 * 0.35**2))
-        alike = alike[np.arange(len(points.colors)), nearest.reshape(near.shape)]
+        pairs = 0.3 + 0.7 * np.exp(-_squared(points.colors, self.colors[some]) / (2 * 0.35**2))
+        alike = pairs[np.arange(len(points.colors)), nearest.reshape(near.shape)]
         return (near * alike * free * points.scores).sum(axis=1), near
 
 
