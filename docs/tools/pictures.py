@@ -93,8 +93,8 @@ def main(run: Path, folder: Path) -> None:
     with atomic_write(folder / "demo.webp") as file:
         file.write(moving(scene))
     export_compact(scene, folder / "demo.html", overwrite=True)
-    for file in sorted(folder.iterdir()):
-        print(f"{file}: {file.stat().st_size:,} bytes")
+    for path in sorted(folder.iterdir()):
+        print(f"{path}: {path.stat().st_size:,} bytes")
 
 
 if __name__ == "__main__":
