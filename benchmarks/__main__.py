@@ -23,6 +23,7 @@ from typing import Any
 import torch
 from ceilings import describe
 from compare import compare
+from crossings import BUSES, Crossing, bench_crossings
 from decoder import DecoderReport, bench_decoder
 from encoder import EncoderReport, bench_encoder
 from losses import LossReport, bench_losses
@@ -38,7 +39,7 @@ from lapgs_wgpu.gpu.probe_subgroup import subgroup_size
 from lapgs_wgpu.train.presets import load_config
 from viewer import bench_viewer, print_viewer
 
-PARTS = ("raster", "encoder", "decoder", "losses", "step", "shares", "viewer")
+PARTS = ("raster", "encoder", "decoder", "losses", "step", "shares", "bytes", "viewer")
 
 
 def options() -> argparse.ArgumentParser:
@@ -50,14 +51,14 @@ def options() -> argparse.ArgumentParser:
         default=FIXED_SET,
         metavar="SCENE@WxH",
         help="what is drawn: a ball of so many Gaussians, or the checkpoint.ply of a training, and the size of the "
-        "image; the first one also decides the sizes in encoder, decoder, losses and shares "
+        "image; the first one also decides the sizes in encoder, decoder, losses, shares and bytes "
         f"[{_names(FIXED_SET)}]",
     )
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS, help=f"what is timed [{' '.join(PARTS)}]")
     parser.add_argument(
         "--preset",
         default="dnerf",
-        help="configuration of the field in encoder and decoder, and of the step in shares [dnerf]",
+        help="configuration of the field in encoder and decoder, and of the step in shares and bytes [dnerf]",
     )
     parser.add_argument("--repeat", type=int, default=15, metavar="R", help="timed runs of each [15]")
     parser.add_argument("--device", metavar="NAME", help="adapter: a part of its name, or its kind")
@@ -127,6 +128,12 @@ def run(options: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
         steps = max(1, repeat // 2)
         results["shares"] = bench_shares(device, options.preset, steps, first.gaussians, first.height)
         print_shares(results["shares"], first, options.preset)
+    if "bytes" in options.parts:
+        results["bytes"] = {}
+        for decoder in ("torch", "device"):
+            crossings = bench_crossings(device, options.preset, first.gaussians, first.height, decoder)
+            print_crossings(crossings, f"{_title(first, options.preset)}, decoder: {decoder}")
+            results["bytes"][decoder] = crossings
     if "viewer" in options.parts:
         results["viewer"] = bench_viewer(device, repeat)
         for one in results["viewer"].values():
@@ -247,11 +254,25 @@ def print_losses(report: LossReport) -> None:
 
 
 def print_shares(shares: dict[str, Timing], scene: SceneSize | TrainedScene, preset: str) -> None:
-    size = f"{scene.height}x{scene.height}"
-    print(f"\ntraining step, preset {preset}: {scene.gaussians:,} Gaussians, {size}, everything moving")
+    print(f"\n{_title(scene, preset)}")
     print(f"  {'':46s}{'median':>8s}  milliseconds")
     for name, time in shares.items():
         print(f"  {name:46s}{time.median:8.2f}  {time.median / shares['step'].median:4.0%}")
+
+
+def print_crossings(crossings: dict[str, Crossing], title: str) -> None:
+    """A row a purpose: megabytes in each direction, and milliseconds at the speeds of buses."""
+    print(f"\n{title}: what crosses over")
+    buses = "".join(f"{f'ms, {speed} GB/s':>13s}" for speed in BUSES)
+    print(f"  {'':50s}{'MB up':>8s}{'MB down':>9s}{buses}")
+    for name, one in crossings.items():
+        times = "".join(f"{one.milliseconds(speed):13.3f}" for speed in BUSES)
+        print(f"  {name:50s}{one.up / 1e6:8.2f}{one.down / 1e6:9.2f}{times}")
+
+
+def _title(scene: SceneSize | TrainedScene, preset: str) -> str:
+    size = f"{scene.height}x{scene.height}"
+    return f"training step, preset {preset}: {scene.gaussians:,} Gaussians, {size}, everything moving"
 
 
 def print_step(report: StepReport) -> None:

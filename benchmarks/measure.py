@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 from unittest import mock
 
 import numpy as np
@@ -16,7 +16,13 @@ from lapgs_wgpu.gpu import array, native
 from lapgs_wgpu.gpu.buffer import Buffer
 from lapgs_wgpu.gpu.kernel import Commands
 
-Event = tuple[str, Any]
+
+class Event(NamedTuple):
+    """kind: dispatch, submit, write or read. name: of the shader, or of the buffer. nbytes: that cross over."""
+
+    kind: str
+    name: str = ""
+    nbytes: int = 0
 
 
 @dataclass(frozen=True)
@@ -70,15 +76,15 @@ def traffic(function: Callable[[], object]) -> Traffic:
 
 def count(events: list[Event]) -> Traffic:
     """Add up what `recording` saw."""
-    kinds = [kind for kind, _ in events]
-    sorts = [i for i, event in enumerate(events) if event == ("dispatch", "sort_scatter")]
+    kinds = [event.kind for event in events]
+    sorts = [i for i, event in enumerate(events) if event.name == "sort_scatter"]
     sorted_at = kinds.index("submit", sorts[-1]) if sorts else 0
     read_backs = [i for i, kind in enumerate(kinds) if kind == "read" and kinds[i - 1 : i] != ["read"]]
     return Traffic(
         dispatches=kinds.count("dispatch"),
         submissions=kinds.count("submit"),
-        uploaded_bytes=sum(value for kind, value in events if kind == "write"),
-        downloaded_bytes=sum(value for kind, value in events if kind == "read"),
+        uploaded_bytes=sum(event.nbytes for event in events if event.kind == "write"),
+        downloaded_bytes=sum(event.nbytes for event in events if event.kind == "read"),
         read_backs=len(read_backs),
         read_backs_before_sort=sum(i < sorted_at for i in read_backs),
     )
@@ -86,25 +92,25 @@ def count(events: list[Event]) -> Traffic:
 
 @contextmanager
 def recording() -> Iterator[list[Event]]:
-    """A list of events, in order: ("dispatch", shader), ("submit", None), ("write", bytes), ("read", bytes)."""
+    """A list of all that happens, in order."""
     events: list[Event] = []
     dispatch_grid, leave, write = Commands.dispatch_grid, Commands.__exit__, Buffer.write
 
     def counted_dispatch(self: Commands, kernel: Any, groups: tuple[int, int], **buffers: Any) -> None:
         if min(groups) > 0:
-            events.append(("dispatch", kernel.name))
+            events.append(Event("dispatch", kernel.name))
         dispatch_grid(self, kernel, groups, **buffers)
 
     def counted_leave(self: Commands, *error: Any) -> None:
-        events.append(("submit", None))
+        events.append(Event("submit"))
         leave(self, *error)
 
     def counted_write(self: Buffer, values: Any, offset: int = 0) -> None:
-        events.append(("write", values.nbytes))
+        events.append(Event("write", self.label, values.nbytes))
         write(self, values, offset)
 
     def counted_mapping(device: Any, buffer: Any, mode: int, offset: int, nbytes: int) -> Any:
-        events.append(("read", nbytes))  # `array` maps for nothing else
+        events.append(Event("read", buffer.label, nbytes))  # `array` maps for nothing else
         return native.mapping(device, buffer, mode, offset, nbytes)
 
     with (
