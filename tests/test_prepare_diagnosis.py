@@ -113,6 +113,10 @@ def test_share_that_moves(pictures, tmp_path: Path) -> None:
     assert measured(folder, "moving share").good is True
     assert measured(folder, "cut off").number == 1.0
     assert measured(folder, "cut off").good is False
+    for room, reaches in ((4, 1.0), (8, 0.0)):  # pixels; nothing is followed nearer to the edge, so masks end before it
+        for path in (folder / "masks").iterdir():
+            Image.fromarray(np.pad(np.full((60, 100), 255, np.uint8), ((30, 30), (room, 60 - room)))).save(path)
+        assert measured(folder, "cut off").number == reaches
     for path in (folder / "masks").iterdir():
         Image.fromarray(np.full((9, 12), 255, np.uint8)).save(path)
     assert "ore of what stands still" in str(measured(folder, "moving share"))

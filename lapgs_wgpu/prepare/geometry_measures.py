@@ -20,6 +20,7 @@ SPAN = 20.0  # degrees around what moves
 CAMERAS = 3.0  # that see what moves at one moment
 LITTLE, MUCH = 0.01, 0.5  # share of the images that moves
 CUT = 0.3  # share of the images in which what moves reaches the image's edge
+RIM = 0.045  # of the shorter side: as near to the edge masks come, since nothing is followed at the edge itself
 SEEN = 0.002  # share of an image that moves, from which on it shows something that does
 
 
@@ -114,7 +115,13 @@ def _coverage_of_moving(cameras: Sequence[Camera], points: Floats) -> Measure:
 
 
 def _touches_edge(mask: Mask) -> bool:
-    edge = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
+    rim = max(1, round(RIM * min(mask.shape)))
+    edge = np.concatenate(
+        [
+            *(part.any(axis=0) for part in (mask[:rim], mask[-rim:])),
+            *(part.any(axis=1) for part in (mask[:, :rim], mask[:, -rim:])),
+        ]
+    )
     return bool(edge.mean() > 0.01)
 
 
