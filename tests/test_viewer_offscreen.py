@@ -191,6 +191,30 @@ def test_a_turn_is_a_whole_one() -> None:
     np.testing.assert_allclose(np.sort(places[[1, 3], 1]), [-2, 2], atol=1e-9)
 
 
+def test_where_cameras_stand_on_one_side_a_turn_swings_between_them() -> None:
+    from lapgs_wgpu.io.initial_view import InitialView, captured_arc
+    from lapgs_wgpu.viewer.camera import ViewCamera
+    from lapgs_wgpu.viewer.video import orbit_views
+
+    def standing(degrees: float) -> Camera:
+        place = [3 * np.cos(np.radians(degrees)), 3 * np.sin(np.radians(degrees)), 1]
+        return Camera.looking_at(place, [0, 0, 0], up=[0, 0, 1], fov_x=0.7, width=8, height=6)
+
+    focus, up = np.zeros(3), np.array([0.0, 0.0, 1.0])
+    cameras = [standing(each) for each in (-20, 0, 15, 40)]
+    arc = captured_arc(cameras[1], cameras, focus, up)
+    assert arc == pytest.approx((20, 40))
+    look = InitialView(cameras[1], focus, up, 4, arc)
+    assert InitialView.from_json(look.to_json()).arc == pytest.approx(arc)
+    assert look.arc_from(cameras[2]) == pytest.approx((35, 25))
+    assert captured_arc(cameras[1], [standing(each) for each in range(0, 360, 60)], focus, up) is None
+
+    start = ViewCamera.of(cameras[1], focus, up)
+    places = np.stack([camera.position for camera, _ in orbit_views(start, (8, 6), 4, None, arc)])
+    for place, degrees in zip(places, (0, -20, 0, 40), strict=True):
+        np.testing.assert_allclose(place, standing(degrees).position, atol=1e-6)
+
+
 @kernels
 def test_a_still_scene_is_shown_from_all_around(run: Path, tmp_path: Path) -> None:
     view(run / "still.ply", "--video", tmp_path / "a.mp4", "--size", "32x24", "--fps", "1")

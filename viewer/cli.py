@@ -155,12 +155,13 @@ def _video(given: Any, scene: LoadedScene) -> None:
         camera = framed(view.camera, *size) if view else scene.camera().camera(*size)
         cameras = video.clip_views(camera, frames)
     else:
-        start = scene.camera()
+        start, arc = scene.camera(), scene.look.arc
         if view is not None:
             start = ViewCamera.of(view.camera, scene.look.focus, scene.look.up)
+            arc = scene.look.arc_from(view.camera)
         usual_time = view.time if view is not None else 0.0
         time = None if path == "both" else usual_time if given.time is None else given.time
-        cameras = video.orbit_views(start, size, frames, time)
+        cameras = video.orbit_views(start, size, frames, time, arc)
     render = OffscreenRenderer(scene, given.mode or "rgb", BACKGROUNDS.get(given.background))
     video.write_video(file, cameras, frames, fps, render)
     print(f"{file}: {frames} frames of {size[0]}x{size[1]} at {fps:g} a second")

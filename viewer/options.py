@@ -125,9 +125,9 @@ def _parse(arguments: Sequence[str]) -> Any:
     add("--video", metavar="FILE.mp4", help="render a video to an MP4 file (H.264); needs PyAV (pip install "
         "'lapgs-wgpu[video]'); replaces an existing file")
     add("--path", metavar="time|view|both|CAMERAS.json", help="camera motion of --video; time: static camera while "
-        "the clip plays; view: one orbit around the focus point at --time; both: one orbit while the clip "
-        "plays; CAMERAS.json: camera path in nerfstudio's format, with its times in the clip; without times, the clip "
-        "plays once [time, or view if the scene does not move]")
+        "the clip plays; view: one orbit around the focus point at --time, to and fro where the capture has cameras "
+        "on one side only; both: the same while the clip plays; CAMERAS.json: camera path in nerfstudio's format, with "
+        "its times in the clip; without times, the clip plays once [time, or view if the scene does not move]")
     add("--seconds", type=_number(0.001, 86400.0), metavar="S", help="length of --video, seconds; the clip, the "
         "orbit or the camera path then takes this long [length of the clip or of the camera path; 6 for view]")
 

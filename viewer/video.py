@@ -38,13 +38,28 @@ def clip_views(camera: Camera, frames: int) -> Iterator[TimedCamera]:
     return ((camera, share) for share in np.linspace(0, 1, frames).tolist())
 
 
-def orbit_views(start: ViewCamera, size: tuple[int, int], frames: int, time: float | None) -> Iterator[TimedCamera]:
-    """One closed orbit around the focus. time: fixed, in [0, 1]; None plays the clip once."""
+def orbit_views(
+    start: ViewCamera,
+    size: tuple[int, int],
+    frames: int,
+    time: float | None,
+    arc: tuple[float, float] | None = None,
+) -> Iterator[TimedCamera]:
+    """One closed orbit around the focus. time: fixed, in [0, 1]; None plays the clip once. arc: swing to these degrees
+    clockwise and counterclockwise (`InitialView.arc`) instead of going all around."""
     times = np.linspace(0, 1, frames).tolist()
     for number in range(frames):
         if number:
-            start.orbit(2 * math.pi / frames, 0.0)
+            start.orbit(_turned(number / frames, arc) - _turned((number - 1) / frames, arc), 0.0)
         yield start.camera(*size), times[number] if time is None else time
+
+
+def _turned(share: float, arc: tuple[float, float] | None) -> float:
+    """Radians clockwise after a share of a closed orbit."""
+    if arc is None:
+        return 2 * math.pi * share
+    wave = math.sin(2 * math.pi * share)
+    return math.radians(wave * (arc[0] if wave > 0 else arc[1]))
 
 
 def path_views(path: CameraPath, size: tuple[int, int], frames: int) -> Iterator[TimedCamera]:

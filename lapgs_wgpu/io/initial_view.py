@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,18 +11,29 @@ from numpy.typing import NDArray
 
 from lapgs_wgpu.splat.camera import Camera
 
+_OPEN = 90.0  # degrees; cameras with no wider gap stand all around
+
 
 class InitialView(NamedTuple):
     """Initial state of the viewer.
 
     camera: the initial camera. focus: (3,) center of orbiting, world units. up: (3,) unit vector.
-    frames: number of frames of the clip.
+    frames: number of frames of the clip. arc: degrees about `up` at the focus from the initial camera clockwise and
+    counterclockwise (seen from above) to the last camera of the capture; None where cameras stand all around.
     """
 
     camera: Camera
     focus: NDArray[np.float64]
     up: NDArray[np.float64]
     frames: int
+    arc: tuple[float, float] | None = None
+
+    def arc_from(self, camera: Camera) -> tuple[float, float] | None:
+        """`arc`, counted from another camera."""
+        if self.arc is None:
+            return None
+        turned = (_bearing(camera, self.focus, self.up) - _bearing(self.camera, self.focus, self.up) + 180) % 360 - 180
+        return max(0.0, self.arc[0] + turned), max(0.0, self.arc[1] - turned)
 
     def to_json(self) -> str:
         """One line of JSON."""
@@ -33,6 +45,7 @@ class InitialView(NamedTuple):
             "focus": self.focus.tolist(),
             "up": self.up.tolist(),
             "frames": self.frames,
+            "arc": self.arc,
         }
         return json.dumps(values)
 
@@ -55,6 +68,31 @@ class InitialView(NamedTuple):
                 and np.allclose(camera.T_cam_world[:3, :3] @ camera.T_cam_world[:3, :3].T, np.eye(3), atol=1e-3)
             )
             frames = int(values["frames"])
+            found = values.get("arc")
+            arc = None if found is None else (float(found[0]), float(found[1]))
+            usable = usable and (arc is None or (min(arc) >= 0 and sum(arc) <= 360))
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError):
             return None
-        return InitialView(camera, focus, up / np.linalg.norm(up), max(1, min(frames, 1_000_000))) if usable else None
+        if not usable:
+            return None
+        return InitialView(camera, focus, up / np.linalg.norm(up), max(1, min(frames, 1_000_000)), arc)
+
+
+def captured_arc(
+    start: Camera, cameras: Sequence[Camera], focus: NDArray[np.float64], up: NDArray[np.float64]
+) -> tuple[float, float] | None:
+    """`InitialView.arc` of a capture: how far its cameras stand to either side of the camera `start`."""
+    first = _bearing(start, focus, up)
+    turned = sorted((_bearing(camera, focus, up) - first) % 360 for camera in cameras)
+    bounds = [0.0, *turned, 360.0]
+    widest = int(np.argmax(np.diff(bounds)))
+    if bounds[widest + 1] - bounds[widest] < _OPEN:
+        return None
+    return 360 - bounds[widest + 1], bounds[widest]
+
+
+def _bearing(camera: Camera, focus: NDArray[np.float64], up: NDArray[np.float64]) -> float:
+    """Degrees counterclockwise about `up`, seen from above, at which a camera stands around the focus."""
+    x = np.cross([1.0, 0.0, 0.0] if abs(up[0]) < 0.9 else [0.0, 1.0, 0.0], up)
+    out = camera.position - focus
+    return float(np.degrees(np.arctan2(out @ np.cross(up, x), out @ x)))

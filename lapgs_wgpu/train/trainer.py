@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device, open_device
-from lapgs_wgpu.io.initial_view import InitialView
+from lapgs_wgpu.io.initial_view import InitialView, captured_arc
 from lapgs_wgpu.motion.fields.config import MIN_SCALE
 from lapgs_wgpu.motion.fields.deformation import Nearby
 from lapgs_wgpu.motion.fields.dynamics import dynamics_loss
@@ -239,7 +239,9 @@ class Trainer:
     def initial_view(self) -> InitialView:
         """Where a viewer begins."""
         data = self.dataset
-        return InitialView((data.test or data.train)[0].camera, data.focus, data.up, len(data.times))
+        camera = (data.test or data.train)[0].camera
+        arc = captured_arc(camera, data.cameras, data.focus, data.up)
+        return InitialView(camera, data.focus, data.up, len(data.times), arc)
 
     def save(self, path: str | Path) -> None:
         """Write a checkpoint (docs/format.md) to `path`, which lapgs-view and `load` open. Raises InputError."""
