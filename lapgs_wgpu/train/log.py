@@ -60,7 +60,8 @@ class Log:
         self.listeners: list[Callable[[dict[str, Any]], None]] = []
         now = time.perf_counter()
         self._start = now - (so_far or before)
-        self._times: deque[float] = deque([now], maxlen=INTERVAL + 1)
+        self._began = now
+        self._times: deque[float] = deque(maxlen=INTERVAL + 1)  # at which steps ended
 
     def __enter__(self) -> Log:
         return self
@@ -90,7 +91,10 @@ class Log:
         self._times.append(time_now)
         if not self._recent:
             return
-        rate = (len(self._times) - 1) / max(time_now - self._times[0], 1e-9)
+        # The first step, which compiles kernels and decodes images, tells nothing about the others.
+        known = len(self._times) > 1
+        steps, since = (len(self._times) - 1, self._times[0]) if known else (1, self._began)
+        rate = steps / max(time_now - since, 1e-9)
         if step % INTERVAL == 0 or step == self._steps:
             count = len(self._recent)
             terms = Counter[str]()
@@ -111,7 +115,7 @@ class Log:
 
         def text() -> str:
             smooth = sum(each.psnr for each in self._recent) / len(self._recent)
-            left = duration((self._steps - step) / rate)
+            left = duration((self._steps - step) / rate) if known or step == self._steps else "?"
             return (
                 f"step {step}/{self._steps}  {smooth:5.2f} dB  {gaussians} Gaussians  {rate:.1f} steps/s  {left} left"
             )
