@@ -48,7 +48,9 @@ export NO_VENV = This Python cannot make virtual environments. On Debian and Ubu
 demo: $(READY)
 	$(BIN)/lapgs-train demo --data synthetic --out runs/demo --overwrite
 	@echo "Pictures of the test views: runs/demo/eval/*.png (ground truth, rendering, 4 x error)."
-	@echo "The scene: runs/demo/checkpoint.ply, which any viewer of 3D Gaussian splats opens as a still."
+	@echo "The scene: runs/demo/checkpoint.ply. To look at it from any side at any time, and to send it to somebody:"
+	@echo "  $(BIN)/lapgs-view runs/demo/checkpoint.ply --time-slider"
+	@echo "  $(BIN)/lapgs-view runs/demo/checkpoint.ply --export runs/demo/scene.html"
 
 # docs/reliability.md says what each promises. LAPGS_SOAK_MINUTES and LAPGS_FUZZ may be given.
 LAPGS_SOAK_MINUTES ?= 30
