@@ -57,6 +57,25 @@ def test_what_hardly_changes_is_not_needed(column: int, change: float, expected:
     assert found.tolist() == 10 * [expected, False]
 
 
+@pytest.mark.parametrize(
+    ("column", "off", "expected"),
+    [(0, 0.007, False), (0, 0.011, True), (8, 0.007, False), (8, 0.011, True), (10, 0.01, False), (10, 0.02, True)],
+)
+def test_what_moves_is_not_needed_where_other_values_are_near(column: int, off: float, expected: bool) -> None:
+    """By a pixel; at times whose part of the clip was not seen, too."""
+    still = gaussians(20)
+    way = np.zeros((20, 14), np.float32)
+    way[:, 0] = 0.1
+    bounds = seen(lambda t: still + np.float32(t) * way, 9)
+    error = np.zeros((14, 20), np.float32)
+    error[column, ::2] = off
+    assert bounds.needed(0.5, CAMERA).all()
+    assert bounds.needed(0.5, CAMERA, error).tolist() == 10 * [expected, False]
+    assert bounds.needed(0.9, CAMERA, error).tolist() == 10 * [expected, False]
+    error[3, 1] = np.nan
+    assert bounds.needed(0.5, CAMERA, error)[1]
+
+
 def test_nearer_motion_counts_more() -> None:
     values = gaussians(2)
     values[:, :3] = [0, 0, 0], [0, -3, 0]

@@ -259,10 +259,9 @@ def test_a_passing_picture_is_the_exact_one_for_less(
         shown = picture(playback, t, camera, passing=True)
         assert np.ptp(shown) > 0.3
         assert playback.exact == (not device.mappable)
-        assert np.abs(shown - picture(other, t, camera)).max() < 1e-3
+        assert np.abs(shown - picture(other, t, camera)).max() < 0.05  # a part of a pixel on an edge
     if device.mappable:
-        assert 0 < min(moved) < max(moved) < 80
-        assert moved[1] + moved[2] <= 100  # those alone that were not up to date
+        assert 0 < sum(moved) < 80  # of five times 300: those alone that are of no use as they are
     else:
         assert moved == 4 * [300]
 

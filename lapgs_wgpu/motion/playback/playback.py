@@ -5,6 +5,7 @@ torch is not imported for static scenes and for fields that the device evaluates
 
 from __future__ import annotations
 
+import math
 import os
 from typing import Protocol
 
@@ -21,6 +22,7 @@ from ..fields.config import MIN_SCALE, FieldConfig
 from ..scene_file import SceneFile, read_scene
 from .grid_field_playback import GridFieldPlayback, runs_on_device
 from .motion_bounds import MotionBounds
+from .seen_moments import SeenMoments
 
 Floats = NDArray[np.float32]
 
@@ -102,7 +104,11 @@ class DevicePlayback:
         if self.moves:
             self._times = np.full(self.count, np.nan)  # of each Gaussian in the buffers
             # Parts of half an entry of the temporal grids' time axis, within which features hardly change.
-            self._bounds = MotionBounds(self.count, 2 * self.field_config.temporal.finest[2])
+            parts = 2 * self.field_config.temporal.finest[2]
+            self._bounds = MotionBounds(self.count, parts)
+            self._moments = SeenMoments(self.count, parts)
+            self._brought = math.nan  # the time to which all Gaussians were brought between moments, and are still near
+            self._colors = activated["colors"].copy()  # of which the field changes the constant part
             self._bounded = True  # whether the bounds include the values in the buffers
             self._field = GridFieldPlayback(device, file.field_config, file.field, activated, block=block)
 
@@ -114,13 +120,33 @@ class DevicePlayback:
         # The choice reads the values back each time, which is too slow from separate device memory.
         if seen_by is not None and self.device.mappable and old.any():
             self._bound()
-            moved = old & self._bounds.needed(t, seen_by)
+            values, error = self._moments.between(t) or (None, None)
+            if values is not None and self._brought != t:
+                self._take(values)
+                self._brought = t
+                old = self._times != t
+            moved = old & self._bounds.needed(t, seen_by, error)
+        if self._brought != t:
+            self._brought = math.nan
         self.exact = bool((moved == old).all())
         if moved.any():
             self._field.move(t, self._now, np.flatnonzero(moved))
             self._times[moved] = t
             self._bounded = False
         return self._now
+
+    def _take(self, values: Floats) -> None:
+        """Write values (14, count), which are of no time exactly."""
+        now = self._now
+        now.means.write(np.ascontiguousarray(values[:3].T))
+        quats = values[3:7] / np.linalg.norm(values[3:7], axis=0)
+        now.quats.write(np.ascontiguousarray(quats.T))
+        now.scales.write(np.ascontiguousarray(values[7:10].T))
+        now.opacities.write(values[10])
+        self._colors[:, 0] = values[11:].T
+        now.sh.write(self._colors)
+        self._times[:] = np.nan
+        self._bounded = False
 
     def _bound(self) -> None:
         """Extend the bounds by the values in the buffers, of whatever times. Called before each choice."""
@@ -130,7 +156,10 @@ class DevicePlayback:
         means, quats, scales, opacities, sh = read_all([now.means, now.quats, now.scales, now.opacities, now.sh])
         values = [means, quats, scales, opacities[:, None], sh[:, 0]]
         whole = bool((self._times == self._times[0]).all())
-        self._bounds.add(np.concatenate(values, axis=1), float(self._times[0]) if whole else None)
+        together = np.concatenate(values, axis=1)
+        self._bounds.add(together, float(self._times[0]) if whole else None)
+        if whole:
+            self._moments.add(together, float(self._times[0]))
         self._bounded = True
 
     def static_features(self) -> Floats | None:
