@@ -51,7 +51,8 @@ def options() -> argparse.ArgumentParser:
         default=FIXED_SET,
         metavar="SCENE@WxH",
         help="what is drawn: a ball of so many Gaussians, or the checkpoint.ply of a training, and the size of the "
-        "image; the first one also decides the sizes in encoder, decoder, losses, shares and bytes "
+        "image; the first one also decides the sizes in encoder, decoder, losses, shares and bytes; the viewer "
+        "shows checkpoints instead of its own balls, if there are any "
         f"[{_names(FIXED_SET)}]",
     )
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS, help=f"what is timed [{' '.join(PARTS)}]")
@@ -135,9 +136,10 @@ def run(options: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
             print_crossings(crossings, f"{_title(first, options.preset)}, decoder: {decoder}")
             results["bytes"][decoder] = crossings
     if "viewer" in options.parts:
-        results["viewer"] = bench_viewer(device, repeat)
-        for one in results["viewer"].values():
-            print_viewer(one)
+        trained = [scene for scene in options.scenes if isinstance(scene, TrainedScene)]
+        results["viewer"] = bench_viewer(device, repeat, trained=trained)
+        for name, one in results["viewer"].items():
+            print_viewer(name, one)
     machine["load afterwards"] = _load()
     if options.json:
         options.json.write_text(json.dumps(results, indent=1, default=dataclasses.asdict) + "\n", encoding="utf-8")

@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -13,7 +14,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import torch
 from measure import Timing, summary
-from scene import SceneSize, make_scene
+from scene import SceneSize, TrainedScene, make_scene
 
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.initial_view import InitialView
@@ -34,26 +35,28 @@ class ViewerReport:
     """Milliseconds. window: from the command to the first picture in a window; None without Xvfb. screenshot: of the
     whole command. scrub: a frame at another time than the one before, by share of the window's size; and SEEN."""
 
-    preset: str
-    gaussians: int
     window: Timing | None
     screenshot: Timing
     scrub: dict[str, Timing]
 
 
-def bench_viewer(device: Device, repeat: int, scenes: Scenes = SCENES) -> dict[str, ViewerReport]:
-    """By preset and number of Gaussians."""
+def bench_viewer(
+    device: Device, repeat: int, scenes: Scenes = SCENES, trained: Sequence[TrainedScene] = ()
+) -> dict[str, ViewerReport]:
+    """By preset and number of Gaussians, or by checkpoint, if some are given."""
     with TemporaryDirectory() as folder:
-        reports = {}
-        for preset, gaussians in scenes:
+        files = {f"{scene.checkpoint}, {scene.gaussians:,} Gaussians": scene.checkpoint for scene in trained}
+        for preset, gaussians in () if trained else scenes:
             file = Path(folder) / f"{preset}-{gaussians}.ply"
             write_moving_scene(file, preset, gaussians, device)
-            starts = max(3, repeat // 3)
-            window = summary([_window(file) for _ in range(starts)]) if _has_screen() else None
-            shots = summary([_screenshot(file) for _ in range(starts)])
-            scrub = _scrub(device, file, repeat)
-            reports[f"{preset} {gaussians}"] = ViewerReport(preset, gaussians, window, shots, scrub)
-        return reports
+            files[f"preset {preset}, {gaussians:,} Gaussians"] = file
+        return {name: _report(device, file, repeat) for name, file in files.items()}
+
+
+def _report(device: Device, file: Path, repeat: int) -> ViewerReport:
+    starts = max(3, repeat // 3)
+    window = summary([_window(file) for _ in range(starts)]) if _has_screen() else None
+    return ViewerReport(window, summary([_screenshot(file) for _ in range(starts)]), _scrub(device, file, repeat))
 
 
 def write_moving_scene(file: Path, preset: str, gaussians: int, device: Device) -> None:
@@ -127,8 +130,8 @@ def _window(file: Path) -> float:
         return 1e3 * (time.perf_counter() - start)
 
 
-def print_viewer(report: ViewerReport) -> None:
-    print(f"\nviewer, {SIZE[0]}x{SIZE[1]}, preset {report.preset}: {report.gaussians:,} Gaussians")
+def print_viewer(name: str, report: ViewerReport) -> None:
+    print(f"\nviewer, {SIZE[0]}x{SIZE[1]}, {name}")
     rows = {"command to first picture, window": report.window, "command with --screenshot": report.screenshot}
     rows |= {f"frame at another time, {share}": timing for share, timing in report.scrub.items()}
     for name, timing in rows.items():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 
 import numpy as np
@@ -12,6 +13,7 @@ from helpers.stages import watch
 
 from lapgs_wgpu.gpu import shader
 from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.splat import rasterizer as rasterizer_module
 from lapgs_wgpu.splat.rasterize import rasterize, rasterizer_of
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 
@@ -158,6 +160,38 @@ def test_growing_on_a_later_image(device: Device, use: Use, scene: Scene, expect
     for name, leaf in leaves.items():
         assert leaf.grad is not None
         assert torch.equal(leaf.grad, alone.gradients[name])
+
+
+def test_a_small_image_does_not_pay_for_a_large_one(device: Device, use: Use, scene: Scene, expected: Step) -> None:
+    """Each size has its plan, and finds it again."""
+    rasterizer = use(Rasterizer(device, capacity=64))
+    same(one_step(scene, device), expected)
+    large = rasterizer.plan
+    small = CAMERA.resized(CAMERA.width // 4, CAMERA.height // 4)
+    first = step(scene, small, device, sh_degree=DEGREE)
+    assert 64 < rasterizer.plan.capacity < large.capacity
+    drawings = rasterizer._drawings
+    same(one_step(scene, device), expected)
+    assert rasterizer.plan == large
+    same(step(scene, small, device, sh_degree=DEGREE), first)
+    assert rasterizer._drawings == drawings + 2  # none was drawn twice
+
+
+def test_a_plan_shrinks_when_no_image_needs_it(
+    device: Device, use: Use, monkeypatch: pytest.MonkeyPatch, scene: Scene, expected: Step, total: int
+) -> None:
+    monkeypatch.setattr(rasterizer_module, "_WATCHED", 3)
+    rasterizer = use(Rasterizer(device, capacity=100 * total))
+    rasterizer.plan = dataclasses.replace(rasterizer.plan, rounds=2)
+    for count in (1, 2, 3, 4):
+        same(one_step(scene, device), expected)
+        assert (rasterizer.plan.capacity < 2 * total + 4096) == (count >= 3)
+    assert rasterizer.plan.rounds == 1
+    assert rasterizer._drawings == 4
+    kept = rasterizer.plan
+    for _ in range(4):
+        same(one_step(scene, device), expected)
+    assert rasterizer.plan == kept
 
 
 def test_passes_folded_into_two_dimensions(device: Device, use: Use, monkeypatch: pytest.MonkeyPatch) -> None:

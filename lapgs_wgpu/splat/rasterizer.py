@@ -27,6 +27,8 @@ from .splat_layout import SPLAT_FLOATS
 
 _RECORD_FLOATS = 8  # rasterize_bwd.wgsl
 _DEPTH_BITS = 32
+_WATCHED = 256  # drawings of one size, after which a plan that is too large for all of them shrinks
+_SIZES = 32  # of images, whose plans are kept
 _LANES = 64  # workgroup size of the passes over Gaussians and intersections
 
 
@@ -34,10 +36,16 @@ def _groups(count: int) -> int:
     return -(-count // _LANES)
 
 
+def _roomy(intersections: int) -> int:
+    """A capacity with room for a quarter more."""
+    return (5 * intersections // 4 + 4095) // 4096 * 4096
+
+
 class Rasterizer:
     """Draws images on one device. Buffers and plan are reused from image to image.
 
-    capacity: of the plan of the first image, see Plan.
+    capacity: of the plan of the first image, see Plan. Each size of images has a plan of its own, since one that is
+    too large makes small images slow; it also shrinks again.
     """
 
     def __init__(self, device: Device, *, config: RasterConfig | None = None, capacity: int = 1 << 16) -> None:
@@ -45,6 +53,10 @@ class Rasterizer:
         self.config = config or raster_config(device)
         self.pool = BufferPool(device)
         self.plan = Plan(capacity)
+        self._first_capacity = capacity
+        self._plans: dict[tuple[int, int], Plan] = {}  # of other sizes, the latest last
+        self._watched = 0  # drawings by this plan
+        self._most, self._sum = 0, 0  # their intersections, of a band and of all
         self.max_capacity = device.max_binding // (4 * _RECORD_FLOATS)
         self._flags_scan = Scan(device, self.pool, "visible", "flags")
         # Saturating: a number of intersections beyond 2^32 must not wrap around to a small one.
@@ -67,9 +79,7 @@ class Rasterizer:
         profile: Profile | None = None,
     ) -> Drawing:
         """Submit the passes that draw an image, which is valid once `grow_on_overflow` has returned False."""
-        if self._size not in (None, (camera.width, camera.height)):
-            self.plan = Plan(self.plan.capacity)  # bands and rounds of another size would be slower
-        self._size = (camera.width, camera.height)
+        self._plan_for((camera.width, camera.height))
         if self.config.round_splats:
             rows, columns = self._tiles(camera)
             bands = max(self.plan.bands, -(-rows // max(1, MAX_BAND_TILES // columns)))
@@ -93,6 +103,33 @@ class Rasterizer:
             return self.draw(gaussians, camera, background, depth=depth, profile=profile)
         return drawing
 
+    def _plan_for(self, size: tuple[int, int]) -> None:
+        """Take the plan of a size of images."""
+        if self._size is not None and self._size != size:
+            self._plans[self._size] = old = self.plan
+            # Small splats lie on one tile at any size, large ones on as many more as there are pixels.
+            share = math.sqrt(math.prod(size) / math.prod(self._size))
+            guess = min(old.capacity, max(self._first_capacity, round(share * old.capacity)))
+            self.plan = self._plans.pop(size, Plan(guess))
+            if len(self._plans) > _SIZES:
+                self._plans.pop(next(iter(self._plans)))
+            self._watched = self._most = self._sum = 0
+        self._size = size
+
+    def _shrink(self, totals: list[int]) -> None:
+        """Watch the numbers of intersections of a drawing that fitted; from time to time, shrink what was too large."""
+        self._watched, self._most = self._watched + 1, max(self._most, *totals)
+        self._sum = max(self._sum, sum(totals))
+        if self._watched < _WATCHED:
+            return
+        plan = self.plan
+        bands = 1 if _roomy(self._sum) <= self.max_capacity else plan.bands
+        capacity = _roomy(self._sum if bands < plan.bands else self._most)
+        if 2 * capacity <= plan.capacity or bands < plan.bands:
+            plan = replace(plan, capacity=min(capacity, self.max_capacity), bands=bands)
+        self.plan = replace(plan, rounds=max(1, plan.rounds // 2))  # if that is too few, one image is drawn twice
+        self._watched = self._most = self._sum = 0
+
     def holds(self, drawing: Drawing) -> bool:
         """Whether the arrays still hold this drawing: no other image was drawn since."""
         return drawing.number == self._drawings
@@ -109,6 +146,8 @@ class Rasterizer:
         most = max(totals)
         if most <= plan.capacity:
             if not self.config.round_splats or not any(count[2] for count in counts):
+                if plan == self.plan:
+                    self._shrink(totals)
                 return False
             self.plan = replace(plan, rounds=2 * plan.rounds)
             return True
@@ -120,8 +159,7 @@ class Rasterizer:
                     f"one row of tiles holds {most} intersections, but the device's bindings hold {self.max_capacity}"
                 )
             bands = min(rows, max(bands + 1, -(-5 * sum(totals) // (4 * self.max_capacity))))
-        capacity = min(self.max_capacity, (5 * most // 4 + 4095) // 4096 * 4096)
-        self.plan = replace(plan, capacity=capacity, bands=bands)
+        self.plan = replace(plan, capacity=min(self.max_capacity, _roomy(most)), bands=bands)
         return True
 
     def _draw_band(self, commands: Commands, drawing: Drawing, band: int) -> TileLists:
