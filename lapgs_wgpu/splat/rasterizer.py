@@ -55,8 +55,7 @@ class Rasterizer:
         self.plan = Plan(capacity)
         self._first_capacity = capacity
         self._plans: dict[tuple[int, int], Plan] = {}  # of other sizes, the latest last
-        self._watched = 0  # drawings by this plan
-        self._most, self._sum = 0, 0  # their intersections, of a band and of all
+        self._watched, self._most = 0, 0  # drawings by this plan, and the most intersections of a band
         self.max_capacity = device.max_binding // (4 * _RECORD_FLOATS)
         self._flags_scan = Scan(device, self.pool, "visible", "flags")
         # Saturating: a number of intersections beyond 2^32 must not wrap around to a small one.
@@ -113,22 +112,24 @@ class Rasterizer:
             self.plan = self._plans.pop(size, Plan(guess))
             if len(self._plans) > _SIZES:
                 self._plans.pop(next(iter(self._plans)))
-            self._watched = self._most = self._sum = 0
+            self._watched = self._most = 0
         self._size = size
 
-    def _shrink(self, totals: list[int]) -> None:
-        """Watch the numbers of intersections of a drawing that fitted; from time to time, shrink what was too large."""
-        self._watched, self._most = self._watched + 1, max(self._most, *totals)
-        self._sum = max(self._sum, sum(totals))
+    def _shrink(self, most: int) -> None:
+        """Watch the intersections of bands that fitted; from time to time, shrink a plan that was too large for all.
+
+        Bands stay: their number decides in which order gradients are added, and so must not depend on what came before
+        more than it has to.
+        """
+        self._watched, self._most = self._watched + 1, max(self._most, most)
         if self._watched < _WATCHED:
             return
-        plan = self.plan
-        bands = 1 if _roomy(self._sum) <= self.max_capacity else plan.bands
-        capacity = _roomy(self._sum if bands < plan.bands else self._most)
-        if 2 * capacity <= plan.capacity or bands < plan.bands:
-            plan = replace(plan, capacity=min(capacity, self.max_capacity), bands=bands)
-        self.plan = replace(plan, rounds=max(1, plan.rounds // 2))  # if that is too few, one image is drawn twice
-        self._watched = self._most = self._sum = 0
+        capacity = self.plan.capacity
+        if 2 * _roomy(self._most) <= capacity:
+            capacity = _roomy(self._most)
+        # Half of the rounds may be too few; then one image is drawn twice.
+        self.plan = replace(self.plan, capacity=capacity, rounds=max(1, self.plan.rounds // 2))
+        self._watched = self._most = 0
 
     def holds(self, drawing: Drawing) -> bool:
         """Whether the arrays still hold this drawing: no other image was drawn since."""
@@ -147,7 +148,7 @@ class Rasterizer:
         if most <= plan.capacity:
             if not self.config.round_splats or not any(count[2] for count in counts):
                 if plan == self.plan:
-                    self._shrink(totals)
+                    self._shrink(most)
                 return False
             self.plan = replace(plan, rounds=2 * plan.rounds)
             return True
