@@ -36,6 +36,7 @@ from lapgs_wgpu.io.checkpoint import read_checkpoint
 from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.io.safe_json_toml import MAX_TOML_BYTES, read_json, read_toml
 from lapgs_wgpu.motion.scene_file import read_scene
+from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.run import evaluate_run, resume
@@ -91,6 +92,17 @@ def test_found_in_results(tmp_path: Path) -> None:
     (tmp_path / "results.json").write_text("[" * 100_000)
     with pytest.raises(InputError, match="nested too deeply"):
         read_results(tmp_path / "results.json")
+
+
+@pytest.mark.parametrize(
+    "arc", [[], [1], [1, 2, 3], "ab", 7, {"a": 1}, [-1, 20], [200, 200], [float("nan"), 1], [[1], 2]]
+)
+def test_an_arc_that_is_none(arc: object) -> None:
+    camera = Camera.looking_at([0, -4, 0], [0, 0, 0], up=[0, 0, 1], fov_x=0.7, width=8, height=6)
+    look = InitialView(camera, np.zeros(3), np.array([0.0, 0.0, 1.0]), 3, (10.0, 20.0))
+    values = json.loads(look.to_json())
+    assert InitialView.from_json(json.dumps(values)) is not None
+    assert InitialView.from_json(json.dumps(values | {"arc": arc})) is None
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, "9" * 5000, "null", '{"size": 1}'])

@@ -68,9 +68,11 @@ class InitialView(NamedTuple):
                 and np.allclose(camera.T_cam_world[:3, :3] @ camera.T_cam_world[:3, :3].T, np.eye(3), atol=1e-3)
             )
             frames = int(values["frames"])
-            found = values.get("arc")
-            arc = None if found is None else (float(found[0]), float(found[1]))
-            usable = usable and (arc is None or (min(arc) >= 0 and sum(arc) <= 360))
+            arc = None
+            if values.get("arc") is not None:
+                clockwise, counterclockwise = map(float, values["arc"])
+                arc = clockwise, counterclockwise
+                usable = usable and clockwise >= 0 and counterclockwise >= 0 and clockwise + counterclockwise <= 360
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError):
             return None
         if not usable:
