@@ -5,7 +5,6 @@ torch is not imported for static scenes and for fields that the device evaluates
 
 from __future__ import annotations
 
-import math
 import os
 from typing import Protocol
 
@@ -107,27 +106,28 @@ class DevicePlayback:
             parts = 2 * self.field_config.temporal.finest[2]
             self._bounds = MotionBounds(self.count, parts)
             self._moments = SeenMoments(self.count, parts)
-            self._brought = math.nan  # the time to which all Gaussians were brought between moments, and are still near
-            self._colors = activated["colors"].copy()  # of which the field changes the constant part
+            # The time near which all Gaussians are, on the way between two moments, and how far they are off at most.
+            self._near: tuple[float, Floats] | None = None
+            self._colors = activated["colors"]  # of which the field may change the constant part
             self._bounded = True  # whether the bounds include the values in the buffers
             self._field = GridFieldPlayback(device, file.field_config, file.field, activated, block=block)
 
     def at(self, t: float, seen_by: Camera | None = None) -> Gaussians[DeviceArray]:
         if self._field is None:
             return self._now
+        if self._near is not None and self._near[0] != t:
+            self._near = None
         old = self._times != t
         moved = old
         # The choice reads the values back each time, which is too slow from separate device memory.
         if seen_by is not None and self.device.mappable and old.any():
             self._bound()
-            values, error = self._moments.between(t) or (None, None)
-            if values is not None and self._brought != t:
-                self._take(values)
-                self._brought = t
+            between = self._moments.between(t) if self._near is None else None
+            if between is not None:
+                self._take(between[0])
+                self._near = t, between[1]
                 old = self._times != t
-            moved = old & self._bounds.needed(t, seen_by, error)
-        if self._brought != t:
-            self._brought = math.nan
+            moved = old & self._bounds.needed(t, seen_by, self._near[1] if self._near else None)
         self.exact = bool((moved == old).all())
         if moved.any():
             self._field.move(t, self._now, np.flatnonzero(moved))
@@ -143,8 +143,9 @@ class DevicePlayback:
         now.quats.write(np.ascontiguousarray(quats.T))
         now.scales.write(np.ascontiguousarray(values[7:10].T))
         now.opacities.write(values[10])
-        self._colors[:, 0] = values[11:].T
-        now.sh.write(self._colors)
+        if self.field_config.appearance_size:
+            self._colors[:, 0] = values[11:].T
+            now.sh.write(self._colors)
         self._times[:] = np.nan
         self._bounded = False
 
