@@ -10,20 +10,8 @@ from numpy.typing import NDArray
 
 from ..gpu.array import DeviceArray
 from .camera import Camera
+from .drawing_plan import Plan
 from .gaussians import Gaussians
-
-
-@dataclass(frozen=True)
-class Plan:
-    """How an image is drawn. The plan does not change the result.
-
-    capacity: maximum number of intersections (tile, splat). bands: number of bands of tile rows, which are drawn one
-    after another. rounds: number of dispatches that draw the tiles' lists.
-    """
-
-    capacity: int
-    bands: int = 1
-    rounds: int = 1
 
 
 class TileLists(NamedTuple):

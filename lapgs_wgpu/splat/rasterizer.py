@@ -20,15 +20,14 @@ from ..gpu.profile import Profile
 from ..gpu.radix_sort import RadixSort
 from ..gpu.scan import Scan
 from .camera import Camera
-from .drawing import Drawing, GaussianGradients, Plan, TileLists
+from .drawing import Drawing, GaussianGradients, TileLists
+from .drawing_plan import Plan, Plans, roomy
 from .gaussians import Gaussians
 from .raster_config import MAX_BAND_TILES, RasterConfig, raster_config
 from .splat_layout import SPLAT_FLOATS
 
 _RECORD_FLOATS = 8  # rasterize_bwd.wgsl
 _DEPTH_BITS = 32
-_WATCHED = 256  # drawings of one size, after which a plan that is too large for all of them shrinks
-_SIZES = 32  # of images, whose plans are kept
 _LANES = 64  # workgroup size of the passes over Gaussians and intersections
 
 
@@ -36,35 +35,34 @@ def _groups(count: int) -> int:
     return -(-count // _LANES)
 
 
-def _roomy(intersections: int) -> int:
-    """A capacity with room for a quarter more."""
-    return (5 * intersections // 4 + 4095) // 4096 * 4096
-
-
 class Rasterizer:
     """Draws images on one device. Buffers and plan are reused from image to image.
 
-    capacity: of the plan of the first image, see Plan. Each size of images has a plan of its own, since one that is
-    too large makes small images slow; it also shrinks again.
+    capacity: of the plan of the first image, see Plan.
     """
 
     def __init__(self, device: Device, *, config: RasterConfig | None = None, capacity: int = 1 << 16) -> None:
         self.device = device
         self.config = config or raster_config(device)
         self.pool = BufferPool(device)
-        self.plan = Plan(capacity)
-        self._first_capacity = capacity
-        self._plans: dict[tuple[int, int], Plan] = {}  # of other sizes, the latest last
-        self._watched, self._most = 0, 0  # drawings by this plan, and the most intersections of a band
+        self._plans = Plans(capacity)
         self.max_capacity = device.max_binding // (4 * _RECORD_FLOATS)
         self._flags_scan = Scan(device, self.pool, "visible", "flags")
         # Saturating: a number of intersections beyond 2^32 must not wrap around to a small one.
         self._offset_scan = Scan(device, self.pool, "offsets", "gather", saturating=True)
         self._depth_sort = RadixSort(device, self.pool, "depth sort", lane_runs=self.config.lane_runs)
         self._tile_sort = RadixSort(device, self.pool, "tile sort", lane_runs=self.config.lane_runs)
-        self._size: tuple[int, int] | None = None  # of the image that the plan was made for
         self._drawings = 0
         self._trusted: set[tuple[str, bool, bool]] = set()  # passes whose subgroups were checked
+
+    @property
+    def plan(self) -> Plan:
+        """Of the images that are drawn now."""
+        return self._plans.now
+
+    @plan.setter
+    def plan(self, plan: Plan) -> None:
+        self._plans.now = plan
 
     # Forward ---------------------------------------------------------------------------------------------------------
 
@@ -78,7 +76,7 @@ class Rasterizer:
         profile: Profile | None = None,
     ) -> Drawing:
         """Submit the passes that draw an image, which is valid once `grow_on_overflow` has returned False."""
-        self._plan_for((camera.width, camera.height))
+        self._plans.turn_to((camera.width, camera.height))
         if self.config.round_splats:
             rows, columns = self._tiles(camera)
             bands = max(self.plan.bands, -(-rows // max(1, MAX_BAND_TILES // columns)))
@@ -102,35 +100,6 @@ class Rasterizer:
             return self.draw(gaussians, camera, background, depth=depth, profile=profile)
         return drawing
 
-    def _plan_for(self, size: tuple[int, int]) -> None:
-        """Take the plan of a size of images."""
-        if self._size is not None and self._size != size:
-            self._plans[self._size] = old = self.plan
-            # Small splats lie on one tile at any size, large ones on as many more as there are pixels.
-            share = math.sqrt(math.prod(size) / math.prod(self._size))
-            guess = min(old.capacity, max(self._first_capacity, round(share * old.capacity)))
-            self.plan = self._plans.pop(size, Plan(guess))
-            if len(self._plans) > _SIZES:
-                self._plans.pop(next(iter(self._plans)))
-            self._watched = self._most = 0
-        self._size = size
-
-    def _shrink(self, most: int) -> None:
-        """Watch the intersections of bands that fitted; from time to time, shrink a plan that was too large for all.
-
-        Bands stay: their number decides in which order gradients are added, and so must not depend on what came before
-        more than it has to.
-        """
-        self._watched, self._most = self._watched + 1, max(self._most, most)
-        if self._watched < _WATCHED:
-            return
-        capacity = self.plan.capacity
-        if 2 * _roomy(self._most) <= capacity:
-            capacity = _roomy(self._most)
-        # Half of the rounds may be too few; then one image is drawn twice.
-        self.plan = replace(self.plan, capacity=capacity, rounds=max(1, self.plan.rounds // 2))
-        self._watched = self._most = 0
-
     def holds(self, drawing: Drawing) -> bool:
         """Whether the arrays still hold this drawing: no other image was drawn since."""
         return drawing.number == self._drawings
@@ -148,7 +117,7 @@ class Rasterizer:
         if most <= plan.capacity:
             if not self.config.round_splats or not any(count[2] for count in counts):
                 if plan == self.plan:
-                    self._shrink(most)
+                    self._plans.fitted(most)
                 return False
             self.plan = replace(plan, rounds=2 * plan.rounds)
             return True
@@ -160,7 +129,7 @@ class Rasterizer:
                     f"one row of tiles holds {most} intersections, but the device's bindings hold {self.max_capacity}"
                 )
             bands = min(rows, max(bands + 1, -(-5 * sum(totals) // (4 * self.max_capacity))))
-        self.plan = replace(plan, capacity=min(self.max_capacity, _roomy(most)), bands=bands)
+        self.plan = replace(plan, capacity=min(self.max_capacity, roomy(most)), bands=bands)
         return True
 
     def _draw_band(self, commands: Commands, drawing: Drawing, band: int) -> TileLists:
