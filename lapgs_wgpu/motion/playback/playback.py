@@ -105,7 +105,7 @@ class DevicePlayback:
             # Parts of half an entry of the temporal grids' time axis, within which features hardly change.
             parts = 2 * self.field_config.temporal.finest[2]
             self._bounds = MotionBounds(self.count, parts)
-            self._moments = SeenMoments(self.count, parts)
+            self._moments = SeenMoments(self.count, 2 / parts)
             # The time near which all Gaussians are, on the way between two moments, and how far they are off at most.
             self._near: tuple[float, Floats] | None = None
             self._colors = activated["colors"]  # of which the field may change the constant part
