@@ -56,10 +56,10 @@ def discover(
     The same configuration and capture give the same scene. Raises InputError where the images show nothing at all.
     """
     started = time.perf_counter()
-    steps = config.discovery.steps
-    fit_steps = config.discovery.field_steps
-    meter = Progress(steps + fit_steps, "steps of motion discovery", terminal)
+    steps, fit_steps = config.discovery.steps, config.discovery.field_steps
+    meter = Progress(steps, "steps of motion discovery, part 1 of 2: what stands still", terminal)
     static, images, corrections = static_fit(config, dataset, device, trainer, meter.at)
+    meter.at(steps, lambda: "motion discovery: following what moves from one time to the next")
     background = 1.0 if config.data.background == "white" else 0.0
     if all(float(np.abs(image.image - background).max()) < SHOWN for image in images):
         raise InputError(
@@ -78,7 +78,8 @@ def discover(
     scene = scene_with(static, tracks, config, device, generator, own_field)
     found = f"{share:.1%} of what it lacks can be followed: nothing is added"
     if tracks is not None:
-        error = fit_field(scene, tracks, clouds.times, len(static), fit_steps, generator, lambda s: meter.at(steps + s))
+        meter = Progress(fit_steps, "steps of motion discovery, part 2 of 2: what moves", terminal)
+        error = fit_field(scene, tracks, clouds.times, len(static), fit_steps, generator, meter.at)
         found = (
             f"{len(np.unique(tracks.part))} moving parts with {len(tracks.part)} Gaussians, {share:.0%} of what it "
             f"lacks, followed within {error:.3f} world units"
