@@ -49,18 +49,19 @@ class DensityControl:
         """Statistics of the Gaussians as they are now, before any view."""
         return Statistics.zeros(len(self._scene), self._scene.parameters["means"].device)
 
-    def change(self, step: int, *, moving: bool) -> None:
+    def change(self, step: int, *, moving: bool) -> str | None:
         """Make the changes that are planned after this step (counted from 1), with the optimizer's state.
 
-        moving: whether the field moves the Gaussians. Raises InputError where no Gaussian would be left.
+        moving: whether the field moves the Gaussians. Returns a sentence on what pruning by contribution did, None
+        where it did nothing. Raises InputError where no Gaussian would be left.
         """
-        if self._config.prunes_at(step, self._last):
-            self._prune_hidden(moving)
+        pruned = self._prune_hidden(moving) if self._config.prunes_at(step, self._last) else None
         if self._config.changes_at(step):
             self._apply_rule(step)
         if self._config.resets_at(step):
             logits = reset_opacities(self._scene.parameters["opacity_logits"], self._config.reset_opacity)
             self._optimizer.reset("opacity_logits", logits)
+        return pruned
 
     def _apply_rule(self, step: int) -> None:
         scene = self._scene
@@ -77,10 +78,16 @@ class DensityControl:
         self._optimizer.reorder(morton_order(scene.parameters["means"].detach()))
         self.statistics = self.nothing_seen()
 
-    def _prune_hidden(self, moving: bool) -> None:
+    def _prune_hidden(self, moving: bool) -> str | None:
         """Prune the Gaussians that contribute too little to all images."""
+        least = self._config.min_contribution
         most = contributions(self._scene, self._views, moving=moving)
-        keep = (most >= self._config.min_contribution) | largest(most, LEAST_KEPT)
-        if not keep.all():
-            self._optimizer.edit_rows(keep, {name: row[:0] for name, row in self._scene.parameters.items()})
-            self.statistics = self.statistics.of(keep)
+        keep = (most >= least) | largest(most, LEAST_KEPT)
+        if keep.all():
+            return None
+        self._optimizer.edit_rows(keep, {name: row[:0] for name, row in self._scene.parameters.items()})
+        self.statistics = self.statistics.of(keep)
+        return (
+            f"pruned {int((~keep).sum())} of {len(keep)} Gaussians, which fill less than {least:g} pixels in each of "
+            f"{len(self._views)} training images (density.min_contribution)"
+        )

@@ -81,6 +81,8 @@ class Log:
         """Take in a step that is done; the loss of one that was skipped does not count. A callback of `Trainer`."""
         if result.skipped is not None:
             self.tell(str(result.skipped))
+        if result.pruned is not None:
+            self.tell(f"step {result.step}: {result.pruned}")
         self.step(result, len(trainer.scene), lambda: _now(trainer))
 
     def step(self, result: StepResult, gaussians: int, now: Callable[[], dict[str, Any]] = dict) -> None:

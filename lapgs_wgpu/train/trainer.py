@@ -308,14 +308,14 @@ class Trainer:
         else:
             self._generator.set_state(drawn)
             self._zero_grad()
-        self._density.change(step, moving=moving)
+        pruned = self._density.change(step, moving=moving)
         if step % config.schedule.sh_interval == 0:
             scene.sh_degree = min(scene.sh_degree + 1, MAX_SH_DEGREE)
         self.done = step
         self.whole = True
         self._health.note(skipped)
         terms = dict(zip(list(totals)[2:], of_terms, strict=True))
-        return StepResult(step, config.schedule.steps, value, psnr, skipped, terms)
+        return StepResult(step, config.schedule.steps, value, psnr, skipped, terms, pruned)
 
     def _nearby(self, view: View) -> Nearby | None:
         if self.done < self.config.smoothness.start:
