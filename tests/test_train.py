@@ -417,10 +417,15 @@ def test_seconds_before_the_first_step_count_once(tmp_path: Path) -> None:
     path = tmp_path / "log.jsonl"
     for done, steps in ((0, 50), (50, 100)):
         with Log(path, 100, done=done, before=1000.0, terminal=io.StringIO()) as log:
+            if not done:
+                log.discovered("nothing")
             for step in range(done + 1, steps + 1):
                 log.step(StepResult(step, 100, 0.5, 20.0, terms={}), 1000)
-    seconds = [json.loads(line)["timing"]["seconds"] for line in path.read_text().splitlines()]
-    assert 1000 <= seconds[0] <= seconds[1] < 1900
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    assert [line["step"] for line in lines] == [0, 50, 100]
+    assert lines[0]["discovery"] == "nothing"
+    seconds = [line["timing"]["seconds"] for line in lines]
+    assert 1000 <= seconds[0] <= seconds[1] <= seconds[2] < 1900
 
 
 def test_log_lines_and_the_progress_line(tmp_path: Path) -> None:

@@ -124,6 +124,10 @@ class Log:
 
         self._progress.at(step, text)
 
+    def discovered(self, summary: str) -> None:
+        """Take in what motion discovery found, before the first step."""
+        self._write({"step": 0, "discovery": summary, "timing": {"seconds": round(self.seconds, 3)}})
+
     def evaluated(self, step: int, psnr: float, views: str, seconds: float) -> None:
         """Take in the mean PSNR (dB) of views after a step, and how long it took to measure."""
         self._start += seconds

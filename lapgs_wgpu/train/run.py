@@ -97,7 +97,7 @@ def train(
     with locked_run_folder(out):
         start_run_folder(out, training.given, training.scene.device, dataset)
         if training.discovery is not None:
-            print(training.discovery, flush=True)
+            print(f"discovery: {training.discovery}; {training.discovery_seconds:.0f} s", flush=True)
         if training.decoder.seconds:
             print(_told(training.decoder), flush=True)
         return _run(training, out, watch, lpips)
@@ -187,6 +187,8 @@ def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None)
     config, scene = training.config, training.scene
     log = Log(out / "log.jsonl", config.schedule.steps, done=training.done, before=training.discovery_seconds)
     with log, _interruptible() as interrupted:
+        if training.discovery is not None:
+            log.discovered(training.discovery)
         training.callbacks += [log.after_step, *_monitors(training, log, out)]
         if config.schedule.save_interval:
             training.callbacks.append(partial(_save_now_and_then, out))

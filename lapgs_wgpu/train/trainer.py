@@ -74,7 +74,7 @@ class Trainer:
         parts: own field, losses, density control, learning rates and callbacks.
         done: number of the steps so far.
         callbacks: a list of functions of the trainer and the StepResult, called after each step.
-        discovery: what motion discovery found, a line; None where it was left out.
+        discovery: what motion discovery found, a sentence; None where it was left out.
         discovery_seconds: that it took; 0 where it was left out.
         cameras: the corrections of the training cameras; None where they are kept.
         decoder: where the field's decoder runs, and why.

@@ -88,9 +88,9 @@ def discover(
     for name, values in scene.parameters.items():
         scene.parameters[name] = torch.nn.Parameter(values.detach()[order])
     meter.clear()
-    seconds = time.perf_counter() - started
-    summary = f"discovery: a static fit of {len(static)} Gaussians; {found}; {seconds:.0f} s"
-    return Discovery(scene, tracks is not None and share >= NEARLY_ALL, summary, corrections, seconds)
+    summary = f"a static fit of {len(static)} Gaussians; {found}"
+    fitted = tracks is not None and share >= NEARLY_ALL
+    return Discovery(scene, fitted, summary, corrections, time.perf_counter() - started)
 
 
 def scene_with(
