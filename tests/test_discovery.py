@@ -346,6 +346,22 @@ def test_parts_must_bring_the_static_fit_nearer_to_the_images(device: Device) ->
     assert tracks_in_images(tracks_along(elsewhere), np.array([0.0, 0.5, 1.0]), images, static, 0.0) is None
 
 
+def test_parts_that_change_mostly_what_moves_need_no_gain(device: Device) -> None:
+    """Here they are too bright; in front of texture a soft rim costs more than they gain."""
+    static = still_scene(device)
+    camera = Camera.looking_at([0, -4, 0], [0, 0, 0], up=[0, 0, 1], fov_x=0.7, width=24, height=16)
+    still = static.render(camera, 0.5, torch.zeros(3)).image.numpy(force=True)
+    path = np.tile([-0.8, 0.0, 0.3], (3, 1))
+    for side, keeps in ((5, True), (1, False)):  # of what moves, pixels
+        images = []
+        for i in range(3):
+            shown = still.copy()
+            shown[5 - side // 2 : 6 + side // 2, max(0, 4 - side // 2) : 5 + side // 2] = 0.12
+            images.append(Residual(camera, i / 2, shown, still))
+        kept = tracks_in_images(tracks_along(path), np.array([0.0, 0.5, 1.0]), images, static, 0.0)
+        assert (kept is not None) == keeps
+
+
 def test_above_a_flat_gaussian_is_no_density(device: Device) -> None:
     """A floor is made of such; what rolls on it is not where the static fit already is."""
     scene = still_scene(device)

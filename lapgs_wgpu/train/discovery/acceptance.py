@@ -1,7 +1,7 @@
 """Which of the parts that were followed a training starts with.
 
-A part must lie where the static fit lacks something, and bring it nearer to the images: patches of what the static fit
-only blurs do not, though they can be followed.
+A part must lie where the static fit lacks something, and bring it nearer to the images, or at least change mostly what
+moves in them: patches of what the static fit only blurs do not, though they can be followed.
 """
 
 from __future__ import annotations
@@ -26,6 +26,8 @@ from .tracks import Tracks
 OPACITY = 0.3  # of the Gaussian of a track
 SCALE = 0.8  # of it, in mean distances to its nearest neighbours
 IMAGES = 60  # by which a part is judged, at most
+CHANGED = 2.0 / 255  # of a pixel's channel, from which on a part changes it
+MOSTLY = 0.42  # share of the pixels that a part changes that move, from which on it needs no gain
 EMPTY = 0.1  # opacity of the static fit, below which a place counts as empty
 LOST = 0.5  # share of the times at which a part is seen that it is where the static fit is empty, at least
 PROBES = 24  # of a part's points that are looked at, about
@@ -52,8 +54,11 @@ def track_gaussians(tracks: Tracks) -> dict[str, Tensor]:
 def tracks_in_images(
     tracks: Tracks, times: NDArray[np.float64], images: Sequence[Residual], static: Scene4D, background: float
 ) -> Tracks | None:
-    """The parts that bring the static fit nearer to the images, each by itself; None where there are none. times: (T,),
-    of the tracks. background: level of its channels."""
+    """The parts that, each by itself, bring the static fit nearer to the images or change mostly moving pixels; None
+    where there are none. The latter are things in front of texture, on which a soft rim costs more than they gain.
+
+    times: (T,), of the tracks. background: level of its channels.
+    """
     kept = np.zeros(int(tracks.part.max()) + 1, bool)
     judges = [images[i] for i in np.linspace(0, len(images) - 1, min(len(images), IMAGES)).astype(np.int64)]
     level = torch.full((3,), background)
@@ -63,14 +68,16 @@ def tracks_in_images(
         new = track_gaussians(part)
         rows = {name: torch.cat([static.parameters[name].detach().cpu(), values]) for name, values in new.items()}
         scene = Scene4D(rows, static.field_config, static.device, sh_degree=static.sh_degree)
-        gain = 0.0
+        gain, changed, moving = 0.0, 0, 0
         for image in judges:
             with torch.no_grad():
                 path = torch.from_numpy(part.paths[np.searchsorted(times, image.time)])
                 scene.parameters["means"][len(static) :] = path
                 rendered = scene.render(image.camera, image.time, level, depth=False).image.numpy(force=True)
             gain += image.error - image.error_of(rendered)
-        kept[k] = gain > 0
+            where = np.abs(rendered - image.still).max(axis=2) > CHANGED
+            changed, moving = changed + int(where.sum()), moving + int((where & image.mask).sum())
+        kept[k] = gain > 0 or 0 < MOSTLY * changed <= moving
     return tracks.of_parts(kept)
 
 

@@ -51,7 +51,7 @@ class Residual:
     """
 
     def __init__(self, camera: Camera, time: float, image: Floats, still: Floats) -> None:
-        self.camera, self.time, self.image = camera, time, image
+        self.camera, self.time, self.image, self.still = camera, time, image, still
         self.mask = moving_pixels(image, still)
         self.error = self.error_of(still)
 
