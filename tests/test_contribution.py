@@ -71,12 +71,12 @@ def test_training_prunes_what_hardly_shows(device: Device, monkeypatch: pytest.M
     monkeypatch.setattr(density_control, "contributions", noted)
     dataset = Dataset("made up", tuple(views(4)), ())
 
-    def trained(least: float) -> tuple[int, dict[int, str]]:
+    def trained(least: float) -> tuple[int, dict[int, int]]:
         config = pruning_config(min_contribution=least)
         training = trainer.Trainer(config, dataset, device, scene=moving_scene(device, config.field))
         results = [training.step() for _ in range(6)]
         training.close()
-        return len(training.scene), {each.step: each.pruned for each in results if each.pruned is not None}
+        return len(training.scene), {each.step: each.pruned for each in results if each.pruned}
 
     everything, told = trained(0.0)
     assert not found, "without a threshold nothing is looked at"
@@ -84,5 +84,4 @@ def test_training_prunes_what_hardly_shows(device: Device, monkeypatch: pytest.M
     remaining, told = trained(0.5)
     assert len(found) == 1, "at step 4, after density.start"
     assert remaining == int((found[0] >= 0.5).sum()) < len(found[0]) == everything
-    assert list(told) == [4]
-    assert f"pruned {everything - remaining} of {everything} Gaussians" in told[4]
+    assert told == {4: everything - remaining}

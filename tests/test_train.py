@@ -76,7 +76,8 @@ def test_a_run_is_whole(run: Path, dataset: Dataset) -> None:
     assert all(f"\n{key} = " in record for key in ("lapgs_wgpu", "torch", "adapter", "driver"))
     (last,) = lines(run)
     assert set(last) == {
-        "step", "loss", "psnr", "terms", "gaussians", "dead_scales", "frequencies", "amplitudes", "memory", "timing",
+        "step", "loss", "psnr", "terms", "gaussians", "pruned", "dead_scales", "frequencies", "amplitudes", "memory",
+        "timing",
     }  # fmt: skip
     assert set(last["terms"]) == {"l1", "ssim", "pyramid", "ncc", "smoothness", "dynamics"}
     assert sum(last["terms"].values()) == pytest.approx(last["loss"], rel=1e-5)
@@ -436,13 +437,16 @@ def test_log_lines_and_the_progress_line(tmp_path: Path) -> None:
     for stream in (io.StringIO(), Terminal()):
         with Log(tmp_path / "log.jsonl", 120, terminal=stream) as log:
             for step in range(1, 121):
-                log.step(StepResult(step, 120, 0.5 + step, 20.0, terms={"l1": 0.25, "ssim": 0.25 + step}), 1000)
+                terms = {"l1": 0.25, "ssim": 0.25 + step}
+                log.step(StepResult(step, 120, 0.5 + step, 20.0, terms=terms, pruned=2 * (step in (60, 70))), 1000)
         text = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
         assert [line["step"] for line in text] == [50, 100, 120]
+        assert [line["pruned"] for line in text] == [0, 4, 0]
         assert text[0]["loss"] == pytest.approx(0.5 + np.mean(range(1, 51)))
         assert text[2]["loss"] == pytest.approx(0.5 + np.mean(range(71, 121)))
         assert all(sum(line["terms"].values()) == pytest.approx(line["loss"]) for line in text)
         shown = stream.getvalue()
+        assert "pruned 4 Gaussians that hardly showed in any image" in shown
         assert "step 120/120  20.00 dB  1000 Gaussians" in shown
         assert shown.endswith("0:00 left\n")
         assert ("\r" in shown) == stream.isatty()

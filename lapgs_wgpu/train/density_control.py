@@ -49,13 +49,13 @@ class DensityControl:
         """Statistics of the Gaussians as they are now, before any view."""
         return Statistics.zeros(len(self._scene), self._scene.parameters["means"].device)
 
-    def change(self, step: int, *, moving: bool) -> str | None:
+    def change(self, step: int, *, moving: bool) -> int:
         """Make the changes that are planned after this step (counted from 1), with the optimizer's state.
 
-        moving: whether the field moves the Gaussians. Returns a sentence on what pruning by contribution did, None
-        where it did nothing. Raises InputError where no Gaussian would be left.
+        moving: whether the field moves the Gaussians. Returns the number of those that were pruned because they
+        contribute too little. Raises InputError where no Gaussian would be left.
         """
-        pruned = self._prune_hidden(moving) if self._config.prunes_at(step, self._last) else None
+        pruned = self._prune_hidden(moving) if self._config.prunes_at(step, self._last) else 0
         if self._config.changes_at(step):
             self._apply_rule(step)
         if self._config.resets_at(step):
@@ -78,16 +78,11 @@ class DensityControl:
         self._optimizer.reorder(morton_order(scene.parameters["means"].detach()))
         self.statistics = self.nothing_seen()
 
-    def _prune_hidden(self, moving: bool) -> str | None:
-        """Prune the Gaussians that contribute too little to all images."""
-        least = self._config.min_contribution
+    def _prune_hidden(self, moving: bool) -> int:
+        """Prune the Gaussians that contribute too little to all images; how many."""
         most = contributions(self._scene, self._views, moving=moving)
-        keep = (most >= least) | largest(most, LEAST_KEPT)
-        if keep.all():
-            return None
-        self._optimizer.edit_rows(keep, {name: row[:0] for name, row in self._scene.parameters.items()})
-        self.statistics = self.statistics.of(keep)
-        return (
-            f"pruned {int((~keep).sum())} of {len(keep)} Gaussians, which fill less than {least:g} pixels in each of "
-            f"{len(self._views)} training images (density.min_contribution)"
-        )
+        keep = (most >= self._config.min_contribution) | largest(most, LEAST_KEPT)
+        if not keep.all():
+            self._optimizer.edit_rows(keep, {name: row[:0] for name, row in self._scene.parameters.items()})
+            self.statistics = self.statistics.of(keep)
+        return int((~keep).sum())

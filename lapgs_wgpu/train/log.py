@@ -62,6 +62,7 @@ class Log:
         self._start = now - (so_far or before)
         self._began = now
         self._times: deque[float] = deque(maxlen=INTERVAL + 1)  # at which steps ended
+        self._pruned = self._pruned_before = 0  # in all, and until the last line
 
     def __enter__(self) -> Log:
         return self
@@ -81,8 +82,6 @@ class Log:
         """Take in a step that is done; the loss of one that was skipped does not count. A callback of `Trainer`."""
         if result.skipped is not None:
             self.tell(str(result.skipped))
-        if result.pruned is not None:
-            self.tell(f"step {result.step}: {result.pruned}")
         self.step(result, len(trainer.scene), lambda: _now(trainer))
 
     def step(self, result: StepResult, gaussians: int, now: Callable[[], dict[str, Any]] = dict) -> None:
@@ -91,6 +90,7 @@ class Log:
         if math.isfinite(result.loss) and math.isfinite(result.psnr):
             self._recent.append(result)
         self._times.append(time_now)
+        self._pruned += result.pruned
         if not self._recent:
             return
         # The first step, which compiles kernels and decodes images, tells nothing about the others.
@@ -110,10 +110,12 @@ class Log:
                     "psnr": round(sum(each.psnr for each in self._recent) / count, 4),
                     "terms": {name: round(value, 9) for name, value in terms.items()},
                     "gaussians": gaussians,
+                    "pruned": self._pruned - self._pruned_before,
                     **now(),
                     "timing": timing,
                 }
             )
+            self._pruned_before = self._pruned
 
         def text() -> str:
             smooth = sum(each.psnr for each in self._recent) / len(self._recent)
@@ -122,6 +124,8 @@ class Log:
                 f"step {step}/{self._steps}  {smooth:5.2f} dB  {gaussians} Gaussians  {rate:.1f} steps/s  {left} left"
             )
 
+        if step == self._steps and self._pruned:
+            self.tell(f"pruned {self._pruned} Gaussians that hardly showed in any image (density.min_contribution)")
         self._progress.at(step, text)
 
     def discovered(self, summary: str) -> None:

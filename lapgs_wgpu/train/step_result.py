@@ -20,7 +20,7 @@ class StepResult(NamedTuple):
         skipped: None, or why the step changed nothing: values that were not finite.
         terms: what each term of the loss adds to it, weight included, by name: `l1`, `ssim` (of 1 - SSIM), `pyramid`,
             `ncc`, `smoothness` and `dynamics`, as far as they were computed, and each term of one's own.
-        pruned: a sentence on the Gaussians that were pruned because they contribute too little; None where none were.
+        pruned: number of Gaussians that were pruned because they contribute too little.
     """
 
     step: int
@@ -29,4 +29,4 @@ class StepResult(NamedTuple):
     psnr: float
     skipped: Skipped | None = None
     terms: Mapping[str, float] = MappingProxyType({})
-    pruned: str | None = None
+    pruned: int = 0
