@@ -30,6 +30,7 @@ from lapgs_wgpu.viewer.viewport import SETTLED
 Picture = NDArray[np.uint8]
 
 MOVING_SIZE, FRAMES, FPS = (400, 300), 96, 16
+FIRST = 24  # frame of the moving picture, all that some programs show: not at the clip's ends, its weakest moments
 SWING = math.radians(40)  # of the camera, to each side
 DISTANCE = 1.1  # in distances from which the viewer begins
 MOST_BYTES = 2_000_000  # of the moving picture
@@ -49,7 +50,7 @@ def moving(scene: LoadedScene) -> bytes:
     """An animated WebP without an end: clip and camera go there and back."""
     render, frames = OffscreenRenderer(scene), []
     for number in range(FRAMES):
-        angle = 2 * math.pi * number / FRAMES
+        angle = 2 * math.pi * (FIRST + number) / FRAMES
         camera = camera_at(scene, SWING * math.sin(angle), MOVING_SIZE)
         frames.append(Image.fromarray(render(camera, 0.5 - 0.5 * math.cos(angle))))
         print(f"\rframe {number + 1} of {FRAMES}", end="", file=sys.stderr)
