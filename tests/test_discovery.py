@@ -346,7 +346,7 @@ def test_parts_must_bring_the_static_fit_nearer_to_the_images(device: Device) ->
     assert tracks_in_images(tracks_along(elsewhere), np.array([0.0, 0.5, 1.0]), images, static, 0.0) is None
 
 
-def test_parts_that_change_mostly_what_moves_need_no_gain(device: Device) -> None:
+def test_parts_that_change_largely_what_moves_need_no_gain(device: Device) -> None:
     """Here they are too bright; in front of texture a soft rim costs more than they gain."""
     static = still_scene(device)
     camera = Camera.looking_at([0, -4, 0], [0, 0, 0], up=[0, 0, 1], fov_x=0.7, width=24, height=16)

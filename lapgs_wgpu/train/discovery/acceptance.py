@@ -1,6 +1,6 @@
 """Which of the parts that were followed a training starts with.
 
-A part must lie where the static fit lacks something, and bring it nearer to the images, or at least change mostly what
+A part must lie where the static fit lacks something, and bring it nearer to the images, or at least change largely what
 moves in them: patches of what the static fit only blurs do not, though they can be followed.
 """
 
@@ -27,7 +27,7 @@ OPACITY = 0.3  # of the Gaussian of a track
 SCALE = 0.8  # of it, in mean distances to its nearest neighbours
 IMAGES = 60  # by which a part is judged, at most
 CHANGED = 2.0 / 255  # of a pixel's channel, from which on a part changes it
-MOSTLY = 0.42  # share of the pixels that a part changes that move, from which on it needs no gain
+LARGELY = 0.42  # share of the pixels that a part changes that move, from which on it needs no gain
 EMPTY = 0.1  # opacity of the static fit, below which a place counts as empty
 LOST = 0.5  # share of the times at which a part is seen that it is where the static fit is empty, at least
 PROBES = 24  # of a part's points that are looked at, about
@@ -54,7 +54,7 @@ def track_gaussians(tracks: Tracks) -> dict[str, Tensor]:
 def tracks_in_images(
     tracks: Tracks, times: NDArray[np.float64], images: Sequence[Residual], static: Scene4D, background: float
 ) -> Tracks | None:
-    """The parts that, each by itself, bring the static fit nearer to the images or change mostly moving pixels; None
+    """The parts that, each by itself, bring the static fit nearer to the images or change largely moving pixels; None
     where there are none. The latter are things in front of texture, on which a soft rim costs more than they gain.
 
     times: (T,), of the tracks. background: level of its channels.
@@ -77,7 +77,7 @@ def tracks_in_images(
             gain += image.error - image.error_of(rendered)
             where = np.abs(rendered - image.still).max(axis=2) > CHANGED
             changed, moving = changed + int(where.sum()), moving + int((where & image.mask).sum())
-        kept[k] = gain > 0 or 0 < MOSTLY * changed <= moving
+        kept[k] = gain > 0 or 0 < LARGELY * changed <= moving
     return tracks.of_parts(kept)
 
 
