@@ -47,13 +47,16 @@ class Residual:
 
     Attributes:
         mask: (H, W), the moving pixels.
-        error: of the static fit.
     """
 
     def __init__(self, camera: Camera, time: float, image: Floats, still: Floats) -> None:
         self.camera, self.time, self.image, self.still = camera, time, image, still
         self.mask = moving_pixels(image, still)
-        self.error = self.error_of(still)
+
+    @cached_property
+    def error(self) -> float:
+        """Of the static fit."""
+        return self.error_of(self.still)
 
     def error_of(self, rendered: Floats) -> float:
         """Mean absolute difference of a rendering (H, W, 3) from the image."""
