@@ -328,10 +328,15 @@ def test_density_is_that_of_the_static_fit(device: Device) -> None:
     assert density[1] < 1e-6
 
 
-def test_parts_must_bring_the_static_fit_nearer_to_the_images(device: Device) -> None:
+def still_view(device: Device) -> tuple[Scene4D, Camera, np.ndarray]:
+    """A static scene, a camera, and the image (16, 24, 3) that it takes."""
     static = still_scene(device)
     camera = Camera.looking_at([0, -4, 0], [0, 0, 0], up=[0, 0, 1], fov_x=0.7, width=24, height=16)
-    still = static.render(camera, 0.5, torch.zeros(3)).image.numpy(force=True)
+    return static, camera, static.render(camera, 0.5, torch.zeros(3)).image.numpy(force=True)
+
+
+def test_parts_must_bring_the_static_fit_nearer_to_the_images(device: Device) -> None:
+    static, camera, still = still_view(device)
     images = []
     for i in range(3):
         shown = still.copy()
@@ -348,9 +353,7 @@ def test_parts_must_bring_the_static_fit_nearer_to_the_images(device: Device) ->
 
 def test_parts_that_change_largely_what_moves_need_no_gain(device: Device) -> None:
     """Here they are too bright; in front of texture a soft rim costs more than they gain."""
-    static = still_scene(device)
-    camera = Camera.looking_at([0, -4, 0], [0, 0, 0], up=[0, 0, 1], fov_x=0.7, width=24, height=16)
-    still = static.render(camera, 0.5, torch.zeros(3)).image.numpy(force=True)
+    static, camera, still = still_view(device)
     path = np.tile([-0.8, 0.0, 0.3], (3, 1))
     for side, keeps in ((5, True), (1, False)):  # of what moves, pixels
         images = []
