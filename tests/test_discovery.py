@@ -21,7 +21,13 @@ from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train.config import Config
-from lapgs_wgpu.train.discovery.acceptance import density_at, explained_share, lost_tracks, tracks_in_images
+from lapgs_wgpu.train.discovery.acceptance import (
+    density_at,
+    explained_share,
+    lost_tracks,
+    track_gaussians,
+    tracks_in_images,
+)
 from lapgs_wgpu.train.discovery.discover import discover
 from lapgs_wgpu.train.discovery.field_fit import fit_field, keeping_rates
 from lapgs_wgpu.train.discovery.residual import Residual, moving_pixels
@@ -314,10 +320,10 @@ def still_scene(device: Device) -> Scene4D:
     )
 
 
-def tracks_along(*paths: np.ndarray) -> Tracks:
+def tracks_along(*paths: np.ndarray, spread: float = 0.03) -> Tracks:
     """Parts of 20 points around paths (T, 3)."""
-    spread = 0.03 * np.random.default_rng(0).normal(size=(20, 3))
-    every = np.concatenate([p[:, None] + spread for p in paths], axis=1).astype(np.float32)
+    around = spread * np.random.default_rng(0).normal(size=(20, 3))
+    every = np.concatenate([p[:, None] + around for p in paths], axis=1).astype(np.float32)
     part = np.repeat(np.arange(len(paths)), 20)
     return Tracks(every[0], np.full((len(part), 3), 0.7, np.float32), part, every, np.ones(every.shape[:2], bool))
 
@@ -328,10 +334,10 @@ def test_density_is_that_of_the_static_fit(device: Device) -> None:
     assert density[1] < 1e-6
 
 
-def still_view(device: Device) -> tuple[Scene4D, Camera, np.ndarray]:
-    """A static scene, a camera, and the image (16, 24, 3) that it takes."""
+def still_view(device: Device, width: int = 24, height: int = 16) -> tuple[Scene4D, Camera, np.ndarray]:
+    """A static scene, a camera, and the image (height, width, 3) that it takes."""
     static = still_scene(device)
-    camera = Camera.looking_at([0, -4, 0], [0, 0, 0], up=[0, 0, 1], fov_x=0.7, width=24, height=16)
+    camera = Camera.looking_at([0, -4, 0], [0, 0, 0], up=[0, 0, 1], fov_x=0.7, width=width, height=height)
     return static, camera, static.render(camera, 0.5, torch.zeros(3)).image.numpy(force=True)
 
 
@@ -362,6 +368,21 @@ def test_parts_that_change_largely_what_moves_need_no_gain(device: Device) -> No
             shown[5 - side // 2 : 6 + side // 2, max(0, 4 - side // 2) : 5 + side // 2] = 0.12
             images.append(Residual(camera, i / 2, shown, still))
         kept = tracks_in_images(tracks_along(path), np.array([0.0, 0.5, 1.0]), images, static, 0.0)
+        assert (kept is not None) == keeps
+
+
+def test_parts_whose_change_is_right_need_no_gain(device: Device) -> None:
+    """Here they have wide rims, as a pale shadow has; the more of what is there shows, the more of them is right."""
+    static, camera, still = still_view(device, 48, 32)
+    part = tracks_along(np.tile([-0.7, 0.0, 0.2], (3, 1)), spread=0.1)
+    rows = {n: torch.cat([static.parameters[n].detach().cpu(), new]) for n, new in track_gaussians(part).items()}
+    scene = Scene4D(rows, static.field_config, device, sh_degree=static.sh_degree)
+    rendered = scene.render(camera, 0.5, torch.zeros(3)).image.numpy(force=True)
+    core = np.where(rendered - still > 0.65 * (rendered - still).max(), rendered - still, 0.0)
+    for strength, keeps in ((1.3, True), (0.9, False)):
+        images = [Residual(camera, i / 2, still + np.float32(strength) * core, still) for i in range(3)]
+        assert images[0].error < images[0].error_of(rendered)
+        kept = tracks_in_images(part, np.array([0.0, 0.5, 1.0]), images, static, 0.0)
         assert (kept is not None) == keeps
 
 

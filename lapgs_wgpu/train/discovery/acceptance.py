@@ -1,7 +1,8 @@
 """Which of the parts that were followed a training starts with.
 
-A part must lie where the static fit lacks something, and bring it nearer to the images, or at least change largely what
-moves in them: patches of what the static fit only blurs do not, though they can be followed.
+A part must lie where the static fit lacks something, and bring it nearer to the images, or at least change it in the
+right direction or largely where something moves: patches of what the static fit only blurs do not, though they can be
+followed.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ OPACITY = 0.3  # of the Gaussian of a track
 SCALE = 0.8  # of it, in mean distances to its nearest neighbours
 IMAGES = 60  # by which a part is judged, at most
 CHANGED = 2.0 / 255  # of a pixel's channel, from which on a part changes it
+RIGHT = 0.75  # share of a part's change that is right, from which on it needs no gain
 LARGELY = 0.42  # share of the pixels that a part changes that move, from which on it needs no gain
 EMPTY = 0.1  # opacity of the static fit, below which a place counts as empty
 LOST = 0.5  # share of the times at which a part is seen that it is where the static fit is empty, at least
@@ -54,8 +56,11 @@ def track_gaussians(tracks: Tracks) -> dict[str, Tensor]:
 def tracks_in_images(
     tracks: Tracks, times: NDArray[np.float64], images: Sequence[Residual], static: Scene4D, background: float
 ) -> Tracks | None:
-    """The parts that, each by itself, bring the static fit nearer to the images or change largely moving pixels; None
-    where there are none. The latter are things in front of texture, on which a soft rim costs more than they gain.
+    """The parts that, each by itself, bring the static fit nearer to the images; None where there are none.
+
+    The soft rims of a part's Gaussians may cost more than the part gains: around a pale shadow, or in front of texture.
+    So a part is kept, too, whose change of the images is right by at least RIGHT (that much of it brings them nearest,
+    by squared differences), or which changes largely moving pixels.
 
     times: (T,), of the tracks. background: level of its channels.
     """
@@ -68,16 +73,20 @@ def tracks_in_images(
         new = track_gaussians(part)
         rows = {name: torch.cat([static.parameters[name].detach().cpu(), values]) for name, values in new.items()}
         scene = Scene4D(rows, static.field_config, static.device, sh_degree=static.sh_degree)
-        gain, changed, moving = 0.0, 0, 0
+        gain, agreeing, change, changed, moving = 0.0, 0.0, 0.0, 0, 0
         for image in judges:
             with torch.no_grad():
                 path = torch.from_numpy(part.paths[np.searchsorted(times, image.time)])
                 scene.parameters["means"][len(static) :] = path
                 rendered = scene.render(image.camera, image.time, level, depth=False).image.numpy(force=True)
             gain += image.error - image.error_of(rendered)
-            where = np.abs(rendered - image.still).max(axis=2) > CHANGED
+            difference = rendered - image.still
+            agreeing += float((difference * (image.image - image.still)).sum())
+            change += float(np.square(difference).sum())
+            where = np.abs(difference).max(axis=2) > CHANGED
             changed, moving = changed + int(where.sum()), moving + int((where & image.mask).sum())
-        kept[k] = gain > 0 or 0 < LARGELY * changed <= moving
+        right, largely = 0 < RIGHT * change <= agreeing, 0 < LARGELY * changed <= moving
+        kept[k] = gain > 0 or right or largely
     return tracks.of_parts(kept)
 
 
