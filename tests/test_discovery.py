@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from contextlib import closing
 from pathlib import Path
 
@@ -21,13 +20,7 @@ from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train.config import Config
-from lapgs_wgpu.train.discovery.acceptance import (
-    density_at,
-    explained_share,
-    lost_tracks,
-    track_gaussians,
-    tracks_in_images,
-)
+from lapgs_wgpu.train.discovery.acceptance import explained_share, track_gaussians, tracks_in_images
 from lapgs_wgpu.train.discovery.discover import discover
 from lapgs_wgpu.train.discovery.field_fit import fit_field, keeping_rates
 from lapgs_wgpu.train.discovery.residual import Residual, moving_pixels
@@ -328,12 +321,6 @@ def tracks_along(*paths: np.ndarray, spread: float = 0.03) -> Tracks:
     return Tracks(every[0], np.full((len(part), 3), 0.7, np.float32), part, every, np.ones(every.shape[:2], bool))
 
 
-def test_density_is_that_of_the_static_fit(device: Device) -> None:
-    density = density_at(still_scene(device), np.array([[0, 0, 0], [1, 0, 0]], np.float32))
-    assert density[0] > 0.5
-    assert density[1] < 1e-6
-
-
 def still_view(device: Device, width: int = 24, height: int = 16) -> tuple[Scene4D, Camera, np.ndarray]:
     """A static scene, a camera, and the image (height, width, 3) that it takes."""
     static = still_scene(device)
@@ -372,39 +359,19 @@ def test_parts_that_change_largely_what_moves_need_no_gain(device: Device) -> No
 
 
 def test_parts_whose_change_is_right_need_no_gain(device: Device) -> None:
-    """Here they have wide rims, as a pale shadow has; the more of what is there shows, the more of them is right."""
+    """Here they have wide rims, as a pale shadow has; the more of what is there shows, the more of them is right.
+    Where several cameras see each time, half is enough."""
     static, camera, still = still_view(device, 48, 32)
     part = tracks_along(np.tile([-0.7, 0.0, 0.2], (3, 1)), spread=0.1)
     rows = {n: torch.cat([static.parameters[n].detach().cpu(), new]) for n, new in track_gaussians(part).items()}
     scene = Scene4D(rows, static.field_config, device, sh_degree=static.sh_degree)
     rendered = scene.render(camera, 0.5, torch.zeros(3)).image.numpy(force=True)
     core = np.where(rendered - still > 0.65 * (rendered - still).max(), rendered - still, 0.0)
-    for strength, keeps in ((1.3, True), (0.9, False)):
-        images = [Residual(camera, i / 2, still + np.float32(strength) * core, still) for i in range(3)]
+    for strength, together, keeps in ((1.3, 1, True), (0.9, 1, False), (0.9, 2, True), (0.6, 2, False)):
+        images = [Residual(camera, i / 2, still + np.float32(strength) * core, still) for i in range(3)] * together
         assert images[0].error < images[0].error_of(rendered)
         kept = tracks_in_images(part, np.array([0.0, 0.5, 1.0]), images, static, 0.0)
         assert (kept is not None) == keeps
-
-
-def test_above_a_flat_gaussian_is_no_density(device: Device) -> None:
-    """A floor is made of such; what rolls on it is not where the static fit already is."""
-    scene = still_scene(device)
-    with torch.no_grad():
-        scene.parameters["means"][:, 1] = 0.0
-        scene.parameters["log_scales"][:] = torch.tensor([0.5, 0.5, 0.005]).log()
-        scene.parameters["quats"][:] = torch.tensor([math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0])  # z to -y
-    density = density_at(scene, np.array([[0.2, 0, 0], [0, 0, 0.2], [0, 0.2, 0]], np.float32))
-    assert density[:2].min() > 0.5
-    assert density[2] < 1e-6
-
-
-def test_only_parts_in_empty_places_are_lost(device: Device) -> None:
-    scene, away = still_scene(device), path(np.linspace(0, 1, 9))
-    kept = lost_tracks(tracks_along(0 * away, away), scene)
-    assert kept is not None
-    assert np.array_equal(kept.positions, tracks_along(away).positions)
-    assert set(kept.part) == {0}
-    assert lost_tracks(tracks_along(0 * away), scene) is None
 
 
 def test_the_static_fit_has_no_motion_and_small_images(dataset: Dataset) -> None:

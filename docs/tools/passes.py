@@ -19,7 +19,7 @@ from lapgs_wgpu.progress import Progress
 from lapgs_wgpu.splat.drawing import Drawing
 from lapgs_wgpu.splat.rasterize import rasterizer_of, upload_gaussians
 from lapgs_wgpu.splat.splat_layout import COLOR, MEAN, OPACITY, RADIUS
-from lapgs_wgpu.train.discovery.acceptance import lost_tracks
+from lapgs_wgpu.train.discovery.acceptance import tracks_in_images
 from lapgs_wgpu.train.discovery.static_fit import static_fit
 from lapgs_wgpu.train.discovery.surface_points import surface_points
 from lapgs_wgpu.train.discovery.tracks import find_tracks
@@ -205,7 +205,7 @@ def discovery(scenes: Path) -> Picture:
     meter.clear()
     clouds = surface_points(images, config.points.box)
     found = find_tracks(clouds, config.points.box)
-    tracks = None if found is None else lost_tracks(found, static)
+    tracks = None if found is None else tracks_in_images(found, clouds.times, images, static, 0.0)
     if tracks is None:
         raise SystemExit("discovery has found no moving parts in the built-in scene")
     shown = min(images, key=lambda image: abs(image.time - TIME))

@@ -1,8 +1,7 @@
 """Which of the parts that were followed a training starts with.
 
-A part must lie where the static fit lacks something, and bring it nearer to the images, or at least change it in the
-right direction or largely where something moves: patches of what the static fit only blurs do not, though they can be
-followed.
+A part must bring the static fit nearer to the images, or at least change it in the right direction or largely where
+something moves: patches of what the static fit only blurs do not, though they can be followed.
 """
 
 from __future__ import annotations
@@ -18,9 +17,8 @@ from torch import Tensor
 from lapgs_wgpu.data.initial_gaussians import initial_scales
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.constants import CONSTANTS
-from lapgs_wgpu.splat.rotation import rotation_matrices
 
-from .residual import Floats, Residual
+from .residual import Residual
 from .surface_points import PointClouds
 from .tracks import Tracks
 
@@ -29,12 +27,8 @@ SCALE = 0.8  # of it, in mean distances to its nearest neighbours
 IMAGES = 60  # by which a part is judged, at most
 CHANGED = 2.0 / 255  # of a pixel's channel, from which on a part changes it
 RIGHT = 0.75  # share of a part's change that is right, from which on it needs no gain
+RIGHT_TOGETHER = 0.5  # the same where several images show each time: their depths agree, whatever moves
 LARGELY = 0.42  # share of the pixels that a part changes that move, from which on it needs no gain
-EMPTY = 0.1  # opacity of the static fit, below which a place counts as empty
-LOST = 0.5  # share of the times at which a part is seen that it is where the static fit is empty, at least
-PROBES = 24  # of a part's points that are looked at, about
-BLOCK = 256  # points whose densities are computed together
-OPAQUE = 0.1  # least opacity of a Gaussian of the static fit that is looked at
 NEAR = 0.1  # box half sides; distance within which a track explains a surface point
 
 
@@ -59,14 +53,15 @@ def tracks_in_images(
     """The parts that, each by itself, bring the static fit nearer to the images; None where there are none.
 
     The soft rims of a part's Gaussians may cost more than the part gains: around a pale shadow, or in front of texture.
-    So a part is kept, too, whose change of the images is right by at least RIGHT (that much of it brings them nearest,
-    by squared differences), or which changes largely moving pixels.
+    So a part is kept, too, whose change of the images is right by RIGHT or RIGHT_TOGETHER at least (that much of it
+    brings them nearest, by squared differences), or which changes largely moving pixels.
 
     times: (T,), of the tracks. background: level of its channels.
     """
     kept = np.zeros(int(tracks.part.max()) + 1, bool)
     judges = [images[i] for i in np.linspace(0, len(images) - 1, min(len(images), IMAGES)).astype(np.int64)]
     level = torch.full((3,), background)
+    least_right = RIGHT if 2 * len(times) > len(images) else RIGHT_TOGETHER
     for k in range(len(kept)):
         part = tracks.of_parts(np.arange(len(kept)) == k)
         assert part is not None
@@ -85,38 +80,9 @@ def tracks_in_images(
             change += float(np.square(difference).sum())
             where = np.abs(difference).max(axis=2) > CHANGED
             changed, moving = changed + int(where.sum()), moving + int((where & image.mask).sum())
-        right, largely = 0 < RIGHT * change <= agreeing, 0 < LARGELY * changed <= moving
+        right, largely = 0 < least_right * change <= agreeing, 0 < LARGELY * changed <= moving
         kept[k] = gain > 0 or right or largely
     return tracks.of_parts(kept)
-
-
-def lost_tracks(tracks: Tracks, static: Scene4D) -> Tracks | None:
-    """The parts that are, mostly, where the static fit is empty; None where there are none."""
-    lost = np.zeros(int(tracks.part.max()) + 1, bool)
-    for k in range(len(lost)):
-        members = np.flatnonzero(tracks.part == k)
-        probes = members[:: -(-len(members) // PROBES)]
-        seen = tracks.paths[:, probes][tracks.supported[:, probes]]
-        lost[k] = (density_at(static, seen) < EMPTY).mean() > LOST if len(seen) else False
-    return tracks.of_parts(lost)
-
-
-def density_at(static: Scene4D, points: Floats) -> NDArray[np.float32]:
-    """(n,) density of the static fit at points (n, 3): the sum over its Gaussians of opacity times falloff."""
-    with torch.no_grad():
-        gaussians = static.canonical()
-        opaque = gaussians.opacities.cpu() > OPAQUE
-        means, opacities = gaussians.means.cpu()[opaque], gaussians.opacities.cpu()[opaque]
-        # Gaussian axes in columns, divided by the scales: a point times these is its distance in standard deviations.
-        axes = rotation_matrices(gaussians.quats.cpu()[opaque]) / gaussians.scales.cpu()[opaque, None]
-        at_means = torch.einsum("gi,gij->gj", means, axes)
-        total = [
-            (
-                opacities * torch.exp(-0.5 * (torch.einsum("ni,gij->ngj", some, axes) - at_means).square().sum(dim=2))
-            ).sum(dim=1)
-            for some in torch.from_numpy(points).float().split(BLOCK)
-        ]
-    return torch.cat(total).numpy()
 
 
 def explained_share(clouds: PointClouds, tracks: Tracks, half_side: float) -> float:

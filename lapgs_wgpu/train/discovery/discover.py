@@ -18,7 +18,7 @@ from lapgs_wgpu.splat.morton import morton_order
 from lapgs_wgpu.train.camera_refinement import Corrections
 from lapgs_wgpu.train.config import Config
 
-from .acceptance import explained_share, lost_tracks, track_gaussians, tracks_in_images
+from .acceptance import explained_share, track_gaussians, tracks_in_images
 from .field_fit import fit_field
 from .static_fit import MakeTrainer, static_fit
 from .surface_points import surface_points
@@ -69,7 +69,6 @@ def discover(
     half_side = config.points.box
     clouds = surface_points(images, half_side)
     tracks = find_tracks(clouds, half_side)
-    tracks = None if tracks is None else lost_tracks(tracks, static)
     tracks = None if tracks is None else tracks_in_images(tracks, clouds.times, images, static, background)
     share = 0.0 if tracks is None else explained_share(clouds, tracks, half_side)
     if share < config.discovery.least:
