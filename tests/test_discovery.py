@@ -20,7 +20,7 @@ from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train.config import Config
-from lapgs_wgpu.train.discovery.acceptance import explained_share, track_gaussians, tracks_in_images
+from lapgs_wgpu.train.discovery.acceptance import explained_share, rows_with, tracks_in_images
 from lapgs_wgpu.train.discovery.discover import discover
 from lapgs_wgpu.train.discovery.field_fit import fit_field, keeping_rates
 from lapgs_wgpu.train.discovery.residual import Residual, moving_pixels
@@ -363,8 +363,7 @@ def test_parts_whose_change_is_right_need_no_gain(device: Device) -> None:
     Where several cameras see each time, half is enough."""
     static, camera, still = still_view(device, 48, 32)
     part = tracks_along(np.tile([-0.7, 0.0, 0.2], (3, 1)), spread=0.1)
-    rows = {n: torch.cat([static.parameters[n].detach().cpu(), new]) for n, new in track_gaussians(part).items()}
-    scene = Scene4D(rows, static.field_config, device, sh_degree=static.sh_degree)
+    scene = Scene4D(rows_with(static, part), static.field_config, device, sh_degree=static.sh_degree)
     rendered = scene.render(camera, 0.5, torch.zeros(3)).image.numpy(force=True)
     core = np.where(rendered - still > 0.65 * (rendered - still).max(), rendered - still, 0.0)
     for strength, together, keeps in ((1.3, 1, True), (0.9, 1, False), (0.9, 2, True), (0.6, 2, False)):

@@ -47,6 +47,12 @@ def track_gaussians(tracks: Tracks) -> dict[str, Tensor]:
     return {name: values.float() for name, values in rows.items()}
 
 
+def rows_with(static: Scene4D, tracks: Tracks) -> dict[str, Tensor]:
+    """The Gaussians of the static fit, then those of the tracks, in host memory."""
+    new = track_gaussians(tracks)
+    return {name: torch.cat([static.parameters[name].detach().cpu(), values]) for name, values in new.items()}
+
+
 def tracks_in_images(
     tracks: Tracks, times: NDArray[np.float64], images: Sequence[Residual], static: Scene4D, background: float
 ) -> Tracks | None:
@@ -58,31 +64,41 @@ def tracks_in_images(
 
     times: (T,), of the tracks. background: level of its channels.
     """
-    kept = np.zeros(int(tracks.part.max()) + 1, bool)
     judges = [images[i] for i in np.linspace(0, len(images) - 1, min(len(images), IMAGES)).astype(np.int64)]
-    level = torch.full((3,), background)
     least_right = RIGHT if 2 * len(times) > len(images) else RIGHT_TOGETHER
+    kept = np.zeros(int(tracks.part.max()) + 1, bool)
     for k in range(len(kept)):
         part = tracks.of_parts(np.arange(len(kept)) == k)
         assert part is not None
-        new = track_gaussians(part)
-        rows = {name: torch.cat([static.parameters[name].detach().cpu(), values]) for name, values in new.items()}
-        scene = Scene4D(rows, static.field_config, static.device, sh_degree=static.sh_degree)
-        gain, agreeing, change, changed, moving = 0.0, 0.0, 0.0, 0, 0
-        for image in judges:
-            with torch.no_grad():
-                path = torch.from_numpy(part.paths[np.searchsorted(times, image.time)])
-                scene.parameters["means"][len(static) :] = path
-                rendered = scene.render(image.camera, image.time, level, depth=False).image.numpy(force=True)
-            gain += image.error - image.error_of(rendered)
-            difference = rendered - image.still
-            agreeing += float((difference * (image.image - image.still)).sum())
-            change += float(np.square(difference).sum())
-            where = np.abs(difference).max(axis=2) > CHANGED
-            changed, moving = changed + int(where.sum()), moving + int((where & image.mask).sum())
-        right, largely = 0 < least_right * change <= agreeing, 0 < LARGELY * changed <= moving
-        kept[k] = gain > 0 or right or largely
+        kept[k] = _improves(part, times, judges, static, background, least_right)
     return tracks.of_parts(kept)
+
+
+def _improves(
+    part: Tracks,
+    times: NDArray[np.float64],
+    images: Sequence[Residual],
+    static: Scene4D,
+    background: float,
+    least_right: float,
+) -> bool:
+    """Whether a part, beside the static fit, gains, is right by least_right, or changes largely what moves."""
+    scene = Scene4D(rows_with(static, part), static.field_config, static.device, sh_degree=static.sh_degree)
+    level = torch.full((3,), background)
+    gain, agreeing, change, changed, moving = 0.0, 0.0, 0.0, 0, 0
+    for image in images:
+        with torch.no_grad():
+            path = torch.from_numpy(part.paths[np.searchsorted(times, image.time)])
+            scene.parameters["means"][len(static) :] = path
+            rendered = scene.render(image.camera, image.time, level, depth=False).image.numpy(force=True)
+        gain += image.error - image.error_of(rendered)
+        difference = rendered - image.still
+        agreeing += float((difference * (image.image - image.still)).sum())
+        change += float(np.square(difference).sum())
+        where = np.abs(difference).max(axis=2) > CHANGED
+        changed, moving = changed + int(where.sum()), moving + int((where & image.mask).sum())
+    right, largely = 0 < least_right * change <= agreeing, 0 < LARGELY * changed <= moving
+    return gain > 0 or right or largely
 
 
 def explained_share(clouds: PointClouds, tracks: Tracks, half_side: float) -> float:
