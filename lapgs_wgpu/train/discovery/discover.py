@@ -17,8 +17,9 @@ from lapgs_wgpu.progress import Progress
 from lapgs_wgpu.splat.morton import morton_order
 from lapgs_wgpu.train.camera_refinement import Corrections
 from lapgs_wgpu.train.config import Config
+from lapgs_wgpu.train.evaluate import BACKGROUND_LEVELS
 
-from .acceptance import explained_share, track_gaussians, tracks_in_images
+from .acceptance import explained_share, rows_with, tracks_in_images
 from .field_fit import fit_field
 from .static_fit import MakeTrainer, static_fit
 from .surface_points import surface_points
@@ -60,7 +61,7 @@ def discover(
     meter = Progress(steps, "steps of motion discovery, part 1 of 2: what stands still", terminal)
     static, images, corrections = static_fit(config, dataset, device, trainer, meter.at)
     meter.at(steps, lambda: "motion discovery: following what moves from one time to the next")
-    background = 1.0 if config.data.background == "white" else 0.0
+    background = BACKGROUND_LEVELS[config.data.background]
     if all(float(np.abs(image.image - background).max()) < SHOWN for image in images):
         raise InputError(
             f"{dataset.train[0].source} and the other {len(dataset.train) - 1} training images show nothing but the "
@@ -101,11 +102,12 @@ def scene_with(
     own_field: nn.Module | None = None,
 ) -> Scene4D:
     """The static fit's Gaussians, then one for each track; the field does not move them yet."""
-    size = config.field.dynamics_size
-    rows = {name: values.detach().cpu() for name, values in static.parameters.items()}
-    rows["dynamics"] = torch.zeros(len(static), size)
-    if tracks is not None:
-        of_part = DYNAMICS * torch.randn(int(tracks.part.max()) + 1, size, generator=generator)
-        new = {**track_gaussians(tracks), "dynamics": of_part[torch.from_numpy(tracks.part)]}
-        rows = {name: torch.cat([rows[name], values]) for name, values in new.items()}
+    dynamics = torch.zeros(len(static), config.field.dynamics_size)
+    if tracks is None:
+        rows = {name: values.detach().cpu() for name, values in static.parameters.items()}
+    else:
+        rows = rows_with(static, tracks)
+        of_part = DYNAMICS * torch.randn(int(tracks.part.max()) + 1, config.field.dynamics_size, generator=generator)
+        dynamics = torch.cat([dynamics, of_part[torch.from_numpy(tracks.part)]])
+    rows["dynamics"] = dynamics
     return Scene4D(rows, config.field, device, sh_degree=static.sh_degree, seed=config.seed, own_field=own_field)
