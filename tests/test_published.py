@@ -114,11 +114,22 @@ def test_a_preset_is_what_was_published_times_the_captures_scale(name: str, scal
 
 
 def test_presets_of_dnerf() -> None:
-    full, small = load_config("dnerf"), load_config("dnerf-400")
-    assert small == dataclasses.replace(full, data=dataclasses.replace(full.data, size=400))
+    full = load_config("dnerf")
     assert on_capture(full, 0.1) == full, "lengths in world units are left alone"
     assert full.density.max_screen_radius == 0, "its published code zeroes the radii first"
     assert full.field.negative_scales == "mirror"
+
+
+def test_the_short_schedule_of_dnerf() -> None:
+    """`dnerf-400` has the losses and the method of `dnerf`; every falling rate ends with its steps."""
+    full, short = load_config("dnerf"), load_config("dnerf-400")
+    assert (full.data.size, short.data.size) == (0, 400)
+    for part in ("loss", "smoothness", "discovery", "exposure", "cameras", "eval"):
+        assert getattr(short, part) == getattr(full, part), part
+    smaller = {name: getattr(short.field, name) for name in ("static", "temporal", "width")}
+    assert short.field == dataclasses.replace(full.field, **smaller)
+    assert all(rate.steps in (1, short.schedule.steps) for rate in short.rates.schedules().values())
+    assert short.density.stop < short.schedule.steps < short.density.reset_interval
 
 
 def test_no_more_frequencies_than_the_times_can_tell_apart() -> None:
