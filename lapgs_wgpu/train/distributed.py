@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import atexit
 import functools
+import importlib
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -62,6 +63,9 @@ def join_ranks() -> Ranks:
     if not distributed.is_available():
         raise InputError("this torch lacks torch.distributed, so several processes cannot train together.")
     if not distributed.is_initialized():
+        # The group of the time when this module is first imported stays in defaults of its functions, and so would
+        # outlive its end. Optimizers import it.
+        importlib.import_module("torch.distributed.nn.functional")
         distributed.init_process_group("gloo")
         # Otherwise gloo's threads may still run when Python ends, and abort the process.
         atexit.register(distributed.destroy_process_group)
