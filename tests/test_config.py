@@ -9,7 +9,7 @@ import pytest
 
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.motion.fields.config import FieldConfig
-from lapgs_wgpu.train.config import CamerasConfig, Config, DiscoveryConfig, ExposureConfig
+from lapgs_wgpu.train.config import AccelerationConfig, CamerasConfig, Config, DiscoveryConfig, ExposureConfig
 from lapgs_wgpu.train.learning_rate import Rate
 from lapgs_wgpu.train.presets import ABLATIONS, config_keys, load_config, preset_names, write_toml
 
@@ -132,7 +132,8 @@ def test_base_gives_what_a_file_leaves_out(tmp_path: Path) -> None:
 def test_presets_are_complete_without_defaults_in_the_code() -> None:
     """But for what the config.toml of older runs lacks, which is off then."""
     optional = {field.name for field in dataclasses.fields(Config) if field.default is not dataclasses.MISSING}
-    assert optional == {"exposure", "precision", "decoder", "discovery", "cameras", "eval"}
+    assert optional == {"acceleration", "exposure", "precision", "decoder", "discovery", "cameras", "eval"}
+    assert AccelerationConfig().weight == 0
     assert not ExposureConfig().enabled
     assert not DiscoveryConfig().enabled
     assert CamerasConfig().refine == "off"

@@ -151,31 +151,36 @@ class Scene4D:
         motion = self.field.motion if isinstance(self.field, GridField) else None
         return motion if isinstance(motion, LaplacianMotion) else None
 
-    def _sh(self) -> Tensor:
-        used = (self.sh_degree + 1) ** 2 - 1
-        return torch.cat([self.parameters["sh_dc"], self.parameters["sh_rest"][:, :used]], dim=1)
-
     def canonical(self) -> Gaussians:
         """The Gaussians without motion, activated. Differentiable in `parameters`."""
-        p = self.parameters
+        return self._activated(self.parameters)
+
+    def _activated(self, p: Mapping[str, Tensor]) -> Gaussians:
         return Gaussians(
             p["means"],
             nn.functional.normalize(p["quats"], dim=1),
             p["log_scales"].exp().clamp(min=MIN_SCALE),
             p["opacity_logits"].sigmoid(),
-            self._sh(),
+            torch.cat([p["sh_dc"], p["sh_rest"][:, : (self.sh_degree + 1) ** 2 - 1]], dim=1),
         )
 
     def at(self, t: float) -> Gaussians:
         """The Gaussians at time t in [0, 1], activated. Differentiable in `parameters` and the field's parameters."""
         return self.deformed(t)[0]
 
-    def deformed(self, t: float, nearby: Nearby | None = None) -> tuple[Gaussians, Tensor | None]:
-        """The Gaussians at time t in [0, 1], and the weighted smoothness loss for `nearby`, None without it."""
-        still = self.canonical()
+    def deformed(
+        self, t: float, nearby: Nearby | None = None, rows: Tensor | None = None
+    ) -> tuple[Gaussians, Tensor | None]:
+        """The Gaussians at time t in [0, 1], and the weighted smoothness loss for `nearby`, None without it.
+
+        rows: (M,) of the Gaussians; None for all.
+        """
+        p: Mapping[str, Tensor] = self.parameters
+        if rows is not None:
+            p = {name: values[rows] for name, values in p.items()}
+        still = self._activated(p)
         if self.field is None or len(self) == 0:
             return still, None
-        p = self.parameters
         move = self.field(p["means"], t, p.get("dynamics"), nearby)
         means, quats, scales, sh, opacities = still.means, still.quats, still.scales, still.sh, still.opacities
         if move.rotation is not None:

@@ -269,6 +269,24 @@ class SmoothnessConfig(Options):
 
 
 @dataclass(frozen=True)
+class AccelerationConfig(Options):
+    """The acceleration loss (train/acceleration.py). Has defaults, since older config.toml files lack it."""
+
+    weight: float = option(
+        "weight of the acceleration loss: how far means and scales are from the straight line between those shortly "
+        "before and after, world units; a distance l counts as l / (1 + 100 l), so that fast motion is not held back; "
+        "begins as the smoothness loss does; 0: off",
+        0.0,
+    )
+    share: float = option("fraction of the Gaussians that it samples in each step, between 0 and 1", 0.25, at_most=1)
+    frames: float = option(
+        "largest distance in time from the view's; 1: that between two training images, if they are evenly spaced; "
+        "drawn between half of it and all",
+        2.0,
+    )
+
+
+@dataclass(frozen=True)
 class DiscoveryConfig(Options):
     """Motion discovery before the training (train/discovery). Has defaults, since older config.toml files lack it."""
 
@@ -385,6 +403,7 @@ class Config(Options):
     loss: LossConfig
     smoothness: SmoothnessConfig
     seed: int = option("seed of all random numbers")
+    acceleration: AccelerationConfig = option("", AccelerationConfig())
     exposure: ExposureConfig = option("", ExposureConfig())
     cameras: CamerasConfig = option("", CamerasConfig())
     discovery: DiscoveryConfig = option("", DiscoveryConfig())

@@ -140,6 +140,8 @@ def fingerprint(config: Config) -> str:
         del values["field"]["negative_scales"]
     if config.smoothness.start == 0:
         del values["smoothness"]["start"]
+    if config.acceleration.weight == 0:
+        del values["acceleration"]
     if config.data.units == "world":
         del values["data"]["units"]
     if config.data.undistort:

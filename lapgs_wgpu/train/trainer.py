@@ -25,6 +25,7 @@ from lapgs_wgpu.motion.fields.deformation import Nearby
 from lapgs_wgpu.motion.fields.dynamics import dynamics_loss
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.scene import Scene4D
+from lapgs_wgpu.train.acceleration import Moments, acceleration_loss, draw_moments
 from lapgs_wgpu.train.autotune import choose_decoder
 from lapgs_wgpu.train.camera_descent import scene_points
 from lapgs_wgpu.train.camera_refinement import CameraRefinement, Corrections
@@ -50,15 +51,17 @@ from lapgs_wgpu.train.step_result import StepResult
 from lapgs_wgpu.train.suited import suited
 
 MAX_SH_DEGREE = 3
-TERMS = frozenset({"l1", "mse", "ssim", "pyramid", "ncc", "smoothness", "dynamics"})  # of the configuration
+# Of the configuration.
+TERMS = frozenset({"l1", "mse", "ssim", "pyramid", "ncc", "smoothness", "acceleration", "dynamics"})
 
 
 class _Look(NamedTuple):
-    """A view of a step: on what it lies, and where the field is asked once more."""
+    """A view of a step: on what it lies, and where and when the field is asked once more."""
 
     view: View
     background: Tensor
     nearby: Nearby | None
+    moments: Moments | None
 
 
 class Trainer:
@@ -278,7 +281,7 @@ class Trainer:
         # Every rank draws the numbers of all views, so that their random streams stay the same.
         chosen = [self._pictures.choose() for _ in range(config.schedule.batch)]
         drawn = self._generator.get_state()
-        looks = [_Look(*each, self._nearby(each[0]) if moving else None) for each in chosen]
+        looks = [_Look(*each, *self._elsewhere(each[0].time, moving)) for each in chosen]
 
         self._zero_grad()
         seen = self._density.nothing_seen()
@@ -317,10 +320,13 @@ class Trainer:
         terms = dict(zip(list(totals)[2:], of_terms, strict=True))
         return StepResult(step, config.schedule.steps, value, psnr, skipped, terms, pruned)
 
-    def _nearby(self, view: View) -> Nearby | None:
-        if self.done < self.config.smoothness.start:
-            return None
-        return draw_nearby(self.config.smoothness, len(self.scene), view.time, self._generator)
+    def _elsewhere(self, t: float, moving: bool) -> tuple[Nearby | None, Moments | None]:
+        config, count, generator = self.config, len(self.scene), self._generator
+        if not moving or self.done < config.smoothness.start:
+            return None, None
+        times = len(self.dataset.times)
+        nearby = draw_nearby(config.smoothness, count, t, generator)
+        return nearby, draw_moments(config.acceleration, count, t, times, generator)
 
     def _loss(self, look: _Look, moving: bool) -> tuple[Tensor, RenderLoss, dict[str, float]]:
         """The loss of a view, all terms together, its rendering, and what each term adds."""
@@ -344,6 +350,10 @@ class Trainer:
         beside: dict[str, Tensor] = {}
         if smoothness is not None:
             beside["smoothness"] = smoothness
+        if look.moments is not None:
+            beside["acceleration"] = config.acceleration.weight * acceleration_loss(
+                scene, gaussians, view.time, look.moments
+            )
         if moving and "dynamics" in scene.parameters:
             spread = dynamics_loss(scene.parameters["dynamics"], config.loss.dynamics_mode)
             beside["dynamics"] = config.loss.dynamics * spread

@@ -1,0 +1,133 @@
+"""The acceleration loss: where it looks, its value and gradients, and what a training makes of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from helpers.training import configure
+from torch import Tensor, nn
+
+from lapgs_wgpu.data import Dataset
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.motion.fields.config import FieldConfig
+from lapgs_wgpu.motion.fields.deformation import Deformation
+from lapgs_wgpu.motion.scene import Scene4D
+from lapgs_wgpu.train.acceleration import WOBBLE, Moments, acceleration_loss, draw_moments, robust_length
+from lapgs_wgpu.train.config import AccelerationConfig
+from lapgs_wgpu.train.run import train
+from lapgs_wgpu.train.trainer import Trainer
+
+CONFIG = AccelerationConfig(weight=1.0, share=0.5, frames=2.0)
+COUNT = 9
+
+
+class Curve(nn.Module):
+    """Means move by speed t + bend t^2, scales grow by t and t^2 as the means do."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.speed = nn.Parameter(torch.tensor([0.3, -0.2, 0.1]))
+        self.bend = nn.Parameter(torch.tensor([0.0, 0.4, 0.0]))
+
+    def forward(self, means: Tensor, t: float) -> Deformation:
+        shift = (self.speed * t + self.bend * t * t).expand(len(means), 3)
+        return Deformation(translation=shift, d_scales=0.1 * shift)
+
+
+def scene_of(device: Device, field: FieldConfig, own: nn.Module | None = None) -> Scene4D:
+    random = np.random.default_rng(0)
+    points = random.uniform(-1, 1, (COUNT, 3))
+    scene = Scene4D.from_points(
+        points, random.random((COUNT, 3)), np.full(COUNT, 0.5), field, device=device, own_field=own
+    )
+    return scene
+
+
+def test_value_is_the_robust_distance_from_the_chord(device: Device) -> None:
+    """Of a parabola: |bend| (t - before) (after - t), of means and, a tenth, of scales."""
+    curve = Curve()
+    scene = scene_of(device, FieldConfig(kind="own"), curve)
+    moments = Moments(torch.tensor([0, 3, 3]), 0.33, 0.37)
+    loss = acceleration_loss(scene, scene.at(0.35), 0.35, moments)
+    loss.backward()
+    bend = torch.tensor(0.4, dtype=torch.float64, requires_grad=True)
+    lengths = bend * 0.02 * 0.02 * torch.tensor([1.0, 0.1], dtype=torch.float64)
+    expected = (WOBBLE * lengths / (lengths + WOBBLE)).sum()
+    expected.backward()
+    assert float(loss.detach()) == pytest.approx(float(expected.detach()), rel=1e-3)
+    assert curve.bend.grad is not None
+    assert curve.speed.grad is not None
+    assert bend.grad is not None
+    torch.testing.assert_close(curve.bend.grad, torch.tensor([0.0, bend.grad.item(), 0.0]), rtol=2e-3, atol=1e-6)
+    torch.testing.assert_close(curve.speed.grad, torch.zeros(3), rtol=0, atol=1e-6)
+
+
+def test_what_turns_quickly_is_not_held_back() -> None:
+    small, large = (torch.tensor([[length, 0.0, 0.0]], requires_grad=True) for length in (0.1 * WOBBLE, 50 * WOBBLE))
+    for vectors in (small, large):
+        robust_length(vectors).backward()
+    assert small.grad is not None
+    assert large.grad is not None
+    assert float(large.grad.norm()) < 1e-3 * float(small.grad.norm())
+
+
+@pytest.mark.parametrize("on_device", [False, True])
+def test_chosen_rows_move_as_all_do(device: Device, on_device: bool) -> None:
+    scene = scene_of(device, configure().field)
+    assert scene.field is not None
+    scene.field.on_device = on_device
+    for parameter in scene.field.parameters():
+        nn.init.normal_(parameter, std=0.1, generator=torch.Generator().manual_seed(1))
+    rows = torch.tensor([7, 2, 2, 5])
+    every, some = scene.deformed(0.4)[0], scene.deformed(0.4, rows=rows)[0]
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        torch.testing.assert_close(getattr(some, name), getattr(every, name)[rows], rtol=1e-5, atol=1e-6, msg=name)
+
+
+def test_times_lie_half_to_whole_the_reach_apart() -> None:
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(50):
+        moments = draw_moments(CONFIG, 40, 0.5, 101, generator)
+        assert moments is not None
+        assert len(moments.rows) == 20
+        assert 0.01 <= 0.5 - moments.before <= 0.02
+        assert moments.after - 0.5 == pytest.approx(0.5 - moments.before)
+    near_end = draw_moments(CONFIG, 40, 0.995, 101, generator)
+    assert near_end is not None
+    assert near_end.after == 1
+
+
+@pytest.mark.parametrize(
+    ("config", "count", "t", "times"),
+    [
+        (AccelerationConfig(), 40, 0.5, 101),
+        (CONFIG, 1, 0.5, 101),
+        (CONFIG, 40, 0.5, 1),
+        (CONFIG, 40, 0.0, 101),
+        (CONFIG, 40, 1.0, 101),
+    ],
+)
+def test_nowhere_to_look(config: AccelerationConfig, count: int, t: float, times: int) -> None:
+    generator = torch.Generator().manual_seed(0)
+    assert draw_moments(config, count, t, times, generator) is None
+
+
+def test_a_training_moves_more_evenly_with_it(dataset: Dataset, device: Device) -> None:
+    bends = []
+    for weight in ("0", "30"):
+        with Trainer(configure(acceleration__weight=weight, schedule__warm_up="0"), dataset, device) as training:
+            results = list(training)
+            assert ("acceleration" in {name for result in results for name in result.terms}) == (weight != "0")
+            before, now, after = (training.scene.at(t).means.detach() for t in (0.4, 0.5, 0.6))
+            bends.append(float((now - (before + after) / 2).norm(dim=1).median()))
+    assert bends[1] < 0.9 * bends[0]
+
+
+def test_it_repeats_to_the_last_bit(dataset: Dataset, device: Device, tmp_path: Path) -> None:
+    config = configure(acceleration__weight="1", schedule__steps="14")
+    for name in ("a", "b"):
+        train(config, dataset, tmp_path / name, device=device)
+    assert (tmp_path / "a" / "checkpoint.ply").read_bytes() == (tmp_path / "b" / "checkpoint.ply").read_bytes()
