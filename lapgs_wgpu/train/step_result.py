@@ -19,7 +19,7 @@ class StepResult(NamedTuple):
         psnr: mean over the step's views, dB.
         skipped: None, or why the step changed nothing: values that were not finite.
         terms: what each term of the loss adds to it, weight included, by name: `l1`, `ssim` (of 1 - SSIM), `pyramid`,
-            `ncc`, `smoothness` and `dynamics`, as far as they were computed, and each term of one's own.
+            `ncc`, `smoothness`, `acceleration` and `dynamics`, as far as they were computed, and each of one's own.
         pruned: number of Gaussians that were pruned because they contribute too little.
     """
 
