@@ -106,13 +106,24 @@ def test_times_lie_half_to_whole_the_reach_apart() -> None:
         (AccelerationConfig(), 40, 0.5, 101),
         (CONFIG, 1, 0.5, 101),
         (CONFIG, 40, 0.5, 1),
-        (CONFIG, 40, 0.0, 101),
-        (CONFIG, 40, 1.0, 101),
     ],
 )
 def test_nowhere_to_look(config: AccelerationConfig, count: int, t: float, times: int) -> None:
     generator = torch.Generator().manual_seed(0)
     assert draw_moments(config, count, t, times, generator) is None
+
+
+@pytest.mark.parametrize("t", [0.0, 1.0])
+def test_ends_of_the_clip_add_nothing(device: Device, t: float) -> None:
+    curve = Curve()
+    scene = scene_of(device, FieldConfig(kind="own"), curve)
+    moments = draw_moments(CONFIG, COUNT, t, 101, torch.Generator().manual_seed(0))
+    assert moments is not None
+    loss = acceleration_loss(scene, scene.at(t), t, moments)
+    loss.backward()
+    assert loss.item() < 1e-5
+    assert curve.bend.grad is not None
+    assert not curve.bend.grad.any()
 
 
 def test_a_training_moves_more_evenly_with_it(dataset: Dataset, device: Device) -> None:

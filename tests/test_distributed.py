@@ -139,7 +139,8 @@ def check_two_processes(config: Config, dataset: Dataset, device: Device, folder
 
 def test_two_processes_are_one_with_two_views(dataset: Dataset, data: Path, device: Device, tmp_path: Path) -> None:
     """And they give the same bits on each repetition."""
-    config = configure(schedule__batch="2", schedule__steps="24", data__path=str(data))
+    given = {"schedule__batch": "2", "schedule__steps": "24", "acceleration__weight": "1"}
+    config = configure(data__path=str(data), **given)
     check_two_processes(config, dataset, device, tmp_path)
     torchrun(tmp_path / "small.toml", tmp_path / "again")
     two, again = ((tmp_path / name / "checkpoint.ply").read_bytes() for name in ("two", "again"))

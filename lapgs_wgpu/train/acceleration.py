@@ -30,15 +30,14 @@ class Moments(NamedTuple):
 def draw_moments(
     config: AccelerationConfig, count: int, t: float, times: int, generator: torch.Generator
 ) -> Moments | None:
-    """Where the acceleration loss of `count` Gaussians looks in a step at time t; None where nowhere, as at an end of
-    the clip. times: how many moments the training images show."""
+    """Where the acceleration loss of `count` Gaussians looks in a step at time t; None where it is off. At an end of
+    the clip one of the times is t itself, and the loss 0. times: how many moments the training images show."""
     chosen = round(config.share * count)
     if chosen == 0 or config.weight == 0 or times < 2:
         return None
     rows = torch.randint(count, (chosen,), generator=generator)
     reach = config.frames / (times - 1) * (1 + float(torch.rand((), generator=generator))) / 2
-    before, after = max(t - reach, 0.0), min(t + reach, 1.0)
-    return Moments(rows, before, after) if before < t < after else None
+    return Moments(rows, max(t - reach, 0.0), min(t + reach, 1.0))
 
 
 def acceleration_loss(scene: Scene4D, now: Gaussians, t: float, moments: Moments) -> Tensor:

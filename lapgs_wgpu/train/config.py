@@ -283,6 +283,7 @@ class AccelerationConfig(Options):
         "largest distance in time from the view's; 1: that between two training images, if they are evenly spaced; "
         "drawn between half of it and all",
         2.0,
+        at_least=0.1,
     )
 
 
