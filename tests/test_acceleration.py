@@ -130,6 +130,13 @@ def test_a_training_moves_more_evenly_with_it(dataset: Dataset, device: Device) 
     assert bends[1] < 0.9 * bends[0]
 
 
+def test_it_rests_where_discovery_explains_what_moves(dataset: Dataset, device: Device) -> None:
+    with Trainer(configure(acceleration__weight=1.0, schedule__warm_up="0"), dataset, device) as training:
+        assert training.step().terms["acceleration"] > 0
+        training._field_fitted = True
+        assert "acceleration" not in training.step().terms
+
+
 def test_it_repeats_to_the_last_bit(dataset: Dataset, device: Device, tmp_path: Path) -> None:
     config = configure(acceleration__weight="1", schedule__steps="14")
     for name in ("a", "b"):

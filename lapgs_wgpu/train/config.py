@@ -275,7 +275,8 @@ class AccelerationConfig(Options):
     weight: float = option(
         "weight of the acceleration loss: how far means and scales are from the straight line between those shortly "
         "before and after, world units; a distance l counts as l / (1 + 100 l), so that fast motion is not held back; "
-        "begins as the smoothness loss does; 0: off",
+        "begins as the smoothness loss does, and is left out where discovery explains at least 80% of what moves; "
+        "0: off",
         0.0,
     )
     share: float = option("fraction of the Gaussians that it samples in each step, between 0 and 1", 0.25, at_most=1)
