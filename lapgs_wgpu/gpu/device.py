@@ -119,6 +119,8 @@ class Device:
         features = {name for name in _WANTED_FEATURES if name in adapter.features}
         if not subgroups:
             features.discard("subgroup")
+        if info.kind not in ("cpu", "integrated"):
+            features.discard("mappable-primary-buffers")  # slow where the device has a memory of its own
         limits = dict(_DEFAULT_LIMITS)
         if not default_limits:
             limits |= {name: adapter.limits[name] for name in _RAISED_LIMITS}
@@ -137,7 +139,7 @@ class Device:
         self.limits = limits
         self.features = features
         self.is_cpu = info.kind == "cpu"
-        self.mappable = "mappable-primary-buffers" in features and info.kind in ("cpu", "integrated")
+        self.mappable = "mappable-primary-buffers" in features
         self.textures = self.is_cpu and limits.get("max-storage-textures-per-shader-stage", 0) >= 8
         self.max_loop_turns = SOFTWARE_LOOP_TURNS if self.is_cpu else None
         self.kernel_cache: dict[Any, Any] = {}
