@@ -326,9 +326,9 @@ class Trainer:
             return None, None
         times = len(self.dataset.times)
         nearby = draw_nearby(config.smoothness, count, t, generator)
-        # What discovery has followed through the clip has its depth from there.
-        known = self._field_fitted
-        return nearby, None if known else draw_moments(config.acceleration, count, t, times, generator)
+        if self._field_fitted:  # what discovery has followed through the clip has its depth from there
+            return nearby, None
+        return nearby, draw_moments(config.acceleration, count, t, times, generator)
 
     def _loss(self, look: _Look, moving: bool) -> tuple[Tensor, RenderLoss, dict[str, float]]:
         """The loss of a view, all terms together, its rendering, and what each term adds."""
