@@ -182,6 +182,7 @@ def test_only_devices_that_share_memory_are_mapped() -> None:
     assert Device(adapter, SOFTWARE).mappable
     assert Device(adapter, INTEGRATED).mappable
     assert not Device(adapter, DISCRETE).mappable
+    assert adapter.requests[-1]["required_features"] == ["subgroup"]
     adapter.features.discard("mappable-primary-buffers")
     assert not Device(adapter, SOFTWARE).mappable
 
