@@ -19,13 +19,12 @@ from PIL import Image
 
 from lapgs_wgpu.data import Dataset
 from lapgs_wgpu.data.normalize import Normalization
-from lapgs_wgpu.errors import DeviceMemoryError, InputError
+from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.checkpoint import read_checkpoint
-from lapgs_wgpu.motion.passes.decoder_passes import DecoderPasses
 from lapgs_wgpu.motion.scene import Scene4D, load
-from lapgs_wgpu.train import autotune, trainer
 from lapgs_wgpu.train import run as run_module
+from lapgs_wgpu.train import trainer
 from lapgs_wgpu.train.config import LossWeights
 from lapgs_wgpu.train.dataloader import Pictures
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
@@ -33,7 +32,7 @@ from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.run import train
 from lapgs_wgpu.train.step_result import StepResult
-from lapgs_wgpu.train.trainer import Trainer
+from lapgs_wgpu.train.suited import with_decoder_placed
 
 
 @pytest.fixture(scope="module")
@@ -204,63 +203,41 @@ def test_the_decoder_on_the_device_trains_as_well_and_repeats(
     assert psnrs[0] == pytest.approx(psnrs[1], abs=0.5)
 
 
-@pytest.mark.parametrize(("seconds", "place"), [((0.3, 0.2), "device"), ((0.2, 0.3), "torch")])
-def test_a_trial_chooses_where_the_decoder_works(
-    seconds: tuple[float, float],
-    place: str,
-    dataset: Dataset,
-    device: Device,
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    """On devices that are no CPUs; the choice is written down, so that a resumed run keeps to it."""
-    monkeypatch.setattr(device, "is_cpu", False)
-    monkeypatch.setattr(autotune, "_seconds", lambda scene, field, there: seconds[there == "device"])
-    train(configure(schedule__steps="1"), dataset, tmp_path / "run", device=device)
-    assert load_config(str(tmp_path / "run/config.toml")).decoder == place
-    assert f"decoder: {place} (a trial took " in capsys.readouterr().out
-
-
-def test_a_device_too_small_for_the_decoder_leaves_it_to_torch(
-    dataset: Dataset,
-    device: Device,
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    def too_large(*arguments: Any) -> None:
-        raise DeviceMemoryError("buffer 'layers' needs more")
-
-    monkeypatch.setattr(device, "is_cpu", False)
-    monkeypatch.setattr(DecoderPasses, "decode_bwd", too_large)
-    train(configure(schedule__steps="1"), dataset, tmp_path / "run", device=device)
-    assert "ms in torch, more memory than the device has)" in capsys.readouterr().out
-
-
-def test_the_trial_leaves_no_trace(dataset: Dataset, device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(device, "is_cpu", False)
-    with closing(Trainer(configure(), dataset, device)) as trained:
-        assert set(trained.decoder.seconds) == {"torch", "device"}
-        assert all(0 < seconds < 60 for seconds in trained.decoder.seconds.values())
-        scene, random = trained.scene, trained.state()["training.random"]
-        assert scene.field is not None
-        assert all(p.grad is None for p in (*scene.field.parameters(), *scene.parameters.values()))
-    with closing(Trainer(configure(decoder="torch"), dataset, device)) as untried:
-        assert not untried.decoder.seconds
-        assert untried.decoder.place == "torch"
-        assert np.array_equal(untried.state()["training.random"], random)
-
-
 @pytest.mark.parametrize(
-    "given", [{"method": "static"}, {"method": "hexplane"}, {"field__depth": "1"}, {"precision": "bfloat16"}]
+    ("given", "is_cpu", "place"),
+    [
+        ({}, True, "torch"),
+        ({}, False, "device"),
+        ({"method": "grid4d"}, False, "device"),
+        ({"method": "static"}, False, "torch"),
+        ({"method": "hexplane"}, False, "torch"),
+        ({"field__depth": "1"}, False, "torch"),
+        ({"precision": "bfloat16"}, False, "torch"),
+        ({"decoder": "torch"}, False, "torch"),
+        ({"decoder": "device"}, True, "device"),
+    ],
 )
-def test_nothing_is_tried_where_only_torch_will_do(
-    given: dict[str, str], dataset: Dataset, device: Device, monkeypatch: pytest.MonkeyPatch
+def test_where_the_decoder_works_follows_from_the_device(
+    given: dict[str, str], is_cpu: bool, place: str, device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(device, "is_cpu", is_cpu)
+    config = configure(**given)
+    assert with_decoder_placed(config, device) == dataclasses.replace(config, decoder=place)
+
+
+def test_the_place_of_the_decoder_is_told_and_recorded(
+    dataset: Dataset,
+    device: Device,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    train(configure(schedule__steps="1"), dataset, tmp_path / "cpu", device=device)
+    assert "decoder:" not in capsys.readouterr().out
     monkeypatch.setattr(device, "is_cpu", False)
-    with closing(Trainer(configure(**given), dataset, device)) as trained:
-        assert trained.decoder == autotune.Choice("torch", {})
+    train(configure(schedule__steps="1"), dataset, tmp_path / "gpu", device=device)
+    assert "decoder: on the device\n" in capsys.readouterr().out
+    assert load_config(str(tmp_path / "gpu/config.toml")).decoder == "device"
 
 
 def test_a_processor_without_bfloat16_is_told(

@@ -418,8 +418,8 @@ class Config(Options):
     decoder: DecoderPlace = option(
         "where the decoder of the fields grid4d and laplacian runs during training; torch: on the CPU; "
         "device: as kernels on the device, which changes the last bits and needs precision float32, field.depth 0 and, "
-        "for the field laplacian, field.motion laplacian; auto: torch on CPU devices, otherwise the faster of the two "
-        "in a trial at the start, recorded in config.toml",
+        "for the field laplacian, field.motion laplacian; auto: torch on CPU devices, device on others where it can; "
+        "config.toml records which",
         "torch",
     )
 

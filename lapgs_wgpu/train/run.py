@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import signal
 import sys
 import threading
@@ -23,7 +22,6 @@ from lapgs_wgpu.gpu.device import Device, open_device
 from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.scene import Scene4D
-from lapgs_wgpu.train.autotune import Choice
 from lapgs_wgpu.train.config import Background, Config
 from lapgs_wgpu.train.distributed import SINGLE_PROCESS, Ranks
 from lapgs_wgpu.train.evaluate import evaluate, write_metrics
@@ -98,8 +96,8 @@ def train(
         start_run_folder(out, training.given, training.scene.device, dataset)
         if training.discovery is not None:
             print(f"discovery: {training.discovery}; {training.discovery_seconds:.0f} s", flush=True)
-        if training.decoder.seconds:
-            print(_told(training.decoder), flush=True)
+        if training.config.decoder == "device":
+            print("decoder: on the device", flush=True)
         return _run(training, out, watch, lpips)
 
 
@@ -155,13 +153,6 @@ def _outside(scene: Scene4D) -> str:
         "cannot tell one from another; that is right for a background that stands still, but if something moves there, "
         "raise field.bound."
     )
-
-
-def _told(choice: Choice) -> str:
-    """Where the decoder works, and why, after a trial."""
-    torch_time, device_time = (1e3 * choice.seconds[place] for place in ("torch", "device"))
-    there = f"{device_time:.0f} ms on the device" if math.isfinite(device_time) else "more memory than the device has"
-    return f"decoder: {choice.place} (a trial took {torch_time:.0f} ms in torch, {there})"
 
 
 def _assist(training: Trainer) -> Scene4D:

@@ -1,4 +1,4 @@
-"""The configuration, suited to the data."""
+"""The configuration, suited to the data and the device."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import dataclasses
 import math
 
 from lapgs_wgpu.data.views import Dataset
+from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.train.config import Config
 
 
@@ -26,3 +27,16 @@ def suited(config: Config, dataset: Dataset) -> Config:
     # The Nyquist frequency is half the number of times; all frequencies above it would end there.
     most = 1 + math.floor(len(dataset.times) / 2 / field.frequency_step)
     return dataclasses.replace(config, field=dataclasses.replace(field, components=min(field.components, max(1, most))))
+
+
+def with_decoder_placed(config: Config, device: Device) -> Config:
+    """The configuration with the decoder's place, which "auto" leaves open, decided.
+
+    It is the device's own processor where it has one and the kernels can do it; a CPU device shares torch's, which
+    torch makes ten times more of. No trial decides, since the place changes the last bits, and near a tie two runs
+    would differ.
+    """
+    if config.decoder != "auto":
+        return config
+    able = config.field.decodes_on_device and config.precision == "float32"
+    return dataclasses.replace(config, decoder="device" if able and not device.is_cpu else "torch")

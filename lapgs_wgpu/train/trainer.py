@@ -26,7 +26,6 @@ from lapgs_wgpu.motion.fields.dynamics import dynamics_loss
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.acceleration import Moments, acceleration_loss, draw_moments
-from lapgs_wgpu.train.autotune import choose_decoder
 from lapgs_wgpu.train.camera_descent import scene_points
 from lapgs_wgpu.train.camera_refinement import CameraRefinement, Corrections
 from lapgs_wgpu.train.config import Config
@@ -48,7 +47,7 @@ from lapgs_wgpu.train.optimizer import FrequencyOptimizer, Optimizer
 from lapgs_wgpu.train.parts import Parts
 from lapgs_wgpu.train.smoothness import draw_nearby
 from lapgs_wgpu.train.step_result import StepResult
-from lapgs_wgpu.train.suited import suited
+from lapgs_wgpu.train.suited import suited, with_decoder_placed
 
 MAX_SH_DEGREE = 3
 # Of the configuration.
@@ -71,7 +70,7 @@ class Trainer:
 
     Attributes:
         scene: as the last step left it.
-        config: the configuration, suited to the data, with the decoder's place chosen.
+        config: the configuration, suited to the data and the device.
         given: the same before it was suited to the data, which config.toml holds.
         dataset: its test views are not touched by any step.
         parts: own field, losses, density control, learning rates and callbacks.
@@ -80,7 +79,6 @@ class Trainer:
         discovery: what motion discovery found, a sentence; None where it was left out.
         discovery_seconds: that it took; 0 where it was left out.
         cameras: the corrections of the training cameras; None where they are kept.
-        decoder: where the field's decoder runs, and why.
         ranks: this process among those that train together.
         whole: whether `state` is that of a whole step, which it also is where `step` raised an error before anything
             that lasts had changed.
@@ -122,8 +120,8 @@ class Trainer:
                 config = dataclasses.replace(config, field=dataclasses.replace(config.field, kind="own"))
             except ValueError as error:
                 raise InputError(f"{error}.") from None
-        given = config
-        config = suited(given, dataset)
+        self.given = with_decoder_placed(config, device)
+        self.config = config = suited(self.given, dataset)
         self.dataset, self.parts, self.callbacks = dataset, parts, list(parts.callbacks)
         if config.schedule.batch % ranks.count:
             raise InputError(
@@ -157,9 +155,6 @@ class Trainer:
             seed=config.seed,
             own_field=parts.field,
         )
-        self.decoder = choose_decoder(config, self.scene, device, ranks)
-        self.config = dataclasses.replace(config, decoder=self.decoder.place)
-        self.given = dataclasses.replace(given, decoder=self.decoder.place)
         self._start(corrections)
         self.whole = True
 
@@ -167,7 +162,7 @@ class Trainer:
         config, scene, dataset = self.config, self.scene, self.dataset
         if isinstance(scene.field, GridField):
             scene.field.precision = getattr(torch, config.precision)
-            scene.field.on_device = self.decoder.place == "device"
+            scene.field.on_device = config.decoder == "device"
         groups = scene.field.parameter_groups() if scene.field else {}
         rates = config.rates.schedules() | self.parts.schedules()
         for name in (*groups, *self.parts.rates):
