@@ -32,9 +32,8 @@ def suited(config: Config, dataset: Dataset) -> Config:
 def with_decoder_placed(config: Config, device: Device) -> Config:
     """The configuration with the decoder's place, which "auto" leaves open, decided.
 
-    It is the device's own processor where it has one and the kernels can do it; a CPU device shares torch's, which
-    torch makes ten times more of. No trial decides, since the place changes the last bits, and near a tie two runs
-    would differ.
+    It is the device where kernels for it exist, but for CPU devices: they share torch's processor, which torch makes
+    ten times more of. No trial decides, since the place changes the last bits, and near a tie two runs would differ.
     """
     if config.decoder != "auto":
         return config

@@ -71,7 +71,7 @@ class Trainer:
     Attributes:
         scene: as the last step left it.
         config: the configuration, suited to the data and the device.
-        given: the same before it was suited to the data, which config.toml holds.
+        given: the same before it was suited to the data, but for the decoder's place; config.toml holds it.
         dataset: its test views are not touched by any step.
         parts: own field, losses, density control, learning rates and callbacks.
         done: number of the steps so far.
