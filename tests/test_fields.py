@@ -8,14 +8,13 @@ import pytest
 import torch
 from helpers.encoder_reference import encode_reference
 from helpers.fields import COUNT, DYNAMICS, NEARBY, OURS, POINTS, ROWS, grid_field, made, parts, stirred
-from torch import Tensor, nn
+from torch import Tensor
 
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields import grid_field as grid_field_module
 from lapgs_wgpu.motion.fields.config import PLANES, FieldKind
 from lapgs_wgpu.motion.fields.hexplane_field import HexPlaneField
 from lapgs_wgpu.motion.fields.laplacian import LaplacianMotion, TimeMotion
-from lapgs_wgpu.motion.fields.layers import last_product
 from lapgs_wgpu.motion.fields.mlp_field import MlpField, octaves
 from lapgs_wgpu.motion.scene import make_field
 
@@ -161,18 +160,17 @@ def test_bfloat16_rounds_features_and_not_what_the_heads_give(device: Device) ->
         assert float((a - b).norm() / b.norm()) < 0.05
 
 
-@pytest.mark.parametrize("depth", [0, 1])
 @pytest.mark.parametrize("kind", ["grid4d", "laplacian"])
-def test_many_gaussians_are_decoded_in_blocks(
-    device: Device, kind: FieldKind, depth: int, monkeypatch: pytest.MonkeyPatch
+def test_many_gaussians_pass_hidden_layers_in_blocks(
+    device: Device, kind: FieldKind, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The same values and gradients, and of the decoder's activations none is kept for the backward pass."""
-    field = grid_field(device, replace(OURS, kind=kind, depth=depth, width=64))
+    field = grid_field(device, replace(OURS, kind=kind, depth=1, width=64))
     d = DYNAMICS.clone().requires_grad_() if kind == "laplacian" else None
     learnt = [*field.parameters(), *([] if d is None else [d])]
     found, kept = [], []
     for most in (COUNT, COUNT - 1):
-        monkeypatch.setattr(grid_field_module, "_KEPT", most)
+        monkeypatch.setattr(grid_field_module, "KEPT", most)
         monkeypatch.setattr(grid_field_module, "_BLOCK", 16)
         shapes: list[tuple[int, ...]] = []
         with torch.autograd.graph.saved_tensors_hooks(lambda x, to=shapes: to.append(tuple(x.shape)) or x, lambda x: x):
@@ -184,26 +182,6 @@ def test_many_gaussians_are_decoded_in_blocks(
     assert kept[1] == 0
     for whole, blocks in zip(*found, strict=True):
         torch.testing.assert_close(blocks, whole, rtol=1e-4, atol=1e-5)
-
-
-@pytest.mark.parametrize("shape", [(0, 5, 3), (1, 1, 1), (300, 64, 17)])
-def test_last_product(shape: tuple[int, int, int]) -> None:
-    count, inputs, outputs = shape
-    generator = torch.Generator().manual_seed(0)
-    x, weight, bias, d_output = (
-        torch.randn(size, generator=generator)
-        for size in ((count, inputs), (outputs, inputs), (outputs,), (count, outputs))
-    )
-    rounded = x.bfloat16().requires_grad_()
-    leaves = [rounded, weight.requires_grad_(), bias.requires_grad_()]
-    found = last_product(*leaves)
-    wide = [leaf.detach().double().requires_grad_() for leaf in leaves]
-    expected = nn.functional.linear(*wide)
-    torch.testing.assert_close(found.double(), expected, rtol=1e-5, atol=1e-5)
-    gradients = torch.autograd.grad(found, leaves, d_output), torch.autograd.grad(expected, wide, d_output.double())
-    for got, exact, leaf in zip(*gradients, leaves, strict=True):
-        assert got.dtype == leaf.dtype
-        assert float((got.double() - exact).norm()) <= 0.01 * float(exact.norm())
 
 
 def test_ablations_of_the_field(device: Device) -> None:

@@ -12,15 +12,15 @@ from ...gpu.device import Device
 from ..passes.decoder_passes import decoder_shape
 from .config import APPEARANCE_SCALE, GEOMETRY, TEMPORAL_AXES, FieldConfig
 from .decoder import Decoder
+from .decoder_layers import KEPT, DecoderWeights, decode
 from .deformation import Deformation, Nearby
 from .gate import gated
 from .hash_encoder import HashEncoder, HashGrid
 from .laplacian import LaplacianMotion, TimeMotion
-from .layers import last_product, linear, product, zero_head
+from .layers import linear, product, zero_head
 from .parameter_shapes import parameter_shapes
 
-_BLOCK = 1 << 13  # Gaussians per decoded block
-_KEPT = 1 << 16  # Gaussians up to which activations are kept for the backward pass instead of recomputed
+_BLOCK = 1 << 13  # Gaussians per block decoded by hidden layers
 
 
 class GridField(nn.Module):
@@ -110,7 +110,13 @@ class GridField(nn.Module):
             for a, b in zip(here, far, strict=True)
             if nearby is not None
         ]
-        return self._decode_blocks(t, dynamics, *here), torch.stack(apart) if apart else means.new_zeros(0)
+        if len(self.hidden):
+            outputs = self._decode_blocks(t, dynamics, *here)
+        else:
+            temporal = here[1] if self.config.temporal_hash else None
+            of_dynamics = dynamics if self.config.dynamics_size else None
+            outputs = decode(here[0], temporal, of_dynamics, self._weights(t))
+        return outputs, torch.stack(apart) if apart else means.new_zeros(0)
 
     def _on_device(
         self, means: Tensor, t: float, dynamics: Tensor | None, nearby: Nearby | None
@@ -127,15 +133,14 @@ class GridField(nn.Module):
             beside = torch.cat([means.new_zeros(len(means), size) if dynamics is None else dynamics, ones], dim=1)
         else:
             beside = ones
-        placed = [self._gate_weights()]
-        heads, bias = self._heads()
-        if isinstance(self.motion, LaplacianMotion):
-            placed.append((self.motion.first.weight, self.motion.first.bias))
-            folded, shift = (self.heads.weight @ factor for factor in self.motion.second_factor(t))
-            heads = torch.cat([heads, nn.functional.pad(folded, (0, 0, 0, len(heads) - len(folded)))], dim=1)
-            bias = bias + nn.functional.pad(shift, (0, len(bias) - len(shift)))
-        of_place = [nn.functional.pad(own[:, None], (size, 0)) for _, own in placed]
-        of_time = torch.cat([self.temporal.weight[:, :size], self.temporal.bias[:, None]], dim=1)
+        w = self._weights(t)
+        placed = [(w.spatial, w.spatial_bias)]
+        heads = w.heads
+        if w.inner is not None and w.inner_bias is not None and w.motion_heads is not None:
+            placed.append((w.inner, w.inner_bias))
+            heads = torch.cat([heads, w.motion_heads], dim=1)
+        of_place = [nn.functional.pad(bias[:, None], (size, 0)) for _, bias in placed]
+        of_time = torch.cat([self.temporal.weight[:, :size], w.temporal_bias[:, None]], dim=1)
         weights = {
             "beside": torch.cat([*of_place, of_time]),
             "static": torch.cat([weight for weight, _ in placed]),
@@ -143,57 +148,65 @@ class GridField(nn.Module):
             "heads": heads,
         }
         outputs, apart = self._decoder((means, time), beside, weights, compared)
-        return outputs + bias, apart
+        return outputs + w.heads_bias, apart
 
-    def _gate_weights(self) -> tuple[Tensor, Tensor]:
-        """Weight and bias of the spatial layer as `gated` reads it."""
-        return 0.5 * self.spatial.weight, 0.5 * self.spatial.bias
-
-    def _heads(self) -> tuple[Tensor, Tensor]:
-        """Weight and bias of all heads as one matrix, so that the features' gradient (N, width) is written once."""
+    def _weights(self, t: float) -> DecoderWeights:
+        """The decoder's weights at a time. The second layer of the motion, which only linear heads follow, is folded
+        into these, and all heads are one matrix, so that the features' gradient (N, width) is written once."""
+        size = self.config.dynamics_size
         looks = [] if self.appearance is None else [self.appearance]
-        weight = torch.cat([self.heads.weight, *(APPEARANCE_SCALE * head.weight for head in looks)])
-        return weight, torch.cat([self.heads.bias, *(APPEARANCE_SCALE * head.bias for head in looks)])
+        heads = torch.cat([self.heads.weight, *(APPEARANCE_SCALE * head.weight for head in looks)])
+        bias = torch.cat([self.heads.bias, *(APPEARANCE_SCALE * head.bias for head in looks)])
+        inner = inner_bias = motion_heads = None
+        if self.motion is not None:
+            (inner, inner_bias), second = self.motion.layers(t)
+            folded, shift = (self.heads.weight @ factor for factor in second)
+            rest = len(heads) - len(folded)
+            motion_heads = nn.functional.pad(folded, (0, 0, 0, rest))
+            bias = bias + nn.functional.pad(shift, (0, rest))
+        return DecoderWeights(
+            spatial=0.5 * self.spatial.weight,
+            spatial_bias=0.5 * self.spatial.bias,
+            temporal=self.temporal.weight[:, size:] if self.config.temporal_hash else None,
+            dynamics=self.temporal.weight[:, :size] if size else None,
+            temporal_bias=self.temporal.bias,
+            inner=inner,
+            inner_bias=inner_bias,
+            heads=heads,
+            motion_heads=motion_heads,
+            heads_bias=bias,
+        )
 
     def _decode_blocks(self, t: float, dynamics: Tensor | None, *features: Tensor) -> Tensor:
-        """`_decode` in blocks, which avoids large allocations. For many Gaussians the backward pass recomputes it: the
-        activations, 4 KB per Gaussian at a width of 256, would be most of a training's memory."""
-        decode = self._decode
-        if len(features[0]) > _KEPT:
-            decode = partial(checkpoint, decode, use_reentrant=False, preserve_rng_state=False)
+        """`_decode_hidden` in blocks, which avoids large allocations. For many Gaussians the backward pass recomputes
+        it: the activations, 4 KB per Gaussian at a width of 256, would be most of a training's memory."""
+        decode_block = self._decode_hidden
+        if len(features[0]) > KEPT:
+            decode_block = partial(checkpoint, decode_block, use_reentrant=False, preserve_rng_state=False)
         blocks = [part.split(_BLOCK) for part in features]
         of_dynamics = [None] * len(blocks[0]) if dynamics is None else dynamics.split(_BLOCK)
-        return torch.cat([decode(t, *block) for block in zip(of_dynamics, *blocks, strict=True)])
+        return torch.cat([decode_block(t, *block) for block in zip(of_dynamics, *blocks, strict=True)])
 
-    def _decode(self, t: float, dynamics: Tensor | None, static: Tensor, *temporal: Tensor) -> Tensor:
-        """Outputs of the geometry heads (N, 14) and, in further columns, of the appearance head."""
-        half = product(static, *self._gate_weights())
-        open_features = gated(self._moving(dynamics, static, *temporal), half)
-        motion = self.motion(static, t) if self.motion is not None else None
-        if len(self.hidden):
-            fused = open_features if motion is None else open_features + motion.features()
-            outputs = self.heads(self.hidden(fused.float()))
-            if self.appearance is None:
-                return outputs
-            return torch.cat([outputs, APPEARANCE_SCALE * self.appearance(open_features.float())], dim=1)
-        outputs = last_product(open_features, *self._heads())
-        if motion is not None:
-            moved = motion.through(self.heads.weight)
-            outputs = outputs + nn.functional.pad(moved, (0, outputs.shape[1] - moved.shape[1]))
-        return outputs
-
-    def _moving(self, dynamics: Tensor | None, static: Tensor, *temporal: Tensor) -> Tensor:
-        """The temporal layer (N, width) of dynamics attributes and temporal features, if the field has them. They are
-        multiplied separately, since concatenation would copy the largest tensors of all."""
-        size = self.config.dynamics_size
-        bias, weight = self.temporal.bias, self.temporal.weight
+    def _decode_hidden(
+        self, t: float, dynamics: Tensor | None, static: Tensor, temporal: Tensor | None = None
+    ) -> Tensor:
+        """Outputs of the geometry heads (N, 14) and, in further columns, of the appearance head, by hidden layers."""
+        half = product(static, 0.5 * self.spatial.weight, 0.5 * self.spatial.bias)
+        size, bias, weight = self.config.dynamics_size, self.temporal.bias, self.temporal.weight
+        moving = bias.to(static.dtype).expand(len(static), -1)
         if size and dynamics is not None:
             moving = product(dynamics.to(static.dtype), weight[:, :size], bias)
-        else:
-            moving = bias.to(static.dtype).expand(len(static), -1)
-        for features in temporal:
-            moving = torch.addmm(moving, features, weight[:, size:].to(features.dtype).T)
-        return moving
+        if temporal is not None:
+            moving = torch.addmm(moving, temporal, weight[:, size:].to(temporal.dtype).T)
+        features = gated(moving, half)
+        fused = features
+        if self.motion is not None:
+            first, second = self.motion.layers(t)
+            fused = fused + product(torch.relu(product(static, *first)), *second)
+        outputs = self.heads(self.hidden(fused.float()))
+        if self.appearance is not None:
+            outputs = torch.cat([outputs, APPEARANCE_SCALE * self.appearance(features.float())], dim=1)
+        return outputs
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """See motion/fields/deformation.py. The spectrum's frequencies, in no group, have their own optimiser."""

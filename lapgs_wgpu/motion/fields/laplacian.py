@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from .layers import last_product, linear, product
+from .layers import linear
 from .parameter_shapes import laplacian_motion, time_motion
 
 VARIANCE_FLOOR = 1e-4
@@ -17,23 +16,7 @@ VARIANCE_SPREAD = (
 )
 
 
-class Factors(NamedTuple):
-    """Features (N, W) = inner (N, W) @ matrix.T (W, W) + bias (W,), as factors.
-
-    If only linear heads follow, they can be folded into the matrix, which is small.
-    """
-
-    inner: Tensor
-    matrix: Tensor
-    bias: Tensor
-
-    def features(self) -> Tensor:
-        """(N, W)."""
-        return product(self.inner, self.matrix, self.bias)
-
-    def through(self, weight: Tensor) -> Tensor:
-        """features() @ weight.T for a weight (outputs, W), in fewer operations."""
-        return last_product(self.inner, weight @ self.matrix, weight @ self.bias)
+Layer = tuple[Tensor, Tensor]  # weight (outputs, inputs) and bias (outputs,)
 
 
 class LaplacianMotion(nn.Module):
@@ -71,15 +54,10 @@ class LaplacianMotion(nn.Module):
         phase = (2 * math.pi * t) * self.frequencies
         return phase.cos() @ self.alpha + phase.sin() @ self.beta
 
-    def forward(self, static: Tensor, t: float) -> Factors:
-        """A_L for static features H_s (N, inputs)."""
-        inner = torch.relu(product(static, self.first.weight, self.first.bias))
-        return Factors(inner, *self.second_factor(t))
-
-    def second_factor(self, t: float) -> tuple[Tensor, Tensor]:
-        """Matrix (W, W) and bias (W,) of `Factors`."""
+    def layers(self, t: float) -> tuple[Layer, Layer]:
+        """The layers of A_L at a time: rectified channels of static features, and features (N, W) of these."""
         series = self.series(t)
-        return series[:, None] * self.second.weight, series * self.second.bias
+        return (self.first.weight, self.first.bias), (series[:, None] * self.second.weight, series * self.second.bias)
 
     def amplitudes(self) -> Tensor:
         """(K,) |c_k|: root mean over the channels of alpha^2 + beta^2; without gradient."""
@@ -113,8 +91,7 @@ class TimeMotion(nn.Module):
         self.first = linear(shapes["first.weight"], generator)
         self.second = linear(shapes["second.weight"], generator)
 
-    def forward(self, static: Tensor, t: float) -> Factors:
-        """Features for static features H_s (N, inputs)."""
-        time = static.new_full((len(static), 1), t)
-        inner = torch.relu(product(torch.cat([static, time], dim=1), self.first.weight, self.first.bias))
-        return Factors(inner, self.second.weight, self.second.bias)
+    def layers(self, t: float) -> tuple[Layer, Layer]:
+        """As LaplacianMotion.layers; the time, the last input, is a part of the bias."""
+        weight, bias = self.first.weight, self.first.bias
+        return (weight[:, :-1], bias + t * weight[:, -1]), (self.second.weight, self.second.bias)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor, nn
 
@@ -31,25 +29,3 @@ def zero_head(shape: tuple[int, ...]) -> nn.Linear:
 def product(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     """x (N, inputs) @ weight.T + bias in the precision of x, to which the float32 weights are rounded."""
     return nn.functional.linear(x, weight.to(x.dtype), bias.to(x.dtype))
-
-
-def last_product(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    """The same product in float32 for any precision of x; gradients have the precision of x.
-
-    For the heads: rounding errors of single features average out in the sum, but rounding the sum would move Gaussians.
-    """
-    return nn.functional.linear(x, weight, bias) if x.dtype == weight.dtype else _LastProduct.apply(x, weight, bias)
-
-
-class _LastProduct(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-        ctx.save_for_backward(x, weight)
-        return nn.functional.linear(x.to(weight.dtype), weight, bias)
-
-    @staticmethod
-    def backward(ctx: Any, *d_outputs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        x, weight = ctx.saved_tensors
-        (d_output,) = d_outputs
-        rounded = d_output.to(x.dtype)
-        return rounded @ weight.to(x.dtype), (rounded.T @ x).to(weight.dtype), d_output.sum(0)

@@ -1,0 +1,126 @@
+"""The decoder without hidden layers in torch: against autograd of the same in float64, and in blocks."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+import torch
+from helpers.matrices import random
+from torch import Tensor
+
+from lapgs_wgpu.motion.fields import decoder_layers
+from lapgs_wgpu.motion.fields.decoder_layers import DecoderWeights, decode
+from lapgs_wgpu.motion.fields.gate import gated
+
+SHAPES = {
+    "static": 6,
+    "temporal": 9,
+    "dynamics": 3,
+}
+WIDTH, OUTPUTS = 12, 7
+Inputs = list[Tensor | None]
+# What a field lacks, by name of a field that lacks it.
+LACKS = {
+    "laplacian": (),
+    "grid4d": ("dynamics", "inner", "inner_bias", "motion_heads"),
+    "no dynamics": ("dynamics",),
+    "no temporal grids": ("temporal",),
+    "neither": ("temporal", "dynamics"),
+}
+
+
+def problem(count: int, lacks: tuple[str, ...] = ()) -> tuple[Inputs, DecoderWeights]:
+    inputs = [None if name in lacks else random(count, size, seed=i) for i, (name, size) in enumerate(SHAPES.items())]
+    shapes = {
+        "spatial": (WIDTH, SHAPES["static"]),
+        "spatial_bias": (WIDTH,),
+        "temporal": (WIDTH, SHAPES["temporal"]),
+        "dynamics": (WIDTH, SHAPES["dynamics"]),
+        "temporal_bias": (WIDTH,),
+        "inner": (WIDTH, SHAPES["static"]),
+        "inner_bias": (WIDTH,),
+        "heads": (OUTPUTS, WIDTH),
+        "motion_heads": (OUTPUTS, WIDTH),
+        "heads_bias": (OUTPUTS,),
+    }
+    weights = {name: None if name in lacks else random(*shapes[name], seed=9) for name in DecoderWeights._fields}
+    return inputs, DecoderWeights(**weights)
+
+
+def decode_reference(
+    static: Tensor, temporal: Tensor | None, dynamics: Tensor | None, weights: DecoderWeights
+) -> Tensor:
+    moving = weights.temporal_bias
+    if temporal is not None:
+        moving = moving + temporal @ weights.temporal.T
+    if dynamics is not None:
+        moving = moving + dynamics @ weights.dynamics.T
+    features = gated(moving.expand(len(static), -1), static @ weights.spatial.T + weights.spatial_bias)
+    outputs = features @ weights.heads.T + weights.heads_bias
+    if weights.inner is not None:
+        inner = torch.relu(static @ weights.inner.T + weights.inner_bias)
+        outputs = outputs + inner @ weights.motion_heads.T
+    return outputs
+
+
+def differentiated(function: object, inputs: Inputs, weights: DecoderWeights, dtype: torch.dtype) -> list[Tensor]:
+    """The outputs, and the gradients of all inputs and weights that there are."""
+    leaves = [None if each is None else each.to(dtype, copy=True).requires_grad_() for each in (*inputs, *weights)]
+    outputs = function(*leaves[: len(inputs)], DecoderWeights(*leaves[len(inputs) :]))
+    wanted = [each for each in leaves if each is not None]
+    return [outputs.detach(), *torch.autograd.grad(outputs, wanted, random(*outputs.shape, seed=5).to(dtype))]
+
+
+@pytest.mark.parametrize("lacks", LACKS.values(), ids=LACKS)
+@pytest.mark.parametrize("count", [1, 37, 1500])
+def test_decode(count: int, lacks: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(decoder_layers, "LARGEST", 400)
+    inputs, weights = problem(count, lacks)
+    expected = differentiated(decode_reference, inputs, weights, torch.float64)
+    for found, exact in zip(differentiated(decode, inputs, weights, torch.float64), expected, strict=True):
+        torch.testing.assert_close(found, exact, rtol=1e-9, atol=1e-9)
+    for found, exact in zip(differentiated(decode, inputs, weights, torch.float32), expected, strict=True):
+        torch.testing.assert_close(found.double(), exact, rtol=1e-4, atol=1e-4 * float(exact.abs().max()))
+
+
+def test_no_gaussians() -> None:
+    inputs, weights = problem(0)
+    outputs, *gradients = differentiated(decode, inputs, weights, torch.float32)
+    assert outputs.shape == (0, OUTPUTS)
+    assert not any(gradient.any() for gradient in gradients)
+
+
+@pytest.mark.parametrize("most", [1, 3, 8])
+def test_the_number_of_threads_changes_no_bit(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(decoder_layers, "LARGEST", 300)
+    inputs, weights = problem(2000)
+    expected = differentiated(decode, inputs, weights, torch.float32)
+    with ThreadPoolExecutor(most, initializer=torch.set_num_threads, initargs=(1,)) as threads:
+        monkeypatch.setattr(decoder_layers, "_threads", lambda: threads)
+        found = differentiated(decode, inputs, weights, torch.float32)
+    assert all(torch.equal(a, b) for a, b in zip(found, expected, strict=True))
+
+
+def test_many_gaussians_keep_no_activations(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are computed again: the same bits, also where a gradient is asked for twice."""
+    inputs, weights = problem(1200)
+    found, kept = [], []
+    for most in (1200, 1199):
+        monkeypatch.setattr(decoder_layers, "KEPT", most)
+        shapes: list[tuple[int, ...]] = []
+        static = inputs[0].clone().requires_grad_()
+        with torch.autograd.graph.saved_tensors_hooks(lambda x, to=shapes: to.append(tuple(x.shape)) or x, lambda x: x):
+            outputs = decode(static, *inputs[1:], weights)
+        kept.append((600, WIDTH) in shapes)
+        for retain in (True, False):
+            found.append(torch.autograd.grad(outputs.square().sum(), static, retain_graph=retain)[0])
+    assert kept == [True, False]
+    assert all(torch.equal(each, found[0]) for each in found)
+
+
+def test_gradients_are_recorded_by_the_caller_alone() -> None:
+    inputs, weights = problem(1200)
+    with torch.no_grad():
+        outputs = decode(*inputs, DecoderWeights(*(each.requires_grad_() for each in weights)))
+    assert not outputs.requires_grad
