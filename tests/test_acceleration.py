@@ -13,9 +13,9 @@ from torch import Tensor, nn
 from lapgs_wgpu.data import Dataset
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.config import FieldConfig
-from lapgs_wgpu.motion.fields.deformation import Deformation
+from lapgs_wgpu.motion.fields.deformation import Deformation, Moments
 from lapgs_wgpu.motion.scene import Scene4D
-from lapgs_wgpu.train.acceleration import WOBBLE, Moments, acceleration_loss, draw_moments, robust_length
+from lapgs_wgpu.train.acceleration import WOBBLE, acceleration_loss, draw_moments, robust_length
 from lapgs_wgpu.train.config import AccelerationConfig
 from lapgs_wgpu.train.run import train
 from lapgs_wgpu.train.trainer import Trainer
@@ -48,8 +48,8 @@ def test_value_is_the_robust_distance_from_the_chord(device: Device) -> None:
     """Of a parabola: |bend| (t - before) (after - t), of means and, a tenth, of scales."""
     curve = Curve()
     scene = scene_of(device, FieldConfig(kind="own"), curve)
-    moments = Moments(torch.tensor([0, 3, 3]), 0.33, 0.37)
-    loss = acceleration_loss(scene, scene.at(0.35), 0.35, moments)
+    moments = Moments(torch.tensor([0, 3, 3]), (0.33, 0.37))
+    loss = acceleration_loss(scene.deformed(0.35, moments=moments), 0.35, moments)
     loss.backward()
     bend = torch.tensor(0.4, dtype=torch.float64, requires_grad=True)
     lengths = bend * 0.02 * 0.02 * torch.tensor([1.0, 0.1], dtype=torch.float64)
@@ -80,9 +80,12 @@ def test_chosen_rows_move_as_all_do(device: Device, on_device: bool) -> None:
     for parameter in scene.field.parameters():
         nn.init.normal_(parameter, std=0.1, generator=torch.Generator().manual_seed(1))
     rows = torch.tensor([7, 2, 2, 5])
-    every, some = scene.deformed(0.4)[0], scene.deformed(0.4, rows=rows)[0]
-    for name in ("means", "quats", "scales", "opacities", "sh"):
-        torch.testing.assert_close(getattr(some, name), getattr(every, name)[rows], rtol=1e-5, atol=1e-6, msg=name)
+    found = scene.deformed(0.7, moments=Moments(rows, (0.4, 0.5)))
+    for t, (means, scales) in zip((0.4, 0.5), found.moments, strict=True):
+        every = scene.at(t)
+        torch.testing.assert_close(means, every.means[rows], rtol=1e-5, atol=1e-6)
+        torch.testing.assert_close(scales, every.scales[rows], rtol=1e-5, atol=1e-6)
+    assert not torch.allclose(found.moments[0][0], found.moments[1][0])
 
 
 def test_times_lie_half_to_whole_the_reach_apart() -> None:
@@ -91,11 +94,11 @@ def test_times_lie_half_to_whole_the_reach_apart() -> None:
         moments = draw_moments(CONFIG, 40, 0.5, 101, generator)
         assert moments is not None
         assert len(moments.rows) == 20
-        assert 0.01 <= 0.5 - moments.before <= 0.02
-        assert moments.after - 0.5 == pytest.approx(0.5 - moments.before)
+        assert 0.01 <= 0.5 - moments.times[0] <= 0.02
+        assert moments.times[1] - 0.5 == pytest.approx(0.5 - moments.times[0])
     near_end = draw_moments(CONFIG, 40, 0.995, 101, generator)
     assert near_end is not None
-    assert near_end.after == 1
+    assert near_end.times[1] == 1
 
 
 @pytest.mark.parametrize(
@@ -112,7 +115,7 @@ def test_ends_of_the_clip_add_nothing(device: Device, t: float) -> None:
     scene = scene_of(device, FieldConfig(kind="own"), curve)
     moments = draw_moments(CONFIG, COUNT, t, 101, torch.Generator().manual_seed(0))
     assert moments is not None
-    loss = acceleration_loss(scene, scene.at(t), t, moments)
+    loss = acceleration_loss(scene.deformed(t, moments=moments), t, moments)
     loss.backward()
     assert loss.item() < 1e-5
     assert curve.bend.grad is not None

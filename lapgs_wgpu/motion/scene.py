@@ -6,7 +6,7 @@ import dataclasses
 import json
 import os
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -23,7 +23,7 @@ from ..splat.gaussians import Gaussians
 from ..splat.rasterize import Rendering, rasterize
 from ..splat.rotation import multiply, rotate
 from .fields.config import MIN_SCALE, FieldConfig
-from .fields.deformation import Nearby
+from .fields.deformation import Deformation, Moments, Nearby
 from .fields.grid_field import GridField
 from .fields.hexplane_field import HexPlaneField
 from .fields.laplacian import LaplacianMotion
@@ -55,6 +55,20 @@ def make_field(config: FieldConfig, device: Device, seed: int = 0, own: nn.Modul
     if config.kind == "hexplane":
         return HexPlaneField(config, seed)
     return GridField(config, device, seed)
+
+
+class Deformed(NamedTuple):
+    """Gaussians at a time.
+
+    Attributes:
+        gaussians: activated.
+        smoothness: the weighted smoothness loss, if it was asked for.
+        moments: means (M, 3) and scales (M, 3) of chosen Gaussians at each further time that was asked for.
+    """
+
+    gaussians: Gaussians[Tensor]
+    smoothness: Tensor | None
+    moments: list[tuple[Tensor, Tensor]]
 
 
 class Scene4D:
@@ -168,39 +182,61 @@ class Scene4D:
         """The Gaussians at time t in [0, 1], activated. Differentiable in `parameters` and the field's parameters."""
         return self.deformed(t)[0]
 
-    def deformed(
-        self, t: float, nearby: Nearby | None = None, rows: Tensor | None = None
-    ) -> tuple[Gaussians, Tensor | None]:
-        """The Gaussians at time t in [0, 1], and the weighted smoothness loss for `nearby`, None without it.
+    def deformed(self, t: float, nearby: Nearby | None = None, moments: Moments | None = None) -> Deformed:
+        """The Gaussians at time t in [0, 1], with what the losses of motion compare.
 
-        rows: (M,) of the Gaussians; None for all.
+        Args:
+            t: time in [0, 1].
+            nearby: where the smoothness loss looks; None without it.
+            moments: some of the Gaussians and further times.
+
+        Returns:
+            Deformed. Differentiable in `parameters` and the field's parameters.
         """
-        p: Mapping[str, Tensor] = self.parameters
-        if rows is not None:
-            p = {name: values[rows] for name, values in p.items()}
+        p = self.parameters
         still = self._activated(p)
         if self.field is None or len(self) == 0:
-            return still, None
-        move = self.field(p["means"], t, p.get("dynamics"), nearby)
-        means, quats, scales, sh, opacities = still.means, still.quats, still.scales, still.sh, still.opacities
-        if move.rotation is not None:
-            means = rotate(move.rotation, means)
-        if move.translation is not None:
-            means = means + move.translation
+            return Deformed(still, None, [])
+        move, *others = self._moves(t, nearby, moments)
+        quats, sh, opacities = still.quats, still.sh, still.opacities
         if move.orientation is not None:
             quats = multiply(move.orientation, quats)
         if move.d_quats is not None:
             quats = nn.functional.normalize(quats + move.d_quats, dim=1)
+        if move.d_dc is not None:
+            sh = torch.cat([sh[:, :1] + move.d_dc[:, None], sh[:, 1:]], dim=1)
+        if move.d_opacity is not None:
+            opacities = (p["opacity_logits"] + move.d_opacity).sigmoid()
+        means, scales = self._placed(move, still.means, still.scales)
+        placed = []
+        if moments is not None:
+            of_rows = p["means"][moments.rows], still.scales[moments.rows]
+            placed = [self._placed(each, *of_rows) for each in others]
+        return Deformed(Gaussians(means, quats, scales, opacities, sh), move.smoothness, placed)
+
+    def _moves(self, t: float, nearby: Nearby | None, moments: Moments | None) -> list[Deformation]:
+        field, means, dynamics = self.field, self.parameters["means"], self.parameters.get("dynamics")
+        assert field is not None
+        if isinstance(field, GridField):
+            return field.at_moments(means, t, dynamics, nearby, moments)
+        move = field(means, t, dynamics, nearby)
+        if moments is None:
+            return [move]
+        chosen, of_rows = means[moments.rows], None if dynamics is None else dynamics[moments.rows]
+        return [move, *(field(chosen, time, of_rows) for time in moments.times)]
+
+    def _placed(self, move: Deformation, means: Tensor, scales: Tensor) -> tuple[Tensor, Tensor]:
+        """Means and scales after a move."""
+        if move.rotation is not None:
+            means = rotate(move.rotation, means)
+        if move.translation is not None:
+            means = means + move.translation
         if move.d_scales is not None:
             scales = scales + move.d_scales
             if self.field_config.negative_scales == "mirror":
                 scales = scales.abs()
             scales = scales.clamp(min=MIN_SCALE)
-        if move.d_dc is not None:
-            sh = torch.cat([sh[:, :1] + move.d_dc[:, None], sh[:, 1:]], dim=1)
-        if move.d_opacity is not None:
-            opacities = (p["opacity_logits"] + move.d_opacity).sigmoid()
-        return Gaussians(means, quats, scales, opacities, sh), move.smoothness
+        return means, scales
 
     def render(self, camera: Camera, t: float, background: Tensor | None = None, *, depth: bool = True) -> Rendering:
         """Render the scene, without gradients.

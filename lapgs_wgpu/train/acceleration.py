@@ -6,25 +6,15 @@ Distances saturate, so that what really turns quickly is not held back.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 
-from lapgs_wgpu.motion.scene import Scene4D
-from lapgs_wgpu.splat.gaussians import Gaussians
+from lapgs_wgpu.motion.fields.deformation import Moments
+from lapgs_wgpu.motion.scene import Deformed
 from lapgs_wgpu.train.config import AccelerationConfig
 
 WOBBLE = 1e-2  # world units: distances far below it count as they are, those far above it all as much as it
 EPSILON = 1e-12  # world units squared: keeps the gradient of a distance of 0 finite
-
-
-class Moments(NamedTuple):
-    """What a step compares. rows: (M,) Gaussians. before, after: times in [0, 1] around that of the step's view."""
-
-    rows: Tensor
-    before: float
-    after: float
 
 
 def draw_moments(
@@ -37,17 +27,17 @@ def draw_moments(
         return None
     rows = torch.randint(count, (chosen,), generator=generator)
     reach = config.frames / (times - 1) * (1 + float(torch.rand((), generator=generator))) / 2
-    return Moments(rows, max(t - reach, 0.0), min(t + reach, 1.0))
+    return Moments(rows, (max(t - reach, 0.0), min(t + reach, 1.0)))
 
 
-def acceleration_loss(scene: Scene4D, now: Gaussians, t: float, moments: Moments) -> Tensor:
+def acceleration_loss(now: Deformed, t: float, moments: Moments) -> Tensor:
     """The robust distance of means from the straight line between those before and after, and likewise of scales, on
-    the average over the chosen Gaussians; world units. now: the scene's Gaussians at time t."""
-    rows = moments.rows
-    before, after = (scene.deformed(each, rows=rows)[0] for each in (moments.before, moments.after))
-    share = (t - moments.before) / (moments.after - moments.before)
-    means = now.means[rows] - torch.lerp(before.means, after.means, share)
-    scales = now.scales[rows] - torch.lerp(before.scales, after.scales, share)
+    the average over the chosen Gaussians; world units. now: the Gaussians at time t and at these moments."""
+    rows, (before, after) = moments
+    share = (t - before) / (after - before)
+    (first_means, first_scales), (last_means, last_scales) = now.moments
+    means = now.gaussians.means[rows] - torch.lerp(first_means, last_means, share)
+    scales = now.gaussians.scales[rows] - torch.lerp(first_scales, last_scales, share)
     return robust_length(means) + robust_length(scales)
 
 

@@ -279,7 +279,13 @@ class AccelerationConfig(Options):
         "0: off",
         0.0,
     )
-    share: float = option("fraction of the Gaussians that it samples in each step, between 0 and 1", 0.25, at_most=1)
+    share: float = option("fraction of the Gaussians that it samples each time, between 0 and 1", 0.25, at_most=1)
+    interval: int = option(
+        "compute it every so many steps, then with so many times the weight: most of its time is the same for few "
+        "Gaussians as for many",
+        1,
+        at_least=1,
+    )
     frames: float = option(
         "largest distance in time from the view's; 1: that between two training images, if they are evenly spaced; "
         "drawn between half of it and all",

@@ -21,11 +21,11 @@ from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device, open_device
 from lapgs_wgpu.io.initial_view import InitialView, captured_arc
 from lapgs_wgpu.motion.fields.config import MIN_SCALE
-from lapgs_wgpu.motion.fields.deformation import Nearby
+from lapgs_wgpu.motion.fields.deformation import Moments, Nearby
 from lapgs_wgpu.motion.fields.dynamics import dynamics_loss
 from lapgs_wgpu.motion.fields.grid_field import GridField
-from lapgs_wgpu.motion.scene import Scene4D
-from lapgs_wgpu.train.acceleration import Moments, acceleration_loss, draw_moments
+from lapgs_wgpu.motion.scene import Deformed, Scene4D
+from lapgs_wgpu.train.acceleration import acceleration_loss, draw_moments
 from lapgs_wgpu.train.camera_descent import scene_points
 from lapgs_wgpu.train.camera_refinement import CameraRefinement, Corrections
 from lapgs_wgpu.train.config import Config
@@ -323,15 +323,18 @@ class Trainer:
         nearby = draw_nearby(config.smoothness, count, t, generator)
         if self._field_fitted:  # what discovery has followed through the clip has its depth from there
             return nearby, None
+        if (self.done + 1) % config.acceleration.interval:
+            return nearby, None
         return nearby, draw_moments(config.acceleration, count, t, times, generator)
 
     def _loss(self, look: _Look, moving: bool) -> tuple[Tensor, RenderLoss, dict[str, float]]:
         """The loss of a view, all terms together, its rendering, and what each term adds."""
         config, scene, view = self.config, self.scene, look.view
         if moving:
-            gaussians, smoothness = scene.deformed(view.time, look.nearby)
+            now = scene.deformed(view.time, look.nearby, look.moments)
         else:
-            gaussians, smoothness = scene.canonical(), None
+            now = Deformed(scene.canonical(), None, [])
+        gaussians = now.gaussians
         weights = config.loss.weights(warm=moving)
         truth = self._pictures.on_device(view)
         correction = None if self._exposures is None else self._exposures.values[self._numbers[view.name]]
@@ -345,12 +348,11 @@ class Trainer:
         )
         self._scales = gaussians.scales.detach()
         beside: dict[str, Tensor] = {}
-        if smoothness is not None:
-            beside["smoothness"] = smoothness
+        if now.smoothness is not None:
+            beside["smoothness"] = now.smoothness
         if look.moments is not None:
-            beside["acceleration"] = config.acceleration.weight * acceleration_loss(
-                scene, gaussians, view.time, look.moments
-            )
+            weight = config.acceleration.weight * config.acceleration.interval
+            beside["acceleration"] = weight * acceleration_loss(now, view.time, look.moments)
         if moving and "dynamics" in scene.parameters:
             spread = dynamics_loss(scene.parameters["dynamics"], config.loss.dynamics_mode)
             beside["dynamics"] = config.loss.dynamics * spread

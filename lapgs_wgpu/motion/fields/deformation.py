@@ -27,6 +27,13 @@ class Nearby(NamedTuple):
     temporal_weight: float
 
 
+class Moments(NamedTuple):
+    """Some of the Gaussians at further times. rows: (M,) indices. times: in [0, 1]."""
+
+    rows: Tensor
+    times: tuple[float, ...]
+
+
 class Deformation(NamedTuple):
     """Changes of N Gaussians at a time. None: no change.
 
