@@ -134,7 +134,9 @@ def test_a_training_moves_more_evenly_with_it(dataset: Dataset, device: Device) 
 
 
 def test_it_rests_where_discovery_explains_what_moves(dataset: Dataset, device: Device) -> None:
-    with Trainer(configure(acceleration__weight=1.0, schedule__warm_up="0"), dataset, device) as training:
+    with Trainer(
+        configure(acceleration__weight="1", acceleration__interval="1", schedule__warm_up="0"), dataset, device
+    ) as training:
         assert training.step().terms["acceleration"] > 0
         training._field_fitted = True
         assert "acceleration" not in training.step().terms
@@ -145,3 +147,25 @@ def test_it_repeats_to_the_last_bit(dataset: Dataset, device: Device, tmp_path: 
     for name in ("a", "b"):
         train(config, dataset, tmp_path / name, device=device)
     assert (tmp_path / "a" / "checkpoint.ply").read_bytes() == (tmp_path / "b" / "checkpoint.ply").read_bytes()
+
+
+def test_static_scenes_have_nothing_to_compare(dataset: Dataset, device: Device) -> None:
+    with Trainer(
+        configure("static", acceleration__weight="1", acceleration__interval="1"), dataset, device
+    ) as training:
+        assert all("acceleration" not in result.terms for result in training)
+
+
+def test_it_rests_between_and_counts_the_more(dataset: Dataset, device: Device) -> None:
+    """Every third step, then with three times the weight: here from the same state."""
+    terms = []
+    for interval, done in (("3", 0), ("3", 1), ("3", 2), ("1", 2)):
+        given = {"acceleration__weight": "1", "acceleration__interval": interval, "acceleration__share": "1"}
+        with Trainer(configure(schedule__warm_up="0", **given), dataset, device) as training:
+            for parameter in training.scene.field.parameters():
+                nn.init.normal_(parameter, std=0.1, generator=torch.Generator().manual_seed(1))
+            training.done = done
+            terms.append(training.step().terms.get("acceleration"))
+    assert terms[:2] == [None, None]
+    assert terms[2] == pytest.approx(3 * terms[3])
+    assert terms[3] > 0

@@ -109,7 +109,7 @@ def test_terms_add_up_to_the_loss(dataset: Dataset, device: Device) -> None:
     for result in results:
         assert sum(result.terms.values()) == pytest.approx(result.loss, rel=1e-5)
     assert set(results[0].terms) == {"l1", "ssim", "pyramid"}
-    assert set(results[-1].terms) == {"l1", "ssim", "pyramid", "ncc", "smoothness", "dynamics"}
+    assert set(results[-1].terms) == {"l1", "ssim", "pyramid", "ncc", "smoothness", "acceleration", "dynamics"}
 
 
 def test_an_error_of_a_callback_leaves_the_step_done(dataset: Dataset, device: Device, tmp_path: Path) -> None:

@@ -78,7 +78,7 @@ def test_a_run_is_whole(run: Path, dataset: Dataset) -> None:
         "step", "loss", "psnr", "terms", "gaussians", "pruned", "dead_scales", "frequencies", "amplitudes", "memory",
         "timing",
     }  # fmt: skip
-    assert set(last["terms"]) == {"l1", "ssim", "pyramid", "ncc", "smoothness", "dynamics"}
+    assert set(last["terms"]) == {"l1", "ssim", "pyramid", "ncc", "smoothness", "acceleration", "dynamics"}
     assert sum(last["terms"].values()) == pytest.approx(last["loss"], rel=1e-5)
     assert 0 <= last["dead_scales"] <= 1
     assert all(last["memory"][name] > 1e5 for name in ("host_bytes", "device_bytes"))

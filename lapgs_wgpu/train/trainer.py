@@ -321,9 +321,9 @@ class Trainer:
             return None, None
         times = len(self.dataset.times)
         nearby = draw_nearby(config.smoothness, count, t, generator)
-        if self._field_fitted:  # what discovery has followed through the clip has its depth from there
-            return nearby, None
-        if (self.done + 1) % config.acceleration.interval:
+        # What discovery has followed through the clip has its depth from there.
+        rests = self._field_fitted or (self.done + 1) % config.acceleration.interval
+        if rests or self.scene.field is None:
             return nearby, None
         return nearby, draw_moments(config.acceleration, count, t, times, generator)
 
