@@ -222,8 +222,8 @@ class Scene4D:
         move = field(means, t, dynamics, nearby)
         if moments is None:
             return [move]
-        chosen, of_rows = means[moments.rows], None if dynamics is None else dynamics[moments.rows]
-        return [move, *(field(chosen, time, of_rows) for time in moments.times)]
+        their_means, their_dynamics = moments.chosen(means, dynamics)
+        return [move, *(field(their_means, time, their_dynamics) for time in moments.times)]
 
     def _placed(self, move: Deformation, means: Tensor, scales: Tensor) -> tuple[Tensor, Tensor]:
         """Means and scales after a move."""

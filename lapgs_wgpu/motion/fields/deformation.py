@@ -33,6 +33,10 @@ class Moments(NamedTuple):
     rows: Tensor
     times: tuple[float, ...]
 
+    def chosen(self, means: Tensor, dynamics: Tensor | None) -> tuple[Tensor, Tensor | None]:
+        """The rows of all Gaussians' means (N, 3) and dynamics attributes (N, D)."""
+        return means[self.rows], None if dynamics is None else dynamics[self.rows]
+
 
 class Deformation(NamedTuple):
     """Changes of N Gaussians at a time. None: no change.

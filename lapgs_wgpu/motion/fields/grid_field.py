@@ -123,9 +123,9 @@ class GridField(nn.Module):
             places.append((means[nearby.rows] + nearby.offsets, self.config.grid_time(nearby.time)))
         decoded = [(t, dynamics)]
         if moments is not None:
-            chosen, of_rows = means[moments.rows], None if dynamics is None else dynamics[moments.rows]
-            places += [(chosen, self.config.grid_time(time)) for time in moments.times]
-            decoded += [(time, of_rows) for time in moments.times]
+            their_means, their_dynamics = moments.chosen(means, dynamics)
+            places += [(their_means, self.config.grid_time(time)) for time in moments.times]
+            decoded += [(time, their_dynamics) for time in moments.times]
         precision = self.precision if torch.is_grad_enabled() else torch.float32
         here, *others = self._encoder.encode_all(places, precision)
         apart = []
@@ -147,8 +147,8 @@ class GridField(nn.Module):
         """The same on the device, without transferring features or their gradients."""
         others = []
         if moments is not None:
-            of_rows = None if dynamics is None else dynamics[moments.rows]
-            others = [self._on_device(means[moments.rows], time, of_rows, None, None)[0] for time in moments.times]
+            their_means, their_dynamics = moments.chosen(means, dynamics)
+            others = [self._on_device(their_means, time, their_dynamics, None, None)[0] for time in moments.times]
         time = self.config.grid_time(t)
         compared = None
         if nearby is not None:
