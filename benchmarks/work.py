@@ -86,7 +86,6 @@ def raster_work(scene: SceneCounts, rasterizer: Rasterizer) -> dict[str, Work]:
         "project": Work(44 * n + 52 * n + 52 * v, 20 * n + 145 * v + 55 * rows),
         "color": Work(4 * n + 24 * v),
         "scan_reduce": Work(4 * n + 8 * v + 4 * counters, n + v + counters),
-        "scan_blocks": Work(8 * (n + v + counters) / 2048),
         "scan_apply": Work(12 * n + 20 * v + 12 * counters, 2 * (n + v + counters)),
         "compact": Work(4 * n + 28 * v),
         "sort_count": Work(4 * keys + 4 * counters, 4 * keys),

@@ -1,4 +1,4 @@
-// Scan, 1 of 3: the sum of each block.
+// Scan, 1 of 2: the sum of each block.
 #import common/index
 #import common/block
 #import common/scan_input

@@ -2,8 +2,12 @@
 #import common/index
 #import common/sort
 
-// [digit][owner], exclusive prefix sums
+// [digit][owner]: exclusive prefix sums, or, for few owners (UNSUMMED), counts that each lane adds up for itself
+#ifdef UNSUMMED
+#table 3 counters: vec4<u32>
+#else
 #table 3 counters: u32
+#endif
 @group(0) @binding(4) var<storage, read_write> keys_out: array<u32>;
 @group(0) @binding(5) var<storage, read_write> payload_out: array<u32>;
 
@@ -15,9 +19,22 @@
 @compute @workgroup_size(8)
 fn main(@builtin(global_invocation_id) id: vec3<u32>) {
     let lane = id.x;
+#ifdef UNSUMMED
+    var before = 0u;
+    for (var d = 0u; d < sort.digits; d++) {
+        var place = before;
+        for (var q = 0u; q < sort.owners / 4u; q++) {
+            let four = counters_at(d * (sort.owners / 4u) + q);
+            place += dot(four, vec4<u32>(4u * q + vec4(0u, 1u, 2u, 3u) < vec4(lane)));
+            before += dot(four, vec4(1u));
+        }
+        my_counters[d] = place;
+    }
+#else
     for (var d = 0u; d < sort.digits; d++) {
         my_counters[d] = counters_at(d * sort.owners + lane);
     }
+#endif
     let count = elements();
     let items = run(lane);
     for (var i = items.x; i < items.y; i++) {

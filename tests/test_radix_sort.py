@@ -17,7 +17,7 @@ from lapgs_wgpu.gpu.radix_sort import RadixSort
 pytestmark = pytest.mark.kernels
 
 Words = NDArray[np.uint32]
-SIZES = [0, 1, 4095, 4096, 4097, 100_000]
+SIZES = [0, 1, 4095, 4096, 4097, 100_000, 200_000]  # from 163,840 on the counters of lane runs take a scan
 LAST = 0xFFFFFFFF
 
 both_shapes = pytest.mark.parametrize("lane_runs", [True, False], ids=["lane runs", "blocks"])
@@ -126,7 +126,7 @@ def test_a_length_beyond_the_room_is_cut(device: Device, lane_runs: bool) -> Non
 @both_shapes
 def test_one_pool_serves_long_and_short_lists_in_turn(device: Device, lane_runs: bool) -> None:
     pool = BufferPool(device)
-    for size in (70_000, 3, 4096, 0, 70_000):
+    for size in (200_000, 3, 4096, 0, 200_000):
         keys = random_keys(size, seed=size)
         found, carried = sort(device, keys, lane_runs=lane_runs, pool=pool)
         np.testing.assert_array_equal(found, np.sort(keys))

@@ -148,12 +148,12 @@ def test_nothing_is_saved_before_the_first_step(
 @pytest.mark.kernels
 def test_a_lost_device_is_named_wherever_it_is_used(doomed: Device) -> None:
     small, large = (DeviceArray.empty(doomed, "words", (count,), "uint32") for count in (16, 1 << 18))
-    kernel = Kernel.get(doomed, "scan_blocks", SCAN_LANES=8)
+    kernel = Kernel.get(doomed, "scan_reduce", SCAN_LANES=8)
     doomed.wgpu_device.destroy()
 
     def dispatch() -> None:
         with Commands(doomed) as commands:
-            commands.dispatch(kernel, 1, blocks=small, block_sums=large, total=small)
+            commands.dispatch(kernel, 1, length=small, values=large, block_sums=small)
 
     def clear() -> None:
         with Commands(doomed) as commands:

@@ -47,8 +47,6 @@ PASSES: dict[str, tuple[str, Defines]] = {
     **{f"{name}{suffix}": (name, _SCAN | flag) for name in ("scan_reduce", "scan_apply")
        for suffix, flag in (("", {}), (" FLAGS", {"FLAGS": 1}), (" GATHER", {"GATHER": 1}))},
     "rasterize DEPTH": ("rasterize", _PLAIN.raster_defines(depth=True)),
-    "scan_blocks": ("scan_blocks", _SCAN),
-    "scan_blocks SATURATING": ("scan_blocks", _SCAN | {"SATURATING": 1}),
     "sort_count": ("sort_count", {}),
     "sort_scatter": ("sort_scatter", {}),
     "sort_scatter IOTA": ("sort_scatter", {"IOTA": 1}),

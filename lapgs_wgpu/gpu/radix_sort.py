@@ -11,6 +11,7 @@ from .pool import BufferPool
 from .scan import Scan
 
 _SORT_BLOCK_ITEMS = 2048  # common/sort.wgsl: 128 lanes x 16 elements
+_FEW_OWNERS = 32  # of runs: adding up their counters in each lane takes less time than the dispatches of a scan
 
 
 class RadixSort:
@@ -46,10 +47,8 @@ class RadixSort:
             owners = 8 * min(128, max(4, capacity // (8 * 4096)))
         else:
             owners = -(-capacity // _SORT_BLOCK_ITEMS)
+        unsummed = self._lane_runs and owners <= _FEW_OWNERS
         counters = self._pool.array(f"{self._name} counters", (digits * owners,), "uint32")
-        places = self._pool.array(f"{self._name} places", (digits * owners,), "uint32")
-        counter_count = self._pool.constant(f"{self._name} counter count", struct.pack("<I", digits * owners))
-        ignored = self._pool.array(f"{self._name} total", (1,), "uint32")
         keys_out = self._pool.array(f"{self._name} keys", (capacity,), "uint32")
         payload_out = self._pool.array(f"{self._name} payload", (capacity,), "uint32")
         second_payload = payload
@@ -64,13 +63,20 @@ class RadixSort:
             )
             arrays = {"sort": uniform, "length": length, "keys": keys}
             commands.dispatch(count_kernel, groups, counters=counters, **arrays)
-            scanned = {"values": counters, "prefix": places, "total": ignored}
-            self._scan(commands, length=counter_count, capacity=digits * owners, **scanned)
-            scatter = Kernel.get(
-                self._device, "sort_scatter", LANE_RUNS=self._lane_runs, IOTA=step == 0 and payload is None
-            )
+            places = counters if unsummed else self._summed(commands, counters)
             arrays |= {"counters": places, "keys_out": keys_out, "payload_out": payload_out, "payload": second_payload}
+            iota = step == 0 and payload is None
+            scatter = Kernel.get(self._device, "sort_scatter", LANE_RUNS=self._lane_runs, UNSUMMED=unsummed, IOTA=iota)
             commands.run(scatter, groups, arrays)
             keys, keys_out = keys_out, keys
             second_payload, payload_out = payload_out, second_payload
         return keys, second_payload
+
+    def _summed(self, commands: Commands, counters: DeviceArray) -> DeviceArray:
+        """The counters' exclusive prefix sums: the place of each counter's first element."""
+        (count,) = counters.shape
+        places = self._pool.array(f"{self._name} places", (count,), "uint32")
+        total = self._pool.array(f"{self._name} total", (1,), "uint32")
+        length = self._pool.constant(f"{self._name} counter count", struct.pack("<I", count))
+        self._scan(commands, length=length, capacity=count, values=counters, prefix=places, total=total)
+        return places

@@ -11,20 +11,16 @@ _BLOCK_ITEMS = 2048  # common/block.wgsl
 
 
 class Scan:
-    """Exclusive prefix sums of u32.
+    """Exclusive prefix sums of u32 below 2^21. A total above 2^32 - 1 is given as 2^32 - 1.
 
     source: of element i; "values": values[i]; "flags": 1 if values[i] is not zero; "gather": values[indices[i]].
-    saturating: sums stop at 2^32 - 1 instead of wrapping around; each element must be below 2^21.
     """
 
-    def __init__(
-        self, device: Device, pool: BufferPool, name: str, source: str = "values", *, saturating: bool = False
-    ) -> None:
+    def __init__(self, device: Device, pool: BufferPool, name: str, source: str = "values") -> None:
         self._pool, self._name = pool, name
         lanes = 8 if device.is_cpu else 256
         defines = {"SCAN_LANES": lanes, "FLAGS": source == "flags", "GATHER": source == "gather"}
         self._reduce = Kernel.get(device, "scan_reduce", **defines)
-        self._blocks = Kernel.get(device, "scan_blocks", SCAN_LANES=lanes, SATURATING=saturating)
         self._apply = Kernel.get(device, "scan_apply", **defines)
 
     def __call__(
@@ -39,10 +35,8 @@ class Scan:
         indices: DeviceArray | None = None,
     ) -> None:
         """prefix[i] = sum of the first i elements, total[0] = sum of all; elements = length[0] <= capacity."""
-        count = -(-capacity // _BLOCK_ITEMS)
+        count = max(1, -(-capacity // _BLOCK_ITEMS))
         sums = self._pool.array(f"{self._name} block sums", (count,), "uint32")
-        uniform = self._pool.constant(f"{self._name} blocks", self._blocks.uniform("Blocks", count=count))
         source = {"length": length, "values": values} | ({} if indices is None else {"indices": indices})
         commands.dispatch(self._reduce, count, **source, block_sums=sums)
-        commands.dispatch(self._blocks, 1, blocks=uniform, block_sums=sums, total=total)
-        commands.dispatch(self._apply, count, **source, block_sums=sums, prefix=prefix)
+        commands.dispatch(self._apply, count, **source, block_sums=sums, prefix=prefix, total=total)

@@ -49,7 +49,7 @@ class Rasterizer:
         self.max_capacity = device.max_binding // (4 * _RECORD_FLOATS)
         self._flags_scan = Scan(device, self.pool, "visible", "flags")
         # Saturating: a number of intersections beyond 2^32 must not wrap around to a small one.
-        self._offset_scan = Scan(device, self.pool, "offsets", "gather", saturating=True)
+        self._offset_scan = Scan(device, self.pool, "offsets", "gather")
         self._depth_sort = RadixSort(device, self.pool, "depth sort", lane_runs=self.config.lane_runs)
         self._tile_sort = RadixSort(device, self.pool, "tile sort", lane_runs=self.config.lane_runs)
         self._drawings = 0

@@ -5,12 +5,9 @@ const LANE_ITEMS = BLOCK_ITEMS / BLOCK_LANES;
 
 var<workgroup> lane_sums: array<u32, BLOCK_LANES>;
 
+// Stops at the largest word instead of wrapping around.
 fn plus(a: u32, b: u32) -> u32 {
-#ifdef SATURATING
     return select(a + b, 0xffffffffu, a + b < a);
-#else
-    return a + b;
-#endif
 }
 
 // Exclusive prefix sum of one value a lane; the total of the workgroup goes to lane_sums[BLOCK_LANES - 1].

@@ -88,12 +88,11 @@ SHAPES: dict[str, Choices] = {
     "rasterize": _with_rounds("CONTINUED", "LAST_ROUND"),
     "rasterize_bwd": _with_rounds("ROUNDS"),
     "scan_apply": _all(_SCAN_LANES, [{}, {"FLAGS": 1}, {"GATHER": 1}]),
-    "scan_blocks": _all(_SCAN_LANES, *_flags("SATURATING")),
     "scan_reduce": _all(_SCAN_LANES, [{}, {"FLAGS": 1}, {"GATHER": 1}]),
     "smoothness": [{}],
     "smoothness_bwd": [{}],
     "sort_count": _all(*_flags("LANE_RUNS")),
-    "sort_scatter": _all(*_flags("LANE_RUNS", "IOTA")),
+    "sort_scatter": _all([{}, {"LANE_RUNS": 1}, {"LANE_RUNS": 1, "UNSUMMED": 1}], *_flags("IOTA")),
     "tile_ranges": [{}],
 }
 

@@ -25,7 +25,7 @@ export class Rasterizer {
         this.maxCapacity = Math.floor(gpu.maxBinding / RECORD_BYTES);
         this.size = "";
         this.flagsScan = new Scan(gpu, this.pool, "visible", "FLAGS");
-        this.offsetScan = new Scan(gpu, this.pool, "offsets", "GATHER", true);
+        this.offsetScan = new Scan(gpu, this.pool, "offsets", "GATHER");
         this.depthSort = new RadixSort(gpu, this.pool, "depth sort");
         this.tileSort = new RadixSort(gpu, this.pool, "tile sort");
     }

@@ -3,21 +3,18 @@ const BLOCK_ITEMS = 2048; // common/block.wgsl
 
 export class Scan {
     // source: "" for the values, "FLAGS" adds 1 for each that is not zero, "GATHER" adds values[indices[i]].
-    constructor(gpu, pool, name, source = "", saturating = false) {
+    constructor(gpu, pool, name, source = "") {
         Object.assign(this, { gpu, pool, name });
         const suffix = source && ` ${source}`;
         this.reduce = `scan_reduce${suffix}`;
-        this.blocks = `scan_blocks${saturating ? " SATURATING" : ""}`;
         this.apply = `scan_apply${suffix}`;
     }
 
     // prefix[i] = sum of the first i elements, total[0] = sum of all; elements = length[0] <= capacity.
     record(commands, { length, capacity, values, prefix, total, indices }) {
-        const count = Math.ceil(capacity / BLOCK_ITEMS);
+        const count = Math.max(1, Math.ceil(capacity / BLOCK_ITEMS));
         const sums = this.pool.array(`${this.name} block sums`, 4 * count);
-        const blocks = this.pool.uniform(`${this.name} blocks`, this.gpu.kernel(this.blocks), "blocks", { count });
         commands.dispatch(this.reduce, count, { length, values, indices, block_sums: sums });
-        commands.dispatch(this.blocks, 1, { blocks, block_sums: sums, total });
-        commands.dispatch(this.apply, count, { length, values, indices, block_sums: sums, prefix });
+        commands.dispatch(this.apply, count, { length, values, indices, block_sums: sums, prefix, total });
     }
 }
