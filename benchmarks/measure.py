@@ -96,8 +96,8 @@ def recording() -> Iterator[list[Event]]:
     events: list[Event] = []
     dispatch_grid, leave, write = Commands.dispatch_grid, Commands.__exit__, Buffer.write
 
-    def counted_dispatch(self: Commands, kernel: Any, groups: tuple[int, int], **buffers: Any) -> None:
-        if min(groups) > 0:
+    def counted_dispatch(self: Commands, kernel: Any, groups: Any, **buffers: Any) -> None:
+        if not isinstance(groups, tuple) or min(groups) > 0:
             events.append(Event("dispatch", kernel.name))
         dispatch_grid(self, kernel, groups, **buffers)
 

@@ -85,8 +85,8 @@ def by_processor_time(device: Device) -> Iterator[Times]:
 
     empty = statistics.median(submit(Commands(device)) for _ in range(9))  # what asking for nothing takes
 
-    def alone(commands: Commands, kernel: Kernel, groups: tuple[int, int], **arrays: DeviceArray) -> None:
-        if min(groups) > 0:
+    def alone(commands: Commands, kernel: Kernel, groups: tuple[int, int] | DeviceArray, **arrays: DeviceArray) -> None:
+        if not isinstance(groups, tuple) or min(groups) > 0:
             for name, texels in kernel.textures.items():
                 commands._texture(arrays[name], texels)
             times.append((COPIES, max(0.0, submit(commands) - empty)))

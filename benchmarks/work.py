@@ -14,6 +14,7 @@ from math import sqrt
 
 from lapgs_wgpu.gpu.array import read_all
 from lapgs_wgpu.gpu.kernel import Commands
+from lapgs_wgpu.gpu.radix_sort import runs
 from lapgs_wgpu.motion.fields.hash_grid_config import GridShape
 from lapgs_wgpu.splat.drawing import Drawing
 from lapgs_wgpu.splat.rasterizer import Rasterizer
@@ -120,7 +121,7 @@ def _sort_counters(rasterizer: Rasterizer, capacity: int, bits: int) -> _Sort:
     bits = max(1, bits)
     if rasterizer.config.lane_runs:
         passes = -(-bits // 8)
-        return _Sort(passes, (1 << -(-bits // passes)) * 8 * min(128, max(4, capacity // (8 * 4096))))
+        return _Sort(passes, (1 << -(-bits // passes)) * runs(capacity))
     return _Sort(-(-bits // 4), 16 * -(-capacity // 2048))
 
 

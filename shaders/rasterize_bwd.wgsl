@@ -29,6 +29,9 @@
 struct Piece { number: u32, state: u32 }   // the place of the state among the tails
 @group(0) @binding(9) var<uniform> piece: Piece;
 #endif
+#ifdef LISTED
+@group(0) @binding(10) var<storage, read> listed_tiles: array<u32>;   // those with splats: a workgroup each
+#endif
 #import common/index
 #import common/raster
 
@@ -74,9 +77,24 @@ fn main(
         ranges[arrayLength(&ranges) - 1u].w = 1u;
     }
 #endif
+#ifdef LISTED
+    let tile = listed_tiles[workgroup_number(group, groups)];
+#else
     let tile = workgroup_number(group, groups);
     if (tile >= (frame.band.y - frame.band.x) * frame.tiles.x) {
         return;
+    }
+#endif
+    let range = ranges[tile];
+#ifdef ROUNDS
+    let begin = range.x + piece.number * u32($ROUND_SPLATS);
+    let end = min(range.z, begin + u32($ROUND_SPLATS));
+#else
+    let begin = range.x;
+    let end = range.z;
+#endif
+    if (begin >= end) {
+        return;   // before a pixel is read: most tiles of many images are empty
     }
     let my = place(lane);
     let corner = vec2(tile % frame.tiles.x * u32($TILE_W), (tile / frame.tiles.x + frame.band.x) * u32($TILE_H));
@@ -111,13 +129,7 @@ fn main(
     }
 #end
 
-    let range = ranges[tile];
 #ifdef ROUNDS
-    let begin = range.x + piece.number * u32($ROUND_SPLATS);
-    let end = min(range.z, begin + u32($ROUND_SPLATS));
-    if (begin >= end) {
-        return;
-    }
     if (piece.number > 0u) {
 #unroll r $ROWS
         if (corner.x + my.column < frame.size.x && corner.y + my.row + $(r)u < frame.size.y) {
@@ -127,9 +139,6 @@ fn main(
         }
 #end
     }
-#else
-    let begin = range.x;
-    let end = range.z;
 #endif
     for (var first = begin; first < end; first += u32(LANES)) {
         var mine = empty();

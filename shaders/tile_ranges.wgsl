@@ -8,6 +8,10 @@
 // sorted
 #table 2 tile_keys: vec4<u32>
 @group(0) @binding(3) var<storage, read_write> ranges: array<vec4<u32>>;   // first, one past the last, drawn, -
+#ifdef LISTED
+@group(0) @binding(4) var<storage, read_write> listed_tiles: array<u32>;   // those with splats, in any order
+@group(0) @binding(5) var<storage, read_write> workgroups: array<atomic<u32>>;   // that draw them
+#endif
 
 @compute @workgroup_size(64)
 fn main(
@@ -31,6 +35,11 @@ fn main(
             if (tile < arrayLength(&ranges)) {   // a pad has no tile
                 ranges[tile].x = i;
             }
+#ifdef LISTED
+            if (tile + 1u < arrayLength(&ranges)) {
+                listed_tiles[atomicAdd(&workgroups[0], 1u)] = tile;
+            }
+#endif
             if (before < arrayLength(&ranges)) {
                 ranges[before].y = i;
             }

@@ -20,7 +20,7 @@ from lapgs_wgpu.gpu import native
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.buffer import Buffer
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.gpu.kernel import Kernel
+from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.fields.deformation import Nearby
 from lapgs_wgpu.motion.fields.grid_field import GridField
@@ -188,13 +188,18 @@ def test_no_buffer_is_made_for_nothing(
     """A pass works with each buffer that the rasteriser holds."""
     rasterizer = use(Rasterizer(device))
     bound: set[Buffer] = set()
-    check = Kernel.check
+    check, copy = Kernel.check, Commands.copy
 
     def spy(self: Kernel, arrays: dict[str, DeviceArray]) -> None:
         bound.update(array.buffer for array in arrays.values())
         check(self, arrays)
 
+    def copying(self: Commands, source: DeviceArray, target: DeviceArray) -> None:
+        bound.update((source.buffer, target.buffer))
+        copy(self, source, target)
+
     monkeypatch.setattr(Kernel, "check", spy)
+    monkeypatch.setattr(Commands, "copy", copying)
     torch_step(scene, oblique_camera(200, 120), device, sh_degree=DEGREE)  # of so many tiles that no sort has one pass
     assert [name for name, buffer in rasterizer.pool._buffers.items() if buffer not in bound] == []
 

@@ -14,6 +14,11 @@ _SORT_BLOCK_ITEMS = 2048  # common/sort.wgsl: 128 lanes x 16 elements
 _FEW_OWNERS = 32  # of runs: adding up their counters in each lane takes less time than the dispatches of a scan
 
 
+def runs(capacity: int) -> int:
+    """Into how many runs, a lane each, lists with room for so many elements are divided (LANE_RUNS)."""
+    return 16 if capacity <= 8 * 4096 else 8 * min(128, max(4, capacity // (8 * 4096)))
+
+
 class RadixSort:
     """A stable sort of u32 keys with a u32 payload, least significant digit first.
 
@@ -44,7 +49,7 @@ class RadixSort:
         width = -(-bits // passes) if self._lane_runs else widest
         digits = 1 << width
         if self._lane_runs:
-            owners = 8 * min(128, max(4, capacity // (8 * 4096)))
+            owners = runs(capacity)
         else:
             owners = -(-capacity // _SORT_BLOCK_ITEMS)
         unsummed = self._lane_runs and owners <= _FEW_OWNERS

@@ -24,6 +24,8 @@ class TileLists(NamedTuple):
     slot_ids: DeviceArray  # (capacity,) uint32, the Gaussian of each slot
     slots: DeviceArray  # (capacity,) uint32, by tile and depth
     ranges: DeviceArray  # (tiles + 1, 4) uint32: first, end and drawn end of a tile's part of `slots`; then flags
+    workgroups: DeviceArray | int  # how many draw the tiles
+    listed_tiles: DeviceArray | None  # (tiles,) uint32, in any order: those with splats, where only they are drawn
 
 
 @dataclass(eq=False)

@@ -18,6 +18,8 @@ class RasterConfig:
 
     subgroups: the lanes form one subgroup and exchange values by shuffles instead of workgroup memory.
     lane_runs: use the radix sort for CPU devices, and a polynomial for exp2, which is slow there.
+    listed: only tiles with splats get a workgroup; the others are there before. Software drivers run all of a
+    workgroup's instructions, whether it leaves early or not.
     round_splats: maximum number of splats of a list that one dispatch draws, on devices that limit loops; else None.
     long_list: on such devices, lists from this length on are always drawn in several rounds. Their slots start without
     a record, which saves the backward pass a loop over the splats that no pixel sees.
@@ -28,6 +30,7 @@ class RasterConfig:
     lanes: int
     subgroups: bool
     lane_runs: bool
+    listed: bool = False
     round_splats: int | None = None
     long_list: int = 1 << 16
 
@@ -42,7 +45,7 @@ class RasterConfig:
     def raster_defines(self, *, depth: bool) -> dict[str, int]:
         """Defines of rasterize and rasterize_bwd. depth: whether to draw it, too."""
         flags = {"SUBGROUPS": self.subgroups, "DEPTH": depth, "LANES_16": self.lanes > 8, "LANES_32": self.lanes > 16}
-        values = {"LANES": self.lanes, "ROWS": self.rows, "POLYNOMIAL_EXP2": self.lane_runs}
+        values = {"LANES": self.lanes, "ROWS": self.rows, "POLYNOMIAL_EXP2": self.lane_runs, "LISTED": self.listed}
         if self.round_splats:
             values |= {"ROUND_SPLATS": self.round_splats, "LONG_LIST": self.long_list}
         return self.tile_defines | values | flags
@@ -54,7 +57,7 @@ def cpu_config(subgroup_size: int, max_loop_turns: int = SOFTWARE_LOOP_TURNS) ->
     subgroups = subgroup_size >= lanes
     # Without subgroups the backward pass sums a splat's ten values in loops over the lanes: 20 iterations per splat.
     round_splats = (max_loop_turns + 1) // (2 if subgroups else 32)
-    return RasterConfig(8, 8, lanes, subgroups, True, round_splats, long_list=max_loop_turns + 1)
+    return RasterConfig(8, 8, lanes, subgroups, True, True, round_splats, long_list=max_loop_turns + 1)
 
 
 def gpu_config(subgroup_size: int) -> RasterConfig:

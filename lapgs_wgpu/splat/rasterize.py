@@ -124,26 +124,37 @@ class _Rasterize(torch.autograd.Function):
             ctx.mark_non_differentiable(radii)
             return image, empty, empty.clone(), radii, probe.detach().clone()
         ctx.drawing, planes, splats = _draw(rasterizer, Gaussians(*tensors), background, camera, depth)
-        out = torch.from_numpy(planes).to(probe.device)
-        ctx.save_for_backward(*tensors, background, out[3])
-        z = out[4].clone() if depth else torch.zeros_like(out[3])
+        # numpy, since each operator of torch of this size wakes its threads, and they and the driver's take turns
+        pixels = np.ascontiguousarray(planes[:3].transpose(1, 2, 0)), 1 - planes[3]
+        z = planes[4].copy() if depth else np.zeros_like(planes[3])
+        image, alpha, z = (torch.from_numpy(array).to(probe.device) for array in (*pixels, z))
+        ctx.save_for_backward(*tensors, background, torch.from_numpy(planes[3]).to(probe.device))
+        ctx.set_materialize_grads(False)
         radii, centres = radii_and_centres(splats, probe.device)
         ctx.mark_non_differentiable(radii, centres)
-        return out[:3].permute(1, 2, 0).contiguous(), 1.0 - out[3], z, radii, centres
+        return image, alpha, z, radii, centres
 
     @staticmethod
     def backward(ctx: Any, *d_outputs: Any) -> tuple[Tensor | None, ...]:
         d_image, d_alpha, d_depth = d_outputs[:3]
         *tensors, background, transmittance = ctx.saved_tensors
-        d_background = (d_image * transmittance[..., None]).sum((0, 1)) if ctx.needs_input_grad[5] else None
+        d_background = None
+        if ctx.needs_input_grad[5] and d_image is not None:
+            d_background = (d_image * transmittance[..., None]).sum((0, 1))
         if ctx.drawing is None:
             empty = [torch.zeros_like(t) for t in tensors]
             return (*empty, d_background, background.new_zeros((0, 2)), *[None] * 3)
         rasterizer: Rasterizer = ctx.rasterizer
         if not rasterizer.holds(ctx.drawing):  # another image was drawn in between
             ctx.drawing, _, _ = _draw(rasterizer, Gaussians(*tensors), background, ctx.camera, ctx.depth)
-        planes = torch.cat([d_image.permute(2, 0, 1), d_alpha[None], *([d_depth[None]] if ctx.depth else [])])
-        gradients = rasterizer.backward(ctx.drawing, upload(rasterizer.pool, "d_image", planes))
+        planes = np.zeros((5 if ctx.depth else 4, *transmittance.shape), np.float32)
+        if d_image is not None:
+            planes[:3] = d_image.numpy(force=True).transpose(2, 0, 1)
+        if d_alpha is not None:
+            planes[3] = d_alpha.numpy(force=True)
+        if ctx.depth and d_depth is not None:
+            planes[4] = d_depth.numpy(force=True)
+        gradients = rasterizer.backward(ctx.drawing, rasterizer.pool.upload("input d_image", planes))
         by_gaussians, d_means2d = gradient_tensors(read_all(gradients.arrays()), background.device)
         return (*by_gaussians, d_background, d_means2d, *[None] * 3)
 

@@ -6,6 +6,7 @@ Only `grow_on_overflow` and, once per pass, `Rasterizer._subgroup_mismatch` wait
 from __future__ import annotations
 
 import math
+import struct
 from dataclasses import replace
 
 import numpy as np
@@ -53,6 +54,7 @@ class Rasterizer:
         self._depth_sort = RadixSort(device, self.pool, "depth sort", lane_runs=self.config.lane_runs)
         self._tile_sort = RadixSort(device, self.pool, "tile sort", lane_runs=self.config.lane_runs)
         self._drawings = 0
+        self._blank_of: tuple[int, int, tuple[float, float, float]] | None = None
         self._trusted: set[tuple[str, bool, bool]] = set()  # passes whose subgroups were checked
 
     @property
@@ -145,6 +147,13 @@ class Rasterizer:
         arrays = vars(gaussians) | {"frame": frame, "splats": drawing.splats, "image": drawing.image, "needed": needed}
         arrays |= {"tile_counts": tile_counts, "ids": ids, "keys": keys, "prefix": offsets, "visible": visible}
         arrays |= {"offsets": offsets, "tile_keys": tile_keys, "slot_ids": slot_ids, "ranges": ranges}
+        workgroups: DeviceArray | int = tiles
+        if config.listed:
+            arrays["listed_tiles"] = pool.array("listed tiles", (tiles,), "uint32")
+            workgroups = arrays["workgroups"] = pool.workgroups("tile workgroups")
+            commands.copy(pool.constant("no workgroups", struct.pack("<3I", 0, 1, 1)), workgroups)
+            if band == 0:
+                commands.copy(self._blank(drawing), drawing.image)
         if config.round_splats:
             commands.clear(needed)
         commands.run(Kernel.get(device, "project", **config.tile_defines), _groups(n), arrays)
@@ -162,13 +171,24 @@ class Rasterizer:
             commands, length=needed, capacity=capacity, bits=bits, keys=tile_keys, payload=None
         )
         commands.clear(ranges)
-        commands.run(Kernel.get(device, "tile_ranges"), _groups(-(-capacity // 4)), arrays)
+        commands.run(Kernel.get(device, "tile_ranges", LISTED=config.listed), _groups(-(-capacity // 4)), arrays)
         for number in range(drawing.plan.rounds):
             defines = config.raster_defines(depth=drawing.depth)
             if config.round_splats:
                 defines |= {"CONTINUED": number > 0, "LAST_ROUND": number == drawing.plan.rounds - 1}
-            commands.run(Kernel.get(device, "rasterize", **defines), tiles, arrays)
-        return TileLists(tile_counts, visible, arrays["ids"], offsets, slot_ids, arrays["slots"], ranges)
+            commands.run(Kernel.get(device, "rasterize", **defines), workgroups, arrays)
+        ids, slots, listed_tiles = arrays["ids"], arrays["slots"], arrays.get("listed_tiles")
+        return TileLists(tile_counts, visible, ids, offsets, slot_ids, slots, ranges, workgroups, listed_tiles)
+
+    def _blank(self, drawing: Drawing) -> DeviceArray:
+        """The image without a splat."""
+        planes, height, width = drawing.image.shape
+        if self._blank_of != (height, width, drawing.background):
+            blank = np.zeros((5, height, width), np.float32)
+            blank[:3], blank[3] = np.reshape(drawing.background, (3, 1, 1)), 1
+            self.pool.upload("blank", blank)
+            self._blank_of = height, width, drawing.background
+        return self.pool.array("blank", (5, height, width)).rows(0, planes)
 
     def _color(self, commands: Commands, drawing: Drawing, frame: DeviceArray, tile_counts: DeviceArray) -> None:
         kernel = Kernel.get(self.device, "color", **drawing.sh_defines)
@@ -231,8 +251,11 @@ class Rasterizer:
         key = (name, drawing.depth, drawing.plan.rounds > 1)
         if not self.config.subgroups or key in self._trusted:
             return False
+        lists = drawing.lists
+        if isinstance(lists.workgroups, DeviceArray) and not lists.workgroups.read()[0]:  # an empty image tells nothing
+            return False
         self._trusted.add(key)
-        flags = drawing.lists.ranges.rows(drawing.lists.ranges.shape[0] - 1, 1).read()[0]
+        flags = lists.ranges.rows(lists.ranges.shape[0] - 1, 1).read()[0]
         if not flags[3 if name == "rasterize_bwd" else 2]:
             return False
         self.config = replace(self.config, subgroups=False)
@@ -305,7 +328,7 @@ class Rasterizer:
             if plan.rounds > 1:
                 uniform = kernel.uniform("Piece", number=number, state=tails)
                 arrays["piece"] = self.pool.constant(f"piece {number}", uniform)
-            commands.run(kernel, self._band_tiles(drawing, band), arrays)
+            commands.run(kernel, lists.workgroups, arrays)
         commands.run(gather, _groups(len(drawing.gaussians)), arrays)
 
     def _color_bwd(

@@ -26,7 +26,7 @@ def _all(*choices: Choices) -> Choices:
 
 def _raster() -> Choices:
     """Of rasterize and rasterize_bwd: splat/raster_config.py."""
-    cpu = [{"TILE_W": 8, "TILE_H": 8, "LANES": n, "ROWS": 64 // n, "POLYNOMIAL_EXP2": 1} for n in (8, 16)]
+    cpu = [{"TILE_W": 8, "TILE_H": 8, "LANES": n, "ROWS": 64 // n, "POLYNOMIAL_EXP2": 1, "LISTED": 1} for n in (8, 16)]
     rounds = {"ROUND_SPLATS": 2048, "LONG_LIST": 65536}
     gpu = [{"TILE_W": 16, "TILE_H": 8, "LANES": n, "ROWS": 128 // n} for n in (16, 32)]
     lanes = [
@@ -93,7 +93,7 @@ SHAPES: dict[str, Choices] = {
     "smoothness_bwd": [{}],
     "sort_count": _all(*_flags("LANE_RUNS")),
     "sort_scatter": _all([{}, {"LANE_RUNS": 1}, {"LANE_RUNS": 1, "UNSUMMED": 1}], *_flags("IOTA")),
-    "tile_ranges": [{}],
+    "tile_ranges": _all(*_flags("LISTED")),
 }
 
 

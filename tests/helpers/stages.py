@@ -22,7 +22,7 @@ def capture(monkeypatch: pytest.MonkeyPatch, pass_name: str, *names: str) -> Cop
     copies: Copies = []
     dispatch_grid = Commands.dispatch_grid
 
-    def spy(self: Commands, kernel: Kernel, groups: tuple[int, int], **arrays: DeviceArray) -> None:
+    def spy(self: Commands, kernel: Kernel, groups: tuple[int, int] | DeviceArray, **arrays: DeviceArray) -> None:
         dispatch_grid(self, kernel, groups, **arrays)
         if kernel.name != pass_name:
             return
@@ -45,7 +45,7 @@ def watch(monkeypatch: pytest.MonkeyPatch, see: Callable[[str], None]) -> None:
     """Calls `see` with the name of each pass that is dispatched from now on."""
     dispatch_grid = Commands.dispatch_grid
 
-    def spy(self: Commands, kernel: Kernel, groups: tuple[int, int], **buffers: Any) -> None:
+    def spy(self: Commands, kernel: Kernel, groups: tuple[int, int] | DeviceArray, **buffers: Any) -> None:
         see(kernel.name)
         dispatch_grid(self, kernel, groups, **buffers)
 
