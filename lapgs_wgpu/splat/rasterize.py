@@ -125,7 +125,7 @@ class _Rasterize(torch.autograd.Function):
             return image, empty, empty.clone(), radii, probe.detach().clone()
         ctx.drawing, planes, splats = _draw(rasterizer, Gaussians(*tensors), background, camera, depth)
         # numpy, since each operator of torch of this size wakes its threads, and they and the driver's take turns
-        pixels = np.ascontiguousarray(planes[:3].transpose(1, 2, 0)), 1 - planes[3]
+        pixels = np.stack(list(planes[:3]), axis=-1), 1 - planes[3]
         z = planes[4].copy() if depth else np.zeros_like(planes[3])
         image, alpha, z = (torch.from_numpy(array).to(probe.device) for array in (*pixels, z))
         ctx.save_for_backward(*tensors, background, torch.from_numpy(planes[3]).to(probe.device))
