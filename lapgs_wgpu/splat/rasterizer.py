@@ -147,13 +147,9 @@ class Rasterizer:
         arrays = vars(gaussians) | {"frame": frame, "splats": drawing.splats, "image": drawing.image, "needed": needed}
         arrays |= {"tile_counts": tile_counts, "ids": ids, "keys": keys, "prefix": offsets, "visible": visible}
         arrays |= {"offsets": offsets, "tile_keys": tile_keys, "slot_ids": slot_ids, "ranges": ranges}
-        workgroups: DeviceArray | int = tiles
         if config.listed:
-            arrays["listed_tiles"] = pool.array("listed tiles", (tiles,), "uint32")
-            workgroups = arrays["workgroups"] = pool.workgroups("tile workgroups")
-            commands.copy(pool.constant("no workgroups", struct.pack("<3I", 0, 1, 1)), workgroups)
-            if band == 0:
-                commands.copy(self._blank(drawing), drawing.image)
+            arrays |= self._begin_list(commands, drawing, band)
+        workgroups = arrays.get("workgroups", tiles)
         if config.round_splats:
             commands.clear(needed)
         commands.run(Kernel.get(device, "project", **config.tile_defines), _groups(n), arrays)
@@ -179,6 +175,15 @@ class Rasterizer:
             commands.run(Kernel.get(device, "rasterize", **defines), workgroups, arrays)
         ids, slots, listed_tiles = arrays["ids"], arrays["slots"], arrays.get("listed_tiles")
         return TileLists(tile_counts, visible, ids, offsets, slot_ids, slots, ranges, workgroups, listed_tiles)
+
+    def _begin_list(self, commands: Commands, drawing: Drawing, band: int) -> dict[str, DeviceArray]:
+        """What `tile_ranges` fills with the tiles to draw: none so far. All others are as in an image without splats."""
+        if band == 0:
+            commands.copy(self._blank(drawing), drawing.image)
+        workgroups = self.pool.workgroups("tile workgroups")
+        commands.copy(self.pool.constant("no workgroups", struct.pack("<3I", 0, 1, 1)), workgroups)
+        listed_tiles = self.pool.array("listed tiles", (self._band_tiles(drawing, band),), "uint32")
+        return {"listed_tiles": listed_tiles, "workgroups": workgroups}
 
     def _blank(self, drawing: Drawing) -> DeviceArray:
         """The image without a splat."""
