@@ -21,6 +21,7 @@ from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.buffer import Buffer
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
+from lapgs_wgpu.gpu.radix_sort import runs
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.fields.deformation import Nearby
 from lapgs_wgpu.motion.fields.grid_field import GridField
@@ -121,9 +122,11 @@ def test_dispatches_a_step(device: Device, scene: Scene, truths: TruthCache, eve
     shape = rasterizer_of(device).config
     tiles = math.ceil(CAMERA.width / shape.tile_width) * math.ceil(CAMERA.height / shape.tile_height)
     widest = 8 if shape.lane_runs else 4
-    digits = math.ceil(32 / widest) + math.ceil(tiles.bit_length() / widest)
+    sorts = {COUNT: math.ceil(32 / widest), rasterizer_of(device).plan.capacity: math.ceil(tiles.bit_length() / widest)}
+    digits = sum(sorts.values())
     assert names.count("sort_count") == names.count("sort_scatter") == digits
-    scans = 2 if shape.lane_runs else 2 + digits  # of few lane runs, the counters are added up without a scan
+    # Of few lane runs, the counters are added up without a scan.
+    scans = 2 + sum(each for capacity, each in sorts.items() if not shape.lane_runs or runs(capacity) > 32)
     assert names.count("scan_reduce") == names.count("scan_apply") == scans
     pyramid = [name for name in names if name.startswith("loss_pyramid")]
     assert len(pyramid) == 3 + 3 + 4

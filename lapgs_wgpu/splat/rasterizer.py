@@ -177,7 +177,7 @@ class Rasterizer:
         return TileLists(tile_counts, visible, ids, offsets, slot_ids, slots, ranges, workgroups, listed_tiles)
 
     def _begin_list(self, commands: Commands, drawing: Drawing, band: int) -> dict[str, DeviceArray]:
-        """What `tile_ranges` fills with the tiles to draw: none so far. All others are as in an image without splats."""
+        """The list of tiles to draw, empty, and how many they are. All others are as in an image without splats."""
         if band == 0:
             commands.copy(self._blank(drawing), drawing.image)
         workgroups = self.pool.workgroups("tile workgroups")
