@@ -14,7 +14,7 @@ from math import sqrt
 
 from lapgs_wgpu.gpu.array import read_all
 from lapgs_wgpu.gpu.kernel import Commands
-from lapgs_wgpu.gpu.radix_sort import runs
+from lapgs_wgpu.gpu.radix_sort import FEW_OWNERS, runs
 from lapgs_wgpu.motion.fields.hash_grid_config import GridShape
 from lapgs_wgpu.splat.drawing import Drawing
 from lapgs_wgpu.splat.rasterizer import Rasterizer
@@ -39,7 +39,7 @@ class SceneCounts:
     """Of an image, added up over the bands in which it is drawn.
 
     visible: splats with a tile. intersections: pairs of splat and tile. drawn: those before their tile was full.
-    pairs: of drawn intersections and the pixels of their tiles.
+    pairs: of drawn intersections and the pixels of their tiles. filled: pixels of tiles with splats.
     """
 
     gaussians: int
@@ -48,6 +48,7 @@ class SceneCounts:
     drawn: int
     pairs: int
     tiles: int
+    filled: int
     pixels: int
     bands: int
 
@@ -55,7 +56,7 @@ class SceneCounts:
 def count_scene(rasterizer: Rasterizer, drawing: Drawing) -> SceneCounts:
     """Of the image that was drawn last, whose bands are drawn once more."""
     config, camera = rasterizer.config, drawing.camera
-    visible = intersections = drawn = tiles = 0
+    visible = intersections = drawn = tiles = filled = 0
     for band in range(drawing.plan.bands):
         with Commands(rasterizer.device) as commands:
             lists = rasterizer._draw_band(commands, drawing, band)
@@ -64,9 +65,19 @@ def count_scene(rasterizer: Rasterizer, drawing: Drawing) -> SceneCounts:
         visible, intersections, tiles = visible + int(seen[0]), intersections + int(needed[0]), tiles + here
         listed = ranges[ranges[:, 1] > 0]
         drawn += int((listed[:, 2] - listed[:, 0]).sum())
-    pairs = drawn * config.tile_width * config.tile_height
-    pixels = camera.width * camera.height
-    return SceneCounts(len(drawing.gaussians), visible, intersections, drawn, pairs, tiles, pixels, drawing.plan.bands)
+        filled += len(listed)
+    area, pixels = config.tile_width * config.tile_height, camera.width * camera.height
+    return SceneCounts(
+        gaussians=len(drawing.gaussians),
+        visible=visible,
+        intersections=intersections,
+        drawn=drawn,
+        pairs=drawn * area,
+        tiles=tiles,
+        filled=min(filled * area, pixels),
+        pixels=pixels,
+        bands=drawing.plan.bands,
+    )
 
 
 def raster_work(scene: SceneCounts, rasterizer: Rasterizer) -> dict[str, Work]:
@@ -83,23 +94,26 @@ def raster_work(scene: SceneCounts, rasterizer: Rasterizer) -> dict[str, Work]:
     )
     keys = depth.passes * v + tile.passes * i
     counters = scene.bands * (depth.passes * depth.counters + tile.passes * tile.counters)
+    scanned = scene.bands * sum(sort.passes * sort.counters for sort in (depth, tile) if sort.scanned)
+    places = scene.bands * sum(sort.passes * sort.counters * sort.readers for sort in (depth, tile))
+    written = scene.filled if rasterizer.config.listed else scene.pixels
     draw = {
         "project": Work(44 * n + 52 * n + 52 * v, 20 * n + 145 * v + 55 * rows),
         "color": Work(4 * n + 24 * v),
-        "scan_reduce": Work(4 * n + 8 * v + 4 * counters, n + v + counters),
-        "scan_apply": Work(12 * n + 20 * v + 12 * counters, 2 * (n + v + counters)),
+        "scan_reduce": Work(4 * n + 8 * v + 4 * scanned, n + v + scanned),
+        "scan_apply": Work(12 * n + 20 * v + 12 * scanned, 2 * (n + v + scanned)),
         "compact": Work(4 * n + 28 * v),
         "sort_count": Work(4 * keys + 4 * counters, 4 * keys),
-        "sort_scatter": Work(16 * keys - 4 * i + 4 * counters, 5 * keys),  # the first tile digit has no payload to read
+        "sort_scatter": Work(16 * keys - 4 * i + 4 * places, 5 * keys),  # the first tile digit has no payload to read
         "duplicate_with_keys": Work((12 + SPLAT) * v + 8 * i, 20 * v + 55 * rows + 3 * i),
         "tile_ranges": Work(6 * i + 16 * scene.tiles, 6 * i),
         "rasterize": Work(
-            BATCH_BYTES * scene.drawn + 16 * scene.pixels + 20 * scene.tiles, 16 * scene.pairs + 14 * lanes, scene.pairs
+            BATCH_BYTES * scene.drawn + 16 * written + 20 * scene.tiles, 16 * scene.pairs + 14 * lanes, scene.pairs
         ),
     }
     backward = {
         "rasterize_bwd": Work(
-            (BATCH_BYTES + RECORD) * scene.drawn + (4 + RECORD) * (i - scene.drawn) + 32 * scene.pixels,
+            (BATCH_BYTES + RECORD) * scene.drawn + (4 + RECORD) * (i - scene.drawn) + 32 * scene.filled,
             32 * scene.pairs + 54 * lanes,
             scene.pairs,
         ),
@@ -112,8 +126,12 @@ def raster_work(scene: SceneCounts, rasterizer: Rasterizer) -> dict[str, Work]:
 
 @dataclass(frozen=True)
 class _Sort:
+    """counters: of a pass. scanned: whether a scan adds them up, or each of `readers` workgroups."""
+
     passes: int
-    counters: int  # a pass
+    counters: int
+    scanned: bool = True
+    readers: int = 1
 
 
 def _sort_counters(rasterizer: Rasterizer, capacity: int, bits: int) -> _Sort:
@@ -121,7 +139,9 @@ def _sort_counters(rasterizer: Rasterizer, capacity: int, bits: int) -> _Sort:
     bits = max(1, bits)
     if rasterizer.config.lane_runs:
         passes = -(-bits // 8)
-        return _Sort(passes, (1 << -(-bits // passes)) * runs(capacity))
+        owners = runs(capacity)
+        scanned = owners > FEW_OWNERS
+        return _Sort(passes, (1 << -(-bits // passes)) * owners, scanned, 1 if scanned else owners // 8)
     return _Sort(-(-bits // 4), 16 * -(-capacity // 2048))
 
 

@@ -21,7 +21,7 @@ from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.buffer import Buffer
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
-from lapgs_wgpu.gpu.radix_sort import runs
+from lapgs_wgpu.gpu.radix_sort import FEW_OWNERS, runs
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.fields.deformation import Nearby
 from lapgs_wgpu.motion.fields.grid_field import GridField
@@ -126,7 +126,7 @@ def test_dispatches_a_step(device: Device, scene: Scene, truths: TruthCache, eve
     digits = sum(sorts.values())
     assert names.count("sort_count") == names.count("sort_scatter") == digits
     # Of few lane runs, the counters are added up without a scan.
-    scans = 2 + sum(each for capacity, each in sorts.items() if not shape.lane_runs or runs(capacity) > 32)
+    scans = 2 + sum(each for capacity, each in sorts.items() if not shape.lane_runs or runs(capacity) > FEW_OWNERS)
     assert names.count("scan_reduce") == names.count("scan_apply") == scans
     pyramid = [name for name in names if name.startswith("loss_pyramid")]
     assert len(pyramid) == 3 + 3 + 4

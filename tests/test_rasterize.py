@@ -155,6 +155,22 @@ def test_a_loss_on_one_output(device: Device, output: str) -> None:
     compare(device, scene, camera, sh_degree=1, background=BACKGROUND, weights=only)
 
 
+@pytest.mark.parametrize("output", ["image", "alpha", "depth"])
+def test_outputs_that_no_loss_takes(device: Device, output: str) -> None:
+    """The gradients are those of a loss that multiplies the others by zero."""
+    scene, camera = random_scene(200, 7), oblique_camera(33, 25)
+    leaves = [value.clone().requires_grad_() for value in (*scene.values(), BACKGROUND)]
+    found = []
+    for zero in (None, 0.0):
+        drawn = rasterize(**dict(zip(scene, leaves, strict=False)), background=leaves[-1], camera=camera, device=device)
+        loss = getattr(drawn, output).sum()
+        if zero is not None:
+            loss = loss + zero * (drawn.image.sum() + drawn.alpha.sum() + drawn.depth.sum())
+        found.append(torch.autograd.grad(loss, leaves))
+    for alone, beside in zip(*found, strict=True):
+        assert torch.equal(alone, beside)
+
+
 # Shapes of the kernels
 
 
@@ -163,6 +179,8 @@ def shapes(device: Device) -> list[RasterConfig]:
     found = [cpu_config(0), RasterConfig(16, 16, 32, subgroups=False, lane_runs=False), gpu_config(0)]
     if subgroup_size(device):
         found += [cpu_config(subgroup_size(device)), gpu_config(subgroup_size(device))]
+    if device.textures:
+        found += [replace(config, listed=True) for config in found if config.round_splats]
     return list(dict.fromkeys(found))
 
 
@@ -201,6 +219,21 @@ def test_workgroups_that_are_cut_into_subgroups_are_noticed(device: Device, use:
         assert torch.equal(other.image, steps[0].image)
         for name, gradient in steps[0].gradients.items():
             assert torch.equal(other.gradients[name], gradient)
+
+
+def test_workgroups_are_checked_when_a_tile_is_drawn(device: Device, use: Callable[[Rasterizer], Any]) -> None:
+    """Not by an image without splats, in which none runs where only tiles with splats are drawn."""
+    if not 0 < subgroup_size(device) < 32 or not device.textures:
+        pytest.skip("this device has no subgroups, or none of fewer than 32 lanes, or draws all tiles")
+    scene, camera = random_scene(500, 8, size=0.08), oblique_camera(101, 61)
+    use(Rasterizer(device, config=gpu_config(0)))
+    expected = step(scene, camera, device)
+    rasterizer = use(Rasterizer(device, config=replace(gpu_config(32), subgroups=True, listed=True)))
+    step(scene | {"opacities": torch.zeros(500)}, camera, device)
+    assert rasterizer.config.subgroups
+    found = step(scene, camera, device)
+    assert not rasterizer.config.subgroups
+    assert torch.equal(found.image, expected.image)
 
 
 def test_only_the_backward_pass_is_cut(

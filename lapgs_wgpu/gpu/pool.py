@@ -33,7 +33,8 @@ class BufferPool:
         return DeviceArray(buffer, shape, dtype)
 
     def workgroups(self, name: str) -> DeviceArray:
-        """An array (3,) uint32 of the numbers of workgroups that `Commands.dispatch` runs in each dimension."""
+        """An array (3,) uint32 of the numbers of workgroups that `Commands.dispatch` runs in each dimension, of which
+        none may exceed the device's limit."""
         if name not in self._buffers:
             self._buffers[name] = Buffer(self.device, 12, name, counts=True)
         return DeviceArray(self._buffers[name], (3,), "uint32")

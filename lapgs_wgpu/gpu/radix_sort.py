@@ -11,7 +11,7 @@ from .pool import BufferPool
 from .scan import Scan
 
 _SORT_BLOCK_ITEMS = 2048  # common/sort.wgsl: 128 lanes x 16 elements
-_FEW_OWNERS = 32  # of runs: adding up their counters in each lane takes less time than the dispatches of a scan
+FEW_OWNERS = 32  # of runs: adding up their counters in each lane takes less time than the dispatches of a scan
 
 
 def runs(capacity: int) -> int:
@@ -52,7 +52,7 @@ class RadixSort:
             owners = runs(capacity)
         else:
             owners = -(-capacity // _SORT_BLOCK_ITEMS)
-        unsummed = self._lane_runs and owners <= _FEW_OWNERS
+        unsummed = self._lane_runs and owners <= FEW_OWNERS
         counters = self._pool.array(f"{self._name} counters", (digits * owners,), "uint32")
         keys_out = self._pool.array(f"{self._name} keys", (capacity,), "uint32")
         payload_out = self._pool.array(f"{self._name} payload", (capacity,), "uint32")

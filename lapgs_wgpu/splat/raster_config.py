@@ -8,7 +8,8 @@ from ..gpu.device import SOFTWARE_LOOP_TURNS, Device
 from ..gpu.probe_subgroup import subgroup_size
 
 # Per band, on devices that limit loops: loops over the tiles of a splat take one iteration per tile, and a splat may
-# cover all. Below the `max_loop_turns` of every device.
+# cover all. Below the `max_loop_turns` of every device, and below the workgroups of one dimension, which a counted
+# dispatch does not fold into two.
 MAX_BAND_TILES = 60_000
 
 
@@ -18,11 +19,11 @@ class RasterConfig:
 
     subgroups: the lanes form one subgroup and exchange values by shuffles instead of workgroup memory.
     lane_runs: use the radix sort for CPU devices, and a polynomial for exp2, which is slow there.
-    listed: only tiles with splats get a workgroup; the others are there before. Software drivers run all of a
-    workgroup's instructions, whether it leaves early or not.
     round_splats: maximum number of splats of a list that one dispatch draws, on devices that limit loops; else None.
     long_list: on such devices, lists from this length on are always drawn in several rounds. Their slots start without
     a record, which saves the backward pass a loop over the splats that no pixel sees.
+    listed: only tiles with splats get a workgroup; the rest of the image is copied from one without splats before.
+    Software drivers run all of a workgroup's instructions, whether it returns early or not.
     """
 
     tile_width: int
@@ -30,9 +31,9 @@ class RasterConfig:
     lanes: int
     subgroups: bool
     lane_runs: bool
-    listed: bool = False
     round_splats: int | None = None
     long_list: int = 1 << 16
+    listed: bool = False
 
     @property
     def rows(self) -> int:
@@ -51,13 +52,22 @@ class RasterConfig:
         return self.tile_defines | values | flags
 
 
-def cpu_config(subgroup_size: int, max_loop_turns: int = SOFTWARE_LOOP_TURNS) -> RasterConfig:
+def cpu_config(subgroup_size: int, max_loop_turns: int = SOFTWARE_LOOP_TURNS, *, listed: bool = False) -> RasterConfig:
     """A workgroup is one vector of the processor, so that no barrier waits."""
     lanes = 16 if subgroup_size == 16 else 8
     subgroups = subgroup_size >= lanes
     # Without subgroups the backward pass sums a splat's ten values in loops over the lanes: 20 iterations per splat.
     round_splats = (max_loop_turns + 1) // (2 if subgroups else 32)
-    return RasterConfig(8, 8, lanes, subgroups, True, True, round_splats, long_list=max_loop_turns + 1)
+    return RasterConfig(
+        8,
+        8,
+        lanes,
+        subgroups,
+        lane_runs=True,
+        round_splats=round_splats,
+        long_list=max_loop_turns + 1,
+        listed=listed,
+    )
 
 
 def gpu_config(subgroup_size: int) -> RasterConfig:
@@ -69,4 +79,7 @@ def gpu_config(subgroup_size: int) -> RasterConfig:
 def raster_config(device: Device) -> RasterConfig:
     """The configuration for this adapter."""
     size = subgroup_size(device)
-    return gpu_config(size) if device.max_loop_turns is None else cpu_config(size, device.max_loop_turns)
+    if device.max_loop_turns is None:
+        return gpu_config(size)
+    # With tables in buffers the list would be one storage buffer too many.
+    return cpu_config(size, device.max_loop_turns, listed=device.textures)

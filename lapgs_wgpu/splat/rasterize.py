@@ -124,10 +124,10 @@ class _Rasterize(torch.autograd.Function):
             ctx.mark_non_differentiable(radii)
             return image, empty, empty.clone(), radii, probe.detach().clone()
         ctx.drawing, planes, splats = _draw(rasterizer, Gaussians(*tensors), background, camera, depth)
-        # numpy, since each operator of torch of this size wakes its threads, and they and the driver's take turns
-        pixels = np.stack(list(planes[:3]), axis=-1), 1 - planes[3]
-        z = planes[4].copy() if depth else np.zeros_like(planes[3])
-        image, alpha, z = (torch.from_numpy(array).to(probe.device) for array in (*pixels, z))
+        # By numpy: each operator of torch of this size wakes its threads, and they and the driver's take turns. By
+        # planes: three times as fast as a transposed copy.
+        rgb, z = np.stack(list(planes[:3]), axis=-1), planes[4].copy() if depth else np.zeros_like(planes[3])
+        image, alpha, z = (torch.from_numpy(array).to(probe.device) for array in (rgb, 1 - planes[3], z))
         ctx.save_for_backward(*tensors, background, torch.from_numpy(planes[3]).to(probe.device))
         ctx.set_materialize_grads(False)
         radii, centres = radii_and_centres(splats, probe.device)
@@ -138,9 +138,9 @@ class _Rasterize(torch.autograd.Function):
     def backward(ctx: Any, *d_outputs: Any) -> tuple[Tensor | None, ...]:
         d_image, d_alpha, d_depth = d_outputs[:3]
         *tensors, background, transmittance = ctx.saved_tensors
-        d_background = None
-        if ctx.needs_input_grad[5] and d_image is not None:
-            d_background = (d_image * transmittance[..., None]).sum((0, 1))
+        d_background = torch.zeros_like(background) if ctx.needs_input_grad[5] else None
+        if d_background is not None and d_image is not None:
+            d_background += (d_image * transmittance[..., None]).sum((0, 1))
         if ctx.drawing is None:
             empty = [torch.zeros_like(t) for t in tensors]
             return (*empty, d_background, background.new_zeros((0, 2)), *[None] * 3)
@@ -154,7 +154,7 @@ class _Rasterize(torch.autograd.Function):
             planes[3] = d_alpha.numpy(force=True)
         if ctx.depth and d_depth is not None:
             planes[4] = d_depth.numpy(force=True)
-        gradients = rasterizer.backward(ctx.drawing, rasterizer.pool.upload("input d_image", planes))
+        gradients = rasterizer.backward(ctx.drawing, rasterizer.pool.upload("d_image", planes))
         by_gaussians, d_means2d = gradient_tensors(read_all(gradients.arrays()), background.device)
         return (*by_gaussians, d_background, d_means2d, *[None] * 3)
 

@@ -1,6 +1,6 @@
 """The rasterizer's forward and backward passes on arrays of a device (docs/architecture.md lists them in order).
 
-Only `grow_on_overflow` and, once per pass, `Rasterizer._subgroup_mismatch` wait for the device.
+Only `grow_on_overflow` and, until a pass has drawn a tile, `Rasterizer._subgroup_mismatch` wait for the device.
 """
 
 from __future__ import annotations
@@ -49,7 +49,6 @@ class Rasterizer:
         self._plans = Plans(capacity)
         self.max_capacity = device.max_binding // (4 * _RECORD_FLOATS)
         self._flags_scan = Scan(device, self.pool, "visible", "flags")
-        # Saturating: a number of intersections beyond 2^32 must not wrap around to a small one.
         self._offset_scan = Scan(device, self.pool, "offsets", "gather")
         self._depth_sort = RadixSort(device, self.pool, "depth sort", lane_runs=self.config.lane_runs)
         self._tile_sort = RadixSort(device, self.pool, "tile sort", lane_runs=self.config.lane_runs)
@@ -98,8 +97,8 @@ class Rasterizer:
         for band in range(self.plan.bands):
             with Commands(self.device, profile) as commands:
                 drawing.lists = self._draw_band(commands, drawing, band)
-        if self._subgroup_mismatch("rasterize", drawing):
-            return self.draw(gaussians, camera, background, depth=depth, profile=profile)
+            if self._subgroup_mismatch("rasterize", drawing):
+                return self.draw(gaussians, camera, background, depth=depth, profile=profile)
         return drawing
 
     def holds(self, drawing: Drawing) -> bool:
@@ -189,6 +188,7 @@ class Rasterizer:
         """The image without a splat."""
         planes, height, width = drawing.image.shape
         if self._blank_of != (height, width, drawing.background):
+            self._blank_of = None
             blank = np.zeros((5, height, width), np.float32)
             blank[:3], blank[3] = np.reshape(drawing.background, (3, 1, 1)), 1
             self.pool.upload("blank", blank)
@@ -248,16 +248,16 @@ class Rasterizer:
         return self.pool.constant(f"frame {band}", content)
 
     def _subgroup_mismatch(self, name: str, drawing: Drawing) -> bool:
-        """Whether the driver has split the workgroups of a pass into several subgroups, checked after its first run.
+        """Whether the driver has split the workgroups of a pass into several subgroups, checked after its first tile.
 
-        If so, the config no longer uses subgroups, and the pass has to be run again. Waits for the device, once per
-        pass.
+        If so, the config no longer uses subgroups, and the pass has to be run again. Waits for the device until a pass
+        has drawn a tile.
         """
         key = (name, drawing.depth, drawing.plan.rounds > 1)
         if not self.config.subgroups or key in self._trusted:
             return False
         lists = drawing.lists
-        if isinstance(lists.workgroups, DeviceArray) and not lists.workgroups.read()[0]:  # an empty image tells nothing
+        if isinstance(lists.workgroups, DeviceArray) and not lists.workgroups.read()[0]:  # no tile was drawn
             return False
         self._trusted.add(key)
         flags = lists.ranges.rows(lists.ranges.shape[0] - 1, 1).read()[0]
@@ -290,8 +290,8 @@ class Rasterizer:
                 if drawing.plan.bands > 1:  # the lists of the other bands are gone
                     drawing.lists = self._draw_band(commands, drawing, band)
                 self._backward_band(commands, drawing, band, d_image, d_splats)
-        if self._subgroup_mismatch("rasterize_bwd", drawing):
-            return self.backward(drawing, d_image, camera=camera, profile=profile)
+            if self._subgroup_mismatch("rasterize_bwd", drawing):
+                return self.backward(drawing, d_image, camera=camera, profile=profile)
         d_sh, d_camera = None, self._camera_sums(n) if camera else None
         arrays = vars(gaussians) | {"frame": self._frame(drawing, 0), "d_splats": d_splats}
         arrays |= {"d_means": d_means, "d_quats": d_quats, "d_scales": d_scales}

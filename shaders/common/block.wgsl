@@ -5,7 +5,7 @@ const LANE_ITEMS = BLOCK_ITEMS / BLOCK_LANES;
 
 var<workgroup> lane_sums: array<u32, BLOCK_LANES>;
 
-// Stops at the largest word instead of wrapping around.
+// Stops at the largest word: a number of intersections beyond it must not wrap around to a small one.
 fn plus(a: u32, b: u32) -> u32 {
     return select(a + b, 0xffffffffu, a + b < a);
 }

@@ -26,12 +26,12 @@ def _all(*choices: Choices) -> Choices:
 
 def _raster() -> Choices:
     """Of rasterize and rasterize_bwd: splat/raster_config.py."""
-    cpu = [{"TILE_W": 8, "TILE_H": 8, "LANES": n, "ROWS": 64 // n, "POLYNOMIAL_EXP2": 1, "LISTED": 1} for n in (8, 16)]
+    cpu = [{"TILE_W": 8, "TILE_H": 8, "LANES": n, "ROWS": 64 // n, "POLYNOMIAL_EXP2": 1} for n in (8, 16)]
     rounds = {"ROUND_SPLATS": 2048, "LONG_LIST": 65536}
     gpu = [{"TILE_W": 16, "TILE_H": 8, "LANES": n, "ROWS": 128 // n} for n in (16, 32)]
     lanes = [
         shape | ({"LANES_16": 1} if shape["LANES"] > 8 else {}) | ({"LANES_32": 1} if shape["LANES"] > 16 else {})
-        for shape in _all(cpu, [rounds]) + gpu
+        for shape in _all(cpu, [rounds], *_flags("LISTED")) + gpu
     ]
     return _all(lanes, *_flags("SUBGROUPS", "DEPTH"))
 
@@ -98,10 +98,12 @@ SHAPES: dict[str, Choices] = {
 
 
 def all_shapes() -> Iterator[tuple[str, Defines]]:
-    """(shader, defines), with tables in buffers and, except where triangles are drawn, in textures."""
+    """(shader, defines), with tables in buffers, unless tiles are listed, and, except where triangles are drawn, in
+    textures."""
     for name, choices in SHAPES.items():
         for defines in choices:
-            yield name, defines
+            if "LISTED" not in defines:
+                yield name, defines
             if name != "present":
                 yield name, defines | {"TEXTURES": 1}
 
