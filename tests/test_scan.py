@@ -85,7 +85,7 @@ def test_more_blocks_than_one_workgroup_has_lanes(device: Device, source: str) -
 @pytest.mark.parametrize("source", SOURCES)
 def test_the_length_is_the_devices(device: Device, source: str, length: int) -> None:
     """Buffers that hold more than there is: what lies behind the length counts for nothing."""
-    values = np.full(20_000, 0xFFFFFFFF, np.uint32)
+    values = np.full(20_000, (1 << 18) - 1, np.uint32)
     values[:length] = np.arange(length)
     check(device, values, source=source, length=length, capacity=20_000)
 
