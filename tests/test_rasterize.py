@@ -236,6 +236,24 @@ def test_workgroups_are_checked_when_a_tile_is_drawn(device: Device, use: Callab
     assert torch.equal(found.image, expected.image)
 
 
+def test_workgroups_are_checked_in_each_band(device: Device, use: Callable[[Rasterizer], Any]) -> None:
+    """Also where the last band has no splat."""
+    if not 0 < subgroup_size(device) < 32 or not device.textures:
+        pytest.skip("this device has no subgroups, or none of fewer than 32 lanes, or draws all tiles")
+    scene, camera = random_scene(500, 8, size=0.02), oblique_camera(101, 61)
+    use(Rasterizer(device, config=gpu_config(0)))
+    whole = rasterize(**scene, camera=camera, device=device)
+    upper = (whole.radii > 0) & (whole.means2d[:, 1] + whole.radii < 24)
+    assert upper.any()
+    scene = scene | {"opacities": torch.where(upper, scene["opacities"], 0.0)}
+    expected = step(scene, camera, device)
+    rasterizer = use(Rasterizer(device, config=replace(gpu_config(32), subgroups=True, listed=True)))
+    rasterizer.plan = replace(rasterizer.plan, bands=2)
+    found = step(scene, camera, device)
+    assert not rasterizer.config.subgroups
+    assert torch.equal(found.image, expected.image)
+
+
 def test_only_the_backward_pass_is_cut(
     device: Device, use: Callable[[Rasterizer], Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
