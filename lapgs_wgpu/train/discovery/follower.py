@@ -180,7 +180,7 @@ class Follower:
         """(s,) how much of the points a part explains when it is moved by each of the shifts (s, 3), and (s, m) how
         near it then is to each of the points."""
         some = members[np.linspace(0, len(members) - 1, min(24, len(members))).astype(np.int64)]
-        moved = (points.positions[None] - shifts[:, None]).reshape(-1, 3)
+        moved = (points.positions.T[:, None] - shifts.T[:, :, None]).reshape(3, -1)
         nearest, squared = _nearest(moved, positions[some])
         near = np.exp(-squared / (2 * (spread * self._unit) ** 2)).reshape(len(shifts), -1)
         pairs = 0.3 + 0.7 * np.exp(-_squared(points.colors, self.colors[some]) / (2 * 0.35**2))
@@ -194,12 +194,18 @@ def _grid(half: float, step: float) -> Floats:
     return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
-def _nearest(a: Floats, b: Floats) -> tuple[NDArray[np.int64], Floats]:
-    """For each row of a (n, 3) the index of the nearest row of b (m, 3), and the squared distance from it."""
+def _nearest(a: Floats, b: Floats) -> tuple[NDArray[np.uint8], Floats]:
+    """For each column of a (3, n) the index of the nearest row of b (m, 3), m at most 255, and the squared distance.
+
+    NumPy is many times as fast along rows of length n as along rows of length m.
+    """
     # Half of |a|² - |a - b|²: one product of matrices, largest where b is nearest.
-    closeness = np.column_stack([a, np.ones_like(a[:, 0])]) @ np.column_stack([b, -0.5 * (b**2).sum(axis=1)]).T
-    nearest = closeness.argmax(axis=1)
-    squared: Floats = (a**2).sum(axis=1) - 2 * closeness[np.arange(len(a)), nearest]
+    closeness = np.column_stack([b, -0.5 * (b**2).sum(axis=1)]) @ np.concatenate([a, np.ones_like(a[:1])])
+    largest = closeness.max(axis=0)
+    numbers = np.arange(len(b), dtype=np.uint8)[:, None]
+    nearest = ((closeness < largest) * np.uint8(255) | numbers).min(axis=0)
+    x, y, z = a**2
+    squared: Floats = x + y + z - 2 * largest
     return nearest, np.maximum(squared, 0.0)
 
 
