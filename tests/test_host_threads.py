@@ -24,12 +24,13 @@ def two_threads(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     torch.set_num_threads(before)
 
 
-def test_small_decoders_on_a_processor_have_one(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_on_a_processor_where_torch_has_little_to_share(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     small, large = load_config("tiny").field, load_config("dnerf").field
-    assert step_threads(small, device) == (1 if device.is_cpu else None)
-    assert step_threads(dataclasses.replace(large, kind="static"), device) == (1 if device.is_cpu else None)
-    assert step_threads(large, device) is None
+    for field in (small, large, dataclasses.replace(large, kind="static"), dataclasses.replace(small, kind="mlp")):
+        assert step_threads(field, device) == (1 if device.is_cpu else None)
+    for field in (dataclasses.replace(large, kind="mlp"), dataclasses.replace(large, depth=2)):
+        assert step_threads(field, device) is None
     monkeypatch.setenv("OMP_NUM_THREADS", "3")
     assert step_threads(small, device) is None, "what the user chose stands"
 

@@ -99,12 +99,11 @@ def rasterize(
     elif tuple(background.shape) != (3,):
         raise ValueError(f"rasterize: background must have shape (3,), got {tuple(background.shape)}")
     sh = colors if sh_degree is None else colors[:, : (sh_degree + 1) ** 2]
-    probe = means.new_zeros((n, 2)).requires_grad_(torch.is_grad_enabled())
+    probe = means.new_empty((n, 2)).requires_grad_(torch.is_grad_enabled())
     image, alpha, z, radii, centres = _Rasterize.apply(
         means, quats, scales, opacities, sh, background, probe, camera, depth, device or open_device()
     )
-    with torch.no_grad():
-        probe.copy_(centres)
+    probe.data = centres
     return Rendering(image, alpha, z, radii, probe)
 
 
@@ -180,8 +179,8 @@ def upload_gaussians(pool: BufferPool, gaussians: Gaussians[Tensor]) -> Gaussian
 
 def radii_and_centres(splats: NDArray[np.float32], device: torch.device) -> tuple[Tensor, Tensor]:
     """`radii` and `means2d` of a Rendering, from splats (N, SPLAT_FLOATS) that were read back."""
-    projected = torch.from_numpy(splats).to(device)
-    return projected[:, RADIUS].to(torch.int32), projected[:, MEAN].contiguous()
+    radii, centres = splats[:, RADIUS].astype(np.int32), splats[:, MEAN].copy()
+    return torch.from_numpy(radii).to(device), torch.from_numpy(centres).to(device)
 
 
 def gradient_tensors(arrays: list[NDArray[np.float32]], device: torch.device) -> tuple[tuple[Tensor, ...], Tensor]:
@@ -193,4 +192,4 @@ def gradient_tensors(arrays: list[NDArray[np.float32]], device: torch.device) ->
 
 def upload(pool: BufferPool, name: str, tensor: Tensor) -> DeviceArray:
     """A copy of a tensor, as float32, in the buffer `input NAME` of a pool."""
-    return pool.upload(f"input {name}", tensor.detach().to("cpu", torch.float32).contiguous().numpy())
+    return pool.upload(f"input {name}", np.ascontiguousarray(tensor.detach().to("cpu", torch.float32).numpy()))

@@ -77,13 +77,12 @@ def render_loss(
         camera_change,
     )
     wanted = torch.is_grad_enabled() and any(tensor is not None and tensor.requires_grad for tensor in tensors)
-    probe = gaussians.means.new_zeros((len(gaussians), 2)).requires_grad_(wanted)
+    probe = gaussians.means.new_empty((len(gaussians), 2)).requires_grad_(wanted)
     red, green, blue = background.tolist()
     loss, computed, radii, centres = _FusedLoss.apply(
         *tensors, probe, camera, camera_unit, truth, (red, green, blue), weights, device, wanted, own
     )
-    with torch.no_grad():
-        probe.copy_(centres)
+    probe.data = centres
     names = ("l1", "mse", "ssim", "pyramid", "ncc", *(term.name for term, _ in own))
     used = (True, True, weights.ssim, weights.pyramid, weights.ncc, *[True] * len(own))
     terms = {name: value for name, value, use in zip(names, computed.tolist(), used, strict=True) if use}

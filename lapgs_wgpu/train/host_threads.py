@@ -17,11 +17,13 @@ SMALL_WIDTH = 64  # of a decoder whose operators are too short to share
 def step_threads(field: FieldConfig, device: Device) -> int | None:
     """The number of threads; None for torch's own, which the environment variable OMP_NUM_THREADS sets.
 
-    On a CPU device a step alternates between torch and the driver, which wake each other's threads. With a small
-    decoder that takes longer than what a second thread of torch saves (docs/notes/speed.md).
+    On a CPU device a step alternates between torch and the driver, and a thread of torch that waits for its next
+    operator keeps the driver's from a core. The decoder of a GridField has threads of its own; another that is small
+    gains less by a second thread of torch than the driver loses (docs/notes/speed.md).
     """
-    small = field.kind == "static" or field.width <= SMALL_WIDTH
-    return 1 if device.is_cpu and small and "OMP_NUM_THREADS" not in os.environ else None
+    own = field.kind in ("grid4d", "laplacian") and not field.depth
+    single = own or field.kind == "static" or field.width <= SMALL_WIDTH
+    return 1 if device.is_cpu and single and "OMP_NUM_THREADS" not in os.environ else None
 
 
 @contextmanager
