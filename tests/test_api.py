@@ -24,6 +24,7 @@ from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands
 from lapgs_wgpu.io.checkpoint import read_checkpoint
+from lapgs_wgpu.motion.fields.own_field import OwnField
 from lapgs_wgpu.motion.playback.playback import open_playback
 from lapgs_wgpu.splat.rotation import rotate, rotation_matrices
 from lapgs_wgpu.train.config import LossWeights
@@ -276,6 +277,33 @@ def test_a_training_says_why_it_leaves_out_discovery(
     assert told(discovery__enabled="false") == told(method="static") == ""
 
 
+def test_a_training_says_that_its_warm_up_lasts_to_its_end(
+    dataset: Dataset, device: Device, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for method, warm_up, told in (
+        ("laplacian", STEPS - 1, False),
+        ("laplacian", STEPS, True),
+        ("static", STEPS, False),
+    ):
+        config = configure(method, discovery__enabled="false", schedule__warm_up=str(warm_up))
+        Trainer(config, dataset, device).close()
+        note = f"(schedule.warm_up: {warm_up} steps) is not shorter than schedule.steps ({STEPS}).\n"
+        assert capsys.readouterr().err == (
+            f"note: nothing moves in this training, since its warm-up {note}" if told else ""
+        )
+
+
+def test_modules_that_cannot_be_fields_are_refused() -> None:
+    class Greedy(Drift):
+        def forward(self, means: Tensor, t: float, dynamics: Tensor, speed: float, *rest: float) -> Tensor:
+            return speed * means
+
+    with pytest.raises(InputError, match=r"must be an nn.Module, such as field=Drift\(\) .* got the class Drift"):
+        OwnField(Drift)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="the forward of the field Greedy needs speed, which it is not given"):
+        OwnField(Greedy())
+
+
 def test_groups_of_ones_own_field_have_rates_of_their_own(dataset: Dataset, device: Device) -> None:
     class Grouped(Drift):
         def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
@@ -299,6 +327,13 @@ def test_groups_of_ones_own_field_have_rates_of_their_own(dataset: Dataset, devi
 
     with pytest.raises(InputError, match=r"parameter_groups\(\) of Forgetful lacks velocity"):
         Trainer(configure(), dataset, device, parts=Parts(field=Forgetful()))
+
+    class Generous(Grouped):
+        def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+            return {"mlp": [self.velocity], "hash": [self.velocity]}
+
+    with pytest.raises(InputError, match=r"parameter_groups\(\) of Generous lists more than once: velocity"):
+        Trainer(configure(), dataset, device, parts=Parts(field=Generous()))
 
 
 # Losses of one's own

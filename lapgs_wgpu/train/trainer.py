@@ -155,6 +155,13 @@ class Trainer:
             seed=config.seed,
             own_field=parts.field,
         )
+        if self.scene.field is not None and self._warm_up >= config.schedule.steps and ranks.first and not resumed:
+            print(
+                f"note: nothing moves in this training, since its warm-up (schedule.warm_up: {self._warm_up} steps) is "
+                f"not shorter than schedule.steps ({config.schedule.steps}).",
+                file=sys.stderr,
+                flush=True,
+            )
         self._start(corrections)
         self.whole = True
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
@@ -15,6 +16,7 @@ _ROWS = {
     "rotation": (4,), "orientation": (4,), "translation": (3,), "d_quats": (4,), "d_scales": (3,), "d_dc": (3,),
     "d_opacity": (),
 }  # fmt: skip
+_OPTIONAL = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
 
 
 class OwnField(nn.Module):
@@ -22,14 +24,24 @@ class OwnField(nn.Module):
 
     module: called as module(means, t), with the arguments dynamics and nearby where its forward names them. It returns
     a translation (N, 3), or a Deformation. Its method parameter_groups(), if it has one, returns its parameters by
-    learning rate; without it all of them learn at the rate "mlp".
+    learning rate; without it all of them learn at the rate "mlp". Raises InputError for what cannot be called so.
     """
 
     def __init__(self, module: nn.Module) -> None:
         super().__init__()
+        if not isinstance(module, nn.Module):
+            given = f"the class {module.__name__}" if isinstance(module, type) else f"a {type(module).__name__}"
+            raise InputError(f"a field must be an nn.Module, such as field=Drift() for a class Drift; got {given}.")
         self.module = module
         named = inspect.signature(module.forward).parameters
         self._takes = [name for name in ("dynamics", "nearby") if name in named]
+        needed = [name for name, each in named.items() if each.default is each.empty and each.kind not in _OPTIONAL]
+        unknown = [name for name in needed[2:] if name not in self._takes]
+        if unknown:
+            raise InputError(
+                f"the forward of the field {type(module).__name__} needs {', '.join(unknown)}, which it is not given: "
+                "it is called with means and t, and with dynamics and nearby where it names them."
+            )
 
     def forward(
         self, means: Tensor, t: float, dynamics: Tensor | None = None, nearby: Nearby | None = None
@@ -53,13 +65,14 @@ class OwnField(nn.Module):
         return move
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        """See motion/fields/deformation.py. Raises InputError where a parameter is in no group."""
+        """See motion/fields/deformation.py. Raises InputError where a parameter is not in one group."""
         grouped = getattr(self.module, "parameter_groups", None)
         groups: dict[str, list[nn.Parameter]] = grouped() if grouped else {"mlp": list(self.parameters())}
-        listed = {id(parameter) for group in groups.values() for parameter in group}
-        missing = [name for name, each in self.module.named_parameters() if id(each) not in listed]
-        if missing:
-            raise InputError(f"parameter_groups() of {type(self.module).__name__} lacks {', '.join(missing)}.")
+        listed = Counter(id(parameter) for group in groups.values() for parameter in group)
+        for number, fault in ((0, "lacks"), (2, "lists more than once:")):
+            named = [name for name, each in self.module.named_parameters() if min(listed[id(each)], 2) == number]
+            if named:
+                raise InputError(f"parameter_groups() of {type(self.module).__name__} {fault} {', '.join(named)}.")
         return {name: group for name, group in groups.items() if group}
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
