@@ -137,8 +137,8 @@ class Trainer:
         corrections: Corrections | None = None
         wanted = config.discovery.enabled and config.field.kind != "static" and scene is None and not resumed
         reason = _no_discovery(config, parts.field)
-        if wanted and reason and ranks.first:
-            print(f"note: motion discovery is left out: {reason}", file=sys.stderr, flush=True)
+        if wanted and reason:
+            _note(f"motion discovery is left out: {reason}", ranks)
         if wanted and not reason:
             with open(os.devnull, "w") as nowhere, torch_threads(self._threads):
                 found = discover(config, dataset, device, Trainer, None if ranks.first else nowhere, parts.field)
@@ -155,12 +155,11 @@ class Trainer:
             seed=config.seed,
             own_field=parts.field,
         )
-        if self.scene.field is not None and self._warm_up >= config.schedule.steps and ranks.first and not resumed:
-            print(
-                f"note: nothing moves in this training, since its warm-up (schedule.warm_up: {self._warm_up} steps) is "
-                f"not shorter than schedule.steps ({config.schedule.steps}).",
-                file=sys.stderr,
-                flush=True,
+        if self.scene.field is not None and self._warm_up >= config.schedule.steps and not resumed:
+            _note(
+                f"nothing moves in this training, since its warm-up (schedule.warm_up: {self._warm_up} steps) is not "
+                f"shorter than schedule.steps ({config.schedule.steps}).",
+                ranks,
             )
         self._start(corrections)
         self.whole = True
@@ -466,6 +465,12 @@ class Trainer:
         self._limit_field_rates(fitted=bool(own.get("field_fitted", False)))
         self._generator.set_state(own["random"])
         self._pictures.order = own["order"].tolist()
+
+
+def _note(text: str, ranks: Ranks) -> None:
+    """Tell, once among all ranks, what a training will not do."""
+    if ranks.first:
+        print(f"note: {text}", file=sys.stderr, flush=True)
 
 
 def _no_discovery(config: Config, own_field: nn.Module | None) -> str:

@@ -69,10 +69,11 @@ class OwnField(nn.Module):
         grouped = getattr(self.module, "parameter_groups", None)
         groups: dict[str, list[nn.Parameter]] = grouped() if grouped else {"mlp": list(self.parameters())}
         listed = Counter(id(parameter) for group in groups.values() for parameter in group)
-        for number, fault in ((0, "lacks"), (2, "lists more than once:")):
-            named = [name for name, each in self.module.named_parameters() if min(listed[id(each)], 2) == number]
-            if named:
-                raise InputError(f"parameter_groups() of {type(self.module).__name__} {fault} {', '.join(named)}.")
+        missing = [name for name, each in self.module.named_parameters() if listed[id(each)] == 0]
+        repeated = [name for name, each in self.module.named_parameters() if listed[id(each)] > 1]
+        for fault, names in (("lacks", missing), ("lists more than once:", repeated)):
+            if names:
+                raise InputError(f"parameter_groups() of {type(self.module).__name__} {fault} {', '.join(names)}.")
         return {name: group for name, group in groups.items() if group}
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
