@@ -1,7 +1,6 @@
 // The gradient of a grid's table, or of the slices of all grids. Each of its entries is a sum over many points, and the same to the
 // last bit on every run:
-// LANE_LEVELS, for devices of few wide cores: a lane owns a level and adds the points in their order. With CELLS, which no level has more
-// of, in memory of its own.
+// LANE_LEVELS, for devices of few wide cores: a lane owns a level and adds the points in their order.
 // Otherwise: a lane owns a point and adds in 64-bit fixed point, whose sum does not depend on the order.
 #import common/d_encoding
 #import common/fixed_scale
@@ -22,9 +21,6 @@ fn first_entry(level: Level) -> u32 {
 
 #ifdef LANE_LEVELS
 @group(0) @binding(4) var<storage, read_write> d_features: array<vec2<f32>>;   // zero before
-#ifdef CELLS
-var<private> sums: array<vec2<f32>, $CELLS>;
-#endif
 
 @compute @workgroup_size(8)
 fn main(
@@ -39,28 +35,13 @@ fn main(
     }
     let level = levels[number];
     let first = first_entry(level);
-#ifdef CELLS
-    let cells = min(level.resolution.x * level.resolution.y, u32($CELLS));
-    for (var i = 0u; i < cells; i++) {
-        sums[i] = d_features[first + i];
-    }
-#endif
     for (var i = 0u; i < grid.points; i++) {
         let cell = find_cell(unit_point(points_at(i).xyz, level, grid), level);
         let gradient = gradient_at(i * grid.all_levels + level.number);
 #unroll c $CORNERS
-#ifdef CELLS
-        sums[cell.index[$c]] += cell.weight[$c] * gradient;
-#else
         d_features[first + cell.index[$c]] += cell.weight[$c] * gradient;
-#endif
 #end
     }
-#ifdef CELLS
-    for (var i = 0u; i < cells; i++) {
-        d_features[first + i] = sums[i];
-    }
-#endif
 }
 #else
 @group(0) @binding(4) var<storage, read_write> d_fixed: array<atomic<u32>>;   // low and high word of each feature; zero before

@@ -53,6 +53,17 @@ def test_default_limits_hold_every_shader() -> None:
     assert max(counts.values()) == _DEFAULT_LIMITS["max-storage-buffers-per-shader-stage"]
 
 
+def test_arrays_of_a_lane_are_short() -> None:
+    """Mesa's software driver sets each word of a private array to zero by an instruction of its own, and takes as long
+    as the square of their number to compile them: 2,048 words took 70 s (docs/notes/speed.md)."""
+    longest = 0
+    for name, defines in all_shapes():
+        arrays = re.findall(r"var<private> \w+: array<(?:vec(\d)<\w+>|\w+), (\d+)u?>", compose(name, defines))
+        assert len(arrays) == compose(name, defines).count("var<private>"), described(name, defines)
+        longest = max([longest, *(int(width or 1) * int(count) for width, count in arrays)])
+    assert 0 < longest <= 256
+
+
 def needs_subgroups(name: str, defines: Defines) -> bool:
     return "SUBGROUPS" in defines or name == "probe_subgroup"
 

@@ -59,10 +59,7 @@ SHAPES: dict[str, Choices] = {
     "gate_bwd": _all(*_flags("MOTION")),
     "gather_gradients": _all(*_flags("DEPTH")),
     "hashgrid": _all(_CORNERS, *_flags("ROWS", "BFLOAT16", "LONG_LANES")),
-    "hashgrid_bwd": [
-        *_all(_CORNERS, *_flags("LANE_LEVELS", "BFLOAT16")),
-        *_all([{"SLICED": 1, "CORNERS": 4, "LANE_LEVELS": 1, "CELLS": 1024}], *_flags("BFLOAT16")),
-    ],
+    "hashgrid_bwd": _all(_CORNERS, *_flags("LANE_LEVELS", "BFLOAT16")),
     "hashgrid_largest": _all([{"CORNERS": 4}], *_flags("BFLOAT16")),
     "hashgrid_slice": _all([{"SLICED": 1, "CORNERS": 4}], *_flags("LONG_LANES")),
     "hashgrid_slice_bwd": _all([{"SLICED": 1, "CORNERS": 4}], *_flags("LONG_LANES")),

@@ -21,7 +21,6 @@ from ..fields.hash_grid_config import TIME, GridShape
 
 _ALIGNED = 64  # rows; a multiple of 256 bytes for every row size, at which a binding may begin
 _LEVEL_WORDS = 16  # common/hashgrid.wgsl: struct Level
-OWN_CELLS = 1024  # entries in a lane's own memory, of which WGSL allows 8192 bytes
 
 
 @dataclass(frozen=True)
@@ -51,12 +50,6 @@ class _Levels:
     @property
     def defines(self) -> dict[str, int]:
         return {"SLICED": 1, "CORNERS": 4} if self.sliced else {"CORNERS": 8}
-
-    @property
-    def lane_defines(self) -> dict[str, int]:
-        """Further ones of the backward pass whose lanes own levels."""
-        own_memory = self.sliced and self.cells <= OWN_CELLS
-        return {"LANE_LEVELS": 1, "CELLS": self.cells} if own_memory else {"LANE_LEVELS": 1}
 
 
 class HashEncoderPasses:
@@ -200,7 +193,7 @@ class HashEncoderPasses:
             arrays = {"points": points.array.rows(first, count), "d_encoding": d_encoding.rows(first, count)}
             arrays |= {"grid": grid, **largest}
             for levels, target in sums:
-                shape = levels.lane_defines if self.lane_levels else {}
+                shape = {"LANE_LEVELS": 1} if self.lane_levels else {}
                 kernel = Kernel.get(self.device, "hashgrid_bwd", **levels.defines, **options, **shape)
                 groups = _shared(levels.count) if self.lane_levels else -(-count // 64) * levels.count
                 commands.run(kernel, groups, arrays | {"levels": levels.array, "d_features": target, "d_fixed": target})
