@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lapgs_wgpu.gpu import shader
 from lapgs_wgpu.gpu.array import DeviceArray, read_all
-from lapgs_wgpu.gpu.buffer import Buffer
+from lapgs_wgpu.gpu.buffer import Buffer, _height
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.pool import BufferPool
@@ -263,6 +263,14 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>) {{
     with Commands(device) as commands:
         commands.clear(source)
     np.testing.assert_array_equal(run(change=None), 0 * values)
+
+
+@pytest.mark.parametrize("rows", [1, 2, 3, 4, 5, 4096, 8191, 8192])
+def test_the_height_of_a_table_is_no_power_of_two(rows: int) -> None:
+    """For which the driver would compile shaders anew; but the largest, which would not be allowed."""
+    height = _height(rows)
+    assert rows <= height <= 8192
+    assert height == 8192 or height.bit_count() > 1
 
 
 def test_a_table_whose_copy_was_never_submitted(device: Device, wgsl: dict[str, str]) -> None:

@@ -21,6 +21,7 @@ from .wgpu_errors import TranslatedErrors
 _STORAGE = wgpu.BufferUsage.STORAGE | wgpu.BufferUsage.UNIFORM | wgpu.BufferUsage.COPY_SRC | wgpu.BufferUsage.COPY_DST
 _SMALL = 1 << 16  # bytes that go through the queue where buffers cannot be mapped
 _MAPPABLE = wgpu.BufferUsage.MAP_READ | wgpu.BufferUsage.MAP_WRITE
+_MOST_ROWS = 8192  # of a texture, by WebGPU's default limits
 _numbers = itertools.count()
 
 
@@ -28,6 +29,13 @@ def _forget(bound: weakref.WeakSet[BindGroup], device: Device, nbytes: int) -> N
     device.allocated_bytes -= nbytes
     for group in list(bound):
         group.drop()
+
+
+def _height(rows: int) -> int:
+    """Of a texture with room for so many rows: no power of two. Mesa's software driver compiles a shader anew for each
+    combination of textures whose sizes are and are not powers of two."""
+    power = rows & (rows - 1) == 0
+    return max(3, rows + 1) if power and rows < _MOST_ROWS else rows
 
 
 @dataclass
@@ -123,6 +131,7 @@ class Buffer:
         rows = -(-count // TABLE_WIDTH)
         held = self._textures.get(texel_format)
         if held is None or held.rows < rows:
+            rows = _height(rows)
             with TranslatedErrors(self.device, f"the texture of buffer {self.label!r}", rows * TABLE_WIDTH * texel):
                 texture = self.device.wgpu_device.create_texture(
                     label=self.label,
