@@ -11,10 +11,12 @@ from lapgs_wgpu.data import Dataset, load_dataset
 from lapgs_wgpu.data.builtin import write_builtin
 from lapgs_wgpu.errors import DeviceMemoryError, InputError
 from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.motion.scene import Scene4D
+from lapgs_wgpu.train import step_costs
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.plan import LEAST_STEPS, Plan, layout_of, plan_training, scaled
 from lapgs_wgpu.train.presets import load_config
-from lapgs_wgpu.train.step_costs import GROWTH, Costs, measure_costs
+from lapgs_wgpu.train.step_costs import GROWTH, USUAL, Costs, measure_costs
 
 
 @pytest.fixture(scope="module")
@@ -130,11 +132,20 @@ def test_exposure(folder: Path) -> None:
     assert "colors of each image corrected" in found.text
 
 
-def test_steps_are_measured(folder: Path, device: Device) -> None:
-    """Of more Gaussians, they take longer; nothing is written."""
+def test_steps_are_measured(folder: Path, device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the numbers of Gaussians that a training begins with and grows to; nothing is written."""
+    counts: list[int] = []
+    scene = step_costs._scene
+
+    def counted(config: Config, dataset: Dataset, device: Device, count: int) -> Scene4D:
+        counts.append(count)
+        return scene(config, dataset, device, count)
+
+    monkeypatch.setattr(step_costs, "_scene", counted)
     config = load_config("tiny", {"data.path": str(folder), "data.size": 64, "points.count": 4000})
     before = sorted(folder.rglob("*"))
     costs = measure_costs(config, load_dataset(folder, image_size=64), device)
-    assert 0 < costs.still < costs.few < costs.many
-    assert costs.view > 0
+    assert counts == [4000 * growth for growth in (USUAL, USUAL, GROWTH)]
+    assert min(costs.still, costs.few, costs.many, costs.view) > 0
+    assert costs.step == (costs.few + costs.many) / 2
     assert sorted(folder.rglob("*")) == before
