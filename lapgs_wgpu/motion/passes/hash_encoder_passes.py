@@ -187,14 +187,13 @@ class HashEncoderPasses:
             for _, fixed in sums:
                 commands.clear(fixed)
 
-        options = _precision(d_encoding)
+        options = _precision(d_encoding) | ({"LANE_LEVELS": 1} if self.lane_levels else {})
         largest = {} if self.lane_levels else {"largest": self._largest(commands, points, d_encoding, options)}
         for first, count, grid in self._blocks(points, d_encoding, self._most_points):
             arrays = {"points": points.array.rows(first, count), "d_encoding": d_encoding.rows(first, count)}
             arrays |= {"grid": grid, **largest}
             for levels, target in sums:
-                shape = {"LANE_LEVELS": 1} if self.lane_levels else {}
-                kernel = Kernel.get(self.device, "hashgrid_bwd", **levels.defines, **options, **shape)
+                kernel = Kernel.get(self.device, "hashgrid_bwd", **levels.defines, **options)
                 groups = _shared(levels.count) if self.lane_levels else -(-count // 64) * levels.count
                 commands.run(kernel, groups, arrays | {"levels": levels.array, "d_features": target, "d_fixed": target})
 
