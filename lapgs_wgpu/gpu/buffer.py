@@ -32,10 +32,11 @@ def _forget(bound: weakref.WeakSet[BindGroup], device: Device, nbytes: int) -> N
 
 
 def _height(rows: int) -> int:
-    """Of a texture with room for so many rows: no power of two. Mesa's software driver compiles a shader anew for each
-    combination of textures whose sizes are and are not powers of two."""
-    power = rows & (rows - 1) == 0
-    return max(3, rows + 1) if power and rows < _MOST_ROWS else rows
+    """The height of a texture with room for so many rows: no power of two, unless no more are allowed. Mesa's software
+    driver compiles a shader anew for each combination of textures whose sizes are and are not powers of two."""
+    if rows.bit_count() > 1 or rows >= _MOST_ROWS:
+        return rows
+    return max(3, rows + 1)
 
 
 @dataclass
