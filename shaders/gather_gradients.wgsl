@@ -48,7 +48,7 @@ fn main(
     let d_mean = vec2(s0.z * a.y + s0.w * a.z, s0.w * a.y + s1.x * a.z);
     // Added, since an image may be drawn in several bands.
     d_splats[id * SPLAT_STRIDE] += vec4(d_mean, -0.5 * a.w, -b.x);
-    d_splats[id * SPLAT_STRIDE + 1u] += vec4(-0.5 * b.y, a.x * exp2(-s1.y), b.zw);
+    d_splats[id * SPLAT_STRIDE + 1u] += vec4(-0.5 * b.y, a.x, b.zw);
     let tail = d_splats[id * SPLAT_STRIDE + 2u];
     d_splats[id * SPLAT_STRIDE + 2u] = vec4(tail.xy + c, 1.0, 0.0);
 }

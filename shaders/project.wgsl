@@ -52,9 +52,13 @@ fn projected(i: u32) -> Projected {
     if (!(det > 0.0) || !(det < 1e30)) {
         return p;
     }
+    let faded = opacity * select(1.0, sqrt(dot(normal, normal) / det), frame.antialiased == 1u);
+    if (!(faded >= ALPHA_MIN)) {
+        return p;
+    }
     let conic = vec3(yy, -xyc, xx) / det;
     let mean2d = frame.focal * camera.xy / camera.z + frame.center;
-    let e = make_ellipse(mean2d, conic, det, log2(opacity));
+    let e = make_ellipse(mean2d, conic, det, log2(faded));
     let size = vec2<f32>(frame.size);
     if (!all(mean2d + e.extent > vec2(0.0)) || !all(mean2d - e.extent < size)) {
         return p;
@@ -67,7 +71,7 @@ fn projected(i: u32) -> Projected {
     }
     p.mean = mean2d;
     p.conic = conic;
-    p.log2_opacity = log2(opacity);
+    p.log2_opacity = log2(faded);
     p.depth = camera.z;
     p.radius = ceil(max(e.extent.x, e.extent.y));
     p.det = det;

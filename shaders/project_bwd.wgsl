@@ -69,16 +69,24 @@ fn main(
     let xx = dot(axes_x, axes_x) + DILATION;
     let yy = dot(axes_y, axes_y) + DILATION;
     let normal = cross(axes_x, axes_y);
-    let det = dot(normal, normal) + DILATION * (xx + yy - DILATION);
+    let flat = dot(normal, normal);   // the determinant without the filter
+    let det = flat + DILATION * (xx + yy - DILATION);
     let a = yy / det;
-    let b = -dot(axes_x, axes_y) / det;
+    let xyc = dot(axes_x, axes_y);
+    let b = -xyc / det;
     let c = xx / det;
 
     // d(covariance) = -conic d(conic) conic, with the off-diagonal element counted twice.
     let g = vec3(d0.z, 0.5 * d0.w, d1.x);
-    let d_xx = -(a * a * g.x + 2.0 * a * b * g.y + b * b * g.z);
-    let d_xy = -2.0 * (a * b * g.x + (a * c + b * b) * g.y + b * c * g.z);
-    let d_yy = -(b * b * g.x + 2.0 * b * c * g.y + c * c * g.z);
+    var d_xx = -(a * a * g.x + 2.0 * a * b * g.y + b * b * g.z);
+    var d_xy = -2.0 * (a * b * g.x + (a * c + b * b) * g.y + b * c * g.z);
+    var d_yy = -(b * b * g.x + 2.0 * b * c * g.y + c * c * g.z);
+    if (frame.antialiased == 1u) {   // the splat's log opacity is the Gaussian's plus log(flat / det) / 2
+        let half = 0.5 * d1.y;
+        d_xx += half * ((yy - DILATION) / flat - a);
+        d_xy += 2.0 * half * (-xyc / flat - b);
+        d_yy += half * ((xx - DILATION) / flat - c);
+    }
     let d_axes_x = 2.0 * d_xx * axes_x + d_xy * axes_y;
     let d_axes_y = 2.0 * d_yy * axes_y + d_xy * axes_x;
 

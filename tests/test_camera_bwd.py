@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -32,7 +34,11 @@ def disturbed(camera: Camera, change: np.ndarray) -> Camera:
 
 
 def expected(
-    monkeypatch: pytest.MonkeyPatch, scene: dict[str, torch.Tensor], camera: Camera, weights: np.ndarray, sh: int | None
+    monkeypatch: pytest.MonkeyPatch,
+    scene: dict[str, torch.Tensor],
+    camera: Camera,
+    weights: np.ndarray,
+    **how: Any,
 ) -> np.ndarray:
     """(7,) by central differences. The limits of the Jacobian count as constants, as for the Gaussians' gradients."""
     limits = reference._frustum_limits(camera)
@@ -40,18 +46,18 @@ def expected(
     tensors = {name: value.double() for name, value in scene.items()}
 
     def loss(change: np.ndarray) -> float:
-        image = reference.rasterize_reference(**tensors, camera=disturbed(camera, change), sh_degree=sh).image
+        image = reference.rasterize_reference(**tensors, camera=disturbed(camera, change), **how).image
         return float((image * torch.from_numpy(weights).double()).sum())
 
     return np.array([(loss(STEP * row) - loss(-STEP * row)) / (2 * STEP) for row in np.eye(7)])
 
 
 def found(
-    device: Device, scene: dict[str, torch.Tensor], camera: Camera, weights: np.ndarray
+    device: Device, scene: dict[str, torch.Tensor], camera: Camera, weights: np.ndarray, *, antialiased: bool = False
 ) -> tuple[CameraGradient, np.ndarray]:
     rasterizer = Rasterizer(device)
     tensors = {"sh" if name == "colors" else name: value for name, value in scene.items()}
-    gaussians = upload_gaussians(rasterizer.pool, Gaussians(**tensors))
+    gaussians = upload_gaussians(rasterizer.pool, Gaussians(**tensors, antialiased=antialiased))
     planes = np.concatenate([np.moveaxis(weights, 2, 0), np.zeros((1, *weights.shape[:2]))]).astype(np.float32)
     while True:
         drawing = rasterizer.draw(gaussians, camera)
@@ -63,17 +69,17 @@ def found(
     return camera_gradient(sums), sums
 
 
-@pytest.mark.parametrize("sh", [None, 0, 2])
+@pytest.mark.parametrize(("sh", "antialiased"), [(None, False), (0, False), (2, False), (0, True)])
 @pytest.mark.parametrize(("count", "camera"), [(70, front_camera(32, 24)), (150, oblique_camera(61, 47))])
 def test_camera_bwd(
-    monkeypatch: pytest.MonkeyPatch, device: Device, sh: int | None, count: int, camera: Camera
+    monkeypatch: pytest.MonkeyPatch, device: Device, sh: int | None, antialiased: bool, count: int, camera: Camera
 ) -> None:
     scene = random_scene(count, 1, sh=None if sh is None else (sh + 1) ** 2)
     weights = np.random.default_rng(0).normal(size=(camera.height, camera.width, 3))
     weights = weights.astype(np.float32).astype(np.float64)
-    gradient, _ = found(device, scene, camera, weights)
+    gradient, _ = found(device, scene, camera, weights, antialiased=antialiased)
     mine = np.concatenate([gradient.rotation, gradient.position, [gradient.log_focal]])
-    theirs = expected(monkeypatch, scene, camera, weights, sh)
+    theirs = expected(monkeypatch, scene, camera, weights, sh_degree=sh, antialiased=antialiased)
     for part in (slice(0, 3), slice(3, 6), slice(6, 7)):
         assert np.linalg.norm(mine[part] - theirs[part]) < 1e-4 * np.linalg.norm(theirs[part]), (mine, theirs)
 

@@ -132,7 +132,16 @@ def test_base_gives_what_a_file_leaves_out(tmp_path: Path) -> None:
 def test_presets_are_complete_without_defaults_in_the_code() -> None:
     """But for what the config.toml of older runs lacks, which is off then."""
     optional = {field.name for field in dataclasses.fields(Config) if field.default is not dataclasses.MISSING}
-    assert optional == {"acceleration", "exposure", "precision", "decoder", "discovery", "cameras", "eval"}
+    assert optional == {
+        "acceleration",
+        "antialiased",
+        "exposure",
+        "precision",
+        "decoder",
+        "discovery",
+        "cameras",
+        "eval",
+    }
     assert AccelerationConfig().weight == 0
     assert not ExposureConfig().enabled
     assert not DiscoveryConfig().enabled

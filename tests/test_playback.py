@@ -154,7 +154,7 @@ def test_an_upload_that_failed_is_made_again(device: Device, tmp_path: Path, mon
     expected = contents(playback.at(0.1))
 
     def fail(pool: BufferPool, now: Gaussians[torch.Tensor]) -> None:
-        upload_gaussians(pool, Gaussians(*(0 * tensor for tensor in vars(now).values())))
+        upload_gaussians(pool, Gaussians(*(0 * tensor for tensor in now.arrays().values())))
         raise MemoryError
 
     with monkeypatch.context() as patched:
@@ -235,7 +235,7 @@ def test_blocks_make_no_difference(device: Device, tmp_path: Path) -> None:
 
 def contents(now: Gaussians[DeviceArray]) -> list[np.ndarray]:
     """As words, so that equal means equal bits."""
-    return [values.view(np.uint32) for values in read_all(list(vars(now).values()))]
+    return [values.view(np.uint32) for values in read_all(list(now.arrays().values()))]
 
 
 @pytest.mark.kernels

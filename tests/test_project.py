@@ -21,31 +21,33 @@ ROUND = [1.0, 0.0, 0.0, 0.0]
 
 
 def projected(
-    monkeypatch: pytest.MonkeyPatch, device: Device, scene: Scene, camera: Camera
+    monkeypatch: pytest.MonkeyPatch, device: Device, scene: Scene, camera: Camera, *, antialiased: bool = False
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """(N, 12) what the pass leaves of each Gaussian, in float64 (see common/splat.wgsl), and (N,) its tile counts."""
     copies = capture(monkeypatch, "project", "splats", "tile_counts")
-    rasterize(**scene, camera=camera, device=device)
+    rasterize(**scene, camera=camera, antialiased=antialiased, device=device)
     count = len(scene["means"])
     splats = all_of(copies[0]["splats"])[: 12 * count].reshape(count, 12)
     tile_counts = all_of(copies[0]["tile_counts"])[:count].astype(np.int64)
     return torch.from_numpy(splats).double(), torch.from_numpy(tile_counts)
 
 
-def check(monkeypatch: pytest.MonkeyPatch, device: Device, scene: Scene, camera: Camera) -> None:
-    splats, tile_counts = projected(monkeypatch, device, scene, camera)
+def check(
+    monkeypatch: pytest.MonkeyPatch, device: Device, scene: Scene, camera: Camera, *, antialiased: bool = False
+) -> None:
+    splats, tile_counts = projected(monkeypatch, device, scene, camera, antialiased=antialiased)
     geometry = [scene[name].double() for name in ("means", "quats", "scales", "opacities")]
-    expected = project(*geometry, camera)
+    expected = project(*geometry, camera, antialiased=antialiased)
     seen = expected.visible
     assert torch.equal(splats[:, 10] > 0, seen)
     assert not tile_counts[~seen].any()
-    splats, geometry[3] = splats[seen], geometry[3][seen]
-    means2d, conics, depths, _, _, half_sides = (group[seen] for group in expected)
+    splats = splats[seen]
+    means2d, conics, depths, _, _, half_sides, opacities = (group[seen] for group in expected)
     size = max(camera.width, camera.height)
     reach = means2d.abs().amax(1, keepdim=True).clamp(min=size)
     assert ((splats[:, :2] - means2d) / reach).abs().max() < 1e-5
     assert ((splats[:, 2:5] - conics) / conics.abs().amax(1, keepdim=True)).abs().max() < 1e-4
-    torch.testing.assert_close(splats[:, 5], geometry[3].log2(), rtol=0, atol=1e-5)
+    torch.testing.assert_close(splats[:, 5], opacities.log2(), rtol=0, atol=1e-5)
     torch.testing.assert_close(splats[:, 9], depths, rtol=1e-5, atol=0)
     largest = half_sides.amax(1)
     assert (splats[:, 10] >= largest * (1 - 1e-4)).all()
@@ -53,11 +55,13 @@ def check(monkeypatch: pytest.MonkeyPatch, device: Device, scene: Scene, camera:
     torch.testing.assert_close(splats[:, 11], 1 / (conics[:, 0] * conics[:, 2] - conics[:, 1] ** 2), rtol=1e-3, atol=0)
 
 
+@pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize(("count", "size", "spread"), [(1000, 0.05, 0.8), (1000, 0.5, 0.8), (1000, 0.003, 3.0)])
 def test_random_gaussians(
-    monkeypatch: pytest.MonkeyPatch, device: Device, count: int, size: float, spread: float
+    monkeypatch: pytest.MonkeyPatch, device: Device, count: int, size: float, spread: float, antialiased: bool
 ) -> None:
-    check(monkeypatch, device, random_scene(count, 1, size=size, spread=spread), oblique_camera(101, 61))
+    scene = random_scene(count, 1, size=size, spread=spread)
+    check(monkeypatch, device, scene, oblique_camera(101, 61), antialiased=antialiased)
 
 
 def test_needles(monkeypatch: pytest.MonkeyPatch, device: Device) -> None:
@@ -116,6 +120,15 @@ def test_who_is_seen(
     assert bool(drawn.radii[0] > 0) == visible
     assert drawn.image.isfinite().all()
     assert visible or not drawn.image.any()
+
+
+@pytest.mark.parametrize("scales", [[0.0, 0.0, 0.0], [1e-30] * 3, [0.1, 0.0, 0.0]], ids=str)
+def test_antialiased_nothing_is_left_of_what_has_no_area(
+    monkeypatch: pytest.MonkeyPatch, device: Device, scales: list[float]
+) -> None:
+    splats, tile_counts = projected(monkeypatch, device, single(scales=scales), front_camera(33, 25), antialiased=True)
+    assert not splats.any()
+    assert not tile_counts.any()
 
 
 def test_beyond_the_frustum_the_jacobian_is_held(monkeypatch: pytest.MonkeyPatch, device: Device) -> None:

@@ -41,15 +41,17 @@ def compare(
     *,
     sh_degree: int | None = None,
     background: Tensor | None = None,
+    antialiased: bool = False,
     weights: Weights | None = None,
     fragile_share: float = 0.1,
 ) -> None:
     """Forward to 2e-5 and every group of gradients to 1e-4, without the few pixels where rounding decides."""
-    fragile = fragile_pixels(scene, camera, sh_degree)
+    fragile = fragile_pixels(scene, camera, sh_degree, antialiased=antialiased)
     assert fragile.double().mean() <= fragile_share
     weights = (weights or Weights.random(camera)).without(fragile)
-    found = step(scene, camera, device, sh_degree=sh_degree, background=background, weights=weights)
-    expected = reference_step(scene, camera, sh_degree=sh_degree, background=background, weights=weights)
+    how: dict[str, Any] = {"sh_degree": sh_degree, "background": background, "antialiased": antialiased}
+    found = step(scene, camera, device, **how, weights=weights)
+    expected = reference_step(scene, camera, **how, weights=weights)
     farthest = float(expected.depth.max()) + 1
     for name, tolerance in (("image", 2e-5), ("alpha", 2e-5), ("depth", 2e-5 * farthest)):
         error = float((getattr(found, name) - getattr(expected, name))[~fragile].abs().max())
@@ -145,6 +147,42 @@ def test_splats_close_to_the_camera(device: Device) -> None:
 def test_tiny_splats(device: Device) -> None:
     """Smaller than a pixel: all that is left of their covariance is the dilation."""
     compare(device, random_scene(2000, 6, size=1e-4), oblique_camera(101, 61))
+
+
+# Antialiased
+
+
+@pytest.mark.parametrize(("count", "size", "sh_degree"), [(100, 0.3, None), (1000, 0.05, 3), (5000, 0.02, 1)])
+def test_antialiased_scenes(device: Device, count: int, size: float, sh_degree: int | None) -> None:
+    stored = None if sh_degree is None else (sh_degree + 1) ** 2
+    scene = random_scene(count, seed=count, sh=stored, size=size)
+    compare(device, scene, oblique_camera(101, 61), sh_degree=sh_degree, background=BACKGROUND, antialiased=True)
+
+
+def test_antialiased_thin_splats(device: Device) -> None:
+    """Edge-on discs, a third of a pixel thick and less: most of what is left of them is their thickness' gradient."""
+    scene, camera = random_scene(300, 7, size=0.1), front_camera(101, 61)
+    scene["means"][:, 2] = scene["means"][:, 2].abs() + 1.5
+    scene["quats"] = torch.tensor([1.0, 0, 0, 0]).repeat(300, 1) + 0.02 * scene["quats"]
+    scene["scales"][:, 1] = 1e-3 * (1 + 9 * scene["colors"][:, 0])
+    compare(device, scene, camera, antialiased=True)
+
+
+def test_antialiased_light_does_not_depend_on_the_resolution(device: Device) -> None:
+    """What a small splat covers, in the image's width: without, the dilation covers more the fewer pixels there are."""
+    still = {"means": [0, 0, 2.0], "quats": [1.0, 0, 0, 0], "scales": [0.02] * 3, "opacities": 0.9, "colors": [1.0] * 3}
+    scene = {name: torch.tensor([value], dtype=torch.float32) for name, value in still.items()}
+    covered = []
+    for antialiased in (True, False):
+        for size in (128, 32):
+            camera = front_camera(size, size, float(size))
+            covered.append(
+                float(rasterize(**scene, camera=camera, antialiased=antialiased).alpha.detach().sum()) / size**2
+            )
+    exact = 0.9 * 2 * torch.pi * (0.02 / 2) ** 2
+    assert covered[0] == pytest.approx(exact, rel=0.03)  # alpha is cut off at 1/255
+    assert covered[1] == pytest.approx(exact, rel=0.05)
+    assert covered[3] > 2 * covered[2]
 
 
 @pytest.mark.parametrize("output", Weights._fields)

@@ -127,6 +127,17 @@ def test_off_axis_ellipse_by_hand() -> None:
     np.testing.assert_allclose(projection.half_sides[0], np.sqrt(2 * math.log(0.7 * 255) * np.diag(cov)), rtol=1e-12)
 
 
+def test_antialiased_opacity_by_hand() -> None:
+    """A Gaussian whose half axes are 0.6 and 0.2 pixels, and turned, so that its covariance is no diagonal."""
+    quat = torch.tensor([[math.cos(0.3), 0, 0, math.sin(0.3)]])
+    mean, scales, opacity = torch.tensor([[0.0, 0, 2]]), torch.tensor([[0.12, 0.04, 0.3]]), torch.tensor([0.9])
+    projection = project(mean, quat, scales, opacity, front_camera(), antialiased=True)
+    faded = 0.9 * 0.6 * 0.2 / math.sqrt((0.36 + 0.3) * (0.04 + 0.3))
+    assert projection.opacities.item() == pytest.approx(faded, abs=1e-14)
+    tau = 2 * math.log(255 * faded)
+    assert projection.tau.item() == pytest.approx(tau, abs=1e-12)
+
+
 def test_jacobian_is_clamped_beyond_the_margin() -> None:
     """Far right of the image x/z counts as (width - cx) / fx + 0.3 (width / 2) / fx in the Jacobian only."""
     camera = Camera(np.array([[10.0, 0, 3], [0, 10, 3.5], [0, 0, 1]]), np.eye(4), 9, 7)
@@ -420,10 +431,13 @@ def test_delicate_scene_visits_every_rule() -> None:
 
 
 @pytest.mark.parametrize("with_background", [False, True])
-@pytest.mark.parametrize("sh_degree", [None, 0, 1, 2, 3])
-def test_gradcheck(sh_degree: int | None, with_background: bool) -> None:
+@pytest.mark.parametrize(
+    ("sh_degree", "antialiased"), [(None, False), (0, False), (1, False), (2, False), (3, False), (None, True)]
+)
+def test_gradcheck(sh_degree: int | None, antialiased: bool, with_background: bool) -> None:
     scene, camera = delicate_scene(sh_degree)
-    risky = near_discontinuity(**scene, camera=camera, sh_degree=sh_degree, band=1e-4, gate=1e-5)
+    how: dict[str, Any] = {"camera": camera, "sh_degree": sh_degree, "antialiased": antialiased}
+    risky = near_discontinuity(**scene, **how, band=1e-4, gate=1e-5)
     assert not risky.any(), "finite differences would cross a discontinuity"
     inputs = scene | {"means2d_offset": torch.zeros(6, 2)}
     if with_background:
@@ -431,7 +445,7 @@ def test_gradcheck(sh_degree: int | None, with_background: bool) -> None:
 
     def scalar(*groups: Tensor) -> Tensor:
         named = dict(zip(inputs, groups, strict=True))
-        return loss(rasterize_reference(**named, camera=camera, sh_degree=sh_degree))
+        return loss(rasterize_reference(**named, **how))
 
     groups = [group.requires_grad_() for group in inputs.values()]
     every_number = sh_degree is None  # else one random direction a group, for speed

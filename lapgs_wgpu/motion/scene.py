@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
 import os
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -29,7 +27,7 @@ from .fields.hexplane_field import HexPlaneField
 from .fields.laplacian import LaplacianMotion
 from .fields.mlp_field import MlpField
 from .fields.own_field import OwnField
-from .scene_file import SceneFile, read_scene, row_shapes
+from .scene_file import SceneFile, read_scene, row_shapes, scene_header
 
 Field = GridField | MlpField | HexPlaneField | OwnField
 
@@ -82,6 +80,7 @@ class Scene4D:
         field: the module that moves the Gaussians; None for static scenes.
         device: that renders.
         sh_degree: degree of the harmonics in use, 0 to 3.
+        antialiased: how the Gaussians are drawn, see Gaussians.
         metadata: texts by name that the checkpoint holds.
     """
 
@@ -92,6 +91,7 @@ class Scene4D:
         device: Device,
         *,
         sh_degree: int = 0,
+        antialiased: bool = False,
         seed: int = 0,
         own_field: nn.Module | None = None,
     ) -> None:
@@ -102,6 +102,7 @@ class Scene4D:
             field_config: configuration of the field.
             device: that renders.
             sh_degree: degree of the harmonics in use, 0 to 3.
+            antialiased: how the Gaussians are drawn.
             seed: of the field's initial parameters.
             own_field: a module in place of the configured field (docs/api.md).
 
@@ -114,6 +115,7 @@ class Scene4D:
         self.field_config = field_config
         self.device = device
         self.sh_degree = sh_degree
+        self.antialiased = antialiased
         self.field: Field | None = make_field(field_config, device, seed, own_field)
         self.metadata: dict[str, str] = {}
 
@@ -125,6 +127,7 @@ class Scene4D:
         field_config: FieldConfig,
         *,
         opacity: float = 0.1,
+        antialiased: bool = False,
         device: Device | None = None,
         seed: int = 0,
         own_field: nn.Module | None = None,
@@ -137,6 +140,7 @@ class Scene4D:
             scales: (N,) standard deviations, world units.
             field_config: configuration of the field.
             opacity: of all Gaussians, in (0, 1).
+            antialiased: how the Gaussians are drawn.
             device: None for the default adapter.
             seed: of the field's initial parameters.
             own_field: a module in place of the configured field (docs/api.md).
@@ -154,7 +158,8 @@ class Scene4D:
             "sh_rest": torch.zeros(n, 15, 3),
             "dynamics": torch.zeros(n, field_config.dynamics_size),
         }
-        return Scene4D(parameters, field_config, device or open_device(), seed=seed, own_field=own_field)
+        device = device or open_device()
+        return Scene4D(parameters, field_config, device, antialiased=antialiased, seed=seed, own_field=own_field)
 
     def __len__(self) -> int:
         return len(self.parameters["means"])
@@ -176,6 +181,7 @@ class Scene4D:
             p["log_scales"].exp().clamp(min=MIN_SCALE),
             p["opacity_logits"].sigmoid(),
             torch.cat([p["sh_dc"], p["sh_rest"][:, : (self.sh_degree + 1) ** 2 - 1]], dim=1),
+            self.antialiased,
         )
 
     def at(self, t: float) -> Gaussians:
@@ -212,7 +218,8 @@ class Scene4D:
         if moments is not None:
             of_rows = p["means"][moments.rows], still.scales[moments.rows]
             placed = [self._placed(each, *of_rows) for each in others]
-        return Deformed(Gaussians(means, quats, scales, opacities, sh), move.smoothness, placed)
+        moved = Gaussians(means, quats, scales, opacities, sh, self.antialiased)
+        return Deformed(moved, move.smoothness, placed)
 
     def _moves(self, t: float, nearby: Nearby | None, moments: Moments | None) -> list[Deformation]:
         field, means, dynamics = self.field, self.parameters["means"], self.parameters.get("dynamics")
@@ -254,7 +261,13 @@ class Scene4D:
             now = self.at(t)
             tensors = (now.means, now.quats, now.scales, now.opacities, now.sh)
             return rasterize(
-                *tensors, camera, sh_degree=now.sh_degree, background=background, depth=depth, device=self.device
+                *tensors,
+                camera,
+                sh_degree=now.sh_degree,
+                background=background,
+                antialiased=now.antialiased,
+                depth=depth,
+                device=self.device,
             )
 
     def still(self, t: float) -> GaussianSnapshot:
@@ -287,7 +300,7 @@ class Scene4D:
         tensors = {f"gaussians.{name}": value.numpy(force=True) for name, value in self.parameters.items()}
         if self.field is not None:
             tensors |= {f"field.{name}": value.numpy(force=True) for name, value in self.field.state_dict().items()}
-        header = {"field": json.dumps(dataclasses.asdict(self.field_config)), "sh_degree": str(self.sh_degree)}
+        header = scene_header(self.field_config, self.sh_degree, self.antialiased)
         write_checkpoint(path, arrays, tensors, {**self.metadata, **(metadata or {}), **header})
 
 
@@ -318,7 +331,12 @@ def scene_of(file: SceneFile, device: Device | None = None, own_field: nn.Module
     parameters = {name: torch.from_numpy(array.copy()) for name, array in file.gaussians.items()}
     try:
         scene = Scene4D(
-            parameters, file.field_config, device or open_device(), sh_degree=file.sh_degree, own_field=own_field
+            parameters,
+            file.field_config,
+            device or open_device(),
+            sh_degree=file.sh_degree,
+            antialiased=file.antialiased,
+            own_field=own_field,
         )
     except InputError as error:
         raise InputError(f"{file.path}: {error}") from error

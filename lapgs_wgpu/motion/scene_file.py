@@ -37,8 +37,8 @@ class SceneFile:
     """The content of a file, float32.
 
     gaussians: canonical ones by name, (N, ...) with rows as in `row_shapes`. field: the field's parameters by name, in
-    the shapes of `parameter_shapes`. metadata: further texts. The Gaussians of a compact scene that moves have
-    static_features (N, F) in place of the field's static table.
+    the shapes of `parameter_shapes`. metadata: further texts. antialiased: see Gaussians. Those of a compact scene
+    that moves have static_features (N, F) in place of the field's static table.
     """
 
     path: str | os.PathLike[str]
@@ -47,14 +47,16 @@ class SceneFile:
     gaussians: dict[str, NDArray[np.float32]]
     field: dict[str, NDArray[np.float32]]
     metadata: dict[str, str]
+    antialiased: bool = False
 
 
 def read_scene(path: str | os.PathLike[str]) -> SceneFile:
     """Read a checkpoint, a compact scene, or any 3DGS .ply file as a static scene. Raises InputError."""
     if is_lapgs(path):
         tensors, metadata = read_lapgs(path)
-        config, degree = _read_header(metadata, path)
-        return SceneFile(path, config, degree, *expand(tensors, config, degree, str(path)), _texts(metadata))
+        config, degree, antialiased = _read_header(metadata, path)
+        arrays = expand(tensors, config, degree, str(path))
+        return SceneFile(path, config, degree, *arrays, _texts(metadata), antialiased)
     still, tensors, metadata = read_checkpoint(path)
     if not tensors:
         sh = np.zeros((len(still.means), 16, 3), np.float32)
@@ -67,9 +69,9 @@ def read_scene(path: str | os.PathLike[str]) -> SceneFile:
             "gaussians.sh_dc": sh[:, :1],
             "gaussians.sh_rest": sh[:, 1:],
         }
-        config, degree = FieldConfig(kind="static"), still.sh_degree
+        config, degree, antialiased = FieldConfig(kind="static"), still.sh_degree, False
     else:
-        config, degree = _read_header(metadata, path)
+        config, degree, antialiased = _read_header(metadata, path)
     count = len(still.means)
     gaussians = {
         name: _tensor(tensors, f"gaussians.{name}", (count, *shape), path) for name, shape in row_shapes(config).items()
@@ -79,7 +81,7 @@ def read_scene(path: str | os.PathLike[str]) -> SceneFile:
     if config.kind == "own":  # its module, which checks them, comes from elsewhere
         shapes = {name[6:]: array.shape for name, array in tensors.items() if name.startswith("field.")}
     field = {name: _tensor(tensors, f"field.{name}", shape, path) for name, shape in shapes.items()}
-    return SceneFile(path, config, degree, gaussians, field, _texts(metadata))
+    return SceneFile(path, config, degree, gaussians, field, _texts(metadata), antialiased)
 
 
 def compact_bytes(file: SceneFile, static_features: NDArray[np.float32] | None) -> bytes:
@@ -94,15 +96,21 @@ def compact_bytes(file: SceneFile, static_features: NDArray[np.float32] | None) 
             f"motion {config.motion}), which no compact scene holds; --export FOLDER --frames N writes stills"
         )
     gaussians = file.gaussians | ({} if static_features is None else {"static_features": static_features})
-    header = {"field": json.dumps(dataclasses.asdict(config)), "sh_degree": str(file.sh_degree)}
+    header = scene_header(config, file.sh_degree, file.antialiased)
     try:
         return pack_lapgs(compress(gaussians, file.field, config, file.sh_degree), file.metadata | header)
     except InputError as error:
         raise InputError(f"{file.path}: no compact scene can be made of it, because {error}") from error
 
 
+def scene_header(config: FieldConfig, sh_degree: int, antialiased: bool) -> dict[str, str]:
+    """The texts that a file needs beside its arrays, by name."""
+    header = {"field": json.dumps(dataclasses.asdict(config)), "sh_degree": str(sh_degree)}
+    return header | ({"antialiased": "true"} if antialiased else {})
+
+
 def _texts(metadata: Mapping[str, str]) -> dict[str, str]:
-    return {key: value for key, value in metadata.items() if key not in ("field", "sh_degree")}
+    return {key: value for key, value in metadata.items() if key not in ("field", "sh_degree", "antialiased")}
 
 
 def row_shapes(config: FieldConfig) -> dict[str, tuple[int, ...]]:
@@ -111,19 +119,22 @@ def row_shapes(config: FieldConfig) -> dict[str, tuple[int, ...]]:
     return _SHAPES | ({"dynamics": (size,)} if size else {})
 
 
-def _read_header(metadata: Mapping[str, str], path: str | os.PathLike[str]) -> tuple[FieldConfig, int]:
+def _read_header(metadata: Mapping[str, str], path: str | os.PathLike[str]) -> tuple[FieldConfig, int, bool]:
     try:
         config = build_dataclass(FieldConfig, parse_json(metadata["field"], "its text"), "field")
         degree = int(metadata["sh_degree"])
         if not 0 <= degree <= _MAX_DEGREE:
             raise ValueError(f"sh_degree {degree} is outside 0 to {_MAX_DEGREE}")
+        antialiased = metadata.get("antialiased", "false")  # older files lack it
+        if antialiased not in ("false", "true"):
+            raise ValueError(f"antialiased {antialiased!r} is neither true nor false")
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         reason = f"{type(error).__name__}: {error}"[:200]
         raise InputError(
             f"{path}: the checkpoint's description of its field cannot be read ({reason}): "
             "it was damaged, or written by another version of lapgs_wgpu"
         ) from error
-    return config, degree
+    return config, degree, antialiased == "true"
 
 
 def _tensor(

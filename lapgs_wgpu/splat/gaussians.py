@@ -19,6 +19,8 @@ class Gaussians(Generic[Array]):
         opacities: (N,) in [0, 1].
         sh: (N, K, 3) spherical harmonics with K = (degree + 1)^2 coefficients, degree 0 to 3; or view-independent
             colors (N, 3).
+        antialiased: whether a Gaussian is drawn as much fainter as the rasterizer's low-pass filter makes it larger in
+            the image (Yu et al., Mip-Splatting, 2024), as it was trained.
     """
 
     means: Array
@@ -26,6 +28,11 @@ class Gaussians(Generic[Array]):
     scales: Array
     opacities: Array
     sh: Array
+    antialiased: bool = False
+
+    def arrays(self) -> dict[str, Array]:
+        """The arrays by name, each with a row for every Gaussian."""
+        return {name: value for name, value in vars(self).items() if name != "antialiased"}
 
     def __len__(self) -> int:
         return int(_shape(self.means)[0])

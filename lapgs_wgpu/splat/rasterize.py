@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from typing import Any, NamedTuple
 
@@ -15,6 +14,7 @@ from ..gpu.array import DeviceArray, read_all
 from ..gpu.device import Device, open_device
 from ..gpu.pool import BufferPool
 from .camera import Camera
+from .constants import CONSTANTS
 from .drawing import Drawing
 from .gaussians import Gaussians
 from .rasterizer import Rasterizer
@@ -55,6 +55,7 @@ def rasterize(
     *,
     sh_degree: int | None = None,
     background: Tensor | None = None,
+    antialiased: bool = False,
     depth: bool = True,
     device: Device | None = None,
 ) -> Rendering:
@@ -69,6 +70,8 @@ def rasterize(
         sh_degree: 0 to 3.
         background: (3,); None for black.
         camera: which renders the image.
+        antialiased: whether a Gaussian is drawn as much fainter as the low-pass filter makes it larger in the image, as
+            gsplat's rasterize_mode "antialiased".
         depth: whether to render depth, which takes a tenth of the time; otherwise it is zero.
         device: None for the default adapter.
 
@@ -101,7 +104,7 @@ def rasterize(
     sh = colors if sh_degree is None else colors[:, : (sh_degree + 1) ** 2]
     probe = means.new_empty((n, 2)).requires_grad_(torch.is_grad_enabled())
     image, alpha, z, radii, centres = _Rasterize.apply(
-        means, quats, scales, opacities, sh, background, probe, camera, depth, device or open_device()
+        means, quats, scales, opacities, sh, background, probe, camera, antialiased, depth, device or open_device()
     )
     probe.data = centres
     return Rendering(image, alpha, z, radii, probe)
@@ -110,10 +113,10 @@ def rasterize(
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
-        *tensors, background, probe, camera, depth, device = arguments
+        *tensors, background, probe, camera, antialiased, depth, device = arguments
         rasterizer = rasterizer_of(device)
         height, width = camera.height, camera.width
-        ctx.camera, ctx.depth, ctx.rasterizer = camera, depth, rasterizer
+        ctx.camera, ctx.antialiased, ctx.depth, ctx.rasterizer = camera, antialiased, depth, rasterizer
         if len(probe) == 0:
             ctx.save_for_backward(*tensors, background, background.new_ones((height, width)))
             ctx.drawing = None
@@ -122,7 +125,8 @@ class _Rasterize(torch.autograd.Function):
             radii = torch.zeros(0, dtype=torch.int32, device=image.device)
             ctx.mark_non_differentiable(radii)
             return image, empty, empty.clone(), radii, probe.detach().clone()
-        ctx.drawing, planes, splats = _draw(rasterizer, Gaussians(*tensors), background, camera, depth)
+        gaussians = Gaussians(*tensors, antialiased=antialiased)
+        ctx.drawing, planes, splats = _draw(rasterizer, gaussians, background, camera, depth)
         # By numpy: each operator of torch of this size wakes its threads, and they and the driver's take turns. By
         # planes: three times as fast as a transposed copy.
         rgb, z = np.stack(list(planes[:3]), axis=-1), planes[4].copy() if depth else np.zeros_like(planes[3])
@@ -142,10 +146,11 @@ class _Rasterize(torch.autograd.Function):
             d_background += (d_image * transmittance[..., None]).sum((0, 1))
         if ctx.drawing is None:
             empty = [torch.zeros_like(t) for t in tensors]
-            return (*empty, d_background, background.new_zeros((0, 2)), *[None] * 3)
+            return (*empty, d_background, background.new_zeros((0, 2)), *[None] * 4)
         rasterizer: Rasterizer = ctx.rasterizer
         if not rasterizer.holds(ctx.drawing):  # another image was drawn in between
-            ctx.drawing, _, _ = _draw(rasterizer, Gaussians(*tensors), background, ctx.camera, ctx.depth)
+            gaussians = Gaussians(*tensors, antialiased=ctx.antialiased)
+            ctx.drawing, _, _ = _draw(rasterizer, gaussians, background, ctx.camera, ctx.depth)
         planes = np.zeros((5 if ctx.depth else 4, *transmittance.shape), np.float32)
         if d_image is not None:
             planes[:3] = d_image.numpy(force=True).transpose(2, 0, 1)
@@ -154,8 +159,8 @@ class _Rasterize(torch.autograd.Function):
         if ctx.depth and d_depth is not None:
             planes[4] = d_depth.numpy(force=True)
         gradients = rasterizer.backward(ctx.drawing, rasterizer.pool.upload("d_image", planes))
-        by_gaussians, d_means2d = gradient_tensors(read_all(gradients.arrays()), background.device)
-        return (*by_gaussians, d_background, d_means2d, *[None] * 3)
+        by_gaussians, d_means2d = gradient_tensors(read_all(gradients.arrays()), tensors[3])
+        return (*by_gaussians, d_background, d_means2d, *[None] * 4)
 
 
 def _draw(
@@ -173,8 +178,8 @@ def _draw(
 
 def upload_gaussians(pool: BufferPool, gaussians: Gaussians[Tensor]) -> Gaussians[DeviceArray]:
     """Upload Gaussians to buffers of a pool."""
-    names = [field.name for field in dataclasses.fields(gaussians)]
-    return Gaussians(*(upload(pool, name, getattr(gaussians, name)) for name in names))
+    arrays = {name: upload(pool, name, tensor) for name, tensor in gaussians.arrays().items()}
+    return Gaussians(**arrays, antialiased=gaussians.antialiased)
 
 
 def radii_and_centres(splats: NDArray[np.float32], device: torch.device) -> tuple[Tensor, Tensor]:
@@ -183,11 +188,15 @@ def radii_and_centres(splats: NDArray[np.float32], device: torch.device) -> tupl
     return torch.from_numpy(radii).to(device), torch.from_numpy(centres).to(device)
 
 
-def gradient_tensors(arrays: list[NDArray[np.float32]], device: torch.device) -> tuple[tuple[Tensor, ...], Tensor]:
-    """Gradients of means, quats, scales, opacities and sh; and of means2d. arrays: GaussianGradients, read back."""
-    d_splats, d_means, d_quats, d_scales, *d_sh = (torch.from_numpy(array).to(device) for array in arrays)
+def gradient_tensors(arrays: list[NDArray[np.float32]], opacities: Tensor) -> tuple[tuple[Tensor, ...], Tensor]:
+    """Gradients of means, quats, scales, opacities and sh; and of means2d, on the device of the opacities (N,).
+
+    arrays: GaussianGradients, read back.
+    """
+    d_splats, d_means, d_quats, d_scales, *d_sh = (torch.from_numpy(array).to(opacities.device) for array in arrays)
+    d_opacities = d_splats[:, OPACITY] / opacities.detach().clamp(min=CONSTANTS["ALPHA_MIN"])  # fainter ones: 0
     d_colors = d_sh[0] if d_sh else d_splats[:, COLOR]
-    return (d_means, d_quats, d_scales, d_splats[:, OPACITY], d_colors), d_splats[:, MEAN]
+    return (d_means, d_quats, d_scales, d_opacities, d_colors), d_splats[:, MEAN]
 
 
 def upload(pool: BufferPool, name: str, tensor: Tensor) -> DeviceArray:

@@ -143,7 +143,8 @@ class Rasterizer:
         tile_keys, slot_ids = (pool.array(name, (capacity,), "uint32") for name in ("tile keys", "slot ids"))
         ranges = pool.array("ranges", (tiles + 1, 4), "uint32")
         length = pool.constant("gaussians", n.to_bytes(4, "little"))
-        arrays = vars(gaussians) | {"frame": frame, "splats": drawing.splats, "image": drawing.image, "needed": needed}
+        arrays = gaussians.arrays() | {"frame": frame, "needed": needed}
+        arrays |= {"splats": drawing.splats, "image": drawing.image}
         arrays |= {"tile_counts": tile_counts, "ids": ids, "keys": keys, "prefix": offsets, "visible": visible}
         arrays |= {"offsets": offsets, "tile_keys": tile_keys, "slot_ids": slot_ids, "ranges": ranges}
         if config.listed:
@@ -244,6 +245,7 @@ class Rasterizer:
             size=(camera.width, camera.height),
             tiles=(columns, rows),
             band=self._band_rows(drawing, band),
+            antialiased=int(drawing.gaussians.antialiased),
         )
         return self.pool.constant(f"frame {band}", content)
 
@@ -293,7 +295,7 @@ class Rasterizer:
             if self._subgroup_mismatch("rasterize_bwd", drawing):
                 return self.backward(drawing, d_image, camera=camera, profile=profile)
         d_sh, d_camera = None, self._camera_sums(n) if camera else None
-        arrays = vars(gaussians) | {"frame": self._frame(drawing, 0), "d_splats": d_splats}
+        arrays = gaussians.arrays() | {"frame": self._frame(drawing, 0), "d_splats": d_splats}
         arrays |= {"d_means": d_means, "d_quats": d_quats, "d_scales": d_scales}
         with Commands(self.device, profile) as commands:
             commands.run(Kernel.get(self.device, "project_bwd"), _groups(n), arrays)

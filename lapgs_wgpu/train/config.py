@@ -416,6 +416,12 @@ class Config(Options):
     cameras: CamerasConfig = option("", CamerasConfig())
     discovery: DiscoveryConfig = option("", DiscoveryConfig())
     eval: EvalConfig = option("", EvalConfig())
+    antialiased: bool = option(
+        "draw each Gaussian as much fainter as the rasterizer's low-pass filter makes it larger in the image, so that "
+        "what is thin looks as thin at every distance and from every side; not of the paper; viewers that draw without "
+        "it show the scene a little thicker",
+        False,
+    )
     precision: Precision = option(
         "data type of the field's features and of its decoder's matrix products and their gradients; bfloat16: "
         "only fields grid4d and laplacian, faster on processors with bfloat16 instructions; all else is float32",

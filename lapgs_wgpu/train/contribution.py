@@ -40,6 +40,8 @@ def _blending_weights(gaussians: Gaussians[Tensor], view: View, scene: Scene4D) 
     """(N,) their sums over the pixels of a view: the gradient of the sum of the image by the colors."""
     colors = torch.zeros_like(gaussians.means, requires_grad=True)
     shape = gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities
-    rendering = rasterize(*shape, colors, view.camera, depth=False, device=scene.device)
+    rendering = rasterize(
+        *shape, colors, view.camera, antialiased=gaussians.antialiased, depth=False, device=scene.device
+    )
     (gradient,) = torch.autograd.grad(rendering.image[..., 0].sum(), colors)
     return gradient[:, 0]

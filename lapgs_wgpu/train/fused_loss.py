@@ -80,7 +80,17 @@ def render_loss(
     probe = gaussians.means.new_empty((len(gaussians), 2)).requires_grad_(wanted)
     red, green, blue = background.tolist()
     loss, computed, radii, centres = _FusedLoss.apply(
-        *tensors, probe, camera, camera_unit, truth, (red, green, blue), weights, device, wanted, own
+        *tensors,
+        probe,
+        camera,
+        camera_unit,
+        gaussians.antialiased,
+        truth,
+        (red, green, blue),
+        weights,
+        device,
+        wanted,
+        own,
     )
     probe.data = centres
     names = ("l1", "mse", "ssim", "pyramid", "ncc", *(term.name for term, _ in own))
@@ -97,9 +107,10 @@ class _FusedLoss(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
-        *tensors, correction, change, probe, camera, unit, truth, background, weights, device, wanted, own = arguments
+        *tensors, correction, change, probe, camera, unit, antialiased = arguments[:-6]
+        truth, background, weights, device, wanted, own = arguments[-6:]
         rasterizer, losses, exposing = rasterizer_of(device), image_loss_of(device), exposure_of(device)
-        gaussians = upload_gaussians(rasterizer.pool, Gaussians(*tensors))
+        gaussians = upload_gaussians(rasterizer.pool, Gaussians(*tensors, antialiased=antialiased))
         while True:
             drawing = rasterizer.draw(gaussians, camera, background)
             d_rows, d_gaussians = [], []
@@ -124,7 +135,7 @@ class _FusedLoss(torch.autograd.Function):
                 break
         ctx.gradients = None
         if gradients:
-            by_gaussians, d_means2d = gradient_tensors(gradients, probe.device)
+            by_gaussians, d_means2d = gradient_tensors(gradients, tensors[3])
             by_correction = None if correction is None else correction.new_tensor(rows[0].sum(axis=0, dtype=np.float64))
             by_camera = None
             if change is not None:
@@ -140,7 +151,7 @@ class _FusedLoss(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *d_outputs: Any) -> tuple[Tensor | None, ...]:
         scaled = (None if gradient is None else d_outputs[0] * gradient for gradient in ctx.gradients)
-        return (*scaled, *[None] * 8)
+        return (*scaled, *[None] * 9)
 
 
 def _own_terms(

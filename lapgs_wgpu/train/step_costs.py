@@ -83,6 +83,7 @@ def _scene(config: Config, dataset: Dataset, device: Device, count: int) -> Scen
         scales[rows] * smaller,
         config.field,
         opacity=config.points.opacity,
+        antialiased=config.antialiased,
         device=device,
         seed=config.seed,
     )

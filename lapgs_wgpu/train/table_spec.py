@@ -122,6 +122,8 @@ def fingerprint(config: Config) -> str:
     # These keys are younger than results that are worth keeping.
     if values["schedule"]["batch"] == 1:
         del values["schedule"]["batch"]
+    if not config.antialiased:
+        del values["antialiased"]
     if not config.exposure.enabled:
         del values["exposure"]
     if config.cameras.refine != "on":

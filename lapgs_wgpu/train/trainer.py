@@ -151,6 +151,7 @@ class Trainer:
             *initial_points(config.points, dataset, config.seed),
             config.field,
             opacity=config.points.opacity,
+            antialiased=config.antialiased,
             device=device,
             seed=config.seed,
             own_field=parts.field,

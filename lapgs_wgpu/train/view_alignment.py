@@ -14,7 +14,6 @@ from torch import Tensor
 
 from lapgs_wgpu.data.views import View
 from lapgs_wgpu.motion.scene import Scene4D
-from lapgs_wgpu.splat.gaussians import Gaussians
 
 from .camera_descent import CameraDescent, image_motion, scene_points, whitening
 from .camera_refinement import changed_camera
@@ -36,8 +35,7 @@ def aligned_view(scene: Scene4D, view: View, background: Tensor, unit: float) ->
     bits on every run of one adapter and driver. Raises InputError where the image cannot be read.
     """
     with torch.no_grad():
-        now = scene.at(view.time)
-    gaussians = Gaussians(now.means, now.quats, now.scales, now.opacities, now.sh)
+        gaussians = scene.at(view.time)
     points = scene_points(gaussians.means, gaussians.opacities)
     truth, descent, camera = upload_rgba(scene.device, view.load()), CameraDescent(1), view.camera
     for step in range(1, STEPS + 1):

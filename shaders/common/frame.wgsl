@@ -10,4 +10,5 @@ struct Frame {
     size: vec2<u32>,        // image, pixels
     tiles: vec2<u32>,       // columns and rows of tiles
     band: vec2<u32>,        // first and one past the last row of tiles that this submission draws
+    antialiased: u32,       // 1: a splat is as much fainter as DILATION makes it larger
 }

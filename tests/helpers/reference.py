@@ -30,7 +30,7 @@ class Projection(NamedTuple):
 
     means2d: (N, 2) pixels. conics: (N, 3) a, b, c of the inverse covariance [[a, b], [b, c]], px^-2.
     depths: (N,) camera z, world units. visible: (N,) bool. tau: (N,) squared Mahalanobis radius of the ellipse where
-    alpha reaches ALPHA_MIN. half_sides: (N, 2) of that ellipse's bounding box, pixels.
+    alpha reaches ALPHA_MIN. half_sides: (N, 2) of that ellipse's bounding box, pixels. opacities: (N,) as drawn.
     """
 
     means2d: Tensor
@@ -39,6 +39,7 @@ class Projection(NamedTuple):
     visible: Tensor
     tau: Tensor
     half_sides: Tensor
+    opacities: Tensor
 
     def front_to_back(self) -> Tensor:
         """Rows of the visible Gaussians by depth, ties by index."""
@@ -64,9 +65,9 @@ def _frustum_limits(camera: Camera) -> list[tuple[float, float]]:
 
 
 def _project(
-    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, camera: Camera
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """means2d, conics, depths, tau and half_sides of every row as it is."""
+    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, camera: Camera, antialiased: bool
+) -> tuple[Tensor, ...]:
+    """means2d, conics, depths, tau, half_sides and opacities of every row as it is."""
     (fx, _, cx), (_, fy, cy) = camera.K[:2].tolist()
     x, y, z = _camera_points(means, camera).unbind(-1)
     means2d = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=-1)
@@ -81,12 +82,15 @@ def _project(
     row_y = (fy / z)[:, None] * (axes[:, 1] - (y / z).clamp(y_low, y_high)[:, None] * axes[:, 2])
     xx, xy, yy = (row_x * row_x).sum(-1), (row_x * row_y).sum(-1), (row_y * row_y).sum(-1)
     # xx yy - xy^2 without its cancellation, so a splat as thin as a needle keeps a positive determinant
-    det = torch.linalg.cross(row_x, row_y).square().sum(-1) + DILATION * (xx + yy) + DILATION**2
+    flat = torch.linalg.cross(row_x, row_y).square().sum(-1)
+    det = flat + DILATION * (xx + yy) + DILATION**2
     variances = torch.stack([xx, yy], dim=-1) + DILATION
     conics = torch.stack([variances[:, 1], -xy, variances[:, 0]], dim=-1) / det[:, None]
 
+    if antialiased:
+        opacities = opacities * torch.sqrt(flat / det)
     tau = 2 * torch.log(opacities / ALPHA_MIN)
-    return means2d, conics, z, tau, torch.sqrt(tau[:, None] * variances)
+    return means2d, conics, z, tau, torch.sqrt(tau[:, None] * variances), opacities
 
 
 def _scattered(values: Tensor, rows: Tensor, count: int) -> Tensor:
@@ -94,25 +98,28 @@ def _scattered(values: Tensor, rows: Tensor, count: int) -> Tensor:
     return values.new_zeros(count, *values.shape[1:]).index_copy(0, rows, values)
 
 
-def project(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, camera: Camera) -> Projection:
+def project(
+    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, camera: Camera, *, antialiased: bool = False
+) -> Projection:
     """Project Gaussians onto the image and cull.
 
-    means: (N, 3) world. quats: (N, 4) wxyz. scales: (N, 3) standard deviations, world units. opacities: (N,).
-    Invisible: depth <= NEAR, opacity < ALPHA_MIN, anything not finite, or an ellipse whose bounding box lies wholly
-    outside the image. camera.K's skew is ignored.
+    means: (N, 3) world. quats: (N, 4) wxyz. scales: (N, 3) standard deviations, world units. opacities: (N,);
+    antialiased, they are drawn fainter by the ratio of the splat's area without DILATION to that with it.
+    Invisible: depth <= NEAR, opacity as drawn < ALPHA_MIN, anything not finite, or an ellipse whose bounding box lies
+    wholly outside the image. camera.K's skew is ignored.
     """
     with torch.no_grad():  # first who is visible, so that no division by the others' depths reaches the gradients
-        means2d, conics, depths, tau, half_sides = _project(means, quats, scales, opacities, camera)
+        means2d, conics, depths, tau, half_sides, _ = _project(means, quats, scales, opacities, camera, antialiased)
         size = means.new_tensor([camera.width, camera.height])
         finite = torch.cat([means2d, conics, half_sides], dim=-1).isfinite().all(-1)
         meets_image = ((means2d + half_sides > 0) & (means2d - half_sides < size)).all(-1)
         visible = finite & meets_image & (depths > NEAR) & (tau >= 0)
     rows = visible.nonzero().squeeze(-1)
-    means2d, conics, depths, tau, half_sides = (
+    means2d, conics, depths, tau, half_sides, opacities = (
         _scattered(values, rows, len(means))
-        for values in _project(means[rows], quats[rows], scales[rows], opacities[rows], camera)
+        for values in _project(means[rows], quats[rows], scales[rows], opacities[rows], camera, antialiased)
     )
-    return Projection(means2d, conics, depths, visible, tau, half_sides)
+    return Projection(means2d, conics, depths, visible, tau, half_sides, opacities)
 
 
 def sh_basis(directions: Tensor, degree: int) -> Tensor:
@@ -193,11 +200,11 @@ def _composite(centres: Tensor, means2d: Tensor, conics: Tensor, opacities: Tens
 
 
 def rasterize(
-    projection: Projection, opacities: Tensor, colors: Tensor, camera: Camera, background: Tensor | None = None
+    projection: Projection, colors: Tensor, camera: Camera, background: Tensor | None = None
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Composite projected Gaussians, in any order, to image (H, W, 3), alpha (H, W) and depth (H, W).
 
-    opacities: (N,). colors: (N, 3). background: (3,), none is black. Pixel (column, row) has its centre at
+    colors: (N, 3). background: (3,), none is black. Pixel (column, row) has its centre at
     (column + 0.5, row + 0.5).
     """
     order = projection.front_to_back()
@@ -207,7 +214,7 @@ def rasterize(
     where, parts = [], []
     for rows, columns, centres, near in _tiles(means2d, half_sides, camera):
         splats = order[near]
-        groups = (group[splats] for group in (projection.means2d, projection.conics, opacities, features))
+        groups = (group[splats] for group in (projection.means2d, projection.conics, projection.opacities, features))
         parts.append(checkpoint(_composite, centres, *groups, use_reentrant=False))  # memory for one tile at a time
         where.append(pixels[rows, columns].flatten())
     result = torch.cat(parts)[torch.cat(where).argsort()].view(camera.height, camera.width, 5)
@@ -227,6 +234,7 @@ def rasterize_reference(
     *,
     sh_degree: int | None = None,
     background: Tensor | None = None,
+    antialiased: bool = False,
     means2d_offset: Tensor | None = None,
 ) -> Rendering:
     """Render N Gaussians in the tensors' own precision, differentiable in all of them.
@@ -235,13 +243,13 @@ def rasterize_reference(
     harmonics when sh_degree is given. background: (3,), none is black. means2d_offset: (N, 2) zeros that are added to
     the projected means, so that their gradient is that of means2d. Rows of means2d that nobody sees are zero.
     """
-    projection = project(means, quats, scales, opacities, camera)
+    projection = project(means, quats, scales, opacities, camera, antialiased=antialiased)
     if means2d_offset is not None:
         projection = projection._replace(means2d=projection.means2d + means2d_offset)
     if sh_degree is not None:
         seen = projection.visible.nonzero().squeeze(-1)
         colors = _scattered(color(colors[seen], means[seen], camera, sh_degree), seen, len(means))
-    image, alpha, depth = rasterize(projection, opacities, colors, camera, background)
+    image, alpha, depth = rasterize(projection, colors, camera, background)
     radii = projection.half_sides.detach().amax(-1).ceil().clamp(max=2.0**30).to(torch.int32)  # within int32
     return Rendering(image, alpha, depth, radii, projection.means2d)
 
@@ -256,6 +264,7 @@ def near_discontinuity(
     camera: Camera,
     *,
     sh_degree: int | None = None,
+    antialiased: bool = False,
     band: float = 1e-3,
     gate: float = 1e-6,
 ) -> Tensor:
@@ -265,9 +274,9 @@ def near_discontinuity(
     gate: relative distance of the depths of two Gaussians that follow each other in a pixel; distance of x/z, y/z to
     the frustum limits, and of a color to the cut at zero.
     """
-    projection = project(means, quats, scales, opacities, camera)
+    projection = project(means, quats, scales, opacities, camera, antialiased=antialiased)
     order = projection.front_to_back()
-    means2d, conics, depths, opacities = (group[order] for group in (*projection[:3], opacities))
+    means2d, conics, depths, opacities = (group[order] for group in (*projection[:3], projection.opacities))
     points = _camera_points(means[order], camera)
     limits = points.new_tensor(_frustum_limits(camera))
     fragile = ((points[:, :2, None] / points[:, 2:, None] - limits).abs() < gate).flatten(1).any(1)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -118,6 +118,7 @@ def step(
     *,
     sh_degree: int | None = None,
     background: Tensor | None = None,
+    antialiased: bool = False,
     weights: Weights | None = None,
 ) -> Step:
     """One forward and backward pass on the device."""
@@ -125,7 +126,8 @@ def step(
     leaves = {name: value.clone().requires_grad_() for name, value in scene.items()}
     if background is not None:
         background = background.clone().requires_grad_()
-    drawn = rasterize(**leaves, camera=camera, sh_degree=sh_degree, background=background, device=device)
+    how: dict[str, Any] = {"sh_degree": sh_degree, "background": background, "antialiased": antialiased}
+    drawn = rasterize(**leaves, camera=camera, **how, device=device)
     (drawn.image * weights.image).sum().add((drawn.alpha * weights.alpha).sum()).add(
         (drawn.depth * weights.depth).sum()
     ).backward()
@@ -138,6 +140,7 @@ def reference_step(
     *,
     sh_degree: int | None = None,
     background: Tensor | None = None,
+    antialiased: bool = False,
     weights: Weights | None = None,
 ) -> Step:
     """The same in float64 on the processor. Pixels near a discontinuity must have no weight."""
@@ -146,9 +149,8 @@ def reference_step(
     if background is not None:
         background = background.double().requires_grad_()
     offset = torch.zeros(len(scene["means"]), 2, dtype=torch.float64, requires_grad=True)
-    drawn = rasterize_reference(
-        **leaves, camera=camera, sh_degree=sh_degree, background=background, means2d_offset=offset
-    )
+    how: dict[str, Any] = {"sh_degree": sh_degree, "background": background, "antialiased": antialiased}
+    drawn = rasterize_reference(**leaves, camera=camera, **how, means2d_offset=offset)
     loss = (drawn.image * weights.image).sum() + (drawn.alpha * weights.alpha).sum()
     (loss + (drawn.depth * weights.depth).sum()).backward()
     return Step(*(value.detach() for value in drawn), _gradients(leaves, background, offset.grad))
@@ -161,9 +163,10 @@ def _gradients(leaves: Scene, background: Tensor | None, means2d: Tensor | None)
     return {name: torch.empty(0) if value is None else value for name, value in found.items()}
 
 
-def fragile_pixels(scene: Scene, camera: Camera, sh_degree: int | None = None) -> Tensor:
+def fragile_pixels(scene: Scene, camera: Camera, sh_degree: int | None = None, *, antialiased: bool = False) -> Tensor:
     """(H, W) bool: pixels where rounding may decide between two results."""
-    return near_discontinuity(**{k: v.double() for k, v in scene.items()}, camera=camera, sh_degree=sh_degree)
+    exact = {name: value.double() for name, value in scene.items()}
+    return near_discontinuity(**exact, camera=camera, sh_degree=sh_degree, antialiased=antialiased)
 
 
 def relative(a: Tensor, b: Tensor) -> float:

@@ -13,10 +13,10 @@ const GEOMETRY = [[4, 0], [3, 2], [4, 1], [3, 3]]; // outputs of a head, and the
 export class Playback {
     constructor(gpu, scene, minScale) {
         Object.assign(this, { gpu, scene, time: NaN });
-        const { count, shDegree } = scene;
+        const { count, shDegree, antialiased } = scene;
         const pool = this.pool = new Pool(gpu);
         const active = activate(scene, minScale);
-        this.gaussians = { count, degree: shDegree };
+        this.gaussians = { count, degree: shDegree, antialiased };
         for (const name of ["means", "quats", "scales", "opacities", "sh"]) {
             this.gaussians[name] = pool.upload(name, active[name]);
         }

@@ -31,7 +31,7 @@ export class Rasterizer {
     }
 
     // Submit the passes that draw an image. It is valid once `valid` says so of what `counts` reads.
-    // gaussians: {count, degree, means, quats, scales, opacities, sh}. camera: see camera.js. depth: as a fifth plane.
+    // gaussians: {count, degree, antialiased, means, quats, scales, opacities, sh}. camera: see camera.js. depth: as a fifth plane.
     draw(gaussians, camera, background, log = null, depth = false) {
         if (this.size !== `${camera.width}x${camera.height}`) { // what another size needed would slow this one down
             this.plan = { capacity: this.plan.capacity, bands: 1 };
@@ -85,7 +85,7 @@ export class Rasterizer {
 
     drawBand(commands, { gaussians, camera, background, plan, rasterize, image, splats }, band) {
         const { gpu, pool } = this;
-        const { count: n, means, quats, scales, opacities } = gaussians;
+        const { count: n, antialiased, means, quats, scales, opacities } = gaussians;
         const { capacity } = plan;
         const [rows, columns] = this.tiles(camera);
         const [top, bottom] = [Math.floor(rows * band / plan.bands), Math.floor(rows * (band + 1) / plan.bands)];
@@ -93,6 +93,7 @@ export class Rasterizer {
         const frame = pool.uniform(`frame ${band}`, gpu.kernel("compact"), "frame", {
             view: camera.view, focal: camera.focal, center: camera.center, position: camera.position, gaussians: n,
             background, capacity, size: [camera.width, camera.height], tiles: [columns, rows], band: [top, bottom],
+            antialiased: Number(antialiased),
         });
         const [counts, ids, keys, offsets] = ["tile counts", "ids", "depth keys", "offsets"].map(name => pool.array(name, 4 * n));
         const visible = pool.array("visible", 4);

@@ -9,10 +9,11 @@ const APPEARANCES = new Map([["none", 0], ["color", 3], ["color+opacity", 4]]); 
 
 const damaged = reason => new Refusal(`The scene cannot be read: ${reason}; the file is damaged.`);
 
-// {count, shDegree, field, gaussians, parameters, metadata}; field is null where nothing moves. Raises Refusal.
+// {count, shDegree, antialiased, field, gaussians, parameters, metadata}; field is null where nothing moves. Raises Refusal.
 export async function readScene(bytes) {
     const { tensors, metadata } = await readContainer(bytes);
     const shDegree = whole(Number(metadata.sh_degree ?? NaN), "sh_degree", 0, 3);
+    const antialiased = metadata.antialiased === "true"; // older files lack it
     const field = readField(metadata.field);
     const means = tensors.get("gaussians.means");
     const count = means?.shape.length === 2 ? means.shape[1] : 0;
@@ -25,7 +26,8 @@ export async function readScene(bytes) {
     for (const [name, width] of Object.entries(columns)) {
         gaussians[name] = dequantize(tensors, `gaussians.${name}`, count, width, [0]);
     }
-    return { count, shDegree, field, gaussians, parameters: field ? readParameters(tensors, field) : {}, metadata };
+    const parameters = field ? readParameters(tensors, field) : {};
+    return { count, shDegree, antialiased, field, gaussians, parameters, metadata };
 }
 
 function whole(value, name, low, high) {

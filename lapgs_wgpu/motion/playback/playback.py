@@ -97,7 +97,8 @@ class DevicePlayback:
         activated = activate(file.gaussians, file.sh_degree)
         pool = BufferPool(device)
         names = {"means": "means", "quats": "quats", "scales": "scales", "opacities": "opacities", "sh": "colors"}
-        self._now = Gaussians(**{name: pool.upload(name, activated[of]) for name, of in names.items()})
+        arrays = {name: pool.upload(name, activated[of]) for name, of in names.items()}
+        self._now = Gaussians(**arrays, antialiased=file.antialiased)
         self.exact = True
         self._field: GridFieldPlayback | None = None
         if self.moves:

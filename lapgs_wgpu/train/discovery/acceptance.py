@@ -83,7 +83,13 @@ def _improves(
     least_right: float,
 ) -> bool:
     """Whether a part, beside the static fit, gains, is right by least_right, or changes largely what moves."""
-    scene = Scene4D(rows_with(static, part), static.field_config, static.device, sh_degree=static.sh_degree)
+    scene = Scene4D(
+        rows_with(static, part),
+        static.field_config,
+        static.device,
+        sh_degree=static.sh_degree,
+        antialiased=static.antialiased,
+    )
     level = torch.full((3,), background)
     gain, agreeing, change, changed, moving = 0.0, 0.0, 0.0, 0, 0
     for image in images:

@@ -110,4 +110,12 @@ def scene_with(
         of_part = DYNAMICS * torch.randn(int(tracks.part.max()) + 1, config.field.dynamics_size, generator=generator)
         dynamics = torch.cat([dynamics, of_part[torch.from_numpy(tracks.part)]])
     rows["dynamics"] = dynamics
-    return Scene4D(rows, config.field, device, sh_degree=static.sh_degree, seed=config.seed, own_field=own_field)
+    return Scene4D(
+        rows,
+        config.field,
+        device,
+        sh_degree=static.sh_degree,
+        antialiased=static.antialiased,
+        seed=config.seed,
+        own_field=own_field,
+    )
