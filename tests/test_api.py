@@ -229,7 +229,7 @@ def test_results_of_another_form_are_named(value: Any, message: str, dataset: Da
 def test_all_parts_of_a_deformation_are_optional(dataset: Dataset, device: Device) -> None:
     with Trainer(configure(), dataset, device, parts=Parts(field=Rows(lambda n: Deformation()))) as trainer:
         still, now = trainer.scene.canonical(), trainer.scene.at(0.3)
-    assert all(torch.equal(a, b) for a, b in zip(vars(still).values(), vars(now).values(), strict=True))
+    assert all(torch.equal(a, b) for a, b in zip(still.arrays().values(), now.arrays().values(), strict=True))
 
 
 class Pivoted(nn.Module):

@@ -158,7 +158,7 @@ def test_some_are_moved_and_the_others_left(device: Device, name: str, block: in
 
 def contents(out: Gaussians[DeviceArray]) -> dict[str, np.ndarray]:
     """As words, so that equal means equal bits."""
-    return {part: array.read().view(np.uint32) for part, array in vars(out).items()}
+    return {part: array.read().view(np.uint32) for part, array in out.arrays().items()}
 
 
 def test_work_goes_with_the_number_of_those_moved(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:

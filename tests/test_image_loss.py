@@ -186,13 +186,14 @@ def test_a_term_of_weight_0_runs_no_passes(device: Device, monkeypatch: pytest.M
 # With the rasteriser
 
 
-def test_a_step_is_that_of_the_rasteriser_and_the_references(device: Device) -> None:
-    scene, other = gaussians(), gaussians()
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_a_step_is_that_of_the_rasteriser_and_the_references(device: Device, antialiased: bool) -> None:
+    scene, other = (gaussians(antialiased=antialiased) for _ in range(2))
     done = step(device, scene)
     done.loss.backward()
     drawn = rasterize(
         other.means, other.quats, other.scales, other.opacities, other.sh, CAMERA,
-        sh_degree=1, background=BACKGROUND, depth=False, device=device,
+        sh_degree=1, background=BACKGROUND, antialiased=antialiased, depth=False, device=device,
     )  # fmt: skip
     truth = torch.from_numpy(TRUTH.astype(np.float32) / 255)
     loss = total(drawn.image.double(), truth.double(), WEIGHTS["all"])

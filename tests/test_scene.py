@@ -84,7 +84,7 @@ def test_an_untrained_field_leaves_the_scene_as_it_is(device: Device) -> None:
 def test_a_picture_trains_every_parameter(device: Device) -> None:
     scene = moving_scene(device)
     now = scene.at(0.4)
-    rendering = rasterize(*vars(now).values(), CAMERA, sh_degree=now.sh_degree, device=device)
+    rendering = rasterize(*now.arrays().values(), CAMERA, sh_degree=now.sh_degree, device=device)
     rendering.image.square().sum().backward()
     for name, parameter in scene.parameters.items():
         assert parameter.grad is not None, name
@@ -131,15 +131,19 @@ def test_from_points(device: Device) -> None:
 
 
 @pytest.mark.parametrize("config", [CONFIG, FieldConfig(kind="static")], ids=["moving", "static"])
-@pytest.mark.parametrize("sh_degree", [0, 3])
+@pytest.mark.parametrize(("sh_degree", "antialiased"), [(0, False), (3, True)])
 def test_a_loaded_scene_draws_the_same_bits(
-    device: Device, tmp_path: Path, config: FieldConfig, sh_degree: int
+    device: Device, tmp_path: Path, config: FieldConfig, sh_degree: int, antialiased: bool
 ) -> None:
     scene = moving_scene(device, config, sh_degree)
+    other = pictures(scene)
+    scene.antialiased = antialiased
+    assert (pictures(scene) != other) == antialiased
     scene.save(tmp_path / "scene.ply", {"step": "1200"})
     again = load(tmp_path / "scene.ply", device)
     assert again.field_config == config
     assert again.sh_degree == sh_degree
+    assert again.antialiased == antialiased
     assert again.metadata == {"step": "1200"}
     for name, parameter in scene.parameters.items():
         assert torch.equal(again.parameters[name], parameter)

@@ -187,6 +187,16 @@ def test_a_still_scene(window: Browser, folder: Path, device: Device) -> None:
     assert not window.value("lapgs.playing")
 
 
+def test_an_antialiased_scene(window: Browser, folder: Path, device: Device) -> None:
+    scene = trained(device, OURS, 300)
+    without = Desktop(export_scene(scene, folder, device, "aliased"), device)
+    scene.antialiased = True
+    made = export_scene(scene, folder, device, "antialiased")
+    open_page(window, made.as_uri())
+    assert same(window, Desktop(made, device), 0.0)
+    assert not same(window, without, 0.0)
+
+
 def test_the_desktop_runs_the_same_dispatches(browser: Browser, page: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Kernels, workgroups and bindings of a frame, in the shape for GPUs: all that the page's own code decides."""
     info, adapter = _adapters()[0]

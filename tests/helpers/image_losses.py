@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import NamedTuple
 
 import numpy as np
@@ -43,10 +42,12 @@ TRUTH = random_pair(CAMERA.height, CAMERA.width).truth
 BACKGROUND = torch.tensor([0.2, 0.5, 0.9])
 
 
-def gaussians(count: int = 200, **changes: torch.Tensor) -> Gaussians:
+def gaussians(count: int = 200, *, antialiased: bool = False, **changes: torch.Tensor) -> Gaussians:
     scene = random_scene(count, 1, sh=4)
     tensors = {"sh" if name == "colors" else name: value for name, value in scene.items()} | changes
-    return Gaussians(**{name: value.clone().requires_grad_() for name, value in tensors.items()})
+    return Gaussians(
+        **{name: value.clone().requires_grad_() for name, value in tensors.items()}, antialiased=antialiased
+    )
 
 
 def step(device: Device, scene: Gaussians, weights: LossWeights = WEIGHTS["all"]) -> RenderLoss:
@@ -54,5 +55,4 @@ def step(device: Device, scene: Gaussians, weights: LossWeights = WEIGHTS["all"]
 
 
 def gradients(scene: Gaussians, done: RenderLoss) -> dict[str, torch.Tensor]:
-    tensors = {field.name: getattr(scene, field.name) for field in dataclasses.fields(scene)}
-    return {name: t.grad for name, t in (tensors | {"means2d": done.means2d}).items()}
+    return {name: t.grad for name, t in (scene.arrays() | {"means2d": done.means2d}).items()}

@@ -78,6 +78,7 @@ DAMAGE: dict[str, tuple[Callable[[dict[str, Any], dict[str, str]], object], str]
     "another type": (lambda _, m: m.update(field="[1, 2]"), "description of its field"),
     "degree in words": (lambda _, m: m.update(sh_degree="three"), "description of its field"),
     "degree 4": (lambda _, m: m.update(sh_degree="4"), "sh_degree 4 is outside 0 to 3"),
+    "antialiased by half": (lambda _, m: m.update(antialiased="half"), "antialiased 'half' is neither true nor false"),
     "unknown kind": (with_field(kind="quantum"), "kind must be static or .*, got 'quantum'"),
     "unknown key": (with_field(color="red"), "description of its field"),
     "a grid missing": (with_field(static=None), "description of its field"),
