@@ -181,7 +181,7 @@ class Scene4D:
             p["log_scales"].exp().clamp(min=MIN_SCALE),
             p["opacity_logits"].sigmoid(),
             torch.cat([p["sh_dc"], p["sh_rest"][:, : (self.sh_degree + 1) ** 2 - 1]], dim=1),
-            self.antialiased,
+            antialiased=self.antialiased,
         )
 
     def at(self, t: float) -> Gaussians:
@@ -218,7 +218,7 @@ class Scene4D:
         if moments is not None:
             of_rows = p["means"][moments.rows], still.scales[moments.rows]
             placed = [self._placed(each, *of_rows) for each in others]
-        moved = Gaussians(means, quats, scales, opacities, sh, self.antialiased)
+        moved = Gaussians(means, quats, scales, opacities, sh, antialiased=self.antialiased)
         return Deformed(moved, move.smoothness, placed)
 
     def _moves(self, t: float, nearby: Nearby | None, moments: Moments | None) -> list[Deformation]:

@@ -37,8 +37,8 @@ class SceneFile:
     """The content of a file, float32.
 
     gaussians: canonical ones by name, (N, ...) with rows as in `row_shapes`. field: the field's parameters by name, in
-    the shapes of `parameter_shapes`. metadata: further texts. The Gaussians of a compact scene that moves have
-    static_features (N, F) in place of the field's static table. antialiased: how the Gaussians are drawn, see Gaussians.
+    the shapes of `parameter_shapes`. metadata: further texts. antialiased: how the Gaussians are drawn, see Gaussians;
+    in a compact scene that moves, they have static_features (N, F) in place of the field's static table.
     """
 
     path: str | os.PathLike[str]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
 Array = TypeVar("Array")
@@ -28,7 +28,7 @@ class Gaussians(Generic[Array]):
     scales: Array
     opacities: Array
     sh: Array
-    antialiased: bool = False
+    antialiased: bool = field(default=False, kw_only=True)
 
     def arrays(self) -> dict[str, Array]:
         """The arrays by name, each with a row for every Gaussian."""
