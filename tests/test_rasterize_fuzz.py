@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -43,8 +44,8 @@ UNSEEN: dict[str, dict[str, list[float] | float]] = {
 }
 
 
-def drawn(scene: Scene, device: Device, width: int = 33, height: int = 25, sh_degree: int | None = None) -> Step:
-    return step(scene, front_camera(width, height), device, sh_degree=sh_degree, background=BACKGROUND)
+def drawn(scene: Scene, device: Device, width: int = 33, height: int = 25, **how: Any) -> Step:
+    return step(scene, front_camera(width, height), device, background=BACKGROUND, **how)
 
 
 def in_front(count: int, seed: int, sh: int | None = None) -> Scene:
@@ -53,9 +54,9 @@ def in_front(count: int, seed: int, sh: int | None = None) -> Scene:
     return scene
 
 
-def check_rest(bad: Scene, rows: torch.Tensor, good: Scene, device: Device, sh_degree: int | None = None) -> None:
+def check_rest(bad: Scene, rows: torch.Tensor, good: Scene, device: Device, **how: Any) -> None:
     """The rows are as if they were not there: the same bits for the others, zeros for them."""
-    found, expected = drawn(bad, device, sh_degree=sh_degree), drawn(good, device, sh_degree=sh_degree)
+    found, expected = drawn(bad, device, **how), drawn(good, device, **how)
     for name in ("image", "alpha", "depth"):
         assert found.bits[name] == expected.bits[name], name
     assert not found.radii[rows].any()
@@ -68,8 +69,9 @@ def check_rest(bad: Scene, rows: torch.Tensor, good: Scene, device: Device, sh_d
 # One bad value
 
 
+@pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("name", UNSEEN)
-def test_an_invisible_gaussian_disturbs_nobody(device: Device, name: str) -> None:
+def test_an_invisible_gaussian_disturbs_nobody(device: Device, name: str, antialiased: bool) -> None:
     good = in_front(40, 1)
     rows = torch.zeros(43, dtype=torch.bool)
     rows[[0, 20, 42]] = True  # first, between, last
@@ -79,7 +81,7 @@ def test_an_invisible_gaussian_disturbs_nobody(device: Device, name: str) -> Non
         bad[group][~rows], bad[group][rows] = values, values[:3]
         if group in UNSEEN[name]:
             bad[group][rows] = torch.tensor(UNSEEN[name][group])
-    check_rest(bad, rows, good, device)
+    check_rest(bad, rows, good, device, antialiased=antialiased)
 
 
 @pytest.mark.parametrize("sh_degree", [None, 1])
@@ -89,7 +91,7 @@ def test_bad_colors_of_invisible_gaussians_do_no_harm(device: Device, sh_degree:
     for value in (NAN, INF):
         bad = {name: tensor.clone() for name, tensor in good.items()}
         bad["opacities"][rows], bad["colors"][rows] = 0.0, value
-        check_rest(bad, rows, {name: tensor[~rows] for name, tensor in good.items()}, device, sh_degree)
+        check_rest(bad, rows, {name: tensor[~rows] for name, tensor in good.items()}, device, sh_degree=sh_degree)
 
 
 def test_only_invisible_gaussians(device: Device) -> None:
@@ -149,15 +151,16 @@ def test_extremes_are_finite_and_as_in_float64(device: Device, name: str, change
         max_size=10,
     ),
     size=st.sampled_from([(33, 25), (1, 1), (16, 8)]),
+    antialiased=st.booleans(),
 )
 def test_any_geometry_gives_a_finite_picture(
-    device: Device, seed: int, values: list[tuple[str, int, int, float]], size: tuple[int, int]
+    device: Device, seed: int, values: list[tuple[str, int, int, float]], size: tuple[int, int], antialiased: bool
 ) -> None:
     scene = in_front(12, seed)
     for group, row, column, value in values:
         scene[group].view(12, -1)[row, column % scene[group].view(12, -1).shape[1]] = value
     scene["opacities"].clamp_(max=1.0)
-    found = drawn(scene, device, *size)
+    found = drawn(scene, device, *size, antialiased=antialiased)
     assert found.image.isfinite().all()
     assert found.alpha.isfinite().all()
     assert float(found.alpha.min()) >= 0
@@ -235,7 +238,9 @@ def test_poisoned_buffers_do_not_change_a_bit(
     scene, larger = in_front(count, 6, sh=sh_degree and 9), in_front(500, 7, sh=sh_degree and 16)
     expected = drawn(scene, device, sh_degree=sh_degree)
     for before in (scene, larger):
-        drawn(before, device, 40, 48, sh_degree)  # so that the buffers are there, with room behind what is needed
+        drawn(
+            before, device, 40, 48, sh_degree=sh_degree
+        )  # so that the buffers are there, with room behind what is needed
         assert poison(rasterizer, PATTERNS[pattern]) > 20
         assert drawn(scene, device, sh_degree=sh_degree).bits == expected.bits
 

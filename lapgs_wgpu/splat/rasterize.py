@@ -194,7 +194,8 @@ def gradient_tensors(arrays: list[NDArray[np.float32]], opacities: Tensor) -> tu
     arrays: GaussianGradients, read back.
     """
     d_splats, d_means, d_quats, d_scales, *d_sh = (torch.from_numpy(array).to(opacities.device) for array in arrays)
-    d_opacities = d_splats[:, OPACITY] / opacities.detach().clamp(min=CONSTANTS["ALPHA_MIN"])  # fainter ones: 0
+    drawn = opacities >= CONSTANTS["ALPHA_MIN"]  # false where it is NaN
+    d_opacities = torch.where(drawn, d_splats[:, OPACITY] / opacities, 0.0)
     d_colors = d_sh[0] if d_sh else d_splats[:, COLOR]
     return (d_means, d_quats, d_scales, d_opacities, d_colors), d_splats[:, MEAN]
 
