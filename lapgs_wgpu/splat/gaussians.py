@@ -20,7 +20,7 @@ class Gaussians(Generic[Array]):
         sh: (N, K, 3) spherical harmonics with K = (degree + 1)^2 coefficients, degree 0 to 3; or view-independent
             colors (N, 3).
         antialiased: whether a Gaussian is drawn as much fainter as the rasterizer's low-pass filter makes it larger in
-            the image (Yu et al., Mip-Splatting, 2024), as it was trained.
+            the image (the 2-D filter of Mip-Splatting, arXiv 2311.16493), as it was trained.
     """
 
     means: Array
