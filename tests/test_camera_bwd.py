@@ -80,8 +80,10 @@ def test_camera_bwd(
     gradient, _ = found(device, scene, camera, weights, antialiased=antialiased)
     mine = np.concatenate([gradient.rotation, gradient.position, [gradient.log_focal]])
     theirs = expected(monkeypatch, scene, camera, weights, sh_degree=sh, antialiased=antialiased)
+    least = 1e-2 * np.linalg.norm(theirs)  # a part may be what is left of terms that cancel
     for part in (slice(0, 3), slice(3, 6), slice(6, 7)):
-        assert np.linalg.norm(mine[part] - theirs[part]) < 1e-4 * np.linalg.norm(theirs[part]), (mine, theirs)
+        error = np.linalg.norm(mine[part] - theirs[part])
+        assert error < 1e-4 * max(np.linalg.norm(theirs[part]), least), (mine, theirs)
 
 
 def test_the_same_bits_on_every_run(device: Device) -> None:
