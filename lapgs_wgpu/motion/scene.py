@@ -341,8 +341,7 @@ def scene_of(file: SceneFile, device: Device | None = None, own_field: nn.Module
     except InputError as error:
         raise InputError(f"{file.path}: {error}") from error
     if scene.field is not None:
-        # load_state_dict copies the arrays, which may be read-only.
-        values = {name: torch.from_numpy(array) for name, array in file.field.items()}
+        values = {name: torch.from_numpy(array) for name, array in file.field.items()}  # read-only, copied below
         try:
             scene.field.load_state_dict(values)
         except InputError as error:  # of a field of one's own: the shapes of the others were checked
