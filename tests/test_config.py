@@ -140,6 +140,7 @@ def test_presets_are_complete_without_defaults_in_the_code() -> None:
         "decoder",
         "discovery",
         "cameras",
+        "timing",
         "eval",
     }
     assert AccelerationConfig().weight == 0

@@ -28,6 +28,7 @@ from .fields.laplacian import LaplacianMotion
 from .fields.mlp_field import MlpField
 from .fields.own_field import OwnField
 from .scene_file import SceneFile, read_scene, row_shapes, scene_header
+from .timing import EVEN, Timing
 
 Field = GridField | MlpField | HexPlaneField | OwnField
 
@@ -81,6 +82,7 @@ class Scene4D:
         device: that renders.
         sh_degree: degree of the harmonics in use, 0 to 3.
         antialiased: how the Gaussians are drawn, see Gaussians.
+        timing: of the capture: the moment of the motion at each time.
         metadata: texts by name that the checkpoint holds.
     """
 
@@ -116,6 +118,7 @@ class Scene4D:
         self.device = device
         self.sh_degree = sh_degree
         self.antialiased = antialiased
+        self.timing: Timing = EVEN
         self.field: Field | None = make_field(field_config, device, seed, own_field)
         self.metadata: dict[str, str] = {}
 
@@ -194,7 +197,7 @@ class Scene4D:
         Args:
             t: time in [0, 1].
             nearby: where the smoothness loss looks; None without it.
-            moments: some of the Gaussians and further times.
+            moments: some of the Gaussians and further moments of the motion.
 
         Returns:
             Deformed. Differentiable in `parameters` and the field's parameters.
@@ -203,7 +206,7 @@ class Scene4D:
         still = self._activated(p)
         if self.field is None or len(self) == 0:
             return Deformed(still, None, [])
-        move, *others = self._moves(t, nearby, moments)
+        move, *others = self._moves(self.timing(t), nearby, moments)
         quats, sh, opacities = still.quats, still.sh, still.opacities
         if move.orientation is not None:
             quats = multiply(move.orientation, quats)
@@ -300,7 +303,7 @@ class Scene4D:
         tensors = {f"gaussians.{name}": value.numpy(force=True) for name, value in self.parameters.items()}
         if self.field is not None:
             tensors |= {f"field.{name}": value.numpy(force=True) for name, value in self.field.state_dict().items()}
-        header = scene_header(self.field_config, self.sh_degree, self.antialiased)
+        header = scene_header(self.field_config, self.sh_degree, self.antialiased, self.timing)
         write_checkpoint(path, arrays, tensors, {**self.metadata, **(metadata or {}), **header})
 
 
@@ -346,5 +349,5 @@ def scene_of(file: SceneFile, device: Device | None = None, own_field: nn.Module
             scene.field.load_state_dict(values)
         except InputError as error:  # of a field of one's own: the shapes of the others were checked
             raise InputError(f"{file.path}: {error}") from error
-    scene.metadata = file.metadata
+    scene.timing, scene.metadata = file.timing, file.metadata
     return scene

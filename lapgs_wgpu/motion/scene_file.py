@@ -20,6 +20,7 @@ from ..io.safe_json_toml import parse_json
 from .compact_scene import compress, expand
 from .fields.config import FieldConfig
 from .fields.parameter_shapes import parameter_shapes
+from .timing import EVEN, Timing, timing_of_text
 
 _MAX_DEGREE = 3
 _SHAPES = {
@@ -38,7 +39,8 @@ class SceneFile:
 
     gaussians: canonical ones by name, (N, ...) with rows as in `row_shapes`. field: the field's parameters by name, in
     the shapes of `parameter_shapes`. metadata: further texts. antialiased: how the Gaussians are drawn, see Gaussians;
-    in a compact scene that moves, they have static_features (N, F) in place of the field's static table.
+    in a compact scene that moves, they have static_features (N, F) in place of the field's static table. timing: of the
+    capture.
     """
 
     path: str | os.PathLike[str]
@@ -48,15 +50,16 @@ class SceneFile:
     field: dict[str, NDArray[np.float32]]
     metadata: dict[str, str]
     antialiased: bool = False
+    timing: Timing = EVEN
 
 
 def read_scene(path: str | os.PathLike[str]) -> SceneFile:
     """Read a checkpoint, a compact scene, or any 3DGS .ply file as a static scene. Raises InputError."""
     if is_lapgs(path):
         tensors, metadata = read_lapgs(path)
-        config, degree, antialiased = _read_header(metadata, path)
+        config, degree, antialiased, timing = _read_header(metadata, path)
         arrays = expand(tensors, config, degree, str(path))
-        return SceneFile(path, config, degree, *arrays, _texts(metadata), antialiased)
+        return SceneFile(path, config, degree, *arrays, _texts(metadata), antialiased, timing)
     still, tensors, metadata = read_checkpoint(path)
     if not tensors:
         sh = np.zeros((len(still.means), 16, 3), np.float32)
@@ -69,9 +72,9 @@ def read_scene(path: str | os.PathLike[str]) -> SceneFile:
             "gaussians.sh_dc": sh[:, :1],
             "gaussians.sh_rest": sh[:, 1:],
         }
-        config, degree, antialiased = FieldConfig(kind="static"), still.sh_degree, False
+        config, degree, antialiased, timing = FieldConfig(kind="static"), still.sh_degree, False, EVEN
     else:
-        config, degree, antialiased = _read_header(metadata, path)
+        config, degree, antialiased, timing = _read_header(metadata, path)
     count = len(still.means)
     gaussians = {
         name: _tensor(tensors, f"gaussians.{name}", (count, *shape), path) for name, shape in row_shapes(config).items()
@@ -81,7 +84,7 @@ def read_scene(path: str | os.PathLike[str]) -> SceneFile:
     if config.kind == "own":  # its module, which checks them, comes from elsewhere
         shapes = {name[6:]: array.shape for name, array in tensors.items() if name.startswith("field.")}
     field = {name: _tensor(tensors, f"field.{name}", shape, path) for name, shape in shapes.items()}
-    return SceneFile(path, config, degree, gaussians, field, _texts(metadata), antialiased)
+    return SceneFile(path, config, degree, gaussians, field, _texts(metadata), antialiased, timing)
 
 
 def compact_bytes(file: SceneFile, static_features: NDArray[np.float32] | None) -> bytes:
@@ -96,21 +99,26 @@ def compact_bytes(file: SceneFile, static_features: NDArray[np.float32] | None) 
             f"motion {config.motion}), which no compact scene holds; --export FOLDER --frames N writes stills"
         )
     gaussians = file.gaussians | ({} if static_features is None else {"static_features": static_features})
-    header = scene_header(config, file.sh_degree, file.antialiased)
+    header = scene_header(config, file.sh_degree, file.antialiased, file.timing)
     try:
         return pack_lapgs(compress(gaussians, file.field, config, file.sh_degree), file.metadata | header)
     except InputError as error:
         raise InputError(f"{file.path}: no compact scene can be made of it, because {error}") from error
 
 
-def scene_header(config: FieldConfig, sh_degree: int, antialiased: bool) -> dict[str, str]:
+def scene_header(config: FieldConfig, sh_degree: int, antialiased: bool, timing: Timing) -> dict[str, str]:
     """The texts that a file needs beside its arrays, by name."""
     header = {"field": json.dumps(dataclasses.asdict(config)), "sh_degree": str(sh_degree)}
-    return header | ({"antialiased": "true"} if antialiased else {})
+    if antialiased:
+        header["antialiased"] = "true"
+    if timing is not EVEN:
+        header["timing"] = timing.to_text()
+    return header
 
 
 def _texts(metadata: Mapping[str, str]) -> dict[str, str]:
-    return {key: value for key, value in metadata.items() if key not in ("field", "sh_degree", "antialiased")}
+    of_header = ("field", "sh_degree", "antialiased", "timing")
+    return {key: value for key, value in metadata.items() if key not in of_header}
 
 
 def row_shapes(config: FieldConfig) -> dict[str, tuple[int, ...]]:
@@ -119,7 +127,7 @@ def row_shapes(config: FieldConfig) -> dict[str, tuple[int, ...]]:
     return _SHAPES | ({"dynamics": (size,)} if size else {})
 
 
-def _read_header(metadata: Mapping[str, str], path: str | os.PathLike[str]) -> tuple[FieldConfig, int, bool]:
+def _read_header(metadata: Mapping[str, str], path: str | os.PathLike[str]) -> tuple[FieldConfig, int, bool, Timing]:
     try:
         config = build_dataclass(FieldConfig, parse_json(metadata["field"], "its text"), "field")
         degree = int(metadata["sh_degree"])
@@ -128,13 +136,14 @@ def _read_header(metadata: Mapping[str, str], path: str | os.PathLike[str]) -> t
         antialiased = metadata.get("antialiased", "false")  # older files lack it
         if antialiased not in ("false", "true"):
             raise ValueError(f"antialiased {antialiased!r} is neither true nor false")
+        timing = timing_of_text(metadata["timing"]) if "timing" in metadata else EVEN
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         reason = f"{type(error).__name__}: {error}"[:200]
         raise InputError(
             f"{path}: the checkpoint's description of its field cannot be read ({reason}): "
             "it was damaged, or written by another version of lapgs_wgpu"
         ) from error
-    return config, degree, antialiased == "true"
+    return config, degree, antialiased == "true", timing
 
 
 def _tensor(

@@ -363,6 +363,29 @@ class CamerasConfig(Options):
 
 
 @dataclass(frozen=True)
+class TimingConfig(Options):
+    """Correction of the training images' times. Has defaults, since older config.toml files lack it."""
+
+    refine: bool = option(
+        "correct the times of the training images while training, by up to 1.5 of their distance, for captures with "
+        "lost, repeated or unevenly timed images; test views get the corrections of the training images around them; "
+        "not of the paper",
+        False,
+    )
+    start: int = option("first step after which times are corrected; the motion forms before it", 3000, at_least=1)
+    interval: int = option(
+        "correct them every this many steps from timing.start on; each time takes as long as rendering all training "
+        "images (of a rig: one for each time) three times",
+        1000,
+        at_least=1,
+    )
+
+    def changes_at(self, step: int, last: int) -> bool:
+        """Whether times are corrected after this step of `last`."""
+        return self.refine and self.start <= step < last and (step - self.start) % self.interval == 0
+
+
+@dataclass(frozen=True)
 class EvalConfig(Options):
     """Evaluation during the training. Has defaults, since older config.toml files lack it."""
 
@@ -414,6 +437,7 @@ class Config(Options):
     acceleration: AccelerationConfig = option("", AccelerationConfig())
     exposure: ExposureConfig = option("", ExposureConfig())
     cameras: CamerasConfig = option("", CamerasConfig())
+    timing: TimingConfig = option("", TimingConfig())
     discovery: DiscoveryConfig = option("", DiscoveryConfig())
     eval: EvalConfig = option("", EvalConfig())
     antialiased: bool = option(

@@ -193,6 +193,8 @@ def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None)
             log.tell(outside)
         if (moved := training.camera_report()) is not None:
             log.tell(_moved(moved))
+        if training.timing is not None:
+            log.tell(_retimed(training.timing.report()))
 
     return_freed_memory()
     done, all_steps = training.done, config.schedule.steps
@@ -207,6 +209,8 @@ def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None)
     measured: dict[str, Any] = {"steps": done, "seconds": round(seconds, 3)}
     if (moved := training.camera_report()) is not None:
         measured["cameras"] = moved
+    if training.timing is not None:
+        measured["timing"] = training.timing.report()
     evaluate_run(out, scene, training.dataset, config.data.background, measured, lpips)
     drop_states(out)
     return scene
@@ -265,6 +269,14 @@ def _moved(report: dict[str, Any]) -> str:
         f"the training cameras were corrected by {turn['median']:.2f} degrees and {shift['median']:.2f} % of their "
         f"extent (medians; at most {turn['largest']:.2f} and {shift['largest']:.2f} %), their focal length by "
         f"{report['focal_percent']:+.2f} %."
+    )
+
+
+def _retimed(report: dict[str, float]) -> str:
+    """How far the times went, in a sentence."""
+    return (
+        f"the times of the training images were corrected by {report['frames']:.2f} of the distance of two images "
+        f"(root mean square; at most {report['frames_most']:.2f})."
     )
 
 

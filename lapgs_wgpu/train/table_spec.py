@@ -128,6 +128,8 @@ def fingerprint(config: Config) -> str:
         del values["exposure"]
     if config.cameras.refine != "on":
         del values["cameras"]
+    if not config.timing.refine:
+        del values["timing"]
     if not config.discovery.enabled:
         del values["discovery"]
     if config.density.limit == 0:

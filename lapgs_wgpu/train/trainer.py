@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from lapgs_wgpu.data.views import Dataset, View
+from lapgs_wgpu.data.views import Dataset, View, composite
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device, open_device
 from lapgs_wgpu.io.initial_view import InitialView, captured_arc
@@ -35,7 +35,7 @@ from lapgs_wgpu.train.density_control import DensityControl
 from lapgs_wgpu.train.discovery.discover import discover
 from lapgs_wgpu.train.discovery.field_fit import keeping_rates
 from lapgs_wgpu.train.distributed import SINGLE_PROCESS, Ranks
-from lapgs_wgpu.train.evaluate import evaluate
+from lapgs_wgpu.train.evaluate import BACKGROUND_LEVELS, evaluate
 from lapgs_wgpu.train.exposure import Exposures
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
 from lapgs_wgpu.train.host_threads import step_threads, torch_threads
@@ -48,6 +48,7 @@ from lapgs_wgpu.train.parts import Parts
 from lapgs_wgpu.train.smoothness import draw_nearby
 from lapgs_wgpu.train.step_result import StepResult
 from lapgs_wgpu.train.suited import suited, with_decoder_placed
+from lapgs_wgpu.train.timing_refinement import TimingRefinement
 
 MAX_SH_DEGREE = 3
 # Of the configuration.
@@ -79,6 +80,7 @@ class Trainer:
         discovery: what motion discovery found, a sentence; None where it was left out.
         discovery_seconds: that it took; 0 where it was left out.
         cameras: the corrections of the training cameras; None where they are kept.
+        timing: the corrections of the training images' times; None where they are kept.
         ranks: this process among those that train together.
         whole: whether `state` is that of a whole step, which it also is where `step` raised an error before anything
             that lasts had changed.
@@ -198,6 +200,9 @@ class Trainer:
                 lambda: scene_points(scene.parameters["means"], scene.parameters["opacity_logits"].sigmoid()),
                 corrections,
             )
+        self.timing = None
+        if config.timing.refine and scene.field is not None and len(dataset.times) > 1:
+            self.timing = TimingRefinement(scene, dataset.train, self._truth, self._picture, self.ranks)
         beside = (self._frequencies, self._exposures, self.cameras)
         self._beside = [each for each in beside if each is not None]
         self._density = DensityControl(
@@ -313,6 +318,8 @@ class Trainer:
         else:
             self._generator.set_state(drawn)
             self._zero_grad()
+        if self.timing is not None and moving and config.timing.changes_at(step, config.schedule.steps):
+            self.timing.refine((step - config.timing.start) // config.timing.interval)
         pruned = self._density.change(step, moving=moving)
         if step % config.schedule.sh_interval == 0:
             scene.sh_degree = min(scene.sh_degree + 1, MAX_SH_DEGREE)
@@ -326,7 +333,7 @@ class Trainer:
         config, count, generator = self.config, len(self.scene), self._generator
         if not moving or self.done < config.smoothness.start:
             return None, None
-        times = len(self.dataset.times)
+        t, times = self.scene.timing(t), len(self.dataset.times)
         nearby = draw_nearby(config.smoothness, count, t, generator)
         # What discovery has followed through the clip has its depth from there.
         rests = self._field_fitted or (self.done + 1) % config.acceleration.interval
@@ -344,7 +351,7 @@ class Trainer:
         gaussians = now.gaussians
         weights = config.loss.weights(warm=moving)
         truth = self._pictures.on_device(view)
-        correction = None if self._exposures is None else self._exposures.values[self._numbers[view.name]]
+        correction = self._exposure_of(view)
         weighted = [(term, weight_at(term, self.done + 1)) for term in self.parts.losses]
         own = [(term, weight) for term, weight in weighted if weight and not isinstance(term, Regularizer)]
         camera, change = view.camera, None
@@ -359,7 +366,7 @@ class Trainer:
             beside["smoothness"] = now.smoothness
         if look.moments is not None:
             weight = config.acceleration.weight * config.acceleration.interval
-            beside["acceleration"] = weight * acceleration_loss(now, view.time, look.moments)
+            beside["acceleration"] = weight * acceleration_loss(now, scene.timing(view.time), look.moments)
         if moving and "dynamics" in scene.parameters:
             spread = dynamics_loss(scene.parameters["dynamics"], config.loss.dynamics_mode)
             beside["dynamics"] = config.loss.dynamics * spread
@@ -374,6 +381,25 @@ class Trainer:
         if "ssim" in terms:
             terms["ssim"] = factors["ssim"] - terms["ssim"]
         return loss, rendering, terms | {name: value.item() for name, value in beside.items()}
+
+    def _exposure_of(self, view: View) -> Tensor | None:
+        return None if self._exposures is None else self._exposures.values[self._numbers[view.name]]
+
+    def _truth(self, view: View) -> Tensor:
+        """The image (H, W, 3) of a training view on the background of the evaluation; NaN where the loss ignores it."""
+        image = composite(view.load(), np.full(3, BACKGROUND_LEVELS[self.config.data.background]))
+        truth = torch.from_numpy(image.astype(np.float32) / 255)
+        ignored = view.load_ignored()
+        return truth if ignored is None else truth.masked_fill(torch.from_numpy(ignored)[..., None], math.nan)
+
+    @torch.no_grad()
+    def _picture(self, view: View) -> Tensor:
+        """The scene's picture (H, W, 3) of a training view, with the corrections of its camera and of its colors."""
+        camera = view.camera if self.cameras is None else self.cameras.refined(view.camera).camera
+        color = torch.full((3,), BACKGROUND_LEVELS[self.config.data.background])
+        image = self.scene.render(camera, view.time, color, depth=False).image
+        correction = self._exposure_of(view)
+        return image if correction is None else image @ correction[:, :3].T + correction[:, 3]
 
     def _gradients(self) -> dict[str, list[Tensor]]:
         """By group, of all parameters that have one."""
@@ -424,6 +450,7 @@ class Trainer:
             "frequencies": self._frequencies.state() if self._frequencies else {},
             "exposure": self._exposures.state() if self._exposures else {},
             "cameras": self.cameras.state() if self.cameras else {},
+            "timing": self.timing.state() if self.timing else {},
             "statistics": vars(self._density.statistics),
             "training": {
                 "done": torch.tensor(self.done),
@@ -459,6 +486,8 @@ class Trainer:
             self._exposures.restore(parts["exposure"])
         if self.cameras is not None:
             self.cameras.restore(parts["cameras"])
+        if self.timing is not None:
+            self.timing.restore(parts["timing"])
         self._density.statistics = Statistics(**parts["statistics"])
         own = parts["training"]
         self.done, scene.sh_degree = int(own["done"]), int(own["sh_degree"])

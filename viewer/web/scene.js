@@ -9,11 +9,13 @@ const APPEARANCES = new Map([["none", 0], ["color", 3], ["color+opacity", 4]]); 
 
 const damaged = reason => new Refusal(`The scene cannot be read: ${reason}; the file is damaged.`);
 
-// {count, shDegree, antialiased, field, gaussians, parameters, metadata}; field is null where nothing moves. Raises Refusal.
+// {count, shDegree, antialiased, timing, field, gaussians, parameters, metadata}; field is null where nothing moves, timing
+// where each time is its own moment. Raises Refusal.
 export async function readScene(bytes) {
     const { tensors, metadata } = await readContainer(bytes);
     const shDegree = whole(Number(metadata.sh_degree ?? NaN), "sh_degree", 0, 3);
     const antialiased = metadata.antialiased === "true"; // older files lack it
+    const timing = metadata.timing === undefined ? null : readTiming(metadata.timing);
     const field = readField(metadata.field);
     const means = tensors.get("gaussians.means");
     const count = means?.shape.length === 2 ? means.shape[1] : 0;
@@ -27,7 +29,7 @@ export async function readScene(bytes) {
         gaussians[name] = dequantize(tensors, `gaussians.${name}`, count, width, [0]);
     }
     const parameters = field ? readParameters(tensors, field) : {};
-    return { count, shDegree, antialiased, field, gaussians, parameters, metadata };
+    return { count, shDegree, antialiased, timing, field, gaussians, parameters, metadata };
 }
 
 function whole(value, name, low, high) {
@@ -42,6 +44,23 @@ function real(value, name, high) {
         throw damaged(`its ${name} is ${quoted(value)}, where numbers above 0 and up to ${high} are possible`);
     }
     return value;
+}
+
+// {times, moments}, as motion/timing.py has them.
+function readTiming(text) {
+    let timing;
+    try {
+        timing = JSON.parse(text);
+    } catch {
+        throw damaged("its timing is not JSON");
+    }
+    const { times, moments } = timing ?? {};
+    const known = list => Array.isArray(list) && list.length > 0 && list.every(x => typeof x === "number" && x >= 0 && x <= 1);
+    const rises = (list, least) => list.every((x, i) => i === 0 || x - list[i - 1] >= least);
+    if (!known(times) || !known(moments) || times.length !== moments.length || !rises(times, Number.MIN_VALUE) || !rises(moments, 0)) {
+        throw damaged("its timing is not of times and moments that rise from 0 to 1");
+    }
+    return { times, moments };
 }
 
 // What playback needs of FieldConfig (motion/fields/config.py).

@@ -93,7 +93,7 @@ class DevicePlayback:
         self.device, self.field_config, self.metadata = device, file.field_config, file.metadata
         self.count, self.sh_degree = len(file.gaussians["means"]), file.sh_degree
         self.moves = file.field_config.kind != "static"
-        self._stored = file.gaussians
+        self._stored, self._timing = file.gaussians, file.timing
         activated = activate(file.gaussians, file.sh_degree)
         pool = BufferPool(device)
         names = {"means": "means", "quats": "quats", "scales": "scales", "opacities": "opacities", "sh": "colors"}
@@ -116,6 +116,7 @@ class DevicePlayback:
     def at(self, t: float, seen_by: Camera | None = None) -> Gaussians[DeviceArray]:
         if self._field is None:
             return self._now
+        t = self._timing(t)
         if self._near is not None and self._near[0] != t:
             self._near = None
         old = self._times != t

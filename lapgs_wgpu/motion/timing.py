@@ -1,0 +1,63 @@
+"""The timing of a capture: which moment of the motion its images show at a time."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..io.safe_json_toml import parse_json
+
+_MOST = 1_000_000  # times
+
+
+@dataclass(frozen=True, eq=False)
+class Timing:
+    """The moment of the motion at each time of the clip, both in [0, 1].
+
+    Attributes:
+        times: (M,) float64, ascending. With none, each time is its own moment.
+        moments: (M,) float64, never descending: those at these times. Between two times the difference of moment and
+            time changes evenly; outside of all it is that of the nearest time.
+    """
+
+    times: NDArray[np.float64]
+    moments: NDArray[np.float64]
+
+    def __call__(self, t: float) -> float:
+        """The moment at a time in [0, 1]."""
+        if len(self.times) == 0:
+            return t
+        return min(max(t + float(np.interp(t, self.times, self.moments - self.times)), 0.0), 1.0)
+
+    def to_text(self) -> str:
+        """JSON, which `timing_of_text` reads to the last bit."""
+        return json.dumps({"times": self.times.tolist(), "moments": self.moments.tolist()})
+
+
+EVEN = Timing(np.zeros(0), np.zeros(0))
+
+
+def timing_of_text(text: str) -> Timing:
+    """The timing that `to_text` wrote. Raises ValueError."""
+    table = parse_json(text, "its timing")
+    if not isinstance(table, dict) or table.keys() != {"times", "moments"}:
+        raise ValueError("timing is no table of times and moments")
+    times, moments = (_numbers(table[name], name) for name in ("times", "moments"))
+    if len(times) != len(moments):
+        raise ValueError(f"timing has {len(times)} times and {len(moments)} moments")
+    if (np.diff(times) <= 0).any():
+        raise ValueError("timing.times do not ascend")
+    if (np.diff(moments) < 0).any():
+        raise ValueError("timing.moments descend")
+    return Timing(times, moments)
+
+
+def _numbers(values: object, name: str) -> NDArray[np.float64]:
+    real = isinstance(values, list) and 0 < len(values) <= _MOST and all(type(each) in (int, float) for each in values)
+    array = np.array(values if real else [], np.float64)
+    if not real or not ((array >= 0) & (array <= 1)).all():
+        raise ValueError(f"timing.{name} are not numbers between 0 and 1")
+    return array

@@ -1,0 +1,112 @@
+"""The timing of a capture, refined while training: by how much its images are early or late.
+
+Films lose and repeat frames, and scenes are rendered from animations of another frame rate, so motion that is even in
+the world goes by jerks in the images. A field that is smooth in time then fits no image. Of each training image, the
+shift in time that fits it best follows by least squares (a step of Gauss-Newton) from pictures of a moment shortly
+before and shortly after its own. Images that are measured have the timing between those of the training.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lapgs_wgpu.data.views import View
+from lapgs_wgpu.motion.scene import Scene4D
+from lapgs_wgpu.motion.timing import Timing
+
+from .distributed import Ranks
+
+REACH = 0.5  # gaps between images, before and after, at which pictures are compared; and the largest step
+FARTHEST = 1.5  # gaps between images, of a moment from its time
+LEAST = 0.01  # share of an image's squared error that its shift must take away
+
+
+class TimingRefinement:
+    """How the timing of a scene is learnt.
+
+    Args:
+        scene: whose timing it is.
+        views: of the training.
+        truth: the image (H, W, 3) of a view; NaN where it does not count.
+        picture: the scene's picture (H, W, 3) of a view, which is compared with it.
+        ranks: which share the work.
+    """
+
+    def __init__(
+        self,
+        scene: Scene4D,
+        views: Sequence[View],
+        truth: Callable[[View], Tensor],
+        picture: Callable[[View], Tensor],
+        ranks: Ranks,
+    ) -> None:
+        self._scene, self._truth, self._picture, self._ranks = scene, truth, picture, ranks
+        self._times = np.unique([view.time for view in views])
+        self._views = [[view for view in views if view.time == t] for t in self._times.tolist()]
+        # Half the distance of both neighbours; at the ends that of the one.
+        self._gaps = np.gradient(self._times, np.arange(len(self._times))) if len(self._times) > 1 else np.ones(1)
+        self.moments = torch.from_numpy(self._times.copy())
+
+    def refine(self, number: int) -> None:
+        """Take one step with all moments. number: of the step, from 0 on: of several views of a time, it takes one.
+
+        The same bits on every run of one adapter and driver. Raises InputError where an image cannot be read.
+        """
+        moments = self.moments.numpy()
+        shifts = np.zeros(len(moments))
+        for row in range(len(moments))[self._ranks.rank :: self._ranks.count]:
+            views = self._views[row]
+            shifts[row] = self._shift(views[number % len(views)], float(moments[row]), float(self._gaps[row]))
+        shifts = self._ranks.sums([torch.from_numpy(shifts)])[0].numpy()
+        farthest = FARTHEST * self._gaps
+        moved = np.clip(moments + shifts, self._times - farthest, self._times + farthest)
+        self._set(np.maximum.accumulate(np.clip(moved, 0.0, 1.0)))
+
+    def _set(self, moments: NDArray[np.float64]) -> None:
+        self.moments.copy_(torch.from_numpy(moments))
+        self._scene.timing = Timing(self._times, moments.copy())
+
+    def _shift(self, view: View, moment: float, gap: float) -> float:
+        """How much later the moment is that fits a view best, as far as its neighbourhood tells."""
+        first, last = max(moment - REACH * gap, 0.0), min(moment + REACH * gap, 1.0)
+        before, now, after = (self._at(view, each).double() for each in (first, moment, last))
+        truth = self._truth(view).double()
+        counts = ~truth.isnan()
+        error, speed = (now - truth)[counts], ((after - before) / (last - first))[counts]
+        along, size, whole = (float(a @ b) for a, b in ((speed, error), (speed, speed), (error, error)))
+        if along**2 <= LEAST * size * whole:
+            return 0.0
+        return float(np.clip(-along / size, -REACH * gap, REACH * gap))
+
+    def _at(self, view: View, moment: float) -> Tensor:
+        """The picture of a view at a moment."""
+        known = self._scene.timing
+        self._scene.timing = Timing(np.array([view.time]), np.array([moment]))
+        try:
+            return self._picture(view)
+        finally:
+            self._scene.timing = known
+
+    def report(self) -> dict[str, float]:
+        """Of the moments' differences from their times: root mean square and largest, in gaps between images."""
+        apart = np.abs(self.moments.numpy() - self._times) / self._gaps
+        return {"frames": float(np.sqrt(np.mean(apart**2))), "frames_most": float(apart.max())}
+
+    def state(self) -> dict[str, Tensor]:
+        """Everything that the next step depends on."""
+        return {"moments": self.moments}
+
+    def restore(self, state: Mapping[str, Tensor]) -> None:
+        """Go on from what `state` gave. Raises ValueError where it is of another capture."""
+        moments = state["moments"]
+        if moments.shape != self.moments.shape or moments.dtype != torch.float64:
+            raise ValueError(f"its moments are {moments.dtype} of shape {tuple(moments.shape)}")
+        if not bool(((moments >= 0) & (moments <= 1)).all() and (moments.diff() >= 0).all()):
+            raise ValueError("its moments do not rise from 0 to 1")
+        if not torch.equal(moments, self.moments):
+            self._set(moments.numpy())
