@@ -19,6 +19,7 @@ from lapgs_wgpu.io.ply import GaussianSnapshot, write_ply
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.fields.hash_encoder import HashGrid
 from lapgs_wgpu.motion.scene import Scene4D, load
+from lapgs_wgpu.motion.timing import Timing
 from lapgs_wgpu.splat.rasterize import rasterize
 
 CAMERA = oblique_camera(48, 32)
@@ -139,6 +140,8 @@ def test_a_loaded_scene_draws_the_same_bits(
     other = pictures(scene)
     scene.antialiased = antialiased
     assert (pictures(scene) != other) == antialiased
+    if antialiased:
+        scene.timing = Timing(np.array([0.0, 0.3, 1.0]), np.array([0.1, 0.3, 0.6]))
     scene.save(tmp_path / "scene.ply", {"step": "1200"})
     again = load(tmp_path / "scene.ply", device)
     assert again.field_config == config

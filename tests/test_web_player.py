@@ -36,6 +36,7 @@ from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.shader import browser_source
 from lapgs_wgpu.io.lapgs_file import MAGIC
 from lapgs_wgpu.motion.fields.config import FieldConfig
+from lapgs_wgpu.motion.timing import Timing
 from lapgs_wgpu.train.open_dataset import open_dataset, with_folder
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.run import train
@@ -195,6 +196,18 @@ def test_an_antialiased_scene(window: Browser, folder: Path, device: Device) -> 
     open_page(window, made.as_uri())
     assert same(window, Desktop(made, device), 0.0)
     assert not same(window, without, 0.0)
+
+
+def test_a_scene_of_uneven_timing(window: Browser, folder: Path, device: Device) -> None:
+    scene = trained(device, OURS, 300)
+    without = Desktop(export_scene(scene, folder, device, "even"), device)
+    scene.timing = Timing(np.array([0.2, 0.4, 0.8]), np.array([0.1, 0.5, 0.7]))
+    made = export_scene(scene, folder, device, "uneven")
+    open_page(window, made.as_uri())
+    for time in (0.05, 0.2, 0.3, 0.8, 0.9):  # before the first time, at it, between two, at the last one, after it
+        call(window, "setTime", time)
+        assert same(window, Desktop(made, device), time)
+        assert not same(window, without, time)
 
 
 def test_the_desktop_runs_the_same_dispatches(browser: Browser, page: Path, monkeypatch: pytest.MonkeyPatch) -> None:

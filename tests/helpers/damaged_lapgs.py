@@ -12,12 +12,13 @@ from hypothesis import strategies as st
 from .hostile import ByteEdits, TreeEdits, byte_edits, edit_bytes, edit_tree, json_text, tree_edits
 
 CompactDamage = tuple[int, str, ByteEdits, TreeEdits]
+_TIMING = '{"times": [0.0, 0.5, 1.0], "moments": [0.1, 0.5, 0.9]}'
 _WORDS = [b'"shape":[0', b'"F16"', b'"U16"', b'"data_offsets":[0,9007199254740991]', b"lapgs4d\n", b"\xff" * 8]
 
 
 def damaged_compact_scenes(files: int) -> st.SearchStrategy[CompactDamage]:
     """Damage to one of so many files."""
-    places = st.sampled_from(["file", "content", "table", "field"])
+    places = st.sampled_from(["file", "content", "table", "field", "timing"])
     return st.tuples(st.integers(0, files - 1), places, byte_edits(_WORDS), tree_edits)
 
 
@@ -33,9 +34,10 @@ def damage_compact(files: Sequence[bytes], damage: CompactDamage) -> bytes:
     if place == "content":
         content = edit_bytes(content, edits, head=length)
     else:
-        if place == "field":
-            field = edit_tree(json.loads(table["__metadata__"]["field"]), changes)
-            table["__metadata__"]["field"] = json_text(field).decode("utf-8", "replace")
+        if place in ("field", "timing"):
+            texts = table["__metadata__"]
+            damaged = edit_tree(json.loads(texts.get(place, _TIMING)), changes)
+            texts[place] = json_text(damaged).decode("utf-8", "replace")
             text = json_text(table)
         else:
             text = json_text(edit_tree(table, changes))

@@ -79,6 +79,12 @@ DAMAGE: dict[str, tuple[Callable[[dict[str, Any], dict[str, str]], object], str]
     "degree in words": (lambda _, m: m.update(sh_degree="three"), "description of its field"),
     "degree 4": (lambda _, m: m.update(sh_degree="4"), "sh_degree 4 is outside 0 to 3"),
     "antialiased by half": (lambda _, m: m.update(antialiased="half"), "antialiased 'half' is neither true nor false"),
+    "timing that is not JSON": (lambda _, m: m.update(timing="{"), "its timing: cannot be read as JSON"),
+    "times alone": (lambda _, m: m.update(timing='{"times": [0]}'), "timing is no table of times and moments"),
+    "time that goes back": (
+        lambda _, m: m.update(timing='{"times": [0, 1], "moments": [0.5, 0.4]}'),
+        "timing.moments descend",
+    ),
     "unknown kind": (with_field(kind="quantum"), "kind must be static or .*, got 'quantum'"),
     "unknown key": (with_field(color="red"), "description of its field"),
     "a grid missing": (with_field(static=None), "description of its field"),

@@ -1,0 +1,225 @@
+"""Times of training images that are corrected while training."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from helpers.interrupts import interrupt_at
+from helpers.scenes import front_camera
+from helpers.training import configure
+from torch import Tensor, nn
+
+from lapgs_wgpu.data import Dataset
+from lapgs_wgpu.data.views import View
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.motion.fields.config import FieldConfig
+from lapgs_wgpu.motion.fields.deformation import Deformation
+from lapgs_wgpu.motion.scene import Scene4D, load
+from lapgs_wgpu.motion.timing import EVEN, Timing
+from lapgs_wgpu.train.distributed import SINGLE_PROCESS
+from lapgs_wgpu.train.run import resume, train
+from lapgs_wgpu.train.timing_refinement import FARTHEST, TimingRefinement
+from lapgs_wgpu.train.trainer import Trainer
+
+TIMES = np.linspace(0, 1, 11)
+# A film of which the fourth and the eighth image were lost, and which repeats its first one.
+MOMENTS = np.array([0.06, 0.1, 0.2, 0.34, 0.44, 0.5, 0.6, 0.74, 0.84, 0.9, 1.0])
+CAMERA = front_camera(48, 32)
+
+
+class Shift(nn.Module):
+    """To the right, by `speed` over the clip."""
+
+    def __init__(self, speed: float) -> None:
+        super().__init__()
+        self.speed = nn.Parameter(torch.tensor(speed))
+
+    def forward(self, means: Tensor, t: float) -> Deformation:
+        return Deformation(translation=self.speed * t * torch.tensor([1.0, 0.0, 0.0]).expand(len(means), 3))
+
+
+def moving(device: Device, speed: float = 0.8) -> Scene4D:
+    random = np.random.default_rng(0)
+    points = random.uniform(-0.4, 0.4, (30, 3)) + np.array([-0.4, 0.0, 3.0])
+    return Scene4D.from_points(
+        points, random.random((30, 3)), np.full(30, 0.1), FieldConfig(kind="own"), opacity=0.8, device=device,
+        own_field=Shift(speed),
+    )  # fmt: skip
+
+
+def views_at(times: Sequence[float]) -> list[View]:
+    return [
+        View(f"train_{n:03}", CAMERA, t, "test", lambda: np.zeros((1, 1, 3), np.uint8)) for n, t in enumerate(times)
+    ]
+
+
+def refinement(scene: Scene4D, truth: Callable[[View], Tensor], times: Sequence[float] = TIMES) -> TimingRefinement:
+    def picture(view: View) -> Tensor:
+        return scene.render(view.camera, view.time).image
+
+    return TimingRefinement(scene, views_at(times), truth, picture, SINGLE_PROCESS)
+
+
+def film(scene: Scene4D, moments: np.ndarray = MOMENTS) -> Callable[[View], Tensor]:
+    """Images at the times TIMES that show the scene at these moments."""
+    images = {t: scene.render(CAMERA, m).image for t, m in zip(TIMES.tolist(), moments.tolist(), strict=True)}
+    return lambda view: images[view.time]
+
+
+def test_it_finds_which_moments_a_film_shows(device: Device) -> None:
+    scene = moving(device)
+    found = refinement(scene, film(scene))
+    for number in range(6):
+        found.refine(number)
+    np.testing.assert_allclose(scene.timing.moments, MOMENTS, atol=1e-3)
+    np.testing.assert_array_equal(scene.timing.times, TIMES)
+    assert found.report()["frames_most"] == pytest.approx(0.6, abs=0.01)
+
+
+def test_one_step_is_that_of_least_squares(device: Device) -> None:
+    """Of an image whose brightness grows evenly with the moment, the minimum itself; by half an image at most."""
+    scene = moving(device)
+
+    def picture(view: View) -> Tensor:
+        return torch.full((2, 2, 3), scene.timing(view.time))
+
+    found = TimingRefinement(
+        scene, views_at([0.0, 0.5, 1.0]), lambda view: torch.full((2, 2, 3), {0.0: 0.1, 0.5: 0.4, 1.0: 0.0}[view.time]),
+        picture, SINGLE_PROCESS,
+    )  # fmt: skip
+    found.refine(0)
+    np.testing.assert_allclose(scene.timing.moments, [0.1, 0.4, 0.75], atol=1e-6)
+
+
+def test_what_does_not_count_is_not_looked_at(device: Device) -> None:
+    scene = moving(device)
+    right, early = film(scene), film(scene, np.maximum(MOMENTS - 0.04, 0))
+
+    def half(view: View) -> Tensor:
+        image = right(view).clone()
+        image[:16] = early(view)[:16]
+        return image
+
+    def covered(view: View) -> Tensor:
+        image = half(view).clone()
+        image[:16] = torch.nan
+        return image
+
+    found = []
+    for truth in (half, covered):
+        scene.timing = EVEN
+        refined = refinement(scene, truth)
+        for number in range(6):
+            refined.refine(number)
+        found.append(np.abs(scene.timing.moments - MOMENTS).max())
+    assert found[0] > 0.01
+    assert found[1] < 1e-3
+
+
+def test_what_stands_still_tells_no_times(device: Device) -> None:
+    scene = moving(device, speed=0.0)
+    other = moving(device)
+    refinement(scene, film(other)).refine(0)
+    np.testing.assert_array_equal(scene.timing.moments, TIMES)
+
+
+def test_an_error_that_a_shift_hardly_mends_moves_nothing(device: Device) -> None:
+    scene = moving(device)
+    noise = np.random.default_rng(1).random((32, 48, 3)).astype(np.float32)
+    refinement(scene, lambda view: torch.from_numpy(noise)).refine(0)
+    np.testing.assert_allclose(scene.timing.moments, TIMES, atol=0.02)
+
+
+def test_moments_rise_and_stay_near_their_times(device: Device) -> None:
+    scene = moving(device)
+    backwards = film(scene, MOMENTS[::-1])
+    found = refinement(scene, backwards)
+    for number in range(9):
+        found.refine(number)
+    assert (np.diff(scene.timing.moments) >= 0).all()
+    assert np.abs(scene.timing.moments - TIMES).max() <= FARTHEST * 0.1 + 1e-12
+
+
+def test_of_a_rig_it_takes_one_camera_after_the_other(device: Device) -> None:
+    scene = moving(device)
+    asked: list[str] = []
+
+    def truth(view: View) -> Tensor:
+        asked.append(view.name)
+        return scene.render(CAMERA, view.time).image
+
+    found = refinement(scene, truth, [0.0, 1.0, 0.0, 1.0, 1.0])
+    for number in range(3):
+        found.refine(number)
+    assert asked == ["train_000", "train_001", "train_002", "train_003", "train_000", "train_004"]
+
+
+# In a training --------------------------------------------------------------------------------------------------------
+
+GIVEN = {"timing__refine": "true", "timing__start": "15", "timing__interval": "6"}
+
+
+def test_an_interrupted_training_goes_on_to_the_same_bytes(
+    dataset: Dataset, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = configure(**GIVEN)
+    train(config, dataset, tmp_path / "whole", device=device)
+    assert load(tmp_path / "whole" / "checkpoint.ply", device).timing is not EVEN
+    with monkeypatch.context() as patched:
+        interrupt_at(23, patched)
+        with pytest.raises(KeyboardInterrupt):
+            train(config, dataset, tmp_path / "run", device=device)
+    resume(config, dataset, tmp_path / "run", device=device)
+    assert (tmp_path / "run" / "checkpoint.ply").read_bytes() == (tmp_path / "whole" / "checkpoint.ply").read_bytes()
+
+
+@pytest.mark.parametrize("moments", [[0.1, 0.2], [1.5] * 8, list(np.linspace(1, 0, 8))])
+def test_a_state_of_other_times_is_refused(dataset: Dataset, device: Device, moments: list[float]) -> None:
+    with Trainer(configure(**GIVEN), dataset, device) as training:
+        state = training.state() | {"timing.moments": np.array(moments)}
+        with pytest.raises(ValueError, match="moments"):
+            training.restore(state)
+
+
+def test_times_stay_until_the_first_step_that_is_planned(dataset: Dataset, device: Device) -> None:
+    with Trainer(configure(**GIVEN), dataset, device) as training:
+        for result in training:
+            assert (training.scene.timing is EVEN) == (result.step < 15)
+    with Trainer(configure(timing__refine="false"), dataset, device) as training:
+        assert training.timing is None
+
+
+def test_static_scenes_have_no_timing(dataset: Dataset, device: Device) -> None:
+    with Trainer(configure("static", **GIVEN), dataset, device) as training:
+        assert training.timing is None
+
+
+def test_it_sees_what_the_losses_see(dataset: Dataset, device: Device) -> None:
+    """Colors and cameras with their corrections; pixels that are ignored do not count."""
+    ignored = np.zeros((32, 32), bool)
+    ignored[:5] = True
+    first = dataclasses.replace(dataset.train[0], ignored=lambda: ignored)
+    masked = dataclasses.replace(dataset, train=(first, *dataset.train[1:]))
+    with Trainer(configure(exposure__enabled="true", cameras__refine="on", **GIVEN), masked, device) as training:
+        assert training._exposures is not None
+        with torch.no_grad():
+            training._exposures.values[0, :, 3] += 0.25
+        plain = training.scene.render(first.camera, first.time, torch.zeros(3)).image
+        torch.testing.assert_close(training._picture(first), plain + 0.25)
+        truth = training._truth(first)
+        assert bool(truth[:5].isnan().all())
+        assert not truth[5:].isnan().any()
+
+
+def test_measured_views_have_the_timing_of_the_training(dataset: Dataset, device: Device) -> None:
+    with Trainer(configure(**GIVEN), dataset, device) as training:
+        list(training)
+        training.scene.timing = EVEN
+        own = training.evaluate()["psnr"]
+        training.scene.timing = Timing(np.array([0.0, 1.0]), np.array([0.5, 0.5]))
+        assert training.evaluate()["psnr"] != own
