@@ -210,7 +210,7 @@ def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None)
     if (moved := training.camera_report()) is not None:
         measured["cameras"] = moved
     if training.timing is not None:
-        measured["timing"] = training.timing.report()
+        measured["image_times"] = training.timing.report()
     evaluate_run(out, scene, training.dataset, config.data.background, measured, lpips)
     drop_states(out)
     return scene
