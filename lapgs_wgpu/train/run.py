@@ -193,8 +193,8 @@ def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None)
             log.tell(outside)
         if (moved := training.camera_report()) is not None:
             log.tell(_moved(moved))
-        if training.timing is not None:
-            log.tell(_retimed(training.timing.report()))
+        if training.timing is not None and (retimed := training.timing.report())["frames_most"] > 0:
+            log.tell(_retimed(retimed))
 
     return_freed_memory()
     done, all_steps = training.done, config.schedule.steps

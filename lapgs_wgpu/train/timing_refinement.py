@@ -23,7 +23,7 @@ from .distributed import Ranks
 
 REACH = 0.5  # gaps between images, before and after, at which pictures are compared; and the largest step
 FARTHEST = 1.5  # gaps between images, of a moment from its time
-LEAST = 0.01  # share of an image's squared error that its shift must take away
+LEAST = 0.05  # share of an image's squared error that its shift must take away; of even films few shifts do
 
 
 class TimingRefinement:
