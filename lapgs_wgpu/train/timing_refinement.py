@@ -17,7 +17,7 @@ from torch import Tensor
 
 from lapgs_wgpu.data.views import View
 from lapgs_wgpu.motion.scene import Scene4D
-from lapgs_wgpu.motion.timing import Timing
+from lapgs_wgpu.motion.timing import EVEN, Timing
 
 from .distributed import Ranks
 
@@ -50,26 +50,25 @@ class TimingRefinement:
         self._views = [[view for view in views if view.time == t] for t in self._times.tolist()]
         # Half the distance of both neighbours; at the ends that of the one.
         self._gaps = np.gradient(self._times, np.arange(len(self._times))) if len(self._times) > 1 else np.ones(1)
-        self.moments = torch.from_numpy(self._times.copy())
+        self._moments = self._times.copy()
 
     def refine(self, number: int) -> None:
         """Take one step with all moments. number: of the step, from 0 on: of several views of a time, it takes one.
 
         The same bits on every run of one adapter and driver. Raises InputError where an image cannot be read.
         """
-        moments = self.moments.numpy()
-        shifts = np.zeros(len(moments))
-        for row in range(len(moments))[self._ranks.rank :: self._ranks.count]:
+        mine = np.zeros(len(self._times))
+        for row in range(len(mine))[self._ranks.rank :: self._ranks.count]:
             views = self._views[row]
-            shifts[row] = self._shift(views[number % len(views)], float(moments[row]), float(self._gaps[row]))
-        shifts = self._ranks.sums([torch.from_numpy(shifts)])[0].numpy()
+            mine[row] = self._shift(views[number % len(views)], float(self._moments[row]), float(self._gaps[row]))
+        shifts = self._ranks.sums([torch.from_numpy(mine)])[0].numpy()
         farthest = FARTHEST * self._gaps
-        moved = np.clip(moments + shifts, self._times - farthest, self._times + farthest)
+        moved = np.clip(self._moments + shifts, self._times - farthest, self._times + farthest)
         self._set(np.maximum.accumulate(np.clip(moved, 0.0, 1.0)))
 
     def _set(self, moments: NDArray[np.float64]) -> None:
-        self.moments.copy_(torch.from_numpy(moments))
-        self._scene.timing = Timing(self._times, moments.copy())
+        self._moments = moments
+        self._scene.timing = EVEN if (moments == self._times).all() else Timing(self._times, moments)
 
     def _shift(self, view: View, moment: float, gap: float) -> float:
         """How much later the moment is that fits a view best, as far as its neighbourhood tells."""
@@ -79,9 +78,9 @@ class TimingRefinement:
         counts = ~truth.isnan()
         error, speed = (now - truth)[counts], ((after - before) / (last - first))[counts]
         along, size, whole = (float(a @ b) for a, b in ((speed, error), (speed, speed), (error, error)))
-        if along**2 <= LEAST * size * whole:
-            return 0.0
-        return float(np.clip(-along / size, -REACH * gap, REACH * gap))
+        if along**2 > LEAST * size * whole:
+            return float(np.clip(-along / size, -REACH * gap, REACH * gap))
+        return 0.0
 
     def _at(self, view: View, moment: float) -> Tensor:
         """The picture of a view at a moment."""
@@ -94,19 +93,18 @@ class TimingRefinement:
 
     def report(self) -> dict[str, float]:
         """Of the moments' differences from their times: root mean square and largest, in gaps between images."""
-        apart = np.abs(self.moments.numpy() - self._times) / self._gaps
+        apart = np.abs(self._moments - self._times) / self._gaps
         return {"frames": float(np.sqrt(np.mean(apart**2))), "frames_most": float(apart.max())}
 
     def state(self) -> dict[str, Tensor]:
         """Everything that the next step depends on."""
-        return {"moments": self.moments}
+        return {"moments": torch.from_numpy(self._moments)}
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
         """Go on from what `state` gave. Raises ValueError where it is of another capture."""
-        moments = state["moments"]
-        if moments.shape != self.moments.shape or moments.dtype != torch.float64:
-            raise ValueError(f"its moments are {moments.dtype} of shape {tuple(moments.shape)}")
-        if not bool(((moments >= 0) & (moments <= 1)).all() and (moments.diff() >= 0).all()):
+        moments = state["moments"].numpy()
+        if moments.shape != self._moments.shape or moments.dtype != np.float64:
+            raise ValueError(f"its moments are {moments.dtype} of shape {moments.shape}")
+        if not (((moments >= 0) & (moments <= 1)).all() and (np.diff(moments) >= 0).all()):
             raise ValueError("its moments do not rise from 0 to 1")
-        if not torch.equal(moments, self.moments):
-            self._set(moments.numpy())
+        self._set(moments)
