@@ -72,5 +72,5 @@ def test_modules_stand_behind_those_that_they_import() -> None:
 def test_the_player_stays_small() -> None:
     """Lines of code: without those that are empty or a comment."""
     lines = [line for text in SCRIPTS.values() for line in text.splitlines()]
-    assert sum(not re.fullmatch(r"\s*(//.*)?", line) for line in lines) <= 1500
+    assert sum(not re.fullmatch(r"\s*(//.*)?", line) for line in lines) <= 1550
     assert max(text.count("\n") for text in SCRIPTS.values()) <= 230

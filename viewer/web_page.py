@@ -29,8 +29,8 @@ from .viewport import SETTLED, SMALLEST_SCALE, TARGET_SECONDS
 
 # The player's modules, each after those that it imports.
 MODULES = (
-    "refusal", "lapgs_file", "hash_grid", "scene", "gpu", "scan", "radix_sort", "rasterizer", "hash_encoder", "field",
-    "camera", "clock", "presenter", "viewport", "controls", "transport", "api", "main",
+    "refusal", "lapgs_file", "hash_grid", "timing", "scene", "gpu", "scan", "radix_sort", "rasterizer", "hash_encoder",
+    "field", "camera", "clock", "presenter", "viewport", "controls", "transport", "api", "main",
 )  # fmt: skip
 _PLAIN, _SUBGROUPS = gpu_config(0), gpu_config(32)
 _SCAN = {"SCAN_LANES": 256}

@@ -2,6 +2,7 @@
 import { Commands, Pool, part } from "./gpu.js";
 import { HashEncoder } from "./hash_encoder.js";
 import { temporalGrids } from "./hash_grid.js";
+import { momentAt } from "./timing.js";
 
 const LANES = 64;
 const POINTS = 2; // Gaussians of a lane, deform.wgsl
@@ -216,15 +217,4 @@ function activate({ count, shDegree, gaussians: g }, minScale) {
     const scales = g.log_scales.map(value => Math.max(Math.exp(value), minScale));
     const opacities = g.opacity_logits.map(value => 0.5 + 0.5 * Math.tanh(0.5 * value));
     return { means: g.means, quats, scales, opacities, sh };
-}
-
-// The moment of the motion at a time in [0, 1]: motion/timing.py.
-export function momentAt(timing, t) {
-    if (!timing) return t;
-    const { times, moments } = timing, last = times.length - 1;
-    const after = times.findIndex(time => time > t);
-    const next = after < 0 ? last : after, before = after < 0 ? last : Math.max(0, after - 1);
-    const apart = i => moments[i] - times[i];
-    const share = next > before ? (t - times[before]) / (times[next] - times[before]) : 0;
-    return Math.min(Math.max(t + apart(before) + share * (apart(next) - apart(before)), 0), 1);
 }

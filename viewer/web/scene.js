@@ -2,6 +2,7 @@
 import { temporalGrids } from "./hash_grid.js";
 import { readContainer } from "./lapgs_file.js";
 import { Refusal, quoted } from "./refusal.js";
+import { isTiming } from "./timing.js";
 
 const EXACT = "motion.frequencies"; // float32, the other weights are float16
 const GEOMETRY_OUTPUTS = 14;
@@ -46,31 +47,23 @@ function real(value, name, high) {
     return value;
 }
 
-// {times, moments}, as motion/timing.py has them.
-function readTiming(text) {
-    let timing;
+function readTable(text, of) {
     try {
-        timing = JSON.parse(text);
+        return JSON.parse(text);
     } catch {
-        throw damaged("its timing is not JSON");
+        throw damaged(`${of} is not JSON`);
     }
-    const { times, moments } = timing ?? {};
-    const known = list => Array.isArray(list) && list.length > 0 && list.every(x => typeof x === "number" && x >= 0 && x <= 1);
-    const rises = (list, least) => list.every((x, i) => i === 0 || x - list[i - 1] >= least);
-    if (!known(times) || !known(moments) || times.length !== moments.length || !rises(times, Number.MIN_VALUE) || !rises(moments, 0)) {
-        throw damaged("its timing is not of times and moments that rise from 0 to 1");
-    }
-    return { times, moments };
+}
+
+function readTiming(text) {
+    const timing = readTable(text, "its timing");
+    if (!isTiming(timing)) throw damaged("its timing is not of times and moments that rise from 0 to 1");
+    return timing;
 }
 
 // What playback needs of FieldConfig (motion/fields/config.py).
 function readField(text) {
-    let field;
-    try {
-        field = JSON.parse(text);
-    } catch {
-        throw damaged("the description of its field is not JSON");
-    }
+    const field = readTable(text, "the description of its field");
     const kind = field?.kind;
     if (kind === "static") return null;
     const laplacian = kind === "laplacian";
