@@ -21,7 +21,7 @@ from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.fields.deformation import Deformation
 from lapgs_wgpu.motion.scene import Scene4D, load
 from lapgs_wgpu.motion.timing import EVEN, Timing
-from lapgs_wgpu.train.distributed import SINGLE_PROCESS
+from lapgs_wgpu.train.distributed import SINGLE_PROCESS, Ranks
 from lapgs_wgpu.train.run import resume, train
 from lapgs_wgpu.train.timing_refinement import FARTHEST, TimingRefinement
 from lapgs_wgpu.train.trainer import Trainer
@@ -58,11 +58,13 @@ def views_at(times: Sequence[float]) -> list[View]:
     ]
 
 
-def refinement(scene: Scene4D, truth: Callable[[View], Tensor], times: Sequence[float] = TIMES) -> TimingRefinement:
+def refinement(
+    scene: Scene4D, truth: Callable[[View], Tensor], times: Sequence[float] = TIMES, ranks: Ranks = SINGLE_PROCESS
+) -> TimingRefinement:
     def picture(view: View) -> Tensor:
         return scene.render(view.camera, view.time).image
 
-    return TimingRefinement(scene, views_at(times), truth, picture, SINGLE_PROCESS)
+    return TimingRefinement(scene, views_at(times), truth, picture, ranks)
 
 
 def film(scene: Scene4D, moments: np.ndarray = MOMENTS) -> Callable[[View], Tensor]:
@@ -167,6 +169,26 @@ def test_of_a_rig_it_takes_one_camera_after_the_other(device: Device) -> None:
     for number in range(3):
         found.refine(number)
     assert asked == ["train_000", "train_001", "train_002", "train_003", "train_000", "train_004"]
+
+
+class Alone(Ranks):
+    """A rank that hears of no other."""
+
+    def sums(self, tensors: Sequence[Tensor]) -> list[Tensor]:
+        return list(tensors)
+
+
+def test_ranks_share_the_images(device: Device) -> None:
+    shifts = []
+    for ranks in (SINGLE_PROCESS, Alone(0, 2), Alone(1, 2)):
+        scene = moving(device)
+        found = refinement(scene, film(scene), ranks=ranks)
+        found.refine(0)
+        shifts.append(found.state()["moments"].numpy() - TIMES)
+    whole, even, odd = shifts
+    assert not even[1::2].any()
+    assert not odd[::2].any()
+    np.testing.assert_array_equal(even + odd, whole)
 
 
 # In a training --------------------------------------------------------------------------------------------------------
