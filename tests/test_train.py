@@ -127,7 +127,7 @@ def test_the_checkpoint_is_the_last_model(run: Path, dataset: Dataset, device: D
 def test_the_format_names_what_a_checkpoint_says_of_itself(dataset: Dataset, device: Device, tmp_path: Path) -> None:
     moved = dataclasses.replace(dataset, normalization=Normalization(np.zeros(3), 1.0))
     # Whose times are corrected.
-    config = configure(schedule__warm_up="0", timing__start="20", timing__interval="1")
+    config = configure(schedule__warm_up="0", timing__refine="true", timing__start="20", timing__interval="1")
     train(config, moved, tmp_path / "run", device=device)
     written = read_checkpoint(tmp_path / "run" / "checkpoint.ply").metadata
     text = (Path(__file__).parents[1] / "docs" / "format.md").read_text(encoding="utf-8")

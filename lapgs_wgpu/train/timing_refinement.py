@@ -3,7 +3,8 @@
 Films lose and repeat frames, and scenes are rendered from animations of another frame rate, so motion that is even in
 the world goes by jerks in the images. A field that is smooth in time then fits no image. Of each training image, the
 shift in time that fits it best follows by least squares (a step of Gauss-Newton) from pictures of a moment shortly
-before and shortly after its own. Images that are measured have the timing between those of the training.
+before and shortly after its own. What the images around it have in common is the field's delay, not theirs, and is left
+to the field. Images that are measured have the timing between those of the training.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from .distributed import Ranks
 REACH = 0.5  # gaps between images, before and after, at which pictures are compared; and the largest step
 FARTHEST = 1.5  # gaps between images, of a moment from its time
 LEAST = 0.05  # share of an image's squared error that its shift must take away; of even films few shifts do
+AROUND = 8  # images before and after one, whose median shift is the field's delay
 
 
 class TimingRefinement:
@@ -57,30 +59,32 @@ class TimingRefinement:
 
         The same bits on every run of one adapter and driver. Raises InputError where an image cannot be read.
         """
-        mine = np.zeros(len(self._times))
+        mine = torch.zeros(len(self._times), 2, dtype=torch.float64)
         for row in range(len(mine))[self._ranks.rank :: self._ranks.count]:
             views = self._views[row]
-            mine[row] = self._shift(views[number % len(views)], float(self._moments[row]), float(self._gaps[row]))
-        shifts = self._ranks.sums([torch.from_numpy(mine)])[0].numpy()
+            mine[row] = torch.tensor(self._fit(views[number % len(views)], float(self._moments[row]), self._gaps[row]))
+        shifts, mended = self._ranks.sums([mine])[0].numpy().T
+        shifts = shifts - running_median(shifts, AROUND)
+        shifts[shifts**2 * mended < LEAST] = 0.0
+        moved = self._moments + self._gaps * shifts.clip(-REACH, REACH)
         farthest = FARTHEST * self._gaps
-        moved = np.clip(self._moments + shifts, self._times - farthest, self._times + farthest)
+        moved = np.clip(moved, self._times - farthest, self._times + farthest)
         self._set(np.maximum.accumulate(np.clip(moved, 0.0, 1.0)))
 
     def _set(self, moments: NDArray[np.float64]) -> None:
         self._moments = moments
         self._scene.timing = EVEN if (moments == self._times).all() else Timing(self._times, moments)
 
-    def _shift(self, view: View, moment: float, gap: float) -> float:
-        """How much later the moment is that fits a view best, as far as its neighbourhood tells."""
+    def _fit(self, view: View, moment: float, gap: float) -> tuple[float, float]:
+        """How much later the moment is that fits a view best, in gaps between images; and the share of the view's
+        squared error that goes with a shift by one gap, as the square of the shift."""
         first, last = max(moment - REACH * gap, 0.0), min(moment + REACH * gap, 1.0)
         before, now, after = (self._at(view, each).double() for each in (first, moment, last))
         truth = self._truth(view).double()
         counts = ~truth.isnan()
-        error, speed = (now - truth)[counts], ((after - before) / (last - first))[counts]
+        error, speed = (now - truth)[counts], ((after - before) * (gap / (last - first)))[counts]
         along, size, whole = (float(a @ b) for a, b in ((speed, error), (speed, speed), (error, error)))
-        if along**2 > LEAST * size * whole:
-            return float(np.clip(-along / size, -REACH * gap, REACH * gap))
-        return 0.0
+        return (-along / size, size / whole) if size > 0 and whole > 0 else (0.0, 0.0)
 
     def _at(self, view: View, moment: float) -> Tensor:
         """The picture of a view at a moment."""
@@ -108,3 +112,9 @@ class TimingRefinement:
         if not (((moments >= 0) & (moments <= 1)).all() and (np.diff(moments) >= 0).all()):
             raise ValueError("its moments do not rise from 0 to 1")
         self._set(moments)
+
+
+def running_median(values: NDArray[np.float64], around: int) -> NDArray[np.float64]:
+    """(N,) of each value and at most `around` before and after it, equally many."""
+    reach = [min(around, i, len(values) - 1 - i) for i in range(len(values))]
+    return np.array([np.median(values[i - r : i + r + 1]) for i, r in enumerate(reach)])
