@@ -24,7 +24,7 @@ from lapgs_wgpu.motion.scene import Scene4D, load
 from lapgs_wgpu.motion.timing import EVEN, Timing
 from lapgs_wgpu.train.distributed import SINGLE_PROCESS, Ranks
 from lapgs_wgpu.train.run import resume, train
-from lapgs_wgpu.train.timing_refinement import FARTHEST, TimingRefinement, running_median
+from lapgs_wgpu.train.timing_refinement import FARTHEST, TimingRefinement, image_to_fit, running_median
 from lapgs_wgpu.train.trainer import Trainer
 
 TIMES = np.linspace(0, 1, 11)
@@ -256,7 +256,7 @@ def test_it_sees_what_the_losses_see(dataset: Dataset, device: Device) -> None:
             training._exposures.values[0, :, 3] += 0.25
         plain = training.scene.render(first.camera, first.time, torch.zeros(3)).image
         torch.testing.assert_close(training._picture(first), plain + 0.25)
-        truth = training._truth(first)
+        truth = image_to_fit(first, torch.zeros(3))
         assert bool(truth[:5].isnan().all())
         assert not truth[5:].isnan().any()
 

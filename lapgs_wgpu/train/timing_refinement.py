@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lapgs_wgpu.data.views import View
+from lapgs_wgpu.data.views import View, composite
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.motion.timing import EVEN, Timing
 
@@ -112,6 +112,13 @@ class TimingRefinement:
         if not (((moments >= 0) & (moments <= 1)).all() and (np.diff(moments) >= 0).all()):
             raise ValueError("its moments do not rise from 0 to 1")
         self._set(moments)
+
+
+def image_to_fit(view: View, color: Tensor) -> Tensor:
+    """The image (H, W, 3) of a training view on a background (3,); NaN where the loss ignores it. Raises InputError."""
+    image = torch.from_numpy(composite(view.load(), color.numpy()).astype(np.float32) / 255)
+    ignored = view.load_ignored()
+    return image if ignored is None else image.masked_fill(torch.from_numpy(ignored)[..., None], torch.nan)
 
 
 def running_median(values: NDArray[np.float64], around: int) -> NDArray[np.float64]:

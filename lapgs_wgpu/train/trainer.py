@@ -8,6 +8,7 @@ import os
 import sys
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from lapgs_wgpu.data.views import Dataset, View, composite
+from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device, open_device
 from lapgs_wgpu.io.initial_view import InitialView, captured_arc
@@ -48,7 +49,7 @@ from lapgs_wgpu.train.parts import Parts
 from lapgs_wgpu.train.smoothness import draw_nearby
 from lapgs_wgpu.train.step_result import StepResult
 from lapgs_wgpu.train.suited import suited, with_decoder_placed
-from lapgs_wgpu.train.timing_refinement import TimingRefinement
+from lapgs_wgpu.train.timing_refinement import TimingRefinement, image_to_fit
 
 MAX_SH_DEGREE = 3
 # Of the configuration.
@@ -200,9 +201,11 @@ class Trainer:
                 lambda: scene_points(scene.parameters["means"], scene.parameters["opacity_logits"].sigmoid()),
                 corrections,
             )
+        self._color = torch.full((3,), BACKGROUND_LEVELS[config.data.background])  # of the evaluation
         self.timing = None
         if config.timing.refine and scene.field is not None and len(dataset.times) > 1:
-            self.timing = TimingRefinement(scene, dataset.train, self._truth, self._picture, self.ranks)
+            truth = partial(image_to_fit, color=self._color)
+            self.timing = TimingRefinement(scene, dataset.train, truth, self._picture, self.ranks)
         beside = (self._frequencies, self._exposures, self.cameras)
         self._beside = [each for each in beside if each is not None]
         self._density = DensityControl(
@@ -385,19 +388,11 @@ class Trainer:
     def _exposure_of(self, view: View) -> Tensor | None:
         return None if self._exposures is None else self._exposures.values[self._numbers[view.name]]
 
-    def _truth(self, view: View) -> Tensor:
-        """The image (H, W, 3) of a training view on the background of the evaluation; NaN where the loss ignores it."""
-        image = composite(view.load(), np.full(3, BACKGROUND_LEVELS[self.config.data.background]))
-        truth = torch.from_numpy(image.astype(np.float32) / 255)
-        ignored = view.load_ignored()
-        return truth if ignored is None else truth.masked_fill(torch.from_numpy(ignored)[..., None], math.nan)
-
     @torch.no_grad()
     def _picture(self, view: View) -> Tensor:
         """The scene's picture (H, W, 3) of a training view, with the corrections of its camera and of its colors."""
         camera = view.camera if self.cameras is None else self.cameras.refined(view.camera).camera
-        color = torch.full((3,), BACKGROUND_LEVELS[self.config.data.background])
-        image = self.scene.render(camera, view.time, color, depth=False).image
+        image = self.scene.render(camera, view.time, self._color, depth=False).image
         correction = self._exposure_of(view)
         return image if correction is None else image @ correction[:, :3].T + correction[:, 3]
 
