@@ -24,7 +24,7 @@ Train a 4D Gaussian splatting model of a moving scene on a folder of images. Run
   lapgs-train tiny --data motion:path=4         built-in scene that measures motion (docs/metrics.md)
   lapgs-train tiny --data DIR                   D-NeRF scene at 200x200 pixels, with settings for a CPU
   lapgs-train dnerf --data DIR --out RUN        D-NeRF scene as in the paper (800x800 pixels)
-  lapgs-train dnerf-400 --data DIR              D-NeRF scene at 400x400 pixels, half an hour on two CPU cores
+  lapgs-train dnerf-400 --data DIR              D-NeRF scene at 400x400 pixels, an hour or two on two CPU cores
   lapgs-train hypernerf --data DIR              Nerfies or HyperNeRF capture; for a CPU: hypernerf-tiny
   lapgs-train neu3d --data DIR                  several static cameras; for a CPU: neu3d-tiny
   lapgs-train hypernerf-tiny --data DIR         your own film, converted by lapgs-prepare (see its --help)
