@@ -76,7 +76,7 @@ class Scene4D:
     Attributes:
         parameters: canonical Gaussians as they are optimized, each an nn.Parameter of float32: means (N, 3) world
             units, log_scales (N, 3), quats (N, 4) wxyz of any length, opacity_logits (N,), sh_dc (N, 1, 3), sh_rest
-            (N, 15, 3); for the field laplacian also dynamics (N, D) (paper eq. 8).
+            (N, 15, 3); for the field laplacian and one's own also dynamics (N, D) (paper eq. 8).
         field_config: configuration of the field.
         field: the module that moves the Gaussians; None for static scenes.
         device: that renders.

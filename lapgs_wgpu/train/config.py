@@ -93,7 +93,9 @@ class ScheduleConfig(Options):
     """Lengths and intervals, in steps."""
 
     steps: int = option(
-        "number of training steps; rates.*.steps, schedule.warm_up and density.* do not change with it", at_least=1
+        "number of training steps; no other key changes with it, such as rates.*.steps, schedule.warm_up, density.* and "
+        "timing.*",
+        at_least=1,
     )
     batch: int = option("images per step; their gradients are averaged", at_least=1)
     warm_up: int = option(
@@ -380,9 +382,9 @@ class TimingConfig(Options):
         at_least=1,
     )
 
-    def changes_at(self, step: int, last: int) -> bool:
-        """Whether times are corrected after this step of `last`."""
-        return self.refine and self.start <= step < last and (step - self.start) % self.interval == 0
+    def corrections(self, steps: int) -> range:
+        """After which of `steps` steps times are corrected."""
+        return range(self.start, steps, self.interval) if self.refine else range(0)
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ SMALLER = 0.6  # of the small preset's image size, where time is short
 
 class Plan(NamedTuple):
     """config, dataset: of the training. preset: where it comes from. seconds, at_most: that it takes, with motion
-    discovery and evaluation. text: what was chosen and why, a line."""
+    discovery, corrections of times and evaluation. text: what was chosen and why, a line."""
 
     config: Config
     dataset: Dataset
@@ -91,19 +91,19 @@ def plan_training(
             if last:
                 raise
             continue
-        views, whole = len(dataset.test), config.schedule.steps
+        rest, whole = _beside_steps(config, costs, dataset), config.schedule.steps
         allowed = minutes if minutes is not None else PATIENCE if candidate.large else math.inf
-        fitting = _steps_within(60 * allowed, config, costs, views) if allowed < math.inf else sys.maxsize
+        fitting = _steps_within(60 * allowed, config, costs, rest) if allowed < math.inf else sys.maxsize
         steps = min(max(whole, SEEN * len(dataset.times)), fitting)
         if steps < LEAST_SHARE * whole and not last:
             continue
         if steps < LEAST_STEPS:
-            needed = math.ceil(_seconds(LEAST_STEPS, config, costs, views)[0] / 6) / 10
+            needed = math.ceil(_seconds(LEAST_STEPS, config, costs, rest)[0] / 6) / 10
             raise InputError(
                 f"{allowed:g} minutes are enough for {max(steps, 0)} steps on {device.info.name}, and at least "
                 f"{LEAST_STEPS} are needed; give --minutes {needed:g} or more."
             )
-        seconds = _seconds(steps, config, costs, views)
+        seconds = _seconds(steps, config, costs, rest)
         found = f"{layout}, {len(dataset.train)} images of {len(dataset.times)} moments"
         text = _text(candidate.preset, _longer_side(dataset), config, steps, seconds, costs, found, device)
         return Plan(scaled(config, steps), dataset, candidate.preset, *seconds, text)
@@ -130,15 +130,22 @@ def _open(folder: Path, preset: str, size: int) -> tuple[Config, Dataset]:
     return config, open_dataset(config)
 
 
-def _steps_within(seconds: float, config: Config, costs: Costs, views: int) -> int:
+def _beside_steps(config: Config, costs: Costs, dataset: Dataset) -> float:
+    """Seconds that do not change with the number of steps: the evaluation, and the corrections of times, as many with
+    a scaled schedule, each of which draws an image of each moment three times."""
+    corrections = len(config.timing.corrections(config.schedule.steps))
+    return len(dataset.test) * costs.view + corrections * 3 * len(dataset.times) * costs.picture
+
+
+def _steps_within(seconds: float, config: Config, costs: Costs, rest: float) -> int:
     per_step = costs.step + _discovery(config, costs)[0] / config.schedule.steps
-    return int((seconds - views * costs.view) / per_step)
+    return int((seconds - rest) / per_step)
 
 
-def _seconds(steps: int, config: Config, costs: Costs, views: int) -> tuple[float, float]:
-    """About and at most, of a whole training with `steps` steps: motion discovery, steps, evaluation."""
+def _seconds(steps: int, config: Config, costs: Costs, rest: float) -> tuple[float, float]:
+    """About and at most, of a whole training with `steps` steps: motion discovery, steps, and the rest."""
     about, most = (each * steps / config.schedule.steps for each in _discovery(config, costs))
-    return about + steps * costs.step + views * costs.view, most + steps * costs.many + views * costs.view
+    return about + steps * costs.step + rest, most + steps * costs.many + rest
 
 
 def _discovery(config: Config, costs: Costs) -> tuple[float, float]:
@@ -169,6 +176,7 @@ def scaled(config: Config, steps: int) -> Config:
         cameras=dataclasses.replace(
             stretched(config.cameras, ("start",)), rate=stretched(config.cameras.rate, ("steps",))
         ),
+        timing=stretched(config.timing, ("start", "interval")),
         discovery=stretched(config.discovery, ("steps", "field_steps")),
     )
 

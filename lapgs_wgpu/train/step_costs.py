@@ -27,11 +27,13 @@ VIEWS = 2  # test views that are timed
 
 class Costs(NamedTuple):
     """Seconds on this machine. few, many: a step with USUAL and with GROWTH times `points.count` Gaussians. still: a
-    step of the static fit with which motion discovery begins. view: the evaluation of a test view."""
+    step of the static fit with which motion discovery begins. picture: a rendering of a training view. view: the
+    evaluation of a test view."""
 
     few: float
     many: float
     still: float
+    picture: float
     view: float
 
     @property
@@ -46,13 +48,17 @@ def measure_costs(config: Config, dataset: Dataset, device: Device) -> Costs:
     still, _ = _timed(static_config(config), dataclasses.replace(dataset, train=tuple(small)), device, USUAL)
     few, _ = _timed(config, dataset, device, USUAL)
     many, scene = _timed(config, dataset, device, GROWTH)
+    for train in dataset.train[:2]:  # the first is not timed
+        begin = time.perf_counter()
+        scene.render(train.camera, train.time, depth=False)
+        picture = time.perf_counter() - begin
     views = dataset.test[: VIEWS + 1]
     unit = (dataset.extent or 1.0) if config.cameras.refines(own_footage=dataset.own_footage) else None
     evaluate(scene, views[:1], config.data.background, camera_unit=unit)  # not timed
     begin = time.perf_counter()
     evaluate(scene, views[-VIEWS:], config.data.background, camera_unit=unit)
     taken = time.perf_counter() - begin
-    return Costs(few, many, still, taken / len(views[-VIEWS:]))
+    return Costs(few, many, still, picture, taken / len(views[-VIEWS:]))
 
 
 def _timed(config: Config, dataset: Dataset, device: Device, growth: float) -> tuple[float, Scene4D]:

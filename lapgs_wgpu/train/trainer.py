@@ -165,6 +165,12 @@ class Trainer:
                 f"shorter than schedule.steps ({config.schedule.steps}).",
                 ranks,
             )
+        if self.scene.field is not None and config.timing.refine and config.timing.start >= config.schedule.steps:
+            _note(
+                f"no times are corrected in this training, since timing.start ({config.timing.start}) is not below "
+                f"schedule.steps ({config.schedule.steps}).",
+                ranks,
+            )
         self._start(corrections)
         self.whole = True
 
@@ -321,8 +327,9 @@ class Trainer:
         else:
             self._generator.set_state(drawn)
             self._zero_grad()
-        if self.timing is not None and moving and config.timing.changes_at(step, config.schedule.steps):
-            self.timing.refine((step - config.timing.start) // config.timing.interval)
+        corrections = config.timing.corrections(config.schedule.steps)
+        if self.timing is not None and moving and step in corrections:
+            self.timing.refine(corrections.index(step))
         pruned = self._density.change(step, moving=moving)
         if step % config.schedule.sh_interval == 0:
             scene.sh_degree = min(scene.sh_degree + 1, MAX_SH_DEGREE)

@@ -15,7 +15,7 @@ from lapgs_wgpu.train.optimizer import ADAM_EPS
 from .tracks import Tracks
 
 STILL = 300  # Gaussians of the static fit that a step asks to stay where they are
-HASH_RATE, MLP_RATE = 1e-2, 2e-3  # learning rates, as in the preset tiny
+HASH_RATE, MLP_RATE = 1e-2, 2e-3  # learning rates, half of those of the preset tiny
 KEEPING = 0.5  # of these rates, at most, at which a training goes on; at higher ones Adam's noise undoes the fit
 LAST = 0.05  # of the learning rates, in the end; they fall over the second half
 SHAPE_WEIGHT = 0.1  # of changes of scales and quaternions, which the tracks do not know

@@ -60,8 +60,8 @@ def static_fit(
 ) -> StaticFit:
     """Fit the static scene, and the training cameras where they are refined.
 
-    config: `discovery` says how many steps and at which size; the learning rate of the means and the losses are those
-    of the training, but for the terms that compare the field. progress: called with each step.
+    config: `discovery` says how many steps and at which size; the learning rate of the means is that of the training,
+    of whose losses L1 and SSIM are left. progress: called with each step.
     """
     views = sorted(dataset.train, key=lambda view: (view.time, view.name))
     chosen = np.linspace(0, len(views) - 1, min(len(views), MOST_VIEWS)).astype(np.int64)
