@@ -102,7 +102,7 @@ def test_times_lie_half_to_whole_the_reach_apart() -> None:
 
 
 @pytest.mark.parametrize(
-    ("config", "count", "times"), [(AccelerationConfig(), 40, 101), (CONFIG, 1, 101), (CONFIG, 40, 1)]
+    ("config", "count", "times"), [(AccelerationConfig(), 40, 101), (CONFIG, 1, 101), (CONFIG, 40, 1), (CONFIG, 40, 2)]
 )
 def test_nowhere_to_look(config: AccelerationConfig, count: int, times: int) -> None:
     generator = torch.Generator().manual_seed(0)

@@ -30,11 +30,11 @@ from lapgs_wgpu.splat.rotation import rotate, rotation_matrices
 from lapgs_wgpu.train.config import LossWeights
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
 from lapgs_wgpu.train.learning_rate import Rate
-from lapgs_wgpu.train.loss_terms import LossTerm
+from lapgs_wgpu.train.loss_terms import LossTerm, torch_loss
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.run import resume, train
 from lapgs_wgpu.train.tensorboard import scalars
-from lapgs_wgpu.train.truth_cache import upload_rgba
+from lapgs_wgpu.train.truth_cache import LEFT_OUT, upload_rgba
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
@@ -264,7 +264,7 @@ def test_a_training_says_why_it_leaves_out_discovery(
     dataset: Dataset, device: Device, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def told(parts: Parts | None = None, method: str = "laplacian", **overrides: str) -> str:
-        with Trainer(configure(method, **overrides), dataset, device, parts=parts) as trainer:
+        with Trainer(configure(method, timing__refine="false", **overrides), dataset, device, parts=parts) as trainer:
             assert trainer.discovery is None
             assert len(list(trainer)) == STEPS
         return capsys.readouterr().err
@@ -285,7 +285,7 @@ def test_a_training_says_that_its_warm_up_lasts_to_its_end(
         ("laplacian", STEPS, True),
         ("static", STEPS, False),
     ):
-        config = configure(method, discovery__enabled="false", schedule__warm_up=str(warm_up))
+        config = configure(method, discovery__enabled="false", schedule__warm_up=str(warm_up), timing__refine="false")
         Trainer(config, dataset, device).close()
         note = f"(schedule.warm_up: {warm_up} steps) is not shorter than schedule.steps ({STEPS}).\n"
         assert capsys.readouterr().err == (
@@ -381,6 +381,41 @@ def test_a_wgsl_term_is_that_of_its_reference(device: Device) -> None:
     found = torch.from_numpy(d_image.read())
     torch.testing.assert_close(found[:3] - 1, image.grad.permute(2, 0, 1).float(), rtol=1e-4, atol=2e-7)
     assert (found[3] == 1).all()
+
+
+@pytest.mark.kernels
+def test_terms_of_ones_own_leave_out_what_the_losses_do(device: Device) -> None:
+    rng, (height, width) = np.random.default_rng(0), (13, 21)
+    planes = rng.random((4, height, width)).astype(np.float32)
+    rgba = rng.integers(1, 256, (height, width, 4), np.uint8)
+    rgba[3:7, 5:] = LEFT_OUT
+    left_out = (rgba == LEFT_OUT).all(axis=2)
+    shown, truth = DeviceArray.upload(device, "image", planes), upload_rgba(device, rgba)
+    image = torch.from_numpy(planes[:3]).permute(1, 2, 0).double()
+    target = torch.from_numpy(lapgs_wgpu.data.views.composite(rgba, np.ones(3))).double() / 255
+    target[left_out] = image[left_out]
+    expected = charbonnier(image, target).item()
+    in_torch, gradient = torch_loss(TorchLoss("mine", charbonnier), shown, truth, (1.0, 1.0, 1.0), 0.3)
+    d_image = DeviceArray.upload(device, "d", np.zeros((4, height, width), np.float32))
+    with Commands(device) as commands:
+        values = WgslLoss("mine", CHARBONNIER).record(commands, shown, truth, (1.0, 1.0, 1.0), 0.3, d_image)
+    assert in_torch == pytest.approx(expected, rel=1e-5)
+    assert values.read().mean(dtype=np.float64) == pytest.approx(expected, rel=1e-5)
+    for found in (gradient, d_image.read()):
+        assert (found[:, left_out] == 0).all()
+        assert (found[:3, ~left_out] != 0).all()
+
+
+def test_a_torch_term_of_a_window_asks_nothing_of_what_is_left_out(device: Device) -> None:
+    """A term that looks at a pixel's neighbours has a gradient there, too."""
+    rgba = np.full((4, 6, 4), 255, np.uint8)
+    rgba[1, 2] = LEFT_OUT
+    planes = np.random.default_rng(0).random((4, 4, 6)).astype(np.float32)
+    term = TorchLoss("mine", lambda image, truth: (image[:, 1:] - image[:, :-1]).square().mean())
+    shown, truth = DeviceArray.upload(device, "image", planes), upload_rgba(device, rgba)
+    _, gradient = torch_loss(term, shown, truth, (0.0, 0.0, 0.0), 1.0)
+    assert (gradient[:, 1, 2] == 0).all()
+    assert (gradient[:3, 1, 1] != 0).all()
 
 
 def test_a_wgsl_term_and_one_in_torch_train_alike(dataset: Dataset, device: Device) -> None:

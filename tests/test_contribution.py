@@ -14,9 +14,11 @@ from helpers.scene_files import moving_scene
 
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train import density_control, trainer
 from lapgs_wgpu.train.config import Config
-from lapgs_wgpu.train.contribution import MOST_VIEWS, contributions, spread_over_time
+from lapgs_wgpu.train.contribution import contributions
+from lapgs_wgpu.train.densify import published_rule
 from lapgs_wgpu.train.presets import load_config
 
 
@@ -44,18 +46,28 @@ def test_contributions_are_the_largest_sums_of_blending_weights(device: Device, 
     torch.testing.assert_close(contributions(scene, shown, moving=moving).double(), expected, rtol=1e-3, atol=1e-2)
 
 
-def test_views_are_spread_over_the_clip() -> None:
+def test_pruning_looks_through_the_cameras_as_they_are_corrected(
+    device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[View] = []
+
+    def noted(scene: Scene4D, views: list[View], *, moving: bool) -> torch.Tensor:
+        seen.extend(views)
+        return torch.ones(len(scene))
+
+    monkeypatch.setattr(density_control, "contributions", noted)
     shown = views(3)
-    assert [view.name for view in spread_over_time(shown[::-1])] == [view.name for view in shown]
-    many = [dataclasses.replace(shown[0], name=f"{i}", time=(i * 37 % 400) / 400) for i in range(400)]
-    times = [view.time for view in spread_over_time(many)]
-    assert len(times) == MOST_VIEWS
-    assert np.allclose(np.diff(times), 1 / MOST_VIEWS)
-    assert times[0] < 1 / MOST_VIEWS
+    moved = {view.name: camera for view, camera in zip(shown, cameras(4, 64, 48)[1:], strict=True)}
+    config, scene = pruning_config(min_contribution=0.5), moving_scene(device)
+    control = density_control.DensityControl(
+        config, scene, None, published_rule, shown, lambda view: moved[view.name], 1.0, torch.Generator()
+    )  # type: ignore[arg-type]
+    control.change(4, moving=True)
+    assert [view.camera for view in seen] == [moved[view.name] for view in shown]
 
 
 def pruning_config(**changes: float) -> Config:
-    config = load_config("demo", {"schedule.steps": "20"})
+    config = load_config("demo", {"schedule.steps": "20", "antialiased": "false"})
     density = dataclasses.replace(config.density, start=2, stop=3, contribution_interval=4, **changes)
     return dataclasses.replace(config, density=density)
 

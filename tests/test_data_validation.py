@@ -27,7 +27,15 @@ from PIL import Image, ImageFilter
 from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.data.cloud import Cloud
 from lapgs_wgpu.data.split import held_out
-from lapgs_wgpu.data.timestamps import ImageName, disorder, frame_numbers, natural_key, read_times, to_unit_range
+from lapgs_wgpu.data.timestamps import (
+    ImageName,
+    disorder,
+    frame_numbers,
+    in_step,
+    natural_key,
+    read_times,
+    to_unit_range,
+)
 from lapgs_wgpu.data.validation import check_film, check_in_view, check_times, check_views
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.errors import InputError
@@ -306,6 +314,31 @@ def test_frame_numbers() -> None:
     with pytest.raises(InputError, match="differ in 2 numbers"):
         numbers("cam0_1.jpg", "cam1_2.jpg")
     assert sorted(["cam10", "cam2", "cam"], key=natural_key) == ["cam", "cam2", "cam10"]
+
+
+def test_cameras_that_are_nearly_in_step_share_their_times() -> None:
+    """Stamps of two films, which differ by rounding and by a twentieth of a frame; the third is half a frame late."""
+    frame = 1 / 30
+    films = [[n * frame for n in range(300)], [0.1 + (n * frame + 0.05 * frame * (n % 2)) - 0.1 for n in range(300)]]
+    films.append([(n + 0.5) * frame for n in range(300)])
+    names = [ImageName(f"{c}/{n}.jpg", str(c)) for c in range(3) for n in range(300)]
+    values = [time for film in films for time in film]
+    assert len(set(values)) > 700
+    found = in_step(names, values)
+    assert np.abs(np.subtract(found, values)).max() < 0.03 * frame
+    assert len(set(found)) == 600
+    for c in range(3):
+        assert len(set(found[300 * c : 300 * (c + 1)])) == 300, "no two of a camera"
+
+
+def test_times_that_are_in_step_stay_to_the_last_bit() -> None:
+    times = [n / 7 for n in range(9)]
+    names = [ImageName(f"{c}/{n}.jpg", c) for c in "abc" for n in range(9)]
+    assert in_step(names, 3 * times) == 3 * times
+    burst = [0.0, 1.0, 1.001, 2.0]
+    assert in_step([ImageName(f"{n}.jpg") for n in range(4)], burst) == burst, "one camera"
+    assert len(set(in_step([*names[:4], *names[9:13]], burst + burst))) == 4, "no two of a camera"
+    assert in_step(names[:1] + names[9:10], [0.0, 1.0]) == [0.0, 1.0], "one image each"
 
 
 def test_times_are_from_0_to_1(tmp_path: Path) -> None:

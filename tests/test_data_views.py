@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 import threading
+from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 
 from lapgs_wgpu.data import Dataset, ImageCache, View, composite
+from lapgs_wgpu.data.views import spread_views
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
 
@@ -33,6 +36,56 @@ class Source:
 
 def view_of(source: Source, name: str = "train_000", time: float = 0.0) -> View:
     return View(name=name, camera=CAMERA, time=time, source=f"{name}.png", pixels=source)
+
+
+def rig(times: int, cameras: int) -> list[View]:
+    """Named as Neu3D's: camera after camera."""
+    return [view_of(Source(), f"cam{c:02}_{t:04}", t / (times - 1)) for c in range(cameras) for t in range(times)]
+
+
+def test_few_views_are_all_taken_by_time() -> None:
+    shown = [view_of(Source(), f"{i}", i / 2) for i in range(3)]
+    assert spread_views(shown[::-1], 50) == spread_views(shown, 3) == shown
+
+
+@pytest.mark.parametrize("count", [400, 130])
+def test_views_are_spread_over_the_clip(count: int) -> None:
+    many = [view_of(Source(), f"{i}", (i * 37 % count) / count) for i in range(count)]
+    times = np.array([view.time for view in spread_views(many, 50)])
+    assert np.abs(times - np.arange(50) / 50).max() <= 1 / 50
+    assert np.diff(times).min() > 0
+
+
+@pytest.mark.parametrize("size", [(300, 17), (300, 19), (100, 4), (50, 6), (50, 7), (50, 2), (10, 20)])
+def test_views_are_spread_over_the_cameras_of_a_rig(size: tuple[int, int]) -> None:
+    times, cameras = size
+    chosen = spread_views(rig(times, cameras), 50)
+    assert len(chosen) == len({view.name for view in chosen}) == 50
+    seen = Counter(view.name[:5] for view in chosen)
+    assert len(seen) == cameras
+    assert max(seen.values()) <= 2 * 50 / cameras
+    assert np.diff([view.time for view in chosen]).max() <= 0.12
+
+
+def test_views_are_spread_over_cameras_that_take_turns() -> None:
+    taken = [view_of(Source(), f"cam{i % 2}_{i:03}", i / 199) for i in range(200)]
+    seen = Counter(view.name[:4] for view in spread_views(taken, 50))
+    assert min(seen.values()) >= 20
+
+
+def test_moments_are_those_of_one_still_camera() -> None:
+    """Of cameras that are not in step; where each image has a camera of its own, there are as many as times."""
+    other = dataclasses.replace(CAMERA)
+    views = [
+        dataclasses.replace(view_of(Source(), f"{c}_{t}", min(1.0, (t + 0.5 * c) / 10)), camera=camera)
+        for c, camera in enumerate((CAMERA, other))
+        for t in range(10)
+    ]
+    still = Dataset("rig", tuple(views), ())
+    assert (still.still_cameras, len(still.times), still.moments) == (True, 20, 10)
+    walking = tuple(dataclasses.replace(view, camera=dataclasses.replace(CAMERA)) for view in views)
+    moving = Dataset("walk", walking, ())
+    assert (moving.still_cameras, moving.moments) == (False, 20)
 
 
 def test_composite_rounds_to_nearest() -> None:

@@ -9,14 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from torch import nn
 
-from lapgs_wgpu.data import Dataset, load_dataset
+from lapgs_wgpu.data import Dataset, View, load_dataset
 from lapgs_wgpu.data.motion_scenes import MotionScene
 from lapgs_wgpu.data.motion_writer import write_motion
 from lapgs_wgpu.data.synthetic import camera_at, cameras
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.config import FieldConfig
+from lapgs_wgpu.motion.fields.deformation import Deformation
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train.config import Config
@@ -385,6 +387,35 @@ def test_the_static_fit_has_no_motion_and_small_images(dataset: Dataset) -> None
     assert small_views(dataset.train[:1], 48) == [dataset.train[0]]
 
 
+class FittedAlready:
+    """The training of a static fit that is done, and has learnt by how much each image is too bright."""
+
+    def __init__(self, scene: Scene4D, gains: dict[str, float] | None) -> None:
+        self.scene, self.gains, self.cameras = scene, gains, None
+
+    def exposure_of(self, view: View) -> torch.Tensor | None:
+        return None if self.gains is None else self.gains[view.name] * torch.eye(3, 4)
+
+    def step(self) -> None: ...
+    def close(self) -> None: ...
+
+
+def test_what_is_exposed_otherwise_does_not_move(device: Device) -> None:
+    static, camera, still = still_view(device, 48, 32)
+    gains = {"train_000": 1.3, "train_001": 0.7}
+
+    def exposed(name: str) -> View:
+        image = np.round(255 * (gains[name] * still).clip(0, 1)).astype(np.uint8)
+        return View(name, camera, 0.5, "made up", lambda: image)
+
+    data = Dataset("made up", tuple(exposed(name) for name in gains), ())
+    for known, moving in ((gains, False), (None, True)):
+        training = FittedAlready(static, known)
+        found = static_fit(configure(), data, device, lambda *_, of=training: of, lambda step: None)
+        assert any(image.mask.any() for image in found.images) == moving
+        assert (found.images[0].error < 1e-3) == (not moving)
+
+
 # The field, and all together -----------------------------------------------------------------------------------------
 
 
@@ -400,6 +431,26 @@ def test_every_field_learns_tracks(device: Device, kind: str) -> None:
     times, generator = np.linspace(0, 1, 20), torch.Generator().manual_seed(0)
     error = fit_field(scene, tracks, times, 0, 250, generator, lambda step: None)
     assert error < {"laplacian": 0.35, "grid4d": 0.35, "hexplane": 0.65, "mlp": 0.65}[kind] * at_rest
+
+
+class Fading(nn.Module):
+    """Changes colors alone."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.rate = nn.Parameter(torch.zeros(3))
+
+    def forward(self, means: torch.Tensor, t: float) -> Deformation:
+        return Deformation(d_dc=(t * self.rate).expand(len(means), -1))
+
+
+def test_a_field_that_moves_nothing_starts_from_the_static_fit(dataset: Dataset, device: Device) -> None:
+    config = configure()
+    config = dataclasses.replace(config, field=dataclasses.replace(config.field, kind="own"))
+    found = discover(config, dataset, device, Trainer, own_field=Fading())
+    assert "the field moves nothing: nothing is added" in found.summary
+    assert f"a static fit of {len(found.scene)} Gaussians" in found.summary
+    assert not found.fitted
 
 
 def test_discovery_starts_a_training_which_goes_on_to_the_same_bits(dataset: Dataset, device: Device) -> None:
@@ -428,6 +479,13 @@ def test_discovery_starts_a_training_which_goes_on_to_the_same_bits(dataset: Dat
     assert ours.keys() == expected.keys()
     for name, value in expected.items():
         assert np.array_equal(ours[name], value), name
+
+
+def test_a_training_draws_a_scene_that_it_starts_from_as_it_is_drawn(dataset: Dataset, device: Device) -> None:
+    config = configure()
+    scene = Scene4D.from_points(np.zeros((3, 3)), np.zeros((3, 3)), np.ones(3), config.field, device=device)
+    with pytest.raises(InputError, match="antialiased = False, and the configuration says True"):
+        Trainer(config, dataset, device, scene=scene)
 
 
 def test_a_field_that_knows_the_tracks_learns_slowly_also_when_resumed(dataset: Dataset, device: Device) -> None:

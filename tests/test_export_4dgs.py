@@ -20,6 +20,7 @@ from lapgs_wgpu.io.fourdgs_file import bytes_harmonics, harmonics_bytes
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.playback.linear_pieces import linear_pieces, piece_errors, roots_of, state
 from lapgs_wgpu.motion.playback.playback import open_playback
+from lapgs_wgpu.motion.timing import Timing
 from lapgs_wgpu.splat.linear_light import directions, display_colors, linear_harmonics, sh_basis, to_display, to_linear
 from lapgs_wgpu.viewer import cli
 from lapgs_wgpu.viewer.export_4dgs import Baked, bake_4dgs, best_degree
@@ -109,6 +110,26 @@ def test_pieces_join_and_are_as_many_as_needed(scene: LoadedScene) -> None:
         assert (pieces.begin[1:][same] == pieces.end[:-1][same]).all()  # all can be seen at all times
         assert (pieces.begin[1:][~same] == 0).all()
         assert (pieces.end[:-1][~same] == 1).all()
+
+
+def test_motion_that_goes_by_jerks_is_as_near(device: Device, tmp_path: Path) -> None:
+    """A field whose images are early and late by turns: its path bends at each of 200 times."""
+    scene = calm(device)
+    times = np.linspace(0, 1, 200)
+    moments = times + 0.4 / 199 * np.where(np.arange(200) % 2, 1, -1)
+    scene.timing = Timing(times, moments.clip(0, 1))
+    scene.save(tmp_path / "a.ply")
+    playback = open_playback(tmp_path / "a.ply", device)
+    span = np.ptp([state(playback, t, np.arange(COUNT))[:, :3] for t in np.linspace(0, 1, 9)], axis=0).max()
+    far = 4e-3 * span
+    pieces = linear_pieces(playback, far, 1.0)
+    worst = 0.0
+    for t in np.random.default_rng(0).random(200).tolist():
+        shown = np.flatnonzero((pieces.begin <= t) & (t < pieces.end))
+        way = (t - 0.5 * (pieces.begin + pieces.end)[shown])[:, None] * pieces.slopes[shown]
+        true = state(playback, t, pieces.source[shown])[:, :3]
+        worst = max(worst, float(np.linalg.norm(pieces.means[shown] + way - true, axis=1).max()))
+    assert worst <= 1.2 * far
 
 
 def test_what_stands_still_is_one_piece(device: Device, tmp_path: Path) -> None:

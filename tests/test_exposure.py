@@ -27,7 +27,7 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands
 from lapgs_wgpu.splat.rasterize import rasterize
 from lapgs_wgpu.splat.rasterizer import Rasterizer
-from lapgs_wgpu.train.exposure import ExposurePasses, Exposures
+from lapgs_wgpu.train.exposure import ExposurePasses, Exposures, without_exposure
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
 from lapgs_wgpu.train.learning_rate import Rate
 from lapgs_wgpu.train.run import resume, train
@@ -37,6 +37,13 @@ from lapgs_wgpu.train.truth_cache import upload_rgba
 CORRECTION = torch.tensor([[0.9, 0.1, -0.05, 0.02], [0.03, 1.2, 0.0, -0.1], [-0.02, 0.05, 0.8, 0.2]])
 IDENTITY = torch.eye(3, 4)
 RATE = Rate(2e-2, 2e-3, 100)
+
+
+def test_a_correction_is_taken_back() -> None:
+    image = np.random.default_rng(0).random((3, 5, 3), np.float32)
+    matrix = CORRECTION.numpy()
+    corrected = (image @ matrix[:, :3].T + matrix[:, 3]).astype(np.float32)
+    np.testing.assert_allclose(without_exposure(corrected, matrix), image, atol=1e-5)
 
 
 # The passes

@@ -133,6 +133,23 @@ def test_exposure(folder: Path) -> None:
     assert "colors of each image corrected" in found.text
 
 
+def test_steps_with_a_further_loss_count(folder: Path, device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The acceleration loss of every fourth step."""
+    clock = [0.0]
+
+    class Slow(step_costs.Trainer):
+        def step(self) -> None:  # type: ignore[override]
+            self.done += 1
+            clock[0] += 1.0 if self.done % 4 else 5.0
+
+    monkeypatch.setattr(step_costs, "Trainer", Slow)
+    monkeypatch.setattr(step_costs.time, "perf_counter", lambda: clock[0])
+    config = load_config("tiny", {"data.path": str(folder), "data.size": 64, "points.count": 400})
+    costs = measure_costs(config, load_dataset(folder, image_size=64), device)
+    assert config.acceleration.interval == 4
+    assert (costs.few, costs.many) == (2.0, 2.0)
+
+
 def test_steps_are_measured(folder: Path, device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of the numbers of Gaussians that a training begins with and grows to; nothing is written."""
     counts: list[int] = []

@@ -12,16 +12,18 @@ import pytest
 import torch
 from helpers.interrupts import interrupt_at
 from helpers.scenes import front_camera
-from helpers.training import configure
+from helpers.training import STEPS, configure
 from torch import Tensor, nn
 
 from lapgs_wgpu.data import Dataset
 from lapgs_wgpu.data.views import View
+from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.fields.deformation import Deformation
 from lapgs_wgpu.motion.scene import Scene4D, load
 from lapgs_wgpu.motion.timing import EVEN, Timing
+from lapgs_wgpu.train import trainer
 from lapgs_wgpu.train.distributed import SINGLE_PROCESS, Ranks
 from lapgs_wgpu.train.run import resume, train
 from lapgs_wgpu.train.timing_refinement import FARTHEST, TimingRefinement, image_to_fit, running_median
@@ -68,6 +70,11 @@ def refinement(
     return TimingRefinement(scene, views_at(times), truth, picture, ranks)
 
 
+def refine(scene: Scene4D, truth: Callable[[View], Tensor]) -> None:
+    found = refinement(scene, truth)
+    found.set(found.fitted(0))
+
+
 def film(scene: Scene4D, moments: np.ndarray = MOMENTS) -> Callable[[View], Tensor]:
     """Images at the times TIMES that show the scene at these moments."""
     images = {t: scene.render(CAMERA, m).image for t, m in zip(TIMES.tolist(), moments.tolist(), strict=True)}
@@ -78,7 +85,7 @@ def test_it_finds_which_moments_a_film_shows(device: Device) -> None:
     scene = moving(device)
     found = refinement(scene, film(scene))
     for number in range(6):
-        found.refine(number)
+        found.set(found.fitted(number))
     np.testing.assert_allclose(scene.timing.moments, MOMENTS, atol=1e-3)
     np.testing.assert_array_equal(scene.timing.times, TIMES)
     assert found.report()["frames_most"] == pytest.approx(0.4, abs=0.01)
@@ -92,9 +99,10 @@ def test_one_step_is_that_of_least_squares(device: Device) -> None:
     def picture(view: View) -> Tensor:
         return torch.full((2, 2, 3), scene.timing(view.time))
 
-    TimingRefinement(
+    found = TimingRefinement(
         scene, views_at(TIMES), lambda view: torch.full((2, 2, 3), shown[view.time]), picture, SINGLE_PROCESS
-    ).refine(0)
+    )
+    found.set(found.fitted(0))
     expected = TIMES.copy()
     expected[[3, 6, 7]] = 0.33, 0.55, 0.71
     np.testing.assert_allclose(scene.timing.moments, expected, atol=1e-5)
@@ -102,7 +110,7 @@ def test_one_step_is_that_of_least_squares(device: Device) -> None:
 
 def test_what_all_images_have_in_common_is_left_to_the_field(device: Device) -> None:
     scene = moving(device)
-    refinement(scene, film(scene, TIMES + 0.04)).refine(0)
+    refine(scene, film(scene, TIMES + 0.04))
     assert scene.timing is EVEN
 
 
@@ -125,7 +133,7 @@ def test_what_does_not_count_is_not_looked_at(device: Device) -> None:
         scene.timing = EVEN
         refined = refinement(scene, truth)
         for number in range(6):
-            refined.refine(number)
+            refined.set(refined.fitted(number))
         found.append(np.abs(scene.timing.moments - MOMENTS).max())
     assert found[0] > 0.01
     assert found[1] < 1e-3
@@ -135,7 +143,7 @@ def test_what_stands_still_tells_no_times(device: Device) -> None:
     scene = moving(device, speed=0.0)
     other = moving(device)
     found = refinement(scene, film(other))
-    found.refine(0)
+    found.set(found.fitted(0))
     assert scene.timing is EVEN
     assert found.report() == {"frames": 0.0, "frames_most": 0.0}
 
@@ -143,7 +151,7 @@ def test_what_stands_still_tells_no_times(device: Device) -> None:
 def test_an_error_that_a_shift_hardly_mends_moves_nothing(device: Device) -> None:
     scene = moving(device)
     noise = np.random.default_rng(1).random((32, 48, 3)).astype(np.float32)
-    refinement(scene, lambda view: torch.from_numpy(noise)).refine(0)
+    refine(scene, lambda view: torch.from_numpy(noise))
     assert scene.timing is EVEN
 
 
@@ -151,7 +159,7 @@ def test_a_picture_that_is_not_finite_moves_nothing(device: Device) -> None:
     scene = moving(device)
     with torch.no_grad():
         scene.parameters["sh_dc"].fill_(torch.nan)
-    refinement(scene, lambda view: torch.zeros(32, 48, 3)).refine(0)
+    refine(scene, lambda view: torch.zeros(32, 48, 3))
     assert scene.timing is EVEN
 
 
@@ -160,9 +168,30 @@ def test_moments_rise_and_stay_near_their_times(device: Device) -> None:
     backwards = film(scene, MOMENTS[::-1])
     found = refinement(scene, backwards)
     for number in range(9):
-        found.refine(number)
+        found.set(found.fitted(number))
     assert (np.diff(scene.timing.moments) >= 0).all()
     assert np.abs(scene.timing.moments - TIMES).max() <= FARTHEST * 0.1 + 1e-12
+
+
+def test_moments_beside_a_pause_stay_near_their_times(device: Device) -> None:
+    """By the usual gap, not by that of the pause."""
+    scene = moving(device)
+    times = [0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.8, 0.85, 0.9, 0.95, 1.0]
+    late = scene.render(CAMERA, 0.9).image
+    found = refinement(scene, lambda view: late if view.time == 0.8 else scene.render(CAMERA, view.time).image, times)
+    for number in range(6):
+        found.set(found.fitted(number))
+    assert np.abs(scene.timing.moments - times).max() <= FARTHEST * 0.05 + 1e-12
+    assert found.report()["frames_most"] == pytest.approx(FARTHEST)
+
+
+def test_it_goes_on_from_the_timing_of_the_scene(device: Device) -> None:
+    scene = moving(device)
+    shown = film(scene)
+    scene.timing = Timing(TIMES, MOMENTS)
+    found = refinement(scene, shown)
+    assert found.report()["frames_most"] == pytest.approx(0.4)
+    np.testing.assert_allclose(found.fitted(0), MOMENTS, atol=1e-3)
 
 
 def test_of_a_rig_it_takes_one_camera_after_the_other(device: Device) -> None:
@@ -175,7 +204,7 @@ def test_of_a_rig_it_takes_one_camera_after_the_other(device: Device) -> None:
 
     found = refinement(scene, truth, [0.0, 1.0, 0.0, 1.0, 1.0])
     for number in range(3):
-        found.refine(number)
+        found.set(found.fitted(number))
     assert asked == ["train_000", "train_001", "train_002", "train_003", "train_000", "train_004"]
 
 
@@ -192,7 +221,7 @@ class Alone(Ranks):
 def test_ranks_share_the_images(device: Device) -> None:
     for ranks in (Alone(0, 1), Alone(0, 2), Alone(1, 2)):
         scene = moving(device)
-        refinement(scene, film(scene), ranks=ranks).refine(0)
+        refinement(scene, film(scene), ranks=ranks).fitted(0)
     whole, even, odd = Alone.said
     assert not even[1::2].any()
     assert not odd[::2].any()
@@ -237,6 +266,35 @@ def test_times_stay_until_the_first_step_that_is_planned(dataset: Dataset, devic
             assert (training.scene.timing is EVEN) == (result.step < 15)
     with Trainer(configure(timing__refine="false"), dataset, device) as training:
         assert training.timing is None
+
+
+def test_a_correction_that_fails_changes_nothing(
+    dataset: Dataset, device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The state of the steps before can be saved."""
+
+    def lost(view: View, color: Tensor) -> Tensor:
+        raise InputError("the disk is gone")
+
+    monkeypatch.setattr(trainer, "image_to_fit", lost)
+    with Trainer(configure(**GIVEN), dataset, device) as training:
+        for _ in range(14):
+            training.step()
+        before = training.state()
+        with pytest.raises(InputError, match="the disk is gone"):
+            training.step()
+        assert training.whole
+        for name, value in training.state().items():
+            np.testing.assert_array_equal(value, before[name])
+
+
+def test_a_training_too_short_for_corrections_says_so(
+    dataset: Dataset, device: Device, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for start, told in ((STEPS - 1, False), (STEPS, True)):
+        Trainer(configure(**GIVEN | {"timing__start": str(start)}), dataset, device).close()
+        note = f"no times are corrected in this training, since timing.start ({start}) is not below"
+        assert (note in capsys.readouterr().err) == told
 
 
 def test_static_scenes_have_no_timing(dataset: Dataset, device: Device) -> None:

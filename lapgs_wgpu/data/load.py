@@ -21,7 +21,7 @@ from lapgs_wgpu.data.images import Pixels, Size, shrink, shrunk_size
 from lapgs_wgpu.data.normalize import BOX, Cube, cube_in_view, cube_of_points
 from lapgs_wgpu.data.readers import colmap, dnerf, endonerf, hypernerf, nerfstudio, neu3d, polycam, record3d
 from lapgs_wgpu.data.split import held_out
-from lapgs_wgpu.data.timestamps import disorder, natural_key, read_times, to_unit_range
+from lapgs_wgpu.data.timestamps import disorder, in_step, natural_key, read_times, to_unit_range
 from lapgs_wgpu.data.undistort import Undistortion
 from lapgs_wgpu.data.validation import check_cloud, check_film, check_frames, check_views
 from lapgs_wgpu.data.views import Dataset, View, focus_of
@@ -163,6 +163,7 @@ def _times(folder: Path, capture: Capture, warnings: list[str]) -> tuple[list[fl
         values, source = read_times(names, folder)
     if capture.own_footage:
         warnings += disorder(names, values)
+        values = in_step(names, values)
     return to_unit_range(values, *(capture.time_range or (min(values), max(values)))), source
 
 

@@ -9,10 +9,14 @@ from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from lapgs_wgpu.data.json_fields import finite, read_json
 from lapgs_wgpu.errors import InputError
 
 TIMES = "times.json"
+IN_STEP = 0.1  # of the time from an image of a camera to its next: less than films are off beside each other
 
 
 class ImageName(NamedTuple):
@@ -36,6 +40,32 @@ def read_times(names: Sequence[ImageName], folder: Path) -> tuple[list[float], s
 def to_unit_range(values: Sequence[float], first: float, last: float) -> list[float]:
     """Scale times so that `first` becomes 0 and `last` 1; all become 0 if the two are equal."""
     return [(value - first) / (last - first) if last > first else 0.0 for value in values]
+
+
+def time_step(times: NDArray[np.float64]) -> float:
+    """The usual difference of ascending times (T,); 1 for a single one."""
+    return float(np.median(np.diff(times))) if len(times) > 1 else 1.0
+
+
+def in_step(names: Sequence[ImageName], values: Sequence[float]) -> list[float]:
+    """Times, in any unit, in which images of different cameras have one time if they differ by less than IN_STEP of the
+    time from an image of a camera to its next: their mean. Films start at times of their own, and keep time roughly."""
+    cameras = [name.camera for name in names]
+    times = np.array(values, np.float64)
+    apart = [np.diff(np.unique(times[[c == camera for c in cameras]])) for camera in dict.fromkeys(cameras)]
+    if len(apart) < 2 or not len(np.concatenate(apart)):
+        return list(values)
+    least = IN_STEP * float(np.median(np.concatenate(apart)))
+    groups: list[list[int]] = []
+    for i in np.argsort(times, kind="stable").tolist():
+        group = groups[-1] if groups else []
+        if group and times[i] - times[group[0]] < least and cameras[i] not in {cameras[j] for j in group}:
+            group.append(i)
+        else:
+            groups.append([i])
+    for group in groups:
+        times[group] = times[group[0]] + np.mean(times[group] - times[group[0]])
+    return times.tolist()
 
 
 def _listed(names: Sequence[ImageName], path: Path) -> list[float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -19,6 +19,8 @@ from lapgs_wgpu.data.normalize import Normalization
 from lapgs_wgpu.data.objects import ObjectTruth
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
+
+GOLDEN_SECTION = (5**0.5 - 1) / 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,6 +137,18 @@ class Dataset:
         return focus_of([view.camera for view in self.train])
 
     @cached_property
+    def still_cameras(self) -> bool:
+        """Whether cameras stand still: each shows several training images."""
+        return len(self.train) >= 2 * len(self.cameras)
+
+    @cached_property
+    def moments(self) -> int:
+        """How many moments of the clip are told apart: as many as there are times or, of a few still cameras, which may
+        not be in step, as many as the one with the most images shows."""
+        most = max(Counter(id(view.camera) for view in self.train).values())
+        return most if len(self.cameras) <= most else len(self.times)
+
+    @cached_property
     def times(self) -> NDArray[np.float64]:
         """(T,) the distinct training times, ascending."""
         return np.unique([view.time for view in self.train])
@@ -153,6 +167,17 @@ def focus_of(cameras: Sequence[Camera]) -> NDArray[np.float64]:
     guess = centres.mean(axis=0) + (extent or 1.0) * ahead.mean(axis=0)
     right_side = np.einsum("nij,nj->i", across, centres) + faint @ guess
     return np.linalg.solve(across.sum(axis=0) + faint, right_side)
+
+
+def spread_views(views: Sequence[View], most: int) -> list[View]:
+    """At most `most` of the views, in the order of their times, spread over the clip and over the cameras.
+
+    Of each equal share of the views, in the order of times and names, one is taken, at a place that moves on from share
+    to share by the golden section: in step with it, no period of the cameras is met again and again.
+    """
+    ordered = sorted(views, key=lambda view: (view.time, view.name))
+    count = min(len(ordered), most)
+    return [ordered[int((i + i * GOLDEN_SECTION % 1) * len(ordered) / count)] for i in range(count)]
 
 
 def composite(image: NDArray[np.uint8], background: ArrayLike) -> NDArray[np.uint8]:

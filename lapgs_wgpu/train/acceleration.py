@@ -21,9 +21,10 @@ def draw_moments(
     config: AccelerationConfig, count: int, t: float, times: int, generator: torch.Generator
 ) -> Moments | None:
     """Where the acceleration loss of `count` Gaussians looks in a step at time t; None where it is off. At an end of
-    the clip one of the times is t itself, and the loss 0. times: how many moments the training images show."""
+    the clip one of the times is t itself, and the loss 0. times: how many times the training images have; with two,
+    both are ends."""
     chosen = round(config.share * count)
-    if chosen == 0 or config.weight == 0 or times < 2:
+    if chosen == 0 or config.weight == 0 or times < 3:
         return None
     rows = torch.randint(count, (chosen,), generator=generator)
     reach = config.frames / (times - 1) * (1 + float(torch.rand((), generator=generator))) / 2

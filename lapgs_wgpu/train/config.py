@@ -93,8 +93,8 @@ class ScheduleConfig(Options):
     """Lengths and intervals, in steps."""
 
     steps: int = option(
-        "number of training steps; no other key changes with it, such as rates.*.steps, schedule.warm_up, density.* and "
-        "timing.*",
+        "number of training steps; no other key changes with it, such as rates.*.steps, schedule.warm_up, "
+        "density.* and timing.*",
         at_least=1,
     )
     batch: int = option("images per step; their gradients are averaged", at_least=1)

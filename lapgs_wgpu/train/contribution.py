@@ -12,15 +12,6 @@ from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterize import rasterize
 
-MOST_VIEWS = 50
-
-
-def spread_over_time(views: Sequence[View]) -> list[View]:
-    """At most MOST_VIEWS of the views, evenly chosen over the clip."""
-    ordered = sorted(views, key=lambda view: (view.time, view.name))
-    count = min(len(ordered), MOST_VIEWS)
-    return [ordered[(2 * i + 1) * len(ordered) // (2 * count)] for i in range(count)]
-
 
 def contributions(scene: Scene4D, views: Sequence[View], *, moving: bool) -> Tensor:
     """(N,) sum of the blending weights of a Gaussian over the pixels of a view, the largest over the views.

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Callable, Sequence
 
 import torch
 
-from lapgs_wgpu.data.views import View
+from lapgs_wgpu.data.views import View, spread_views
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.motion.scene import Scene4D
+from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.morton import morton_order
 from lapgs_wgpu.train.config import Config
-from lapgs_wgpu.train.contribution import contributions, spread_over_time
+from lapgs_wgpu.train.contribution import contributions
 from lapgs_wgpu.train.densify import (
     LEAST_KEPT,
     DensityRule,
@@ -22,6 +24,8 @@ from lapgs_wgpu.train.densify import (
     reset_opacities,
 )
 from lapgs_wgpu.train.optimizer import Optimizer
+
+MOST_VIEWS = 50  # by which Gaussians are pruned
 
 
 class DensityControl:
@@ -37,12 +41,15 @@ class DensityControl:
         optimizer: Optimizer,
         rule: DensityRule,
         views: Sequence[View],
+        camera_of: Callable[[View], Camera],
         extent: float,
         generator: torch.Generator,
     ) -> None:
+        """views: of the training. camera_of: a view's camera as it is drawn."""
         self._config, self._last = config.density, config.schedule.steps
         self._scene, self._optimizer, self._rule = scene, optimizer, rule
-        self._views, self._extent, self._generator = spread_over_time(views), extent, generator
+        self._views, self._camera_of = spread_views(views, MOST_VIEWS), camera_of
+        self._extent, self._generator = extent, generator
         self.statistics = self.nothing_seen()
 
     def nothing_seen(self) -> Statistics:
@@ -80,7 +87,8 @@ class DensityControl:
 
     def _prune_hidden(self, moving: bool) -> int:
         """Prune the Gaussians that contribute too little to all images; how many."""
-        most = contributions(self._scene, self._views, moving=moving)
+        views = [dataclasses.replace(view, camera=self._camera_of(view)) for view in self._views]
+        most = contributions(self._scene, views, moving=moving)
         keep = (most >= self._config.min_contribution) | largest(most, LEAST_KEPT)
         if not keep.all():
             self._optimizer.edit_rows(keep, {name: row[:0] for name, row in self._scene.parameters.items()})

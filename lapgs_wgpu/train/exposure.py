@@ -9,7 +9,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from ..gpu.array import DeviceArray
@@ -20,6 +22,11 @@ from .learning_rate import Rate
 from .row_adam import RowAdam, restore_rows
 
 SQUARE_DECAY = 0.999  # Adam's
+
+
+def without_exposure(image: NDArray[np.float32], correction: NDArray[np.float32]) -> NDArray[np.float32]:
+    """An image (H, W, 3) with its correction (3, 4) taken back: the colors that the scene has there."""
+    return (image - correction[:, 3]) @ np.linalg.pinv(correction[:, :3]).T
 
 
 class Exposed(NamedTuple):

@@ -21,6 +21,7 @@ from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.gaussians import Gaussians
+from lapgs_wgpu.train.truth_cache import LEFT_OUT
 
 SIDE = 8  # pixels; a workgroup of a WGSL loss is a square
 
@@ -45,7 +46,8 @@ class Regularizer:
 
 @dataclass(frozen=True)
 class TorchLoss:
-    """A term of the image, in torch. The image and its gradient then go through the host's memory in each step.
+    """A term of the image, in torch. The image and its gradient then go through the host's memory in each step. Pixels
+    that the losses leave out (data.masks) have the image's own color as ground truth, and no gradient.
 
     Attributes:
         name: in `StepResult.terms` and log.jsonl.
@@ -158,7 +160,8 @@ def torch_loss(
     target = torch.from_numpy(composite(rgba, np.array(background)).astype(np.float32) / 255)
     with torch.enable_grad():
         shown = torch.from_numpy(planes[:3]).permute(1, 2, 0).requires_grad_()
-        value = term.function(shown, target)
+        left_out = torch.from_numpy((rgba == LEFT_OUT).all(axis=2))[..., None]
+        value = term.function(shown, torch.where(left_out, shown.detach(), target))
         if not isinstance(value, Tensor) or value.ndim:
             raise InputError(
                 f"the loss {term.name!r} must return a scalar tensor, got {getattr(value, 'shape', value)}."
@@ -166,7 +169,7 @@ def torch_loss(
         gradient = torch.zeros_like(shown)
         if value.requires_grad:
             (found,) = torch.autograd.grad(value, shown, allow_unused=True)
-            gradient = gradient if found is None else found
+            gradient = gradient if found is None else found.masked_fill(left_out, 0.0)
     d_image = np.zeros(planes.shape[1:], np.float32)[None].repeat(4, axis=0)
     d_image[:3] = weight * gradient.permute(2, 0, 1).numpy()
     return float(value.detach()), d_image

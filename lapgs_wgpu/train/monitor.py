@@ -6,7 +6,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from lapgs_wgpu.data.views import Dataset, View
+from lapgs_wgpu.data.views import Dataset, View, spread_views
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.dataclass_table import did_you_mean
 from lapgs_wgpu.train.evaluate import mean_psnr
@@ -25,8 +25,7 @@ def monitored_views(dataset: Dataset, wanted: str) -> tuple[str, Sequence[View]]
     if dataset.val and wanted in ("auto", "val"):
         return "val", dataset.val
     if wanted in ("auto", "train"):
-        count = min(SOME, len(dataset.train))
-        return "train", [dataset.train[i * len(dataset.train) // count] for i in range(count)]
+        return "train", spread_views(dataset.train, SOME)
     known = {view.name: view for view in (*dataset.train, *dataset.val)}
     names = [name.strip() for name in wanted.split(",")]
     for name in names:

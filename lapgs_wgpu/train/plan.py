@@ -47,7 +47,7 @@ class _Candidate(NamedTuple):
 
 def layout_of(dataset: Dataset) -> str:
     """How the cameras of a capture stand: a key of LARGE and SMALL."""
-    if len(dataset.train) >= 2 * len(dataset.cameras):
+    if dataset.still_cameras:
         return "still cameras"
     return "one camera that moves" if dataset.own_footage or dataset.cloud is not None else "cameras all around"
 
@@ -94,7 +94,7 @@ def plan_training(
         rest, whole = _beside_steps(config, costs, dataset), config.schedule.steps
         allowed = minutes if minutes is not None else PATIENCE if candidate.large else math.inf
         fitting = _steps_within(60 * allowed, config, costs, rest) if allowed < math.inf else sys.maxsize
-        steps = min(max(whole, SEEN * len(dataset.times)), fitting)
+        steps = min(max(whole, SEEN * dataset.moments), fitting)
         if steps < LEAST_SHARE * whole and not last:
             continue
         if steps < LEAST_STEPS:
@@ -104,7 +104,7 @@ def plan_training(
                 f"{LEAST_STEPS} are needed; give --minutes {needed:g} or more."
             )
         seconds = _seconds(steps, config, costs, rest)
-        found = f"{layout}, {len(dataset.train)} images of {len(dataset.times)} moments"
+        found = f"{layout}, {len(dataset.train)} images of {dataset.moments} moments"
         text = _text(candidate.preset, _longer_side(dataset), config, steps, seconds, costs, found, device)
         return Plan(scaled(config, steps), dataset, candidate.preset, *seconds, text)
     raise AssertionError("there is a last candidate")

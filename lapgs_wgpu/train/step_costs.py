@@ -20,7 +20,7 @@ from lapgs_wgpu.train.trainer import Trainer
 # Gaussians of the two scenes that are timed, relative to `points.count`: as many as trainings often have that begin
 # with a static fit (docs/results.md), and the limit of a plan.
 USUAL, GROWTH = 0.75, 2.0
-UNTIMED = 2  # steps first, which compile kernels, allocate buffers and decode images
+UNTIMED = 2  # steps first, at least, which compile kernels, allocate buffers and decode images
 LEAST_STEPS, LEAST_SECONDS, MOST_STEPS = 4, 3.0, 40  # of a measurement; each step shows another image
 VIEWS = 2  # test views that are timed
 
@@ -64,14 +64,16 @@ def measure_costs(config: Config, dataset: Dataset, device: Device) -> Costs:
 def _timed(config: Config, dataset: Dataset, device: Device, growth: float) -> tuple[float, Scene4D]:
     """Seconds of a step with `growth` times points.count Gaussians, the field moving them, and the scene."""
     scene = _scene(config, dataset, device, round(growth * config.points.count))
+    rhythm = config.acceleration.interval if config.acceleration.weight else 1  # some steps have a further loss
     with Trainer(config, dataset, device, scene=scene) as trainer:
-        for _ in range(UNTIMED):
+        for _ in range(max(UNTIMED, rhythm)):
             trainer.step()
         taken: list[float] = []
         while len(taken) < LEAST_STEPS or (sum(taken) < LEAST_SECONDS and len(taken) < MOST_STEPS):
             begin = time.perf_counter()
-            trainer.step()
-            taken.append(time.perf_counter() - begin)
+            for _ in range(rhythm):
+                trainer.step()
+            taken += rhythm * [(time.perf_counter() - begin) / rhythm]
     return float(np.median(taken)), scene
 
 

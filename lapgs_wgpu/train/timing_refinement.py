@@ -16,13 +16,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from lapgs_wgpu.data.timestamps import time_step
 from lapgs_wgpu.data.views import View, composite
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.motion.timing import EVEN, Timing
 
 from .distributed import Ranks
 
-REACH = 0.5  # gaps between images, before and after, at which pictures are compared; and the largest step
+REACH = (
+    0.5  # gaps between images (the usual one), before and after, at which pictures are compared; and the largest step
+)
 FARTHEST = 1.5  # gaps between images, of a moment from its time
 LEAST = 0.05  # share of an image's squared error that its shift must take away; of even films few shifts do
 AROUND = 8  # images before and after one, whose median shift is the field's delay
@@ -50,34 +53,35 @@ class TimingRefinement:
         self._scene, self._truth, self._picture, self._ranks = scene, truth, picture, ranks
         self._times = np.unique([view.time for view in views])
         self._views = [[view for view in views if view.time == t] for t in self._times.tolist()]
-        # Half the distance of both neighbours; at the ends that of the one.
-        self._gaps = np.gradient(self._times, np.arange(len(self._times))) if len(self._times) > 1 else np.ones(1)
-        self._moments = self._times.copy()
+        self._gap = time_step(self._times)
+        self._moments = np.array([scene.timing(t) for t in self._times.tolist()])
 
-    def refine(self, number: int) -> None:
-        """Take one step with all moments. number: of the step, from 0 on: of several views of a time, it takes one.
+    def fitted(self, number: int) -> NDArray[np.float64]:
+        """(T,) all moments a step on. number: of the step, from 0 on: of several views of a time, it takes one.
 
         The same bits on every run of one adapter and driver. Raises InputError where an image cannot be read.
         """
         mine = torch.zeros(len(self._times), 2, dtype=torch.float64)
         for row in range(len(mine))[self._ranks.rank :: self._ranks.count]:
             views = self._views[row]
-            mine[row] = torch.tensor(self._fit(views[number % len(views)], float(self._moments[row]), self._gaps[row]))
+            mine[row] = torch.tensor(self._fit(views[number % len(views)], float(self._moments[row])))
         shifts, mended = self._ranks.sums([mine])[0].numpy().T
         shifts = shifts - running_median(shifts, AROUND)
         shifts[shifts**2 * mended < LEAST] = 0.0
-        moved = self._moments + self._gaps * shifts.clip(-REACH, REACH)
-        farthest = FARTHEST * self._gaps
+        moved = self._moments + self._gap * shifts.clip(-REACH, REACH)
+        farthest = FARTHEST * self._gap
         moved = np.clip(moved, self._times - farthest, self._times + farthest)
-        self._set(np.maximum.accumulate(np.clip(moved, 0.0, 1.0)))
+        return np.maximum.accumulate(np.clip(moved, 0.0, 1.0))
 
-    def _set(self, moments: NDArray[np.float64]) -> None:
+    def set(self, moments: NDArray[np.float64]) -> None:
+        """Give the scene its timing. moments: (T,), never descending."""
         self._moments = moments
         self._scene.timing = EVEN if (moments == self._times).all() else Timing(self._times, moments)
 
-    def _fit(self, view: View, moment: float, gap: float) -> tuple[float, float]:
+    def _fit(self, view: View, moment: float) -> tuple[float, float]:
         """How much later the moment is that fits a view best, in gaps between images; and the share of the view's
         squared error that goes with a shift by one gap, as the square of the shift."""
+        gap = self._gap
         first, last = max(moment - REACH * gap, 0.0), min(moment + REACH * gap, 1.0)
         before, now, after = (self._at(view, each).double() for each in (first, moment, last))
         truth = self._truth(view).double()
@@ -97,7 +101,7 @@ class TimingRefinement:
 
     def report(self) -> dict[str, float]:
         """Of the moments' differences from their times: root mean square and largest, in gaps between images."""
-        apart = np.abs(self._moments - self._times) / self._gaps
+        apart = np.abs(self._moments - self._times) / self._gap
         return {"frames": float(np.sqrt(np.mean(apart**2))), "frames_most": float(apart.max())}
 
     def state(self) -> dict[str, Tensor]:
@@ -111,7 +115,7 @@ class TimingRefinement:
             raise ValueError(f"its moments are {moments.dtype} of shape {moments.shape}")
         if not (((moments >= 0) & (moments <= 1)).all() and (np.diff(moments) >= 0).all()):
             raise ValueError("its moments do not rise from 0 to 1")
-        self._set(moments)
+        self.set(moments)
 
 
 def image_to_fit(view: View, color: Tensor) -> Tensor:

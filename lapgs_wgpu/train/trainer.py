@@ -26,6 +26,7 @@ from lapgs_wgpu.motion.fields.deformation import Moments, Nearby
 from lapgs_wgpu.motion.fields.dynamics import dynamics_loss
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.scene import Deformed, Scene4D
+from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train.acceleration import acceleration_loss, draw_moments
 from lapgs_wgpu.train.camera_descent import scene_points
 from lapgs_wgpu.train.camera_refinement import CameraRefinement, Corrections
@@ -150,6 +151,11 @@ class Trainer:
         # What discovery found moves from the first step on, at rates that rise: Adam's first steps, all of the size of
         # the rate, would shake off what the field knows.
         self._warm_up = config.schedule.warm_up if scene is None else 0
+        if scene is not None and scene.antialiased != config.antialiased:
+            raise InputError(
+                f"the scene to start from is drawn with antialiased = {scene.antialiased}, and the configuration says "
+                f"{config.antialiased}; give the configuration the scene's."
+            )
         self.scene = scene or Scene4D.from_points(
             *initial_points(config.points, dataset, config.seed),
             config.field,
@@ -209,13 +215,20 @@ class Trainer:
             )
         self._color = torch.full((3,), BACKGROUND_LEVELS[config.data.background])  # of the evaluation
         self.timing = None
-        if config.timing.refine and scene.field is not None and len(dataset.times) > 1:
+        if config.timing.refine and scene.field is not None and len(dataset.times) > 2:
             truth = partial(image_to_fit, color=self._color)
             self.timing = TimingRefinement(scene, dataset.train, truth, self._picture, self.ranks)
         beside = (self._frequencies, self._exposures, self.cameras)
         self._beside = [each for each in beside if each is not None]
         self._density = DensityControl(
-            config, scene, self._optimizer, self.parts.density, dataset.train, self._extent, self._generator
+            config,
+            scene,
+            self._optimizer,
+            self.parts.density,
+            dataset.train,
+            self._camera_of,
+            self._extent,
+            self._generator,
         )
         self._numbers = {view.name: number for number, view in enumerate(dataset.train)}
         self._scales = scene.parameters["log_scales"].detach().exp()
@@ -260,7 +273,7 @@ class Trainer:
         data = self.dataset
         camera = (data.test or data.train)[0].camera
         arc = captured_arc(camera, data.cameras, data.focus, data.up)
-        return InitialView(camera, data.focus, data.up, len(data.times), arc)
+        return InitialView(camera, data.focus, data.up, data.moments, arc)
 
     def save(self, path: str | Path) -> None:
         """Write a checkpoint (docs/format.md) to `path`, which lapgs-view and `load` open. Raises InputError."""
@@ -315,6 +328,9 @@ class Trainer:
 
         names = ", ".join(look.view.name for look in looks)
         skipped = self._examine(renderings, value, step, names)
+        moments, corrections = None, config.timing.corrections(config.schedule.steps)
+        if self.timing is not None and moving and step in corrections:
+            moments = self.timing.fitted(corrections.index(step))
         self.whole = False
         if skipped is None:
             rising = config.schedule.warm_up - self._warm_up
@@ -327,9 +343,8 @@ class Trainer:
         else:
             self._generator.set_state(drawn)
             self._zero_grad()
-        corrections = config.timing.corrections(config.schedule.steps)
-        if self.timing is not None and moving and step in corrections:
-            self.timing.refine(corrections.index(step))
+        if moments is not None and self.timing is not None:
+            self.timing.set(moments)
         pruned = self._density.change(step, moving=moving)
         if step % config.schedule.sh_interval == 0:
             scene.sh_degree = min(scene.sh_degree + 1, MAX_SH_DEGREE)
@@ -361,7 +376,7 @@ class Trainer:
         gaussians = now.gaussians
         weights = config.loss.weights(warm=moving)
         truth = self._pictures.on_device(view)
-        correction = self._exposure_of(view)
+        correction = self.exposure_of(view)
         weighted = [(term, weight_at(term, self.done + 1)) for term in self.parts.losses]
         own = [(term, weight) for term, weight in weighted if weight and not isinstance(term, Regularizer)]
         camera, change = view.camera, None
@@ -392,15 +407,19 @@ class Trainer:
             terms["ssim"] = factors["ssim"] - terms["ssim"]
         return loss, rendering, terms | {name: value.item() for name, value in beside.items()}
 
-    def _exposure_of(self, view: View) -> Tensor | None:
+    def _camera_of(self, view: View) -> Camera:
+        """The camera of a training view, corrected where it is."""
+        return view.camera if self.cameras is None else self.cameras.refined(view.camera).camera
+
+    def exposure_of(self, view: View) -> Tensor | None:
+        """The correction (3, 4) of the colors of a training view; None where they are taken as they are."""
         return None if self._exposures is None else self._exposures.values[self._numbers[view.name]]
 
     @torch.no_grad()
     def _picture(self, view: View) -> Tensor:
         """The scene's picture (H, W, 3) of a training view, with the corrections of its camera and of its colors."""
-        camera = view.camera if self.cameras is None else self.cameras.refined(view.camera).camera
-        image = self.scene.render(camera, view.time, self._color, depth=False).image
-        correction = self._exposure_of(view)
+        image = self.scene.render(self._camera_of(view), view.time, self._color, depth=False).image
+        correction = self.exposure_of(view)
         return image if correction is None else image @ correction[:, :3].T + correction[:, 3]
 
     def _gradients(self) -> dict[str, list[Tensor]]:

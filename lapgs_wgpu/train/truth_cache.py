@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from ..gpu.array import DeviceArray
 from ..gpu.device import Device
 
+LEFT_OUT = (1, 0, 0, 0)  # RGBA of a pixel that the losses leave out
+
 
 class TruthCache:
     """Pictures on the device in 8 bits, the most recently used first to stay, within a bound in bytes.
@@ -54,7 +56,7 @@ def without(pixels: NDArray[np.uint8], ignored: NDArray[np.bool_] | None) -> NDA
     rgba = np.full((*pixels.shape[:2], 4), 255, np.uint8)
     rgba[..., : pixels.shape[2]] = pixels
     rgba[rgba[..., 3] == 0] = 0
-    rgba[ignored] = (1, 0, 0, 0)
+    rgba[ignored] = LEFT_OUT
     return rgba
 
 

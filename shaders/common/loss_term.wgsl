@@ -24,9 +24,13 @@ fn rendered(pixel: vec2<u32>) -> vec3<f32> {
     return vec3(image_at(i), image_at(count + i), image_at(2u * count + i));
 }
 
-// The color of the ground truth at a pixel, in [0, 1].
+// The color of the ground truth at a pixel, in [0, 1]; of a pixel that the loss leaves out, that of the rendered image.
 fn truth(pixel: vec2<u32>) -> vec3<f32> {
-    return vec3<f32>(composite(rgba_at(pixel.y * term.size.x + pixel.x), term.background)) / 255.0;
+    let texel = rgba_at(pixel.y * term.size.x + pixel.x);
+    if (is_ignored(texel)) {
+        return rendered(pixel);
+    }
+    return vec3<f32>(composite(texel, term.background)) / 255.0;
 }
 
 // The pixel's value, whose mean over the image is the loss; and the derivatives, by the pixel's rendered color, of the sum
@@ -35,6 +39,9 @@ fn leave(pixel: vec2<u32>, value: f32, derivatives: vec3<f32>) {
     let count = term.size.x * term.size.y;
     let i = pixel.y * term.size.x + pixel.x;
     values[i] = value;
+    if (is_ignored(rgba_at(i))) {
+        return;
+    }
     d_image[i] += term.share * derivatives.x;
     d_image[count + i] += term.share * derivatives.y;
     d_image[2u * count + i] += term.share * derivatives.z;

@@ -6,5 +6,5 @@ const SPLAT_STRIDE = 3u;
 
 // The loss's gradient by those, as `gather_gradients` leaves it: three vec4.
 //   0: mean x, mean y, conic a, conic b
-//   1: conic c, opacity (not its logarithm), red, green
+//   1: conic c, natural logarithm of the opacity, red, green
 //   2: blue, depth, 1 where the Gaussian was drawn, -

@@ -20,9 +20,10 @@ from .playback import Playback
 Floats = NDArray[np.floating]
 
 SAMPLES = 128  # of the clip at least; a field's spectrum has up to 16 cycles
+_MOST_SAMPLES = 1024  # of the clip at first: two of the shortest piece
 _PIECE_SAMPLES = 8  # of a piece at least
 _SHORTEST = 2.0**-9  # of the clip: shorter pieces are not halved
-_BLOCK = 1 << 14  # Gaussians at once: 0.1 GB of samples
+_BLOCK = 1 << 21  # samples at once: 0.1 GB
 _CHECKS = 97  # moments at which finished pieces are compared; none but a few is one of those they were made of
 _REPAIRS = 4  # times that what is still too far is baked again, twice as finely
 _MEAN, _ROOT, _REST = slice(0, 3), slice(3, 9), slice(9, 13)  # columns of a state: mean, root; opacity and colour
@@ -76,9 +77,13 @@ def _bake(
 ) -> Pieces:
     """The pieces of some Gaussians, near enough at the samples."""
     found: list[tuple[Floats, ...]] = []
-    for first in range(0, len(rows), _BLOCK):
-        block = rows[first : first + _BLOCK]
-        values = np.stack([state(playback, t, block) for t in np.linspace(0, 1, SAMPLES + 1).tolist()])
+    samples = SAMPLES
+    while samples < min(2 * len(playback.timing.times), _MOST_SAMPLES):  # motion bends where images are early or late
+        samples *= 2
+    size = _BLOCK // samples
+    for first in range(0, len(rows), size):
+        block = rows[first : first + size]
+        values = np.stack([state(playback, t, block) for t in np.linspace(0, 1, samples + 1).tolist()])
         for piece in _halve(playback, values, block, 0.0, 1.0, farthest, shade):
             found.append(piece)
             done((first + len(block) * float(piece[1].max(initial=0))) / len(rows))
@@ -93,9 +98,10 @@ def _bake(
 
 
 def piece_errors(playback: Playback, pieces: Pieces) -> Floats:
-    """(P,) largest displacement of each piece from the playback, world units, at _CHECKS moments of the clip."""
+    """(P,) largest displacement of each piece from the playback, world units, at _CHECKS times of the clip and at those
+    of its timing."""
     worst = np.zeros(len(pieces.source))
-    for t in np.linspace(0, 1, _CHECKS).tolist():
+    for t in np.union1d(np.linspace(0, 1, _CHECKS), playback.timing.times).tolist():
         shown = np.flatnonzero((pieces.begin <= t) & ((t < pieces.end) | (pieces.end == 1.0)))
         way = (t - 0.5 * (pieces.begin + pieces.end)[shown])[:, None] * pieces.slopes[shown]
         moved = np.concatenate([pieces.means[shown] + way, roots_of(pieces.scales[shown], pieces.quats[shown])], axis=1)

@@ -19,6 +19,7 @@ from ...splat.camera import Camera
 from ...splat.gaussians import Gaussians
 from ..fields.config import MIN_SCALE, FieldConfig
 from ..scene_file import SceneFile, read_scene
+from ..timing import Timing
 from .grid_field_playback import GridFieldPlayback, runs_on_device
 from .motion_bounds import MotionBounds
 from .seen_moments import SeenMoments
@@ -29,7 +30,7 @@ Floats = NDArray[np.float32]
 class Playback(Protocol):
     """A scene that can be rendered at any time in [0, 1].
 
-    count: number of Gaussians. moves: False for static scenes. metadata: of the checkpoint.
+    count: number of Gaussians. moves: False for static scenes. timing: of the scene. metadata: of the checkpoint.
     """
 
     device: Device
@@ -42,6 +43,8 @@ class Playback(Protocol):
     def sh_degree(self) -> int: ...
     @property
     def moves(self) -> bool: ...
+    @property
+    def timing(self) -> Timing: ...
     @property
     def exact(self) -> bool:
         """Whether all Gaussians of the last call of `at` are of the requested time."""
@@ -93,7 +96,7 @@ class DevicePlayback:
         self.device, self.field_config, self.metadata = device, file.field_config, file.metadata
         self.count, self.sh_degree = len(file.gaussians["means"]), file.sh_degree
         self.moves = file.field_config.kind != "static"
-        self._stored, self._timing = file.gaussians, file.timing
+        self._stored, self.timing = file.gaussians, file.timing
         activated = activate(file.gaussians, file.sh_degree)
         pool = BufferPool(device)
         names = {"means": "means", "quats": "quats", "scales": "scales", "opacities": "opacities", "sh": "colors"}
@@ -116,7 +119,7 @@ class DevicePlayback:
     def at(self, t: float, seen_by: Camera | None = None) -> Gaussians[DeviceArray]:
         if self._field is None:
             return self._now
-        t = self._timing(t)
+        t = self.timing(t)
         if self._near is not None and self._near[0] != t:
             self._near = None
         old = self._times != t

@@ -17,6 +17,7 @@ from ...splat.camera import Camera
 from ...splat.gaussians import Gaussians
 from ...splat.rasterize import upload_gaussians
 from ..scene import Scene4D
+from ..timing import Timing
 
 
 class _Shown(NamedTuple):
@@ -57,6 +58,10 @@ class TorchPlayback:
     @property
     def count(self) -> int:
         return len(self.scene)
+
+    @property
+    def timing(self) -> Timing:
+        return self.scene.timing
 
     @property
     def sh_degree(self) -> int:

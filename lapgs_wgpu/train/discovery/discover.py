@@ -80,6 +80,10 @@ def discover(
     if tracks is not None:
         meter = Progress(fit_steps, "steps of motion discovery, part 2 of 2: what moves", terminal)
         error = fit_field(scene, tracks, clouds.times, len(static), fit_steps, generator, meter.at)
+        if error is None:
+            tracks, scene = None, scene_with(static, None, config, device, generator, own_field)
+            found = f"{share:.1%} of what it lacks can be followed, and the field moves nothing: nothing is added"
+    if tracks is not None:
         found = (
             f"{len(np.unique(tracks.part))} moving parts with {len(tracks.part)} Gaussians, {share:.0%} of what it "
             f"lacks, followed within {error:.3f} world units"

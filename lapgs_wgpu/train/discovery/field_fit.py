@@ -30,10 +30,11 @@ def fit_field(
     steps: int,
     generator: torch.Generator,
     progress: Callable[[int], None],
-) -> float:
+) -> float | None:
     """Train the field of a scene so that its last Gaussians follow the tracks, and the first `still` ones stay.
 
-    Each step looks at one of the times (T,). Returns the mean distance of tracks and Gaussians in the end, world units.
+    Each step looks at one of the times (T,). Returns the mean distance of tracks and Gaussians in the end, world units;
+    None, and nothing is trained, where the field moves no Gaussians.
     """
     field = scene.field
     assert field is not None
@@ -63,6 +64,8 @@ def fit_field(
         loss = loss + SHAPE_WEIGHT * sum(
             change.abs().mean() for change in (move.d_scales, move.d_quats) if change is not None
         )
+        if not loss.requires_grad:
+            return None
         for group, name in zip(optimizer.param_groups, groups, strict=True):
             group["lr"] = rates[name] * max(LAST, min(1.0, 2.0 * (steps - step) / steps))
         optimizer.zero_grad()

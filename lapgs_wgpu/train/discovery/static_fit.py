@@ -10,15 +10,17 @@ from typing import NamedTuple, Protocol
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from lapgs_wgpu.data.images import shrink
-from lapgs_wgpu.data.views import Dataset, View, composite
+from lapgs_wgpu.data.views import Dataset, View, composite, spread_views
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train.camera_refinement import CameraRefinement, Corrections
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.evaluate import BACKGROUND_LEVELS
+from lapgs_wgpu.train.exposure import without_exposure
 from lapgs_wgpu.train.learning_rate import Rate
 
 from .residual import Residual
@@ -39,6 +41,7 @@ class StaticTrainer(Protocol):
     scene: Scene4D
     cameras: CameraRefinement | None
 
+    def exposure_of(self, view: View) -> Tensor | None: ...
     def step(self) -> object: ...
     def close(self) -> None: ...
 
@@ -63,9 +66,7 @@ def static_fit(
     config: `discovery` says how many steps and at which size; the learning rate of the means is that of the training,
     of whose losses L1 and SSIM are left. progress: called with each step.
     """
-    views = sorted(dataset.train, key=lambda view: (view.time, view.name))
-    chosen = np.linspace(0, len(views) - 1, min(len(views), MOST_VIEWS)).astype(np.int64)
-    picked = [views[i] for i in dict.fromkeys(chosen.tolist())]
+    picked = spread_views(dataset.train, MOST_VIEWS)
     small = small_views(picked, config.discovery.size)
     training = trainer(static_config(config), dataclasses.replace(dataset, train=tuple(small)), device)
     try:
@@ -80,6 +81,8 @@ def static_fit(
         image = (composite(view.load(), background.numpy()) / 255).astype(np.float32)
         camera = view.camera if refinement is None else refinement.refined(view.camera).camera
         still = training.scene.render(camera, view.time, background, depth=False).image.numpy(force=True)
+        if (correction := training.exposure_of(view)) is not None:
+            image = without_exposure(image, correction.numpy(force=True))
         if (ignored := view.load_ignored()) is not None:
             image[ignored] = still[ignored]
         images.append(Residual(camera, view.time, image, still))

@@ -13,6 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lapgs_wgpu.data.timestamps import time_step
+
 from .residual import Floats
 from .surface_points import PointClouds, parts_of
 
@@ -140,8 +142,3 @@ def _smooth(groups: _Groups, path: list[int], clock: NDArray[np.float64]) -> Tra
     seen = np.zeros(len(clock), bool)
     seen[groups.time[path]] = True
     return Trajectory(result, seen)
-
-
-def time_step(times: NDArray[np.float64]) -> float:
-    """The typical difference of ascending times; 1 for a single one."""
-    return float(np.median(np.diff(times))) if len(times) > 1 else 1.0
