@@ -17,6 +17,7 @@ from lapgs_wgpu.command import beside
 from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.prepare.capture import prepare
+from lapgs_wgpu.prepare.capture_folder import appearing
 from lapgs_wgpu.prepare.extract import extract, images_per_second
 from lapgs_wgpu.prepare.film import Film
 from lapgs_wgpu.prepare.hdr import to_sdr
@@ -321,6 +322,62 @@ def test_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     monkeypatch.setattr(Image.Image, "save", full)
     assert "No space left on device" in refused([str(film), "--out", str(tmp_path / "out")], capsys)
     assert [child.name for child in tmp_path.iterdir()] == ["film.mkv"]
+
+
+def finish(out: Path) -> None:
+    with appearing(out) as folder:
+        (folder / "images").mkdir()
+        (folder / "times.json").write_text("{}")
+
+
+@pytest.mark.parametrize("kind", ["new", "empty", "present", "link"])
+def test_a_capture_appears_where_it_was_asked_for(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = tmp_path / "parent" / "out"
+    if kind != "new":
+        out.mkdir(parents=True)
+        out.parent.chmod(0o555)  # as that of a mount may be
+    if kind == "present":
+        monkeypatch.chdir(out)
+    elif kind == "link":
+        (tmp_path / "link").symlink_to(out)
+    finish({"present": Path("."), "link": tmp_path / "link"}.get(kind, out))
+    out.parent.chmod(0o755)
+    assert sorted(child.name for child in out.iterdir()) == ["images", "times.json"]
+
+
+def test_what_is_finished_is_never_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(self: Path, target: Path) -> Path:
+        if self.name == "times.json":
+            raise OSError(5, "Input/output error")
+        return rename(self, target)
+
+    out, rename = tmp_path / "out", Path.rename
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "rename", fail)
+        with pytest.raises(InputError, match=r"\.finished holds the finished capture"):
+            finish(out)
+    assert (out / ".finished" / "times.json").is_file()
+    with pytest.raises(InputError, match="not an empty folder"):
+        finish(out)
+    assert (out / ".finished" / "times.json").is_file()
+
+
+def test_two_processes_do_not_write_to_one_folder(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with appearing(out) as folder:
+        (folder / "images").mkdir()
+        with pytest.raises(InputError, match="written by another lapgs-prepare"):
+            finish(out)
+        assert (folder / "images").is_dir()
+    assert [child.name for child in out.iterdir()] == ["images"]
+
+
+def test_what_a_killed_process_left_is_removed(tmp_path: Path) -> None:
+    (tmp_path / ".unfinished").mkdir()
+    (tmp_path / ".unfinished" / "old").touch()
+    (tmp_path / ".lock").touch()
+    finish(tmp_path)
+    assert sorted(child.name for child in tmp_path.iterdir()) == ["images", "times.json"]
 
 
 @pytest.mark.parametrize("missing", ["av", "pycolmap"])

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import shutil
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from lapgs_wgpu.data.readers.colmap import IMAGES, SPARSE
 from lapgs_wgpu.data.timestamps import write_times
 from lapgs_wgpu.errors import InputError
 
+from .capture_folder import appearing
 from .diagnosis import Diagnosis, diagnose
 from .extract import LONGER_SIDE, Extraction, aligned, extract, images_per_second, shortened
 from .film import Film
@@ -68,7 +68,7 @@ def prepare(
         raise InputError("--masks goes with one moving camera; cameras that stand still need no masks.")
     import_pycolmap()
     films = [Film(video) for video in videos]
-    with _appearing(out) as folder:
+    with appearing(out) as folder:
         extractions = extract_all(films, folder / IMAGES, fps, longer_side)
         pictures = [picture for each in extractions for picture in each.pictures]
         write_times(folder, {picture.name: picture.seconds for picture in pictures})
@@ -92,6 +92,7 @@ def prepare(
         told = tuple(warning.replace(str(folder), str(out)) for warning in diagnosis.dataset.warnings)
         diagnosis = replace(diagnosis, folder=out, dataset=replace(diagnosis.dataset, warnings=told))
         write_report(diagnosis, folder / REPORT, out.resolve().name)
+        shutil.rmtree(folder / "colmap", ignore_errors=True)
     preset = "neu3d-tiny" if still else "hypernerf-tiny"
     return Prepared(out, len(pictures), placed, wanted, preset, diagnosis)
 
@@ -148,26 +149,6 @@ def _still_cameras(folder: Path, extractions: Sequence[Extraction]) -> Any:
     source.find_features()
     source.match([pair for moment in zip(*groups, strict=True) for pair in all_pairs(moment)])
     return merged(source, groups, work / "merged").solve()
-
-
-@contextmanager
-def _appearing(out: Path) -> Iterator[Path]:
-    """A folder to write to, which becomes `out` if the block ends without an exception, and is removed otherwise."""
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError(f"{out} is not an empty folder; name a new one with --out.")
-    partial = out.parent / f".{out.name}.unfinished"
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir(parents=True)
-    try:
-        yield partial
-        shutil.rmtree(partial / "colmap", ignore_errors=True)
-        if out.exists():
-            out.rmdir()
-        partial.rename(out)
-    except InputError as error:
-        raise InputError(str(error).replace(str(partial), str(out))) from None
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
 
 
 def say(text: str) -> None:
