@@ -50,12 +50,14 @@ def _train(arguments: list[str]) -> None:
     if given["motion_from"]:
         raise InputError("--motion-from goes with --eval RUN, after the training.")
     lpips = _lpips(given)
+    ranks = join_ranks()
     watch = None
     if given["view"]:
         from lapgs_wgpu.viewer import live
 
+        if ranks.first:
+            live.check_window()  # before anything is written or replaced
         watch = live.watch
-    ranks = join_ranks()
     if given["resume"]:
         _resume(Path(given["resume"]), given, overrides, watch, ranks, lpips)
         return

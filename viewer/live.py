@@ -21,6 +21,7 @@ from lapgs_wgpu.motion.scene import Scene4D
 from .app import App
 from .loaded_scene import LoadedScene
 from .training_control import TrainingControl, TrainingStep
+from .window import choose_backend, make_canvas
 
 SHARE = 0.02  # of the time may go into pictures while nobody moves anything
 _OPENING = 4.0  # seconds after the first step, in which the window draws what it begins with: shaders are compiled
@@ -28,10 +29,13 @@ _ATTENTION = 0.5  # seconds after a move in which the pictures come first
 _PATIENCE = 0.02  # seconds between looks at mouse and keys while the training rests
 
 
+def check_window() -> None:
+    """Raises InputError where no window can be opened here."""
+    choose_backend("auto", otherwise="leave out --view")
+
+
 def watch(scene: Scene4D, look: InitialView, steps: Iterator[TrainingStep]) -> None:
     """Show the scene in a window and take the training's steps, until the window is closed."""
-    from .window import choose_backend, make_canvas
-
     canvas, loop = make_canvas(choose_backend("auto"), "training - lapgs-train", (1280, 720))
     app = App(canvas, loop, LoadedScene(None, TorchPlayback(scene), look), transport=True)
     state, viewport = app.state, app.viewport

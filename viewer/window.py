@@ -19,8 +19,9 @@ from .loaded_scene import LoadedScene
 _OTHERWISE = "take --backend http to look in a browser (also from another machine), or --screenshot FILE.png"
 
 
-def choose_backend(wanted: str) -> str:
-    """glfw or qt: the wanted one, or for `auto` the first that works here. Raises InputError where it does not."""
+def choose_backend(wanted: str, *, otherwise: str = _OTHERWISE) -> str:
+    """glfw or qt: the wanted one, or for `auto` the first that works here. otherwise: what works without a window.
+    Raises InputError where it does not."""
     if importlib.util.find_spec("imgui_bundle") is None:
         raise InputError("the viewer needs imgui-bundle: pip install 'lapgs-wgpu[viewer]'.")
     if wanted != "auto":
@@ -34,7 +35,7 @@ def choose_backend(wanted: str) -> str:
         if reason is None:
             return name
         reasons[name] = reason
-    raise InputError(f"no window can be opened here ({reasons['glfw']}): {_OTHERWISE}.")
+    raise InputError(f"no window can be opened here ({reasons['glfw']}): {otherwise}.")
 
 
 def run_window(
