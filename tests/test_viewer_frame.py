@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import asyncio
 import re
+import signal
+from collections.abc import Callable, Coroutine, Iterator
+from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from helpers.still_scenes import CAMERA, KINDS, half_still
 from helpers.trained_scenes import GRID4D, trained
 
+from lapgs_wgpu.errors import NumericalError
 from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.motion.playback.playback import open_playback
 from lapgs_wgpu.viewer.frame import Frame, FrameRenderer, FrameRequest
 from lapgs_wgpu.viewer.render_modes import Mode
@@ -129,3 +136,31 @@ def test_a_file_that_cannot_be_shown_leaves_the_scene_as_it_is(
     assert opened is not before["frame"]
     canvas.draw()
     assert app.viewport.frame is opened  # drawn once
+
+
+def test_an_error_of_a_watched_step_reaches_the_caller(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    offscreen = pytest.importorskip("rendercanvas.offscreen")
+    from lapgs_wgpu.viewer import live
+
+    tasks: list[Callable[[], Coroutine[Any, Any, None]]] = []
+
+    def run() -> None:
+        for task in tasks:
+            with suppress(Exception):  # as rendercanvas logs it
+                asyncio.run(task())
+
+    def steps() -> Iterator[Any]:
+        yield SimpleNamespace(step=1, steps=9, psnr=20.0)
+        raise NumericalError("step 2: the loss is nan.")
+
+    canvas = offscreen.RenderCanvas(size=(64, 48), pixel_ratio=1)
+    loop = SimpleNamespace(add_task=tasks.append, run=run, call_later=lambda seconds, callback: None)
+    monkeypatch.setattr(live, "choose_backend", lambda wanted: "glfw")
+    monkeypatch.setattr(live, "make_canvas", lambda *_: (canvas, loop))
+    interrupt = signal.getsignal(signal.SIGINT)
+    try:
+        with pytest.raises(NumericalError, match="the loss is nan"):
+            live.watch(trained(device, GRID4D, 20), InitialView(CAMERA, np.zeros(3), np.array([0.0, 0, 1]), 9), steps())
+    finally:
+        signal.signal(signal.SIGINT, interrupt)
+    assert canvas.get_closed()

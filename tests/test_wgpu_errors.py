@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -25,6 +25,8 @@ from lapgs_wgpu.gpu.buffer import Buffer
 from lapgs_wgpu.gpu.device import _DEFAULT_LIMITS, _RAISED_LIMITS, Device, DeviceInfo
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.wgpu_errors import TranslatedErrors
+from lapgs_wgpu.io.initial_view import InitialView
+from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.rasterize import rasterizer_of
 from lapgs_wgpu.train.dataloader import Pictures
 from lapgs_wgpu.train.log import Log
@@ -128,6 +130,25 @@ def test_a_step_that_broke_off_halfway_is_not_saved(
     state = load_state(tmp_path)
     assert state is not None
     assert state["training.done"] == 8
+
+
+def test_a_half_step_whose_error_is_kept_is_not_saved_either(
+    dataset: Dataset, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any, **__: Any) -> None:
+        raise MemoryError
+
+    def keep(scene: Scene4D, look: InitialView, steps: Iterator[StepResult]) -> None:
+        with pytest.raises(MemoryError):
+            list(steps)
+
+    monkeypatch.setattr("lapgs_wgpu.train.densify.densify", fail)
+    with pytest.raises(RuntimeError, match="step 10 broke off halfway"):
+        train(configure(schedule__save_interval="4", density__start="9"), dataset, tmp_path, device=device, watch=keep)
+    state = load_state(tmp_path)
+    assert state is not None
+    assert state["training.done"] == 8
+    assert not (tmp_path / "checkpoint.ply").exists()
 
 
 def test_nothing_is_saved_before_the_first_step(

@@ -35,12 +35,16 @@ def check_window() -> None:
 
 
 def watch(scene: Scene4D, look: InitialView, steps: Iterator[TrainingStep]) -> None:
-    """Show the scene in a window and take the training's steps, until the window is closed."""
+    """Show the scene in a window and take the training's steps, until the window is closed.
+
+    An error of a step closes the window and goes on to the caller.
+    """
     canvas, loop = make_canvas(choose_backend("auto"), "training - lapgs-train", (1280, 720))
     app = App(canvas, loop, LoadedScene(None, TorchPlayback(scene), look), transport=True)
     state, viewport = app.state, app.viewport
     state.training = training = TrainingControl()
     interrupt = signal.getsignal(signal.SIGINT)
+    failed: list[Exception] = []
 
     def on_interrupt(signum: int, frame: FrameType | None) -> None:
         training.paused = False  # the training notices after its next step
@@ -56,7 +60,11 @@ def watch(scene: Scene4D, look: InitialView, steps: Iterator[TrainingStep]) -> N
             if moving or (training.paused and not training.single):
                 await sleep(_PATIENCE)
                 continue
-            progress = next(steps, None)
+            try:
+                progress = next(steps, None)
+            except Exception as error:  # the window's loop would log it and go on
+                failed.append(error)
+                progress = None
             if progress is None:  # done, or interrupted: what follows must not wait for somebody to close the window
                 canvas.close()
                 return
@@ -73,3 +81,5 @@ def watch(scene: Scene4D, look: InitialView, steps: Iterator[TrainingStep]) -> N
 
     loop.add_task(drive)
     loop.run()
+    if failed:
+        raise failed[0]

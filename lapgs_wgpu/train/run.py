@@ -188,6 +188,8 @@ def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None)
             watch(scene, training.initial_view, steps)
         for _ in steps:
             pass
+        if not training.whole:  # nothing of it may be saved
+            raise RuntimeError(f"step {training.done + 1} broke off halfway, and what watched it kept its error.")
         seconds = log.seconds
         if training.done == config.schedule.steps and (outside := _outside(scene)):
             log.tell(outside)
