@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import getpass
 import os
+import platform
 import socket
 import subprocess
 import sys
@@ -156,3 +157,16 @@ def test_the_report_names_no_user_and_no_folder(monkeypatch: pytest.MonkeyPatch)
     for private in (str(Path.home()), socket.gethostname(), f"/{getpass.getuser()}"):
         assert private not in text
     assert "missing" not in facts["packages"].split(",")[0]
+
+
+@pytest.mark.parametrize(
+    ("lines", "named"),
+    [
+        ("processor\t: 0\nBogoMIPS\t: 50.00\nCPU part\t: 0xd0c\n", platform.processor() or platform.machine()),
+        ("processor\t: 0\nmodel name\t: Some Processor\n", "Some Processor"),
+    ],
+    ids=["ARM", "x86"],
+)
+def test_a_processor_may_have_no_name(lines: str, named: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Path, "read_text", lambda *_, **__: lines)
+    assert system.system_facts()["processor"].startswith(f"{named}, ")

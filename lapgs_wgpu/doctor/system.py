@@ -52,10 +52,12 @@ def _distribution() -> str:
 
 
 def _processor() -> str:
-    with suppress(OSError, IndexError):
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
-    return platform.processor() or platform.machine()
+    with suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines():
+            name, _, text = line.partition(":")
+            if name.strip() == "model name" and text.strip():
+                return text.strip()
+    return platform.processor() or platform.machine()  # ARM's Linux tells no name
 
 
 def _cores() -> int:
