@@ -22,8 +22,8 @@ if typing.TYPE_CHECKING:
 
 # Of the keys, what goes with --eval: where the pictures lie now, and how they are read. The size must be the run's own.
 EVAL_KEYS = ("data.path", "data.size", "data.split", "data.background", "data.cache_gb")
-# And with --resume: where they lie now, on another machine.
-RESUME_KEYS = ("data.path", "data.cache_gb")
+# And with --resume: where they and their masks lie now, on another machine.
+RESUME_KEYS = ("data.path", "data.masks", "data.cache_gb")
 
 
 def train_command(arguments: Sequence[str] | None = None) -> int:
@@ -126,7 +126,7 @@ def _evaluate(run: Path, given: dict[str, typing.Any], overrides: dict[str, str 
     lpips = _lpips(given)
     _check_files("--eval", "a finished run", run / "config.toml", run / "checkpoint.ply")
     size = load_config(str(run / "config.toml")).data.size
-    config = load_config(str(run / "config.toml"), overrides)
+    config = load_config(str(run / "config.toml"), {**overrides, "data.masks": ""})  # which concern the training alone
     if config.data.size != size:
         raise InputError(
             f"--eval measures a run at its own size, so --data.size {config.data.size} cannot be given; "

@@ -15,6 +15,7 @@ from helpers.scenes import relative
 from helpers.training import configure
 from PIL import Image
 
+from lapgs_wgpu import cli
 from lapgs_wgpu.data import Dataset, load_dataset
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
@@ -22,6 +23,7 @@ from lapgs_wgpu.splat.rasterize import rasterize
 from lapgs_wgpu.train.discovery.static_fit import small_views
 from lapgs_wgpu.train.fused_loss import render_loss
 from lapgs_wgpu.train.run import train
+from lapgs_wgpu.train.run_folder import start_run_folder
 from lapgs_wgpu.train.truth_cache import upload_rgba, without
 
 IGNORED = np.zeros(TRUTH.shape[:2], np.bool_)
@@ -130,3 +132,19 @@ def test_bad_masks_are_refused(masked: tuple[Path, Path], tmp_path: Path) -> Non
         load_dataset(capture, masks=masks)
     with pytest.raises(InputError, match=r"is not a folder; data\.masks"):
         load_dataset(capture, masks=tmp_path / "none")
+
+
+def test_a_run_whose_masks_have_moved_is_resumed_and_evaluated(
+    dataset: Dataset, data: Path, device: Device, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    old, new, run = tmp_path / "old", tmp_path / "new", tmp_path / "run"
+    for path in (data / "train").glob("*.png"):
+        (new / "train").mkdir(parents=True, exist_ok=True)
+        Image.new("L", Image.open(path).size).save(new / "train" / path.name)
+    run.mkdir()
+    config = configure(data__path=str(data), data__masks=str(old), schedule__steps="3", schedule__save_interval="0")
+    start_run_folder(run, config, device, dataset)
+    assert cli.train_command(["--resume", str(run)]) == 2
+    assert f"{old} is not a folder" in capsys.readouterr().err
+    assert cli.train_command(["--resume", str(run), "--data.masks", str(new)]) == 0
+    assert cli.train_command(["--eval", str(run)]) == 0
