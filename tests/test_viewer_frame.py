@@ -13,15 +13,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from helpers.still_scenes import CAMERA, KINDS, half_still
-from helpers.trained_scenes import GRID4D, trained
+from helpers.trained_scenes import GRID4D, OURS, trained
 
 from lapgs_wgpu.errors import NumericalError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.motion.playback.playback import open_playback
+from lapgs_wgpu.motion.playback.torch_playback import TorchPlayback
 from lapgs_wgpu.viewer.frame import Frame, FrameRenderer, FrameRequest
+from lapgs_wgpu.viewer.loaded_scene import LoadedScene
 from lapgs_wgpu.viewer.render_modes import Mode
+from lapgs_wgpu.viewer.training_control import TrainingControl
 
 pytestmark = pytest.mark.kernels
 
@@ -136,6 +140,30 @@ def test_a_file_that_cannot_be_shown_leaves_the_scene_as_it_is(
     assert opened is not before["frame"]
     canvas.draw()
     assert app.viewport.frame is opened  # drawn once
+
+
+@pytest.mark.parametrize("mode", ["motion", "dynamics", "scale"])
+def test_the_values_of_a_training_are_those_after_its_last_step(device: Device, mode: Mode) -> None:
+    """Also where the frame is drawn since the camera moves, and not since `refresh` was called."""
+    offscreen = pytest.importorskip("rendercanvas.offscreen")
+    from lapgs_wgpu.viewer.view_state import ViewState
+    from lapgs_wgpu.viewer.viewport import Viewport
+
+    scene = trained(device, OURS, 60)
+    look = InitialView(CAMERA, np.zeros(3), np.array([0.0, 0, 1]), 9)
+    state = ViewState(LoadedScene(None, TorchPlayback(scene), look))
+    state.mode, state.training = mode, TrainingControl()
+    viewport = Viewport(offscreen.RenderCanvas(size=(64, 48), pixel_ratio=1), state)
+    viewport.draw(50.0)
+    with torch.no_grad():  # a step that reorders the Gaussians
+        for parameter in scene.parameters.values():
+            parameter.copy_(parameter.flip(0))
+    state.training.last = SimpleNamespace(step=1, steps=9, psnr=20.0)
+    state.camera.orbit(0.2, 0.0)
+    viewport.draw(51.0)
+    assert viewport.frame is not None
+    fresh = FrameRenderer(TorchPlayback(scene)).draw(viewport.frame.request)
+    np.testing.assert_array_equal(planes(viewport.frame), planes(fresh))
 
 
 def test_an_error_of_a_watched_step_reaches_the_caller(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:

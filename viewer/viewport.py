@@ -38,6 +38,7 @@ class Viewport:
         self._presenter = Presenter(self.device, self.format)
         self.frame: Frame | None = None
         self.scale = self._moving_scale = 1.0
+        self._trained: Any = None  # the training's last step before the frame was drawn
         self._drawn: tuple[Any, ...] = ()  # all that the frame depends on, with the renderer at the end
         self.stale = False
         self.moved_at = time.perf_counter()
@@ -73,6 +74,9 @@ class Viewport:
             return
         else:
             moving = False
+        if state.training is not None and state.training.last is not self._trained:
+            self._trained = state.training.last
+            state.renderer.forget()
         self.scale = self._moving_scale if moving else 1.0
         camera = full
         if self.scale < 1:
