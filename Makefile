@@ -36,7 +36,8 @@ $(BIN)/pip:
 	$$python -m venv .venv
 
 HAS_ADAPTER = $(BIN)/python -c 'from lapgs_wgpu import list_devices; raise SystemExit(not list_devices())'
-MESA = apt-get install -y mesa-vulkan-drivers libvulkan1
+# The last two are of the viewer's GUI, which does not bring them.
+MESA = apt-get install -y mesa-vulkan-drivers libvulkan1 libx11-6 libxext6
 INSTALL_MESA = { echo "No Vulkan adapter: installing Mesa's software driver"; command -v apt-get >/dev/null && \
   if [ "$$(id -u)" = 0 ]; then $(MESA) || { apt-get update && $(MESA); }; \
   else sudo $(MESA) || { sudo apt-get update && sudo $(MESA); }; fi; }

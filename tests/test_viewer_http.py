@@ -244,6 +244,23 @@ def test_without_a_display_it_says_what_works(
     assert "there is no display): take --backend http" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("backend", ["glfw", "http"])
+def test_a_missing_library_of_the_system_is_named(
+    backend: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for package in ("uvicorn", "websockets"):
+        pytest.importorskip(package)
+    text = "libXext.so.6: cannot open shared object file: No such file or directory"
+    (tmp_path / "imgui_bundle.py").write_text(f"raise ImportError({text!r})")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "imgui_bundle", raising=False)
+    assert cli.view_command(["scene.ply", "--backend", backend]) == 2
+    error = capsys.readouterr().err
+    assert f"imgui-bundle cannot be loaded ({text}); install" in error
+    assert "apt-get install -y libx11-6 libxext6" in error
+    assert error.count("\n") == 1
+
+
 # The canvas
 
 

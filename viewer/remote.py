@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 from lapgs_wgpu.errors import InputError
 
 from .auth import LOCAL, Application, AuthMiddleware, Receive, Scope, Send, answer, check_entry
+from .gui_library import check_imgui
 from .initial_state import InitialState
 
 DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 8080
@@ -60,6 +61,7 @@ def open_entry(host: str, port: int, token: str | None) -> Entry:
     missing = [name for name in ("uvicorn", "websockets", "imgui_bundle") if importlib.util.find_spec(name) is None]
     if missing:
         raise InputError(f"--backend http needs {', '.join(missing)}: pip install 'lapgs-wgpu[remote]'.")
+    check_imgui()
     address = "127.0.0.1" if host == "localhost" else host
     family = socket.AF_INET6 if ":" in address else socket.AF_INET
     try:

@@ -13,6 +13,7 @@ from typing import Any
 from lapgs_wgpu.errors import InputError
 
 from .app import App
+from .gui_library import check_imgui
 from .initial_state import InitialState
 from .loaded_scene import LoadedScene
 
@@ -22,8 +23,7 @@ _OTHERWISE = "take --backend http to look in a browser (also from another machin
 def choose_backend(wanted: str, *, otherwise: str = _OTHERWISE) -> str:
     """glfw or qt: the wanted one, or for `auto` the first that works here. otherwise: what works without a window.
     Raises InputError where it does not."""
-    if importlib.util.find_spec("imgui_bundle") is None:
-        raise InputError("the viewer needs imgui-bundle: pip install 'lapgs-wgpu[viewer]'.")
+    check_imgui()
     if wanted != "auto":
         reason = _CHECKS[wanted]()
         if reason:

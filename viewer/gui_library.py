@@ -1,0 +1,20 @@
+"""Whether Dear ImGui can be loaded: a package, and libraries of the system that it does not bring."""
+
+from __future__ import annotations
+
+from lapgs_wgpu.errors import InputError
+
+PACKAGES = "libx11-6 libxext6"  # Debian's and Ubuntu's, of libX11.so.6 and libXext.so.6
+
+
+def check_imgui() -> None:
+    """Raises InputError where it cannot be loaded."""
+    try:
+        import imgui_bundle  # noqa: F401
+    except ModuleNotFoundError:
+        raise InputError("the viewer needs imgui-bundle: pip install 'lapgs-wgpu[viewer]'.") from None
+    except ImportError as error:
+        raise InputError(
+            f"the viewer's package imgui-bundle cannot be loaded ({error}); install the system's library, on Debian "
+            f"and Ubuntu: sudo apt-get install -y {PACKAGES}."
+        ) from None
