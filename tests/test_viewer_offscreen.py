@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -24,9 +25,13 @@ from lapgs_wgpu.train.evaluate import to_8_bit
 from lapgs_wgpu.viewer import offscreen as offscreen_module
 from lapgs_wgpu.viewer.capture import open_capture
 from lapgs_wgpu.viewer.cli import view_command
+from lapgs_wgpu.viewer.loaded_scene import load_scene
 from lapgs_wgpu.viewer.offscreen import framed
 from lapgs_wgpu.viewer.path import CameraPath, KeyFrame, Pose
 from lapgs_wgpu.viewer.path_file import PathFile, write_path
+from lapgs_wgpu.viewer.render_modes import Compare
+from lapgs_wgpu.viewer.view_state import ViewState
+from lapgs_wgpu.viewer.viewport import Viewport
 
 pytestmark = pytest.mark.triangles
 kernels = pytest.mark.kernels
@@ -426,3 +431,34 @@ def test_the_capture_opens_as_the_training_opened_it(
     (tmp_path / "config.toml").write_text(f'[data]\npath = "{tmp_path}"\nsize = 200\n{line}\n')
     assert open_capture(tmp_path / "checkpoint.ply", {}) is not None
     assert opened == [{"image_size": 200, "normalize": True, "undistort": expected}]
+
+
+@pytest.mark.parametrize("compare", ["side", "split", "error"])
+def test_an_image_that_cannot_be_read_ends_the_comparison(
+    compare: Compare, run: Path, device: Device, tmp_path: Path
+) -> None:
+    offscreen = pytest.importorskip("rendercanvas.offscreen")
+    shutil.copytree(run, tmp_path / "run")
+    (tmp_path / "run" / "config.toml").write_text(f'[data]\npath = "{tmp_path / "run" / "toys"}"\nsize = 0\n')
+    state = ViewState(load_scene(tmp_path / "run" / "checkpoint.ply", lambda: device))
+    canvas = offscreen.RenderCanvas(size=(64, 48), pixel_ratio=1)
+    viewport = Viewport(canvas, state)
+    state.next_compare()
+    state.compare = compare
+    assert state.comparing() == compare
+    for image in (tmp_path / "run" / "toys" / "test").glob("*.png"):
+        image.write_bytes(image.read_bytes()[:60])
+
+    def draw() -> None:
+        viewport.draw(50.0)
+        viewport.present()
+
+    canvas.request_draw(draw)
+    canvas.draw()
+    assert state.compare == "off"
+    assert state.message is not None
+    assert "cannot be decoded as an image" in state.message
+    shown = canvas.draw()
+    state.message = None
+    np.testing.assert_array_equal(shown, canvas.draw())
+    assert state.message is None

@@ -7,6 +7,7 @@ import time
 from collections import deque
 from typing import Any
 
+from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
 
 from .frame import Frame, FrameRequest
@@ -107,19 +108,30 @@ class Viewport:
     def _placed(self, width: int, height: int) -> list[Placed]:
         """The layout on a canvas of this size, pixels."""
         assert self.frame is not None
-        state, placed = self.state, self.frame.placed
-        compare = state.comparing()
+        placed = self.frame.placed._replace(**self._truth())
+        compare = self.state.comparing()
         columns = width // 2 if compare == "side" else width
-        if compare != "off" and state.capture is not None and state.view is not None:
-            placed = placed._replace(**state.capture.truth(state.view, state.background, self.device))
         if compare == "side":
             right = _fit(placed._replace(truth_until=0.0), columns, height, columns)
             return [_fit(placed._replace(truth_until=1.0), columns, height, 0), right]
         if compare == "split":
-            placed = placed._replace(truth_until=state.split)
+            placed = placed._replace(truth_until=self.state.split)
         elif compare == "error":
             placed = placed._replace(error_gain=_ERROR_GAIN)
         return [_fit(placed, columns, height, 0)]
+
+    def _truth(self) -> dict[str, Any]:
+        """What `Placed` has to know of the image that is compared with, if any. One that cannot be read ends the
+        comparison, with a message."""
+        state = self.state
+        if state.comparing() == "off" or state.capture is None or state.view is None:
+            return {}
+        try:
+            return state.capture.truth(state.view, state.background, self.device)
+        except InputError as error:
+            state.compare, state.message = "off", str(error)
+            self.canvas.request_draw()
+            return {}
 
     def on_image(self, x: float, y: float) -> tuple[float, float] | None:
         """A point of the canvas (logical pixels) as shares of the image's width and height; None beside the image. Of
