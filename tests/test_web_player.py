@@ -310,6 +310,20 @@ def test_keys(browser: Browser, desktop: Desktop) -> None:
     assert same(browser, desktop, 0.0, background="black")
 
 
+def test_keys_fly_by_their_letter(browser: Browser, desktop: Desktop) -> None:
+    """Of a Dvorak keyboard, whose S lies where others have their semicolon."""
+    browser.key("v")
+    where = {"key": "s", "code": "Semicolon"}
+    browser.value("(window.seen = 0, lapgs.onframe = () => seen++)")
+    browser.call("Input.dispatchKeyEvent", type="keyDown", text="s", **where)
+    wait_for(lambda: browser.value("seen") > 2, 60, "the flight")
+    browser.call("Input.dispatchKeyEvent", type="keyUp", **where)
+    assert not same(browser, desktop, 0.0)
+    browser.key("v")
+    browser.key("r")
+    assert same(browser, desktop, 0.0)
+
+
 def test_orbit_zoom_and_reset(browser: Browser, desktop: Desktop) -> None:
     browser.mouse("mousePressed", 100, 80, down=True)
     browser.mouse("mouseMoved", 160, 100, down=True)

@@ -6,7 +6,7 @@ export class Controls {
         this.keys = new Map(Object.entries(keys)).set("/", "toggle_help");
         this.pointer = [0, 0]; // where it was last
         this.pointers = new Map(); // that are down, by number: where each is
-        this.held = new Set(); // keys that fly, and those that say how fast
+        this.held = new Map(); // keys that fly, and those that say how fast: where each is on the keyboard -> its name
         this.flying = false;
         this.dragging = null;
         const listen = (name, handler, options) => canvas.addEventListener(name, event => {
@@ -68,7 +68,7 @@ export class Controls {
         if (event.ctrlKey || event.metaKey || event.target.closest?.("select")) return;
         const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
         if (this.flying && (key in this.fly || key === "Shift" || key === "Alt")) {
-            this.held.add(event.code);
+            this.held.set(event.code, key);
         } else {
             const action = this.actions[this.keys.get(event.key) ?? this.keys.get(key)];
             if (!action) return;
@@ -85,10 +85,10 @@ export class Controls {
 
     // Move the camera by what the held keys say.
     advance(seconds) {
-        const moves = [...this.held].map(code => this.fly[code.replace("Key", "").toLowerCase()]).filter(Boolean);
+        const held = new Set(this.held.values());
+        const moves = [...held].map(key => this.fly[key]).filter(Boolean);
         if (!moves.length) return;
-        const held = name => this.held.has(`${name}Left`) || this.held.has(`${name}Right`);
-        const far = seconds * this.reach * (held("Shift") ? 4 : held("Alt") ? 0.25 : 1) * this.state.camera.distance;
+        const far = seconds * this.reach * (held.has("Shift") ? 4 : held.has("Alt") ? 0.25 : 1) * this.state.camera.distance;
         this.state.camera.fly(...[0, 1, 2].map(axis => far * moves.reduce((sum, move) => sum + move[axis], 0)));
     }
 }
