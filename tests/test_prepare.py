@@ -65,6 +65,30 @@ def test_frames_stand_upright(tmp_path: Path, degrees: int) -> None:
         assert np.abs(gray - expected[..., 0]).mean() < 8
 
 
+@pytest.mark.parametrize("degrees", [0, 90])
+def test_pixels_that_are_not_square_become_so(tmp_path: Path, degrees: int) -> None:
+    """As of cameras that record 1440x1080 to be shown as 1920x1080."""
+    picture = np.full((48, 48, 3), 30, np.uint8)
+    picture[:24, :24] = 220
+    path = write_film(tmp_path / "film.mp4", [picture] * 3, aspect="4/3")
+    if degrees:
+        turn_film(path, degrees)
+    film = Film(path)
+    expected = np.rot90(np.repeat(picture[:, :, 0], 4, axis=1)[:, ::3], -degrees // 90)
+    assert film.size == (64, 48)  # before the first frame says how it is turned
+    for frame in film.frames():
+        assert film.size == expected.shape[::-1]
+        assert frame.pixels(1000).shape == (*expected.shape, 3)
+        assert np.abs(frame.pixels(1000)[..., 0].astype(int) - expected).mean() < 5
+        assert np.abs(frame.gray - expected).mean() < 8
+        assert max(frame.pixels(32).shape) == 32
+
+
+@pytest.mark.parametrize("aspect", ["1/100", "100"])
+def test_an_impossible_shape_of_pixels_is_left_out_of_account(tmp_path: Path, aspect: str) -> None:
+    assert Film(write_film(tmp_path / "film.mp4", noise(3), aspect=aspect)).size == (64, 48)
+
+
 @pytest.mark.parametrize(("trc", "transfer"), [("arib-std-b67", "HLG"), ("smpte2084", "PQ")])
 def test_hdr_films_look_like_ordinary_ones(tmp_path: Path, trc: str, transfer: str) -> None:
     """Gray of the reference white in 10 bits becomes (almost) white; half of its light sRGB's level for half."""

@@ -1,4 +1,4 @@
-"""Films as phones and cameras record them: upright frames in 8-bit RGB, each with its own time."""
+"""Films as phones and cameras record them: upright frames of square pixels in 8-bit RGB, each with its own time."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from .hdr import Transfer, to_sdr, transfer_of
 
 THUMBNAIL = 320  # longer side, pixels: what is blurred or equal at this size is so for a training, too
 _FAST_BILINEAR = 0x1  # of swscale: exact enough for a thumbnail
+WIDEST = 4.0  # width by height of a pixel, or height by width; what a header states beyond it is no such ratio
 _ATTACHED_PICTURE = 0x400  # libavformat's flag of a cover image
 
 
@@ -30,12 +31,13 @@ class FilmFrame:
     seconds: float
     gray: NDArray[np.float32]
     _frame: Any
+    _size: Size  # of square pixels, not yet turned
     _turns: int
     _transfer: Transfer | None
 
     def pixels(self, longer_side: int) -> Pixels:
         """(H, W, 3) RGB, upright, shrunk to at most `longer_side` pixels."""
-        width, height = shrunk_size((self._frame.width, self._frame.height), longer_side)
+        width, height = shrunk_size(self._size, longer_side)
         if self._transfer is None:
             image = self._frame.to_ndarray(format="rgb24", width=width, height=height, interpolation=EXACT_COLORS)
         else:
@@ -47,7 +49,8 @@ class FilmFrame:
 class Film:
     """A film whose header was checked.
 
-    size: (width, height) of the upright frames, pixels. seconds: length as the header states it, 0 if it does not.
+    size: (width, height) of the upright frames, in pixels that are square. seconds: length as the header states it, 0
+    if it does not.
     notes: what the user should know of the file, one sentence each; `frames` adds to them while it decodes.
     """
 
@@ -66,6 +69,7 @@ class Film:
                 if stream.codec_context is None:
                     raise InputError(f"{path} is in a format that PyAV cannot decode; convert it to H.264.")
                 coded = (int(stream.width), int(stream.height))
+                self._aspect = _pixel_aspect(stream)
                 self.seconds = _seconds(stream, file)
         except (av.error.FFmpegError, OSError) as error:
             raise InputError(f"{path} is not a readable film ({error}); copy or record it again.") from None
@@ -73,7 +77,7 @@ class Film:
             raise InputError(
                 f"{path} states frames of {size_text(coded)} pixels; 1 to {LARGEST_FRAME:,} pixels a frame are allowed."
             )
-        self.size: Size = coded  # turned by `frames` where the first frame says so
+        self.size: Size = _squared(coded, self._aspect)  # turned by `frames` where the first frame says so
 
     def frames(self) -> Iterator[FilmFrame]:
         """Decode the frames in the order of their times. Raises InputError; a film that is damaged after its first
@@ -88,7 +92,8 @@ class Film:
                 rate = float(stream.average_rate or stream.guessed_rate or rate)
                 for frame in file.decode(stream):
                     turns = round(frame.rotation / 90) % 4
-                    size = (frame.height, frame.width) if turns % 2 else (frame.width, frame.height)
+                    shown = _squared((frame.width, frame.height), self._aspect)
+                    size = shown[::-1] if turns % 2 else shown
                     if number == 0:
                         self.size, first = size, frame.time or 0.0
                     elif size != self.size:
@@ -100,7 +105,8 @@ class Film:
                     if number and seconds <= last:  # no time stamp, or one that was there before
                         guessed, seconds = True, last + 1 / rate
                     seconds = max(seconds, 0.0)
-                    yield FilmFrame(number, seconds, _gray(frame, turns), frame, turns, transfer_of(frame))
+                    gray = _gray(frame, shown, turns)
+                    yield FilmFrame(number, seconds, gray, frame, shown, turns, transfer_of(frame))
                     number, last = number + 1, seconds
         except (av.error.FFmpegError, OSError) as error:
             if number < 2:
@@ -141,7 +147,18 @@ def _seconds(stream: Any, file: Any) -> float:
     return file.duration / 1e6 if file.duration is not None else 0.0  # of the container: microseconds
 
 
-def _gray(frame: Any, turns: int) -> NDArray[np.float32]:
-    width, height = shrunk_size((frame.width, frame.height), THUMBNAIL)
+def _pixel_aspect(stream: Any) -> float:
+    """Width by height of a pixel; 1 where the film states nothing, or nothing possible."""
+    aspect = float(stream.sample_aspect_ratio or 1)
+    return aspect if 1 / WIDEST <= aspect <= WIDEST else 1.0
+
+
+def _squared(coded: Size, aspect: float) -> Size:
+    """The size in which pixels are square: the width follows."""
+    return max(1, round(coded[0] * aspect)), coded[1]
+
+
+def _gray(frame: Any, size: Size, turns: int) -> NDArray[np.float32]:
+    width, height = shrunk_size(size, THUMBNAIL)
     small = frame.to_ndarray(format="gray", width=width, height=height, interpolation=_FAST_BILINEAR)
     return np.rot90(small, turns).astype(np.float32)

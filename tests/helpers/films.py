@@ -112,8 +112,9 @@ def write_film(
     rate: int = 30,
     options: dict[str, str] | None = None,
     pix_fmt: str = "yuv420p",
+    aspect: str = "1",
 ) -> Path:
-    """H.264. times: seconds of each frame, for films of variable rate."""
+    """H.264. times: seconds of each frame, for films of variable rate. aspect: width by height of a pixel."""
     av = __import__("av")
     from fractions import Fraction
 
@@ -122,6 +123,7 @@ def write_film(
         stream.width, stream.height, stream.pix_fmt = pictures[0].shape[1], pictures[0].shape[0], pix_fmt
         base = Fraction(1, 1000) if times else Fraction(1, rate)
         stream.codec_context.time_base = base
+        stream.codec_context.sample_aspect_ratio = Fraction(aspect)
         for i, picture in enumerate(pictures):
             frame = av.VideoFrame.from_ndarray(picture, "rgb24")
             frame.pts = round(1000 * times[i]) if times else i
