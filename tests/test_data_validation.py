@@ -314,6 +314,7 @@ def test_frame_numbers() -> None:
     with pytest.raises(InputError, match="differ in 2 numbers"):
         numbers("cam0_1.jpg", "cam1_2.jpg")
     assert sorted(["cam10", "cam2", "cam"], key=natural_key) == ["cam", "cam2", "cam10"]
+    assert sorted(["²", "2"], key=natural_key) == ["2", "²"]
 
 
 def test_cameras_that_are_nearly_in_step_share_their_times() -> None:

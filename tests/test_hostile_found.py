@@ -30,10 +30,12 @@ from helpers.ply_files import columns_of, ply_bytes, random_still
 
 from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.data.cloud import read_npy
+from lapgs_wgpu.data.readers.colmap_model import read_model
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.checkpoint import read_checkpoint
 from lapgs_wgpu.io.initial_view import InitialView
+from lapgs_wgpu.io.ply_points import read_points
 from lapgs_wgpu.io.safe_json_toml import MAX_TOML_BYTES, read_json, read_toml
 from lapgs_wgpu.motion.scene_file import read_scene
 from lapgs_wgpu.splat.camera import Camera
@@ -92,6 +94,22 @@ def test_found_in_results(tmp_path: Path) -> None:
     (tmp_path / "results.json").write_text("[" * 100_000)
     with pytest.raises(InputError, match="nested too deeply"):
         read_results(tmp_path / "results.json")
+
+
+def test_found_in_clouds(tmp_path: Path) -> None:
+    header = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
+    for line in ("property", "property float"):
+        (tmp_path / "a.ply").write_text(f"{header}{line}\nend_header\n1 2 3 4\n")
+        with pytest.raises(InputError, match=f"a.ply: '{line}' in its header has no type and name"):
+            read_points(tmp_path / "a.ply")
+
+
+def test_found_in_models(tmp_path: Path) -> None:
+    for name in ("images", "points3D"):
+        (tmp_path / f"{name}.txt").touch()
+    (tmp_path / "cameras.txt").write_text(f"1 SIMPLE_PINHOLE {'9' * 400} 48 50 32 24\n")
+    with pytest.raises(InputError, match=r"cameras.txt, line 1: width and height must be .* got 999.*\.\.\.x48\."):
+        read_model(tmp_path)
 
 
 @pytest.mark.parametrize(

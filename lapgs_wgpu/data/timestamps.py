@@ -147,7 +147,7 @@ def disorder(names: Sequence[ImageName], times: Sequence[float]) -> list[str]:
 def natural_key(name: str) -> tuple[tuple[int, int | str], ...]:
     """Sort key that puts cam2 before cam10."""
     parts = re.split(r"(\d+)", name)
-    return tuple((0, int(part)) if part.isdigit() else (1, part) for part in parts)
+    return tuple((0, int(part)) if part.isdecimal() else (1, part) for part in parts)
 
 
 def write_times(folder: Path, times: dict[str, float]) -> None:

@@ -50,6 +50,8 @@ def _read_text(path: PathLike) -> tuple[Floats, Floats | None]:
     start, count = elements[0][0], int(elements[0][1][-1])
     stop = elements[1][0] if len(elements) > 1 else end
     properties = [line for line in words[start + 1 : stop] if line[:1] == ["property"]]
+    if short := [line for line in properties if len(line) < 3]:
+        raise InputError(f"{path}: {' '.join(short[0])!r} in its header has no type and name; it is damaged.")
     names = [line[-1] for line in properties]
     if not {"x", "y", "z"} <= set(names):
         raise InputError(f"{path}: has no element vertex with properties x, y, z, so it is no cloud of points.")

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.errors import InputError, shown
 
 Array = NDArray[np.float64]
 
@@ -113,7 +113,7 @@ def _camera(where: str, model: str, width: float, height: float, values: list[fl
             f"{where}: a {model} has {len(names)} parameters ({', '.join(names)}), but there are {len(values)}."
         )
     if not (1 <= width <= 1e5 and 1 <= height <= 1e5):
-        raise InputError(f"{where}: width and height must be 1 to 100000 pixels, got {width:g}x{height:g}.")
+        raise InputError(f"{where}: width and height must be 1 to 100000 pixels, got {shown(width)}x{shown(height)}.")
     parameters = dict(zip(names, values, strict=True))
     for name, value in parameters.items():
         if not abs(value) <= 1e6 or (name[0] == "f" and value <= 0):  # true for NaN, too
