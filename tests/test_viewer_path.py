@@ -392,3 +392,31 @@ def test_the_window_shows_the_path_at_that_moment(
     state.path.play(now[0])
     app.controls._on_pointer_down({"x": 5, "y": 5, "button": 1, "modifiers": ()})
     assert state.path.started is None
+
+
+def test_the_browser_of_files_lists_folders_that_cannot_be_looked_into(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("imgui_bundle")
+    from lapgs_wgpu.viewer import file_browser
+
+    def refuse(self: Path) -> bool:  # as Python 3.11's does for a link into somebody else's folder
+        raise PermissionError(13, "Permission denied", str(self))
+
+    listed: list[str] = []
+    quiet = SimpleNamespace(
+        separator_text=lambda *_: None,
+        text_wrapped=lambda *_: None,
+        begin_child=lambda *_: None,
+        end_child=lambda: None,
+        ChildFlags_=SimpleNamespace(borders=0),
+        selectable=lambda name, _: (bool(listed.append(name)), False),
+    )
+    monkeypatch.setattr(file_browser, "imgui", quiet)
+    monkeypatch.setattr(Path, "is_dir", refuse)
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "scene.ply").touch()
+    browser = file_browser.FileBrowser(tmp_path, lambda file: None)
+    browser.toggle()
+    browser.draw()
+    assert listed == ["../", "folder/", "scene.ply"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -36,7 +37,7 @@ class FileBrowser:
         for entry in entries:
             if entry.name.startswith("."):
                 continue
-            if entry.is_dir() and imgui.selectable(f"{entry.name}/", False)[0]:
+            if os.path.isdir(entry) and imgui.selectable(f"{entry.name}/", False)[0]:
                 self._folder = entry
             elif entry.suffix.lower() in (".ply", ".lapgs") and imgui.selectable(entry.name, False)[0]:
                 self._shown = False
