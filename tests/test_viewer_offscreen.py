@@ -330,6 +330,26 @@ def test_an_exported_still(run: Path, scene: Scene4D, tmp_path: Path, capsys: py
 
 
 @kernels
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_exports_for_other_viewers_say_that_these_draw_it_thicker(
+    antialiased: bool, device: Device, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = moving_scene(device)
+    scene.antialiased = antialiased
+    scene.save(tmp_path / "a.ply")
+    for told, words in (
+        (True, ["still.ply"]),
+        (True, ["frames", "--frames", "2"]),
+        (True, ["a.4dgs", "--max-error", "50"]),
+        (False, ["a.lapgs"]),
+    ):
+        view(tmp_path / "a.ply", "--export", tmp_path / words[0], *words[1:])
+        notes = [line for line in capsys.readouterr().err.splitlines() if line.startswith("note: ")]
+        assert len(notes) == (antialiased and told), words
+        assert all("trained antialiased" in note and "thicker" in note for note in notes)
+
+
+@kernels
 def test_an_exported_sequence(run: Path, scene: Scene4D, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "new" / "frames"
     view(run / "checkpoint.ply", "--export", folder, "--frames", "3")

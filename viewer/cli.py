@@ -168,6 +168,17 @@ def _video(given: Any, scene: LoadedScene) -> None:
 
 
 def _export(given: Any, scene: LoadedScene) -> None:
+    _write_export(given, scene)
+    ours = Path(given.export).suffix.lower() in (".lapgs", ".html")
+    if not ours and scene.playback.at(0.0).antialiased:
+        print(
+            "note: the scene was trained antialiased, which a file for other viewers cannot say: where they offer "
+            "antialiased drawing, turn it on; elsewhere thin places look a little thicker.",
+            file=sys.stderr,
+        )
+
+
+def _write_export(given: Any, scene: LoadedScene) -> None:
     from .export import export_compact, export_frames, export_still
 
     overwrite = bool(given.overwrite)
