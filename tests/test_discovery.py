@@ -14,6 +14,7 @@ from torch import nn
 from lapgs_wgpu.data import Dataset, View, load_dataset
 from lapgs_wgpu.data.motion_scenes import MotionScene
 from lapgs_wgpu.data.motion_writer import write_motion
+from lapgs_wgpu.data.small_views import small_views
 from lapgs_wgpu.data.synthetic import camera_at, cameras
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
@@ -26,7 +27,7 @@ from lapgs_wgpu.train.discovery.acceptance import explained_share, rows_with, tr
 from lapgs_wgpu.train.discovery.discover import discover
 from lapgs_wgpu.train.discovery.field_fit import fit_field, keeping_rates
 from lapgs_wgpu.train.discovery.residual import Residual, moving_pixels
-from lapgs_wgpu.train.discovery.static_fit import small_views, static_config, static_fit
+from lapgs_wgpu.train.discovery.static_fit import static_config, static_fit
 from lapgs_wgpu.train.discovery.surface_points import PointClouds, Points, surface_points
 from lapgs_wgpu.train.discovery.tracks import Tracks, find_tracks
 from lapgs_wgpu.train.discovery.trajectories import find_trajectories

@@ -8,11 +8,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lapgs_wgpu.data.small_views import small_views
 from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.config import Config
-from lapgs_wgpu.train.discovery.static_fit import small_views, static_config
+from lapgs_wgpu.train.discovery.static_fit import static_config
 from lapgs_wgpu.train.evaluate import evaluate
 from lapgs_wgpu.train.initial_points import initial_points
 from lapgs_wgpu.train.trainer import Trainer

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
-from functools import cache, partial
+from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from lapgs_wgpu.data.images import shrink
+from lapgs_wgpu.data.small_views import small_views
 from lapgs_wgpu.data.views import Dataset, View, composite, spread_views
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.scene import Scene4D
-from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train.camera_refinement import CameraRefinement, Corrections
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.evaluate import BACKGROUND_LEVELS
@@ -132,33 +129,3 @@ def static_config(config: Config) -> Config:
         precision="float32",
         decoder="torch",
     )
-
-
-def small_views(views: Sequence[View], size: int) -> list[View]:
-    """The views with their longer side shrunk to `size` pixels, smaller ones as they are. Views that share a camera
-    still share one, and each image is read once."""
-    cameras: dict[int, Camera] = {}
-    found = []
-    for view in views:
-        width, height = view.camera.width, view.camera.height
-        scale = size / max(width, height)
-        if scale >= 1:
-            found.append(view)
-            continue
-        small = max(1, round(scale * width)), max(1, round(scale * height))
-        camera = cameras.setdefault(id(view.camera), view.camera.resized(*small))
-        ignored = None if view.ignored is None else partial(_shrunk_mask, view, small)
-        pixels = cache(partial(_shrunk, view, small))
-        found.append(dataclasses.replace(view, camera=camera, pixels=pixels, ignored=ignored))
-    return found
-
-
-def _shrunk(view: View, size: tuple[int, int]) -> NDArray[np.uint8]:
-    return shrink(view.load(), size)
-
-
-def _shrunk_mask(view: View, size: tuple[int, int]) -> NDArray[np.bool_]:
-    """A pixel is ignored where any of the pixels mixed into it is."""
-    ignored = view.load_ignored()
-    assert ignored is not None
-    return shrink(np.repeat(np.where(ignored, 255, 0).astype(np.uint8)[..., None], 3, axis=2), size)[..., 0] > 0

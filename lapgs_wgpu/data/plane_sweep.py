@@ -1,0 +1,162 @@
+"""Surfaces of what stands still, by a plane sweep between cameras that stand still.
+
+The median of a camera's images over the clip shows what does not move. Where a plane before a camera, at the depth of a
+surface, carries the other cameras' images to it, they look as its own there. A depth is believed that other cameras'
+depths confirm. Source: Collins, A space-sweep approach to true multi-image matching (CVPR 1996).
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from lapgs_wgpu.data.small_views import small_views
+from lapgs_wgpu.data.views import Dataset
+from lapgs_wgpu.splat.camera import Camera
+
+Array = NDArray[np.float64]
+
+SIDE = 168  # pixels, of the images that are compared
+IMAGES = 25  # of a camera, whose median shows what stands still
+CAMERAS = 24  # of a rig, at most
+OTHERS = 6  # the nearest cameras, with which one is compared
+DEPTHS = 128  # planes, evenly in 1 / depth
+WINDOW = 7  # pixels; side of the square whose colors are compared
+LEAST = 0.6  # normalized cross-correlation of a surface's image in two cameras
+CONFIRMED = 2  # other cameras that must find the same depth
+NEAR = 2.5  # planes by which two cameras' depths may differ
+FLAT = 1e-8  # product of two variances, below which windows are flat and look like nothing
+
+
+class Surface(NamedTuple):
+    """points: (N, 3) world units. colors: (N, 3) in [0, 1]. share: of all pixels, those whose depth is known."""
+
+    points: NDArray[np.float32]
+    colors: NDArray[np.float32]
+    share: float
+
+
+class _Still(NamedTuple):
+    """A camera, and what it sees that does not move: colors (H, W, 3) in [0, 1], and their gray (H, W)."""
+
+    camera: Camera
+    colors: NDArray[np.float32]
+    gray: Array
+
+
+@lru_cache(maxsize=2)
+def still_surface(dataset: Dataset) -> Surface | None:
+    """The surfaces that the training cameras of a rig see, a point a pixel; None where cameras move, where there are
+    fewer than three, or where nothing states how deep they see. Raises InputError where an image cannot be read."""
+    if dataset.depths is None or not dataset.still_cameras or len(dataset.cameras) < 3:
+        return None
+    stills = _stills(dataset)
+    near, far = dataset.depths
+    planes = np.linspace(1 / far, 1 / near, DEPTHS)
+    maps = [_sweep(still, _nearest(still, stills), planes) for still in stills]
+    points, colors, known, every = [], [], 0, 0
+    for i, (still, inverse) in enumerate(zip(stills, maps, strict=True)):
+        places = _places(still.camera, 1 / inverse.ravel())
+        agreeing = sum(
+            _agrees(places, other.camera, of_other, NEAR * (planes[1] - planes[0]))
+            for j, (other, of_other) in enumerate(zip(stills, maps, strict=True))
+            if j != i
+        )
+        kept = np.isfinite(inverse.ravel()) & (agreeing >= CONFIRMED)
+        points.append(places[kept].astype(np.float32))
+        colors.append(still.colors.reshape(-1, 3)[kept])
+        known, every = known + int(kept.sum()), every + kept.size
+    return Surface(np.concatenate(points), np.concatenate(colors), known / every)
+
+
+def _stills(dataset: Dataset) -> list[_Still]:
+    cameras = [dataset.cameras[i] for i in _evenly(len(dataset.cameras), CAMERAS)]
+    found = []
+    for camera in cameras:
+        views = sorted((view for view in dataset.train if view.camera is camera), key=lambda view: view.time)
+        small = small_views([views[i] for i in _evenly(len(views), IMAGES)], SIDE)
+        colors = (np.median([view.load()[..., :3] for view in small], axis=0) / 255).astype(np.float32)
+        found.append(_Still(small[0].camera, colors, colors.mean(axis=2, dtype=np.float64)))
+    return found
+
+
+def _evenly(count: int, most: int) -> list[int]:
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)).tolist()
+
+
+def _nearest(still: _Still, stills: list[_Still]) -> list[_Still]:
+    others = [other for other in stills if other is not still]
+    return sorted(others, key=lambda other: float(np.linalg.norm(other.camera.position - still.camera.position)))[
+        :OTHERS
+    ]
+
+
+def _sweep(still: _Still, others: list[_Still], planes: Array) -> Array:
+    """(H, W) the inverse depth at which the better half of the other cameras sees the same; NaN where none does."""
+    scores = np.stack([_likeness(still, others, plane) for plane in planes])
+    best = scores.argmax(axis=0)[None]
+    score = np.take_along_axis(scores, best, 0)
+    before, after = (np.take_along_axis(scores, (best + k).clip(0, len(planes) - 1), 0) for k in (-1, 1))
+    bend = before - 2 * score + after
+    shift = np.where(bend < 0, 0.5 * (before - after) / np.minimum(bend, -1e-9), 0.0).clip(-0.5, 0.5)
+    inverse = planes[best] + shift * (planes[1] - planes[0])
+    return np.where(score >= LEAST, inverse, np.nan)[0]
+
+
+def _likeness(still: _Still, others: list[_Still], plane: float) -> Array:
+    """(H, W) mean normalized cross-correlation with the better half of the others at this inverse depth; -1 where
+    fewer than two see it."""
+    height, width = still.gray.shape
+    places = _places(still.camera, np.full(height * width, 1 / plane))
+    mean = _box(still.gray)
+    variance = _box(still.gray**2) - mean**2
+    found = []
+    for other in others:
+        x, y, inside = _pixels(places, other.camera)
+        at = np.stack([y, x]).reshape(2, height, width) - 0.5
+        there = ndimage.map_coordinates(other.gray, at, order=1, mode="nearest")
+        its_mean = _box(there)
+        both = variance * (_box(there**2) - its_mean**2)
+        likeness = (_box(still.gray * there) - mean * its_mean) / np.sqrt(np.maximum(both, FLAT))
+        found.append(np.where(inside.reshape(height, width), likeness, np.nan))
+    ordered = np.sort(found, axis=0)  # NaN last
+    seeing = np.isfinite(ordered).sum(axis=0)
+    taken = np.maximum(2, (seeing + 1) // 2)
+    sums = np.concatenate([np.zeros((1, height, width)), np.cumsum(np.nan_to_num(ordered), axis=0)])
+    better = np.take_along_axis(sums, seeing[None], 0) - np.take_along_axis(
+        sums, np.maximum(seeing - taken, 0)[None], 0
+    )
+    return np.where(seeing >= 2, better[0] / taken, -1.0)
+
+
+def _box(image: Array) -> Array:
+    return ndimage.uniform_filter(image, WINDOW, mode="nearest")
+
+
+def _places(camera: Camera, depths: Array) -> Array:
+    """(H W, 3) the points at these depths (H W,) of the middles of the pixels, world units."""
+    y, x = np.mgrid[: camera.height, : camera.width] + 0.5
+    rays = np.linalg.solve(camera.K, np.stack([x.ravel(), y.ravel(), np.ones(x.size)]))
+    return (rays * depths - camera.T_cam_world[:3, 3:]).T @ camera.T_cam_world[:3, :3]
+
+
+def _pixels(places: Array, camera: Camera) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Where points (N, 3) are in a camera's image, x and y (N,) in pixels, and whether they are inside it."""
+    local = places @ camera.T_cam_world[:3, :3].T + camera.T_cam_world[:3, 3]
+    ahead = local[:, 2] > 1e-9
+    x, y = (local @ camera.K.T)[:, :2].T / np.where(ahead, local[:, 2], 1.0)
+    inside = ahead & (x >= 0.5) & (y >= 0.5) & (x <= camera.width - 0.5) & (y <= camera.height - 0.5)
+    return np.where(inside, x, 0.5), np.where(inside, y, 0.5), inside
+
+
+def _agrees(places: Array, camera: Camera, inverse: Array, most: float) -> NDArray[np.bool_]:
+    """(N,) whether a camera's inverse depths (H, W) are those of the points."""
+    x, y, inside = _pixels(places, camera)
+    of_camera = inverse[y.astype(np.int64), x.astype(np.int64)]
+    depths = places @ camera.T_cam_world[2, :3] + camera.T_cam_world[2, 3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return inside & (np.abs(of_camera - 1 / depths) < most)
