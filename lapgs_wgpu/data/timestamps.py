@@ -55,11 +55,11 @@ def in_step(names: Sequence[ImageName], values: Sequence[float]) -> list[float]:
     apart = [np.diff(np.unique(times[[c == camera for c in cameras]])) for camera in dict.fromkeys(cameras)]
     if len(apart) < 2 or not len(np.concatenate(apart)):
         return list(values)
-    least = IN_STEP * float(np.median(np.concatenate(apart)))
+    apart_at_most = IN_STEP * float(np.median(np.concatenate(apart)))
     groups: list[list[int]] = []
     for i in np.argsort(times, kind="stable").tolist():
         group = groups[-1] if groups else []
-        if group and times[i] - times[group[0]] < least and cameras[i] not in {cameras[j] for j in group}:
+        if group and times[i] - times[group[0]] < apart_at_most and cameras[i] not in {cameras[j] for j in group}:
             group.append(i)
         else:
             groups.append([i])
