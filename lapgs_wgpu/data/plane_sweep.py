@@ -41,11 +41,14 @@ class Surface(NamedTuple):
 
 
 class _Still(NamedTuple):
-    """A camera, and what it sees that does not move: colors (H, W, 3) in [0, 1], and their gray (H, W)."""
+    """A camera, and what it sees that does not move: colors (H, W, 3) in [0, 1], their gray (H, W), and its mean and
+    variance (H, W) over the window of each pixel."""
 
     camera: Camera
     colors: NDArray[np.float32]
     gray: Array
+    mean: Array
+    variance: Array
 
 
 @lru_cache(maxsize=2)
@@ -80,7 +83,9 @@ def _stills(dataset: Dataset) -> list[_Still]:
         views = sorted((view for view in dataset.train if view.camera is camera), key=lambda view: view.time)
         small = small_views([views[i] for i in _evenly(len(views), IMAGES)], SIDE)
         colors = (np.median([view.load()[..., :3] for view in small], axis=0) / 255).astype(np.float32)
-        found.append(_Still(small[0].camera, colors, colors.mean(axis=2, dtype=np.float64)))
+        gray = colors.mean(axis=2, dtype=np.float64)
+        mean = _box(gray)
+        found.append(_Still(small[0].camera, colors, gray, mean, _box(gray**2) - mean**2))
     return found
 
 
@@ -89,10 +94,10 @@ def _evenly(count: int, most: int) -> list[int]:
 
 
 def _nearest(still: _Still, stills: list[_Still]) -> list[_Still]:
-    others = [other for other in stills if other is not still]
-    return sorted(others, key=lambda other: float(np.linalg.norm(other.camera.position - still.camera.position)))[
-        :OTHERS
-    ]
+    def distance(other: _Still) -> float:
+        return float(np.linalg.norm(other.camera.position - still.camera.position))
+
+    return sorted((other for other in stills if other is not still), key=distance)[:OTHERS]
 
 
 def _sweep(still: _Still, others: list[_Still], planes: Array) -> Array:
@@ -112,25 +117,21 @@ def _likeness(still: _Still, others: list[_Still], plane: float) -> Array:
     fewer than two see it."""
     height, width = still.gray.shape
     places = _places(still.camera, np.full(height * width, 1 / plane))
-    mean = _box(still.gray)
-    variance = _box(still.gray**2) - mean**2
     found = []
     for other in others:
         x, y, inside = _pixels(places, other.camera)
         at = np.stack([y, x]).reshape(2, height, width) - 0.5
         there = ndimage.map_coordinates(other.gray, at, order=1, mode="nearest")
         its_mean = _box(there)
-        both = variance * (_box(there**2) - its_mean**2)
-        likeness = (_box(still.gray * there) - mean * its_mean) / np.sqrt(np.maximum(both, FLAT))
+        both = still.variance * (_box(there**2) - its_mean**2)
+        likeness = (_box(still.gray * there) - still.mean * its_mean) / np.sqrt(np.maximum(both, FLAT))
         found.append(np.where(inside.reshape(height, width), likeness, np.nan))
     ordered = np.sort(found, axis=0)  # NaN last
     seeing = np.isfinite(ordered).sum(axis=0)
     taken = np.maximum(2, (seeing + 1) // 2)
     sums = np.concatenate([np.zeros((1, height, width)), np.cumsum(np.nan_to_num(ordered), axis=0)])
-    better = np.take_along_axis(sums, seeing[None], 0) - np.take_along_axis(
-        sums, np.maximum(seeing - taken, 0)[None], 0
-    )
-    return np.where(seeing >= 2, better[0] / taken, -1.0)
+    all_of, worse = (np.take_along_axis(sums, k[None], 0)[0] for k in (seeing, np.maximum(seeing - taken, 0)))
+    return np.where(seeing >= 2, (all_of - worse) / taken, -1.0)
 
 
 def _box(image: Array) -> Array:
