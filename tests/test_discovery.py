@@ -331,47 +331,33 @@ def still_view(device: Device, width: int = 24, height: int = 16) -> tuple[Scene
     return static, camera, static.render(camera, 0.5, torch.zeros(3)).image.numpy(force=True)
 
 
-def test_parts_must_bring_the_static_fit_nearer_to_the_images(device: Device) -> None:
+def test_parts_must_show_where_something_moves(device: Device) -> None:
     static, camera, still = still_view(device)
     images = []
     for i in range(3):
         shown = still.copy()
-        shown[4:7, 3 + i : 6 + i] = 0.7
+        shown[3:8, 2 + i : 7 + i] = 0.7
         images.append(Residual(camera, i / 2, shown, still))
-        assert images[-1].error == images[-1].error_of(still) > 0
     there = np.array([[-0.9 + 0.12 * i, 0.0, 0.3] for i in range(3)])
     elsewhere = there * [-1, 1, 1]
-    kept = tracks_in_images(tracks_along(elsewhere, there), np.array([0.0, 0.5, 1.0]), images, static, 0.0)
+    times = np.array([0.0, 0.5, 1.0])
+    kept = tracks_in_images(tracks_along(elsewhere, there), times, images, static, 0.0)
     assert kept is not None
     assert np.array_equal(kept.paths, tracks_along(there).paths)
-    assert tracks_in_images(tracks_along(elsewhere), np.array([0.0, 0.5, 1.0]), images, static, 0.0) is None
+    for together in (1, 2):
+        assert tracks_in_images(tracks_along(elsewhere), times, images * together, static, 0.0) is None
 
 
-def test_parts_that_change_largely_what_moves_need_no_gain(device: Device) -> None:
-    """Here they are too bright; in front of texture a soft rim costs more than they gain."""
-    static, camera, still = still_view(device)
-    path = np.tile([-0.8, 0.0, 0.3], (3, 1))
-    for side, keeps in ((5, True), (1, False)):  # of what moves, pixels
-        images = []
-        for i in range(3):
-            shown = still.copy()
-            shown[5 - side // 2 : 6 + side // 2, max(0, 4 - side // 2) : 5 + side // 2] = 0.12
-            images.append(Residual(camera, i / 2, shown, still))
-        kept = tracks_in_images(tracks_along(path), np.array([0.0, 0.5, 1.0]), images, static, 0.0)
-        assert (kept is not None) == keeps
-
-
-def test_parts_whose_change_is_right_need_no_gain(device: Device) -> None:
-    """Here they have wide rims, as a pale shadow has; the more of what is there shows, the more of them is right.
-    Where several cameras see each time, half is enough."""
+def test_parts_of_several_cameras_may_bring_the_images_nearer_instead(device: Device) -> None:
+    """Here little of what a part changes moves; the more of what is there shows, the more it gains."""
     static, camera, still = still_view(device, 48, 32)
     part = tracks_along(np.tile([-0.7, 0.0, 0.2], (3, 1)), spread=0.1)
     scene = Scene4D(rows_with(static, part), static.field_config, device, sh_degree=static.sh_degree)
-    rendered = scene.render(camera, 0.5, torch.zeros(3)).image.numpy(force=True)
-    core = np.where(rendered - still > 0.65 * (rendered - still).max(), rendered - still, 0.0)
-    for strength, together, keeps in ((1.3, 1, True), (0.9, 1, False), (0.9, 2, True), (0.6, 2, False)):
+    change = scene.render(camera, 0.5, torch.zeros(3)).image.numpy(force=True) - still
+    core = np.where(change > 0.5 * change.max(), change, 0.0)
+    for strength, together, keeps in ((1.0, 1, False), (1.0, 2, True), (0.5, 2, False)):
         images = [Residual(camera, i / 2, still + np.float32(strength) * core, still) for i in range(3)] * together
-        assert images[0].error < images[0].error_of(rendered)
+        assert images[0].mask.sum() < 0.5 * (change > 2 / 255).any(axis=2).sum()
         kept = tracks_in_images(part, np.array([0.0, 0.5, 1.0]), images, static, 0.0)
         assert (kept is not None) == keeps
 
@@ -414,7 +400,8 @@ def test_what_is_exposed_otherwise_does_not_move(device: Device) -> None:
         training = FittedAlready(static, known)
         found = static_fit(configure(), data, device, lambda *_, of=training: of, lambda step: None)
         assert any(image.mask.any() for image in found.images) == moving
-        assert (found.images[0].error < 1e-3) == (not moving)
+        error = np.abs(found.images[0].still - found.images[0].image).mean()
+        assert (error < 1e-3) == (not moving)
 
 
 # The field, and all together -----------------------------------------------------------------------------------------

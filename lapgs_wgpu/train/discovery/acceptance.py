@@ -1,7 +1,7 @@
 """Which of the parts that were followed a training starts with.
 
-A part must bring the static fit nearer to the images, or at least change it in the right direction or largely where
-something moves: patches of what the static fit only blurs do not, though they can be followed.
+A part must show where something moves, or, where several cameras see each time, bring the static fit nearer to the
+images. Patches of what the static fit only blurs do neither, though they can be followed.
 """
 
 from __future__ import annotations
@@ -23,12 +23,11 @@ from .surface_points import PointClouds
 from .tracks import Tracks
 
 OPACITY = 0.3  # of the Gaussian of a track
-SCALE = 0.8  # of it, in mean distances to its nearest neighbours
+SCALE = 0.4  # of it, in mean distances to its nearest neighbours; more of them lie behind one another
 IMAGES = 60  # by which a part is judged, at most
-CHANGED = 2.0 / 255  # of a pixel's channel, from which on a part changes it
-RIGHT = 0.75  # share of a part's change that is right, from which on it needs no gain
-RIGHT_TOGETHER = 0.5  # the same where several images show each time: their depths agree, whatever moves
-LARGELY = 0.42  # share of the pixels that a part changes that move, from which on it needs no gain
+CHANGED = 2.0 / 255  # of a pixel's channel, from which on a part shows there
+MOVING = 0.53  # share of the pixels in which a part shows that move, at least
+GAIN = 0.05  # or share of the static fit's error there that it takes away: where several images show each time
 NEAR = 0.1  # box half sides; distance within which a track explains a surface point
 
 
@@ -56,33 +55,29 @@ def rows_with(static: Scene4D, tracks: Tracks) -> dict[str, Tensor]:
 def tracks_in_images(
     tracks: Tracks, times: NDArray[np.float64], images: Sequence[Residual], static: Scene4D, background: float
 ) -> Tracks | None:
-    """The parts that, each by itself, bring the static fit nearer to the images; None where there are none.
+    """The parts that, each by itself, show where something moves; None where there are none.
 
-    The soft rims of a part's Gaussians may cost more than the part gains: around a pale shadow, or in front of texture.
-    So a part is kept, too, whose change of the images is right by RIGHT or RIGHT_TOGETHER at least (that much of it
-    brings them nearest, by squared differences), or which changes largely moving pixels.
+    Where several images show each time, their depths agree whatever moves, and a part that brings the static fit nearer
+    to the images is kept, too.
 
     times: (T,), of the tracks. background: level of its channels.
     """
     judges = [images[i] for i in np.linspace(0, len(images) - 1, min(len(images), IMAGES)).astype(np.int64)]
-    least_right = RIGHT if 2 * len(times) > len(images) else RIGHT_TOGETHER
+    together = 2 * len(times) <= len(images)
     kept = np.zeros(int(tracks.part.max()) + 1, bool)
     for k in range(len(kept)):
         part = tracks.of_parts(np.arange(len(kept)) == k)
         assert part is not None
-        kept[k] = _improves(part, times, judges, static, background, least_right)
+        moving, gain = _shares(part, times, judges, static, background)
+        kept[k] = moving >= MOVING or (together and gain >= GAIN)
     return tracks.of_parts(kept)
 
 
-def _improves(
-    part: Tracks,
-    times: NDArray[np.float64],
-    images: Sequence[Residual],
-    static: Scene4D,
-    background: float,
-    least_right: float,
-) -> bool:
-    """Whether a part, beside the static fit, gains, is right by least_right, or changes largely what moves."""
+def _shares(
+    part: Tracks, times: NDArray[np.float64], images: Sequence[Residual], static: Scene4D, background: float
+) -> tuple[float, float]:
+    """Of the pixels in which a part shows, those that move; and of the static fit's error there (sum of absolute
+    differences), what it takes away."""
     scene = Scene4D(
         rows_with(static, part),
         static.field_config,
@@ -91,20 +86,17 @@ def _improves(
         antialiased=static.antialiased,
     )
     level = torch.full((3,), background)
-    gain, agreeing, change, changed, moving = 0.0, 0.0, 0.0, 0, 0
+    pixels, moving, before, after = 0, 0, 0.0, 0.0
     for image in images:
         with torch.no_grad():
             path = torch.from_numpy(part.paths[np.searchsorted(times, image.time)])
             scene.parameters["means"][len(static) :] = path
             rendered = scene.render(image.camera, image.time, level, depth=False).image.numpy(force=True)
-        gain += image.error - image.error_of(rendered)
-        difference = rendered - image.still
-        agreeing += float((difference * (image.image - image.still)).sum())
-        change += float(np.square(difference).sum())
-        where = np.abs(difference).max(axis=2) > CHANGED
-        changed, moving = changed + int(where.sum()), moving + int((where & image.mask).sum())
-    right, largely = 0 < least_right * change <= agreeing, 0 < LARGELY * changed <= moving
-    return gain > 0 or right or largely
+        shows = np.abs(rendered - image.still).max(axis=2) > CHANGED
+        pixels, moving = pixels + int(shows.sum()), moving + int((shows & image.mask).sum())
+        before += float(np.abs(image.still - image.image)[shows].sum())
+        after += float(np.abs(rendered - image.image)[shows].sum())
+    return moving / max(pixels, 1), 1.0 - after / max(before, 1e-6)
 
 
 def explained_share(clouds: PointClouds, tracks: Tracks, half_side: float) -> float:

@@ -54,15 +54,6 @@ class Residual:
         self.mask = moving_pixels(image, still)
 
     @cached_property
-    def error(self) -> float:
-        """Of the static fit."""
-        return self.error_of(self.still)
-
-    def error_of(self, rendered: Floats) -> float:
-        """Mean absolute difference of a rendering (H, W, 3) from the image."""
-        return float(np.abs(rendered - self.image).mean())
-
-    @cached_property
     def _soft(self) -> Floats:
         """(H, W): 1 in the mask, falling off around it."""
         if not self.mask.any():
