@@ -81,12 +81,13 @@ fn main(
     var d_xx = -(a * a * g.x + 2.0 * a * b * g.y + b * b * g.z);
     var d_xy = -2.0 * (a * b * g.x + (a * c + b * b) * g.y + b * c * g.z);
     var d_yy = -(b * b * g.x + 2.0 * b * c * g.y + c * c * g.z);
-    if (frame.antialiased == 1u) {   // the splat's log opacity is the Gaussian's plus log(flat / det) / 2
-        let half = 0.5 * d1.y;
-        d_xx += half * ((yy - DILATION) / flat - a);
-        d_xy += 2.0 * half * (-xyc / flat - b);
-        d_yy += half * ((xx - DILATION) / flat - c);
-    }
+    // The splat's log opacity is the Gaussian's plus log(flat / det) / 2. No branch: with one, Mesa's software driver
+    // loses some memory at each run.
+    let half = 0.5 * d1.y;
+    let antialiased = frame.antialiased == 1u;
+    d_xx += select(0.0, half * ((yy - DILATION) / flat - a), antialiased);
+    d_xy += select(0.0, 2.0 * half * (-xyc / flat - b), antialiased);
+    d_yy += select(0.0, half * ((xx - DILATION) / flat - c), antialiased);
     let d_axes_x = 2.0 * d_xx * axes_x + d_xy * axes_y;
     let d_axes_y = 2.0 * d_yy * axes_y + d_xy * axes_x;
 
