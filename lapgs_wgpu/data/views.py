@@ -143,8 +143,8 @@ class Dataset:
 
     @cached_property
     def moments(self) -> int:
-        """How many moments of the clip are told apart: as many as there are times. A few still cameras may not be in
-        step: then the images of the one that has most are counted."""
+        """The number of moments of the clip: that of its times. Of a few still cameras, which may not be in step, it is
+        the largest number of images of one camera."""
         most = max(Counter(id(view.camera) for view in self.train).values())
         return most if len(self.cameras) <= most else len(self.times)
 

@@ -18,8 +18,8 @@ UNFINISHED, FINISHED, LOCK = ".unfinished", ".finished", ".lock"
 def appearing(out: Path) -> Iterator[Path]:
     """A folder to write to, whose contents move to `out` if the block ends without an exception.
 
-    An exception removes the folder, and a new `out` with it. The folder lies in `out`. `out` may be the present
-    folder, a link or a mount. What is finished is never removed. Raises InputError where `out` is not empty,
+    The folder lies in `out`, which may be the present folder, a link or a mount. An exception removes the folder, and
+    `out` too if it is new. What is finished is never removed. Raises InputError where `out` is not empty,
     or another process writes to it.
     """
     new = not out.exists()
