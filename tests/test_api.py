@@ -321,6 +321,13 @@ def test_groups_of_ones_own_field_have_rates_of_their_own(dataset: Dataset, devi
         assert module.velocity.abs().max().item() == pytest.approx(1e-3, rel=1e-3)  # Adam's first step
         assert (trainer.scene.parameters["means"] - before).abs().max() < 2e-7
 
+    class Greedy(Grouped):
+        def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+            return {"means": [self.velocity]}
+
+    with pytest.raises(InputError, match="the field's group means has the name of parameters of the training's own"):
+        Trainer(configure(), dataset, device, parts=Parts(field=Greedy()))
+
     class Forgetful(Grouped):
         def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
             return {}

@@ -28,7 +28,7 @@ from lapgs_wgpu.train.camera_descent import ScenePoints, image_motion, whitening
 from lapgs_wgpu.train.camera_refinement import CameraRefinement, changed_camera, rotation_of, rotation_vector
 from lapgs_wgpu.train.config import CamerasConfig
 from lapgs_wgpu.train.discovery.static_fit import static_config
-from lapgs_wgpu.train.evaluate import evaluate
+from lapgs_wgpu.train.evaluate import evaluate, mean_psnr
 from lapgs_wgpu.train.fused_loss import render_loss
 from lapgs_wgpu.train.learning_rate import Rate
 from lapgs_wgpu.train.presets import load_config
@@ -306,6 +306,17 @@ def test_what_discovery_corrected_stays_corrected(device: Device, dataset: Datas
         training.step()  # at once, though cameras.start is later
         later = [training.cameras.refined(camera).camera for camera in dataset.cameras]
         assert any(np.abs(a.T_cam_world - b.T_cam_world).max() > 1e-7 for a, b in zip(start, later, strict=True))
+
+
+def test_training_views_are_measured_by_their_corrected_cameras(
+    refined_walk: tuple[Trainer, list[Camera]],
+) -> None:
+    training, _ = refined_walk
+    views = training.dataset.train[:4]
+    as_given = mean_psnr(training.scene, views, "black")
+    assert training.psnr(views) > as_given + 1
+    assert training.evaluate(views)["psnr"] == training.psnr(views)
+    assert training.psnr(training.dataset.test) == mean_psnr(training.scene, training.dataset.test, "black")
 
 
 def test_state_of_other_cameras_is_refused() -> None:

@@ -163,6 +163,18 @@ def test_validation_views_that_are_not_usable_are_left_out_with_a_warning(tmp_pa
     assert any("validation views" in warning and "transforms_val.json" in warning for warning in dataset.warnings)
 
 
+def test_validation_views_of_another_size_are_left_out_with_a_warning(tmp_path: Path) -> None:
+    def with_val(folder: Path, scene: Scene) -> None:
+        scene["val"] = {**scene["test"], "frames": [{**scene["test"]["frames"][0], "file_path": "./val"}]}
+        Image.new("RGBA", (2 * WIDTH, 2 * HEIGHT)).save(folder / "val.png")
+
+    dataset = load_dataset(make_scene(tmp_path / "toy", with_val))
+    assert (len(dataset.train), dataset.val) == (3, ())
+    (warning,) = (warning for warning in dataset.warnings if "validation views" in warning)
+    assert f"{2 * WIDTH}x{2 * HEIGHT}" in warning
+    assert f"is {WIDTH}x{HEIGHT}" in warning
+
+
 def frame_with(**fields: Any) -> Callable[[Path, Scene], None]:
     """Give the second training frame other fields."""
     return lambda folder, scene: scene["train"]["frames"][1].update(fields)

@@ -6,6 +6,8 @@ Each sample is what cameras see of blobs. The reader's cameras must see the same
 from __future__ import annotations
 
 import json
+import struct
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -87,6 +89,35 @@ def test_without_points_gaussians_start_before_the_cameras(device: Device, tmp_p
     assert "holds 0 points" in data.warnings[0]
 
 
+def test_other_poses_than_endonerfs(device: Device, tmp_path: Path) -> None:
+    """poses_bounds.npy beside images/ may be LLFF's, whose axes are others."""
+    folder = write_endonerf(tmp_path / "toy", device)
+    rows = np.load(folder / "poses_bounds.npy")
+    rows[:, 3] += np.linspace(0, 1, len(rows))
+    np.save(folder / "poses_bounds.npy", rows)
+    warning, *_ = load_dataset(folder).warnings
+    assert "10 poses" in warning
+    assert "LLFF" in warning
+
+
+def test_a_phone_on_a_tripod(device: Device, tmp_path: Path) -> None:
+    """Without a cloud nothing tells its depths, which is said; the scene keeps a sane size."""
+
+    def stand(folder: Path) -> Path:
+        file = folder / "metadata.json"
+        data = json.loads(file.read_text())
+        data["poses"] = [data["poses"][0]] * len(data["poses"])
+        file.write_text(json.dumps(data))
+        return folder
+
+    data = load_dataset(stand(write_record3d(tmp_path / "toy", device)))
+    assert data.cloud is None
+    assert any("look in one direction" in warning and "is a guess" in warning for warning in data.warnings)
+    assert data.depths is not None
+    assert 0.1 < data.depths[0] < data.depths[1] < 10
+    assert 0.1 < data.scale < 10
+
+
 def test_megasams_crop() -> None:
     assert _uncropped((584, 328), (854, 480)) == (591, 332)
     assert _uncropped((854, 480), (854, 480)) == (854, 480)
@@ -157,6 +188,13 @@ def with_value(row: int, column: int, value: float) -> Callable[[np.ndarray], np
     return change
 
 
+def claim(png: Path, side: int) -> None:
+    """Let a PNG's header claim so many pixels a side."""
+    file = png.read_bytes()
+    header = b"IHDR" + struct.pack(">II", side, side) + file[24:29]
+    png.write_bytes(file[:12] + header + struct.pack(">I", zlib.crc32(header)) + file[33:])
+
+
 REFUSED: dict[str, tuple[Callable[[Path, Device], Path], Callable[[Path], Any], list[str]]] = {
     "a pose too few": (write_record3d, edit("metadata.json", lambda d: d["poses"].pop()), ["5 poses", "5.jpg"]),
     "a quaternion too long": (
@@ -213,6 +251,11 @@ REFUSED: dict[str, tuple[Callable[[Path, Device], Path], Callable[[Path], Any], 
         write_endonerf,
         lambda folder: Image.fromarray(np.ones((HEIGHT, WIDTH, 3), np.uint8)).save(folder / "depth/000000.png"),
         ["mode RGB", "gray"],
+    ),
+    "a depth map that claims to be huge": (
+        write_endonerf,
+        lambda folder: claim(folder / "depth/000000.png", 30_000),
+        ["000000.png is not a readable depth map"],
     ),
     "a depth map that is none": (
         write_endonerf,

@@ -113,6 +113,23 @@ def test_cameras_and_frames_go_by_number(device: Device, tmp_path: Path) -> None
         assert agreement(data, moved(frame), device, frame_of([*data.train, *data.test], frame)) > 50
 
 
+def test_masks_have_the_names_of_the_images(toy: Path, tmp_path: Path) -> None:
+    """Not those of the images' places in the film: these begin with 7.png."""
+    for file in sorted((toy).glob("cam*/images/*.png"), reverse=True):
+        file.rename(file.with_name(f"{int(file.stem) + 7}.png"))
+    for camera in range(1, 4):
+        folder = tmp_path / f"masks/cam{camera:02}"
+        folder.mkdir(parents=True)
+        for frame in range(10):  # of a longer film
+            Image.new("L", (WIDTH, HEIGHT), 255 if frame == 8 else 0).save(folder / f"{frame}.png")
+    data = load_dataset(toy, masks=tmp_path / "masks")
+    ignored = {view.name: view.load_ignored() for view in data.train}
+    assert {name for name, pixels in ignored.items() if pixels is not None and pixels.all()} == {
+        f"train_cam{camera:02}_00001" for camera in range(1, 4)
+    }
+    assert sum(pixels is not None and not pixels.any() for pixels in ignored.values()) == 6
+
+
 def test_pictures_go_before_a_video(clip: Path, toy: Path) -> None:
     shutil.copytree(toy / "cam00", clip / "cam00")
     data = load_dataset(clip)
@@ -331,6 +348,7 @@ BAD: dict[str, tuple[Change, list[str]]] = {
     "no pictures": (gone(*(f"cam01/images/{i:04d}.png" for i in range(3))), ["cam01/images", "no images"]),
     "a frame less": (gone("cam02/images/0001.png"), ["cam02", "2 frames", "cam00", "3"]),
     "other size": (picture("cam02/images/0000.png", (32, 24)), ["cam02", "32x24", "cam00", "64x48"]),
+    "one of another size": (picture("cam02/images/0002.png", (32, 24)), ["cam02/images/0002.png", "32x24", "64x48"]),
     "other proportions": (square, ["cam00", "64x64", "128x96", FILE]),
     "a number twice": (picture("cam01/images/x_001.png"), ["cam01/images", "the number 1"]),
     "no number": (picture("cam01/images/last.png"), ["last.png", "has no number"]),

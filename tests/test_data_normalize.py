@@ -130,6 +130,10 @@ def test_a_still_camera(tmp_path: Path) -> None:
     data = load_dataset(write_scene(tmp_path / "toy", [away] * 4))
     points = initial_points(load_config("tiny").points, data, 0)[0].astype(np.float64)
     assert (views_of(points, data.cameras[:1]) > 0).mean() > 0.5
+    one, many = cube_in_view([away]), cube_in_view([away] * 97)  # whose mean position is off by a rounding
+    assert one is not None
+    assert many is not None
+    assert many.half == pytest.approx(one.half, rel=1e-6)
 
 
 def test_cameras_that_look_outward(tmp_path: Path) -> None:

@@ -88,6 +88,14 @@ def test_cameras_at_one_place() -> None:
     assert "4.36 away from the cloud" in warning
 
 
+def test_a_camera_of_many_images_counts_once() -> None:
+    taken = cameras(4)
+    taken[1] = turned(taken[1])
+    (warning,) = views([camera for camera in taken for _ in range(10)])
+    assert "10.png see none" in warning
+    assert "1 of 4 cameras" in warning
+
+
 @pytest.mark.parametrize("scale", [1e-5, 100.0])
 def test_cloud_and_cameras_at_different_scales(scale: float, device: Device, tmp_path: Path) -> None:
     """Points that were scaled, cameras that were not."""

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from lapgs_wgpu.data import Dataset, ImageCache, View, composite
-from lapgs_wgpu.data.views import spread_views
+from lapgs_wgpu.data.normalize import BOX
+from lapgs_wgpu.data.views import extent_of, spread_views
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
 
@@ -143,7 +144,18 @@ def test_extent_and_times() -> None:
     views = tuple(view_of(Source(), f"train_{i}", time) for i, time in enumerate((0.5, 0.0, 0.5)))
     data = Dataset("toy", views, ())
     np.testing.assert_array_equal(data.times, [0.0, 0.5])
-    assert data.extent == 0
+
+
+@pytest.mark.parametrize("count", [1, 3, 97])
+def test_cameras_at_one_place_have_the_extent_of_the_scene(count: int) -> None:
+    """Also where their mean is off by a rounding."""
+    eye = np.array([0.1, -3.7, 1 / 3])
+    camera = Camera.looking_at(eye, [0, 0, 0], up=[0, 0, 1], fov_x=0.7, width=5, height=4)
+    views = [dataclasses.replace(view_of(Source()), camera=dataclasses.replace(camera)) for _ in range(count)]
+    data = Dataset("toy", tuple(views), ())
+    assert data.extent == BOX
+    np.testing.assert_allclose(data.focus, eye + BOX * camera.T_cam_world[2, :3], rtol=1e-6)
+    assert extent_of([camera, CAMERA]) == pytest.approx(0.55 * np.linalg.norm(eye - CAMERA.position))
 
 
 def test_cache_keeps_the_most_recently_used() -> None:

@@ -24,7 +24,7 @@ from lapgs_wgpu.splat.rasterize import rasterize
 from lapgs_wgpu.train.fused_loss import render_loss
 from lapgs_wgpu.train.run import train
 from lapgs_wgpu.train.run_folder import start_run_folder
-from lapgs_wgpu.train.truth_cache import upload_rgba, without
+from lapgs_wgpu.train.truth_cache import LEFT_OUT, upload_rgba, without
 
 IGNORED = np.zeros(TRUTH.shape[:2], np.bool_)
 IGNORED[10:30, 20:45] = True
@@ -62,7 +62,17 @@ def test_transparent_pixels_still_count() -> None:
     assert marked[0, 0].tolist() == [0, 0, 0, 0]
     assert marked[1, 2].tolist() == [1, 0, 0, 0]
     assert marked[0, 1].tolist() == [7, 7, 7, 7]
-    assert without(rgba, None) is rgba
+    opaque = rgba[..., :3]
+    assert without(opaque, None) is opaque
+
+
+def test_colors_under_transparency_leave_nothing_out() -> None:
+    """The mark of what is left out is a color that a file may hold."""
+    rgba = np.full((2, 3, 4), 7, np.uint8)
+    rgba[0, 0] = LEFT_OUT
+    cleaned = without(rgba, None)
+    assert cleaned[0, 0].tolist() == [0, 0, 0, 0]
+    np.testing.assert_array_equal(cleaned[1], rgba[1])
 
 
 def test_what_is_ignored_does_not_change_a_bit(device: Device, dataset: Dataset, tmp_path: Path) -> None:

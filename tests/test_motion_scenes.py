@@ -93,6 +93,7 @@ def test_masks_and_clean_plates_match_the_images(scene: MotionScene, tmp_path: P
                 assert np.abs(centroid - expected).max() < 0.5
                 centred += 1
     assert centred > 0 or scene.objects == "occluded"
+    assert [len(view.objects) for view in data.val] == [len(moving)] * len(data.val)
 
 
 @pytest.mark.parametrize("camera_motion", ["jump", "walk", "still"])

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from lapgs_wgpu.data import Dataset, View
-from lapgs_wgpu.data.plane_sweep import still_surface
+from lapgs_wgpu.data.plane_sweep import _stills, _sweep, still_surface
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train.initial_points import initial_points
 from lapgs_wgpu.train.presets import load_config
@@ -58,6 +58,17 @@ def test_the_surface_is_where_the_wall_is() -> None:
     at = (found.points[:, :2].T + 5.0) * 20.0
     true = np.stack([ndimage.map_coordinates(TEXTURE[..., c], at, order=1, mode="grid-wrap") for c in range(3)], 1)
     assert np.abs(found.colors - true).mean() < 0.03
+
+
+def test_no_depth_is_beyond_the_stated_ones() -> None:
+    """Where the wall is behind the furthest plane, that plane looks most like it."""
+    stills = _stills(rig(moments=2))
+    planes = np.linspace(1 / 3.9, 1 / 2, 4)
+    for still in stills:
+        inverse = _sweep(still, [other for other in stills if other is not still], planes)
+        found = inverse[np.isfinite(inverse)]
+        assert len(found)
+        assert found.min() >= planes[0]
 
 
 def test_what_looks_the_same_everywhere_has_no_depth() -> None:

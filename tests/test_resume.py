@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
 import random
 import shutil
@@ -20,7 +21,7 @@ import torch
 from helpers.interrupts import interrupt_at
 from helpers.training import STEPS, configure
 
-from lapgs_wgpu import cli
+from lapgs_wgpu import cli, load
 from lapgs_wgpu.data import Dataset
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
@@ -29,7 +30,7 @@ from lapgs_wgpu.train import run_folder
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.host_threads import step_threads
 from lapgs_wgpu.train.presets import write_toml
-from lapgs_wgpu.train.run import resume, train
+from lapgs_wgpu.train.run import evaluate_run, resume, train
 from lapgs_wgpu.train.run_folder import STATE, STATE_BEFORE, load_state, locked_run_folder, save_state
 from lapgs_wgpu.train.trainer import Trainer
 
@@ -145,6 +146,22 @@ def test_a_finished_run_is_not_resumed(
     assert "so --schedule.steps cannot be given" in capsys.readouterr().err
     assert cli.train_command(["--resume", str(whole.parent / "nowhere")]) == 2
     assert "config.toml does not exist; --resume needs the folder of a run" in capsys.readouterr().err
+
+
+def test_a_run_that_was_measured_halfway_goes_on(
+    whole: Path, dataset: Dataset, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As lapgs-train --eval does, which leaves metrics.json."""
+    out = tmp_path / "run"
+    with monkeypatch.context() as patched:
+        interrupt_at(20, patched)
+        with pytest.raises(KeyboardInterrupt):
+            train(configure(), dataset, out, device=device)
+    evaluate_run(out, load(out / "checkpoint.ply", device), dataset, "black", {"steps": 20})
+    assert json.loads((out / "metrics.json").read_text())["training"] == {"steps": 20}
+    resume(configure(), dataset, out, device=device)
+    assert (out / "checkpoint.ply").read_bytes() == (whole / "checkpoint.ply").read_bytes()
+    assert json.loads((out / "metrics.json").read_text())["training"]["steps"] == STEPS
 
 
 def test_two_writers_are_kept_apart(tmp_path: Path) -> None:

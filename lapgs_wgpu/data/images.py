@@ -26,7 +26,7 @@ Size = tuple[int, int]  # (width, height) in pixels
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
 _FORMATS = ("PNG", "JPEG")  # no other decoder of Pillow gets a file
-_ERRORS = (  # what Pillow raises; the last five for damage that it takes for valid data
+ERRORS = (  # what Pillow raises; the last five for damage that it takes for valid data
     OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError,
     IndexError, KeyError, TypeError, struct.error, zlib.error,
 )  # fmt: skip
@@ -65,7 +65,7 @@ def check_image(path: Path, *, whole: bool = True) -> ImageFile:
             size, mode = file.size, file.mode
             if whole:
                 file.verify()
-    except _ERRORS as error:
+    except ERRORS as error:
         reason = "neither PNG nor JPEG" if isinstance(error, Image.UnidentifiedImageError) else error
         raise InputError(f"{path} is not a readable image ({reason}); copy or render it again.") from None
     if mode not in _EIGHT_BIT_MODES:
@@ -95,7 +95,7 @@ def gray_thumbnail(path: Path, side: int) -> NDArray[np.float32]:
 def _decoding(path: Path) -> Iterator[None]:
     try:
         yield
-    except _ERRORS as error:
+    except ERRORS as error:
         raise InputError(f"{path} cannot be decoded as an image ({error}); copy or render it again.") from None
 
 

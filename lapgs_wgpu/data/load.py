@@ -18,7 +18,7 @@ from lapgs_wgpu.data.covisible import read_mask
 from lapgs_wgpu.data.frames import Capture, Frame, ImageSource, Reader, Split
 from lapgs_wgpu.data.ignored import find_masks, read_ignored
 from lapgs_wgpu.data.images import Pixels, Size, shrink, shrunk_size
-from lapgs_wgpu.data.normalize import BOX, Cube, cube_in_view, cube_of_points
+from lapgs_wgpu.data.normalize import BOX, Cube, are_parallel, cube_in_view, cube_of_points
 from lapgs_wgpu.data.readers import colmap, dnerf, endonerf, hypernerf, nerfstudio, neu3d, polycam, record3d
 from lapgs_wgpu.data.split import held_out
 from lapgs_wgpu.data.timestamps import disorder, in_step, natural_key, read_times, to_unit_range
@@ -97,7 +97,7 @@ def _dataset(folder: Path, capture: Capture, image_size: int | None, normalize: 
             names = [frame.name.file for frame in frames]
             warnings += check_views(cloud, cameras, names, capture.source, capture.axes_hint)
         check_cloud(cloud, training, capture.source)
-    depths = _depths(capture, splits, training)
+    depths = _depths(capture, splits, training, warnings)
     cube = _cube(capture, training, depths)
     if cube is None:
         warnings.append(
@@ -204,8 +204,11 @@ def _read_pixels(image: ImageSource, undistortion: Undistortion | None, size: Si
     return image.read(size) if undistortion is None else shrink(undistortion.apply(image.read(image.size)), size)
 
 
-def _depths(capture: Capture, splits: Sequence[Split], cameras: Sequence[Camera]) -> tuple[float, float] | None:
-    """Nearest and furthest depth of the training cameras, if the files state it or there is no cloud to replace it."""
+def _depths(
+    capture: Capture, splits: Sequence[Split], cameras: Sequence[Camera], warnings: list[str]
+) -> tuple[float, float] | None:
+    """Nearest and furthest depth of the training cameras, if the files state it or there is no cloud to replace it.
+    Appends a warning where it is a guess."""
     trained = [frame for frame, split in zip(capture.frames, splits, strict=True) if split == "train"]
     stated = [frame.depths for frame in trained if frame.depths is not None]
     if stated:
@@ -220,7 +223,14 @@ def _depths(capture: Capture, splits: Sequence[Split], cameras: Sequence[Camera]
             f"{capture.source}: there is no cloud, and {behind} of {len(cameras)} cameras look away from the point "
             f"nearest to all optical axes: {capture.axes_hint}, or give a cloud."
         )
-    return NEAREST * float(depth[depth > 0].min()), FURTHEST * float(depth.max())
+    near, far = NEAREST * float(depth[depth > 0].min()), FURTHEST * float(depth.max())
+    if are_parallel(cameras):
+        warnings.append(
+            f"{capture.source}: there is no cloud, and all cameras look in one direction, so nothing tells how far "
+            f"away the scene is, and {near:.3g} to {far:.3g} in the capture's units is a guess: walk around what "
+            "moves, or give a cloud."
+        )
+    return near, far
 
 
 def _cube(capture: Capture, cameras: Sequence[Camera], depths: tuple[float, float] | None) -> Cube | None:

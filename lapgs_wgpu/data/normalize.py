@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lapgs_wgpu.data.cloud import Cloud, in_view
-from lapgs_wgpu.data.poses import Array, world_to_camera
+from lapgs_wgpu.data.poses import Array, spread, world_to_camera
 from lapgs_wgpu.splat.camera import Camera
 
 BOX = 1.3  # half side of the cube: D-NeRF's scenes lie in it
@@ -101,6 +101,17 @@ def cube_in_view(cameras: Sequence[Camera]) -> Cube | None:
     return Cube(center, max(half, 1e-6))
 
 
+def are_parallel(cameras: Sequence[Camera]) -> bool:
+    """Whether all look in one direction, as one camera that stands still does: their axes meet nowhere."""
+    return bool(np.linalg.eigvalsh(_across(cameras).mean(axis=0))[0] < PARALLEL)
+
+
+def _across(cameras: Sequence[Camera]) -> Array:
+    """(N, 3, 3) the projections onto the planes across the optical axes."""
+    ahead = np.stack([camera.T_cam_world[2, :3] for camera in cameras])
+    return np.eye(3) - ahead[:, :, None] * ahead[:, None, :]
+
+
 def _focus(cameras: Sequence[Camera]) -> Array:
     """(3,) the point with the least sum of distances from the optical axes, so that outliers hardly move it.
 
@@ -109,10 +120,9 @@ def _focus(cameras: Sequence[Camera]) -> Array:
     """
     centres = np.stack([camera.position for camera in cameras])
     ahead = np.stack([camera.T_cam_world[2, :3] for camera in cameras])
-    across = np.eye(3) - ahead[:, :, None] * ahead[:, None, :]
-    radius = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
-    guess = centres.mean(axis=0) + (radius or 1.0) * ahead.mean(axis=0)
-    if np.linalg.eigvalsh(across.mean(axis=0))[0] < PARALLEL:
+    across = _across(cameras)
+    guess = centres.mean(axis=0) + (spread(centres) or 1.0) * ahead.mean(axis=0)
+    if are_parallel(cameras):
         origin = np.zeros((1, 3))
         return origin[0] if np.mean([in_view(origin, camera)[1][0] for camera in cameras]) >= 0.5 else guess
     point, weights = guess, np.full(len(cameras), 1 / len(cameras))

@@ -107,7 +107,8 @@ def _sweep(still: _Still, others: list[_Still], planes: Array) -> Array:
     score = np.take_along_axis(scores, best, 0)
     before, after = (np.take_along_axis(scores, (best + k).clip(0, len(planes) - 1), 0) for k in (-1, 1))
     bend = before - 2 * score + after
-    shift = np.where(bend < 0, 0.5 * (before - after) / np.minimum(bend, -1e-9), 0.0).clip(-0.5, 0.5)
+    between = (bend < 0) & (best > 0) & (best < len(planes) - 1)
+    shift = np.where(between, 0.5 * (before - after) / np.minimum(bend, -1e-9), 0.0).clip(-0.5, 0.5)
     inverse = planes[best] + shift * (planes[1] - planes[0])
     return np.where(score >= LEAST, inverse, np.nan)[0]
 

@@ -17,6 +17,7 @@ from lapgs_wgpu.data.cloud import Cloud, in_view, views_of
 from lapgs_wgpu.data.covisible import check_mask
 from lapgs_wgpu.data.frames import Frame
 from lapgs_wgpu.data.images import check_image, gray_thumbnail, size_text
+from lapgs_wgpu.data.poses import spread
 from lapgs_wgpu.data.undistort import Lens
 from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.errors import InputError
@@ -193,10 +194,13 @@ def check_in_view(dataset: Dataset, points: NDArray[np.floating]) -> list[str]:
 def check_views(cloud: Cloud, cameras: Sequence[Camera], names: Sequence[str], where: Path, axes: str) -> list[str]:
     """Warn about cameras that see no point of the cloud or hardly move, and about a sparse cloud.
 
-    Cloud and cameras are in the same coordinates. names: of the cameras' images. axes: advice for cameras that look the
+    Cloud and cameras are in the same coordinates. cameras, names: of each image; a camera counts once, by the name of
+    its first image. axes: advice for cameras that look the
     wrong way. Raises InputError if more than half of the cameras see no point.
     """
     points = cloud.points.astype(np.float64)
+    first = sorted({id(camera): i for i, camera in reversed(list(enumerate(cameras)))}.values())
+    cameras, names = [cameras[i] for i in first], [names[i] for i in first]
     seen = np.array([views_of(points, [camera]).sum() for camera in cameras])
     blind = np.flatnonzero(seen == 0).tolist()
     if 2 * len(blind) > len(cameras):
@@ -219,11 +223,11 @@ def check_views(cloud: Cloud, cameras: Sequence[Camera], names: Sequence[str], w
             "more images or larger ones give more."
         )
     centres = np.stack([camera.position for camera in cameras])
-    spread = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
+    reach = spread(centres)
     distance = float(np.median(np.linalg.norm(np.median(points, axis=0) - centres, axis=1)))
-    if spread < STANDING * distance:
+    if reach < STANDING * distance:
         warnings.append(
-            f"the cameras hardly move: they lie within {spread:.3g} of each other, {distance:.3g} away from the cloud, "
+            f"the cameras hardly move: they lie within {reach:.3g} of each other, {distance:.3g} away from the cloud, "
             "so depth cannot be told; walk around what moves."
         )
     return warnings

@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lapgs_wgpu.data.cloud import Cloud
-from lapgs_wgpu.data.normalize import Normalization
+from lapgs_wgpu.data.normalize import BOX, Normalization
 from lapgs_wgpu.data.objects import ObjectTruth
+from lapgs_wgpu.data.poses import spread
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
 
@@ -109,9 +110,9 @@ class Dataset:
 
     @cached_property
     def extent(self) -> float:
-        """1.1 times the largest distance of a training camera from their mean, world units; 0 if all coincide."""
-        centres = np.stack([view.camera.position for view in self.train])
-        return 1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
+        """1.1 times the largest distance of a training camera from their mean, world units; where all are at one place,
+        that of the scene's own size, BOX."""
+        return extent_of([view.camera for view in self.train])
 
     @cached_property
     def fingerprint(self) -> str:
@@ -154,6 +155,11 @@ class Dataset:
         return np.unique([view.time for view in self.train])
 
 
+def extent_of(cameras: Sequence[Camera]) -> float:
+    """As `Dataset.extent`, of any cameras."""
+    return 1.1 * spread(np.stack([camera.position for camera in cameras])) or BOX
+
+
 def focus_of(cameras: Sequence[Camera]) -> NDArray[np.float64]:
     """(3,) the point nearest to all optical axes, in the least-squares sense.
 
@@ -163,8 +169,7 @@ def focus_of(cameras: Sequence[Camera]) -> NDArray[np.float64]:
     ahead = np.stack([camera.T_cam_world[2, :3] for camera in cameras])
     across = np.eye(3) - ahead[:, :, None] * ahead[:, None, :]
     faint = 1e-3 * len(centres) * np.eye(3)
-    extent = 1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
-    guess = centres.mean(axis=0) + (extent or 1.0) * ahead.mean(axis=0)
+    guess = centres.mean(axis=0) + extent_of(cameras) * ahead.mean(axis=0)
     right_side = np.einsum("nij,nj->i", across, centres) + faint @ guess
     return np.linalg.solve(across.sum(axis=0) + faint, right_side)
 

@@ -9,7 +9,6 @@ from pathlib import Path
 from lapgs_wgpu.data.views import Dataset, View, spread_views
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.dataclass_table import did_you_mean
-from lapgs_wgpu.train.evaluate import mean_psnr
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.step_result import StepResult
 from lapgs_wgpu.train.trainer import Trainer
@@ -46,7 +45,7 @@ class Monitor:
         if result.step % trainer.config.eval.interval:
             return
         started = time.perf_counter()
-        psnr = mean_psnr(trainer.scene, self._views, trainer.config.data.background)
+        psnr = trainer.psnr(self._views)
         self._log.evaluated(result.step, psnr, self._name, time.perf_counter() - started)
 
 

@@ -35,6 +35,7 @@ from lapgs_wgpu.train.run_folder import (
     check_run_folder,
     check_state,
     drop_states,
+    has_state,
     load_state,
     locked_run_folder,
     save_state,
@@ -75,6 +76,8 @@ def train(
     whatever else ends a step go on to the caller when that state has been written.
     """
     out = Path(out)
+    if not dataset.test:
+        raise InputError(f"{dataset.name} has no test view, by which a run is measured; add images to the capture.")
     found = check_times(dataset, moving=config.field.kind != "static")
     if config.eval.interval:
         monitored_views(dataset, config.eval.views)
@@ -115,7 +118,7 @@ def resume(
     """Go on with an interrupted training of this configuration and dataset in its run folder, from its last saved
     state, or from the start where it has none. Otherwise as `train`."""
     out = Path(out)
-    if (out / "metrics.json").exists():
+    if (out / "metrics.json").exists() and not has_state(out):  # --eval measures interrupted runs, too
         raise InputError(f"{out} is finished: there is nothing to resume.")
     keep_freed_memory()
     device = device or open_device()
@@ -200,8 +203,7 @@ def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None)
 
     return_freed_memory()
     done, all_steps = training.done, config.schedule.steps
-    if done < all_steps or config.schedule.save_interval:
-        save_state(out, training.state())
+    save_state(out, training.state())
     training.save(out / "checkpoint.ply")
     if done < all_steps:
         raise KeyboardInterrupt(
@@ -299,7 +301,7 @@ def evaluate_run(
         if folder.is_symlink():
             raise InputError(f"{folder} is a link, and pictures are written into the run's own folder only; remove it.")
     (out / "eval").mkdir(exist_ok=True)
-    unit = (dataset.extent or 1.0) if "cameras" in training else None  # they were refined
+    unit = dataset.extent if "cameras" in training else None  # they were refined
     metrics = evaluate(scene, dataset.test, background, out / "eval", lpips=lpips, static=static, camera_unit=unit)
     metrics["training"] = training
     write_metrics(out, metrics)

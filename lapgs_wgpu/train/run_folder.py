@@ -134,6 +134,11 @@ def save_state(out: Path, state: State) -> None:
             os.replace(out / STATE, out / STATE_BEFORE)
 
 
+def has_state(out: Path) -> bool:
+    """Whether the folder holds a state, from which a training goes on; a finished one has none."""
+    return any((out / name).is_file() for name in (STATE, STATE_BEFORE))
+
+
 def load_state(out: Path) -> dict[str, NDArray[Any]] | None:
     """The last state that is whole; None where there is none yet. Raises InputError where all there is is damaged."""
     damaged: InputError | None = None

@@ -54,7 +54,7 @@ def measure_costs(config: Config, dataset: Dataset, device: Device) -> Costs:
         scene.render(train.camera, train.time, depth=False)
         picture = time.perf_counter() - begin
     views = dataset.test[: VIEWS + 1]
-    unit = (dataset.extent or 1.0) if config.cameras.refines(own_footage=dataset.own_footage) else None
+    unit = dataset.extent if config.cameras.refines(own_footage=dataset.own_footage) else None
     evaluate(scene, views[:1], config.data.background, camera_unit=unit)  # not timed
     begin = time.perf_counter()
     evaluate(scene, views[-VIEWS:], config.data.background, camera_unit=unit)

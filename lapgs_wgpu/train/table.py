@@ -27,7 +27,7 @@ from lapgs_wgpu.gpu.device import open_device
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.train import plots
 from lapgs_wgpu.train.presets import load_config, write_toml
-from lapgs_wgpu.train.run_folder import STATE, STATE_BEFORE
+from lapgs_wgpu.train.run_folder import has_state
 from lapgs_wgpu.train.table_results import Result, Results, read_results, read_run, write_results
 from lapgs_wgpu.train.table_spec import Run, RunKey, Spec, fingerprint
 
@@ -183,8 +183,7 @@ def _goes_on(run: Run, out: Path) -> bool:
         made = fingerprint(load_config(str(out / "config.toml")))
     except InputError:  # not there, or damaged
         return False
-    saved = any((out / name).is_file() for name in (STATE, STATE_BEFORE))
-    return saved and made == run.fingerprint and not (out / "metrics.json").exists()
+    return has_state(out) and made == run.fingerprint
 
 
 def _train_in_process(run: Run, data: Path, out: Path, launch: Launch) -> str | None:

@@ -37,7 +37,7 @@ from lapgs_wgpu.train.density_control import DensityControl
 from lapgs_wgpu.train.discovery.discover import discover
 from lapgs_wgpu.train.discovery.field_fit import keeping_rates
 from lapgs_wgpu.train.distributed import SINGLE_PROCESS, Ranks
-from lapgs_wgpu.train.evaluate import BACKGROUND_LEVELS, evaluate
+from lapgs_wgpu.train.evaluate import BACKGROUND_LEVELS, evaluate, mean_psnr
 from lapgs_wgpu.train.exposure import Exposures
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
 from lapgs_wgpu.train.host_threads import step_threads, torch_threads
@@ -156,15 +156,17 @@ class Trainer:
                 f"the scene to start from is drawn with antialiased = {scene.antialiased}, and the configuration says "
                 f"{config.antialiased}; give the configuration the scene's."
             )
-        self.scene = scene or Scene4D.from_points(
-            *initial_points(config.points, dataset, config.seed),
-            config.field,
-            opacity=config.points.opacity,
-            antialiased=config.antialiased,
-            device=device,
-            seed=config.seed,
-            own_field=parts.field,
-        )
+        if scene is None:
+            scene = Scene4D.from_points(
+                *initial_points(config.points, dataset, config.seed),
+                config.field,
+                opacity=config.points.opacity,
+                antialiased=config.antialiased,
+                device=device,
+                seed=config.seed,
+                own_field=parts.field,
+            )
+        self.scene = scene
         if self.scene.field is not None and self._warm_up >= config.schedule.steps and not resumed:
             _note(
                 f"nothing moves in this training, since its warm-up (schedule.warm_up: {self._warm_up} steps) is not "
@@ -187,6 +189,11 @@ class Trainer:
             scene.field.on_device = config.decoder == "device"
         groups = scene.field.parameter_groups() if scene.field else {}
         rates = config.rates.schedules() | self.parts.schedules()
+        for name in groups:
+            if name in scene.parameters or name == FrequencyOptimizer.name:
+                raise InputError(
+                    f"the field's group {name} has the name of parameters of the training's own; give it another."
+                )
         for name in (*groups, *self.parts.rates):
             if name not in rates or (name in self.parts.rates and name not in {*scene.parameters, *groups}):
                 known = ", ".join([*scene.parameters, *groups])
@@ -202,8 +209,7 @@ class Trainer:
             limit = len(dataset.times) / 2
             self._frequencies = FrequencyOptimizer(scene.spectrum, config.rates.frequencies, limit)
         self._exposures = Exposures(len(dataset.train), config.exposure.rate) if config.exposure.enabled else None
-        # Cameras that all stand at one place have no extent; the scene's own size must serve.
-        self._extent = dataset.extent or config.points.box
+        self._extent = dataset.extent
         self.cameras = None
         if config.cameras.refines(own_footage=dataset.own_footage):
             self.cameras = CameraRefinement(
@@ -264,8 +270,14 @@ class Trainer:
         return float((self._scales <= MIN_SCALE).float().mean())
 
     def evaluate(self, views: Sequence[View] | None = None) -> dict[str, Any]:
-        """Measure the scene on views, the test views where None: the content of metrics.json (docs/metrics.md)."""
-        return evaluate(self.scene, self.dataset.test if views is None else views, self.config.data.background)
+        """Measure the scene on views, the test views where None: the content of metrics.json (docs/metrics.md).
+        Training views are seen by their corrected cameras."""
+        chosen = self.dataset.test if views is None else views
+        return evaluate(self.scene, self._as_seen(chosen), self.config.data.background)
+
+    def psnr(self, views: Sequence[View]) -> float:
+        """The mean over views of the PSNR, dB, as `evaluate` measures it."""
+        return mean_psnr(self.scene, self._as_seen(views), self.config.data.background)
 
     @property
     def initial_view(self) -> InitialView:
@@ -410,6 +422,13 @@ class Trainer:
     def _camera_of(self, view: View) -> Camera:
         """The camera of a training view, corrected where it is."""
         return view.camera if self.cameras is None else self.cameras.refined(view.camera).camera
+
+    def _as_seen(self, views: Sequence[View]) -> list[View]:
+        """The views, those of the training with their corrected cameras."""
+        return [
+            dataclasses.replace(view, camera=self._camera_of(view)) if view.name in self._numbers else view
+            for view in views
+        ]
 
     def exposure_of(self, view: View) -> Tensor | None:
         """The correction (3, 4) of the colors of a training view; None where they are taken as they are."""

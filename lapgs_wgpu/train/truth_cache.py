@@ -49,14 +49,16 @@ class TruthCache:
 def without(pixels: NDArray[np.uint8], ignored: NDArray[np.bool_] | None) -> NDArray[np.uint8]:
     """A picture (H, W, 3) or (H, W, 4) with the pixels marked that the loss leaves out: (H, W) bool, None for none.
 
-    A transparent pixel has no color; with red 1 it is left out (shaders/common/on_background.wgsl), with 0 it counts.
+    A transparent pixel has no color, whatever the file says; with red 1 it is left out
+    (shaders/common/on_background.wgsl), with 0 it counts.
     """
-    if ignored is None:
+    if ignored is None and pixels.shape[2] == 3:
         return pixels
     rgba = np.full((*pixels.shape[:2], 4), 255, np.uint8)
     rgba[..., : pixels.shape[2]] = pixels
     rgba[rgba[..., 3] == 0] = 0
-    rgba[ignored] = LEFT_OUT
+    if ignored is not None:
+        rgba[ignored] = LEFT_OUT
     return rgba
 
 

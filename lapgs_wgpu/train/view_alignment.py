@@ -20,7 +20,7 @@ from .camera_refinement import changed_camera
 from .config import LossWeights
 from .fused_loss import render_loss
 from .learning_rate import Rate
-from .truth_cache import upload_rgba
+from .truth_cache import upload_rgba, without
 
 STEPS = 24
 RATE = Rate(4e-3, 2e-4, STEPS)  # radians of image motion: 1.5 degrees together
@@ -37,7 +37,7 @@ def aligned_view(scene: Scene4D, view: View, background: Tensor, unit: float) ->
     with torch.no_grad():
         gaussians = scene.at(view.time)
     points = scene_points(gaussians.means, gaussians.opacities)
-    truth, descent, camera = upload_rgba(scene.device, view.load()), CameraDescent(1), view.camera
+    truth, descent, camera = upload_rgba(scene.device, without(view.load(), None)), CameraDescent(1), view.camera
     for step in range(1, STEPS + 1):
         change = torch.zeros(7, requires_grad=True)
         render_loss(

@@ -25,6 +25,7 @@ from lapgs_wgpu.data.objects import read_objects
 from lapgs_wgpu.data.poses import opengl_pose
 from lapgs_wgpu.data.timestamps import ImageName
 from lapgs_wgpu.data.undistort import Lens
+from lapgs_wgpu.data.validation import check_frames
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import intrinsics_of_fov
 
@@ -42,7 +43,9 @@ def _read(folder: Path, image_size: int | None) -> Capture:
     frames, warnings = [*_read_split(folder, "train"), *_read_split(folder, "test")], []
     if (folder / "transforms_val.json").is_file():
         try:
-            frames += _read_split(folder, "val")
+            found = _read_split(folder, "val")
+            check_frames([frames[0], *found])
+            frames += found
         except InputError as error:
             warnings.append(f"the validation views are left out: {error}")
     path = find_cloud(folder, CLOUDS)
@@ -81,7 +84,7 @@ def _read_split(folder: Path, split: Split) -> list[Frame]:
         lens = lenses.setdefault((*lens.K.ravel(), *lens.radial, *lens.tangential), lens)
         name, label = ImageName(file_path), f"{index:03d}"
         frames.append(Frame(image, lens, T_cam_world, where, name, time=time, split=split, label=label))
-    if split == "test":
+    if split != "train":
         objects = read_objects(folder, split, [Path(str(frame.image)).stem for frame in frames])
         frames = [dataclasses.replace(frame, objects=records) for frame, records in zip(frames, objects, strict=True)]
     return frames

@@ -18,7 +18,7 @@ from PIL import Image
 
 from lapgs_wgpu.data.cloud import Cloud, read_npy
 from lapgs_wgpu.data.frames import Capture, Frame, Reader
-from lapgs_wgpu.data.images import SUFFIXES, check_image, decode, size_text
+from lapgs_wgpu.data.images import ERRORS, SUFFIXES, check_image, decode, size_text
 from lapgs_wgpu.data.poses import LARGEST_ENTRY, check_rotation, world_to_camera
 from lapgs_wgpu.data.timestamps import ImageName, natural_key
 from lapgs_wgpu.data.undistort import Lens
@@ -32,6 +32,10 @@ LARGEST_MAP = 64_000_000  # pixels
 EXPECT = (
     "one camera that stands still sees no parallax, so {depth}; what the camera sees will be right, and views from "
     "elsewhere the worse the further away they are"
+)
+AXES = (
+    "{count} poses, whose axes are read as right, down and forward, as EndoNeRF's scenes have them; those of an LLFF "
+    "capture are down, right and backward, so convert it to COLMAP's or nerfstudio's format"
 )
 
 
@@ -79,7 +83,7 @@ def _read(folder: Path, image_size: int | None) -> Capture:
         cloud,
         source=path if cloud is None else folder / DEPTH,
         time_source=f"the order of the images in {folder / IMAGES}",
-        warnings=[f"{folder}: {EXPECT.format(depth=told)}."] if len(poses) == 1 else [],
+        warnings=[f"{folder}: {EXPECT.format(depth=told) if len(poses) == 1 else AXES.format(count=len(poses))}."],
     )
 
 
@@ -144,7 +148,7 @@ def _depth_map(path: Path) -> NDArray[np.float64]:
             return np.asarray(file).astype(np.float64)
     except InputError:
         raise
-    except (OSError, SyntaxError, ValueError) as error:
+    except ERRORS as error:
         raise InputError(f"{path} is not a readable depth map ({error}); export it again, or remove depth/.") from None
 
 

@@ -59,7 +59,7 @@ def _read(folder: Path, image_size: int | None) -> Capture:
             pose.lens,
             pose.T_cam_world,
             pose.where,
-            ImageName(f"{recording.stem}/{index}", recording.stem),
+            ImageName(f"{recording.stem}/{_file_name(image, index)}", recording.stem),
             time=index,
             split="train" if camera else "test",
             label=f"{recording.stem}_{index:05d}",
@@ -96,6 +96,11 @@ def _recordings(folder: Path) -> dict[Path, list[ImageSource]]:
     return {found[name]: _images(found[name]) if found[name].is_dir() else _video(found[name]) for name in names}
 
 
+def _file_name(image: ImageSource, index: int) -> str:
+    """Of an image; of a film's frame, its number from 0 on, which masks are named by."""
+    return image.path.name if isinstance(image, ImageFile) else f"{index}.png"
+
+
 def _video(path: Path) -> list[ImageSource]:
     video = Video(path)
     return [VideoFrame(video, index) for index in range(video.frames)]
@@ -114,9 +119,7 @@ def _images(folder: Path) -> list[ImageSource]:
             why = "has no number" if number < 0 else f"has the number {number}, as {numbers[number].name}"
             raise InputError(f"{file} {why}; frames are put in order by the last number in their names.")
         numbers[number] = file
-    first, *others = (numbers[number] for number in sorted(numbers))
-    checked = check_image(first, whole=False)  # all of them may be gigabytes
-    return [checked, *(ImageFile(file, checked.size) for file in others)]
+    return [check_image(numbers[number], whole=False) for number in sorted(numbers)]  # whole, they may be gigabytes
 
 
 def _read_poses(path: Path, recordings: Sequence[Path]) -> list[_Pose]:
