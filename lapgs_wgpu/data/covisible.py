@@ -20,7 +20,7 @@ SPLITS = ("val", "val_intl")  # of DyCheck's captures; of rigs that alternate th
 WHITE = 255
 
 
-def find_masks(covisible: Path, names: Sequence[str], factor: str) -> dict[str, Path]:
+def find_covisible(covisible: Path, names: Sequence[str], factor: str) -> dict[str, Path]:
     """Find the masks of all these test images, by id; {} if there is none.
 
     They come from one folder of `covisible`: that of the images' factor, such as "2x", or, if it holds none of them,

@@ -15,7 +15,7 @@ from lapgs_wgpu.errors import InputError
 WHITE = 128  # level from which on a pixel is ignored
 
 
-def find_masks(folder: Path, names: Sequence[str], splits: Sequence[str], size: Size) -> dict[str, Path]:
+def find_ignored(folder: Path, names: Sequence[str], splits: Sequence[str], size: Size) -> dict[str, Path]:
     """Find the mask of each training image, NAME.png or NAME.jpg.png, and check its proportions.
 
     Args:

@@ -16,7 +16,7 @@ import numpy as np
 from lapgs_wgpu.data.cloud import Cloud, points_in_view
 from lapgs_wgpu.data.covisible import read_mask
 from lapgs_wgpu.data.frames import Capture, Frame, ImageSource, Reader, Split
-from lapgs_wgpu.data.ignored import find_masks, read_ignored
+from lapgs_wgpu.data.ignored import find_ignored, read_ignored
 from lapgs_wgpu.data.images import Pixels, Size, shrink, shrunk_size
 from lapgs_wgpu.data.normalize import BOX, Cube, are_parallel, cube_in_view, cube_of_points
 from lapgs_wgpu.data.readers import colmap, dnerf, endonerf, hypernerf, nerfstudio, neu3d, polycam, record3d
@@ -110,7 +110,7 @@ def _dataset(folder: Path, capture: Capture, image_size: int | None, normalize: 
     if cloud is not None and capture.own_footage:
         cloud = _filled(cloud, training)
     order = _film_order(frames, times, warnings) if capture.own_footage else range(len(frames))
-    ignored = {} if masks is None else find_masks(masks, [frame.name.file for frame in frames], splits, stored)
+    ignored = {} if masks is None else find_ignored(masks, [frame.name.file for frame in frames], splits, stored)
     placed = {id(camera): camera if fit is None else fit.camera(camera) for camera in cameras}
 
     def views(split: Split) -> tuple[View, ...]:

@@ -23,9 +23,8 @@ from lapgs_wgpu.motion.timing import EVEN, Timing
 
 from .distributed import Ranks
 
-REACH = (
-    0.5  # gaps between images (the usual one), before and after, at which pictures are compared; and the largest step
-)
+# Of gaps between images (the usual one), before and after: at which pictures are compared, and the largest step.
+REACH = 0.5
 FARTHEST = 1.5  # gaps between images, of a moment from its time
 LEAST = 0.05  # share of an image's squared error that its shift must take away; of even films few shifts do
 AROUND = 8  # images before and after one, whose median shift is the field's delay

@@ -58,7 +58,8 @@ TERMS = frozenset({"l1", "mse", "ssim", "pyramid", "ncc", "smoothness", "acceler
 
 
 class _Look(NamedTuple):
-    """A view of a step: on what it lies, and where and when the field is asked once more."""
+    """A view of a step: the background (3,) that its image lies on; the places that the smoothness loss compares, and
+    the moments that the acceleration loss does, None in steps without them."""
 
     view: View
     background: Tensor

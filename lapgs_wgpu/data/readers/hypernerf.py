@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from lapgs_wgpu.data.cloud import find_cloud, read_cloud
-from lapgs_wgpu.data.covisible import factor_folders, find_masks
+from lapgs_wgpu.data.covisible import factor_folders, find_covisible
 from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
 from lapgs_wgpu.data.images import check_image
 from lapgs_wgpu.data.json_fields import finite, kind, read_json, required, vector
@@ -47,7 +47,7 @@ def _read(folder: Path, image_size: int | None) -> Capture:
     times = _times(folder / "metadata.json", ids)
     cameras = {name: _read_camera(folder / "camera" / f"{name}.json") for name in train_ids + test_ids}
     rgb = _image_folder(folder / "rgb", train_ids + test_ids, image_size)
-    masks = find_masks(folder / "covisible", test_ids, rgb.name)
+    masks = find_covisible(folder / "covisible", test_ids, rgb.name)
     splits: list[tuple[Split, list[str]]] = [("train", train_ids), ("test", test_ids)]
     frames = [
         Frame(
