@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 import shutil
 import sys
 from collections.abc import Callable
@@ -53,7 +54,7 @@ def guarded(name: str, command: Callable[[list[str]], int | None], arguments: li
 
 def beside(name: str) -> str:
     """How another of the commands is called: by its name where the shell finds it, otherwise as this one was."""
-    return name if shutil.which(name) else str(Path(sys.argv[0]).with_name(name))
+    return name if shutil.which(name) else shlex.quote(str(Path(sys.argv[0]).with_name(name)))
 
 
 def print_devices() -> None:

@@ -6,6 +6,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING
 
 from lapgs_wgpu.command import HelpFormatter, Parser, beside, guarded
@@ -98,7 +99,7 @@ def _convert(given: argparse.Namespace, out: Path) -> Diagnosis:
     for measure in done.diagnosis.measures:
         if measure.good is False:
             print(measure, file=sys.stderr)
-    then = "" if given.train else f"; {beside('lapgs-train')} {done.preset} --data {done.folder}"
+    then = "" if given.train else f"; {beside('lapgs-train')} {done.preset} --data {quote(str(done.folder))}"
     print(f"{done.folder}: {done.images} images, {done.placed} of {done.cameras} cameras placed{then}", flush=True)
     return done.diagnosis
 
@@ -109,8 +110,12 @@ def _check(folder: Path) -> Diagnosis:
 
     diagnosis = diagnose(folder)
     print(diagnosis, flush=True)
-    write_report(diagnosis, folder / REPORT, folder.resolve().name)
-    print(f"{folder / REPORT} shows it with pictures", flush=True)
+    try:
+        write_report(diagnosis, folder / REPORT, folder.resolve().name)
+    except InputError as error:  # a training can follow all the same
+        print(f"note: {error}", file=sys.stderr, flush=True)
+    else:
+        print(f"{folder / REPORT} shows it with pictures", flush=True)
     return diagnosis
 
 
@@ -127,7 +132,7 @@ def _train(capture: Path, run: Path, minutes: float | None, diagnosis: Diagnosis
     print(plan.text, flush=True)
     train(plan.config, plan.dataset, run, device=device)
     print(result_text(run))
-    print(f"{beside('lapgs-view')} {run / 'checkpoint.ply'}")
+    print(f"{beside('lapgs-view')} {quote(str(run / 'checkpoint.ply'))}")
 
 
 if __name__ == "__main__":

@@ -33,6 +33,7 @@ from lapgs_wgpu.train.learning_rate import Rate
 from lapgs_wgpu.train.loss_terms import LossTerm, torch_loss
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.run import resume, train
+from lapgs_wgpu.train.run_folder import load_state, save_state
 from lapgs_wgpu.train.tensorboard import scalars
 from lapgs_wgpu.train.truth_cache import LEFT_OUT, upload_rgba
 
@@ -224,6 +225,28 @@ def test_results_of_another_form_are_named(value: Any, message: str, dataset: Da
         pytest.raises(InputError, match=message),
     ):
         trainer.step()
+
+
+def test_buffers_of_ones_own_field_are_kept(dataset: Dataset, device: Device, tmp_path: Path) -> None:
+    class Masked(Drift):
+        def __init__(self, **buffers: Tensor) -> None:
+            super().__init__()
+            for name, value in buffers.items():
+                self.register_buffer(name, value)
+
+    moving = torch.tensor([True, False, True])
+    with Trainer(configure(), dataset, device, parts=Parts(field=Masked(moving=moving))) as trainer:
+        trainer.step()
+        trainer.save(tmp_path / "a.ply")
+        state = trainer.state()
+    save_state(tmp_path, state)
+    assert load_state(tmp_path)["field.module.moving"].tolist() == [True, False, True]
+    found = load(tmp_path / "a.ply", device, field=Masked(moving=torch.zeros(3, dtype=torch.bool)))
+    assert torch.equal(found.field.module.moving, moving)
+    complex_ = torch.zeros(1, dtype=torch.cfloat)
+    for buffer, what in ((torch.tensor([-torch.inf]), "NaN or infinity"), (complex_, "complex64")):
+        with pytest.raises(InputError, match=f"Masked keeps .*{what} in mask, which checkpoints do not hold"):
+            Trainer(configure(), dataset, device, parts=Parts(field=Masked(mask=buffer)))
 
 
 def test_all_parts_of_a_deformation_are_optional(dataset: Dataset, device: Device) -> None:
@@ -462,7 +485,8 @@ def test_a_term_that_is_not_finite_is_named(dataset: Dataset, device: Device) ->
 
 def test_losses_that_cannot_be_are_refused(dataset: Dataset, device: Device, tmp_path: Path) -> None:
     twice = [TorchLoss("mine", charbonnier), TorchLoss("mine", charbonnier)]
-    for losses, name in ((twice, "mine"), ([TorchLoss("l1", charbonnier)], "l1")):
+    taken = [([TorchLoss(name, charbonnier)], name) for name in ("l1", "loss", "psnr")]
+    for losses, name in ((twice, "mine"), *taken):
         with pytest.raises(InputError, match=f"two loss terms named '{name}'"):
             Trainer(configure(), dataset, device, parts=Parts(losses=losses))
     with pytest.raises(InputError, match=r"nothing\.wgsl: a loss needs a file of WGSL"):

@@ -316,6 +316,11 @@ def test_training_views_are_measured_by_their_corrected_cameras(
     as_given = mean_psnr(training.scene, views, "black")
     assert training.psnr(views) > as_given + 1
     assert training.evaluate(views)["psnr"] == training.psnr(views)
+    other = [
+        dataclasses.replace(view, camera=view.camera.resized(50, 40), pixels=lambda: np.zeros((40, 50, 3), np.uint8))
+        for view in views
+    ]
+    assert training.psnr(other) == mean_psnr(training.scene, other, "black"), "by cameras that it does not know"
     assert training.psnr(training.dataset.test) == mean_psnr(training.scene, training.dataset.test, "black")
 
 

@@ -315,7 +315,7 @@ def test_what_cannot_be_stored_is_not_written(tmp_path: Path) -> None:
         InputError, match=r"a\.ply: not written, because tensor 'x' .* NaN or infinite in 1 of 2 values"
     ):
         write_checkpoint(path, STILL, {"x": np.array([0, np.inf])}, {})
-    for array in [np.array([None]), np.array(["text"]), np.array([1j]), np.array([True])]:
+    for array in [np.array([None]), np.array(["text"]), np.array([1j])]:
         with pytest.raises(ValueError, match=r"'x' of type .* cannot be stored"):
             write_checkpoint(path, STILL, {"x": array}, {})
     with pytest.raises(ValueError, match="cannot be stored"):

@@ -247,6 +247,9 @@ def test_a_base_that_leads_back(tmp_path: Path) -> None:
         ("field.kind", "grid5d", "did you mean grid4d?"),
         ("field.static.base", ["1", "2", "x"], "--field.static.base must be a whole number, got 'x'"),
         ("seed", "1\nfoo = 2", "--seed must be a whole number"),
+        ("seed", ["5"], "--seed must be a whole number, got ['5']"),
+        ("field.static.base", ["16", "16"], "--field.static.base must be 3 numbers, got ['16', '16']"),
+        ("data.background", ["black"], "--data.background must be black or white or random, got ['black']"),
     ],
 )
 def test_mistakes_in_an_override(key: str, text: str | list[str], message: str) -> None:

@@ -186,6 +186,7 @@ def refused(folder: Path, words: list[str]) -> None:
         ("element vertex", "element face", ["no element vertex"]),
         ("property float x", "property float a", ["properties x, y, z"]),
         ("end_header\n", "end_header\nx ", ["line 11", "6 numbers"]),
+        ("end_header\n", "end_header\n7\n", ["line 11", "'7'", "6 numbers"]),
         ("end_header\n", "end_header\nnan nan nan 0 0 0\n", ["NaN", "1 of 40 points", "point 0"]),
         ("end_header", "end", ["end_header"]),
     ],

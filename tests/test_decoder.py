@@ -72,7 +72,8 @@ def test_smoothness(device: Device) -> None:
     uniform = DeviceArray.upload(device, "smoothness", content)
     a, b, sums = on_device(device, here), on_device(device, there), on_device(device, torch.full((70,), torch.nan))
     with Commands(device) as commands:
-        commands.dispatch(forth, 2, smoothness=uniform, here=a, there=b, sums=sums)
+        # In a column, as where the groups are too many for a row.
+        commands.dispatch_grid(forth, (1, 2), smoothness=uniform, here=a, there=b, sums=sums)
         commands.dispatch(back, -(-70 * 6 // 64), smoothness=uniform, here=a, there=b)
     of_here, of_there = here.double().requires_grad_(), there.double().requires_grad_()
     exact = (of_there - of_here).square().sum(dim=1)

@@ -23,7 +23,7 @@ from lapgs_wgpu.motion.scene import Scene4D, load
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.drawing import Drawing
 from lapgs_wgpu.splat.rasterizer import Rasterizer
-from lapgs_wgpu.train.evaluate import evaluate, side_by_side, to_8_bit, write_metrics
+from lapgs_wgpu.train.evaluate import evaluate, mean_psnr, side_by_side, to_8_bit, write_metrics
 from lapgs_wgpu.train.losses import MS_SSIM_SMALLEST, masked_ssim, ms_ssim, psnr
 from lapgs_wgpu.train.lpips import BLOCKS, Lpips
 
@@ -75,6 +75,12 @@ def test_metrics_are_means_over_views_of_8_bit_pictures(scene: Scene4D, tmp_path
     assert metrics["environment"]["adapter"] == scene.device.info.name
     panel = np.asarray(Image.open(tmp_path / "off.png"))
     assert np.array_equal(panel, side_by_side(off, drawn))
+
+
+def test_no_views_are_told(scene: Scene4D) -> None:
+    for measure in (evaluate, mean_psnr):
+        with pytest.raises(InputError, match="no views to measure"):
+            measure(scene, (), "black")
 
 
 def test_no_depth_is_drawn(scene: Scene4D, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,14 +15,15 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from lapgs_wgpu import Scene4D
+from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.io.fourdgs_file import bytes_harmonics, harmonics_bytes
+from lapgs_wgpu.io.fourdgs_file import _symbols, bytes_harmonics, harmonics_bytes
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.playback.linear_pieces import linear_pieces, piece_errors, roots_of, state
 from lapgs_wgpu.motion.playback.playback import open_playback
 from lapgs_wgpu.motion.timing import Timing
 from lapgs_wgpu.splat.linear_light import directions, display_colors, linear_harmonics, sh_basis, to_display, to_linear
-from lapgs_wgpu.viewer import cli
+from lapgs_wgpu.viewer import cli, export_4dgs
 from lapgs_wgpu.viewer.export_4dgs import Baked, bake_4dgs, best_degree
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene, load_scene
 
@@ -207,6 +208,21 @@ def test_the_command(device: Device, tmp_path: Path, capsys: pytest.CaptureFixtu
     ):
         assert cli.view_command([source, *options]) == 2
         assert reason in capsys.readouterr().err
+
+
+def test_a_folder_that_is_missing_is_told_before_the_work(
+    device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    calm(device).save(tmp_path / "a.ply")
+    monkeypatch.setattr(export_4dgs, "bake_4dgs", lambda *_: pytest.fail("minutes of work"))
+    assert cli.view_command([str(tmp_path / "a.ply"), "--export", str(tmp_path / "none/b.4dgs")]) == 2
+    assert "none/b.4dgs: not written" in capsys.readouterr().err
+
+
+def test_what_is_too_far_for_the_format_is_refused() -> None:
+    with pytest.raises(InputError, match="so far away at such a precision; give a larger --max-error"):
+        _symbols(np.array([[1 << 31]]))
+    assert _symbols(np.array([[(1 << 31) - 1]]))[0] == 4
 
 
 def test_a_still_scene_is_refused(device: Device, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

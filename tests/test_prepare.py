@@ -16,9 +16,9 @@ from PIL import Image
 from lapgs_wgpu.command import beside
 from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.errors import InputError
-from lapgs_wgpu.prepare.capture import prepare
+from lapgs_wgpu.prepare.capture import extract_all, prepare
 from lapgs_wgpu.prepare.capture_folder import appearing
-from lapgs_wgpu.prepare.extract import extract, images_per_second
+from lapgs_wgpu.prepare.extract import Extraction, Picture, common_moments, extract, images_per_second
 from lapgs_wgpu.prepare.film import Film
 from lapgs_wgpu.prepare.hdr import to_sdr
 from lapgs_wgpu.prepare.reconstruct import neighbouring_pairs
@@ -229,6 +229,44 @@ def test_a_long_film_gives_fewer_images_a_second(tmp_path: Path) -> None:
     film.seconds = 5.0
     assert images_per_second(film, None, still=False) == 10
     assert images_per_second(film, None, still=True) == 30
+
+
+def test_moments_of_several_films_are_common_ones() -> None:
+    """Where one camera dropped images, and one has another rate."""
+
+    def film(camera: int, seconds: list[float]) -> Extraction:
+        return Extraction([Picture(f"cam{camera}/{s:.3f}", s, 1.0, 99.0) for s in seconds], 10.0, 99, still=True)
+
+    even = [0.1 * i for i in range(20)]
+    films = [film(0, even), film(1, [s for s in even if not 0.45 < s < 0.95]), film(2, [0.04 * i for i in range(48)])]
+    moments = common_moments(films, 5)
+    assert len(moments) == 5
+    for pictures in moments:
+        assert [picture.name[:4] for picture in pictures] == ["cam0", "cam1", "cam2"]
+        seconds = [picture.seconds for picture in pictures]
+        assert max(seconds) - min(seconds) < 1e-6, "0, 0.2, ... are those of all three"
+        assert not 0.45 < seconds[0] < 0.95
+    assert common_moments(films[:2], 99)[5][1].seconds == pytest.approx(1.0)
+
+
+def test_films_of_several_cameras_have_one_rate(tmp_path: Path) -> None:
+    films = [Film(write_film(tmp_path / f"{n}.mkv", noise(n), rate=30)) for n in (30, 36)]
+    films[0].seconds, films[1].seconds = 12.0, 14.4  # as long ones say
+    found = extract_all(films, tmp_path / "images", None, 64)
+    assert found[0].fps == found[1].fps == 25
+    stamps = [[picture.name.split("/")[1] for picture in each.pictures] for each in found]
+    assert stamps[0] == stamps[1][: len(stamps[0])]
+
+
+def test_a_film_of_nothing(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    blank = [np.full((48, 64, 3), 60 + 40 * i, np.uint8) for i in range(4)]
+    path = write_film(tmp_path / "wall.mkv", blank, rate=10)
+    assert "0 of 4 images could be placed" in refused([str(path), "--out", str(tmp_path / "out")], capsys)
+
+
+def test_masks_that_are_missing_are_told_before_the_work(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    arguments = [str(tmp_path / "none.mp4"), "--out", str(tmp_path / "out"), "--masks", str(tmp_path / "typo")]
+    assert "typo is not a folder; --masks needs one" in refused(arguments, capsys)
 
 
 def test_pairs() -> None:

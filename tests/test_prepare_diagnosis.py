@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from helpers.films import Board, drawn, walk
 from PIL import Image, ImageFilter
 
 from lapgs_wgpu.command import beside
-from lapgs_wgpu.prepare.diagnosis import diagnose
+from lapgs_wgpu.prepare.diagnosis import _mask, diagnose
 from lapgs_wgpu.prepare.image_measures import blur
 from lapgs_wgpu.prepare.measure import Measure
 from lapgs_wgpu.prepare.report import write_report
@@ -203,6 +204,25 @@ def test_check_prints_and_writes(pictures, tmp_path: Path, capsys: pytest.Captur
     assert (folder / "report.html").is_file()
     assert prepare_command(["--check", str(folder / "images")]) == 2
     assert "is no scene in a known format" in capsys.readouterr().err
+
+
+def test_a_page_of_another_program_stays(pictures, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    cameras, images, _ = pictures
+    folder = write_capture(tmp_path, cameras, images)
+    (folder / "report.html").write_text("<title>mine</title>")
+    assert prepare_command(["--check", str(folder)]) == 0
+    said = capsys.readouterr()
+    assert "report.html is of another program and stays as it is" in said.err
+    assert "shows it with pictures" not in said.out
+    assert (folder / "report.html").read_text() == "<title>mine</title>"
+
+
+def test_photos_beside_masks_are_no_masks(tmp_path: Path) -> None:
+    for name in ("masks", "rgb"):
+        (tmp_path / name).mkdir()
+    Image.new("L", (8, 8), 200).save(tmp_path / "rgb/0001.png")
+    view = SimpleNamespace(source=str(tmp_path / "rgb/0001.png"))
+    assert _mask(tmp_path, view) is None
 
 
 def test_train_goes_on_to_a_scene(

@@ -25,6 +25,7 @@ from torch import Tensor
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.probe_subgroup import subgroup_size
 from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.splat.drawing import Drawing
 from lapgs_wgpu.splat.raster_config import RasterConfig, cpu_config, gpu_config
 from lapgs_wgpu.splat.rasterize import rasterize
 from lapgs_wgpu.splat.rasterizer import Rasterizer
@@ -321,6 +322,36 @@ def test_only_the_backward_pass_is_cut(
         assert torch.equal(found.gradients[name], gradient)
 
 
+@pytest.mark.parametrize("lanes", [8, 16])
+def test_a_processors_rounds_follow_its_shape(lanes: int) -> None:
+    """Without subgroups a round has fewer splats, or the driver would end its loops early."""
+    assert cpu_config(lanes).without_subgroups() == replace(cpu_config(0), lanes=lanes)
+    assert gpu_config(32).without_subgroups() == gpu_config(0)
+
+
+def test_a_processors_backward_pass_is_cut(device: Device, use: Callable[[Rasterizer], Any]) -> None:
+    """It then has more rounds than the drawing."""
+    if subgroup_size(device) < 8:
+        pytest.skip("this device has no subgroups, or none of 8 lanes")
+    scene, camera = random_scene(300, 8, size=0.3), oblique_camera(20, 12)
+    use(Rasterizer(device, config=cpu_config(0, 255)))
+    expected = step(scene, camera, device)
+    rasterizer = use(Rasterizer(device, config=cpu_config(8, 255)))
+    torn = iter([True])
+
+    def mismatch(name: str, drawn: Drawing) -> bool:
+        if name == "rasterize" or not next(torn, False):
+            return False
+        rasterizer.config = rasterizer.config.without_subgroups()
+        return True
+
+    rasterizer._subgroup_mismatch = mismatch  # type: ignore[method-assign]
+    found = step(scene, camera, device)
+    assert rasterizer.plan.rounds > 1
+    for name, gradient in expected.gradients.items():
+        assert torch.equal(found.gradients[name], gradient), name
+
+
 # The door for torch
 
 
@@ -337,6 +368,13 @@ def test_means2d_has_the_gradient_in_pixels(device: Device) -> None:
     assert drawn.means2d.grad[0, 0].item() == pytest.approx(drawn.alpha.sum().item(), rel=0.05)  # the skipped rim
     with torch.no_grad():
         assert not rasterize(**scene, camera=camera, device=device).means2d.requires_grad
+
+
+def test_radii_of_what_is_larger_than_whole_numbers(device: Device) -> None:
+    """A needle that fills the image."""
+    scene, camera = random_scene(1, 9), front_camera(33, 25)
+    scene |= {"means": torch.tensor([[0.0, 0.0, 1.0]]), "scales": torch.tensor([[1e8, 1e-3, 1e-3]])}
+    assert rasterize(**scene, camera=camera, device=device).radii.item() > 1e9
 
 
 def test_only_what_is_asked_for_has_gradients(device: Device) -> None:

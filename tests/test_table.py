@@ -102,6 +102,9 @@ def test_the_fingerprint_is_that_of_the_training_not_of_the_machine(tmp_path: Pa
     exposed = dataclasses.replace(config.exposure, enabled=True)
     assert fingerprint(dataclasses.replace(config, exposure=exposed)) != fingerprint(config)
     assert fingerprint(dataclasses.replace(config, precision="bfloat16")) != fingerprint(config)
+    assert fingerprint(dataclasses.replace(config, decoder="device")) == fingerprint(config), "as a GPU has it"
+    kept = dataclasses.replace(config.cameras, refine="off")
+    assert fingerprint(dataclasses.replace(config, cameras=kept)) != fingerprint(config)
     (tmp_path / "again.toml").write_text(write_toml(dataclasses.asdict(config)))
     assert fingerprint(load_config(str(tmp_path / "again.toml"))) == fingerprint(config)
 

@@ -31,6 +31,7 @@ def test_outside_of_all_times_the_difference_is_that_of_the_nearest() -> None:
 
 def test_without_times_each_is_its_own_moment() -> None:
     assert [EVEN(t) for t in (0.0, 0.3, 1.0)] == [0.0, 0.3, 1.0]
+    assert [EVEN(t) for t in (-0.2, 1.2)] == [0.0, 1.0]
 
 
 def test_the_text_gives_the_same_bits() -> None:

@@ -312,6 +312,15 @@ def test_nothing_is_drawn_before_the_browser_has_a_size(sent: Any) -> None:
     assert height == 1
 
 
+def test_a_watching_browser_cannot_say_who_drives(sent: Any) -> None:
+    canvas, _ = sent
+    canvas._on_event({"type": "_clients_change", "ids": (1, 2)}, 0)
+    for ids in ((2, 1), ()):
+        canvas._on_event({"type": "_clients_change", "ids": ids}, 2)
+        assert canvas._active_client == 1
+        assert set(canvas._frame_info_per_client) == {1, 2}
+
+
 def test_what_a_leaving_browser_held_is_let_go(sent: Any) -> None:
     canvas, _ = sent
     ends: list[tuple[str, Any]] = []

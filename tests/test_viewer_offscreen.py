@@ -14,6 +14,7 @@ from PIL import Image
 
 from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.data.synthetic import write_synthetic
+from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu import device as device_module
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.config import FieldConfig
@@ -25,6 +26,7 @@ from lapgs_wgpu.train.evaluate import to_8_bit
 from lapgs_wgpu.viewer import offscreen as offscreen_module
 from lapgs_wgpu.viewer.capture import open_capture
 from lapgs_wgpu.viewer.cli import view_command
+from lapgs_wgpu.viewer.export import export_compact
 from lapgs_wgpu.viewer.loaded_scene import load_scene
 from lapgs_wgpu.viewer.offscreen import framed
 from lapgs_wgpu.viewer.path import CameraPath, KeyFrame, Pose
@@ -365,6 +367,18 @@ def test_an_exported_sequence(run: Path, scene: Scene4D, tmp_path: Path, capsys:
     assert_still(folder / "frame_0001.ply", scene, 1.0)
 
 
+def test_a_file_that_is_replaced_while_it_is_exported(run: Path, device: Device, tmp_path: Path) -> None:
+    """As by a training: half of it would be of the one, half of the other."""
+    file = Path(shutil.copy(run / "checkpoint.ply", tmp_path / "a.ply"))
+    scene = load_scene(file, lambda: device)
+    export_compact(scene, tmp_path / "a.lapgs")
+    file.unlink()
+    shutil.copy(run / "checkpoint.ply", file)
+    with pytest.raises(InputError, match=r"a\.ply: was replaced while it was exported"):
+        export_compact(scene, tmp_path / "b.lapgs")
+    assert {each.name for each in tmp_path.iterdir()} == {"a.ply", "a.lapgs"}
+
+
 def test_the_opened_file_is_never_replaced(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = (run / "checkpoint.ply").read_bytes()
     assert view_command([str(run / "checkpoint.ply"), "--export", str(run / "checkpoint.ply"), "--overwrite"]) == 2
@@ -385,6 +399,7 @@ MISTAKES = {
     "time of a sequence": (["CHECKPOINT", "--export", "a", "--frames", "3", "--time", "0.5"], "no use with --frames"),
     "time of a clip": (["CHECKPOINT", "--video", "a.mp4", "--time", "0.5"], "--time has no use with --path time"),
     "time of a still scene": (["STILL", "--screenshot", "a.png", "--time", "0.5"], "holds no motion"),
+    "speed of a still scene": (["STILL", "--speed", "2", "--backend", "http", "--port", "0"], "so --speed has no use"),
     "frames of a still scene": (["STILL", "--export", "a", "--frames", "3"], "holds no motion"),
     "clip of a still scene": (["STILL", "--video", "a.mp4", "--path", "both"], "holds no motion"),
     "motion of a still scene": (["STILL", "--screenshot", "a.png", "--mode", "motion"], "nothing to show in mode"),

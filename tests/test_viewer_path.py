@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,7 +21,7 @@ from lapgs_wgpu.motion.fields.hash_grid_config import HashConfig
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.viewer.camera import ViewCamera
 from lapgs_wgpu.viewer.path import CameraPath, KeyFrame, Pose
-from lapgs_wgpu.viewer.path_editor import PathEditor, beside
+from lapgs_wgpu.viewer.path_editor import PathEditor, path_file_of
 from lapgs_wgpu.viewer.path_file import PathFile, read_path, write_path
 
 
@@ -333,7 +334,7 @@ def test_the_preview_shows_the_path_at_that_moment() -> None:
 
 
 def test_saving_and_loading(tmp_path: Path) -> None:
-    file = beside(tmp_path / "checkpoint.ply")
+    file = path_file_of(tmp_path / "checkpoint.ply")
     assert file == tmp_path / "checkpoint.camera_path.json"
     editor, other = edited(), PathEditor()
     editor.save(file, (640, 360), 25.0)
@@ -344,6 +345,15 @@ def test_saving_and_loading(tmp_path: Path) -> None:
     with pytest.raises(InputError):
         other.load(file)
     assert seconds(other) == seconds(editor)
+    file.write_text("another path")
+    assert PathEditor().path is None
+    third = edited()
+    kept = third.save(file, (640, 360), 25.0)
+    assert kept == tmp_path / "checkpoint.camera_path.before.json"
+    assert kept.read_text() == "another path"
+    assert third.save(file, (640, 360), 25.0) is None, "its own"
+    other.load(file)
+    assert other.save(file, (640, 360), 25.0) is None
     with pytest.raises(InputError, match="no key-frame"):
         PathEditor().save(file, (640, 360), 25.0)
 
@@ -416,7 +426,8 @@ def test_the_browser_of_files_lists_folders_that_cannot_be_looked_into(
     monkeypatch.setattr(Path, "is_dir", refuse)
     (tmp_path / "folder").mkdir()
     (tmp_path / "scene.ply").touch()
+    (tmp_path / os.fsdecode(b"sz\xe4ne.ply")).touch()
     browser = file_browser.FileBrowser(tmp_path, lambda file: None)
     browser.toggle()
     browser.draw()
-    assert listed == ["../", "folder/", "scene.ply"]
+    assert listed == ["../", "folder/", "scene.ply", "sz\ufffdne.ply"]

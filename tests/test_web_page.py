@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 
 from lapgs_wgpu.gpu.shader import compose
+from lapgs_wgpu.io.initial_view import InitialView
+from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.viewer.web_page import MODULES, PASSES, module_script, page_html, player_data
 
 WEB = Path(__file__).parents[1] / "viewer" / "web"
@@ -36,6 +38,15 @@ def test_it_holds_scene_shaders_and_title(page: str) -> None:
     assert data == json.loads(json.dumps(player_data()))
     for name, (shader, defines) in PASSES.items():
         assert data["kernels"][name]["source"].endswith(compose(shader, defines))
+
+
+def test_the_poster_is_as_high_as_the_field_of_view() -> None:
+    """Of a scene that was filmed upright, in a window that is narrower still, as of a phone."""
+    look = InitialView(Camera(np.diag([900.0, 900, 1]), np.eye(4), 540, 960), np.ones(3), np.ones(3), 30)
+    assert look.narrowest == 0.5625
+    upright = page_html(b"", "walk", np.zeros((4, 6, 3), np.uint8), narrowest=look.narrowest)
+    assert "height: min(100vh, 100vw / 0.5625); top: calc(50vh - min(50vh, 50vw / 0.5625))" in upright
+    assert "{{" not in part(upright, r"<style>(.*?)</style>")
 
 
 def test_the_policy_names_the_scripts_own_digest(page: str) -> None:

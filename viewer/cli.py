@@ -43,7 +43,7 @@ def _view(arguments: list[str]) -> None:
 
         scene = load_scene(Path(given.file), device.result)
     if not scene.playback.moves:
-        for name in ("time", "play", "frames"):
+        for name in ("time", "play", "frames", "speed", "loop", *(("fps",) if place is not None else ())):
             if getattr(given, name) is not None:
                 raise InputError(f"{given.file} holds no motion, so --{name} has no use.")
     if place is not None:

@@ -15,7 +15,7 @@ from lapgs_wgpu.motion.playback.playback import DevicePlayback
 from lapgs_wgpu.motion.scene_file import compact_bytes, read_scene
 from lapgs_wgpu.progress import Progress
 
-from .loaded_scene import LoadedScene
+from .loaded_scene import LoadedScene, stamp_of
 from .offscreen import OffscreenRenderer
 from .web_page import page_html
 
@@ -46,15 +46,17 @@ def export_compact(scene: LoadedScene, file: Path, *, overwrite: bool = False) -
     if file.exists() and file.samefile(scene.path):
         raise InputError(f"{file}: is the opened file; take another name.")
     check_free(file, overwrite)
-    stored = read_scene(scene.path)
-    features = scene.playback.static_features() if isinstance(scene.playback, DevicePlayback) else None
-    metadata = stored.metadata | {"view": scene.look.to_json()}
-    content = compact_bytes(dataclasses.replace(stored, metadata=metadata), features)
-    if file.suffix.lower() == ".html":
-        camera = scene.camera().camera(*_POSTER_SIZE)
-        poster = OffscreenRenderer(scene)(camera, 0.0)
-        content = page_html(content, file.stem, poster).encode()
-    with atomic_write(file) as target:
+    with atomic_write(file) as target:  # before a minute of work
+        stored = read_scene(scene.path)
+        if scene.stamp != stamp_of(scene.path):
+            raise InputError(f"{scene.path}: was replaced while it was exported, as by a training; export it again.")
+        features = scene.playback.static_features() if isinstance(scene.playback, DevicePlayback) else None
+        metadata = stored.metadata | {"view": scene.look.to_json()}
+        content = compact_bytes(dataclasses.replace(stored, metadata=metadata), features)
+        if file.suffix.lower() == ".html":
+            camera = scene.camera().camera(*_POSTER_SIZE)
+            poster = OffscreenRenderer(scene)(camera, 0.0)
+            content = page_html(content, file.stem, poster, narrowest=scene.look.narrowest).encode()
         target.write(content)
 
 

@@ -41,8 +41,8 @@ class Baked(NamedTuple):
 def export_4dgs(scene: LoadedScene, file: Path, max_error: float, *, overwrite: bool = False) -> Baked:
     """Write a `.4dgs`. Atomic. Raises InputError as `bake_4dgs`, and where it cannot be written or is there already."""
     check_free(file, overwrite)
-    baked = bake_4dgs(scene, max_error)
-    with atomic_write(file) as target:
+    with atomic_write(file) as target:  # before minutes of work
+        baked = bake_4dgs(scene, max_error)
         target.write(baked.data)
     return baked
 

@@ -8,6 +8,8 @@ from pathlib import Path
 
 from imgui_bundle import imgui
 
+from .gui_library import printable
+
 
 class FileBrowser:
     """A section of a panel, closed at first. open_file: gets the .ply or .lapgs that the user chooses."""
@@ -25,7 +27,7 @@ class FileBrowser:
         if not self._shown:
             return
         imgui.separator_text("Open")
-        imgui.text_wrapped(str(self._folder))
+        imgui.text_wrapped(printable(str(self._folder)))
         imgui.begin_child("files", (0, 180), imgui.ChildFlags_.borders)
         if imgui.selectable("../", False)[0]:
             self._folder = self._folder.parent
@@ -33,13 +35,14 @@ class FileBrowser:
             entries = sorted(self._folder.iterdir())
         except OSError as error:
             entries = []
-            imgui.text_wrapped(str(error))
+            imgui.text_wrapped(printable(str(error)))
         for entry in entries:
             if entry.name.startswith("."):
                 continue
-            if os.path.isdir(entry) and imgui.selectable(f"{entry.name}/", False)[0]:
+            name = printable(entry.name)
+            if os.path.isdir(entry) and imgui.selectable(f"{name}/", False)[0]:
                 self._folder = entry
-            elif entry.suffix.lower() in (".ply", ".lapgs") and imgui.selectable(entry.name, False)[0]:
+            elif entry.suffix.lower() in (".ply", ".lapgs") and imgui.selectable(name, False)[0]:
                 self._shown = False
                 self._open_file(entry)
         imgui.end_child()

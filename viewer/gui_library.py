@@ -1,6 +1,8 @@
-"""Whether Dear ImGui can be loaded: a package, and libraries of the system that it does not bring."""
+"""Dear ImGui: whether it can be loaded, a package and libraries of the system that it does not bring, and its texts."""
 
 from __future__ import annotations
+
+import os
 
 from lapgs_wgpu.errors import InputError
 
@@ -18,3 +20,8 @@ def check_imgui() -> None:
             f"the viewer's package imgui-bundle cannot be loaded ({error}); install the system's library, on Debian "
             f"and Ubuntu: sudo apt-get install -y {PACKAGES}."
         ) from None
+
+
+def printable(text: str) -> str:
+    """A text that may hold names of files, as UTF-8: others end Dear ImGui's frame with an error."""
+    return os.fsencode(text).decode("utf-8", "replace")

@@ -19,17 +19,21 @@ from .camera import ViewCamera
 from .clock import Clock
 from .render_modes import BACKGROUNDS
 
+Stamp = tuple[int, int, int]
+
 _ELEVATION = math.radians(35)  # of the guessed camera above the middle
 _FLAT = 0.5  # of the extents along x and y: what is lower lies on the ground
 _FRAMES = 150  # of a clip whose file does not say how many it has
 
 
 class LoadedScene(NamedTuple):
-    """path: where it came from, None for a training under way. look: camera, focus, up and frames to begin with."""
+    """path: where it came from, None for a training under way. look: camera, focus, up and frames to begin with. stamp:
+    of the file, when it was read."""
 
     path: Path | None
     playback: Playback
     look: InitialView
+    stamp: Stamp | None = None
 
     def camera(self) -> ViewCamera:
         """A camera where the viewer begins."""
@@ -50,9 +54,19 @@ def load_scene(path: Path, device: Callable[[], Device]) -> LoadedScene:
 
     device: is asked for when the file has been read.
     """
+    stamp = stamp_of(path)
     playback = playback_of(read_scene(path), device())
     look = InitialView.from_json(playback.metadata.get("view", ""))
-    return LoadedScene(path, playback, look or guess_look(playback))
+    return LoadedScene(path, playback, look or guess_look(playback), stamp)
+
+
+def stamp_of(path: Path) -> Stamp | None:
+    """What tells a file from another one that takes its place; None where there is none."""
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_ino, found.st_size, found.st_mtime_ns
 
 
 def guess_look(playback: Playback) -> InitialView:

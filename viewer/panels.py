@@ -10,6 +10,7 @@ from imgui_bundle import imgui
 from wgpu.utils.imgui import ImguiRenderer
 
 from .file_browser import FileBrowser
+from .gui_library import printable
 from .key_bindings import KEYS, MOUSE
 from .path_panel import draw_path
 from .present import HEAT
@@ -117,6 +118,8 @@ class Panels:
             ("Open", self._files.toggle, "another .ply or .lapgs file; one can also be dropped on the window"),
             ("Help", state.toggle_help, "keys and mouse (?)"),
         ):
+            if text == "Open" and state.training is not None:  # there would be no way back to the training
+                continue
             if imgui.button(text, (66, 0)):
                 action()
             _tip(tip)
@@ -193,7 +196,7 @@ class Panels:
         imgui.set_next_window_pos((0.5 * width, _GAP), imgui.Cond_.always, (0.5, 0.0))
         imgui.set_next_window_size((min(420.0, width - 2 * _GAP), 0))
         imgui.begin("message", None, _BAR)
-        imgui.text_wrapped(message)
+        imgui.text_wrapped(printable(message))
         if imgui.button("OK"):
             state.message = None
         self._end()

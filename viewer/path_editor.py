@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from lapgs_wgpu.errors import InputError
@@ -22,6 +23,7 @@ class PathEditor:
         self.keys: list[KeyFrame] = []
         self.chosen: int | None = None
         self.started: float | None = None
+        self._known: Path | None = None  # file that this path was loaded from or saved to
 
     @property
     def path(self) -> CameraPath | None:
@@ -62,7 +64,7 @@ class PathEditor:
         self.keys = list(CameraPath(self.keys).keys) if self.keys else []
 
     def play(self, now: float) -> None:
-        """InitialState the preview, or end it."""
+        """Start the preview, or end it."""
         self.started = None if self.started is not None or len(self.keys) < 2 else now
 
     def preview(self, now: float) -> tuple[Pose, float] | None:
@@ -76,19 +78,30 @@ class PathEditor:
             self.started = None
         return path.at(second)
 
-    def save(self, file: Path, size: tuple[int, int], fps: float) -> None:
-        """Write the path. Raises InputError where there is none, or where it cannot be written."""
+    def save(self, file: Path, size: tuple[int, int], fps: float) -> Path | None:
+        """Write the path. A file that was neither loaded nor saved here is kept under the name that is returned.
+        Raises InputError where there is no path, or where it cannot be written."""
         path = self.path
         if path is None:
             raise InputError("there is no key-frame to save yet; K adds one.")
+        kept = None
+        if file.exists() and file != self._known:
+            kept = file.with_name(f"{file.stem}.before.json")
+            try:
+                os.replace(file, kept)
+            except OSError as error:
+                raise InputError(f"{file}: another path is there and cannot be kept ({error.strerror}).") from error
         write_path(file, PathFile(path, size, fps))
+        self._known = file
+        return kept
 
     def load(self, file: Path) -> None:
         """Read a path in place of this one. Raises InputError, and then keeps this one."""
         self.keys = list(read_path(file).path.keys)
         self.chosen = self.started = None
+        self._known = file
 
 
-def beside(ply: Path | None) -> Path:
+def path_file_of(ply: Path) -> Path:
     """The file of the camera path that belongs to a .ply file."""
-    return ply.with_name(f"{ply.stem}.camera_path.json") if ply else Path("camera_path.json")
+    return ply.with_name(f"{ply.stem}.camera_path.json")

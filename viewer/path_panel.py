@@ -9,7 +9,8 @@ from imgui_bundle import imgui
 
 from lapgs_wgpu.errors import InputError
 
-from .path_editor import beside
+from .gui_library import printable
+from .path_editor import path_file_of
 from .view_state import ViewState
 from .viewport import Viewport
 
@@ -29,7 +30,7 @@ def draw_path(state: ViewState, viewport: Viewport) -> None:
     if imgui.button("Play" if editor.started is None else "Stop", (66, 0)):
         editor.play(time.perf_counter())
     imgui.end_disabled()
-    file = beside(state.scene.path or Path("training.ply"))
+    file = path_file_of(state.scene.path or Path("training.ply"))
     for text, action, possible in (
         ("Save", lambda: editor.save(file, viewport.canvas.get_physical_size(), state.clock.fps), bool(editor.keys)),
         ("Load", lambda: editor.load(file), file.is_file()),
@@ -39,13 +40,14 @@ def draw_path(state: ViewState, viewport: Viewport) -> None:
         imgui.begin_disabled(not possible)
         if imgui.button(text, (66, 0)):
             try:
-                action()
+                kept = action()
                 state.message = f"{'saved' if text == 'Save' else 'loaded'} {file}"
+                state.message += f"; the path that was there is {kept.name} now" if kept else ""
             except InputError as error:
                 state.message = str(error)
         imgui.end_disabled()
         if imgui.is_item_hovered():
-            imgui.set_tooltip(str(file))
+            imgui.set_tooltip(printable(str(file)))
     if not editor.keys:
         return
     imgui.begin_child("key-frames", (0, 110), imgui.ChildFlags_.borders)

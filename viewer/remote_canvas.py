@@ -22,6 +22,8 @@ class RemoteCanvas(HttpRenderCanvas):
         driver, kind = self._active_client, event.get("type")
         if kind == "close":  # upstream closes the canvas for everybody
             return
+        if kind == "_clients_change" and id:  # the server's own word, which a browser could say, too, to take over
+            return
         if id == driver and id:
             self._keep_held(event)
             if kind == "resize":

@@ -22,7 +22,7 @@ def draw_time_slider(state: ViewState) -> None:
         moved, time = True, _slider_value()
     if moved:
         clock.playing = False
-        clock.seek(min(max(time, 0.0), 1.0))
+        clock.seek(time)
     for text, action in (("|<", state.first_frame), ("<", state.previous_frame)):
         if imgui.button(text, (32, 0)):
             action()
@@ -40,11 +40,10 @@ def draw_time_slider(state: ViewState) -> None:
         clock.fps = min(max(fps, 0.1), 1000.0)
     imgui.same_line()
     imgui.set_next_item_width(70)
-    speeds = [f"{speed:g}x" for speed in SPEEDS]
-    present = SPEEDS.index(clock.speed) if clock.speed in SPEEDS else SPEEDS.index(1.0)
-    changed, chosen = imgui.combo("speed", present, speeds)
+    speeds = sorted({*SPEEDS, clock.speed})
+    changed, chosen = imgui.combo("speed", speeds.index(clock.speed), [f"{speed:g}x" for speed in speeds])
     if changed:
-        clock.speed = SPEEDS[chosen]
+        clock.speed = speeds[chosen]
     imgui.same_line()
     imgui.set_next_item_width(84)
     changed, chosen = imgui.combo("##loop", LOOPS.index(clock.loop), list(LOOPS))

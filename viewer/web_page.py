@@ -108,10 +108,12 @@ def _uniform(source: str, binding: Binding) -> dict[str, Any]:
     }
 
 
-def page_html(scene: bytes, title: str, poster: NDArray[np.uint8]) -> str:
-    """The page. scene: a scene.lapgs. poster: (H, W, 3), shown until the first frame, and where WebGPU is missing."""
+def page_html(scene: bytes, title: str, poster: NDArray[np.uint8], *, narrowest: float = 1.0) -> str:
+    """The page. scene: a scene.lapgs. poster: (H, W, 3), shown until the first frame, and where WebGPU is missing.
+    narrowest: of the scene's first camera (`InitialView`)."""
     edge = "#" + bytes(np.median(poster[0], axis=0).astype(np.uint8)).hex()
-    script, style = _script(), _file("player.css").replace("{{background}}", edge)
+    style = _file("player.css").replace("{{background}}", edge).replace("{{narrowest}}", f"{narrowest:.4g}")
+    script = _script()
     policy = "; ".join([
         "default-src 'none'",
         f"script-src '{_digest(script)}'",

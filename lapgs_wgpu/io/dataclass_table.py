@@ -111,9 +111,10 @@ def checked(kind: Any, value: Any, where: str, least: float = 0) -> Any:
 
 
 def from_text(text: str | list[str], kind: Any) -> Any:
-    """Text as a value of this type; a list as a tuple's entries. Text that is no number stays as it is."""
+    """Text as a value of this type; a list as a tuple's entries. What is none stays as it is, for `checked`."""
     if isinstance(text, list):
-        return [from_text(entry, part) for entry, part in zip(text, typing.get_args(kind), strict=True)]
+        parts = typing.get_args(kind)
+        return [from_text(*each) for each in zip(text, parts, strict=True)] if len(text) == len(parts) else text
     if kind is bool:
         return {"true": True, "false": False}.get(text, text)
     if kind in (int, float):

@@ -15,6 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lapgs_wgpu.errors import InputError
+
 Floats = NDArray[np.floating]
 Whole = NDArray[np.integer]
 
@@ -230,6 +232,10 @@ def _symbols(values: Whole) -> tuple[int, bytes]:
     """Bytes of each, and the deflated bytes: first the lowest of all, then the next."""
     folded = ((values << 1) ^ (values >> 63)).reshape(-1).astype(np.uint64)
     most = int(folded.max(initial=0))
+    if most >= 1 << 32:
+        raise InputError(
+            "a .4dgs file cannot hold a Gaussian so far away at such a precision; give a larger --max-error."
+        )
     width = 1 if most < 1 << 8 else 2 if most < 1 << 16 else 4
     return width, zlib.compress(folded.astype(f"<u{width}").view(np.uint8).reshape(-1, width).T.tobytes(), 9)
 

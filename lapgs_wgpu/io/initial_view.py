@@ -28,6 +28,11 @@ class InitialView(NamedTuple):
     frames: int
     arc: tuple[float, float] | None = None
 
+    @property
+    def narrowest(self) -> float:
+        """Width by height of a picture, at most 1: in a narrower window a page shows more (viewer/web/camera.js)."""
+        return min(max(self.camera.width / self.camera.height, 0.1), 1.0)
+
     def arc_from(self, camera: Camera) -> tuple[float, float] | None:
         """`arc`, counted from another camera."""
         if self.arc is None:

@@ -62,7 +62,7 @@ def _read_text(path: PathLike) -> tuple[Floats, Floats | None]:
     for index, row in enumerate(rows):
         try:
             with np.errstate(over="ignore"):
-                values[index] = np.array(row.split(), dtype=np.float64)
+                values[index] = np.array(row.split(), dtype=np.float64).reshape(len(names))
         except ValueError:
             raise InputError(
                 f"{path}: line {end + 2 + index}, {row[:80]!r}, does not hold {len(names)} numbers; it is damaged."

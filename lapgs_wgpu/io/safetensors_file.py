@@ -22,7 +22,7 @@ Array = NDArray[Any]
 MAX_HEADER_BYTES = 1 << 20
 _DTYPES = {
     "F64": "<f8", "F32": "<f4", "F16": "<f2", "I64": "<i8", "I32": "<i4", "I16": "<i2", "I8": "|i1", "U64": "<u8",
-    "U32": "<u4", "U16": "<u2", "U8": "|u1",
+    "U32": "<u4", "U16": "<u2", "U8": "|u1", "BOOL": "|b1",
 }  # fmt: skip
 _NAMES = {np.dtype(code): name for name, code in _DTYPES.items()}
 _METADATA = "__metadata__"
@@ -141,6 +141,8 @@ def _read_array(file: BinaryIO, spec: _Spec, where: str) -> Array:
     if file.readinto(array.view(np.uint8)) != array.nbytes:  # type: ignore[attr-defined]  # all binary files have it
         raise InputError(f"{where}: became shorter while it was read, in tensor {spec.name[:80]!r}")
     _check_finite(array, f"{where}: tensor {spec.name[:80]!r}")
+    if array.dtype == np.bool_ and (array.view(np.uint8) > 1).any():
+        raise InputError(f"{where}: tensor {spec.name[:80]!r} has truth values other than 0 and 1; the file is damaged")
     return array.reshape(spec.shape)
 
 

@@ -37,9 +37,9 @@ _SHAPES = {
 class SceneFile:
     """The content of a file, float32.
 
-    gaussians: canonical ones by name, (N, ...) with rows as in `row_shapes`. field: the field's parameters by name, in
-    the shapes of `parameter_shapes`. metadata: further texts. antialiased: how the Gaussians are drawn, see Gaussians;
-    in a compact scene that moves, they have static_features (N, F) in place of the field's static table. timing: of the
+    gaussians: canonical ones by name, (N, ...) with rows as in `row_shapes`; in a compact scene that moves, with
+    static_features (N, F) in place of the field's static table. field: the field's parameters by name, in the shapes of
+    `parameter_shapes`. metadata: further texts. antialiased: how the Gaussians are drawn, see Gaussians. timing: of the
     capture.
     """
 

@@ -27,10 +27,9 @@ class Timing:
     moments: NDArray[np.float64]
 
     def __call__(self, t: float) -> float:
-        """The moment at a time in [0, 1]."""
-        if len(self.times) == 0:
-            return t
-        return min(max(t + float(np.interp(t, self.times, self.moments - self.times)), 0.0), 1.0)
+        """The moment at a time in [0, 1]; at others that of the nearest end."""
+        later = float(np.interp(t, self.times, self.moments - self.times)) if len(self.times) else 0.0
+        return min(max(t + later, 0.0), 1.0)
 
     def to_text(self) -> str:
         """JSON, which `timing_of_text` reads to the last bit."""

@@ -18,9 +18,9 @@ from lapgs_wgpu.errors import InputError
 
 from .capture_folder import appearing
 from .diagnosis import Diagnosis, diagnose
-from .extract import LONGER_SIDE, Extraction, aligned, extract, images_per_second, shortened
+from .extract import LONGER_SIDE, Extraction, common_end, common_moments, extract, images_per_second, shortened
 from .film import Film
-from .masks import MASKS, read_masks, write_masks
+from .masks import MASKS, check_folder, read_masks, write_masks
 from .moving import World, area, remove_matches, rim, solve_world
 from .reconstruct import Reconstruction, all_pairs, import_pycolmap, merged, neighbouring_pairs
 from .report import REPORT, write_report
@@ -66,6 +66,8 @@ def prepare(
         raise InputError(f"--size must be 64 to 8192 pixels, got {longer_side}.")
     if masks is not None and len(videos) > 1:
         raise InputError("--masks goes with one moving camera; cameras that stand still need no masks.")
+    if masks is not None:
+        check_folder(masks)
     import_pycolmap()
     films = [Film(video) for video in videos]
     with appearing(out) as folder:
@@ -98,12 +100,12 @@ def prepare(
 
 
 def extract_all(films: Sequence[Film], images: Path, fps: float | None, longer_side: int) -> list[Extraction]:
-    """The images of all films. Says how many, and why. Several films end with the shortest."""
+    """The images of all films. Says how many, and why. Several films end with the shortest, and have one rate."""
     still = len(films) > 1
+    rate = max(images_per_second(film, fps, still=still) for film in films)
     extractions = []
     for index, film in enumerate(films):
         prefix = f"cam{index:02d}/" if still else ""
-        rate = images_per_second(film, fps, still=still)
         extractions.append(extract(film, images, prefix, rate, longer_side, still=still))
         say(f"{film.path}: {extractions[-1]}")
         for note in film.notes:
@@ -114,7 +116,7 @@ def extract_all(films: Sequence[Film], images: Path, fps: float | None, longer_s
                 f"{films[0].size[0]}x{films[0].size[1]}; film with one size."
             )
     if still:
-        end = aligned(extractions)
+        end = common_end(extractions)
         longest = max(each.pictures[-1].seconds for each in extractions)
         if longest > end + 1 / extractions[0].fps:
             say(f"the films are {end:.2f} to {longest:.2f} s long; all are cut to {end:.2f} s.")
@@ -141,9 +143,8 @@ def _moving_camera(folder: Path, extraction: Extraction, masks: Path | None) -> 
 
 def _still_cameras(folder: Path, extractions: Sequence[Extraction]) -> Any:
     """Compare all cameras at several moments."""
-    count = min(len(each.pictures) for each in extractions)
-    moments = sorted({round(i * (count - 1) / (MOMENTS - 1)) for i in range(MOMENTS)})
-    groups = [[each.pictures[moment].name for moment in moments] for each in extractions]
+    moments = common_moments(extractions, MOMENTS)
+    groups = [[picture.name for picture in of_camera] for of_camera in zip(*moments, strict=True)]
     work = folder / "colmap"
     source = Reconstruction(folder / IMAGES, [name for group in groups for name in group], work, FEW_CAMERAS_LENS)
     source.find_features()

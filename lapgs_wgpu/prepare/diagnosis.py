@@ -95,6 +95,8 @@ def _mask(folder: Path, view: View) -> Mask | None:
         name = PurePosixPath(Path(os.path.relpath(view.source, folder / IMAGES)).as_posix())
     except ValueError:  # of another drive
         return None
+    if ".." in name.parts:  # not among the images that lapgs-prepare wrote
+        return None
     path = folder / MASKS / name.with_suffix(".png")
     if not path.is_file():
         return None

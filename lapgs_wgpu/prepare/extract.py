@@ -144,9 +144,27 @@ def _blurred(pictures: Sequence[Picture]) -> list[bool]:
     return found
 
 
-def aligned(extractions: Sequence[Extraction]) -> float:
+def common_end(extractions: Sequence[Extraction]) -> float:
     """Seconds that all cameras film: the end of the shortest film."""
     return min(each.pictures[-1].seconds for each in extractions)
+
+
+def common_moments(extractions: Sequence[Extraction], most: int) -> list[tuple[Picture, ...]]:
+    """At most `most` moments that all cameras filmed, in order, a picture of each camera.
+
+    A moment is that of a picture of the first camera to which each other one has a picture less than half a span away.
+    Of each equal share of the moments the one is taken whose pictures are closest together in time.
+    """
+    times = [np.array([picture.seconds for picture in each.pictures]) for each in extractions]
+    found: list[tuple[float, tuple[Picture, ...]]] = []
+    for now in times[0].tolist():
+        nearest = [int(np.abs(own - now).argmin()) for own in times]
+        apart = max(abs(float(own[i]) - now) for own, i in zip(times, nearest, strict=True))
+        if apart < 0.5 / extractions[0].fps:
+            chosen = tuple(each.pictures[i] for each, i in zip(extractions, nearest, strict=True))
+            found.append((apart, chosen))
+    shares = np.array_split(np.arange(len(found)), min(most, len(found)))
+    return [found[min(share, key=lambda i: (round(found[i][0], 4), i))][1] for share in shares]
 
 
 def shortened(extraction: Extraction, images: Path, seconds: float) -> Extraction:

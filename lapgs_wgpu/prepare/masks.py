@@ -24,13 +24,18 @@ def write_masks(folder: Path, masks: Mapping[str, Mask]) -> None:
         path.write_bytes(encode_png(mask.astype(np.uint8) * 255))
 
 
+def check_folder(folder: Path) -> None:
+    """Raises InputError where a folder of masks is none."""
+    if not folder.is_dir():
+        raise InputError(f"{folder} is not a folder; --masks needs one with a PNG for each image.")
+
+
 def read_masks(folder: Path, names: Sequence[str], size: Size) -> dict[str, Mask]:
     """Read the masks of images of (width, height), white where something moves, by the images' names.
 
     Every image needs one: NAME.png or NAME.jpg.png (COLMAP's way) below the folder. Raises InputError.
     """
-    if not folder.is_dir():
-        raise InputError(f"{folder} is not a folder; --masks needs one with a PNG for each image.")
+    check_folder(folder)
     paths = {name: [folder / PurePosixPath(name).with_suffix(".png"), folder / f"{name}.png"] for name in names}
     found = {name: next((path for path in both if path.is_file()), None) for name, both in paths.items()}
     missing = [name for name, path in found.items() if path is None]

@@ -151,6 +151,8 @@ def find_tracks(database: Any) -> Tracks:
         edges.append(geometry.inlier_matches.astype(np.int64).reshape(-1, 2) + np.array([first[a], first[b]]))
     one, other = np.concatenate(edges).T
     count = int(first[-1])
+    if count == 0:  # nothing but blank images
+        return Tracks(tuple(image.name for image in images), np.zeros(0, int), np.zeros((0, 2)), np.zeros(0, int))
     _, labels = connected_components(
         coo_matrix((np.ones(len(one)), (one, other)), shape=(count, count)), directed=False
     )

@@ -14,10 +14,12 @@ from PIL import Image
 
 from lapgs_wgpu.data import Dataset, View
 from lapgs_wgpu.data.images import Pixels
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.io.atomic import atomic_write
 
 from .diagnosis import Diagnosis
 from .masks import Mask
-from .measure import Look, Measure
+from .measure import Look, Measure, evenly
 
 REPORT = "report.html"
 THUMBNAILS = 24  # evenly chosen from the views that were looked at
@@ -25,6 +27,8 @@ _WIDTH = 220  # pixels of a thumbnail
 _MOST_POINTS = 1200  # of the cloud, in the drawing
 _DRAWING = 420  # pixels: width of the drawing
 _TINT, _STRENGTH = np.array([235.0, 60.0, 40.0]), 0.45  # color over what moves
+
+_MARK = b": diagnosis</title>"  # which tells the page from others
 
 _STYLE = """
 :root { color-scheme: light dark; --line: #8884; --good: #1a7f37; --poor: #c9372c; --soft: #777; }
@@ -43,18 +47,19 @@ figcaption { font-size: .8rem; overflow-wrap: anywhere; }
 
 
 def write_report(diagnosis: Diagnosis, path: Path, title: str) -> None:
-    """Write the page. title: name of the capture."""
-    path.write_text(_page(diagnosis, title), encoding="utf-8")
+    """Write the page. title: name of the capture. Atomic. Raises InputError where it cannot be written, or where a page
+    of another program is there."""
+    if path.exists() and _MARK not in path.read_bytes():
+        raise InputError(f"{path} is of another program and stays as it is; the report was not written.")
+    with atomic_write(path) as file:
+        file.write(_page(diagnosis, title).encode())
 
 
 def _page(diagnosis: Diagnosis, title: str) -> str:
     dataset = diagnosis.dataset
     poor = [measure for measure in diagnosis.measures if measure.good is False]
     verdict = f"{len(poor)} of {len(diagnosis.measures)} properties are poor" if poor else "nothing speaks against it"
-    chosen = [
-        diagnosis.looks[i]
-        for i in sorted(set(np.linspace(0, len(diagnosis.looks) - 1, THUMBNAILS).round().astype(int).tolist()))
-    ]
+    chosen = [diagnosis.looks[i] for i in evenly(len(diagnosis.looks), THUMBNAILS)]
     masked = any(look.mask is not None and look.mask.any() for look in chosen)
     count = len(dataset.train) + len(dataset.test)
     layout = "cameras that stand still" if diagnosis.still else "one camera that moves"
@@ -76,7 +81,7 @@ def _page(diagnosis: Diagnosis, title: str) -> str:
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{escape(title)}: diagnosis</title><style>{_STYLE}</style></head><body>{''.join(body)}</body></html>\n"
+        f"<title>{escape(title)}{_MARK.decode()}<style>{_STYLE}</style></head><body>{''.join(body)}</body></html>\n"
     )
 
 
@@ -122,7 +127,6 @@ def _drawing(dataset: Dataset, name: str) -> str:
     points = np.zeros((0, 2))
     if dataset.cloud is not None:
         points = dataset.cloud.at_most(_MOST_POINTS, 0).points.astype(np.float64) @ plane.T
-    kept = np.concatenate([centers, points])
     low, high = np.percentile(points, [2, 98], axis=0) if len(points) else (centers.min(0), centers.max(0))
     low, high = np.minimum(low, centers.min(axis=0)), np.maximum(high, centers.max(axis=0))
     length = 0.06 * float(np.max(high - low)) or 1.0
@@ -134,7 +138,7 @@ def _drawing(dataset: Dataset, name: str) -> str:
         middle = (places - (low + high) / 2) * scale
         return np.round(middle * [1, -1] + size / 2, 1)
 
-    inside = ((kept[len(centers) :] >= low) & (kept[len(centers) :] <= high)).all(axis=1)
+    inside = ((points >= low) & (points <= high)).all(axis=1)
     dots = "".join(f'<circle cx="{x}" cy="{y}" r="1"/>' for x, y in at(points[inside]))
     cameras = []
     for view, (x, y), (x1, y1) in zip(views, at(centers), at(centers + length * ahead), strict=True):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from ..gpu.device import SOFTWARE_LOOP_TURNS, Device
 from ..gpu.probe_subgroup import subgroup_size
@@ -11,6 +11,10 @@ from ..gpu.probe_subgroup import subgroup_size
 # cover all. Below the `max_loop_turns` of every device, and below the workgroups of one dimension, which a counted
 # dispatch does not fold into two.
 MAX_BAND_TILES = 60_000
+
+# At least the turns of loops for each splat of a round. Without subgroups the backward pass sums a splat's ten values
+# in loops over the lanes: 20 turns.
+SUBGROUP_TURNS, PLAIN_TURNS = 2, 32
 
 
 @dataclass(frozen=True)
@@ -43,6 +47,11 @@ class RasterConfig:
     def tile_defines(self) -> dict[str, int]:
         return {"TILE_W": self.tile_width, "TILE_H": self.tile_height}
 
+    def without_subgroups(self) -> RasterConfig:
+        """The same for a driver that tears subgroups apart; its rounds are shorter, as loops are longer."""
+        rounds = self.round_splats and self.round_splats * SUBGROUP_TURNS // PLAIN_TURNS
+        return replace(self, subgroups=False, round_splats=rounds)
+
     def raster_defines(self, *, depth: bool) -> dict[str, int]:
         """Defines of rasterize and rasterize_bwd. depth: whether to draw it, too."""
         flags = {"SUBGROUPS": self.subgroups, "DEPTH": depth, "LANES_16": self.lanes > 8, "LANES_32": self.lanes > 16}
@@ -56,8 +65,7 @@ def cpu_config(subgroup_size: int, max_loop_turns: int = SOFTWARE_LOOP_TURNS, *,
     """A workgroup is one vector of the processor, so that no barrier waits."""
     lanes = 16 if subgroup_size == 16 else 8
     subgroups = subgroup_size >= lanes
-    # Without subgroups the backward pass sums a splat's ten values in loops over the lanes: 20 iterations per splat.
-    round_splats = (max_loop_turns + 1) // (2 if subgroups else 32)
+    round_splats = (max_loop_turns + 1) // (SUBGROUP_TURNS if subgroups else PLAIN_TURNS)
     return RasterConfig(
         8,
         8,

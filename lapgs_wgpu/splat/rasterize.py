@@ -184,7 +184,8 @@ def upload_gaussians(pool: BufferPool, gaussians: Gaussians[Tensor]) -> Gaussian
 
 def radii_and_centres(splats: NDArray[np.float32], device: torch.device) -> tuple[Tensor, Tensor]:
     """`radii` and `means2d` of a Rendering, from splats (N, SPLAT_FLOATS) that were read back."""
-    radii, centres = splats[:, RADIUS].astype(np.int32), splats[:, MEAN].copy()
+    largest = np.float32(np.iinfo(np.int32).max - 127)  # the nearest float32 below
+    radii, centres = np.minimum(splats[:, RADIUS], largest).astype(np.int32), splats[:, MEAN].copy()
     return torch.from_numpy(radii).to(device), torch.from_numpy(centres).to(device)
 
 

@@ -265,7 +265,7 @@ class Rasterizer:
         flags = lists.ranges.rows(lists.ranges.shape[0] - 1, 1).read()[0]
         if not flags[3 if name == "rasterize_bwd" else 2]:
             return False
-        self.config = replace(self.config, subgroups=False)
+        self.config = self.config.without_subgroups()
         return True
 
     # Backward --------------------------------------------------------------------------------------------------------
@@ -293,6 +293,8 @@ class Rasterizer:
                     drawing.lists = self._draw_band(commands, drawing, band)
                 self._backward_band(commands, drawing, band, d_image, d_splats)
             if self._subgroup_mismatch("rasterize_bwd", drawing):
+                if self.config.round_splats:  # there may be more rounds now
+                    self._draw_again(drawing)
                 return self.backward(drawing, d_image, camera=camera, profile=profile)
         d_sh, d_camera = None, self._camera_sums(n) if camera else None
         arrays = gaussians.arrays() | {"frame": self._frame(drawing, 0), "d_splats": d_splats}
@@ -310,6 +312,14 @@ class Rasterizer:
                 shifted = {"frame": arrays["frame"], "d_means": d_means, "d_camera": d_camera.rows(1, 1)}
                 commands.run(Kernel.get(self.device, "camera_bwd", FORCE=True), _groups(n), shifted)
         return GaussianGradients(d_splats, d_means, d_quats, d_scales, d_sh, d_camera)
+
+    def _draw_again(self, drawing: Drawing) -> None:
+        """Make a drawing one of the present config."""
+        while True:
+            again = self.draw(drawing.gaussians, drawing.camera, drawing.background, depth=drawing.depth)
+            if not self.grow_on_overflow(again):
+                vars(drawing).update(vars(again))
+                return
 
     def _camera_sums(self, n: int) -> DeviceArray:
         """A row for each workgroup of camera_bwd, twice; each half begins at a multiple of 256 bytes."""

@@ -21,6 +21,7 @@ from torch import Tensor
 
 from lapgs_wgpu.data.images import encode_png
 from lapgs_wgpu.data.views import View, composite
+from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.camera import Camera
@@ -64,8 +65,9 @@ def evaluate(
     stands still, and psnr_still is that of the other pixels. Absent where no moving pixel is known.
     camera_unit: extent of the cameras, world units, where training cameras were refined. `aligned` then holds the
     measures once more, after test-time alignment (`view_alignment`), labelled as such; the others stay without it.
-    Raises InputError where a picture or a mask cannot be read.
+    Raises InputError where there are no views, or a picture or a mask cannot be read.
     """
+    _check_any(views)
     start = time.perf_counter()
     color = torch.full((3,), BACKGROUND_LEVELS[background])
     rows = []
@@ -128,8 +130,14 @@ def _apart(given: Camera, fitted: Camera, unit: float) -> dict[str, float]:
 
 def mean_psnr(scene: Scene4D, views: Sequence[View], background: str) -> float:
     """The mean over the views of the PSNR, dB, as in `evaluate`. Raises InputError."""
+    _check_any(views)
     color = torch.full((3,), BACKGROUND_LEVELS[background])
     return float(np.mean([psnr(_unit(_render(scene, view, color)), _unit(_on(color, view))) for view in views]))
+
+
+def _check_any(views: Sequence[View]) -> None:
+    if not views:
+        raise InputError("there are no views to measure: most captures have no validation views, only test views.")
 
 
 def _on(color: Tensor, view: View) -> NDArray[np.uint8]:

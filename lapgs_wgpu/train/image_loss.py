@@ -18,7 +18,7 @@ from .config import LossWeights
 from .losses import NCC_WINDOW, pyramid_sizes, pyramid_weights
 
 TERMS = 5  # in the buffer that `record` leaves
-_WHOLE = 1 << 14  # longer than any side of an image: a lane takes a whole row or column
+_WHOLE = 1 << 14  # a lane takes a whole row or column, of a longer side several runs
 
 
 class LossArrays(NamedTuple):

@@ -23,6 +23,7 @@ import json
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,8 +31,8 @@ from lapgs_wgpu.data.builtin import builtin_folder, is_builtin
 from lapgs_wgpu.errors import InputError, shown
 from lapgs_wgpu.io.dataclass_table import did_you_mean
 from lapgs_wgpu.io.safe_json_toml import read_toml
-from lapgs_wgpu.train.config import Config
-from lapgs_wgpu.train.presets import Table, build_config, merge
+from lapgs_wgpu.train.config import CamerasConfig, Config
+from lapgs_wgpu.train.presets import Table, build_config, load_config, merge, preset_names
 
 MOST_RUNS = 10_000
 _NAME = re.compile(r"\w[\w .+=-]*", re.ASCII)  # becomes the name of a folder, and a cell of a Markdown table
@@ -115,10 +116,17 @@ def read_spec(path: Path) -> Spec:
     return Spec(path.stem, preset, tuple(sorted(runs, key=lambda run: order.index(run.key.scene))))
 
 
+@lru_cache(maxsize=1)
+def _usual_cameras() -> frozenset[CamerasConfig]:
+    """How the presets refine cameras."""
+    return frozenset(load_config(name).cameras for name in preset_names())
+
+
 def fingerprint(config: Config) -> str:
-    """Of all that the result of a training depends on: not of where its images lie or how often it is saved."""
+    """Of all that the result of a training depends on: not of where its images lie, how often it is saved, or where its
+    decoder runs, which changes last bits and follows from the device."""
     values = dataclasses.asdict(config)
-    del values["data"]["path"], values["schedule"]["save_interval"], values["eval"]
+    del values["data"]["path"], values["schedule"]["save_interval"], values["eval"], values["decoder"]
     # These keys are younger than results that are worth keeping.
     if values["schedule"]["batch"] == 1:
         del values["schedule"]["batch"]
@@ -126,7 +134,7 @@ def fingerprint(config: Config) -> str:
         del values["antialiased"]
     if not config.exposure.enabled:
         del values["exposure"]
-    if config.cameras.refine != "on":
+    if config.cameras in _usual_cameras():
         del values["cameras"]
     if not config.timing.refine:
         del values["timing"]
@@ -152,8 +160,6 @@ def fingerprint(config: Config) -> str:
         del values["data"]["undistort"]
     if config.precision == "float32":
         del values["precision"]
-    if config.decoder != "device":
-        del values["decoder"]
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:16]
 
 

@@ -53,8 +53,8 @@ from lapgs_wgpu.train.suited import suited, with_decoder_placed
 from lapgs_wgpu.train.timing_refinement import TimingRefinement, image_to_fit
 
 MAX_SH_DEGREE = 3
-# Of the configuration.
-TERMS = frozenset({"l1", "mse", "ssim", "pyramid", "ncc", "smoothness", "acceleration", "dynamics"})
+# Terms of the configuration, and what stands beside them in the log.
+TERMS = frozenset({"l1", "mse", "ssim", "pyramid", "ncc", "smoothness", "acceleration", "dynamics", "loss", "psnr"})
 
 
 class _Look(NamedTuple):
@@ -425,9 +425,10 @@ class Trainer:
         return view.camera if self.cameras is None else self.cameras.refined(view.camera).camera
 
     def _as_seen(self, views: Sequence[View]) -> list[View]:
-        """The views, those of the training with their corrected cameras."""
+        """The views, those by cameras of the training with the corrections of these."""
+        trained = {id(camera) for camera in self.dataset.cameras}
         return [
-            dataclasses.replace(view, camera=self._camera_of(view)) if view.name in self._numbers else view
+            dataclasses.replace(view, camera=self._camera_of(view)) if id(view.camera) in trained else view
             for view in views
         ]
 

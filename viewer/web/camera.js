@@ -81,10 +81,15 @@ export class ViewCamera {
         return [right, cross(forward, right), forward];
     }
 
+    // What fovY spans on a canvas of this size.
+    pictureHeight(width, height) {
+        return Math.min(height, width / this.narrowest);
+    }
+
     // What the rasteriser takes for a picture of this size; view is column by column.
     camera(width, height) {
         const [x, y, z] = this.rotation;
-        const f = 0.5 * Math.min(height, width / this.narrowest) / Math.tan(0.5 * this.fovY);
+        const f = 0.5 * this.pictureHeight(width, height) / Math.tan(0.5 * this.fovY);
         const shift = [x, y, z].map(row => -dot(row, this.position));
         const view = [0, 1, 2].flatMap(i => [x[i], y[i], z[i], 0]).concat(shift, 1);
         return { view, focal: [f, f], center: [width / 2, height / 2], position: this.position, width, height };

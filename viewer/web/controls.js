@@ -38,7 +38,7 @@ export class Controls {
         if (!last) return;
         const { camera } = this.state;
         const [right, down] = [event.clientX - last[0], event.clientY - last[1]];
-        const height = this.canvas.clientHeight;
+        const height = camera.pictureHeight(this.canvas.clientWidth, this.canvas.clientHeight);
         const before = this.pointers.size === 2 && this.spread();
         this.pointers.set(event.pointerId, [event.clientX, event.clientY]);
         if (before) { // two fingers: pan by their middle, zoom by their distance

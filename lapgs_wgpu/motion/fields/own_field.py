@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
+import torch
 from torch import Tensor, nn
 
 from ...errors import InputError
@@ -16,6 +17,10 @@ _ROWS = {
     "rotation": (4,), "orientation": (4,), "translation": (3,), "d_quats": (4,), "d_scales": (3,), "d_dc": (3,),
     "d_opacity": (),
 }  # fmt: skip
+_STORED = (
+    torch.float64, torch.float32, torch.float16, torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8,
+    torch.bool,
+)  # fmt: skip
 _OPTIONAL = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
 
 
@@ -33,6 +38,13 @@ class OwnField(nn.Module):
             given = f"the class {module.__name__}" if isinstance(module, type) else f"a {type(module).__name__}"
             raise InputError(f"a field must be an nn.Module, such as field=Drift() for a class Drift; got {given}.")
         self.module = module
+        for name, value in module.state_dict().items():
+            if value.dtype not in _STORED or (value.is_floating_point() and not bool(value.isfinite().all())):
+                what = "NaN or infinity" if value.dtype in _STORED else f"numbers of type {value.dtype}"
+                raise InputError(
+                    f"the field {type(module).__name__} keeps {what} in {name}, which checkpoints do not hold; make it "
+                    "another, or a buffer with persistent=False."
+                )
         named = inspect.signature(module.forward).parameters
         self._takes = [name for name in ("dynamics", "nearby") if name in named]
         needed = [name for name, each in named.items() if each.default is each.empty and each.kind not in _OPTIONAL]

@@ -176,7 +176,7 @@ class GridFieldPlayback:
         if self._config.kind == "laplacian":
             phase = 2 * math.pi * t * p["motion.frequencies"].astype(np.float64)
             series = np.cos(phase) @ p["motion.alpha"] + np.sin(phase) @ p["motion.beta"]
-            # As Factors.through: only these heads read A_L.
+            # As GridField: only these heads read A_L.
             _fill_geometry(columns[:width, heads:], (weight @ (series[:, None] * p["motion.second.weight"])).T)
             bias = p["heads.bias"] + weight @ (series * p["motion.second.bias"])
             _fill_geometry(start[None], bias[None])
