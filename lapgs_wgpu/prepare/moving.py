@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from lapgs_wgpu.data.images import Size
 from lapgs_wgpu.errors import InputError
 
+from .masks import Mask
+from .measure import Floats
 from .reconstruct import Reconstruction, import_pycolmap
 
-Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 SHORTEST = 5  # images of a track that counts: two images agree with almost any motion along their epipolar lines
 TOLERANCE, MIN_TOLERANCE = 2.5e-3, 1.0  # median reprojection error of a still track: of the longer side; pixels

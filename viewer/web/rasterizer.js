@@ -33,7 +33,7 @@ export class Rasterizer {
     // Submit the passes that draw an image. It is valid once `valid` says so of what `counts` reads.
     // gaussians: {count, degree, antialiased, means, quats, scales, opacities, sh}. camera: see camera.js. depth: as a fifth plane.
     draw(gaussians, camera, background, log = null, depth = false) {
-        if (this.size !== `${camera.width}x${camera.height}`) { // what another size needed would slow this one down
+        if (this.size !== `${camera.width}x${camera.height}`) { // the bands of another size would slow this one down
             this.plan = { capacity: this.plan.capacity, bands: 1 };
             this.size = `${camera.width}x${camera.height}`;
         }
