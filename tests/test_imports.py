@@ -27,7 +27,7 @@ ALLOWED = {
     "train": {"errors", "progress", "gpu", "splat", "motion", "data", "io"},
     "command": {"errors", "gpu"},
     "viewer": {"errors", "command", "progress", "gpu", "splat", "motion", "data", "io"},
-    "prepare": {"errors", "progress", "data", "splat.camera"},
+    "prepare": {"errors", "progress", "data", "splat.camera", "io.atomic"},
     "prepare_cli": {"errors", "command", "gpu", "prepare", "train"},
     "doctor": {"errors", "gpu", "splat", "motion", "train"},
     "doctor_cli": {"errors", "command", "doctor"},
