@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from lapgs_wgpu.data import Dataset, ImageCache, View, composite
+from lapgs_wgpu.data.focus import focus_of, spread
 from lapgs_wgpu.data.normalize import BOX
-from lapgs_wgpu.data.views import extent_of, spread_views
+from lapgs_wgpu.data.views import spread_views
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
 
@@ -154,8 +155,10 @@ def test_cameras_at_one_place_have_the_extent_of_the_scene(count: int) -> None:
     views = [dataclasses.replace(view_of(Source()), camera=dataclasses.replace(camera)) for _ in range(count)]
     data = Dataset("toy", tuple(views), ())
     assert data.extent == BOX
-    np.testing.assert_allclose(data.focus, eye + BOX * camera.T_cam_world[2, :3], rtol=1e-6)
-    assert extent_of([camera, CAMERA]) == pytest.approx(0.55 * np.linalg.norm(eye - CAMERA.position))
+    np.testing.assert_allclose(data.focus, [0, 0, 0], atol=1e-9)
+    away = [dataclasses.replace(view.camera, T_cam_world=np.eye(4)) for view in views]  # the origin is not before it
+    np.testing.assert_allclose(focus_of(away, origin=True), [0, 0, 1], atol=1e-9)
+    assert spread([camera, CAMERA]) == pytest.approx(0.5 * np.linalg.norm(eye - CAMERA.position))
 
 
 def test_cache_keeps_the_most_recently_used() -> None:

@@ -15,16 +15,17 @@ import numpy as np
 
 from lapgs_wgpu.data.cloud import Cloud, points_in_view
 from lapgs_wgpu.data.covisible import read_mask
+from lapgs_wgpu.data.focus import are_parallel, focus_of
 from lapgs_wgpu.data.frames import Capture, Frame, ImageSource, Reader, Split
 from lapgs_wgpu.data.ignored import find_ignored, read_ignored
 from lapgs_wgpu.data.images import Pixels, Size, shrink, shrunk_size
-from lapgs_wgpu.data.normalize import BOX, Cube, are_parallel, cube_in_view, cube_of_points
+from lapgs_wgpu.data.normalize import BOX, Cube, cube_in_view, cube_of_points
 from lapgs_wgpu.data.readers import colmap, dnerf, endonerf, hypernerf, nerfstudio, neu3d, polycam, record3d
 from lapgs_wgpu.data.split import held_out
 from lapgs_wgpu.data.timestamps import disorder, in_step, natural_key, read_times, to_unit_range
 from lapgs_wgpu.data.undistort import Undistortion
 from lapgs_wgpu.data.validation import check_cloud, check_film, check_frames, check_views
-from lapgs_wgpu.data.views import Dataset, View, focus_of
+from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
 
@@ -215,7 +216,7 @@ def _depths(
         return min(near for near, _ in stated), float(np.median([far for _, far in stated]))
     if capture.cloud is not None or capture.keeps_coordinates:
         return None
-    focus = focus_of(cameras)
+    focus = focus_of(cameras, origin=False)
     depth = np.array([(camera.T_cam_world @ [*focus, 1.0])[2] for camera in cameras])
     behind = int((depth <= 0).sum())
     if 2 * behind > len(cameras):

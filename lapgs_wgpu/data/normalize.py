@@ -11,8 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lapgs_wgpu.data.cloud import Cloud, in_view
-from lapgs_wgpu.data.poses import Array, spread, world_to_camera
+from lapgs_wgpu.data.cloud import Cloud
+from lapgs_wgpu.data.focus import focus_of
+from lapgs_wgpu.data.poses import Array, world_to_camera
 from lapgs_wgpu.splat.camera import Camera
 
 BOX = 1.3  # half side of the cube: D-NeRF's scenes lie in it
@@ -21,8 +22,6 @@ ENCODED = 1.6  # half side of the encoder's box in every preset (field.bound), w
 MIN_SIZE = 0.5  # of BOX: half side from which on a scene is large enough to keep its coordinates
 SEEN = 1.45  # half-width that D-NeRF's cameras see at the point that they look at, world units
 QUANTILE = 75  # per cent of the cameras see no more than the cube shows: a few distant ones have no influence
-PARALLEL = 1e-2  # mean squared sine between optical axes below which they do not determine a point
-ITERATIONS = 20  # of the reweighted least squares
 
 
 class Normalization(NamedTuple):
@@ -91,7 +90,7 @@ def cube_in_view(cameras: Sequence[Camera]) -> Cube | None:
     The size follows from the half-width (of the longer side) that the cameras see at that point; the QUANTILE decides.
     Returns None if half or more of the cameras look away from the point: the size is then unknown.
     """
-    center = _focus(cameras)
+    center = focus_of(cameras, origin=True)
     depths = np.array([(camera.T_cam_world @ [*center, 1.0])[2] for camera in cameras])
     tangents = np.array([max(c.width / c.K[0, 0], c.height / c.K[1, 1]) / 2 for c in cameras])
     ahead = depths > 0
@@ -99,39 +98,3 @@ def cube_in_view(cameras: Sequence[Camera]) -> Cube | None:
         return None
     half = float(np.percentile((depths * tangents)[ahead], QUANTILE)) * BOX / SEEN
     return Cube(center, max(half, 1e-6))
-
-
-def are_parallel(cameras: Sequence[Camera]) -> bool:
-    """Whether all look in one direction, as one camera that stands still does: their axes meet nowhere."""
-    return bool(np.linalg.eigvalsh(_across(cameras).mean(axis=0))[0] < PARALLEL)
-
-
-def _across(cameras: Sequence[Camera]) -> Array:
-    """(N, 3, 3) the projections onto the planes across the optical axes."""
-    ahead = np.stack([camera.T_cam_world[2, :3] for camera in cameras])
-    return np.eye(3) - ahead[:, :, None] * ahead[:, None, :]
-
-
-def _focus(cameras: Sequence[Camera]) -> Array:
-    """(3,) the point with the least sum of distances from the optical axes, so that outliers hardly move it.
-
-    Parallel axes determine no point. The result is then the origin, where D-NeRF scenes lie, if half of the cameras see
-    it; else a point one camera radius (1 if the cameras coincide) in front of them.
-    """
-    centres = np.stack([camera.position for camera in cameras])
-    ahead = np.stack([camera.T_cam_world[2, :3] for camera in cameras])
-    across = _across(cameras)
-    guess = centres.mean(axis=0) + (spread(centres) or 1.0) * ahead.mean(axis=0)
-    if are_parallel(cameras):
-        origin = np.zeros((1, 3))
-        return origin[0] if np.mean([in_view(origin, camera)[1][0] for camera in cameras]) >= 0.5 else guess
-    point, weights = guess, np.full(len(cameras), 1 / len(cameras))
-    for _ in range(ITERATIONS):
-        matrix = np.einsum("n,nij->ij", weights, across)
-        # Regularize towards the guess: reweighting may leave parallel axes alone.
-        faint = 1e-6 * np.trace(matrix) * np.eye(3)
-        point = np.linalg.solve(matrix + faint, np.einsum("n,nij,nj->i", weights, across, centres) + faint @ guess)
-        misses = np.linalg.norm(np.einsum("nij,nj->ni", across, point - centres), axis=1)
-        floor = 1e-3 * float(np.median(np.linalg.norm(point - centres, axis=1))) + 1e-12
-        weights = 1 / np.maximum(misses / floor, 1.0)
-    return point

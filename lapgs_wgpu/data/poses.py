@@ -15,7 +15,6 @@ Array = NDArray[np.float64]
 # Largest deviation of R^T R from the identity: files store about seven digits; scale or shear exceeds this by far.
 ROTATION_TOLERANCE = 1e-3
 LARGEST_ENTRY = 1e9  # of a pose: matrix products of larger entries lose all digits
-ROUNDING = 1e-9  # relative to coordinates: what tells them apart by less is no distance
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0])  # y up, z backward -> y down, z forward
 
 
@@ -40,12 +39,6 @@ def world_to_camera(R_world_cam: Array, position: Array) -> Array:
     T_cam_world = np.eye(4)
     T_cam_world[:3, :3], T_cam_world[:3, 3] = R_world_cam.T, -R_world_cam.T @ position
     return T_cam_world
-
-
-def spread(positions: Array) -> float:
-    """The largest distance of positions (N, 3) from their mean; 0 where rounding alone tells them apart."""
-    largest = float(np.linalg.norm(positions - positions.mean(axis=0), axis=1).max())
-    return largest if largest > ROUNDING * np.abs(positions).max() else 0.0
 
 
 def opengl_pose(value: Any, where: str) -> Array:

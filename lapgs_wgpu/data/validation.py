@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from lapgs_wgpu.data.cloud import Cloud, in_view, views_of
 from lapgs_wgpu.data.covisible import check_mask
+from lapgs_wgpu.data.focus import spread
 from lapgs_wgpu.data.frames import Frame
 from lapgs_wgpu.data.images import check_image, gray_thumbnail, size_text
-from lapgs_wgpu.data.poses import spread
 from lapgs_wgpu.data.undistort import Lens
 from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.errors import InputError
@@ -223,7 +223,7 @@ def check_views(cloud: Cloud, cameras: Sequence[Camera], names: Sequence[str], w
             "more images or larger ones give more."
         )
     centres = np.stack([camera.position for camera in cameras])
-    reach = spread(centres)
+    reach = spread(cameras)
     distance = float(np.median(np.linalg.norm(np.median(points, axis=0) - centres, axis=1)))
     if reach < STANDING * distance:
         warnings.append(

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lapgs_wgpu.data.cloud import Cloud
+from lapgs_wgpu.data.focus import focus_of, spread
 from lapgs_wgpu.data.normalize import BOX, Normalization
 from lapgs_wgpu.data.objects import ObjectTruth
-from lapgs_wgpu.data.poses import spread
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
 
@@ -112,7 +112,7 @@ class Dataset:
     def extent(self) -> float:
         """1.1 times the largest distance of a training camera from their mean, world units; where all are at one place,
         that of the scene's own size, BOX."""
-        return extent_of([view.camera for view in self.train])
+        return 1.1 * spread([view.camera for view in self.train]) or BOX
 
     @cached_property
     def fingerprint(self) -> str:
@@ -135,7 +135,7 @@ class Dataset:
     @cached_property
     def focus(self) -> NDArray[np.float64]:
         """(3,) the point that the training cameras look at (`focus_of`)."""
-        return focus_of([view.camera for view in self.train])
+        return focus_of(self.cameras, origin=True)
 
     @cached_property
     def still_cameras(self) -> bool:
@@ -153,25 +153,6 @@ class Dataset:
     def times(self) -> NDArray[np.float64]:
         """(T,) the distinct training times, ascending."""
         return np.unique([view.time for view in self.train])
-
-
-def extent_of(cameras: Sequence[Camera]) -> float:
-    """As `Dataset.extent`, of any cameras."""
-    return 1.1 * spread(np.stack([camera.position for camera in cameras])) or BOX
-
-
-def focus_of(cameras: Sequence[Camera]) -> NDArray[np.float64]:
-    """(3,) the point nearest to all optical axes, in the least-squares sense.
-
-    Parallel axes do not determine it; the result is then a point one extent (see `Dataset.extent`) in front.
-    """
-    centres = np.stack([camera.position for camera in cameras])
-    ahead = np.stack([camera.T_cam_world[2, :3] for camera in cameras])
-    across = np.eye(3) - ahead[:, :, None] * ahead[:, None, :]
-    faint = 1e-3 * len(centres) * np.eye(3)
-    guess = centres.mean(axis=0) + extent_of(cameras) * ahead.mean(axis=0)
-    right_side = np.einsum("nij,nj->i", across, centres) + faint @ guess
-    return np.linalg.solve(across.sum(axis=0) + faint, right_side)
 
 
 def spread_views(views: Sequence[View], most: int) -> list[View]:
