@@ -175,6 +175,12 @@ def test_validation_views_of_another_size_are_left_out_with_a_warning(tmp_path: 
     assert f"is {WIDTH}x{HEIGHT}" in warning
 
 
+def test_a_time_of_null_is_no_time(tmp_path: Path) -> None:
+    """Of one frame, or it would get another one's."""
+    with pytest.raises(InputError, match=r"transforms_train\.json, frame 1: time must be made of numbers, got null"):
+        load_dataset(make_scene(tmp_path / "toy", lambda folder, scene: scene["train"]["frames"][1].update(time=None)))
+
+
 def frame_with(**fields: Any) -> Callable[[Path, Scene], None]:
     """Give the second training frame other fields."""
     return lambda folder, scene: scene["train"]["frames"][1].update(fields)

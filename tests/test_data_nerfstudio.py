@@ -200,6 +200,10 @@ def test_a_bad_cloud_of_text(old: str, new: str, words: list[str], make: Any) ->
     refused(toy, ["sparse_pc.ply", *words])
 
 
+def test_a_time_of_null_is_no_time(make: Any) -> None:
+    refused(make(lambda data: data["frames"][1].update(time=None)), ["frame 1: time must be made of numbers", "null"])
+
+
 def test_sizes_mixed(make: Any) -> None:
     toy = make()
     Image.new("RGB", (WIDTH // 2, HEIGHT // 2)).save(toy / "images/frame_00002.png")

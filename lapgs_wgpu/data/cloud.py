@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.ply_points import read_points
 from lapgs_wgpu.splat.camera import Camera
@@ -74,15 +75,10 @@ def read_npy(path: Path) -> NDArray[np.floating]:
     return array
 
 
-def evenly_chosen(cameras: Sequence[Camera]) -> list[Camera]:
-    """Return at most PROBES of the cameras, evenly spaced."""
-    return [cameras[i] for i in np.unique(np.linspace(0, len(cameras) - 1, PROBES).round().astype(int))]
-
-
 def views_of(points: Array, cameras: Sequence[Camera], near: float = 0.0, far: float = np.inf) -> NDArray[np.int64]:
     """Count the cameras that see each point (N, 3) at a depth between near and far, of at most PROBES cameras: (N,)."""
     seen = np.zeros(len(points), dtype=np.int64)
-    for camera in evenly_chosen(cameras):
+    for camera in evenly(cameras, PROBES):
         depths, inside = in_view(points, camera)
         seen += inside & (depths >= near) & (depths <= far)
     return seen

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.data.small_views import small_views
 from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.splat.camera import Camera
@@ -77,20 +78,15 @@ def still_surface(dataset: Dataset) -> Surface | None:
 
 
 def _stills(dataset: Dataset) -> list[_Still]:
-    cameras = [dataset.cameras[i] for i in _evenly(len(dataset.cameras), CAMERAS)]
     found = []
-    for camera in cameras:
+    for camera in evenly(dataset.cameras, CAMERAS):
         views = sorted((view for view in dataset.train if view.camera is camera), key=lambda view: view.time)
-        small = small_views([views[i] for i in _evenly(len(views), IMAGES)], SIDE)
+        small = small_views(evenly(views, IMAGES), SIDE)
         colors = (np.median([view.load()[..., :3] for view in small], axis=0) / 255).astype(np.float32)
         gray = colors.mean(axis=2, dtype=np.float64)
         mean = _box(gray)
         found.append(_Still(small[0].camera, colors, gray, mean, _box(gray**2) - mean**2))
     return found
-
-
-def _evenly(count: int, most: int) -> list[int]:
-    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)).tolist()
 
 
 def _nearest(still: _Still, stills: list[_Still]) -> list[_Still]:

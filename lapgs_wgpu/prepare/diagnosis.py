@@ -12,6 +12,7 @@ import numpy as np
 
 from lapgs_wgpu.data import Dataset, View, load_dataset
 from lapgs_wgpu.data.cloud import points_in_view
+from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.data.images import check_image, decode
 from lapgs_wgpu.data.readers.colmap import IMAGES
 from lapgs_wgpu.progress import Progress
@@ -20,7 +21,7 @@ from lapgs_wgpu.splat.camera import Camera
 from .geometry_measures import gaps, motion, parallax
 from .image_measures import blur_measure, exposure
 from .masks import MASKS, Mask
-from .measure import Floats, Look, Measure, distinct_cameras, evenly, gray
+from .measure import Floats, Look, Measure, distinct_cameras, gray
 
 SIZE = 320  # longer side of the images that are looked at, pixels
 MOST_VIEWS = 96  # of a capture that are looked at, evenly chosen over the clip
@@ -69,11 +70,11 @@ def diagnose(folder: Path) -> Diagnosis:
 def _looks(folder: Path, views: Sequence[View], cameras: Sequence[Camera] | None) -> list[Look]:
     """The images of some views by time, with masks. cameras: those that stand still; then all show the same moments."""
     if cameras is None:
-        chosen = [views[i] for i in evenly(len(views), MOST_VIEWS)]
+        chosen = evenly(views, MOST_VIEWS)
     else:
         each = [[view for view in views if view.camera is camera] for camera in cameras]
         moments = max(3, MOST_VIEWS // len(cameras))
-        chosen = [own[i] for own in each for i in evenly(len(own), moments)]
+        chosen = [view for own in each for view in evenly(own, moments)]
     with ThreadPoolExecutor(4) as pool, Progress(len(chosen), "images looked at") as progress:
         images = []
         for image in pool.map(lambda view: view.load()[..., :3], chosen):

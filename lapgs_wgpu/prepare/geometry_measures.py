@@ -7,12 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from lapgs_wgpu.data.cloud import in_view
+from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.data.validation import GAP, GAP_FACTOR
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
 
 from .masks import Mask
-from .measure import Floats, Look, Measure, evenly
+from .measure import Floats, Look, Measure
 
 MOST_CAMERAS = 48  # between which angles are measured
 PARALLAX = 5.0  # degrees; half a pixel of a phone's image is then 1 % of the depth
@@ -26,7 +27,7 @@ SEEN = 0.002  # share of an image that moves, from which on it shows something t
 
 def parallax(cameras: Sequence[Camera], points: Floats) -> Measure:
     """The largest angle between two cameras that see a point, the median over the points."""
-    chosen = [cameras[i] for i in evenly(len(cameras), MOST_CAMERAS)]
+    chosen = evenly(cameras, MOST_CAMERAS)
     seen = np.stack([in_view(points, camera)[1] for camera in chosen])
     away = points - np.stack([camera.position for camera in chosen])[:, None]
     rays = np.where(seen[..., None], away / np.maximum(np.linalg.norm(away, axis=2, keepdims=True), 1e-12), np.nan)

@@ -49,10 +49,6 @@ def distinct_cameras(views: Sequence[View]) -> list[Camera]:
     return list({id(view.camera): view.camera for view in views}.values())
 
 
-def evenly(count: int, most: int) -> list[int]:
-    return sorted(set(np.linspace(0, count - 1, min(count, most)).round().astype(int).tolist()))
-
-
 def gray(image: Pixels) -> NDArray[np.float32]:
     """Gray levels (h, w), 0 to 255, of RGB."""
     return (image.astype(np.float32) @ np.array([0.299, 0.587, 0.114], np.float32)).astype(np.float32)

@@ -13,13 +13,14 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from lapgs_wgpu.data import Dataset, View
+from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.data.images import Pixels
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.atomic import atomic_write
 
 from .diagnosis import Diagnosis
 from .masks import Mask
-from .measure import Look, Measure, evenly
+from .measure import Look, Measure
 
 REPORT = "report.html"
 THUMBNAILS = 24  # evenly chosen from the views that were looked at
@@ -59,7 +60,7 @@ def _page(diagnosis: Diagnosis, title: str) -> str:
     dataset = diagnosis.dataset
     poor = [measure for measure in diagnosis.measures if measure.good is False]
     verdict = f"{len(poor)} of {len(diagnosis.measures)} properties are poor" if poor else "nothing speaks against it"
-    chosen = [diagnosis.looks[i] for i in evenly(len(diagnosis.looks), THUMBNAILS)]
+    chosen = evenly(diagnosis.looks, THUMBNAILS)
     masked = any(look.mask is not None and look.mask.any() for look in chosen)
     count = len(dataset.train) + len(dataset.test)
     layout = "cameras that stand still" if diagnosis.still else "one camera that moves"

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 
+from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.data.views import View
 
 THRESHOLD = 16  # levels of 255 in any channel: above the noise of a compressed video
@@ -43,8 +44,7 @@ def still_backgrounds(views: Sequence[View], load: Callable[[View], Image]) -> l
         ordered = sorted(group, key=lambda index: views[index].time)
         if len({views[index].time for index in ordered}) < LEAST_TIMES:
             continue
-        picked = np.unique(np.linspace(0, len(ordered) - 1, min(len(ordered), MOST_IMAGES)).round().astype(int))
-        middle = _median([load(views[ordered[i]]) for i in picked])
+        middle = _median([load(views[index]) for index in evenly(ordered, MOST_IMAGES)])
         for index in group:
             result[index] = middle
     return result

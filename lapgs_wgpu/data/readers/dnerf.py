@@ -76,7 +76,7 @@ def _read_split(folder: Path, split: Split) -> list[Frame]:
     for index, (entry, where, stated) in enumerate(entries):
         file_path, file = image_path(entry, folder, where, NEEDED, suffix=".png")
         T_cam_world = opengl_pose(required(entry, "transform_matrix", where, NEEDED), where)
-        time = index / max(len(entries) - 1, 1) if stated is None else number(stated, "time", where)
+        time = index / max(len(entries) - 1, 1) if stated is None else stated
         if not 0 <= time <= 1:
             raise InputError(f"{where}: time must lie in [0, 1], got {time:g}; divide by the clip's duration.")
         image = check_image(file)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from lapgs_wgpu.data.cloud import Cloud, read_npy
+from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.data.frames import Capture, Frame, Reader
 from lapgs_wgpu.data.images import ERRORS, SUFFIXES, check_image, decode, size_text
 from lapgs_wgpu.data.poses import LARGEST_ENTRY, check_rotation, world_to_camera
@@ -112,14 +113,13 @@ def _cloud(folder: Path, frames: list[Frame]) -> Cloud | None:
             f"{folder / DEPTH} holds {len(maps)} depth maps (.png) for {len(frames)} images; each image needs one, or "
             "remove the folder."
         )
-    chosen = sorted(set(np.linspace(0, len(frames) - 1, MAPS).round().astype(int).tolist()))
+    chosen = evenly(list(zip(frames, maps, strict=True)), MAPS)
     random, points, colors = np.random.default_rng(0), [], []
-    for index in chosen:
-        frame = frames[index]
-        depth, image = _depth_map(maps[index]), decode(folder / IMAGES / frame.name.file)[..., :3]
+    for frame, path in chosen:
+        depth, image = _depth_map(path), decode(folder / IMAGES / frame.name.file)[..., :3]
         if depth.shape != image.shape[:2]:
             raise InputError(
-                f"{maps[index]} is {size_text(depth.shape[::-1])} pixels, and its image is "
+                f"{path} is {size_text(depth.shape[::-1])} pixels, and its image is "
                 f"{size_text(image.shape[1::-1])}; a depth map needs the size of its image."
             )
         row, column = np.nonzero(depth > 0)

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from lapgs_wgpu.data.json_fields import finite, kind, required
+from lapgs_wgpu.data.json_fields import finite, kind, number, required
 from lapgs_wgpu.errors import InputError
 
 INTRINSICS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2")  # pixels of an image w x h
@@ -16,7 +16,7 @@ LIMITS = {"w": (1, 1e5), "h": (1, 1e5), "fl_x": (1e-9, LARGEST), "fl_y": (1e-9, 
 
 def frame_entries(
     data: dict[str, Any], path: Path, needed: str, field: str = "time"
-) -> Iterator[tuple[dict[str, Any], str, Any]]:
+) -> Iterator[tuple[dict[str, Any], str, float | None]]:
     """Yield the entry of each frame, its place for errors, and its time as stated; None if no frame has one.
 
     needed: reason for the field frames, for errors. field: that states the time. Raises InputError, also if only some
@@ -31,7 +31,7 @@ def frame_entries(
         where = f"{path}, frame {index}"
         if not isinstance(entry, dict):
             raise InputError(f"{where} must be a JSON object, got {kind(entry)}.")
-        yield entry, where, required(entry, field, where, hint) if timed else None
+        yield entry, where, number(required(entry, field, where, hint), field, where) if timed else None
 
 
 def intrinsics(entry: dict[str, Any], shared: dict[str, Any], where: str, path: Path) -> dict[str, float]:
