@@ -17,6 +17,7 @@ from lapgs_wgpu.motion.fields.config import DynamicsMode, FieldConfig
 from .learning_rate import Rate, RatesConfig
 
 Background = Literal["black", "white", "random"]
+BACKGROUND_LEVELS = {"black": 0.0, "white": 1.0, "random": 0.0}  # under views that are measured
 Split = Literal["plain", "adaptive"]
 HeldOut = Literal["test", "val"]
 Units = Literal["world", "capture"]

@@ -13,8 +13,7 @@ from torch import Tensor
 from lapgs_wgpu.data.views import ImageCache, View, composite
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.train.config import Background
-from lapgs_wgpu.train.evaluate import BACKGROUND_LEVELS
+from lapgs_wgpu.train.config import BACKGROUND_LEVELS, Background
 from lapgs_wgpu.train.truth_cache import TruthCache, without
 
 AHEAD = 8  # pictures that are decoded before they are needed

@@ -26,6 +26,7 @@ from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train.camera_refinement import rotation_vector
+from lapgs_wgpu.train.config import BACKGROUND_LEVELS
 from lapgs_wgpu.train.log import environment
 from lapgs_wgpu.train.losses import MS_SSIM_SMALLEST, SSIM_WINDOW, masked_ssim, ms_ssim, psnr, ssim
 from lapgs_wgpu.train.lpips import SMALLEST, Lpips
@@ -38,7 +39,6 @@ MEASURES = ("psnr", "ssim", "ms_ssim", "lpips", "lpips_unscaled", "masked_psnr",
 MOTION_MEASURES = ("psnr_moving", "psnr_still")  # of views of which motion masks are known
 NOT_AVAILABLE = "not available"
 ALIGNED = "test-time alignment: the camera of each test view was fitted to its image, the scene fixed"
-BACKGROUND_LEVELS = {"black": 0.0, "white": 1.0, "random": 0.0}  # of the background under test views
 
 
 def evaluate(

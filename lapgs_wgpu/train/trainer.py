@@ -30,14 +30,14 @@ from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train.acceleration import acceleration_loss, draw_moments
 from lapgs_wgpu.train.camera_descent import scene_points
 from lapgs_wgpu.train.camera_refinement import CameraRefinement, Corrections
-from lapgs_wgpu.train.config import Config
+from lapgs_wgpu.train.config import BACKGROUND_LEVELS, Config
 from lapgs_wgpu.train.dataloader import Pictures
 from lapgs_wgpu.train.densify import Statistics
 from lapgs_wgpu.train.density_control import DensityControl
 from lapgs_wgpu.train.discovery.discover import discover
 from lapgs_wgpu.train.discovery.field_fit import keeping_rates
 from lapgs_wgpu.train.distributed import SINGLE_PROCESS, Ranks
-from lapgs_wgpu.train.evaluate import BACKGROUND_LEVELS, evaluate, mean_psnr
+from lapgs_wgpu.train.evaluate import evaluate, mean_psnr
 from lapgs_wgpu.train.exposure import Exposures
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
 from lapgs_wgpu.train.host_threads import step_threads, torch_threads

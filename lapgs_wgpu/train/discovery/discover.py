@@ -16,8 +16,7 @@ from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.progress import Progress
 from lapgs_wgpu.splat.morton import morton_order
 from lapgs_wgpu.train.camera_refinement import Corrections
-from lapgs_wgpu.train.config import Config
-from lapgs_wgpu.train.evaluate import BACKGROUND_LEVELS
+from lapgs_wgpu.train.config import BACKGROUND_LEVELS, Config
 
 from .acceptance import explained_share, rows_with, tracks_in_images
 from .field_fit import fit_field

@@ -15,8 +15,7 @@ from lapgs_wgpu.data.views import Dataset, View, composite, spread_views
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.camera_refinement import CameraRefinement, Corrections
-from lapgs_wgpu.train.config import Config
-from lapgs_wgpu.train.evaluate import BACKGROUND_LEVELS
+from lapgs_wgpu.train.config import BACKGROUND_LEVELS, Config
 from lapgs_wgpu.train.exposure import without_exposure
 from lapgs_wgpu.train.learning_rate import Rate
 
