@@ -18,9 +18,9 @@ UNFINISHED, FINISHED, LOCK = ".unfinished", ".finished", ".lock"
 def appearing(out: Path) -> Iterator[Path]:
     """A folder to write to, whose contents move to `out` if the block ends without an exception.
 
-    The folder lies in `out`, which may be the present folder, a link or a mount. An exception removes the folder, and
-    `out` too if it is new. What is finished is never removed. Raises InputError where `out` is not empty,
-    or another process writes to it.
+    The folder is made inside `out`, so `out` may be the current folder, a link or a mount. An exception removes the
+    folder, and `out` too if it is new. A finished capture is never removed. Raises InputError if `out` is not empty, or
+    if another process writes to it.
     """
     new = not out.exists()
     _check_empty(out)
