@@ -10,8 +10,8 @@ struct Part { first: u32, count: u32 }   // the Gaussians whose harmonics are bo
 
 @group(0) @binding(0) var<uniform> frame: Frame;
 @group(0) @binding(1) var<uniform> part: Part;
-#table 2 colors: f32
 // (count, SH coefficients, 3)
+#table 2 colors: f32
 #table 3 means: f32
 #table 4 d_splats: vec4<f32>
 @group(0) @binding(5) var<storage, read_write> d_colors: array<f32>;

@@ -9,16 +9,16 @@
 @group(0) @binding(1) var<storage, read> levels: array<Level>;
 // (N, 4): x, y, z, -
 #table 2 points: vec4<f32>
-#table 3 features: vec2<f32>
 // a grid's table, or the slices of all grids
+#table 3 features: vec2<f32>
 #ifdef BFLOAT16
 @group(0) @binding(4) var<storage, read_write> encoding: array<u32>;         // (N, all levels), two features in each
 #else
 @group(0) @binding(4) var<storage, read_write> encoding: array<f32>;         // (N, 2 x all levels)
 #endif
 #ifdef ROWS
-#table 5 rows: u32
 // ascending, grid.points of them
+#table 5 rows: u32
 #endif
 
 const LANES = 64u;

@@ -1,6 +1,5 @@
 // Spreads the gradient of a slice over the two planes of the table from which it was blended.
-#import common/hashgrid
-#import common/slice_lanes
+#import common/slice
 
 @group(0) @binding(0) var<uniform> grid: Grid;
 @group(0) @binding(1) var<storage, read> levels: array<Level>;
@@ -10,17 +9,13 @@
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
     let level = levels[group.y];
-    let plane = level.resolution.x * level.resolution.y;
-    let p = grid.time * level.scale.z;
-    let up = smooth_weight(vec3(p - floor(p))).x;
-    let low = u32(floor(p));
-    let high = min(low + 1u, level.resolution.z - 1u);
+    let slice = slice_of(level, grid.time);
     for (var k = 0u; k < LANE_CELLS; k++) {
         let cell = (group.x * LANE_CELLS + k) * LANES + lane;
-        if (cell < plane) {
+        if (cell < slice.cells) {
             let gradient = d_slices_at(level.first_sliced + cell);
-            d_features[level.first + low * plane + cell] += (1.0 - up) * gradient;
-            d_features[level.first + high * plane + cell] += up * gradient;
+            d_features[slice.below + cell] += (1.0 - slice.up) * gradient;
+            d_features[slice.above + cell] += slice.up * gradient;
         }
     }
 }

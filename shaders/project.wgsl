@@ -40,25 +40,17 @@ fn projected(i: u32) -> Projected {
     let jacobian = frame.focal / camera.z;
     let scale = vec3(scales_at(3u * i), scales_at(3u * i + 1u), scales_at(3u * i + 2u));
     let R = view_rotation(frame) * rotation(q * inverseSqrt(norm));
-    // Rows of J R S: the half axes of the Gaussian in the image.
-    let axes_x = jacobian.x * scale * vec3(R[0].x - xy.x * R[0].z, R[1].x - xy.x * R[1].z, R[2].x - xy.x * R[2].z);
-    let axes_y = jacobian.y * scale * vec3(R[0].y - xy.y * R[0].z, R[1].y - xy.y * R[1].z, R[2].y - xy.y * R[2].z);
-    let xx = dot(axes_x, axes_x) + DILATION;
-    let xyc = dot(axes_x, axes_y);
-    let yy = dot(axes_y, axes_y) + DILATION;
-    // The determinant without cancellation: |u x v|^2 is never negative.
-    let normal = cross(axes_x, axes_y);
-    let det = dot(normal, normal) + DILATION * (xx + yy - DILATION);
-    if (!(det > 0.0) || !(det < 1e30)) {
+    let f = footprint(R, scale, jacobian, xy);
+    if (!(f.det > 0.0) || !(f.det < 1e30)) {
         return p;
     }
-    let faded = opacity * select(1.0, sqrt(dot(normal, normal) / det), frame.antialiased == 1u);
+    let faded = opacity * select(1.0, sqrt(f.flat / f.det), frame.antialiased == 1u);
     if (!(faded >= ALPHA_MIN)) {
         return p;
     }
-    let conic = vec3(yy, -xyc, xx) / det;
+    let conic = vec3(f.yy, -f.xy, f.xx) / f.det;
     let mean2d = frame.focal * camera.xy / camera.z + frame.center;
-    let e = make_ellipse(mean2d, conic, det, log2(faded));
+    let e = make_ellipse(mean2d, conic, f.det, log2(faded));
     let size = vec2<f32>(frame.size);
     if (!all(mean2d + e.extent > vec2(0.0)) || !all(mean2d - e.extent < size)) {
         return p;
@@ -74,7 +66,7 @@ fn projected(i: u32) -> Projected {
     p.log2_opacity = log2(faded);
     p.depth = camera.z;
     p.radius = ceil(max(e.extent.x, e.extent.y));
-    p.det = det;
+    p.det = f.det;
     return p;
 }
 

@@ -62,19 +62,10 @@ fn main(
     let q = quats_at(i) * norm;
     let view = view_rotation(frame);
     let R = view * rotation(q);
-    let M = mat3x3<f32>(scale.x * R[0], scale.y * R[1], scale.z * R[2]);
-    let Mz = vec3(M[0].z, M[1].z, M[2].z);
-    let axes_x = jacobian.x * (vec3(M[0].x, M[1].x, M[2].x) - xy.x * Mz);
-    let axes_y = jacobian.y * (vec3(M[0].y, M[1].y, M[2].y) - xy.y * Mz);
-    let xx = dot(axes_x, axes_x) + DILATION;
-    let yy = dot(axes_y, axes_y) + DILATION;
-    let normal = cross(axes_x, axes_y);
-    let flat = dot(normal, normal);   // the determinant without the filter
-    let det = flat + DILATION * (xx + yy - DILATION);
-    let a = yy / det;
-    let xyc = dot(axes_x, axes_y);
-    let b = -xyc / det;
-    let c = xx / det;
+    let f = footprint(R, scale, jacobian, xy);
+    let a = f.yy / f.det;
+    let b = -f.xy / f.det;
+    let c = f.xx / f.det;
 
     // d(covariance) = -conic d(conic) conic, with the off-diagonal element counted twice.
     let g = vec3(d0.z, 0.5 * d0.w, d1.x);
@@ -85,16 +76,17 @@ fn main(
     // loses some memory at each run.
     let half = 0.5 * d1.y;
     let antialiased = frame.antialiased == 1u;
-    d_xx += select(0.0, half * ((yy - DILATION) / flat - a), antialiased);
-    d_xy += select(0.0, 2.0 * half * (-xyc / flat - b), antialiased);
-    d_yy += select(0.0, half * ((xx - DILATION) / flat - c), antialiased);
-    let d_axes_x = 2.0 * d_xx * axes_x + d_xy * axes_y;
-    let d_axes_y = 2.0 * d_yy * axes_y + d_xy * axes_x;
+    d_xx += select(0.0, half * ((f.yy - DILATION) / f.flat - a), antialiased);
+    d_xy += select(0.0, 2.0 * half * (-f.xy / f.flat - b), antialiased);
+    d_yy += select(0.0, half * ((f.xx - DILATION) / f.flat - c), antialiased);
+    let d_axes_x = 2.0 * d_xx * f.axes_x + d_xy * f.axes_y;
+    let d_axes_y = 2.0 * d_yy * f.axes_y + d_xy * f.axes_x;
 
-    let d_clamped = -jacobian * vec2(dot(d_axes_x, Mz), dot(d_axes_y, Mz));
+    let forward = scale * vec3(R[0].z, R[1].z, R[2].z);
+    let d_clamped = -jacobian * vec2(dot(d_axes_x, forward), dot(d_axes_y, forward));
     let inside = ratio == xy;
     let d_ratio = frame.focal * d0.xy + select(vec2(0.0), d_clamped, inside);
-    let d_z = d2.y - (dot(d_axes_x, axes_x) + dot(d_axes_y, axes_y) + dot(d_ratio, ratio)) / camera.z;
+    let d_z = d2.y - (dot(d_axes_x, f.axes_x) + dot(d_axes_y, f.axes_y) + dot(d_ratio, ratio)) / camera.z;
     let d_mean = vec3(d_ratio / camera.z, d_z) * view;   // the transpose of `view` times the vector
 
     let along_x = jacobian.x * d_axes_x;

@@ -121,19 +121,13 @@ fn main(
 #unroll r $ROWS
             {
                 let v = dy + $r.0;
-                let log2_alpha = fma(v, fma(s.c, v, slope), base);
-                let alpha = select(0.0, min(ALPHA_MAX, power_of_two(log2_alpha)), log2_alpha >= LOG2_ALPHA_MIN);
-                let t = T[$r];
-                let weight = t * alpha;
-                let next = t - weight;
-                let stop = next <= TRANSMITTANCE_MIN;
-                let w = select(weight, 0.0, stop);
-                T[$r] = select(next, -abs(t), stop);
-                red[$r] = fma(w, s.color.x, red[$r]);
-                green[$r] = fma(w, s.color.y, green[$r]);
-                blue[$r] = fma(w, s.color.z, blue[$r]);
+                let b = blend(fma(v, fma(s.c, v, slope), base), T[$r]);
+                T[$r] = b.transmittance;
+                red[$r] = fma(b.weight, s.color.x, red[$r]);
+                green[$r] = fma(b.weight, s.color.y, green[$r]);
+                blue[$r] = fma(b.weight, s.color.z, blue[$r]);
 #ifdef DEPTH
-                depth[$r] = fma(w, s.depth, depth[$r]);
+                depth[$r] = fma(b.weight, s.depth, depth[$r]);
 #endif
             }
 #end
@@ -173,11 +167,6 @@ fn main(
         if (unfinished) {
             needed[2] = 1u;
         }
-#ifndef CONTINUED
-        if (range.y - range.x > u32($LONG_LIST)) {
-            needed[2] = 1u;
-        }
-#endif
 #endif
     }
 #endif

@@ -174,29 +174,23 @@ fn main(
 #unroll r $ROWS
             {
                 let v = dy + $r.0;
-                let log2_alpha = fma(v, fma(s.c, v, slope), base);
-                let unclamped = power_of_two(log2_alpha);
-                let alpha = select(0.0, min(ALPHA_MAX, unclamped), log2_alpha >= LOG2_ALPHA_MIN);
                 let t = T[$r];
-                let weight = t * alpha;
-                let next = t - weight;
-                let stop = next <= TRANSMITTANCE_MIN;
-                let w = select(weight, 0.0, stop);
-                T[$r] = select(next, -abs(t), stop);
+                let b = blend(fma(v, fma(s.c, v, slope), base), t);
+                T[$r] = b.transmittance;
                 var value = fma(s.color.x, d_red[$r], fma(s.color.y, d_green[$r], s.color.z * d_blue[$r]));
 #ifdef DEPTH
                 value = fma(s.depth, d_depth[$r], value);
-                g_depth = fma(w, d_depth[$r], g_depth);
+                g_depth = fma(b.weight, d_depth[$r], g_depth);
 #endif
-                rest[$r] = fma(-w, value, rest[$r]);
-                let d_alpha = t * value - rest[$r] / (1.0 - alpha);
-                let moment = select(alpha * d_alpha, 0.0, stop || unclamped > ALPHA_MAX);
+                rest[$r] = fma(-b.weight, value, rest[$r]);
+                let d_alpha = t * value - rest[$r] / (1.0 - b.alpha);
+                let moment = select(b.alpha * d_alpha, 0.0, b.stop || b.unclamped > ALPHA_MAX);
                 m0 += moment;
                 m1 = fma(moment, v, m1);
                 m2 = fma(moment * v, v, m2);
-                g_red = fma(w, d_red[$r], g_red);
-                g_green = fma(w, d_green[$r], g_green);
-                g_blue = fma(w, d_blue[$r], g_blue);
+                g_red = fma(b.weight, d_red[$r], g_red);
+                g_green = fma(b.weight, d_green[$r], g_green);
+                g_blue = fma(b.weight, d_blue[$r], g_blue);
             }
 #end
             let mx = m0 * dx;

@@ -7,7 +7,7 @@
 @group(0) @binding(1) var<uniform> needed: Count;   // intersections
 // sorted
 #table 2 tile_keys: vec4<u32>
-@group(0) @binding(3) var<storage, read_write> ranges: array<vec4<u32>>;   // first, one past the last, drawn, -
+@group(0) @binding(3) var<storage, read_write> ranges: array<vec4<u32>>;   // first, one past the last; rasterize: drawn, unfinished
 #ifdef LISTED
 @group(0) @binding(4) var<storage, read_write> listed_tiles: array<u32>;   // those with splats, in any order
 @group(0) @binding(5) var<storage, read_write> workgroups: array<atomic<u32>>;   // that draw them
@@ -24,6 +24,7 @@ fn main(
     if (4u * quad >= count) {
         return;
     }
+    let tiles = arrayLength(&ranges) - 1u;   // the key of a pad
     let keys = tile_keys_at(quad);
     // No key is so large: a list begins at the first element in any case.
     var before = select(tile_keys_at(max(quad, 1u) - 1u).w, 0xffffffffu, quad == 0u);
@@ -32,15 +33,13 @@ fn main(
         let i = 4u * quad + $(k)u;
         let tile = keys[$k];
         if (i < count && tile != before) {
-            if (tile < arrayLength(&ranges)) {   // a pad has no tile
+            if (tile < tiles) {
                 ranges[tile].x = i;
-            }
 #ifdef LISTED
-            if (tile + 1u < arrayLength(&ranges)) {
                 listed_tiles[atomicAdd(&workgroups[0], 1u)] = tile;
-            }
 #endif
-            if (before < arrayLength(&ranges)) {
+            }
+            if (before < tiles) {
                 ranges[before].y = i;
             }
         }
@@ -48,7 +47,7 @@ fn main(
     }
 #end
     let last = keys[(count - 1u) % 4u];
-    if (4u * quad + 4u >= count && last < arrayLength(&ranges)) {
+    if (4u * quad + 4u >= count && last < tiles) {
         ranges[last].y = count;
     }
 }

@@ -50,7 +50,7 @@ PASSES: dict[str, tuple[str, Defines]] = {
     "sort_count": ("sort_count", {}),
     "sort_scatter": ("sort_scatter", {}),
     "sort_scatter IOTA": ("sort_scatter", {"IOTA": 1}),
-    "hashgrid_slice": ("hashgrid_slice", {"SLICED": 1, "CORNERS": 4}),
+    "hashgrid_slice": ("hashgrid_slice", {}),
     "hashgrid SLICED ROWS": ("hashgrid", {"SLICED": 1, "CORNERS": 4, "ROWS": 1}),
     "hashgrid ROWS": ("hashgrid", {"CORNERS": 8, "ROWS": 1}),
     "deform": ("deform", _HEADS | {"HEADS": 4}),

@@ -24,8 +24,6 @@ class RasterConfig:
     subgroups: the lanes form one subgroup and exchange values by shuffles instead of workgroup memory.
     lane_runs: use the radix sort for CPU devices, and a polynomial for exp2, which is slow there.
     round_splats: maximum number of splats of a list that one dispatch draws, on devices that limit loops; else None.
-    long_list: on such devices, lists from this length on are always drawn in several rounds. Their slots start without
-    a record, which saves the backward pass a loop over the splats that no pixel sees.
     listed: only tiles with splats get a workgroup; the rest of the image is copied from one without splats before.
     Software drivers run all of a workgroup's instructions, whether it returns early or not.
     """
@@ -36,7 +34,6 @@ class RasterConfig:
     subgroups: bool
     lane_runs: bool
     round_splats: int | None = None
-    long_list: int = 1 << 16
     listed: bool = False
 
     @property
@@ -57,7 +54,7 @@ class RasterConfig:
         flags = {"SUBGROUPS": self.subgroups, "DEPTH": depth, "LANES_16": self.lanes > 8, "LANES_32": self.lanes > 16}
         values = {"LANES": self.lanes, "ROWS": self.rows, "POLYNOMIAL_EXP2": self.lane_runs, "LISTED": self.listed}
         if self.round_splats:
-            values |= {"ROUND_SPLATS": self.round_splats, "LONG_LIST": self.long_list}
+            values["ROUND_SPLATS"] = self.round_splats
         return self.tile_defines | values | flags
 
 
@@ -66,16 +63,7 @@ def cpu_config(subgroup_size: int, max_loop_turns: int = SOFTWARE_LOOP_TURNS, *,
     lanes = 16 if subgroup_size == 16 else 8
     subgroups = subgroup_size >= lanes
     round_splats = (max_loop_turns + 1) // (SUBGROUP_TURNS if subgroups else PLAIN_TURNS)
-    return RasterConfig(
-        8,
-        8,
-        lanes,
-        subgroups,
-        lane_runs=True,
-        round_splats=round_splats,
-        long_list=max_loop_turns + 1,
-        listed=listed,
-    )
+    return RasterConfig(8, 8, lanes, subgroups, lane_runs=True, round_splats=round_splats, listed=listed)
 
 
 def gpu_config(subgroup_size: int) -> RasterConfig:

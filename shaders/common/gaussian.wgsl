@@ -23,3 +23,26 @@ fn jacobian_limits(frame: Frame) -> JacobianLimits {
     let margin = FRUSTUM_MARGIN * 0.5 * size / frame.focal;
     return JacobianLimits(-frame.center / frame.focal - margin, (size - frame.center) / frame.focal + margin);
 }
+
+// A Gaussian's footprint on the image: the rows of J R S, whose products are its covariance; pixels.
+struct Footprint {
+    axes_x: vec3<f32>,
+    axes_y: vec3<f32>,
+    xx: f32,     // the covariance, dilated
+    xy: f32,
+    yy: f32,
+    flat: f32,   // the determinant before the dilation
+    det: f32,
+}
+
+// R: from the Gaussian's axes to the camera's. jacobian: focal lengths / depth. xy: x/z and y/z, within the limits.
+fn footprint(R: mat3x3<f32>, scale: vec3<f32>, jacobian: vec2<f32>, xy: vec2<f32>) -> Footprint {
+    let u = jacobian.x * scale * vec3(R[0].x - xy.x * R[0].z, R[1].x - xy.x * R[1].z, R[2].x - xy.x * R[2].z);
+    let v = jacobian.y * scale * vec3(R[0].y - xy.y * R[0].z, R[1].y - xy.y * R[1].z, R[2].y - xy.y * R[2].z);
+    let xx = dot(u, u) + DILATION;
+    let yy = dot(v, v) + DILATION;
+    // The determinant without cancellation: |u x v|^2 is never negative.
+    let normal = cross(u, v);
+    let flat = dot(normal, normal);
+    return Footprint(u, v, xx, dot(u, v), yy, flat, flat + DILATION * (xx + yy - DILATION));
+}

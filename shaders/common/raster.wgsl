@@ -2,7 +2,7 @@
 // as many splats as lanes is loaded at once, one a lane, then handed round. With SUBGROUPS the workgroup lies in one
 // subgroup and splats are handed round by shuffles, otherwise through workgroup memory. A driver may choose narrower
 // subgroups for one pipeline than for another: then the pass says so behind the ranges of all tiles (z: rasterize, w:
-// rasterize_bwd), and what it has written is worth nothing.
+// rasterize_bwd), and its output is invalid.
 #import common/constants
 #import common/frame
 #import common/splat
@@ -35,6 +35,24 @@ fn power_of_two(x: f32) -> f32 {
 #else
     return exp2(x);
 #endif
+}
+
+// What a splat does to a pixel. Both passes blend by this function, so that they agree to the bit.
+struct Blend {
+    unclamped: f32,
+    alpha: f32,
+    weight: f32,          // of the splat's colour; 0 where the pixel stops
+    transmittance: f32,   // behind the splat; its sign turns negative where the pixel stops
+    stop: bool,
+}
+
+fn blend(log2_alpha: f32, transmittance: f32) -> Blend {
+    let unclamped = power_of_two(log2_alpha);
+    let alpha = select(0.0, min(ALPHA_MAX, unclamped), log2_alpha >= LOG2_ALPHA_MIN);
+    let weight = transmittance * alpha;
+    let next = transmittance - weight;
+    let stop = next <= TRANSMITTANCE_MIN;
+    return Blend(unclamped, alpha, select(weight, 0.0, stop), select(next, -abs(transmittance), stop), stop);
 }
 
 struct Place { column: u32, row: u32 }   // a lane's pixels within the tile: its column and its first row

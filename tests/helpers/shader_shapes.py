@@ -27,7 +27,7 @@ def _all(*choices: Choices) -> Choices:
 def _raster() -> Choices:
     """Of rasterize and rasterize_bwd: splat/raster_config.py."""
     cpu = [{"TILE_W": 8, "TILE_H": 8, "LANES": n, "ROWS": 64 // n, "POLYNOMIAL_EXP2": 1} for n in (8, 16)]
-    rounds = {"ROUND_SPLATS": 2048, "LONG_LIST": 65536}
+    rounds = {"ROUND_SPLATS": 2048}
     gpu = [{"TILE_W": 16, "TILE_H": 8, "LANES": n, "ROWS": 128 // n} for n in (16, 32)]
     lanes = [
         shape | ({"LANES_16": 1} if shape["LANES"] > 8 else {}) | ({"LANES_32": 1} if shape["LANES"] > 16 else {})
@@ -60,10 +60,10 @@ SHAPES: dict[str, Choices] = {
     "gather_gradients": _all(*_flags("DEPTH")),
     "hashgrid": _all(_CORNERS, *_flags("ROWS", "BFLOAT16", "LONG_LANES")),
     "hashgrid_bwd": _all(_CORNERS, *_flags("LANE_LEVELS", "BFLOAT16")),
-    "hashgrid_largest": _all([{"CORNERS": 4}], *_flags("BFLOAT16")),
-    "hashgrid_slice": _all([{"SLICED": 1, "CORNERS": 4}], *_flags("LONG_LANES")),
-    "hashgrid_slice_bwd": _all([{"SLICED": 1, "CORNERS": 4}], *_flags("LONG_LANES")),
-    "hashgrid_unfix": _CORNERS,
+    "hashgrid_largest": _all(*_flags("BFLOAT16")),
+    "hashgrid_slice": _all(*_flags("LONG_LANES")),
+    "hashgrid_slice_bwd": _all(*_flags("LONG_LANES")),
+    "hashgrid_unfix": [{}],
     "loss_gradient": _all(_LOSS_LANES, *_flags("SSIM", "NCC", "PYRAMID")),
     "loss_ncc_across": _LOSS_LANES,
     "loss_ncc_down": _LOSS_LANES,

@@ -111,7 +111,7 @@ class HashEncoderPasses:
     def _uniform(self, points: PointSet, first: int, count: int, most: int) -> DeviceArray:
         """The uniform of a block of points, of at most so many (0: of all). All blocks of all sets are submitted
         together, so each has its own."""
-        content = Kernel.get(self.device, "hashgrid_slice", SLICED=1, CORNERS=4).uniform(
+        content = Kernel.get(self.device, "hashgrid_slice").uniform(
             "Grid",
             points=count,
             all_points=points.count,
@@ -163,7 +163,7 @@ class HashEncoderPasses:
             blocks = [(points.count, {"grid": grid, "points": points.array, "encoding": encoding, "rows": rows})]
         slices = self.pool.array("slices", (self._slice_entries, 2))
         for number, cut in self._cuts.items():
-            kernel = Kernel.get(self.device, "hashgrid_slice", **cut.defines, **self._long_lanes)
+            kernel = Kernel.get(self.device, "hashgrid_slice", **self._long_lanes)
             arrays = {"levels": cut.array, "features": tables[number], "slices": slices, "grid": blocks[0][1]["grid"]}
             commands.dispatch_grid(kernel, (-(-cut.cells // self._group_cells), cut.count), **arrays)
         for count, of_block in blocks:
@@ -199,11 +199,11 @@ class HashEncoderPasses:
 
         if not self.lane_levels:
             for (levels, target), (_, fixed) in zip(floats, sums, strict=True):
-                unfix = Kernel.get(self.device, "hashgrid_unfix", **levels.defines)
+                unfix = Kernel.get(self.device, "hashgrid_unfix")
                 groups = -(-target.size // 64)
                 commands.dispatch(unfix, groups, grid=grid, d_fixed=fixed, d_features=target, **largest)
         for number, cut in self._cuts.items():
-            kernel = Kernel.get(self.device, "hashgrid_slice_bwd", **cut.defines, **self._long_lanes)
+            kernel = Kernel.get(self.device, "hashgrid_slice_bwd", **self._long_lanes)
             arrays = {"levels": cut.array, "d_slices": d_slices, "d_features": d_tables[number], "grid": grid}
             commands.dispatch_grid(kernel, (-(-cut.cells // self._group_cells), cut.count), **arrays)
 
@@ -213,7 +213,7 @@ class HashEncoderPasses:
         """The largest absolute value of a gradient, which scales fixed-point sums."""
         largest = self.pool.array(f"largest {points.number}", (1,), "uint32")
         commands.clear(largest)
-        kernel = Kernel.get(self.device, "hashgrid_largest", CORNERS=4, **options)
+        kernel = Kernel.get(self.device, "hashgrid_largest", **options)
         for first, count, grid in self._blocks(points, d_encoding):
             gradient = d_encoding.rows(first, count)
             commands.dispatch(kernel, -(-count * self._row // 4096), grid=grid, d_encoding=gradient, largest=largest)
