@@ -26,6 +26,7 @@ from lapgs_wgpu.gpu.kernel import Commands
 from lapgs_wgpu.io.checkpoint import read_checkpoint
 from lapgs_wgpu.motion.fields.own_field import OwnField
 from lapgs_wgpu.motion.playback.playback import open_playback
+from lapgs_wgpu.motion.timing import Timing
 from lapgs_wgpu.splat.rotation import rotate, rotation_matrices
 from lapgs_wgpu.train.config import LossWeights
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
@@ -128,6 +129,45 @@ def test_an_error_of_a_callback_leaves_the_step_done(dataset: Dataset, device: D
     with Trainer(configure(), dataset, device) as trainer:
         list(trainer)
         assert equal(found, saved(trainer, tmp_path / "whole.ply"))
+
+
+def test_a_state_stays_as_it_is(dataset: Dataset, device: Device) -> None:
+    """While the trainer that gave it, and one that took it, go on."""
+    with Trainer(configure(), dataset, device) as one, Trainer(configure(), dataset, device, resumed=True) as two:
+        for _ in range(12):
+            one.step()
+        state = one.state()
+        before = {name: value.copy() for name, value in state.items()}
+        one.step()
+        two.restore(state)
+        for _ in range(2):
+            two.step()
+    assert equal(state, before)
+
+
+def test_a_scene_to_start_from_keeps_its_shape_and_its_timing(dataset: Dataset, device: Device) -> None:
+    """Though the capture has fewer times than the field has frequencies; and a restored state, too."""
+    config = configure()
+    scenes = [
+        Scene4D.from_points(
+            np.zeros((40, 3)), np.zeros((40, 3)), np.ones(40), config.field, antialiased=True, device=device
+        )
+        for _ in range(2)
+    ]
+    assert config.field.components > len(dataset.times)
+    scenes[0].timing = Timing(np.array([0.0, 0.5, 1.0]), np.array([0.0, 0.6, 1.0]))
+    config = dataclasses.replace(config, timing=dataclasses.replace(config.timing, refine=False))
+    with Trainer(config, dataset, device, scene=scenes[0]) as one:
+        assert one.config.field == one.scene.field_config == config.field
+        one.step()
+        state = one.state()
+        one.step()
+        expected = one.state()
+    with Trainer(config, dataset, device, scene=scenes[1]) as two:
+        two.restore(state)
+        assert two.scene.timing(0.5) == 0.6
+        two.step()
+        assert equal(two.state(), expected)
 
 
 # A field of one's own

@@ -184,7 +184,11 @@ def test_the_number_of_gaussians_is_bounded_and_the_largest_gradients_come_first
     assert len(change(rows, statistics).added["means"]) == 8
 
 
-def test_faint_gaussians_are_never_all_removed() -> None:
+@pytest.mark.parametrize("gradient", [0.0, 1.0])
+@pytest.mark.parametrize("size", ["small", "large"])
+def test_faint_gaussians_are_never_all_removed(size: str, gradient: float) -> None:
     opacities = [1e-4 * (1 + i) for i in range(8)]
-    result = change(make_rows([SMALL] * 8, opacities), make_statistics([0.0] * 8))
+    scales = {"small": SMALL, "large": LARGE}[size]
+    result = change(make_rows([scales] * 8, opacities), make_statistics([gradient] * 8))
     assert result.keep.tolist() == [False] * 6 + [True] * 2
+    assert not len(result.added["means"])

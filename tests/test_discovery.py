@@ -33,7 +33,8 @@ from lapgs_wgpu.train.discovery.tracks import Tracks, find_tracks
 from lapgs_wgpu.train.discovery.trajectories import find_trajectories
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.run import train
-from lapgs_wgpu.train.trainer import Trainer
+from lapgs_wgpu.train.optimizer import Optimizer
+from lapgs_wgpu.train.trainer import RISE, Trainer
 
 RADIUS, BOX = 0.2, 1.3
 QUICK = {
@@ -474,6 +475,32 @@ def test_a_training_draws_a_scene_that_it_starts_from_as_it_is_drawn(dataset: Da
     scene = Scene4D.from_points(np.zeros((3, 3)), np.zeros((3, 3)), np.ones(3), config.field, device=device)
     with pytest.raises(InputError, match="antialiased = False, and the configuration says True"):
         Trainer(config, dataset, device, scene=scene)
+
+
+@pytest.mark.parametrize(("warm_up", "first"), [(10, 0.1), (0, 1 / RISE)])
+def test_rates_rise_after_discovery(
+    dataset: Dataset, device: Device, monkeypatch: pytest.MonkeyPatch, warm_up: int, first: float
+) -> None:
+    """Also in presets without a warm-up, and on from where they were in a training that is resumed."""
+    shares = []
+    step = Optimizer.step
+
+    def noted(self: Optimizer, number: int, share: float = 1.0) -> None:
+        shares.append(share)
+        step(self, number, share)
+
+    monkeypatch.setattr(Optimizer, "step", noted)
+    config = configure(schedule__warm_up=str(warm_up))
+    with closing(Trainer(config, dataset, device)) as training:
+        shares.clear()  # those of discovery
+        for _ in range(2):
+            training.step()
+        state = training.state()
+    with closing(Trainer(config, dataset, device, resumed=True)) as resumed:
+        resumed.restore(state)
+        for _ in range(10):
+            resumed.step()
+    assert shares == pytest.approx([min(1, first * (1 + i)) for i in range(12)])
 
 
 def test_a_field_that_knows_the_tracks_learns_slowly_also_when_resumed(dataset: Dataset, device: Device) -> None:

@@ -44,7 +44,14 @@ def timing_of_text(text: str) -> Timing:
     table = parse_json(text, "its timing")
     if not isinstance(table, dict) or table.keys() != {"times", "moments"}:
         raise ValueError("timing is no table of times and moments")
-    times, moments = (_numbers(table[name], name) for name in ("times", "moments"))
+    return checked_timing(*(_numbers(table[name], name) for name in ("times", "moments")))
+
+
+def checked_timing(times: NDArray[np.float64], moments: NDArray[np.float64]) -> Timing:
+    """A timing of these times and moments, in [0, 1]. Raises ValueError where they are none."""
+    for name, values in (("times", times), ("moments", moments)):
+        if values.ndim != 1 or values.dtype != np.float64 or not ((values >= 0) & (values <= 1)).all():
+            raise ValueError(f"timing.{name} are not numbers between 0 and 1")
     if len(times) != len(moments):
         raise ValueError(f"timing has {len(times)} times and {len(moments)} moments")
     if (np.diff(times) <= 0).any():
@@ -56,7 +63,6 @@ def timing_of_text(text: str) -> Timing:
 
 def _numbers(values: object, name: str) -> NDArray[np.float64]:
     real = isinstance(values, list) and 0 < len(values) <= _MOST and all(type(each) in (int, float) for each in values)
-    array = np.array(values if real else [], np.float64)
-    if not real or not ((array >= 0) & (array <= 1)).all():
+    if not real:
         raise ValueError(f"timing.{name} are not numbers between 0 and 1")
-    return array
+    return np.array(values, np.float64)

@@ -161,7 +161,8 @@ def densify(
     bound_sizes: whether the bounds on screen and world size hold, which they do after the first opacity reset.
     """
     gradients = statistics.mean_gradients
-    wanted = gradients >= config.gradient
+    # Clones and children of faint ones are faint: they would go at once, and a split parent with them.
+    wanted = (gradients >= config.gradient) & ~_faint(rows, config)
     large = rows["log_scales"].amax(dim=1) > math.log(config.split_size * extent)
     clone = wanted & ~large
     split = wanted & large
@@ -196,8 +197,11 @@ def split_rows(parents: Rows, generator: torch.Generator) -> dict[str, Tensor]:
 
 def prunable(rows: Rows, radii: Tensor, config: DensityConfig, extent: float, *, bound_sizes: bool) -> Tensor:
     """(N,) which Gaussians are too faint, or too large (radii: (N,) largest so far on an image, pixels)."""
-    faint: Tensor = rows["opacity_logits"] < _logit(config.min_opacity)
-    return faint | oversized(rows, radii, config, extent, bound_sizes=bound_sizes)
+    return _faint(rows, config) | oversized(rows, radii, config, extent, bound_sizes=bound_sizes)
+
+
+def _faint(rows: Rows, config: DensityConfig) -> Tensor:
+    return rows["opacity_logits"] < _logit(config.min_opacity)
 
 
 def oversized(rows: Rows, radii: Tensor, config: DensityConfig, extent: float, *, bound_sizes: bool) -> Tensor:

@@ -24,9 +24,15 @@ def suited(config: Config, dataset: Dataset) -> Config:
             ),
             smoothness=dataclasses.replace(config.smoothness, reach=scale * config.smoothness.reach),
         )
-    # The Nyquist frequency is half the number of times; all frequencies above it would end there.
-    most = 1 + math.floor(len(dataset.times) / 2 / field.frequency_step)
-    return dataclasses.replace(config, field=dataclasses.replace(field, components=min(field.components, max(1, most))))
+    # All frequencies above the limit would end there.
+    most = 1 + math.floor(nyquist_frequency(dataset) / field.frequency_step + 1e-9)
+    return dataclasses.replace(config, field=dataclasses.replace(field, components=min(field.components, most)))
+
+
+def nyquist_frequency(dataset: Dataset) -> float:
+    """Half the rate of the training times, cycles over the clip: above it a frequency looks like one below."""
+    times = dataset.times
+    return (len(times) - 1) / 2 / float(times[-1] - times[0]) if len(times) > 1 else 0.0
 
 
 def with_decoder_placed(config: Config, device: Device) -> Config:

@@ -26,6 +26,7 @@ from lapgs_wgpu.motion.fields.deformation import Moments, Nearby
 from lapgs_wgpu.motion.fields.dynamics import dynamics_loss
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.scene import Deformed, Scene4D
+from lapgs_wgpu.motion.timing import Timing, checked_timing
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train.acceleration import acceleration_loss, draw_moments
 from lapgs_wgpu.train.camera_descent import scene_points
@@ -49,12 +50,14 @@ from lapgs_wgpu.train.optimizer import FrequencyOptimizer, Optimizer
 from lapgs_wgpu.train.parts import Parts
 from lapgs_wgpu.train.smoothness import draw_nearby
 from lapgs_wgpu.train.step_result import StepResult
-from lapgs_wgpu.train.suited import suited, with_decoder_placed
+from lapgs_wgpu.train.suited import nyquist_frequency, suited, with_decoder_placed
 from lapgs_wgpu.train.timing_refinement import TimingRefinement, image_to_fit
 
 MAX_SH_DEGREE = 3
 # Terms of the configuration, and what stands beside them in the log.
 TERMS = frozenset({"l1", "mse", "ssim", "pyramid", "ncc", "smoothness", "acceleration", "dynamics", "loss", "psnr"})
+
+RISE = 200  # steps over which rates rise after discovery, where schedule.warm_up is 0
 
 
 class _Look(NamedTuple):
@@ -107,7 +110,8 @@ class Trainer:
             dataset: None for the one that config.data names; a built-in scene is then written into the folder runs.
             device: None for the default adapter.
             ranks: this process among those that train together.
-            scene: to start from, and to move from the first step on, in place of discovery and initial points.
+            scene: to start from, and to move from the first step on, in place of discovery and initial points. Its
+                field keeps its shape, whatever config.field says.
             parts: own field, losses, density control, learning rates and callbacks.
             resumed: leave out discovery, since `restore` follows.
 
@@ -125,8 +129,13 @@ class Trainer:
                 config = dataclasses.replace(config, field=dataclasses.replace(config.field, kind="own"))
             except ValueError as error:
                 raise InputError(f"{error}.") from None
+        if scene is not None:
+            config = dataclasses.replace(config, field=scene.field_config)
         self.given = with_decoder_placed(config, device)
-        self.config = config = suited(self.given, dataset)
+        config = suited(self.given, dataset)
+        if scene is not None:  # whose field does not change its shape any more
+            config = dataclasses.replace(config, field=scene.field_config)
+        self.config = config
         self.dataset, self.parts, self.callbacks = dataset, parts, list(parts.callbacks)
         if config.schedule.batch % ranks.count:
             raise InputError(
@@ -151,7 +160,11 @@ class Trainer:
         self._generator = torch.Generator().manual_seed(config.seed)
         # What discovery found moves from the first step on, at rates that rise: Adam's first steps, all of the size of
         # the rate, would shake off what the field knows.
-        self._warm_up = config.schedule.warm_up if scene is None else 0
+        self._warm_up, self._rising = config.schedule.warm_up, 0
+        if scene is not None:
+            self._warm_up, self._rising = 0, config.schedule.warm_up
+        if self.discovery is not None:
+            self._rising = config.schedule.warm_up or RISE
         if scene is not None and scene.antialiased != config.antialiased:
             raise InputError(
                 f"the scene to start from is drawn with antialiased = {scene.antialiased}, and the configuration says "
@@ -207,7 +220,7 @@ class Trainer:
         self._limit_field_rates(fitted=self._field_fitted)
         self._frequencies = None
         if scene.spectrum is not None:
-            limit = len(dataset.times) / 2
+            limit = nyquist_frequency(dataset)
             self._frequencies = FrequencyOptimizer(scene.spectrum, config.rates.frequencies, limit)
         self._exposures = Exposures(len(dataset.train), config.exposure.rate) if config.exposure.enabled else None
         self._extent = dataset.extent
@@ -346,8 +359,7 @@ class Trainer:
             moments = self.timing.fitted(corrections.index(step))
         self.whole = False
         if skipped is None:
-            rising = config.schedule.warm_up - self._warm_up
-            self._optimizer.step(step, min(1.0, step / rising) if rising else 1.0)
+            self._optimizer.step(step, min(1.0, step / self._rising) if self._rising else 1.0)
             for beside in self._beside:
                 beside.step(step)
             # After the optimiser's step, so that no gradient is lost with the rows that change.
@@ -483,7 +495,7 @@ class Trainer:
     # The state between two steps -------------------------------------------------------------------------------------
 
     def state(self) -> dict[str, NDArray[np.generic]]:
-        """Everything that the next step depends on, by name."""
+        """Everything that the next step depends on, by name; copies."""
         scene = self.scene
         parts: dict[str, Mapping[str, Tensor]] = {
             "gaussians": scene.parameters,
@@ -492,18 +504,19 @@ class Trainer:
             "frequencies": self._frequencies.state() if self._frequencies else {},
             "exposure": self._exposures.state() if self._exposures else {},
             "cameras": self.cameras.state() if self.cameras else {},
-            "timing": self.timing.state() if self.timing else {},
+            "timing": self.timing.state() if self.timing else _timing_state(scene.timing),
             "statistics": vars(self._density.statistics),
             "training": {
                 "done": torch.tensor(self.done),
                 "warm_up": torch.tensor(self._warm_up),
+                "rising": torch.tensor(self._rising),
                 "field_fitted": torch.tensor(int(self._field_fitted)),
                 "sh_degree": torch.tensor(scene.sh_degree),
                 "random": self._generator.get_state(),
                 "order": torch.tensor(self._pictures.order, dtype=torch.int64),
             },
         }
-        return {f"{part}.{name}": t.numpy(force=True) for part, tensors in parts.items() for name, t in tensors.items()}
+        return {f"{part}.{name}": t.numpy(force=True).copy() for part, tensors in parts.items() for name, t in tensors.items()}
 
     def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
         """Go on from what `state` gave. Raises KeyError, RuntimeError or ValueError where it belongs to a training of
@@ -511,7 +524,7 @@ class Trainer:
         parts: dict[str, dict[str, Tensor]] = {}
         for name, array in state.items():
             part, _, rest = name.partition(".")
-            parts.setdefault(part, {})[rest] = torch.from_numpy(array)
+            parts.setdefault(part, {})[rest] = torch.tensor(array)
         scene = self.scene
         if parts["gaussians"].keys() != scene.parameters.keys():
             raise ValueError(f"it has Gaussians with {sorted(parts['gaussians'])}, not {sorted(scene.parameters)}")
@@ -528,15 +541,26 @@ class Trainer:
             self._exposures.restore(parts["exposure"])
         if self.cameras is not None:
             self.cameras.restore(parts["cameras"])
+        timing = parts.get("timing", {})
         if self.timing is not None:
-            self.timing.restore(parts["timing"])
+            self.timing.restore(timing)
+        elif timing:
+            scene.timing = checked_timing(timing["times"].numpy(), timing["moments"].numpy())
         self._density.statistics = Statistics(**parts["statistics"])
         own = parts["training"]
         self.done, scene.sh_degree = int(own["done"]), int(own["sh_degree"])
-        self._warm_up = int(own.get("warm_up", self._warm_up))  # older states lack it
+        self._warm_up = int(own.get("warm_up", self._warm_up))  # older states lack it, and the next one
+        self._rising = int(own.get("rising", self.config.schedule.warm_up - self._warm_up))
+        if self._rising < 0:
+            raise ValueError("its rates rise over a negative number of steps")
         self._limit_field_rates(fitted=bool(own.get("field_fitted", False)))
         self._generator.set_state(own["random"])
         self._pictures.order = own["order"].tolist()
+
+
+def _timing_state(timing: Timing) -> dict[str, Tensor]:
+    """Of a scene that began with a timing, which this training does not change."""
+    return {name: torch.from_numpy(values) for name, values in vars(timing).items() if len(values)}
 
 
 def _note(text: str, ranks: Ranks) -> None:

@@ -89,8 +89,8 @@ class FieldConfig(Options):
         "laplacian",
     )
     components: int = option(
-        "field laplacian: number of frequencies in the motion spectrum; at most 1 + T / (2 x frequency_step), rounded "
-        "down, are used, where T is the number of distinct training times",
+        "field laplacian: number of frequencies in the motion spectrum; at most 1 + (T - 1) / (2 x frequency_step), "
+        "rounded down, are used, where T is the number of distinct training times",
         16,
         at_least=1,
         at_most=256,
