@@ -31,9 +31,9 @@ from lapgs_wgpu.train.discovery.static_fit import static_config, static_fit
 from lapgs_wgpu.train.discovery.surface_points import PointClouds, Points, surface_points
 from lapgs_wgpu.train.discovery.tracks import Tracks, find_tracks
 from lapgs_wgpu.train.discovery.trajectories import find_trajectories
+from lapgs_wgpu.train.optimizer import Optimizer
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.run import train
-from lapgs_wgpu.train.optimizer import Optimizer
 from lapgs_wgpu.train.trainer import RISE, Trainer
 
 RADIUS, BOX = 0.2, 1.3

@@ -19,6 +19,7 @@ from lapgs_wgpu.motion.scene import make_field
 SMALL = FieldConfig(
     kind="grid4d",
     bound=1.5,
+    unit=0.5,
     static=HashConfig(3, (4, 4, 4), (16, 16, 16), table_log2=9),
     temporal=HashConfig(4, (4, 4, 4), (12, 12, 8)),
     width=16,
@@ -74,7 +75,7 @@ def by_hand(field: GridField, points: Tensor, t: float) -> list[Tensor]:
         hidden = torch.relu(layer(f"hidden.{2 * i}", hidden))
     heads = layer("heads", hidden)
     turn = heads[:, :4] + torch.tensor([1.0, 0, 0, 0])
-    return [turn / turn.norm(dim=1, keepdim=True), heads[:, 4:7], heads[:, 7:11], heads[:, 11:]]
+    return [turn / turn.norm(dim=1, keepdim=True), 0.5 * heads[:, 4:7], heads[:, 7:11], 0.5 * heads[:, 11:]]
 
 
 @pytest.mark.parametrize("depth", [0, 1, 2])

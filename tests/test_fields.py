@@ -13,6 +13,7 @@ from torch import Tensor
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields import grid_field as grid_field_module
 from lapgs_wgpu.motion.fields.config import PLANES, FieldKind
+from lapgs_wgpu.motion.fields.deformation import Deformation
 from lapgs_wgpu.motion.fields.hexplane_field import HexPlaneField
 from lapgs_wgpu.motion.fields.laplacian import LaplacianMotion, TimeMotion
 from lapgs_wgpu.motion.fields.mlp_field import MlpField, octaves
@@ -48,6 +49,18 @@ def test_time_and_place_matter_and_all_weights_learn(device: Device, kind: Field
     for name, parameter in field.named_parameters():
         assert parameter.grad is not None, name
         assert parameter.grad.any(), name
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_lengths_are_learnt_in_units(device: Device, kind: FieldKind) -> None:
+    one, half = (
+        stirred(made(device, replace(OURS, kind=kind, unit=unit)))(POINTS, 0.3, DYNAMICS) for unit in (1.0, 0.5)
+    )
+    for name in Deformation._fields:
+        expected, found = getattr(one, name), getattr(half, name)
+        if expected is not None:
+            factor = 0.5 if name in ("translation", "d_scales") else 1.0
+            torch.testing.assert_close(found, factor * expected, msg=name)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -51,6 +51,7 @@ def expected(scene: Scene4D, t: float) -> dict[str, Tensor]:
         series = phase.cos() @ w["motion.alpha"] + phase.sin() @ w["motion.beta"]
         hidden = hidden + series * layer("motion.second", torch.relu(layer("motion.first", static)))
     turn, shift, d_quats, d_scales = layer("heads", hidden).split((4, 3, 4, 3), dim=1)
+    shift, d_scales = config.unit * shift, config.unit * d_scales
     unit = nn.functional.normalize
     turn = unit(turn + turn.new_tensor([1.0, 0, 0, 0]), dim=1)
     dc, logits = p["sh_dc"], p["opacity_logits"]

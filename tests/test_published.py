@@ -86,6 +86,7 @@ def test_a_preset_is_what_was_published_times_the_captures_scale(name: str, scal
     # Lengths.
     assert config.data.units == "world"
     assert field.bound == pytest.approx(scale * known.bound)
+    assert field.unit == scale, "the heads' outputs are lengths of the capture"
     start, end = (scale * rate for rate in POSITION_RATE)
     assert dataclasses.astuple(rates.means) == pytest.approx((start, end, known.position_rate_steps))
     assert smoothness.reach == pytest.approx(scale * known.reach[1])

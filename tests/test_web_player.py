@@ -166,7 +166,9 @@ FIELDS = {
     "grid4d without time, mirrored scales": dataclasses.replace(
         CONFIGS["grid4d without time"], negative_scales="mirror"
     ),
-    "no appearance, odd width": dataclasses.replace(CONFIGS["odd width"], appearance="none"),
+    "no appearance, odd width, lengths in units": dataclasses.replace(
+        CONFIGS["odd width"], appearance="none", unit=0.3
+    ),
 }
 
 

@@ -15,7 +15,7 @@ def suited(config: Config, dataset: Dataset) -> Config:
     field = config.field
     if config.data.units == "capture":
         scale, means = dataset.scale, config.rates.means
-        field = dataclasses.replace(field, bound=scale * field.bound)
+        field = dataclasses.replace(field, bound=scale * field.bound, unit=scale * field.unit)
         config = dataclasses.replace(
             config,
             data=dataclasses.replace(config.data, units="world"),

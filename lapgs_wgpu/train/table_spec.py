@@ -140,6 +140,8 @@ def fingerprint(config: Config) -> str:
         del values["timing"]
     if not config.discovery.enabled:
         del values["discovery"]
+    if config.field.unit == 1:
+        del values["field"]["unit"]
     if config.density.limit == 0:
         del values["density"]["limit"]
     if config.density.min_contribution == 0:

@@ -516,7 +516,11 @@ class Trainer:
                 "order": torch.tensor(self._pictures.order, dtype=torch.int64),
             },
         }
-        return {f"{part}.{name}": t.numpy(force=True).copy() for part, tensors in parts.items() for name, t in tensors.items()}
+        return {
+            f"{part}.{name}": t.numpy(force=True).copy()
+            for part, tensors in parts.items()
+            for name, t in tensors.items()
+        }
 
     def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
         """Go on from what `state` gave. Raises KeyError, RuntimeError or ValueError where it belongs to a training of

@@ -35,6 +35,7 @@ CONFIGS: dict[str, FieldConfig] = {
     "neither": replace(OURS, temporal_hash=False, dynamics=0),
     "one channel": replace(OURS, width=1),
     "mirrored scales": replace(OURS, negative_scales="mirror"),
+    "lengths in units": replace(OURS, unit=0.3),
     "odd width": replace(OURS, width=43, dynamics=1),
     "odd levels": replace(OURS, static=HashConfig(1, (4, 4, 4)), temporal=HashConfig(1, (4, 4, 4))),
     "sizes of dnerf": replace(

@@ -9,7 +9,7 @@ const POINTS = 2; // Gaussians of a lane, deform.wgsl
 const CANONICAL = 16; // floats of a Gaussian before its still features, deform.wgsl
 const BLOCK_BYTES = 128 * 2 ** 20;
 const APPEARANCE_SCALE = 0.1; // motion/fields/config.py
-const GEOMETRY = [[4, 0], [3, 2], [4, 1], [3, 3]]; // outputs of a head, and the quad that takes them
+const GEOMETRY = [[4, 0, false], [3, 2, true], [4, 1, false], [3, 3, true]]; // outputs of a head, the quad that takes them, and whether they are lengths
 
 export class Playback {
     constructor(gpu, scene, minScale) {
@@ -130,16 +130,17 @@ export class Playback {
 
     // Biases and, by channel, weights of the heads; with the Laplacian motion at a time folded in.
     headsAt(t) {
-        const { field: { width, laplacian, appearance }, parameters: p } = this.scene;
+        const { field: { width, laplacian, appearance, unit }, parameters: p } = this.scene;
         const { heads } = this;
         const row = laplacian ? heads + 4 : heads;
         const out = new Float32Array(4 * (heads + 4 * this.rounds * row));
         const column = channel => 4 * (heads + channel * row);
-        const outputs = GEOMETRY.flatMap(([count, quad]) => Array.from({ length: count }, (_, i) => 4 * quad + i));
+        const outputs = GEOMETRY.flatMap(([count, quad, length]) =>
+            Array.from({ length: count }, (_, i) => [4 * quad + i, length ? unit : 1]));
         const series = laplacian ? this.series(t) : null;
-        outputs.forEach((place, output) => {
-            const weight = p["heads.weight"].subarray(output * width, (output + 1) * width);
-            let bias = p["heads.bias"][output];
+        outputs.forEach(([place, factor], output) => {
+            const weight = p["heads.weight"].subarray(output * width, (output + 1) * width).map(value => factor * value);
+            let bias = factor * p["heads.bias"][output];
             const folded = new Float64Array(width);
             for (let k = 0; k < width; k++) {
                 out[column(k) + place] = weight[k];

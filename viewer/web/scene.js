@@ -87,6 +87,7 @@ function readField(text) {
         temporal_hash: field.temporal_hash,
         mirrorsScales: field.negative_scales === "mirror", // older files lack it
         bound: real(field.bound, "bound", 1e6),
+        unit: real(field.unit ?? 1, "unit", 1e6), // older files lack it
         timeScale: real(field.time_scale, "time_scale", 1),
         width: whole(field.width, "width", 1, 4096),
         staticFeatures: 2 * whole(field.static?.levels, "static.levels", 1, 64),

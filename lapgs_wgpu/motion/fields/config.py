@@ -58,6 +58,13 @@ class FieldConfig(Options):
         above=0,
         below=1e6,
     )
+    unit: float = option(
+        "length that an output of 1 of the field's heads means, for shifts and changes of the scales, world units; the "
+        "heads learn at a rate of their own, so this sets how fast things move while training; field own: not used",
+        1.0,
+        above=0,
+        below=1e6,
+    )
     static: HashConfig = option(
         "fields grid4d and laplacian: spatial hash grid (x, y, z)", HashConfig(16, (16, 16, 16), (2048, 2048, 2048))
     )
@@ -135,6 +142,13 @@ class FieldConfig(Options):
     def appearance_size(self) -> int:
         """Number of outputs of the appearance head; 0 for fields without it."""
         return {"none": 0, "color": 3, "color+opacity": 4}[self.appearance] if self.kind == "laplacian" else 0
+
+    @property
+    def head_factors(self) -> list[float]:
+        """Of the outputs of the grid fields' heads, geometry and appearance: lengths are learnt in `unit`."""
+        turn, shift, quaternion, scale = GEOMETRY
+        lengths = [*[1.0] * turn, *[self.unit] * shift, *[1.0] * quaternion, *[self.unit] * scale]
+        return [*lengths, *[APPEARANCE_SCALE] * self.appearance_size]
 
     @property
     def decodes_on_device(self) -> bool:

@@ -10,7 +10,7 @@ from torch.utils.checkpoint import checkpoint
 
 from ...gpu.device import Device
 from ..passes.decoder_passes import decoder_shape
-from .config import APPEARANCE_SCALE, GEOMETRY, TEMPORAL_AXES, FieldConfig
+from .config import GEOMETRY, TEMPORAL_AXES, FieldConfig
 from .decoder import Decoder
 from .decoder_layers import KEPT, DecoderWeights, decode
 from .deformation import Deformation, Moments, Nearby
@@ -181,14 +181,15 @@ class GridField(nn.Module):
         """The decoder's weights at a time. The second layer of the motion, which only linear heads follow, is folded
         into these, and all heads are one matrix, so that the features' gradient (N, width) is written once."""
         size = self.config.dynamics_size
-        looks = [] if self.appearance is None else [self.appearance]
-        heads = torch.cat([self.heads.weight, *(APPEARANCE_SCALE * head.weight for head in looks)])
-        bias = torch.cat([self.heads.bias, *(APPEARANCE_SCALE * head.bias for head in looks)])
+        layers = [self.heads] if self.appearance is None else [self.heads, self.appearance]
+        factors = self._head_factors()
+        heads = torch.cat([head.weight for head in layers]) * factors[:, None]
+        bias = torch.cat([head.bias for head in layers]) * factors
         inner = inner_bias = motion_heads = None
         if self.motion is not None:
             (inner, inner_bias), second = self.motion.layers(t)
-            folded, shift = (self.heads.weight @ factor for factor in second)
-            rest = len(heads) - len(folded)
+            rest = len(heads) - sum(GEOMETRY)
+            folded, shift = (heads[: sum(GEOMETRY)] @ factor for factor in second)
             motion_heads = nn.functional.pad(folded, (0, 0, 0, rest))
             bias = bias + nn.functional.pad(shift, (0, rest))
         return DecoderWeights(
@@ -232,8 +233,11 @@ class GridField(nn.Module):
             fused = fused + product(torch.relu(product(static, *first)), *second)
         outputs = self.heads(self.hidden(fused.float()))
         if self.appearance is not None:
-            outputs = torch.cat([outputs, APPEARANCE_SCALE * self.appearance(features.float())], dim=1)
-        return outputs
+            outputs = torch.cat([outputs, self.appearance(features.float())], dim=1)
+        return outputs * self._head_factors()
+
+    def _head_factors(self) -> Tensor:
+        return self.heads.bias.new_tensor(self.config.head_factors)
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """See motion/fields/deformation.py. The spectrum's frequencies, in no group, have their own optimiser."""

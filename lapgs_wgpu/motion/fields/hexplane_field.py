@@ -24,7 +24,7 @@ class HexPlaneField(nn.Module):
     def __init__(self, config: FieldConfig, seed: int) -> None:
         super().__init__()
         generator = torch.Generator().manual_seed(seed)
-        self.bound, shapes = config.bound, parameter_shapes(config)
+        self.bound, self.unit, shapes = config.bound, config.unit, parameter_shapes(config)
         self.planes = nn.ParameterList()
         for number in range(len(PLANES) * config.planes.levels):
             # Time planes start at one, and thus without motion.
@@ -55,7 +55,7 @@ class HexPlaneField(nn.Module):
         hidden = self.trunk(torch.cat(levels, dim=1))
         shift, d_quats, d_scales = (head(hidden) for head in self.heads)
         smoothness = self._smoothness() if nearby is not None else None
-        return Deformation(None, shift, d_quats, d_scales, smoothness=smoothness)
+        return Deformation(None, self.unit * shift, d_quats, self.unit * d_scales, smoothness=smoothness)
 
     def _features(self, unit: Tensor, first: int) -> Tensor:
         """(N, F) features at points and time (N, 4) in [-1, 1], from six planes starting with number `first`."""

@@ -20,7 +20,7 @@ class MlpField(nn.Module):
         super().__init__()
         generator = torch.Generator().manual_seed(seed)
         shapes = parameter_shapes(config)
-        self.bound = config.bound
+        self.bound, self.unit = config.bound, config.unit
         self.time = nn.Sequential(
             linear(shapes["time.0.weight"], generator), nn.ReLU(), linear(shapes["time.2.weight"], generator)
         )
@@ -37,7 +37,7 @@ class MlpField(nn.Module):
         for number, layer in enumerate(self.layers):
             hidden = torch.relu(layer(torch.cat([inputs, hidden], dim=1) if number == MLP_SKIP else hidden))
         shift, d_quats, d_scales = self.heads(hidden).split(MLP_OUTPUTS, dim=1)
-        return Deformation(None, shift, d_quats, d_scales)
+        return Deformation(None, self.unit * shift, d_quats, self.unit * d_scales)
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """See motion/fields/deformation.py."""

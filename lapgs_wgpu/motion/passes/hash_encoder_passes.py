@@ -198,7 +198,7 @@ class HashEncoderPasses:
                 commands.run(kernel, groups, arrays | {"levels": levels.array, "d_features": target, "d_fixed": target})
 
         if not self.lane_levels:
-            for (levels, target), (_, fixed) in zip(floats, sums, strict=True):
+            for (_, target), (_, fixed) in zip(floats, sums, strict=True):
                 unfix = Kernel.get(self.device, "hashgrid_unfix")
                 groups = -(-target.size // 64)
                 commands.dispatch(unfix, groups, grid=grid, d_fixed=fixed, d_features=target, **largest)

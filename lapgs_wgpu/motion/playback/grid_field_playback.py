@@ -17,7 +17,7 @@ from ...gpu.device import Device
 from ...gpu.kernel import Commands, Kernel
 from ...gpu.pool import BufferPool
 from ...splat.gaussians import Gaussians
-from ..fields.config import APPEARANCE_SCALE, GEOMETRY, FieldConfig, static_grid, temporal_grids
+from ..fields.config import GEOMETRY, FieldConfig, static_grid, temporal_grids
 from ..passes.hash_encoder_passes import HashEncoderPasses, PointSet
 
 Floats = NDArray[np.float32]
@@ -167,21 +167,22 @@ class GridFieldPlayback:
     def _heads(self, t: float) -> Floats:
         """(vectors, 4) biases and, by channel, weights of the heads, with the Laplacian motion at a time folded in."""
         p, width = self._parameters, self._sizes.width
-        weight = p["heads.weight"]
+        factors = np.array(self._config.head_factors, np.float32)
+        of_geometry, of_look = np.split(factors, [sum(GEOMETRY)])
+        weight, bias = p["heads.weight"] * of_geometry[:, None], p["heads.bias"] * of_geometry
         heads, channels = self._defines["HEADS"], self._rounds * self._channels
         columns = np.zeros((channels, heads + 4 if "MOTION" in self._defines else heads, 4), np.float32)
         start = np.zeros((heads, 4), np.float32)
         _fill_geometry(columns[:width], weight.T)
-        _fill_geometry(start[None], p["heads.bias"][None])
+        _fill_geometry(start[None], bias[None])
         if self._config.kind == "laplacian":
             phase = 2 * math.pi * t * p["motion.frequencies"].astype(np.float64)
             series = np.cos(phase) @ p["motion.alpha"] + np.sin(phase) @ p["motion.beta"]
             # As GridField: only these heads read A_L.
             _fill_geometry(columns[:width, heads:], (weight @ (series[:, None] * p["motion.second.weight"])).T)
-            bias = p["heads.bias"] + weight @ (series * p["motion.second.bias"])
-            _fill_geometry(start[None], bias[None])
+            _fill_geometry(start[None], (bias + weight @ (series * p["motion.second.bias"]))[None])
         if self._config.appearance_size:
-            look = APPEARANCE_SCALE * p["appearance.weight"], APPEARANCE_SCALE * p["appearance.bias"]
+            look = of_look[:, None] * p["appearance.weight"], of_look * p["appearance.bias"]
             columns[:width, 4, :3], start[4, :3] = look[0][:3].T, look[1][:3]
             if self._config.appearance_size == 4:
                 columns[:width, 2, 3], start[2, 3] = look[0][3], look[1][3]
