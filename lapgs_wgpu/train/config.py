@@ -51,8 +51,8 @@ class DataConfig(Options):
     )
     units: Units = option(
         "units of rates.means, smoothness.reach, field.bound and field.unit; world: those of the scene in the presets' "
-        "cube; capture: those of the capture's files, as in published settings; the training multiplies these values by the "
-        "scale of the cube when it starts; all other lengths are in world units",
+        "cube; capture: those of the capture's files, as in published settings; the training multiplies these values "
+        "by the scale of the cube when it starts; all other lengths are in world units",
         "world",
     )
     masks: str = option(
