@@ -164,17 +164,35 @@ def test_what_moves_all_cameras_alike_is_taken_out() -> None:
 
 
 def test_corrections_are_pulled_back() -> None:
-    refinement = refinement_of(cameras(), dataclasses.replace(CONFIG, pull=0.5))
-    gradient = torch.zeros(5, 7)
-    gradient[0, 0] = 1e-30
-    sizes = []
-    refinement._learnt[0, 0], refinement._learnt[1, 0] = 0.02, -0.02
-    for number in range(3):
+    """Those of cameras with a gradient, and the zoom, by the rate times the pull."""
+    pull, first = 0.5, torch.from_numpy(np.random.default_rng(2).normal(scale=0.02, size=(5, 6)))
+    gradient = torch.randn(5, 7, generator=torch.Generator().manual_seed(0))
+    gradient[[1, 4]] = 0.0
+    pulled, twin = (refinement_of(cameras(), dataclasses.replace(CONFIG, pull=each)) for each in (pull, 0.0))
+    for refinement in (pulled, twin):
+        refinement._common = torch.zeros(30, 0, dtype=torch.float64)
+        refinement._learnt.copy_(first)
+        refinement._zoom += 0.1
         refinement.values.grad = gradient.clone()
-        refinement._descent._mean.zero_()
+        refinement.step(1)
+    factor = 1 - CONFIG.rate.start * pull
+    assert torch.equal(pulled._learnt[[0, 2, 3]], twin._learnt[[0, 2, 3]] * factor)
+    assert torch.equal(pulled._learnt[[1, 4]], first[[1, 4]])
+    assert torch.equal(pulled._zoom, twin._zoom * factor)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize(("focal", "rows"), [(True, 5), (True, 2), (False, 5)])
+def test_the_zoom_goes_down_its_gradient(sign: float, focal: bool, rows: int) -> None:
+    """By the rate in a step, times the share of the cameras with a gradient; only where focal lengths are refined."""
+    refinement = refinement_of(cameras(), dataclasses.replace(CONFIG, focal=focal))
+    for number in range(3):
+        refinement.values.grad = torch.zeros(5, 7)
+        refinement.values.grad[:rows, 6] = sign
         refinement.step(number + 1)
-        sizes.append(float(refinement._learnt.norm()))
-    assert sizes[0] > sizes[1] > sizes[2]
+    expected = -sign * 3 * CONFIG.rate.start * rows / 5 if focal else 0.0
+    assert float(refinement._zoom) == pytest.approx(expected, rel=1e-6)
+    assert not refinement._learnt.any()
 
 
 def test_cameras_stay_before_the_first_step() -> None:
