@@ -19,6 +19,7 @@ from lapgs_wgpu.train import density_control, trainer
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.contribution import contributions
 from lapgs_wgpu.train.densify import published_rule
+from lapgs_wgpu.train.optimizer import Optimizer
 from lapgs_wgpu.train.presets import load_config
 
 
@@ -70,6 +71,22 @@ def pruning_config(**changes: float) -> Config:
     config = load_config("demo", {"schedule.steps": "20", "antialiased": "false"})
     density = dataclasses.replace(config.density, start=2, stop=3, contribution_interval=4, **changes)
     return dataclasses.replace(config, density=density)
+
+
+def test_pruning_keeps_the_largest_whatever_they_contribute(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    config, scene, shown = pruning_config(min_contribution=0.5), moving_scene(device), views(3)
+    most = torch.linspace(0.0, 0.4, len(scene))[torch.randperm(len(scene), generator=torch.Generator().manual_seed(0))]
+    monkeypatch.setattr(density_control, "contributions", lambda *_, **options: most)
+    monkeypatch.setattr(density_control, "LEAST_KEPT", 3)
+    optimizer = Optimizer(scene.parameters, {}, config.rates.schedules())
+    control = density_control.DensityControl(
+        config, scene, optimizer, published_rule, shown, lambda view: view.camera, 1.0, torch.Generator()
+    )
+    kept = scene.parameters["means"].detach()[most >= most.sort().values[-3]]
+    pruned = len(scene) - 3
+    assert control.change(4, moving=True) == pruned
+    assert torch.equal(scene.parameters["means"], kept)
+    assert len(control.statistics.views) == 3
 
 
 def test_training_prunes_what_hardly_shows(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -171,6 +171,9 @@ def test_schedule() -> None:
     assert CONFIG.changes_at(14_900)
     assert not CONFIG.changes_at(15_000)
     assert [step for step in range(1, 20_000) if CONFIG.resets_at(step)] == [3000, 6000, 9000, 12_000]
+    for least, steps in ((0.5, [1000, 1500]), (0.0, [])):  # not after the last step, nor without a threshold
+        pruning = dataclasses.replace(CONFIG, min_contribution=least, contribution_interval=500)
+        assert [step for step in range(1, 2001) if pruning.prunes_at(step, 2000)] == steps
 
 
 def test_the_number_of_gaussians_is_bounded_and_the_largest_gradients_come_first() -> None:

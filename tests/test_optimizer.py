@@ -53,6 +53,15 @@ def test_step_is_adam_at_the_rate_of_the_step() -> None:
     assert torch.allclose(gaussians["means"], expected, atol=1e-7)
 
 
+def test_a_step_at_a_share_of_the_rates() -> None:
+    gaussians, mlp, optimiser = make()
+    before, weights = gaussians["means"].detach().clone(), mlp.detach().clone()
+    (gaussians["means"].square().sum() + mlp.square().sum()).backward()
+    optimiser.step(1, 0.25)
+    assert torch.allclose(gaussians["means"], before - 0.25 * RATES["means"].at(1) * before.sign(), atol=1e-7)
+    assert torch.allclose(mlp, weights - 0.25 * RATES["mlp"].at(1) * weights.sign(), atol=1e-7)
+
+
 def test_no_rate_exceeds_the_highest_one_of_its_group() -> None:
     gaussians, mlp, optimiser = make()
     optimiser.highest = {"mlp": 0.1 * RATES["mlp"].at(1)}

@@ -29,6 +29,7 @@ from lapgs_wgpu.train.config import LossWeights
 from lapgs_wgpu.train.dataloader import Pictures
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
 from lapgs_wgpu.train.log import Log
+from lapgs_wgpu.train.optimizer import Optimizer
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.run import train
 from lapgs_wgpu.train.step_result import StepResult
@@ -277,6 +278,30 @@ def test_nothing_moves_during_the_warm_up(dataset: Dataset, device: Device, tmp_
         torch.equal(ours, initial)
         for ours, initial in zip(moved.field.parameters(), fresh.field.parameters(), strict=True)
     )
+
+
+def test_rates_rise_where_a_training_starts_from_a_scene(
+    dataset: Dataset, device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Over the steps of the warm-up, which such a training goes without."""
+    shares: list[float] = []
+    original = Optimizer.step
+
+    def noted(self: Optimizer, step: int, share: float = 1.0) -> None:
+        shares.append(share)
+        original(self, step, share)
+
+    monkeypatch.setattr(Optimizer, "step", noted)
+    config = configure(schedule__steps="6", schedule__warm_up="4")
+    with trainer.Trainer(config, dataset, device) as first:
+        for _ in first:
+            pass
+    assert shares == [1.0] * 6
+    shares.clear()
+    with trainer.Trainer(config, dataset, device, scene=first.scene) as second:
+        for _ in second:
+            pass
+    assert shares == [0.25, 0.5, 0.75, 1.0, 1.0, 1.0]
 
 
 def test_cross_correlation_counts_once_the_warm_up_is_over(
