@@ -30,6 +30,7 @@ from PIL import Image
 from lapgs_wgpu.data import load_dataset, video_frames
 from lapgs_wgpu.data.initial_gaussians import first_points
 from lapgs_wgpu.data.readers import neu3d
+from lapgs_wgpu.data.readers.poses_bounds import read_rows
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 
@@ -334,7 +335,7 @@ BAD: dict[str, tuple[Change, list[str]]] = {
     "text": (lambda folder, _: (folder / FILE).write_text("hello"), [FILE, "NumPy array"]),
     "objects": (other_array(np.array([{}])), [FILE, "NumPy array"]),
     "14 numbers": (other_array(GOOD[:, :14]), [FILE, "17", "(4, 14)"]),
-    "one row less": (other_array(GOOD[:3]), [FILE, "poses of 3 cameras", "4 recordings", "cam00 to cam03"]),
+    "one row less": (other_array(GOOD[:3]), [FILE, "3 poses", "4 recordings", "cam00 to cam03"]),
     "NaN": (poses(1, 2, math.nan), [FILE, "row 1 (cam01)", "nan", "column 2"]),
     "far away": (poses(1, 3, 1e12), [FILE, "row 1", "1e+12", "column 3"]),
     "focal length tiny": (poses(2, 14, 1e-9), [FILE, "row 2 (cam02)", "1e-09 pixels", "0.05 to 1000"]),
@@ -434,15 +435,15 @@ def test_formats_are_told_by_their_files(toy: Path) -> None:
         load_dataset(toy.parent)
 
 
-def test_rows_are_llffs() -> None:
+def test_rows_are_llffs(tmp_path: Path) -> None:
     """down, right, back: as in the rows that this file writes, but by hand."""
     row = [*np.array([[0, 1, 0, 5, 48], [-1, 0, 0, 6, 64], [0, 0, 1, 7, 80]], float).ravel(), 1, 9]
-    path = Path("poses_bounds.npy")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(neu3d, "read_npy", lambda _: np.array([row]))
-        (pose,) = neu3d._read_poses(path, [Path("cam00")])
-    R, t = pose.T_cam_world[:3, :3], pose.T_cam_world[:3, 3]
+    path = tmp_path / "poses_bounds.npy"
+    np.save(path, np.array([row]))
+    (found,) = read_rows(path, ["cam00"], "recordings")
+    T_cam_world = neu3d._pose(found)
+    R, t = T_cam_world[:3, :3], T_cam_world[:3, 3]
     np.testing.assert_array_equal(-R.T @ t, [5, 6, 7])
     np.testing.assert_array_equal(R, [[1, 0, 0], [0, -1, 0], [0, 0, -1]])
-    np.testing.assert_array_equal(pose.lens.K, [[80, 0, 32], [0, 80, 24], [0, 0, 1]])
-    assert (pose.lens.width, pose.lens.height, pose.depths) == (64, 48, (1, 9))
+    np.testing.assert_array_equal(found.lens.K, [[80, 0, 32], [0, 80, 24], [0, 0, 1]])
+    assert (found.lens.width, found.lens.height, found.depths) == (64, 48, (1, 9))

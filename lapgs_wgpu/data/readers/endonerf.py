@@ -16,16 +16,18 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from lapgs_wgpu.data.cloud import Cloud, read_npy
+from lapgs_wgpu.data.cloud import Cloud
 from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.data.frames import Capture, Frame, Reader
 from lapgs_wgpu.data.images import ERRORS, SUFFIXES, check_image, decode, size_text
-from lapgs_wgpu.data.poses import LARGEST_ENTRY, check_rotation, world_to_camera
+from lapgs_wgpu.data.poses import world_to_camera
 from lapgs_wgpu.data.timestamps import ImageName, natural_key
 from lapgs_wgpu.data.undistort import Lens
 from lapgs_wgpu.errors import InputError
 
-POSES, IMAGES, DEPTH = "poses_bounds.npy", "images", "depth"
+from .poses_bounds import POSES, read_rows
+
+IMAGES, DEPTH = "images", "depth"
 EVERY, FIRST = 8, 1  # images that are tested
 MAPS = 8  # depth maps that make the cloud, evenly chosen over the clip
 MOST_POINTS = 40_000  # of the cloud
@@ -48,33 +50,24 @@ def _read(folder: Path, image_size: int | None) -> Capture:
     path = folder / POSES
     found = (file for file in (folder / IMAGES).iterdir() if file.suffix.lower() in SUFFIXES)
     images = [check_image(file) for file in sorted(found, key=lambda file: natural_key(file.name))]
-    rows = read_npy(path).astype(np.float64)
-    if rows.ndim != 2 or rows.shape[1] != 17 or len(rows) != len(images) or not len(images):
-        raise InputError(
-            f"{path} must hold 17 numbers for each of {len(images)} images in {folder / IMAGES}, an array of "
-            f"({len(images)}, 17), got {rows.shape}."
-        )
+    if not images:
+        raise InputError(f"{folder / IMAGES} holds no images (.png or .jpg); extract the camera's frames into it.")
     lenses: dict[bytes, Lens] = {}
     poses: dict[bytes, NDArray[np.float64]] = {}
     frames = []
+    rows = read_rows(path, [image.path.name for image in images], "images")
     for index, (row, image) in enumerate(zip(rows, images, strict=True)):
-        where = f"{path}, row {index} ({image.path.name})"
-        _check(row, where)
-        pose, (near, far) = row[:15].reshape(3, 5), row[15:]
-        height, width, focal = pose[:, 4]
-        K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-        lens = lenses.setdefault(pose[:, 4].tobytes(), Lens(K, round(width), round(height)))
-        T_cam_world = poses.setdefault(pose[:, :4].tobytes(), world_to_camera(pose[:, :3], pose[:, 3]))
+        T_cam_world = world_to_camera(row.R, row.position)  # right, down and forward are OpenCV's axes
         frames.append(
             Frame(
                 image,
-                lens,
-                T_cam_world,
-                where,
+                lenses.setdefault(row.lens.K.tobytes(), row.lens),
+                poses.setdefault(T_cam_world.tobytes(), T_cam_world),
+                row.where,
                 ImageName(image.path.name),
                 time=index,
                 split="test" if index % EVERY == FIRST else "train",
-                depths=(float(near), float(far)),
+                depths=row.depths,
             )
         )
     cloud = _cloud(folder, frames)
@@ -86,21 +79,6 @@ def _read(folder: Path, image_size: int | None) -> Capture:
         time_source=f"the order of the images in {folder / IMAGES}",
         warnings=[f"{folder}: {EXPECT.format(depth=told) if len(poses) == 1 else AXES.format(count=len(poses))}."],
     )
-
-
-def _check(row: NDArray[np.float64], where: str) -> None:
-    """Raises InputError unless a row is a camera with depth bounds."""
-    bad = ~(np.abs(row) <= LARGEST_ENTRY)  # true for NaN, too
-    if bad.any():
-        column = int(np.argmax(bad))
-        raise InputError(f"{where} holds {row[column]:g} in column {column}; it must be at most {LARGEST_ENTRY:g}.")
-    pose, (near, far) = row[:15].reshape(3, 5), row[15:]
-    check_rotation(pose[:, :3], f"{where}: the pose")
-    if not (1 <= pose[0, 4] <= 1e5 and 1 <= pose[1, 4] <= 1e5 and pose[2, 4] > 0):
-        sizes = ", ".join(f"{value:g}" for value in pose[:, 4])
-        raise InputError(f"{where}: height, width and focal length must be positive pixels, got {sizes}.")
-    if not 0 < near < far:
-        raise InputError(f"{where}: the depth bounds must be 0 < near < far, got {near:g} and {far:g}.")
 
 
 def _cloud(folder: Path, frames: list[Frame]) -> Cloud | None:
