@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.data.images import NEAREST, Size, check_image, decode, resize, shrink, size_text
+from lapgs_wgpu.data.images import NEAREST, Size, decode, resize, shrink
+from lapgs_wgpu.data.mask_files import WHITE, check_mask_size, find_mask
 from lapgs_wgpu.data.undistort import Undistortion
 from lapgs_wgpu.errors import InputError
-
-WHITE = 128  # level from which on a pixel is ignored
 
 
 def find_ignored(folder: Path, names: Sequence[str], splits: Sequence[str], size: Size) -> dict[str, Path]:
@@ -35,24 +34,18 @@ def find_ignored(folder: Path, names: Sequence[str], splits: Sequence[str], size
     found: dict[str, Path] = {}
     missing = []
     for name in (name for name, split in zip(names, splits, strict=True) if split == "train"):
-        for path in (folder / PurePosixPath(name).with_suffix(".png"), folder / f"{name}.png"):
-            if path.is_file():
-                found[name] = path
-                break
-        else:
+        path = find_mask(folder, name)
+        if path is None:
             missing.append(name)
+        else:
+            found[name] = path
     if missing:
         raise InputError(
             f"{folder} lacks {len(missing)} of {len(missing) + len(found)} masks of training images, such as that of "
             f"{missing[0]}; name each mask as its image, or leave out data.masks."
         )
     for path in found.values():
-        stored = check_image(path, whole=False).size
-        if abs(stored[0] * size[1] / size[0] - stored[1]) > 1.5:
-            raise InputError(
-                f"{path} is {size_text(stored)} pixels, and the images are {size_text(size)}, which has other "
-                "proportions; make the masks from the images."
-            )
+        check_mask_size(path, size)
     return found
 
 

@@ -8,12 +8,12 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.data.images import Size, check_image, decode, encode_png, size_text
+from lapgs_wgpu.data.images import Size, decode, encode_png
+from lapgs_wgpu.data.mask_files import WHITE, check_mask_size, find_mask
 from lapgs_wgpu.errors import InputError
 
 Mask = NDArray[np.bool_]
 MASKS = "masks"  # folder of a capture
-_WHITE = 128  # from this level on a pixel moves
 
 
 def write_masks(folder: Path, masks: Mapping[str, Mask]) -> None:
@@ -36,22 +36,17 @@ def read_masks(folder: Path, names: Sequence[str], size: Size) -> dict[str, Mask
     Every image needs one: NAME.png or NAME.jpg.png (COLMAP's way) below the folder. Raises InputError.
     """
     check_folder(folder)
-    paths = {name: [folder / PurePosixPath(name).with_suffix(".png"), folder / f"{name}.png"] for name in names}
-    found = {name: next((path for path in both if path.is_file()), None) for name, both in paths.items()}
+    found = {name: find_mask(folder, name) for name in names}
     missing = [name for name, path in found.items() if path is None]
     if missing:
+        example = PurePosixPath(missing[0]).with_suffix(".png").name
         raise InputError(
-            f"{folder} lacks {len(missing)} of {len(names)} masks, such as {paths[missing[0]][0].name}; name each mask "
-            "as its image in images/ of a first run without --masks, with the same --fps."
+            f"{folder} lacks {len(missing)} of {len(names)} masks, such as {example}; name each mask as its image in "
+            "images/ of a first run without --masks, with the same --fps."
         )
     masks = {}
     for name, path in found.items():
         assert path is not None
-        stored = check_image(path, whole=False).size
-        if abs(stored[0] * size[1] / size[0] - stored[1]) > 1.5:
-            raise InputError(
-                f"{path} is {size_text(stored)} pixels, and the images are {size_text(size)}, which has other "
-                "proportions; make the masks from the images."
-            )
-        masks[name] = decode(path)[..., 0] >= _WHITE
+        check_mask_size(path, size)
+        masks[name] = decode(path)[..., 0] >= WHITE
     return masks
