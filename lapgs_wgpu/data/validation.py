@@ -18,6 +18,7 @@ from lapgs_wgpu.data.covisible import check_mask
 from lapgs_wgpu.data.focus import spread
 from lapgs_wgpu.data.frames import Frame
 from lapgs_wgpu.data.images import check_image, gray_thumbnail, size_text
+from lapgs_wgpu.data.thumbnails import BLURRED, EQUAL, THUMBNAIL, blurred, repeats, sharpness, sharpness_around
 from lapgs_wgpu.data.undistort import Lens
 from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.errors import InputError
@@ -27,10 +28,6 @@ MIN_FOCAL, MAX_FOCAL = 0.05, 1000.0  # of an image's longer side: 169 and 0.06 d
 # A triangulated point was seen by cameras. If most points are not, cloud and cameras use different coordinates.
 MIN_SEEN = 0.5
 MIN_SPREAD = 1e-3  # of the cloud, relative to its distance from the cameras: a smaller one covers less than a pixel
-THUMBNAIL = 320  # longer side in pixels: what is blurred at this size is blurred for a training, too
-BLURRED = 0.3  # relative to the sharpness of the images before and after
-AROUND = 5  # number of images before, and after
-EQUAL = 3  # levels of 255: the largest difference of a repeated image, above noise at the thumbnail's size
 NAMED = 5  # images that a warning names
 STANDING = 0.01  # cameras with a spread below this, relative to their distance from the cloud, have no parallax
 FEW_POINTS = 100
@@ -235,30 +232,21 @@ def check_views(cloud: Cloud, cameras: Sequence[Camera], names: Sequence[str], w
 
 def check_film(images: Sequence[Path]) -> list[str]:
     """Warn about images of one camera, in the order of time, that are blurred or repeated."""
-    from scipy.ndimage import laplace  # slow to import
-
     if len(images) < 3:
         return []
     with ThreadPoolExecutor(4, thread_name_prefix="thumbnails") as pool:
         thumbnails = list(pool.map(lambda path: gray_thumbnail(path, THUMBNAIL), images))
-    sharpness = np.array([laplace(thumbnail).var() for thumbnail in thumbnails])
+    values = np.array([sharpness(thumbnail) for thumbnail in thumbnails])
     warnings = []
-    blurred = []
-    for i, value in enumerate(sharpness):
-        around = np.delete(sharpness[max(i - AROUND, 0) : i + AROUND + 1], min(i, AROUND))
-        if value < BLURRED * np.median(around):
-            blurred.append((images[i].name, value / np.median(around)))
-    if blurred:
-        name, share = min(blurred, key=lambda entry: entry[1])
+    found = np.flatnonzero(blurred(values))
+    if len(found):
+        shares = values[found] / sharpness_around(values)[found]
+        worst = found[np.argmin(shares)]
         warnings.append(
-            f"blurred images: {_named([name for name, _ in blurred])} ({len(blurred)} of {len(images)}) have less "
-            f"than {BLURRED:g} of their neighbours' sharpness, {name} {share:.2g}; leave them out."
+            f"blurred images: {_named([images[i].name for i in found])} ({len(found)} of {len(images)}) have less "
+            f"than {BLURRED:g} of their neighbours' sharpness, {images[worst].name} {shares.min():.2g}; leave them out."
         )
-    repeated = [
-        images[i].name
-        for i in range(1, len(images))
-        if thumbnails[i].shape == thumbnails[i - 1].shape and np.abs(thumbnails[i] - thumbnails[i - 1]).max() <= EQUAL
-    ]
+    repeated = [images[i].name for i in range(1, len(images)) if repeats(thumbnails[i], thumbnails[i - 1])]
     if repeated:
         warnings.append(
             f"repeated images: {_named(repeated)} ({len(repeated)} of {len(images)}) differ by at most {EQUAL} of "

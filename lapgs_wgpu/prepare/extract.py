@@ -8,10 +8,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
-from lapgs_wgpu.data.validation import AROUND, BLURRED, EQUAL
+from lapgs_wgpu.data.thumbnails import blurred, repeats, sharpness
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.progress import Progress
 
@@ -79,7 +78,7 @@ def extract(film: Film, images: Path, prefix: str, fps: float, longer_side: int,
             frames += len(group.sharpness)
             best = group.first if still else group.best
             progress.at(max(1, math.floor(best.seconds)))
-            if not still and before is not None and np.abs(best.gray - before).max() <= EQUAL:
+            if not still and before is not None and repeats(best.gray, before):
                 repeated += 1
                 continue
             before = best.gray
@@ -91,7 +90,8 @@ def extract(film: Film, images: Path, prefix: str, fps: float, longer_side: int,
             f"{film.path} is black: the brightest of its {len(pictures)} images has a mean of "
             f"{max(picture.brightness for picture in pictures):.1f} of 255 levels; film with light, without a lens cap."
         )
-    kept = pictures if still else [p for p, bad in zip(pictures, _blurred(pictures), strict=True) if not bad]
+    bad = blurred(np.array([picture.sharpness for picture in pictures]))
+    kept = pictures if still else [picture for picture, each in zip(pictures, bad, strict=True) if not each]
     for picture in set(pictures) - set(kept):
         (images / picture.name).unlink()
     if len(kept) < 2:
@@ -100,12 +100,6 @@ def extract(film: Film, images: Path, prefix: str, fps: float, longer_side: int,
             "another); film something that moves, for at least a few seconds."
         )
     return Extraction(kept, fps, frames, still, repeated, len(pictures) - len(kept))
-
-
-def sharpness(gray: NDArray[np.float32]) -> float:
-    """Variance of the Laplacian."""
-    inner = gray[1:-1, 1:-1]
-    return float((gray[:-2, 1:-1] + gray[2:, 1:-1] + gray[1:-1, :-2] + gray[1:-1, 2:] - 4 * inner).var())
 
 
 @dataclass
@@ -133,15 +127,6 @@ def _spans(film: Film, fps: float) -> Iterator[_Span]:
         span.sharpness.append(value)
     if span is not None:
         yield span
-
-
-def _blurred(pictures: Sequence[Picture]) -> list[bool]:
-    values = np.array([picture.sharpness for picture in pictures])
-    found = []
-    for i, value in enumerate(values):
-        around = np.delete(values[max(i - AROUND, 0) : i + AROUND + 1], min(i, AROUND))
-        found.append(len(around) > 0 and bool(value < BLURRED * np.median(around)))
-    return found
 
 
 def common_end(extractions: Sequence[Extraction]) -> float:

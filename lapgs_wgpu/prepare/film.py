@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.data.images import Pixels, Size, shrunk_size, size_text
+from lapgs_wgpu.data.thumbnails import THUMBNAIL
 from lapgs_wgpu.data.video_frames import EXACT_COLORS, LARGEST_FRAME, import_av
 from lapgs_wgpu.errors import InputError
 
 from .hdr import Transfer, to_sdr, transfer_of
 
-THUMBNAIL = 320  # longer side, pixels: what is blurred or equal at this size is so for a training, too
 _FAST_BILINEAR = 0x1  # of swscale: exact enough for a thumbnail
 WIDEST = 4.0  # width by height of a pixel, or height by width; what a header states beyond it is no such ratio
 _ATTACHED_PICTURE = 0x400  # libavformat's flag of a cover image
