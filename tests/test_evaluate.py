@@ -24,7 +24,7 @@ from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.drawing import Drawing
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 from lapgs_wgpu.train.evaluate import evaluate, mean_psnr, side_by_side, to_8_bit, write_metrics
-from lapgs_wgpu.train.losses import MS_SSIM_SMALLEST, masked_ssim, ms_ssim, psnr
+from lapgs_wgpu.train.image_metrics import MS_SSIM_SMALLEST, masked_ssim, ms_ssim, psnr
 from lapgs_wgpu.train.lpips import BLOCKS, Lpips
 
 CAMERA = Camera.looking_at([0, -4, 0], [0, 0, 0], up=[0, 0, 1], fov_x=0.7, width=24, height=16)

@@ -30,7 +30,7 @@ from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterize import rasterize
 from lapgs_wgpu.splat.rasterizer import Rasterizer
-from lapgs_wgpu.train import fused_loss, losses
+from lapgs_wgpu.train import fused_loss, image_metrics
 from lapgs_wgpu.train.config import LossWeights
 from lapgs_wgpu.train.fused_loss import RenderLoss
 from lapgs_wgpu.train.image_loss import ImageLoss
@@ -145,7 +145,7 @@ def test_constants_are_those_of_the_references(device: Device) -> None:
     source = Kernel.get(device, "loss_ssim_across", LANES=8).source
     numbers = source.split("array<f32, 11>(")[1].split(")")[0].split(",")
     torch.testing.assert_close(
-        torch.tensor([float(n) for n in numbers]), losses._window(torch.float32, torch.device("cpu"))
+        torch.tensor([float(n) for n in numbers]), image_metrics._window(torch.float32, torch.device("cpu"))
     )
     assert str(loss_reference.LUMINANCE) in source
 
@@ -204,13 +204,13 @@ def test_a_step_is_that_of_the_rasteriser_and_the_references(device: Device, ant
         {
             "l1": loss_reference.l1(image, truth).item(),
             "mse": (image - truth).square().mean().item(),
-            "ssim": losses.ssim(image, truth.double()).item(),
+            "ssim": image_metrics.ssim(image, truth.double()).item(),
             "pyramid": loss_reference.pyramid_loss(image, truth).item(),
             "ncc": loss_reference.ncc_loss(image, truth.double()).item(),
         },
         rel=1e-5,
     )
-    assert done.psnr == pytest.approx(losses.psnr(image, truth), rel=1e-5)
+    assert done.psnr == pytest.approx(image_metrics.psnr(image, truth), rel=1e-5)
     assert torch.equal(done.radii, drawn.radii)
     assert torch.equal(done.means2d, drawn.means2d)
     expected = gradients(other, RenderLoss(loss, {}, drawn.radii, drawn.means2d))

@@ -18,12 +18,11 @@ from lapgs_wgpu.data.objects import ObjectTruth
 from lapgs_wgpu.data.views import composite
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.train.object_metrics import (
-    BEST_PSNR,
     NOT_FOUND,
     ObjectFrame,
-    masked_psnr,
     measure_object,
     measure_objects,
+    psnr_within,
     summarise,
     visible,
 )
@@ -90,7 +89,7 @@ def test_the_truth_itself_is_found_exactly(views: Any) -> None:
     frames = frames_of(views, lambda clean, color, alpha, d: over(clean, color, alpha))
     assert min(frame.iou for frame in frames) > 0.88
     assert max(frame.distance or 0 for frame in frames) < 0.05
-    assert {frame.psnr for frame in frames} == {BEST_PSNR}
+    assert {frame.psnr for frame in frames} == {100.0}
 
 
 def test_a_missing_object_is_not_found(views: Any) -> None:
@@ -175,13 +174,13 @@ def test_hardly_visible_objects_do_not_count() -> None:
     assert visible(square(6, (10, 10), (1, 1, 1))[1], 7.0) is True
 
 
-def test_masked_psnr_written_out() -> None:
+def test_psnr_within_written_out() -> None:
     image, truth = np.zeros((4, 4, 3), np.uint8), np.zeros((4, 4, 3), np.uint8)
     truth[0, 0] = 51
     pixels = np.zeros((4, 4), bool)
     pixels[0, :2] = True
-    assert masked_psnr(image, truth, pixels) == pytest.approx(-10 * np.log10(0.2**2 / 2))
-    assert masked_psnr(image, truth, ~pixels) == BEST_PSNR
+    assert psnr_within(image, truth, pixels) == pytest.approx(-10 * np.log10(0.2**2 / 2))
+    assert psnr_within(image, truth, ~pixels) == 100.0
 
 
 def test_summary_over_frames_and_objects() -> None:

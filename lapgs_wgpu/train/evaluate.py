@@ -27,11 +27,11 @@ from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train.camera_refinement import rotation_vector
 from lapgs_wgpu.train.config import BACKGROUND_LEVELS
+from lapgs_wgpu.train.image_metrics import MS_SSIM_SMALLEST, SSIM_WINDOW, masked_ssim, ms_ssim, psnr, ssim
 from lapgs_wgpu.train.log import environment
-from lapgs_wgpu.train.losses import MS_SSIM_SMALLEST, SSIM_WINDOW, masked_ssim, ms_ssim, psnr, ssim
 from lapgs_wgpu.train.lpips import SMALLEST, Lpips
 from lapgs_wgpu.train.motion_masks import differs_from_median, differs_from_static, still_backgrounds
-from lapgs_wgpu.train.object_metrics import masked_psnr, measure_objects, summarise
+from lapgs_wgpu.train.object_metrics import measure_objects, psnr_within, summarise
 from lapgs_wgpu.train.view_alignment import aligned_view
 
 ERROR_GAIN = 4  # of the error pictures
@@ -153,7 +153,7 @@ def _render(scene: Scene4D, view: View, color: Tensor) -> NDArray[np.uint8]:
 def _moving(image: NDArray[np.uint8], truth: NDArray[np.uint8], pixels: NDArray[np.bool_]) -> dict[str, float]:
     """psnr_moving and psnr_still of a view, each only where it has such pixels."""
     parts = {"psnr_moving": pixels, "psnr_still": ~pixels}
-    return {name: masked_psnr(image, truth, part) for name, part in parts.items() if part.any()}
+    return {name: psnr_within(image, truth, part) for name, part in parts.items() if part.any()}
 
 
 def _measures(

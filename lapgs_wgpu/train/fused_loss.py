@@ -20,8 +20,8 @@ from ..splat.rasterize import gradient_tensors, radii_and_centres, rasterizer_of
 from .config import LossWeights
 from .exposure import ExposurePasses
 from .image_loss import ImageLoss
+from .image_metrics import psnr_of
 from .loss_terms import TorchLoss, WgslLoss, torch_loss
-from .losses import LEAST_ERROR
 
 
 class RenderLoss(NamedTuple):
@@ -37,7 +37,7 @@ class RenderLoss(NamedTuple):
     @property
     def psnr(self) -> float:
         """In dB over all pixels and channels, at most 100 dB."""
-        return -10.0 * float(np.log10(max(self.terms["mse"], LEAST_ERROR)))
+        return psnr_of(self.terms["mse"])
 
 
 # The passes of a device, whose buffers serve all calls of `render_loss`.

@@ -15,10 +15,29 @@ from ..gpu.device import Device
 from ..gpu.kernel import Commands, Kernel
 from ..gpu.pool import BufferPool
 from .config import LossWeights
-from .losses import NCC_WINDOW, pyramid_sizes, pyramid_weights
 
 TERMS = 5  # in the buffer that `record` leaves
+PYRAMID_BANDS = 3  # band-pass levels; below them lies the residual
+NCC_WINDOW = 11
 _WHOLE = 1 << 14  # a lane takes a whole row or column, of a longer side several runs
+
+
+def pyramid_sizes(height: int, width: int) -> list[tuple[int, int]]:
+    """(height, width) of each level, the finest first, the residual last: halves, rounded up.
+
+    A level is only divided further where both sides are at least 3 pixels, which reflection needs: small images have
+    fewer band-pass levels, and the smallest are nothing but a residual.
+    """
+    sizes = [(height, width)]
+    while len(sizes) <= PYRAMID_BANDS and min(sizes[-1]) >= 3:
+        sizes.append(((sizes[-1][0] + 1) // 2, (sizes[-1][1] + 1) // 2))
+    return sizes
+
+
+def pyramid_weights(levels: int) -> list[float]:
+    """Of each level, the finest first: 2^-(l - 1), divided by their sum."""
+    weights = [2.0**-level for level in range(levels)]
+    return [weight / sum(weights) for weight in weights]
 
 
 class LossArrays(NamedTuple):

@@ -25,6 +25,7 @@ from scipy.spatial import cKDTree
 
 from lapgs_wgpu.data.objects import ObjectTruth
 from lapgs_wgpu.data.views import composite
+from lapgs_wgpu.train.image_metrics import psnr_of
 
 CONTRAST = 0.5
 REACH = 1.0  # diameters from the true mask within which a silhouette is looked for
@@ -33,7 +34,6 @@ LEAST_DIFFERENCE = 16.0  # levels of 255, over the channels: less between object
 VISIBLE_PIXELS, VISIBLE_SHARE = 20, 0.25  # least of an object that must be seen: pixels, share of its whole disc
 LEAST_CLAIM = 0.1  # a silhouette of fewer pixels than this share of the true one has no centroid
 FOUND_IOU = 0.5
-BEST_PSNR = 100.0  # of equal images
 NOT_FOUND = "not found"  # the track error where most frames have no silhouette
 
 Image = NDArray[np.uint8]
@@ -104,7 +104,7 @@ def measure_object(
     if np.count_nonzero(claimed) >= max(1.0, LEAST_CLAIM * np.count_nonzero(true)) and true.any():
         distance = float(np.linalg.norm(_centroid(claimed) - _centroid(true))) / diameter
     pixels = (_distance_from(mask > 0) <= MARGIN) | claimed
-    return ObjectFrame(name, masked_psnr(image, truth, pixels), iou, distance)
+    return ObjectFrame(name, psnr_within(image, truth, pixels), iou, distance)
 
 
 def silhouette(
@@ -127,10 +127,9 @@ def silhouette(
     return claimed, counted
 
 
-def masked_psnr(image: Image, truth: Image, pixels: Mask) -> float:
-    """PSNR in dB over all channels of the chosen pixels (H, W), at least one; at most BEST_PSNR."""
-    error = np.square(image[pixels].astype(np.float64) - truth[pixels]).mean() / 255**2
-    return min(BEST_PSNR, float(-10 * np.log10(max(error, 1e-12))))
+def psnr_within(image: Image, truth: Image, pixels: Mask) -> float:
+    """PSNR in dB over all channels of the chosen pixels (H, W), at least one; at most 100 dB."""
+    return psnr_of(float(np.square(image[pixels].astype(np.float64) - truth[pixels]).mean()) / 255**2)
 
 
 def summarise(frames: Sequence[Sequence[ObjectFrame]], views: Sequence[str]) -> dict[str, object]:

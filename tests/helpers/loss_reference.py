@@ -11,11 +11,19 @@ from torch.nn import functional
 
 from lapgs_wgpu.splat.constants import CONSTANTS
 from lapgs_wgpu.train.config import LossWeights
-from lapgs_wgpu.train.losses import NCC_WINDOW, pyramid_sizes, pyramid_weights, ssim
+from lapgs_wgpu.train.image_loss import NCC_WINDOW, pyramid_sizes, pyramid_weights
+from lapgs_wgpu.train.image_metrics import ssim
 
 PYRAMID_TAPS = (1.0, 4.0, 6.0, 4.0, 1.0)  # sum 16
 NCC_E, NCC_TINY = CONSTANTS["NCC_E"], CONSTANTS["NCC_TINY"]
 LUMINANCE = (0.299, 0.587, 0.114)  # Rec. 601, which is meant for gamma-encoded images such as ours
+
+
+def noisy_pair(height: int, width: int, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:
+    """Two random images, the second near the first."""
+    generator = torch.Generator().manual_seed(height * 1000 + width)
+    a, noise = torch.rand((2, height, width, 3), generator=generator, dtype=dtype)
+    return a, 0.7 * a + 0.3 * noise
 
 
 def exposure(image: Tensor, correction: Tensor) -> Tensor:

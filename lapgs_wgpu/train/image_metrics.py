@@ -1,4 +1,4 @@
-"""Measures of images: SSIM, MS-SSIM, PSNR; and the sizes of the image losses. Images are (H, W, 3) in [0, 1].
+"""Measures of images: SSIM, MS-SSIM, PSNR. Images are (H, W, 3) in [0, 1].
 
 In torch, differentiable, for any float dtype; all sums have a fixed order.
 """
@@ -6,6 +6,7 @@ In torch, differentiable, for any float dtype; all sums have a fixed order.
 from __future__ import annotations
 
 import functools
+import math
 
 import torch
 from torch import Tensor
@@ -18,8 +19,6 @@ SSIM_SIGMA = 1.5  # pixels
 SSIM_C1, SSIM_C2 = CONSTANTS["SSIM_C1"], CONSTANTS["SSIM_C2"]
 MS_SSIM_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)  # of the scales, the finest first
 MS_SSIM_SMALLEST = (SSIM_WINDOW - 1) * 2 ** (len(MS_SSIM_WEIGHTS) - 1) + 1  # 161: the coarsest has one window
-PYRAMID_BANDS = 3  # band-pass levels; below them lies the residual
-NCC_WINDOW = 11
 LEAST_ERROR = 1e-10  # mean squared error that PSNR takes equal images to have: 100 dB
 
 
@@ -78,28 +77,14 @@ def masked_ssim(image: Tensor, target: Tensor, mask: Tensor) -> Tensor:
     return (luminance * (2 * covariance + SSIM_C2) / (variance_a + variance_b + SSIM_C2)).mean()
 
 
-def pyramid_sizes(height: int, width: int) -> list[tuple[int, int]]:
-    """(height, width) of each level, the finest first, the residual last: halves, rounded up.
-
-    A level is only divided further where both sides are at least 3 pixels, which reflection needs: small images have
-    fewer band-pass levels, and the smallest are nothing but a residual.
-    """
-    sizes = [(height, width)]
-    while len(sizes) <= PYRAMID_BANDS and min(sizes[-1]) >= 3:
-        sizes.append(((sizes[-1][0] + 1) // 2, (sizes[-1][1] + 1) // 2))
-    return sizes
-
-
-def pyramid_weights(levels: int) -> list[float]:
-    """Of each level, the finest first: 2^-(l - 1), divided by their sum."""
-    weights = [2.0**-level for level in range(levels)]
-    return [weight / sum(weights) for weight in weights]
-
-
 def psnr(image: Tensor, target: Tensor) -> float:
     """Peak signal-to-noise ratio in dB over all pixels and channels, at most 100 dB."""
-    error = (image - target).square().mean().clamp(min=LEAST_ERROR)
-    return -10.0 * float(torch.log10(error))
+    return psnr_of(float((image - target).square().mean()))
+
+
+def psnr_of(mean_squared_error: float) -> float:
+    """Peak signal-to-noise ratio in dB of values in [0, 1], at most 100 dB."""
+    return -10.0 * math.log10(max(mean_squared_error, LEAST_ERROR))
 
 
 def _blur(planes: Tensor) -> Tensor:

@@ -1,77 +1,22 @@
-"""Image losses in torch: each against its definition in float64, their sum, PSNR."""
+"""The image losses of the reference: each against its definition in float64, and their sum."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 
 import pytest
 import torch
-from helpers.loss_reference import l1, ncc_loss, pyramid_loss, total
+from helpers.loss_reference import l1, ncc_loss, noisy_pair, pyramid_loss, total
 from torch import Tensor
 
 from lapgs_wgpu.train.config import LossWeights
-from lapgs_wgpu.train.losses import psnr, pyramid_sizes, pyramid_weights, ssim
-
-
-def pair(height: int, width: int, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:
-    generator = torch.Generator().manual_seed(height * 1000 + width)
-    a, noise = torch.rand((2, height, width, 3), generator=generator, dtype=dtype)
-    return a, 0.7 * a + 0.3 * noise
-
-
-def ssim_by_definition(a: Tensor, b: Tensor) -> float:
-    """The sum over each pixel's 11x11 window, one by one; zeros beyond the border."""
-    height, width, channels = a.shape
-    weights = [math.exp(-((k - 5) ** 2) / (2 * 1.5**2)) for k in range(11)]
-    norm = sum(weights) ** 2
-    total = 0.0
-    for y in range(height):
-        for x in range(width):
-            for c in range(channels):
-                sums = [0.0] * 5
-                for dy in range(-5, 6):
-                    for dx in range(-5, 6):
-                        if 0 <= y + dy < height and 0 <= x + dx < width:
-                            w = weights[dy + 5] * weights[dx + 5] / norm
-                            p, q = a[y + dy, x + dx, c].item(), b[y + dy, x + dx, c].item()
-                            for i, value in enumerate((p, q, p * p, q * q, p * q)):
-                                sums[i] += w * value
-                mu, nu, pp, qq, pq = sums
-                above = (2 * mu * nu + 1e-4) * (2 * (pq - mu * nu) + 9e-4)
-                total += above / ((mu * mu + nu * nu + 1e-4) * (pp - mu * mu + qq - nu * nu + 9e-4))
-    return total / (height * width * channels)
-
-
-@pytest.mark.parametrize("size", [(1, 1), (4, 7), (13, 12)])
-def test_ssim_is_its_definition(size: tuple[int, int]) -> None:
-    a, b = pair(*size)
-    assert ssim(a, b).item() == pytest.approx(ssim_by_definition(a, b), abs=1e-12)
-
-
-def test_ssim_of_equal_images_is_one_and_its_gradient_zero() -> None:
-    a, _ = pair(20, 31, torch.float32)
-    a.requires_grad_()
-    value = ssim(a, a.detach())
-    value.backward()
-    assert value.item() == pytest.approx(1, abs=1e-6)
-    assert a.grad is not None
-    assert a.grad.abs().max() < 1e-6
-
-
-def test_ssim_gradient() -> None:
-    a, b = pair(6, 13)
-    assert torch.autograd.gradcheck(lambda image: ssim(image, b), a.requires_grad_())
-
-
-def test_ssim_is_precise_in_float32() -> None:
-    a, b = pair(40, 50)
-    assert ssim(a.float(), b.float()).item() == pytest.approx(ssim(a, b).item(), abs=2e-6)
+from lapgs_wgpu.train.image_loss import pyramid_sizes, pyramid_weights
+from lapgs_wgpu.train.image_metrics import ssim
 
 
 def test_loss_is_the_weighted_sum_of_its_parts() -> None:
-    a, b = pair(15, 9)
-    expected = 0.8 * (a - b).abs().mean().item() + 0.2 * (1 - ssim_by_definition(a, b))
+    a, b = noisy_pair(15, 9)
+    expected = 0.8 * (a - b).abs().mean().item() + 0.2 * (1 - ssim(a, b).item())
     assert total(a, b, LossWeights(0.8, 0.2)).item() == pytest.approx(expected, abs=1e-12)
     assert total(a, b, LossWeights(1.0, 0.0)) == l1(a, b)
     more = expected + 0.3 * pyramid_loss(a, b).item() + 0.4 * ncc_loss(a, b).item()
@@ -83,7 +28,7 @@ SIZES = [(1, 1), (2, 9), (3, 3), (3, 4), (4, 7), (13, 12), (16, 11), (40, 33)]
 
 @pytest.mark.parametrize("size", SIZES)
 def test_pyramid_is_zero_only_for_equal_images(size: tuple[int, int]) -> None:
-    a, b = pair(*size)
+    a, b = noisy_pair(*size)
     assert pyramid_loss(a, a) == 0
     for y, x in {(0, 0), (size[0] - 1, size[1] // 2), (size[0] // 2, size[1] - 1)}:
         changed = a.clone()
@@ -94,7 +39,7 @@ def test_pyramid_is_zero_only_for_equal_images(size: tuple[int, int]) -> None:
 
 @pytest.mark.parametrize("size", SIZES)
 def test_an_offset_only_touches_the_residual(size: tuple[int, int]) -> None:
-    a, _ = pair(*size)
+    a, _ = noisy_pair(*size)
     share = pyramid_weights(len(pyramid_sizes(*size)))[-1]
     assert pyramid_loss(a + 0.3, a).item() == pytest.approx(0.3 * share, rel=1e-12)
 
@@ -117,7 +62,7 @@ def test_pyramid_of_a_dot_by_hand() -> None:
 
 
 def test_ncc_ignores_brightness_and_contrast() -> None:
-    a, b = pair(30, 24)
+    a, b = noisy_pair(30, 24)
     assert ncc_loss(a, a).item() == pytest.approx(0, abs=1e-6)
     assert ncc_loss(0.6 * a + 0.3, a).item() == pytest.approx(0, abs=2e-3)  # e against variances near 0.03
     assert ncc_loss(0.6 * a + 0.3, b).item() == pytest.approx(ncc_loss(a, b).item(), abs=2e-3)
@@ -126,7 +71,7 @@ def test_ncc_ignores_brightness_and_contrast() -> None:
 
 def test_ncc_of_flat_images() -> None:
     """By its definition what is flat agrees with everything: that is left to the other losses."""
-    a, _ = pair(20, 20)
+    a, _ = noisy_pair(20, 20)
     flat = torch.full_like(a, 0.3)
     assert ncc_loss(flat, flat + 0.4).item() == pytest.approx(0, abs=2e-3)
     assert ncc_loss(flat, a).item() == pytest.approx(0, abs=2e-3)
@@ -134,7 +79,7 @@ def test_ncc_of_flat_images() -> None:
 
 
 def test_ncc_is_its_definition() -> None:
-    a, b = pair(13, 12)
+    a, b = noisy_pair(13, 12)
     weights = torch.tensor([0.299, 0.587, 0.114], dtype=torch.float64)
     values = []
     for y in range(3):
@@ -146,7 +91,7 @@ def test_ncc_is_its_definition() -> None:
 
 
 def test_ncc_of_an_image_without_a_window() -> None:
-    a, b = pair(10, 40)
+    a, b = noisy_pair(10, 40)
     assert ncc_loss(a.requires_grad_(), b) == 0
     ncc_loss(a, b).backward()
     assert a.grad is not None
@@ -156,11 +101,5 @@ def test_ncc_of_an_image_without_a_window() -> None:
 @pytest.mark.parametrize("size", [(2, 4), (3, 4), (12, 13), (9, 16)])
 @pytest.mark.parametrize("loss", [pyramid_loss, ncc_loss])
 def test_gradients_of_pyramid_and_ncc(loss: Callable[[Tensor, Tensor], Tensor], size: tuple[int, int]) -> None:
-    a, b = pair(*size)
+    a, b = noisy_pair(*size)
     assert torch.autograd.gradcheck(lambda image: loss(image, b), a.requires_grad_())
-
-
-def test_psnr() -> None:
-    a = torch.zeros(4, 5, 3)
-    assert psnr(a, a + 0.1) == pytest.approx(20)
-    assert psnr(a, a) == pytest.approx(100)  # the bound for equal images
