@@ -70,6 +70,25 @@ class Deformed(NamedTuple):
     moments: list[tuple[Tensor, Tensor]]
 
 
+def isotropic_rows(
+    points: NDArray[np.floating[Any]],
+    colors: NDArray[np.floating[Any]],
+    scales: NDArray[np.floating[Any]],
+    opacity: float,
+) -> dict[str, Tensor]:
+    """The parameters, as `Scene4D` has them, of isotropic Gaussians that stand still; arguments as for `from_points`."""
+    n = len(points)
+    return {
+        "means": torch.as_tensor(np.asarray(points, np.float32)),
+        "log_scales": torch.as_tensor(np.log(np.asarray(scales, np.float32)))[:, None].repeat(1, 3),
+        "quats": torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
+        "opacity_logits": torch.full((n,), float(np.log(opacity / (1 - opacity)))),
+        "sh_dc": (torch.as_tensor(np.asarray(colors, np.float32)) - CONSTANTS["SH_OFFSET"])[:, None]
+        / CONSTANTS["SH_C0"],
+        "sh_rest": torch.zeros(n, 15, 3),
+    }
+
+
 class Scene4D:
     """A moving scene.
 
@@ -151,16 +170,8 @@ class Scene4D:
         Returns:
             The scene.
         """
-        n = len(points)
-        parameters = {
-            "means": torch.as_tensor(np.asarray(points, np.float32)),
-            "log_scales": torch.as_tensor(np.log(np.asarray(scales, np.float32)))[:, None].repeat(1, 3),
-            "quats": torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
-            "opacity_logits": torch.full((n,), float(np.log(opacity / (1 - opacity)))),
-            "sh_dc": (torch.as_tensor(np.asarray(colors, np.float32)) - 0.5)[:, None] / CONSTANTS["SH_C0"],
-            "sh_rest": torch.zeros(n, 15, 3),
-            "dynamics": torch.zeros(n, field_config.dynamics_size),
-        }
+        parameters = isotropic_rows(points, colors, scales, opacity)
+        parameters["dynamics"] = torch.zeros(len(points), field_config.dynamics_size)
         device = device or open_device()
         return Scene4D(parameters, field_config, device, antialiased=antialiased, seed=seed, own_field=own_field)
 

@@ -15,8 +15,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from lapgs_wgpu.data.initial_gaussians import initial_scales
-from lapgs_wgpu.motion.scene import Scene4D
-from lapgs_wgpu.splat.constants import CONSTANTS
+from lapgs_wgpu.motion.scene import Scene4D, isotropic_rows
 
 from .residual import Residual
 from .surface_points import PointClouds
@@ -33,17 +32,8 @@ NEAR = 0.1  # box half sides; distance within which a track explains a surface p
 
 def track_gaussians(tracks: Tracks) -> dict[str, Tensor]:
     """A Gaussian for each track, at its place at the key time: the parameters of a scene without a field, float32."""
-    count = len(tracks.part)
     scales = SCALE * initial_scales(tracks.positions)
-    rows = {
-        "means": torch.from_numpy(tracks.positions),
-        "log_scales": torch.from_numpy(np.log(scales))[:, None].repeat(1, 3),
-        "quats": torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
-        "opacity_logits": torch.full((count,), float(np.log(OPACITY / (1 - OPACITY)))),
-        "sh_dc": (torch.from_numpy(tracks.colors) - 0.5)[:, None] / CONSTANTS["SH_C0"],
-        "sh_rest": torch.zeros(count, 15, 3),
-    }
-    return {name: values.float() for name, values in rows.items()}
+    return isotropic_rows(tracks.positions, tracks.colors, scales, OPACITY)
 
 
 def rows_with(static: Scene4D, tracks: Tracks) -> dict[str, Tensor]:
