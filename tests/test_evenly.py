@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from lapgs_wgpu.data.evenly import evenly
+from lapgs_wgpu.data.evenly import evenly, evenly_indices
 
 
 @pytest.mark.parametrize(("count", "most", "chosen"), [
@@ -18,3 +18,11 @@ from lapgs_wgpu.data.evenly import evenly
 ])  # fmt: skip
 def test_they_are_spread_from_the_first_to_the_last(count: int, most: int, chosen: list[int]) -> None:
     assert evenly(range(count), most) == chosen
+
+
+def test_indices_ascend() -> None:
+    for count in range(40):
+        for most in range(1, count + 2):
+            indices = evenly_indices(count, most)
+            assert len(indices) == min(count, most)
+            assert (indices[1:] > indices[:-1]).all()

@@ -6,11 +6,16 @@ from collections.abc import Sequence
 from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 T = TypeVar("T")
 
 
 def evenly(items: Sequence[T], most: int) -> list[T]:
     """At most `most` of the items, in their order, evenly spaced; the first and the last are among them."""
-    places = np.linspace(0, len(items) - 1, min(len(items), most)).round().astype(int)
-    return [items[i] for i in np.unique(places).tolist()]
+    return [items[i] for i in evenly_indices(len(items), most).tolist()]
+
+
+def evenly_indices(count: int, most: int) -> NDArray[np.int64]:
+    """Ascending indices of at most `most` of `count` items, evenly spaced; the first and the last are among them."""
+    return np.linspace(0, count - 1, min(count, most)).round().astype(np.int64)

@@ -76,7 +76,7 @@ def isotropic_rows(
     scales: NDArray[np.floating[Any]],
     opacity: float,
 ) -> dict[str, Tensor]:
-    """The parameters, as `Scene4D` has them, of isotropic Gaussians that stand still; arguments as for `from_points`."""
+    """The parameters of isotropic Gaussians that stand still, as `Scene4D` has them; arguments as for `from_points`."""
     n = len(points)
     return {
         "means": torch.as_tensor(np.asarray(points, np.float32)),

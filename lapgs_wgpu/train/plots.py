@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
+from lapgs_wgpu.data.evenly import evenly_indices
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.motion.scene import Scene4D
 
@@ -98,7 +99,7 @@ def sample_trajectories(scene: Scene4D) -> tuple[Floats, Floats]:
     opacities = scene.parameters["opacity_logits"].detach().sigmoid().numpy(force=True)
     visible = np.flatnonzero(opacities >= VISIBLE)
     among = visible if len(visible) else np.arange(len(scene))
-    sample = among[np.linspace(0, len(among) - 1, min(SAMPLE, len(among))).astype(int)]
+    sample = among[evenly_indices(len(among), SAMPLE)]
     with torch.no_grad():
         places = np.stack([scene.at(float(t)).means.numpy(force=True)[sample] for t in times])
     travelled = np.linalg.norm(np.diff(places, axis=0), axis=2).sum(axis=0)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.data.initial_gaussians import initial_scales
 from lapgs_wgpu.motion.scene import Scene4D, isotropic_rows
 
@@ -52,7 +53,7 @@ def tracks_in_images(
 
     times: (T,), of the tracks. background: level of its channels.
     """
-    judges = [images[i] for i in np.linspace(0, len(images) - 1, min(len(images), IMAGES)).astype(np.int64)]
+    judges = evenly(images, IMAGES)
     together = 2 * len(times) <= len(images)
     kept = np.zeros(int(tracks.part.max()) + 1, bool)
     for k in range(len(kept)):

@@ -10,6 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lapgs_wgpu.data.evenly import evenly_indices
+
 from .residual import Floats
 from .surface_points import Points, parts_of
 from .trajectories import Trajectory
@@ -179,7 +181,7 @@ class Follower:
     ) -> tuple[Floats, Floats]:
         """(s,) how much of the points a part explains when it is moved by each of the shifts (s, 3), and (s, m) how
         near it then is to each of the points."""
-        some = members[np.linspace(0, len(members) - 1, min(24, len(members))).astype(np.int64)]
+        some = members[evenly_indices(len(members), 24)]
         moved = (points.positions.T[:, None] - shifts.T[:, :, None]).reshape(3, -1)
         nearest, squared = _nearest(moved, positions[some])
         near = np.exp(-squared / (2 * (spread * self._unit) ** 2)).reshape(len(shifts), -1)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from lapgs_wgpu.data.evenly import evenly_indices
 from lapgs_wgpu.splat.camera import Camera
 
 Floats = NDArray[np.float32]
@@ -83,7 +84,7 @@ class Residual:
     def rays(self, most: int) -> Rays:
         """Rays of at most `most` moving pixels, evenly chosen."""
         rows, columns = np.nonzero(self.mask)
-        chosen = np.linspace(0, len(rows) - 1, min(most, len(rows))).astype(np.int64)
+        chosen = evenly_indices(len(rows), most)
         rows, columns = rows[chosen], columns[chosen]
         K = self.camera.K
         u, v = (columns + 0.5 - K[0, 2]) / K[0, 0], (rows + 0.5 - K[1, 2]) / K[1, 1]

@@ -18,6 +18,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from lapgs_wgpu.data.evenly import evenly_indices
+
 from .residual import Floats, Residual
 
 RAYS = 300  # of an image, at most
@@ -44,7 +46,7 @@ class Points(NamedTuple):
 
     def thinned(self, most: int) -> Points:
         """At most `most` of the points, evenly chosen."""
-        chosen = np.linspace(0, len(self.scores) - 1, min(most, len(self.scores))).astype(np.int64)
+        chosen = evenly_indices(len(self.scores), most)
         return Points(*(values[chosen] for values in self))
 
 
