@@ -22,6 +22,7 @@ from helpers.reference import (
     rasterize_reference,
     sh_basis,
 )
+from helpers.scenes import Scene, front_camera, oblique_camera, random_scene
 from scipy.special import lpmv
 from torch import Tensor
 
@@ -30,8 +31,8 @@ from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.rasterize import Rendering
 from lapgs_wgpu.splat.rotation import rotation_matrices
 
-Scene = dict[str, Tensor]
 IDENTITY = [1.0, 0.0, 0.0, 0.0]
+FRONT = front_camera(9, 7, 10.0)  # its axis meets the centre of the middle pixel
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -42,19 +43,6 @@ def _float64_on_one_thread() -> Any:
     yield
     torch.set_default_dtype(dtype)
     torch.set_num_threads(threads)
-
-
-def front_camera(width: int = 9, height: int = 7, focal: float = 10.0) -> Camera:
-    """At the origin, looking along +z; the axis meets the centre of the middle pixel when both sizes are odd."""
-    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-    return Camera(K, np.eye(4), width, height)
-
-
-def oblique_camera(width: int, height: int) -> Camera:
-    """Rotated, unequal focal lengths, a principal point off the centre."""
-    camera = Camera.looking_at([1.0, -3.0, 0.7], [0.1, 0, 0], up=[0, 0, 1], fov_x=0.8, width=width, height=height)
-    K = camera.K * np.array([[1.0, 1, 1.1], [1, 1.15, 0.93], [1, 1, 1]])
-    return Camera(K, camera.T_cam_world, width, height)
 
 
 def splats(*rows: tuple[list[float], float, float, list[float]]) -> Scene:
@@ -69,21 +57,6 @@ def splats(*rows: tuple[list[float], float, float, list[float]]) -> Scene:
     }
 
 
-def random_scene(count: int, seed: int, sh_degree: int | None = None, spread: float = 0.8, size: float = 0.15) -> Scene:
-    generator = torch.Generator().manual_seed(seed)
-
-    def normal(*shape: int) -> Tensor:
-        return torch.randn(*shape, generator=generator, dtype=torch.float64)
-
-    return {
-        "means": spread * normal(count, 3),
-        "quats": normal(count, 4),
-        "scales": size * torch.exp(0.6 * normal(count, 3)),
-        "opacities": torch.sigmoid(2 * normal(count)),
-        "colors": normal(count, 3).abs() if sh_degree is None else 0.5 * normal(count, (sh_degree + 1) ** 2, 3),
-    }
-
-
 # One Gaussian, by hand
 
 
@@ -95,7 +68,7 @@ def test_the_logarithm_of_the_smallest_alpha() -> None:
 def test_single_gaussian_pixels_by_hand() -> None:
     scene = splats(([0, 0, 2], 0.3, 0.8, [0.2, 0.5, 0.9]))
     background = torch.tensor([1.0, 0.0, 0.5])
-    image, alpha, depth, radii, means2d = rasterize_reference(**scene, camera=front_camera(), background=background)
+    image, alpha, depth, radii, means2d = rasterize_reference(**scene, camera=FRONT, background=background)
     variance = (10.0 / 2 * 0.3) ** 2 + 0.3  # focal / z * scale, squared, and the dilation
     off = 0.8 * math.exp(-0.5 * (2**2 + 1**2) / variance)
     assert means2d.tolist() == [[4.5, 3.5]]
@@ -131,7 +104,7 @@ def test_antialiased_opacity_by_hand() -> None:
     """A Gaussian whose half axes are 0.6 and 0.2 pixels, and turned, so that its covariance is no diagonal."""
     quat = torch.tensor([[math.cos(0.3), 0, 0, math.sin(0.3)]])
     mean, scales, opacity = torch.tensor([[0.0, 0, 2]]), torch.tensor([[0.12, 0.04, 0.3]]), torch.tensor([0.9])
-    projection = project(mean, quat, scales, opacity, front_camera(), antialiased=True)
+    projection = project(mean, quat, scales, opacity, FRONT, antialiased=True)
     faded = 0.9 * 0.6 * 0.2 / math.sqrt((0.36 + 0.3) * (0.04 + 0.3))
     assert projection.opacities.item() == pytest.approx(faded, abs=1e-14)
     tau = 2 * math.log(255 * faded)
@@ -170,7 +143,7 @@ def test_nearer_gaussian_comes_first_and_ties_go_by_index() -> None:
         ([([0, 0, 2], 0.3, 0.5, red), ([0, 0, 2], 0.3, 0.6, green)], (0.5, 0.5 * 0.6)),
         ([([0, 0, 2], 0.3, 0.6, green), ([0, 0, 2], 0.3, 0.5, red)], (0.4 * 0.5, 0.6)),
     ):
-        pixel = rasterize_reference(**splats(*rows), camera=front_camera()).image[3, 4]
+        pixel = rasterize_reference(**splats(*rows), camera=FRONT).image[3, 4]
         assert pixel.tolist() == pytest.approx([*expected, 0.0], abs=1e-14)
 
 
@@ -178,7 +151,7 @@ def test_pixel_stops_before_the_gaussian_that_would_pass_the_limit() -> None:
     opacities = [0.9, 0.98, 0.96, 0.5]  # transmittance 0.1, 0.002, then 0.00008 would be too little
     rows = [([0, 0, 2.0 + i], 0.3 * (1 + i), opacity, [0.0, 0, 1]) for i, opacity in enumerate(opacities)]
     rows[3][3][:] = [1.0, 0, 0]  # weak enough to pass alone, yet behind the stop
-    out = rasterize_reference(**splats(*rows), camera=front_camera())
+    out = rasterize_reference(**splats(*rows), camera=FRONT)
     assert out.alpha[3, 4].item() == pytest.approx(1 - 0.002, abs=1e-14)
     assert out.image[3, 4].tolist() == pytest.approx([0, 0, 0.998], abs=1e-14)
     assert out.depth[3, 4].item() == pytest.approx(2 * 0.9 + 3 * 0.098, abs=1e-14)
@@ -187,7 +160,7 @@ def test_pixel_stops_before_the_gaussian_that_would_pass_the_limit() -> None:
 def test_alpha_is_clamped_and_faint_alpha_skipped() -> None:
     scene = splats(([0, 0, 2], 0.3, 1.0, [1.0, 1, 1]))
     scene["opacities"].requires_grad_()
-    out = rasterize_reference(**scene, camera=front_camera(31, 31))
+    out = rasterize_reference(**scene, camera=front_camera(31, 31, 10.0))
     assert out.alpha[15, 15].item() == pytest.approx(ALPHA_MAX, abs=1e-14)
     assert torch.autograd.grad(out.alpha[15, 15], scene["opacities"], retain_graph=True)[0].item() == 0
     assert torch.autograd.grad(out.alpha[15, 16], scene["opacities"])[0].item() > 0
@@ -219,7 +192,7 @@ def test_culled_gaussians_leave_no_trace() -> None:
     scene["quats"][len(unseen) - 1] = 0.0
     for group in scene.values():
         group.requires_grad_()
-    expected, out = (rasterize_reference(**group, camera=front_camera()) for group in (alone, scene))
+    expected, out = (rasterize_reference(**group, camera=FRONT) for group in (alone, scene))
     assert torch.equal(expected.image, out.image)
     assert out.radii[:-1].count_nonzero() == 0
     assert out.radii[-1] == expected.radii[0] > 0
@@ -232,10 +205,10 @@ def test_culled_gaussians_leave_no_trace() -> None:
 def test_no_gaussians_show_the_background(width: int, height: int) -> None:
     scene = {name: group[:0] for name, group in random_scene(1, 0).items()}
     background = torch.tensor([0.1, 0.2, 0.3])
-    out = rasterize_reference(**scene, camera=front_camera(width, height), background=background)
+    out = rasterize_reference(**scene, camera=front_camera(width, height, 10.0), background=background)
     assert torch.equal(out.image, background.expand(height, width, 3))
     assert out.alpha.count_nonzero() == out.depth.count_nonzero() == out.radii.numel() == 0
-    assert not near_discontinuity(**scene, camera=front_camera(width, height)).any()
+    assert not near_discontinuity(**scene, camera=front_camera(width, height, 10.0)).any()
 
 
 # Against a literal loop
@@ -307,7 +280,7 @@ def test_radius_bounds_the_reached_pixels_tightly() -> None:
 
 
 def test_image_does_not_depend_on_the_world_frame_or_the_order() -> None:
-    camera, scene = oblique_camera(23, 17), random_scene(30, seed=9)
+    camera, scene = oblique_camera(23, 17), random_scene(30, seed=9, size=0.15)
     before = rasterize_reference(**scene, camera=camera)
     turn, shift = rotation_matrices(torch.tensor([[0.3, -0.5, 0.2, 0.9]]))[0], torch.tensor([3.0, -2.0, 5.0])
     T_world = torch.eye(4)
@@ -324,7 +297,7 @@ def test_image_does_not_depend_on_the_world_frame_or_the_order() -> None:
 
 
 def test_float32_agrees_outside_the_discontinuities() -> None:
-    camera, scene = oblique_camera(37, 29), random_scene(300, seed=2, sh_degree=2)
+    camera, scene = oblique_camera(37, 29), random_scene(300, seed=2, sh=9, size=0.15)
     exact = rasterize_reference(**scene, camera=camera, sh_degree=2)
     single = rasterize_reference(**{name: group.float() for name, group in scene.items()}, camera=camera, sh_degree=2)
     sure = ~near_discontinuity(**scene, camera=camera, sh_degree=2)
@@ -370,7 +343,7 @@ def test_sh_basis_equals_associated_legendre_functions() -> None:
 
 
 def test_sh_degree_0_is_the_same_from_everywhere() -> None:
-    scene = random_scene(5, seed=1, sh_degree=3)
+    scene = random_scene(5, seed=1, sh=16)
     sh = 4 * scene["colors"]
     colors = color(sh, scene["means"], oblique_camera(9, 7), 0)
     torch.testing.assert_close(colors, (0.5 / math.sqrt(math.pi) * sh[:, 0] + 0.5).clamp(min=0))
@@ -389,7 +362,7 @@ def test_sh_looks_from_the_camera_to_the_mean() -> None:
 @pytest.mark.parametrize(("degree", "words"), [(4, "degrees 0 to 3"), (-1, "degrees 0 to 3"), (2, "K at least 9")])
 def test_impossible_sh_degree_is_refused(degree: int, words: str) -> None:
     with pytest.raises(InputError, match=words):
-        color(torch.zeros(1, 25 if degree == 4 else 4, 3), torch.ones(1, 3), front_camera(), degree)
+        color(torch.zeros(1, 25 if degree == 4 else 4, 3), torch.ones(1, 3), FRONT, degree)
 
 
 # Gradients
@@ -398,7 +371,8 @@ def test_impossible_sh_degree_is_refused(degree: int, words: str) -> None:
 def delicate_scene(sh_degree: int | None) -> tuple[Scene, Camera]:
     """Six Gaussians that between them are clamped, skipped, stopped and beyond the frustum's margin."""
     camera = oblique_camera(9, 7)
-    scene = random_scene(6, seed=11, sh_degree=sh_degree, spread=0.12, size=0.25)
+    sh = None if sh_degree is None else (sh_degree + 1) ** 2
+    scene = random_scene(6, seed=11, sh=sh, spread=0.12, size=0.25)
     scene["opacities"] = torch.tensor([1.0, 0.97, 0.96, 0.95, 0.9, 0.7])
     scene["means"][5] = torch.tensor([2.2, 0.5, 0.1])
     scene["scales"][0] = torch.tensor([0.8, 0.9, 0.7])
@@ -466,7 +440,7 @@ def test_gradcheck_of_the_color(degree: int) -> None:
 
 
 def test_near_discontinuity_sees_each_kind() -> None:
-    camera, white = front_camera(), [1.0, 1, 1]
+    camera, white = FRONT, [1.0, 1, 1]
 
     def centre(*rows: tuple[list[float], float, float, list[float]], **kwargs: Any) -> bool:
         return bool(near_discontinuity(**splats(*rows), camera=camera, **kwargs)[3, 4])
