@@ -18,8 +18,9 @@ from scene import SceneSize, TrainedScene, make_scene
 
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.initial_view import InitialView
-from lapgs_wgpu.motion.playback.playback import open_playback
+from lapgs_wgpu.motion.playback.playback import playback_of
 from lapgs_wgpu.motion.scene import Scene4D
+from lapgs_wgpu.motion.scene_file import read_scene
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.viewer.frame import FrameRenderer, FrameRequest
 
@@ -81,7 +82,7 @@ def write_moving_scene(file: Path, preset: str, gaussians: int, device: Device) 
 
 
 def _scrub(device: Device, file: Path, repeat: int) -> dict[str, Timing]:
-    renderer = FrameRenderer(open_playback(file, device))
+    renderer = FrameRenderer(playback_of(read_scene(file), device))
     look = InitialView.from_json(renderer.playback.metadata["view"])
     assert look is not None
     times = iter(np.linspace(0, 1, 3 + len(SHARES) * (repeat + 1)).tolist())

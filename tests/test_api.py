@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.image_losses import BACKGROUND, CAMERA, TRUTH, gaussians, gradients
+from helpers.playback import open_playback
 from helpers.training import STEPS, configure
 from torch import Tensor, nn
 
@@ -25,7 +26,6 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands
 from lapgs_wgpu.io.checkpoint import read_checkpoint
 from lapgs_wgpu.motion.fields.own_field import OwnField
-from lapgs_wgpu.motion.playback.playback import open_playback
 from lapgs_wgpu.motion.timing import Timing
 from lapgs_wgpu.splat.rotation import rotate, rotation_matrices
 from lapgs_wgpu.train.config import LossWeights

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from fourdgs.validate import validate
+from helpers.playback import open_playback
 from helpers.reference import sh_basis as reference_basis
 from helpers.scene_files import moving_scene
 from scipy.spatial import cKDTree
@@ -20,7 +21,6 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.fourdgs_file import _symbols, bytes_harmonics, harmonics_bytes
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.playback.linear_pieces import linear_pieces, piece_errors, roots_of, state
-from lapgs_wgpu.motion.playback.playback import open_playback
 from lapgs_wgpu.motion.timing import Timing
 from lapgs_wgpu.splat.linear_light import directions, display_colors, linear_harmonics, sh_basis, to_display, to_linear
 from lapgs_wgpu.viewer import cli, export_4dgs

@@ -41,6 +41,7 @@ from helpers.hostile import (
     toml_text,
     tree_edits,
 )
+from helpers.playback import open_playback
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
@@ -48,7 +49,7 @@ from PIL import Image
 from lapgs_wgpu.data import Dataset, load_dataset
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.initial_view import InitialView
-from lapgs_wgpu.motion.playback.playback import DevicePlayback, open_playback
+from lapgs_wgpu.motion.playback.playback import DevicePlayback
 from lapgs_wgpu.motion.scene_file import compact_bytes, read_scene
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.log import Log

@@ -18,13 +18,14 @@ from helpers.browser import CHROMIUM, Browser
 from helpers.damaged_files import small_scene
 from helpers.damaged_lapgs import CompactDamage, damage_compact, damaged_compact_scenes
 from helpers.hostile import fuzzed
+from helpers.playback import open_playback
 from helpers.trained_scenes import OURS, trained
 from hypothesis import given
 
 from lapgs_wgpu import Scene4D
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.lapgs_file import MAGIC, pack_lapgs
-from lapgs_wgpu.motion.playback.playback import DevicePlayback, open_playback
+from lapgs_wgpu.motion.playback.playback import DevicePlayback
 from lapgs_wgpu.motion.scene_file import compact_bytes, read_scene
 from lapgs_wgpu.viewer.web_page import module_script
 

@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers.playback import open_playback
 
 from lapgs_wgpu.gpu.array import read_all
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.initial_view import InitialView
-from lapgs_wgpu.motion.playback.playback import open_playback
 from lapgs_wgpu.motion.scene import load
 from lapgs_wgpu.train.presets import load_config
 

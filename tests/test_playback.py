@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers.playback import open_playback
 from helpers.ply_files import columns_of, ply_bytes, random_still
 from helpers.scene_files import DAMAGE, moving_scene, rewrite
 from helpers.still_scenes import CAMERA, KINDS, half_still
@@ -25,7 +26,7 @@ from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.io.ply import GaussianSnapshot, write_ply
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.playback import torch_playback
-from lapgs_wgpu.motion.playback.playback import DevicePlayback, Playback, open_playback
+from lapgs_wgpu.motion.playback.playback import DevicePlayback, Playback
 from lapgs_wgpu.motion.playback.torch_playback import TorchPlayback
 from lapgs_wgpu.motion.scene import Scene4D, load
 from lapgs_wgpu.motion.scene_file import read_scene
@@ -277,12 +278,13 @@ def test_a_passing_picture_is_the_exact_one_for_less(
 SHOW = """
 import sys
 from lapgs_wgpu.gpu.device import open_device
-from lapgs_wgpu.motion.playback.playback import open_playback
+from lapgs_wgpu.motion.playback.playback import playback_of
+from lapgs_wgpu.motion.scene_file import read_scene
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 
 device = open_device()
-playback = open_playback(sys.argv[1], device)
+playback = playback_of(read_scene(sys.argv[1]), device)
 rasterizer = Rasterizer(device)
 camera = Camera.looking_at([0, -4, 0], [0, 0, 0], up=[0, 0, 1], fov_x=0.8, width=32, height=32)
 while True:

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers.playback import open_playback
 from helpers.scenes import front_camera, random_scene
 from helpers.training import configure
 from torch import Tensor
@@ -24,7 +25,6 @@ from lapgs_wgpu.data import Dataset, load_dataset
 from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.motion.playback.playback import open_playback
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.raster_config import raster_config

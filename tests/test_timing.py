@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers.playback import open_playback
 from helpers.trained_scenes import OURS, trained
 
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.config import FieldConfig
-from lapgs_wgpu.motion.playback.playback import open_playback
 from lapgs_wgpu.motion.scene import load
 from lapgs_wgpu.motion.timing import EVEN, Timing, timing_of_text
 

@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from helpers.playback import open_playback
 from helpers.still_scenes import CAMERA, KINDS, half_still
 from helpers.trained_scenes import GRID4D, OURS, trained
 
 from lapgs_wgpu.errors import NumericalError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.initial_view import InitialView
-from lapgs_wgpu.motion.playback.playback import open_playback
 from lapgs_wgpu.motion.playback.torch_playback import TorchPlayback
 from lapgs_wgpu.viewer.frame import Frame, FrameRenderer, FrameRequest
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene

@@ -6,11 +6,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
+from helpers.playback import open_playback
 from helpers.trained_scenes import CONFIGS, GRID4D, OURS, trained
 
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.config import FieldConfig
-from lapgs_wgpu.motion.playback.playback import DevicePlayback, open_playback
+from lapgs_wgpu.motion.playback.playback import DevicePlayback
 from lapgs_wgpu.splat.camera import Camera
 
 CAMERA = Camera.looking_at([1.0, -4, 0.7], [0, 0, 0], up=[0, 0, 1], fov_x=0.8, width=64, height=48)

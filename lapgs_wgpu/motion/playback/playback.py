@@ -1,11 +1,10 @@
-"""Playback of a trained scene at any time: the interface, and opening files.
+"""Playback of a trained scene at any time: the interface, and what implements it for a file.
 
 torch is not imported for static scenes and for fields that the device evaluates: that would take longer than the rest.
 """
 
 from __future__ import annotations
 
-import os
 from typing import Protocol
 
 import numpy as np
@@ -18,7 +17,7 @@ from ...io.ply import GaussianSnapshot
 from ...splat.camera import Camera
 from ...splat.gaussians import Gaussians
 from ..fields.config import MIN_SCALE, FieldConfig
-from ..scene_file import SceneFile, read_scene
+from ..scene_file import SceneFile
 from ..timing import Timing
 from .grid_field_playback import GridFieldPlayback, runs_on_device
 from .motion_bounds import MotionBounds
@@ -64,11 +63,6 @@ class Playback(Protocol):
 
     def still(self, t: float) -> GaussianSnapshot:
         """All Gaussians at a time, as 3DGS viewers read them. `Scene4D.save` writes those at time 0."""
-
-
-def open_playback(path: str | os.PathLike[str], device: Device) -> Playback:
-    """Open a checkpoint, or any 3DGS .ply, which becomes a static scene. Raises as `read_scene` and `playback_of`."""
-    return playback_of(read_scene(path), device)
 
 
 def playback_of(file: SceneFile, device: Device) -> Playback:
