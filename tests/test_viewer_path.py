@@ -127,7 +127,7 @@ def test_round_trip(tmp_path: Path) -> None:
     held = PathFile(CameraPath(keys()), (640, 360), 24.0)
     write_path(tmp_path / "a.json", held)
     back = read_path(tmp_path / "a.json")
-    assert (back.size, back.fps, back.moves) == ((640, 360), 24.0, True)
+    assert (back.size, back.fps) == ((640, 360), 24.0)
     for a, b in zip(back.path.keys, held.path.keys, strict=True):
         assert (a.second, a.time) == (pytest.approx(b.second), pytest.approx(b.time))
         assert_near(a.pose, b.pose)
@@ -163,7 +163,6 @@ def read(tmp_path: Path, values: Any) -> PathFile:
 def test_nerfstudios_key_frames(tmp_path: Path) -> None:
     held = read(tmp_path, nerfstudio())
     assert [key.second for key in held.path.keys] == [0.0, 2.0, 2.5]
-    assert not held.moves
     assert [key.time for key in held.path.keys] == pytest.approx([0.0, 0.8, 1.0])  # the clip once along the path
     first = held.path.keys[0].pose
     np.testing.assert_allclose(first.rotation, np.diag([1, -1, -1]), atol=1e-12)
@@ -185,7 +184,6 @@ def test_frames_serve_where_there_are_no_key_frames(tmp_path: Path) -> None:
     rows = [{"camera_to_world": np.eye(4).tolist(), "fov": 50, "time": t} for t in (0.5, 0.75, 0.25)]
     held = read(tmp_path, {"camera_path": rows, "render_width": 64, "render_height": 48})
     assert [key.time for key in held.path.keys] == [0.5, 0.75, 0.25]
-    assert held.moves
 
 
 def test_times_are_read_from_the_key_frames(tmp_path: Path) -> None:

@@ -15,8 +15,6 @@ from lapgs_wgpu.io.safe_json_toml import read_toml
 if TYPE_CHECKING:
     from lapgs_wgpu.data import View
 
-SYNTHETIC = "synthetic"
-
 
 class Capture:
     """views: those held out first, then the training's."""
@@ -50,8 +48,6 @@ def open_capture(checkpoint: Path, metadata: Mapping[str, str]) -> Capture | Non
     try:
         data = read_toml(checkpoint.parent / "config.toml")["data"]
         path, size = Path(data["path"]), int(data["size"])
-        if str(path) == SYNTHETIC:
-            path = checkpoint.parent.parent / SYNTHETIC
         dataset = load_dataset(
             path,
             image_size=size or None,

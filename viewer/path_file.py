@@ -10,24 +10,23 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lapgs_wgpu.data.poses import OPENGL_TO_OPENCV
 from lapgs_wgpu.errors import InputError, shown
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.io.safe_json_toml import read_json
 
 from .path import CameraPath, KeyFrame, Pose
 
-_OPENGL = np.diag([1.0, -1.0, -1.0])  # camera axes there: x right, y up, z backwards
 _MOST_KEYS = 100_000
 _MOST_SECONDS = 24 * 3600.0
 
 
 class PathFile(NamedTuple):
-    """size: of the pictures, (width, height). fps: pictures a second. moves: whether the key-frames carry times."""
+    """size: of the pictures, (width, height). fps: pictures a second."""
 
     path: CameraPath
     size: tuple[int, int]
     fps: float
-    moves: bool = True
 
 
 def write_path(file: Path, held: PathFile) -> None:
@@ -105,16 +104,15 @@ class _Reader:
             found = self.key_frames(keys)
         else:
             found = self.frames(fps)
-        moves = all(time is not None for _, time, _ in found)
+        timed = all(time is not None for _, time, _ in found)
         length = max(found[-1][0], 1e-9)
         return PathFile(
             CameraPath(
-                KeyFrame(second, time if moves and time is not None else min(second / length, 1.0), pose)
+                KeyFrame(second, time if timed and time is not None else min(second / length, 1.0), pose)
                 for second, time, pose in found
             ),
             (size[0], size[1]),
             fps,
-            moves,
         )
 
     def key_frames(self, keys: list[Any]) -> list[tuple[float, float | None, Pose]]:
@@ -180,7 +178,7 @@ class _Reader:
             raise self.wrong(field, "is not a rotation and a position")
         left, _, right = np.linalg.svd(turn)  # rounded in the file; exactly a rotation again
         fov = math.radians(self.number(entry, "fov", 0.1, 179.0, where=name))
-        return Pose(matrix[:3, 3].copy(), _OPENGL @ (left @ right).T, fov)
+        return Pose(matrix[:3, 3].copy(), OPENGL_TO_OPENCV @ (left @ right).T, fov)
 
     def number(
         self, entry: dict[str, Any], key: str, low: float, high: float, default: float | None = None, where: str = ""
@@ -204,6 +202,6 @@ class _Reader:
 def _matrix(pose: Pose) -> list[float]:
     """Camera to world in OpenGL's axes, 16 numbers row by row."""
     matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = (_OPENGL @ pose.rotation).T, pose.position
+    matrix[:3, :3], matrix[:3, 3] = (OPENGL_TO_OPENCV @ pose.rotation).T, pose.position
     values: list[float] = matrix.ravel().tolist()
     return values
