@@ -27,7 +27,7 @@ TINY_NORM = 1e-30  # only keeps 0 / 0 away, whatever the unit of the world is
 def adaptive_split(rows: Mapping[str, Tensor], candidates: Tensor, config: DensityConfig) -> Tensor:
     """(N,) bool: the candidates whose score tau reaches a quantile of all candidates' scores, and the outliers in d.
 
-    rows: means (N, 3), log_scales (N, 3), quats (N, 4) wxyz, dynamics (N, 16); without dynamics (an ablation) there are
+    rows: means (N, 3), log_scales (N, 3), quats (N, 4) wxyz, dynamics (N, D); without dynamics (an ablation) there are
     no outliers. candidates: (N,) bool. A Gaussian with values that are not finite is never split.
     """
     of = candidates.nonzero()[:, 0]

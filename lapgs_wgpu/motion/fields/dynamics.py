@@ -1,6 +1,6 @@
 """The dynamics attributes d of the Gaussians: their outliers, and the loss L_dy (paper eqs. 10 to 12).
 
-d: (N, 16) float32, without a unit. The distance of a Gaussian is that between its row and the mean row.
+d: (N, D) float32, without a unit. The distance of a Gaussian is that between its row and the mean row.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def dynamics_loss(d: Tensor, mode: DynamicsMode) -> Tensor:
 
 
 def _offsets(d: Tensor) -> Tensor:
-    """(N, 16) each row less the mean row."""
+    """(N, D) each row less the mean row."""
     return d - d.detach().mean(dim=0)
 
 
