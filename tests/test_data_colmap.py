@@ -28,7 +28,7 @@ from scipy.spatial import cKDTree
 
 from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.data.cloud import views_of
-from lapgs_wgpu.data.readers.colmap import rotation
+from lapgs_wgpu.data.poses import rotation
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -18,7 +17,7 @@ import numpy as np
 from lapgs_wgpu.data.cloud import Cloud
 from lapgs_wgpu.data.frames import Capture, Frame, Reader
 from lapgs_wgpu.data.images import SUFFIXES, Size, check_image
-from lapgs_wgpu.data.poses import check_rotation
+from lapgs_wgpu.data.poses import check_rotation, rotation
 from lapgs_wgpu.data.timestamps import ImageName, natural_key
 from lapgs_wgpu.data.undistort import Lens
 from lapgs_wgpu.errors import InputError
@@ -145,18 +144,6 @@ def _pose(image: ColmapImage) -> np.ndarray:
     T[:3, :3], T[:3, 3] = rotation(image.quaternion), image.translation
     check_rotation(T[:3, :3], image.where)
     return T
-
-
-def rotation(quaternion: Sequence[float] | np.ndarray) -> np.ndarray:
-    """(3, 3) of a unit quaternion wxyz."""
-    w, x, y, z = quaternion
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
 
 
 READER = Reader("COLMAP", "sparse/0/cameras.bin or .txt beside images/", _matches, _read)

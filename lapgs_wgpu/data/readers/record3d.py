@@ -15,12 +15,10 @@ import numpy as np
 from lapgs_wgpu.data.frames import Capture, Frame, Reader
 from lapgs_wgpu.data.images import SUFFIXES, check_image
 from lapgs_wgpu.data.json_fields import finite, kind, read_json, required, vector
-from lapgs_wgpu.data.poses import LARGEST_ENTRY, OPENGL_TO_OPENCV, world_to_camera
+from lapgs_wgpu.data.poses import LARGEST_ENTRY, OPENGL_TO_OPENCV, rotation, world_to_camera
 from lapgs_wgpu.data.timestamps import ImageName
 from lapgs_wgpu.data.undistort import Lens
 from lapgs_wgpu.errors import InputError
-
-from .colmap import rotation
 
 NEEDED = "which an export of Record3D needs"
 LAYOUTS = (("metadata.json", "rgb"), ("metadata", "rgbd"), ("metadata.json", "rgbd"))
