@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 import tomllib
@@ -76,6 +77,15 @@ def test_every_part_has_a_rule() -> None:
     parts = {part_of(file) for file in FILES} - {"__init__", "__main__"}
     assert {"gpu", "splat", "motion", "data", "io"} <= parts
     assert parts - {"shaders", "configs", "viewer"} <= set(ALLOWED)
+
+
+def test_the_table_of_layers_says_the_same() -> None:
+    """Of the folders, in docs/architecture.md. All may import `errors` and `progress`, a command also `command`."""
+    text = (Path(__file__).parents[1] / "docs/architecture.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `(\w+)/` \|.*\|(.*)\|$", text, re.MULTILINE)
+    table = {part: set(re.findall(r"`([\w.]+)`", cell)) for part, cell in rows}
+    folders = {part_of(file) for file in FILES if len(file.parts) > 1} & set(ALLOWED)
+    assert table == {part: ALLOWED[part] - {"errors", "progress", "command"} for part in folders} | {"shaders": set()}
 
 
 @pytest.mark.parametrize("file", [file for file in FILES if part_of(file) in ALLOWED], ids=str)
