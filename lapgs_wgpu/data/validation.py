@@ -238,13 +238,15 @@ def check_film(images: Sequence[Path]) -> list[str]:
         thumbnails = list(pool.map(lambda path: gray_thumbnail(path, THUMBNAIL), images))
     values = np.array([sharpness(thumbnail) for thumbnail in thumbnails])
     warnings = []
-    found = np.flatnonzero(blurred(values))
-    if len(found):
-        shares = values[found] / sharpness_around(values)[found]
-        worst = found[np.argmin(shares)]
+    found: list[int] = np.flatnonzero(blurred(values)).tolist()
+    if found:
+        around = sharpness_around(values)
+        shares = {i: float(values[i] / around[i]) for i in found}
+        worst = min(found, key=shares.__getitem__)
         warnings.append(
             f"blurred images: {_named([images[i].name for i in found])} ({len(found)} of {len(images)}) have less "
-            f"than {BLURRED:g} of their neighbours' sharpness, {images[worst].name} {shares.min():.2g}; leave them out."
+            f"than {BLURRED:g} of their neighbours' sharpness, {images[worst].name} {shares[worst]:.2g}; leave them "
+            "out."
         )
     repeated = [images[i].name for i in range(1, len(images)) if repeats(thumbnails[i], thumbnails[i - 1])]
     if repeated:
