@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import threading
 import weakref
 from typing import Any
 
@@ -366,6 +367,29 @@ def test_writes_and_kernels_take_turns(either: Device, wgsl: dict[str, str]) -> 
             with Commands(either) as commands:
                 commands.dispatch(kernel, count, a=a, sum=total)
         assert set(total.read().tolist()) == {10}
+
+
+@pytest.mark.parametrize("waits", [True, False])
+def test_threads_read_and_write_at_once(configuration: str, wgsl: dict[str, str], waits: bool) -> None:
+    """Whichever thread polls, each gets its own answer. waits: in the native library, or by polling, as on Metal."""
+    device = open_test_device(configuration)
+    device.waits = waits
+    kernel, right = add(device), [0, 0]
+
+    def work(which: int) -> None:
+        a, total = numbers(device, [which + 1]), numbers(device, [0])
+        for turn in range(1, 301):
+            with Commands(device) as commands:
+                commands.dispatch(kernel, 1, a=a, sum=total)
+            right[which] += int(total.read()[0]) == turn * (which + 1)
+
+    threads = [threading.Thread(target=work, args=(which,), daemon=True) for which in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(60)
+        assert not thread.is_alive()
+    assert right == [300, 300]
 
 
 def test_what_is_written_once_keeps_no_staging_buffer(monkeypatch: pytest.MonkeyPatch) -> None:

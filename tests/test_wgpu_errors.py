@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -16,10 +18,12 @@ import torch
 import wgpu
 from conftest import open_test_device
 from helpers.training import configure
+from wgpu.backends.wgpu_native import lib
 
 from lapgs_wgpu.command import OUT_OF_DEVICE, guarded
 from lapgs_wgpu.data import Dataset
 from lapgs_wgpu.errors import DeviceError, DeviceLostError, DeviceMemoryError, NoAdapterError
+from lapgs_wgpu.gpu import native
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.buffer import Buffer
 from lapgs_wgpu.gpu.device import _DEFAULT_LIMITS, _RAISED_LIMITS, Device, DeviceInfo
@@ -197,6 +201,34 @@ def test_a_lost_device_is_named_wherever_it_is_used(doomed: Device) -> None:
     for use in uses:
         with pytest.raises(DeviceLostError, match="was lost, because its driver gave up or it was removed"):
             use()
+
+
+class _Deaf:
+    """The native library, but polls do nothing."""
+
+    def __getattr__(self, name: str) -> Any:
+        return (lambda *_: None) if name == "wgpuDevicePoll" else getattr(lib, name)
+
+
+def test_a_device_that_never_answers_is_given_up(doomed: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on Metal, where macOS kills work that takes too long and the mapping that waits for it never ends."""
+    array = DeviceArray.upload(doomed, "values", np.arange(4, dtype=np.uint32))
+    doomed.waits = False
+    assert array.read().tolist() == [0, 1, 2, 3]
+    monkeypatch.setattr(native, "lib", _Deaf())
+    monkeypatch.setattr(native, "LONGEST_WAIT", 0.2)
+    begun = time.monotonic()
+    with pytest.raises(DeviceLostError, match=f"{re.escape(doomed.info.name)} has not answered for 0 seconds"):
+        array.read()
+    assert 0.2 <= time.monotonic() - begun < 5
+
+
+def test_only_metal_is_polled() -> None:
+    limits = dict.fromkeys((*_DEFAULT_LIMITS, *_RAISED_LIMITS), 1 << 31)
+    opened = SimpleNamespace(queue=None)
+    adapter = SimpleNamespace(features=(), limits=limits, request_device_sync=lambda **_: opened)
+    for backend, waits in (("Vulkan", True), ("D3D12", True), ("Metal", False)):
+        assert Device(adapter, DeviceInfo("Card", "integrated", backend, "")).waits == waits
 
 
 def test_other_errors_stay_what_they_are(device: Device) -> None:

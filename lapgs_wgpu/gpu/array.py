@@ -107,7 +107,7 @@ def read_all(arrays: Sequence[DeviceArray]) -> list[NDArray[Any]]:
         device = array.buffer.device
         with (
             TranslatedErrors(device, f"what is read from buffer {array.buffer.label!r}", nbytes),
-            mapping(device.wgpu_device, source, READ, offset, size) as content,
+            mapping(device, source, READ, offset, size) as content,
         ):
             out.append(content[:nbytes].copy().view(array.dtype).reshape(array.shape))
     return out

@@ -119,7 +119,7 @@ class Buffer:
                 self._uploaded = True
 
     def _fill(self, target: Any, data: NDArray[np.uint8], offset: int) -> None:
-        with mapping(self.device.wgpu_device, target, WRITE, offset, (data.nbytes + 7) & ~7) as content:
+        with mapping(self.device, target, WRITE, offset, (data.nbytes + 7) & ~7) as content:
             content[: data.nbytes] = data
 
     def texture(self, encoder: Encoder, texel_format: str, offset: int, size: int) -> Any:

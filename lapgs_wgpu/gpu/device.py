@@ -108,6 +108,8 @@ class Device:
 
     wgpu_device, queue: wgpu's objects.
     textures: whether tables are read through textures (gpu/shader), which is much faster on Mesa's software driver.
+    waits: whether the native library may wait for the device. On Metal it would wait for ever once macOS has killed a
+        command buffer (gfx-rs/wgpu#9531), so there the host polls.
     mappable: whether buffers can be mapped without a staging copy (CPU and integrated devices).
     allocated_bytes: of all buffers at present, without staging buffers and textures.
     max_loop_turns: number of iterations, of all loops of an invocation together, after which the driver ends it; None
@@ -139,6 +141,7 @@ class Device:
         self.limits = limits
         self.features = features
         self.is_cpu = info.kind == "cpu"
+        self.waits = info.backend != "Metal"
         self.mappable = "mappable-primary-buffers" in features
         self.textures = self.is_cpu and limits.get("max-storage-textures-per-shader-stage", 0) >= 8
         self.max_loop_turns = SOFTWARE_LOOP_TURNS if self.is_cpu else None

@@ -6,7 +6,9 @@ wgpu-py's own, which keep them alive; errors are raised as wgpu-py raises them.
 
 from __future__ import annotations
 
+import itertools
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -18,9 +20,15 @@ from wgpu.backends.wgpu_native import ffi, lib
 from wgpu.backends.wgpu_native._api import error_handler
 from wgpu.backends.wgpu_native._helpers import ERROR_TYPES
 
+from ..errors import DeviceLostError
+from .device import Device
+
 READ, WRITE = lib.WGPUMapMode_Read, lib.WGPUMapMode_Write
-_PENDING = -1
-_status = threading.local()  # of the mapping under way
+# The longest wait for a device that is polled, seconds: macOS kills work long before, and the library tells nobody.
+LONGEST_WAIT = 60.0
+_SHORTEST_SLEEP, _LONGEST_SLEEP = 50e-6, 1e-3  # seconds between two polls
+_numbers = itertools.count(1)  # of mappings
+_statuses: dict[int, int] = {}  # of mappings that are done, by number
 
 
 @contextmanager
@@ -37,33 +45,62 @@ def raising(what: str) -> Iterator[None]:
 
 
 @ffi.callback("void(WGPUMapAsyncStatus, WGPUStringView, void *, void *)")
-def _mapped(status: int, _message: Any, _first: Any, _second: Any) -> None:
-    _status.value = status  # in the thread that polls, which is the one that waits for it
+def _mapped(status: int, _message: Any, number: Any, _second: Any) -> None:
+    """Called in any thread that polls, which may not be the one that waits."""
+    _statuses[int(ffi.cast("uintptr_t", number))] = status
 
 
-_MAPPED = ffi.new("WGPUBufferMapCallbackInfo *")
-_MAPPED.mode = lib.WGPUCallbackMode_AllowProcessEvents
-_MAPPED.callback = _mapped
+class _Callback(threading.local):
+    """What a thread passes for the mapping that it begins: the library copies it."""
+
+    def __init__(self) -> None:
+        self.info = ffi.new("WGPUBufferMapCallbackInfo *")
+        self.info.mode = lib.WGPUCallbackMode_AllowProcessEvents
+        self.info.callback = _mapped
+
+
+_callback = _Callback()
 
 
 @contextmanager
-def mapping(device: Any, buffer: Any, mode: int, offset: int, nbytes: int) -> Iterator[NDArray[np.uint8]]:
-    """The bytes of a buffer, in place, once the device has done what uses them.
+def mapping(device: Device, buffer: Any, mode: int, offset: int, nbytes: int) -> Iterator[NDArray[np.uint8]]:
+    """The bytes of a buffer, in place, once the device has done what uses them. Threads may map at the same time.
 
     offset: a multiple of 8. nbytes: a multiple of 4. Raises wgpu.GPUError, or RuntimeError where the device refuses.
     """
-    _status.value = _PENDING
+    number, info = next(_numbers), _callback.info
+    info.userdata1 = ffi.cast("void *", number)
     with raising("wgpuBufferMapAsync"):
-        lib.wgpuBufferMapAsync(buffer._internal, mode, offset, nbytes, _MAPPED[0])
-        while _status.value == _PENDING:
-            lib.wgpuDevicePoll(device._internal, True, ffi.NULL)
-    if _status.value != lib.WGPUMapAsyncStatus_Success:
-        raise RuntimeError(f"Could not map buffer ({_status.value}).")
+        lib.wgpuBufferMapAsync(buffer._internal, mode, offset, nbytes, info[0])
+        _wait_for(device, number)
+    status = _statuses.pop(number)
+    if status != lib.WGPUMapAsyncStatus_Success:
+        raise RuntimeError(f"Could not map buffer ({status}).")
     try:
         start = lib.wgpuBufferGetMappedRange(buffer._internal, offset, nbytes)
         yield np.frombuffer(ffi.buffer(start, nbytes), np.uint8)
     finally:
         lib.wgpuBufferUnmap(buffer._internal)
+
+
+def _wait_for(device: Device, number: int) -> None:
+    """Poll the device until a mapping is done. Raises DeviceLostError where it never is."""
+    native = device.wgpu_device._internal
+    if device.waits:
+        while number not in _statuses:
+            lib.wgpuDevicePoll(native, True, ffi.NULL)
+        return
+    deadline, pause = time.monotonic() + LONGEST_WAIT, _SHORTEST_SLEEP
+    while True:
+        lib.wgpuDevicePoll(native, False, ffi.NULL)
+        if number in _statuses:
+            return
+        if time.monotonic() > deadline:
+            raise DeviceLostError(
+                f"{device.info.name} has not answered for {LONGEST_WAIT:.0f} seconds: its driver has ended the work"
+            )
+        time.sleep(pause)
+        pause = min(2 * pause, _LONGEST_SLEEP)
 
 
 class Encoder:
