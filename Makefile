@@ -115,7 +115,7 @@ test-shapes: $(READY)
 
 test-all: $(READY)
 	@for width in $(if $(WIDTHS),128 256 512); do $(call widths,kernels) || exit 1; done
-	@for name in no-subgroups default-limits gpu-shape staging; do $(call kernels,$$name,kernels) || exit 1; done
+	@for name in no-subgroups default-limits gpu-shape; do $(call kernels,$$name,kernels) || exit 1; done
 	@echo "== all tests"
 	@$(PYTEST)
 

@@ -1,6 +1,6 @@
 """The device of the kernel tests, in the configuration that the environment variable LAPGS_TEST_DEVICE names.
 
-The tests marked `kernels` hold in each configuration, for example `LAPGS_TEST_DEVICE=staging pytest -m kernels`.
+The tests marked `kernels` hold in each configuration, for example `LAPGS_TEST_DEVICE=gpu-shape pytest -m kernels`.
 The Makefile says which configurations `make test` and `make test-all` run.
 """
 
@@ -29,9 +29,9 @@ CONFIGURATIONS: dict[str, tuple[str | None, dict[str, bool]]] = {
     "default": (None, {}),
     "no-subgroups": (None, {"subgroups": False}),
     "default-limits": (None, {"default_limits": True}),
-    "gpu-shape": ("integrated", {}),  # tables in buffers, the GPU shapes of rasteriser, sort and hash gradients
-    "staging": ("discrete", {}),  # the same, and no buffer can be mapped where it is
-    "gpu": ("discrete", {"default_limits": True}),  # gpu-shape, staging and default-limits at once
+    # Tables in buffers, staging, the GPU shapes of rasteriser, sort and hash gradients.
+    "gpu-shape": ("discrete", {}),
+    "gpu": ("discrete", {"default_limits": True}),  # gpu-shape and default-limits at once
 }
 
 

@@ -393,7 +393,7 @@ def test_threads_read_and_write_at_once(configuration: str, wgsl: dict[str, str]
 
 
 def test_what_is_written_once_keeps_no_staging_buffer(monkeypatch: pytest.MonkeyPatch) -> None:
-    device = open_test_device("staging")
+    device = open_test_device("gpu-shape")
     held: weakref.WeakSet[Any] = weakref.WeakSet()
     made: list[str] = []
     create = device.wgpu_device.create_buffer

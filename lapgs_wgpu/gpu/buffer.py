@@ -19,7 +19,7 @@ from .shader import TABLE_TYPES, TABLE_WIDTH
 from .wgpu_errors import TranslatedErrors
 
 _STORAGE = wgpu.BufferUsage.STORAGE | wgpu.BufferUsage.UNIFORM | wgpu.BufferUsage.COPY_SRC | wgpu.BufferUsage.COPY_DST
-_SMALL = 1 << 16  # bytes that go through the queue where buffers cannot be mapped
+_SMALL = 1 << 16  # bytes that go through the queue where buffers are not mapped
 _MAPPABLE = wgpu.BufferUsage.MAP_READ | wgpu.BufferUsage.MAP_WRITE
 _MOST_ROWS = 8192  # of a texture, by WebGPU's default limits
 _numbers = itertools.count()
@@ -52,9 +52,9 @@ class _Texture:
 class Buffer:
     """A storage or uniform buffer of `nbytes` (rounded up to 16), initially zero.
 
-    Devices that can map their own memory (CPU and integrated ones) read and write with one copy by the processor.
-    Others use staging buffers of the same size. The one for reading is kept; the one for writing is kept from the
-    second write on, so that write-once buffers do not take their memory twice.
+    On CPU devices the buffer is mapped itself, and the processor reads and writes it with one copy. Others use staging
+    buffers of the same size. The one for reading is kept; the one for writing is kept from the second write on, so that
+    write-once buffers do not take their memory twice.
 
     counts: whether a dispatch may read its number of workgroups from it.
     """
@@ -83,7 +83,7 @@ class Buffer:
 
     @property
     def download(self) -> Any:
-        """The staging buffer for reading, on devices that cannot map their own memory."""
+        """The staging buffer for reading, where buffers are not mapped themselves."""
         if self._download is None:
             self._download = self._create(wgpu.BufferUsage.MAP_READ | wgpu.BufferUsage.COPY_DST)
         return self._download

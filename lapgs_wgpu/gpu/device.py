@@ -110,7 +110,7 @@ class Device:
     textures: whether tables are read through textures (gpu/shader), which is much faster on Mesa's software driver.
     waits: whether the native library may wait for the device. On Metal it would wait for ever once macOS has killed a
         command buffer (gfx-rs/wgpu#9531), so there the host polls.
-    mappable: whether buffers can be mapped without a staging copy (CPU and integrated devices).
+    mappable: whether buffers can be mapped without a staging copy (CPU devices).
     allocated_bytes: of all buffers at present, without staging buffers and textures.
     max_loop_turns: number of iterations, of all loops of an invocation together, after which the driver ends it; None
         for no limit.
@@ -121,8 +121,10 @@ class Device:
         features = {name for name in _WANTED_FEATURES if name in adapter.features}
         if not subgroups:
             features.discard("subgroup")
-        if info.kind not in ("cpu", "integrated"):
-            features.discard("mappable-primary-buffers")  # slow where the device has a memory of its own
+        if info.kind != "cpu":
+            # Kernels are slow on memory of the host, and the host reads memory of an integrated device at a few hundred
+            # MB/s, since it is write-combined (gpu-allocator#311).
+            features.discard("mappable-primary-buffers")
         limits = dict(_DEFAULT_LIMITS)
         if not default_limits:
             limits |= {name: adapter.limits[name] for name in _RAISED_LIMITS}

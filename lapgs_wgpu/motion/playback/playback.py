@@ -118,7 +118,7 @@ class DevicePlayback:
             self._near = None
         old = self._times != t
         moved = old
-        # The choice reads the values back each time, which is too slow from separate device memory.
+        # The choice reads the values back each time, which is fast only where buffers are mapped.
         if seen_by is not None and self.device.mappable and old.any():
             self._bound()
             between = self._moments.between(t) if self._near is None else None
