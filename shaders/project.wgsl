@@ -1,4 +1,4 @@
-// Projects each Gaussian: culling, the 2-D covariance and its inverse, and the number of tiles that it touches.
+// Projects each Gaussian: culling, the 2-D covariance and its inverse, and the number of tiles that it may touch.
 #import common/gaussian
 #import common/index
 #import common/splat
@@ -56,9 +56,9 @@ fn projected(i: u32) -> Projected {
         return p;
     }
 
-    let rows = tile_rows(e, frame.band);
+    let rows = tile_rows(e, frame.band, COUNTED_PADDING);
     for (var row = rows.x; row < rows.y; row++) {
-        let columns = tile_columns(e, row, frame.tiles.x);
+        let columns = tile_columns(e, row, frame.tiles.x, COUNTED_PADDING);
         p.tiles += columns.y - columns.x;
     }
     p.mean = mean2d;

@@ -1,9 +1,11 @@
 // Which tiles a splat touches: exactly those that hold a pixel centre inside the ellipse where its alpha reaches 1/255.
-// `project` counts with these functions and `duplicate_with_keys` writes with them, so the two cannot disagree.
+// `project` counts with these functions and `duplicate_with_keys` writes with them. A driver may round differently in
+// the two, so `project` counts within a slightly larger ellipse: what is written is always among what was counted.
 #import common/constants
 
 // Pixels added around the ellipse, against rounding. A tile too many costs a little time, a tile too few a hole.
-const EDGE_PADDING: f32 = 0.02;
+const WRITTEN_PADDING: f32 = 0.02;
+const COUNTED_PADDING: f32 = 0.025;
 const LN_2: f32 = 0.6931471805599453;
 
 struct Ellipse {
@@ -22,9 +24,9 @@ fn make_ellipse(mean: vec2<f32>, conic: vec3<f32>, covariance_det: f32, log2_opa
 }
 
 // First and one past the last row of tiles, within the band.
-fn tile_rows(e: Ellipse, frame_band: vec2<u32>) -> vec2<u32> {
-    let low = ceil(e.mean.y - e.extent.y - EDGE_PADDING - 0.5);
-    let high = floor(e.mean.y + e.extent.y + EDGE_PADDING - 0.5);
+fn tile_rows(e: Ellipse, frame_band: vec2<u32>, padding: f32) -> vec2<u32> {
+    let low = ceil(e.mean.y - e.extent.y - padding - 0.5);
+    let high = floor(e.mean.y + e.extent.y + padding - 0.5);
     let band = vec2<f32>(frame_band);
     let first = clamp(floor(low / f32($TILE_H)), band.x, band.y);
     let last = clamp(floor(high / f32($TILE_H)) + 1.0, first, band.y);
@@ -33,19 +35,20 @@ fn tile_rows(e: Ellipse, frame_band: vec2<u32>) -> vec2<u32> {
 
 // First and one past the last column of tiles in one row of tiles. The ellipse cut by the row's pixel centres is convex,
 // so its tiles are an interval, whose ends lie where the ellipse's border is farthest out within the row.
-fn tile_columns(e: Ellipse, row: u32, columns: u32) -> vec2<u32> {
+fn tile_columns(e: Ellipse, row: u32, columns: u32, padding: f32) -> vec2<u32> {
     let top = f32(row * u32($TILE_H)) + 0.5 - e.mean.y;
-    let low = max(top, -e.extent.y);
-    let high = min(top + f32($TILE_H - 1), e.extent.y);
-    if (low > high + 2.0 * EDGE_PADDING) {
+    let slack = padding - WRITTEN_PADDING;   // also along y: in long flat splats a little of y is much of x
+    let low = max(top - slack, -e.extent.y);
+    let high = min(top + f32($TILE_H - 1) + slack, e.extent.y);
+    if (low > high + 2.0 * padding) {
         return vec2(0u);
     }
     let y_right = clamp(-e.conic.y / e.conic.z * e.extent.x, min(low, high), max(low, high));
     let y_left = clamp(e.conic.y / e.conic.z * e.extent.x, min(low, high), max(low, high));
     let x_right = (-e.conic.y * y_right + sqrt(max(0.0, e.conic.x * e.tau - e.det * y_right * y_right))) / e.conic.x;
     let x_left = (-e.conic.y * y_left - sqrt(max(0.0, e.conic.x * e.tau - e.det * y_left * y_left))) / e.conic.x;
-    let first_pixel = ceil(e.mean.x + x_left - EDGE_PADDING - 0.5);
-    let last_pixel = floor(e.mean.x + x_right + EDGE_PADDING - 0.5);
+    let first_pixel = ceil(e.mean.x + x_left - padding - 0.5);
+    let last_pixel = floor(e.mean.x + x_right + padding - 0.5);
     if (first_pixel > last_pixel) {
         return vec2(0u);
     }
