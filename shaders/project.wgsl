@@ -1,4 +1,5 @@
 // Projects each Gaussian: culling, the 2-D covariance and its inverse, and the number of tiles that it may touch.
+#import common/finite
 #import common/gaussian
 #import common/index
 #import common/splat
@@ -30,7 +31,10 @@ fn projected(i: u32) -> Projected {
     let opacity = opacities_at(i);
     let q = quats_at(i);
     let norm = dot(q, q);
-    // Written so that NaN fails each test.
+    // Comparisons are written so that NaN fails each, too.
+    if (!finite(camera.z) || !finite(opacity) || !finite(norm)) {
+        return p;
+    }
     if (!(camera.z > NEAR) || !(opacity >= ALPHA_MIN) || !(norm > 0.0)) {
         return p;
     }
@@ -41,7 +45,7 @@ fn projected(i: u32) -> Projected {
     let scale = vec3(scales_at(3u * i), scales_at(3u * i + 1u), scales_at(3u * i + 2u));
     let R = view_rotation(frame) * rotation(q * inverseSqrt(norm));
     let f = footprint(R, scale, jacobian, xy);
-    if (!(f.det > 0.0) || !(f.det < 1e30)) {
+    if (!finite(f.det) || !(f.det > 0.0) || !(f.det < 1e30)) {
         return p;
     }
     let faded = opacity * select(1.0, sqrt(f.flat / f.det), frame.antialiased == 1u);
@@ -52,6 +56,9 @@ fn projected(i: u32) -> Projected {
     let mean2d = frame.focal * camera.xy / camera.z + frame.center;
     let e = make_ellipse(mean2d, conic, f.det, log2(faded));
     let size = vec2<f32>(frame.size);
+    if (!finite(mean2d.x) || !finite(mean2d.y)) {
+        return p;
+    }
     if (!all(mean2d + e.extent > vec2(0.0)) || !all(mean2d - e.extent < size)) {
         return p;
     }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from helpers.reference import ALPHA_MIN, NEAR, project
 from helpers.scenes import Scene, front_camera, needles, oblique_camera, random_scene
 from helpers.stages import all_of, capture
 
+from lapgs_wgpu.gpu import shader
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.rasterize import rasterize
@@ -103,6 +105,10 @@ def single(**changes: object) -> Scene:
         ({"scales": [0.1, math.nan, 0.1]}, False),
         ({"scales": [0.1, math.inf, 0.1]}, False),
         ({"opacities": math.nan}, False),
+        ({"opacities": math.inf}, False),
+        ({"means": [math.inf, 0, 2.0]}, False),
+        ({"means": [0, math.nan, 2.0]}, False),
+        ({"quats": [math.inf, 0, 0, 1.0]}, False),
         ({"scales": [0.0, 0.0, 0.0]}, True),
         ({"scales": [1e-30] * 3}, True),
         ({"scales": [1e30] * 3}, False),
@@ -120,6 +126,31 @@ def test_who_is_seen(
     assert bool(drawn.radii[0] > 0) == visible
     assert drawn.image.isfinite().all()
     assert visible or not drawn.image.any()
+
+
+def test_no_comparison_is_needed_against_nan(monkeypatch: pytest.MonkeyPatch, device: Device) -> None:
+    """As a compiler may turn them round, which assumes that there is no NaN."""
+    text = shader.shader_text
+
+    def turned(name: str) -> str:
+        source = text(name)
+        if name == "project":
+            for one, other in ((">", "<="), (">=", "<"), ("<", ">=")):
+                source = re.sub(rf"!\(([\w.]+) {one} ([\w.]+)\)", rf"(\1 {other} \2)", source)
+            assert "!(" not in source
+        return source
+
+    monkeypatch.setattr(device, "kernel_cache", {})
+    monkeypatch.setattr(shader, "shader_text", turned)
+    for name, ordinary in single().items():
+        for i in range(ordinary.numel()):
+            for bad in (math.nan, math.inf, -math.inf):
+                scene = single()
+                scene[name].view(-1)[i] = bad
+                if name != "colors":
+                    splats, tile_counts = projected(monkeypatch, device, scene, front_camera(33, 25))
+                    assert not splats.any(), (name, i, bad)
+                    assert not tile_counts.any(), (name, i, bad)
 
 
 @pytest.mark.parametrize("scales", [[0.0, 0.0, 0.0], [1e-30] * 3, [0.1, 0.0, 0.0]], ids=str)
