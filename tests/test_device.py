@@ -88,6 +88,19 @@ def test_no_adapter_at_all_says_what_to_install(monkeypatch: pytest.MonkeyPatch)
             module._open_device.__wrapped__(name, 0)
 
 
+def test_d3d12_is_used_where_its_newer_compiler_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    both = {"backends": ["Vulkan", "Metal", "DX12"], "flags": ["Empty"]}
+    assert module.instance_options("linux", None) == module.instance_options("darwin", None) == both
+    dll = "C:\\dxc\\dxcompiler.dll"
+    assert module.instance_options("win32", dll) == both | {"dx12_compiler": "Dxc", "dxc_path": dll}
+    without = module.instance_options("win32", None)
+    assert without == both | {"backends": ["Vulkan", "Metal"]}
+    monkeypatch.setattr(module, "_adapters", list)
+    monkeypatch.setattr(module, "_options", lambda: without)
+    with pytest.raises(NoAdapterError, match=r"D3D12 adapters need dxcompiler\.dll .* in a folder of PATH$"):
+        module._open_device.__wrapped__(None, 0)
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="the Vulkan loader's variables mean nothing here")
 def test_a_machine_without_a_driver_really_has_no_adapter() -> None:
     program = (

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ctypes.util
 import functools
 import os
+import sys
 from dataclasses import dataclass
 from typing import Any
 
@@ -31,6 +33,7 @@ INSTALL_HINT = (
     "install a Vulkan driver for your graphics card, or Mesa's software driver: "
     "sudo apt-get install -y mesa-vulkan-drivers libvulkan1"
 )
+_WITHOUT_DXC = "; D3D12 adapters need dxcompiler.dll (Microsoft's DirectX Shader Compiler) in a folder of PATH"
 
 
 @dataclass(frozen=True)
@@ -57,6 +60,38 @@ class AdapterDetails:
     too_small: dict[str, tuple[int, int]]
 
 
+def instance_options(platform: str, dxc: str | None) -> dict[str, Any]:
+    """Options of wgpu's instance on a platform, as `sys.platform` names it.
+
+    dxc: path of dxcompiler.dll, if there is one. The compiler that D3D12 has without it, FXC, knows no subgroups and
+    refuses barriers in loops, so D3D12 is then left out.
+    """
+    # Not OpenGL: it offers the same hardware with fewer features.
+    backends = ["Vulkan", "Metal", "DX12"]
+    options: dict[str, Any] = {"backends": backends, "flags": ["Empty"]}
+    if platform == "win32":
+        if dxc is None:
+            backends.remove("DX12")
+        else:
+            options |= {"dx12_compiler": "Dxc", "dxc_path": dxc}
+    return options
+
+
+@functools.cache
+def _options() -> dict[str, Any]:
+    return instance_options(sys.platform, _dxc() if sys.platform == "win32" else None)
+
+
+def _dxc() -> str | None:
+    """The path of dxcompiler.dll: beside wgpu's own library, or in a folder of PATH."""
+    from wgpu._coreutils import get_library_filename
+
+    try:
+        return str(get_library_filename("dxcompiler.dll"))
+    except RuntimeError:
+        return ctypes.util.find_library("dxcompiler")
+
+
 @functools.cache
 def _instance() -> Any:
     """wgpu's instance, without the validation that wgpu otherwise runs before each indirect dispatch."""
@@ -66,8 +101,7 @@ def _instance() -> Any:
     from wgpu.backends.wgpu_native.extras import set_instance_extras
 
     parse_named_types_only(ffi)
-    # Not OpenGL: it offers the same hardware with fewer features.
-    set_instance_extras(backends=["Vulkan", "Metal", "DX12"], flags=["Empty"])
+    set_instance_extras(**_options())
     return wgpu.gpu
 
 
@@ -181,7 +215,8 @@ def open_device(name: str | None = None, *, number: int = 0) -> Device:
 def _open_device(name: str | None, number: int) -> Device:
     adapters = _adapters()
     if not adapters:
-        raise NoAdapterError(f"no Vulkan, Metal or D3D12 adapter was found on this machine: {INSTALL_HINT}")
+        hint = INSTALL_HINT if "DX12" in _options()["backends"] else INSTALL_HINT + _WITHOUT_DXC
+        raise NoAdapterError(f"no Vulkan, Metal or D3D12 adapter was found on this machine: {hint}")
     chosen = [pair for pair in adapters if name is None or _matches(pair[0], name)]
     if not chosen:
         there = ", ".join(f"{info.name!r} ({info.kind})" for info, _ in adapters)
