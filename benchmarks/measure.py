@@ -94,16 +94,16 @@ def count(events: list[Event]) -> Traffic:
 def recording() -> Iterator[list[Event]]:
     """A list of all that happens, in order."""
     events: list[Event] = []
-    dispatch_grid, leave, write = Commands.dispatch_grid, Commands.__exit__, Buffer.write
+    dispatch_grid, submit, write = Commands.dispatch_grid, Commands._submit, Buffer.write
 
     def counted_dispatch(self: Commands, kernel: Any, groups: Any, **buffers: Any) -> None:
         if not isinstance(groups, tuple) or min(groups) > 0:
             events.append(Event("dispatch", kernel.name))
         dispatch_grid(self, kernel, groups, **buffers)
 
-    def counted_leave(self: Commands, *error: Any) -> None:
+    def counted_submit(self: Commands) -> None:
         events.append(Event("submit"))
-        leave(self, *error)
+        submit(self)
 
     def counted_write(self: Buffer, values: Any, offset: int = 0) -> None:
         events.append(Event("write", self.label, values.nbytes))
@@ -115,7 +115,7 @@ def recording() -> Iterator[list[Event]]:
 
     with (
         mock.patch.object(Commands, "dispatch_grid", counted_dispatch),
-        mock.patch.object(Commands, "__exit__", counted_leave),
+        mock.patch.object(Commands, "_submit", counted_submit),
         mock.patch.object(Buffer, "write", counted_write),
         mock.patch.object(array, "mapping", counted_mapping),
     ):

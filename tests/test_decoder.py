@@ -15,6 +15,7 @@ from torch import Tensor
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
+from lapgs_wgpu.gpu.native import Encoder
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.fields.decoder import Decoder
 from lapgs_wgpu.motion.fields.deformation import Nearby
@@ -144,6 +145,29 @@ def test_blocks_of_gaussians_give_the_same(device: Device) -> None:
     assert torch.equal(runs[0][0], runs[1][0])
     for a, b in zip(runs[0][1], runs[1][1], strict=True):
         assert relative(a, b) < 1e-6
+
+
+def test_submitted_in_parts_the_bits_are_the_same(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As where a watchdog ends long submissions: after each block of the decoder and each lookup of the encoder."""
+    field = grid_field(device, PLAIN)
+    points = torch.rand(200, 3, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    shape = field._decoder.shape
+    weights = {name: random(*size, seed=i).requires_grad_() for i, (name, size) in enumerate(shape.weights.items())}
+    beside = random(200, shape.beside).requires_grad_()
+    learnt = [beside, *weights.values(), *(grid.table for grid in field.grids)]
+    submitted, submit = [], Encoder.submit
+    monkeypatch.setattr(Encoder, "submit", lambda *arguments: submitted.append(1) or submit(*arguments))
+    runs, counts = [], []
+    for watchdog in (False, True):
+        monkeypatch.setattr(device, "watchdog", watchdog)
+        submitted.clear()
+        decoded = make_decoder(device, field, block=64)((points, 0.4), beside, weights)
+        gradients = torch.autograd.grad(decoded.outputs.square().sum(), learnt)
+        runs.append([decoded.outputs.detach(), *gradients])
+        counts.append(len(submitted))
+    assert all(map(torch.equal, *runs))
+    assert counts[0] == 2
+    assert counts[1] == 2 + 4 + 2  # 4 blocks; the static grid, and the slices of the temporal ones
 
 
 @pytest.mark.parametrize("in_torch", [False, True])

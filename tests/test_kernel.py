@@ -193,6 +193,32 @@ def test_nothing_runs_where_the_block_fails(device: Device, wgsl: dict[str, str]
     assert b.read()[0] == 5
 
 
+def test_a_flush_submits_what_there_is(device: Device, wgsl: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only where there is a watchdog. What follows sees it, and a later error takes nothing back."""
+    kernel = add(device)
+    for watchdog, expected in ((True, 6), (False, 5)):
+        monkeypatch.setattr(device, "watchdog", watchdog)
+        a, b = numbers(device, [1]), numbers(device, [5])
+
+        def fail(a: DeviceArray, b: DeviceArray) -> None:
+            with Commands(device) as commands:
+                commands.dispatch(kernel, 1, a=a, sum=b)
+                commands.flush()
+                commands.dispatch(kernel, 1, a=a, sum=b)
+                raise ZeroDivisionError
+
+        with pytest.raises(ZeroDivisionError):
+            fail(a, b)
+        assert b.read()[0] == expected
+        with Commands(device) as commands:
+            commands.flush()
+            commands.dispatch(kernel, 1, a=a, sum=b)
+            commands.flush()
+            commands.dispatch(kernel, 1, a=b, sum=a)
+            commands.flush()
+        assert (a.read()[0], b.read()[0]) == (expected + 2, expected + 1)
+
+
 def test_clearing_all_or_the_beginning(device: Device) -> None:
     a, b = numbers(device, range(1, 9)), numbers(device, range(1, 9))
     with Commands(device) as commands:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
 from lapgs_wgpu.gpu.array import DeviceArray
@@ -33,6 +35,23 @@ def test_dispatches_are_timed_in_order_over_several_submissions(device: Device, 
     names, times = zip(*profile.read(), strict=True)
     assert names == ("scan_reduce",) * 3
     assert min(times) > 0.0
+
+
+@pytest.mark.kernels
+def test_dispatches_are_timed_beyond_a_flush(device: Device, profile: Profile, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(device, "watchdog", True)
+    dispatch = Commands.dispatch
+
+    def flushed(self: Commands, *given: Any, **arrays: DeviceArray) -> None:
+        dispatch(self, *given, **arrays)
+        self.flush()
+
+    monkeypatch.setattr(Commands, "dispatch", flushed)
+    run(device, profile, [1, 50_000, 1])
+    names, times = zip(*profile.read(), strict=True)
+    assert names == ("scan_reduce",) * 3
+    assert min(times) > 0.0
+    assert max(times) == times[1]
 
 
 @pytest.mark.kernels

@@ -144,6 +144,7 @@ class Device:
     textures: whether tables are read through textures (gpu/shader), which is much faster on Mesa's software driver.
     waits: whether the native library may wait for the device. On Metal it would wait for ever once macOS has killed a
         command buffer (gfx-rs/wgpu#9531), so there the host polls.
+    watchdog: whether the driver ends a submission that takes seconds, as on Windows and macOS (all but CPU devices).
     mappable: whether buffers can be mapped without a staging copy (CPU devices).
     allocated_bytes: of all buffers at present, without staging buffers and textures.
     max_loop_turns: number of iterations, of all loops of an invocation together, after which the driver ends it; None
@@ -177,6 +178,7 @@ class Device:
         self.limits = limits
         self.features = features
         self.is_cpu = info.kind == "cpu"
+        self.watchdog = not self.is_cpu
         self.waits = info.backend != "Metal"
         self.mappable = "mappable-primary-buffers" in features
         self.textures = self.is_cpu and limits.get("max-storage-textures-per-shader-stage", 0) >= 8

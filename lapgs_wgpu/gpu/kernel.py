@@ -192,6 +192,23 @@ class Commands:
             source.buffer.wgpu_buffer, source.offset, target.buffer.wgpu_buffer, target.offset, source.nbytes
         )
 
+    def flush(self) -> None:
+        """Submit what was recorded so far, where a watchdog ends long submissions, and go on. It runs even where the
+        `with` block fails later."""
+        if not self.device.watchdog:
+            return
+        with TranslatedErrors(self.device, "commands"):
+            self._submit()
+        self._encoder = Encoder(self.device.wgpu_device)
+        self._raising = raising("commands")
+        self._raising.__enter__()
+        self._copied.clear()
+
+    def _submit(self) -> None:
+        self._encoder.end_pass()
+        self._raising.__exit__(None, None, None)
+        self._encoder.submit(self.device.queue)
+
     def __enter__(self) -> Commands:
         self._raising.__enter__()
         return self
@@ -209,5 +226,4 @@ class Commands:
             self._encoder.end_pass()
             if self._profile is not None:
                 self._profile.resolve(self._encoder.wgpu_encoder)
-            self._raising.__exit__(None, None, None)
-            self._encoder.submit(self.device.queue)
+            self._submit()

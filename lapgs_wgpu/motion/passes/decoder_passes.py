@@ -121,6 +121,7 @@ class DecoderPasses:
                     commands, f"d weights {name} {first}", own.transpose, given, d_weights[name], add=first > 0
                 )
                 self._product(commands, f"d {name} {first}", own, Matrix.of(weights[name]), given)
+            commands.flush()  # all blocks together may take longer than a watchdog allows
 
     def _blocks(self, outputs: DeviceArray) -> Iterator[tuple[int, int]]:
         n = outputs.shape[0]

@@ -196,6 +196,7 @@ class HashEncoderPasses:
                 kernel = Kernel.get(self.device, "hashgrid_bwd", **levels.defines, **options)
                 groups = _shared(levels.count) if self.lane_levels else -(-count // 64) * levels.count
                 commands.run(kernel, groups, arrays | {"levels": levels.array, "d_features": target, "d_fixed": target})
+                commands.flush()  # all lookups together may take longer than a watchdog allows
 
         if not self.lane_levels:
             for (_, target), (_, fixed) in zip(floats, sums, strict=True):
