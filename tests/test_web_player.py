@@ -244,6 +244,33 @@ def test_default_limits(window: Browser, page: Path, desktop: Desktop) -> None:
     assert same(window, desktop, 0.37)
 
 
+def test_a_browser_that_looks_only_where_something_is_submitted(window: Browser, page: Path) -> None:
+    """As Firefox does: a mapped buffer is seen with the next submission, otherwise late. No submission at rest."""
+    script = """
+        window.seen = [];
+        window.empty = 0;
+        const submit = GPUQueue.prototype.submit, map = GPUBuffer.prototype.mapAsync;
+        let look = () => {};
+        GPUQueue.prototype.submit = function (list) {
+            window.empty += list.length === 0;
+            look("submission");
+            return submit.call(this, list);
+        };
+        GPUBuffer.prototype.mapAsync = async function (...given) {
+            await map.apply(this, given);
+            seen.push(await new Promise(resolve => { look = resolve; setTimeout(resolve, 5000, "late"); }));
+        };"""
+    open_page(window, page.as_uri() + "?firefox", first=script)
+    call(window, "setTime", 0.37)
+    page_picture(window)
+    assert set(window.value("seen")) == {"submission"}
+    page_picture(window)
+    before = window.value("empty")
+    assert before > 0
+    sleep(0.3)
+    assert window.value("empty") == before
+
+
 def test_workgroups_that_are_no_subgroups(window: Browser, page: Path, desktop: Desktop) -> None:
     """An adapter that promises subgroups of 32 lanes and has less: the pass says so, and the page does without them."""
     script = "Object.defineProperty(GPUAdapterInfo.prototype, 'subgroupMinSize', { get: () => 32 });"

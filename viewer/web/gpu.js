@@ -198,7 +198,9 @@ export class Commands {
             at += bytes;
         }
         this.submit();
-        await staging.mapAsync(GPUMapMode.READ);
+        // Firefox looks only every 100 ms whether a buffer is mapped, unless something is submitted (bug 1870699).
+        const nudge = setInterval(() => this.gpu.device.queue.submit([]), 2);
+        await staging.mapAsync(GPUMapMode.READ).finally(() => clearInterval(nudge));
         const content = staging.getMappedRange().slice(0);
         staging.destroy();
         return content;
