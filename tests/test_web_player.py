@@ -244,6 +244,28 @@ def test_default_limits(window: Browser, page: Path, desktop: Desktop) -> None:
     assert same(window, desktop, 0.37)
 
 
+def test_a_window_larger_than_a_binding(window: Browser, page: Path) -> None:
+    """As 4K with bindings of 128 MiB, in small: the canvas has fewer pixels, and depth still fits."""
+    limit = 20 * 30_000
+    script = "GPUAdapter.prototype.requestDevice = async function (...given) {"
+    script += " const device = await own.apply(this, given); const limits = {};"
+    script += " for (const name in GPUSupportedLimits.prototype) limits[name] = device.limits[name];"
+    script += (
+        f" Object.defineProperty(device, 'limits', {{ value: {{ ...limits, maxStorageBufferBindingSize: {limit} }} }});"
+    )
+    script += " return device; };"
+    open_page(window, page.as_uri() + "?binding", first=OWN_DEVICE + script)
+    width, height = window.value("[document.getElementById('canvas').width, document.getElementById('canvas').height]")
+    assert 29_500 < width * height <= limit / 20
+    assert abs(width / height - SIZE[0] / SIZE[1]) < 0.01
+    assert page_picture(window).shape == (height, width, 3)
+    window.mouse("mouseMoved", 160, 120)
+    window.key("f")  # draws depth
+    sleep(1)
+    assert page_picture(window).shape == (height, width, 3)
+    assert window.note() == ""
+
+
 def test_a_browser_that_looks_only_where_something_is_submitted(window: Browser, page: Path) -> None:
     """As Firefox does: a mapped buffer is seen with the next submission, otherwise late. No submission at rest."""
     script = """

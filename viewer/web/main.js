@@ -11,7 +11,7 @@ import { Rasterizer } from "./rasterizer.js";
 import { Refusal } from "./refusal.js";
 import { readScene } from "./scene.js";
 import { Transport } from "./transport.js";
-import { Viewport } from "./viewport.js";
+import { Viewport, canvasSize } from "./viewport.js";
 
 const find = name => document.getElementById(name);
 const LONGEST_STEP = 0.25; // seconds that the clock goes on at once, after a tab was in the background
@@ -153,9 +153,7 @@ function start(gpu, { scene, playback, rasterizer }, state, data) {
     addEventListener("hashchange", address, { signal });
 
     const resize = () => {
-        const ratio = Math.min(devicePixelRatio, gpu.device.limits.maxTextureDimension2D
-            / Math.max(canvas.clientWidth, canvas.clientHeight, 1));
-        const size = [canvas.clientWidth, canvas.clientHeight].map(length => Math.max(1, Math.round(ratio * length)));
+        const size = canvasSize(canvas.clientWidth, canvas.clientHeight, devicePixelRatio, gpu.device.limits);
         if (size[0] !== canvas.width || size[1] !== canvas.height) [canvas.width, canvas.height] = size;
     };
     const presenter = new Presenter(gpu, canvas, data.present);

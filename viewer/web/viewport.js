@@ -2,6 +2,17 @@
 import { add } from "./camera.js";
 import { Commands, part } from "./gpu.js";
 
+const PIXEL_BYTES = 20; // of an image with depth, which lies in one binding
+
+// Width and height of a canvas of CSS pixels: of the screen's pixels, unless a texture or a binding holds fewer.
+export function canvasSize(width, height, density, { maxTextureDimension2D, maxStorageBufferBindingSize }) {
+    const most = Math.floor(maxStorageBufferBindingSize / PIXEL_BYTES);
+    const ratio = Math.min(density, maxTextureDimension2D / Math.max(width, height, 1), Math.sqrt(most / Math.max(width * height, 1)));
+    const size = rounded => [width, height].map(length => Math.max(1, rounded(ratio * length)));
+    const [columns, rows] = size(Math.round);
+    return columns * rows > most ? size(Math.floor) : [columns, rows];
+}
+
 export class Viewport {
     // state: {camera, clock, background}. numbers: settled and target seconds, smallest scale.
     constructor(canvas, state, { playback, rasterizer, presenter, numbers }) {
