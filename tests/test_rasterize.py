@@ -242,7 +242,7 @@ def test_all_shapes_draw_the_same(device: Device, use: Callable[[Rasterizer], An
 
 
 def test_workgroups_that_are_cut_into_subgroups_are_noticed(device: Device, use: Callable[[Rasterizer], Any]) -> None:
-    """As a driver may do for one pass and not for another: both do without shuffles then."""
+    """And the pass does without shuffles then."""
     if not 0 < subgroup_size(device) < 32:
         pytest.skip("this device has no subgroups, or none of fewer than 32 lanes")
     scene, camera = random_scene(500, 8, size=0.08), oblique_camera(101, 61)
@@ -252,7 +252,7 @@ def test_workgroups_that_are_cut_into_subgroups_are_noticed(device: Device, use:
     for shape in (whole, cut):
         rasterizer = use(Rasterizer(device, config=shape))
         drawn = [step(scene, camera, device, background=BACKGROUND, weights=weights) for _ in range(2)]
-        assert not rasterizer.config.subgroups
+        assert not any(map(rasterizer.config.shuffles, ("rasterize", "rasterize_bwd")))
         steps += drawn
     for other in steps[1:]:
         assert torch.equal(other.image, steps[0].image)
@@ -269,9 +269,9 @@ def test_workgroups_are_checked_when_a_tile_is_drawn(device: Device, use: Callab
     expected = step(scene, camera, device)
     rasterizer = use(Rasterizer(device, config=replace(gpu_config(32), subgroups=True, listed=True)))
     step(scene | {"opacities": torch.zeros(500)}, camera, device)
-    assert rasterizer.config.subgroups
+    assert not rasterizer.config.torn
     found = step(scene, camera, device)
-    assert not rasterizer.config.subgroups
+    assert not rasterizer.config.shuffles("rasterize")
     assert torch.equal(found.image, expected.image)
 
 
@@ -289,7 +289,7 @@ def test_workgroups_are_checked_in_each_band(device: Device, use: Callable[[Rast
     rasterizer = use(Rasterizer(device, config=replace(gpu_config(32), subgroups=True, listed=True)))
     rasterizer.plan = replace(rasterizer.plan, bands=2)
     found = step(scene, camera, device)
-    assert not rasterizer.config.subgroups
+    assert not rasterizer.config.shuffles("rasterize")
     assert torch.equal(found.image, expected.image)
 
 
@@ -305,9 +305,9 @@ def test_only_the_backward_pass_is_cut(
     rasterizer = use(Rasterizer(device, config=replace(gpu_config(32), subgroups=True)))
     torn = rasterizer._subgroup_mismatch
 
-    def forward_without(self: RasterConfig, *, depth: bool) -> dict[str, int]:
-        found = defines(self, depth=depth)
-        if not rasterizer._trusted:  # the forward pass
+    def forward_without(self: RasterConfig, name: str = "rasterize", *, depth: bool) -> dict[str, int]:
+        found = defines(self, name, depth=depth)
+        if name == "rasterize":
             found.pop("SUBGROUPS", None)
         return found
 
@@ -318,6 +318,8 @@ def test_only_the_backward_pass_is_cut(
     )
     found = step(scene, camera, device)
     assert asked == [("rasterize", False), ("rasterize_bwd", True), ("rasterize_bwd", False)]
+    assert rasterizer.config.shuffles("rasterize")
+    assert not rasterizer.config.shuffles("rasterize_bwd")
     for name, gradient in expected.gradients.items():
         assert torch.equal(found.gradients[name], gradient)
 
@@ -325,8 +327,20 @@ def test_only_the_backward_pass_is_cut(
 @pytest.mark.parametrize("lanes", [8, 16])
 def test_a_processors_rounds_follow_its_shape(lanes: int) -> None:
     """Without subgroups a round has fewer splats, or the driver would end its loops early."""
-    assert cpu_config(lanes).without_subgroups() == replace(cpu_config(0), lanes=lanes)
-    assert gpu_config(32).without_subgroups() == gpu_config(0)
+    for name in ("rasterize", "rasterize_bwd"):
+        assert cpu_config(lanes).without_subgroups(name) == replace(cpu_config(0), lanes=lanes)
+
+
+def test_a_gpus_other_pass_keeps_its_subgroups() -> None:
+    whole, plain = gpu_config(32), gpu_config(0)
+    passes = ("rasterize", "rasterize_bwd")
+    for name, other in (passes, passes[::-1]):
+        cut = whole.without_subgroups(name)
+        for depth in (False, True):
+            assert cut.raster_defines(name, depth=depth) == plain.raster_defines(name, depth=depth)
+            assert cut.raster_defines(other, depth=depth) == whole.raster_defines(other, depth=depth)
+        both = cut.without_subgroups(other)
+        assert not any(map(both.shuffles, passes))
 
 
 def test_a_processors_backward_pass_is_cut(device: Device, use: Callable[[Rasterizer], Any]) -> None:
@@ -342,7 +356,7 @@ def test_a_processors_backward_pass_is_cut(device: Device, use: Callable[[Raster
     def mismatch(name: str, drawn: Drawing) -> bool:
         if name == "rasterize" or not next(torn, False):
             return False
-        rasterizer.config = rasterizer.config.without_subgroups()
+        rasterizer.config = rasterizer.config.without_subgroups(name)
         return True
 
     rasterizer._subgroup_mismatch = mismatch  # type: ignore[method-assign]

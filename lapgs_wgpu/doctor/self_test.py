@@ -100,7 +100,8 @@ def _run(device_name: str | None) -> None:
         kind="device",
         subgroup=lanes,
         shape=f"tiles of {config.tile_width}x{config.tile_height} pixels, {config.lanes} lanes, "
-        f"{'with' if config.subgroups else 'without'} subgroups",
+        f"{'with' if config.subgroups else 'without'} subgroups"
+        + "".join(f", but not in {name}" for name in sorted(config.torn)),
         exchange=f"{'mapped buffers' if device.mappable else 'staged copies'}, "
         f"tables in {'textures' if device.textures else 'buffers'}",
     )

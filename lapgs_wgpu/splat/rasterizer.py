@@ -252,11 +252,11 @@ class Rasterizer:
     def _subgroup_mismatch(self, name: str, drawing: Drawing) -> bool:
         """Whether the driver has split the workgroups of a pass into several subgroups, checked after its first tile.
 
-        If so, the config no longer uses subgroups, and the pass has to be run again. Waits for the device until a pass
+        If so, the pass no longer uses subgroups, and has to be run again. Waits for the device until a pass
         has drawn a tile.
         """
         key = (name, drawing.depth, drawing.plan.rounds > 1)
-        if not self.config.subgroups or key in self._trusted:
+        if not self.config.shuffles(name) or key in self._trusted:
             return False
         lists = drawing.lists
         if isinstance(lists.workgroups, DeviceArray) and not lists.workgroups.read()[0]:  # no tile was drawn
@@ -265,7 +265,7 @@ class Rasterizer:
         flags = lists.ranges.rows(lists.ranges.shape[0] - 1, 1).read()[0]
         if not flags[3 if name == "rasterize_bwd" else 2]:
             return False
-        self.config = self.config.without_subgroups()
+        self.config = self.config.without_subgroups(name)
         return True
 
     # Backward --------------------------------------------------------------------------------------------------------
@@ -333,7 +333,7 @@ class Rasterizer:
         tails = (3 if drawing.depth else 2) * plan.capacity
         states = 2 * drawing.camera.width * drawing.camera.height if plan.rounds > 1 else 0
         record_tails = self.pool.array("record tails", (tails + states,), "uint32")
-        defines = self.config.raster_defines(depth=drawing.depth)
+        defines = self.config.raster_defines("rasterize_bwd", depth=drawing.depth)
         kernel = Kernel.get(self.device, "rasterize_bwd", ROUNDS=plan.rounds > 1, **defines)
         gather = Kernel.get(self.device, "gather_gradients", DEPTH=drawing.depth)
         arrays = lists._asdict() | {"ids": lists.sorted_ids, "frame": self._frame(drawing, band)}
