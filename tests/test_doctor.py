@@ -26,7 +26,7 @@ BROKEN = {
     "radix sort": [("sort_scatter", "my_counters[d] = place + 1u;", "my_counters[d] = place;"),
                    ("sort_scatter", "ranks[rank] = place + 1u;", "ranks[rank] = place;")],
     "matmul": [("matmul", "fma(vec4(of_a[row + $(i)u])", "fma(vec4(of_a[row])")],
-    "image": [("project", "dot(axes_x, axes_x) + DILATION", "dot(axes_x, axes_x) + 1.01 * DILATION")],
+    "image": [("common/gaussian", "dot(u, u) + DILATION", "dot(u, u) + 1.01 * DILATION")],
     "gradient of the image": [("project_bwd", "let along_x = jacobian.x *", "let along_x = 1.01 * jacobian.x *")],
     "hash encoding": [("common/hashgrid", "3.0 - 2.0 *", "3.0 - 2.001 *")],
     "gradient of the hash encoding": [
