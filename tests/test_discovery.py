@@ -34,6 +34,7 @@ from lapgs_wgpu.train.discovery.trajectories import find_trajectories
 from lapgs_wgpu.train.optimizer import Optimizer
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.run import train
+from lapgs_wgpu.train.suited import suited
 from lapgs_wgpu.train.trainer import RISE, Trainer
 
 RADIUS, BOX = 0.2, 1.3
@@ -443,7 +444,7 @@ def test_a_field_that_moves_nothing_starts_from_the_static_fit(dataset: Dataset,
 
 
 def test_discovery_starts_a_training_which_goes_on_to_the_same_bits(dataset: Dataset, device: Device) -> None:
-    config = configure()
+    config = suited(configure(), dataset)
     found = discover(config, dataset, device, Trainer)
     assert "moving parts" in found.summary
     with closing(Trainer(config, dataset, device, scene=found.scene)) as whole:
