@@ -9,6 +9,7 @@ from pathlib import Path
 
 from lapgs_wgpu.command import guarded, print_devices
 from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.progress import say
 from lapgs_wgpu.train_options import parse_options
 
 if typing.TYPE_CHECKING:
@@ -65,14 +66,15 @@ def _train(arguments: list[str]) -> None:
         raise InputError("name a preset, such as tiny, and the data to train on; lapgs-train --help says more.")
     ablate = [part.strip() for part in (given["ablate"] or "").split(",") if part.strip()]
     config = load_config(given["preset"], overrides, method=given["field"], ablate=ablate)
-    out = Path(given["out"] or f"runs/{_scene_name(config)}-{Path(given['preset']).stem}")
+    default = f"runs/{_scene_name(config)}-{Path(given['preset']).stem}"
+    out = Path(default if given["out"] is None else given["out"])
     if ranks.first:
         check_run_folder(out, overwrite=given["overwrite"])
     device = open_device(given["device"], number=ranks.on_machine)
     config, dataset = _open_data(config, out.parent, ranks)
     train(config, dataset, out, device=device, overwrite=given["overwrite"], watch=watch, ranks=ranks, lpips=lpips)
     if ranks.first:
-        print(result_text(out))
+        say(result_text(out))
 
 
 def _resume(
@@ -86,7 +88,7 @@ def _resume(
     from lapgs_wgpu.gpu.device import open_device
     from lapgs_wgpu.train.presets import load_config
     from lapgs_wgpu.train.run import resume
-    from lapgs_wgpu.train.run_folder import changes_since, result_text
+    from lapgs_wgpu.train.run_folder import changes_since, check_same_data, result_text
 
     names = ("preset", "field", "ablate", "out", "overwrite")
     others = _others(given, names, [key for key in overrides if key not in RESUME_KEYS])
@@ -94,13 +96,16 @@ def _resume(
         raise InputError(f"--resume goes on as the run began, so {others[0]} cannot be given.")
     _check_files("--resume", "a run", run / "config.toml")
     config = load_config(str(run / "config.toml"), overrides)
+    _check_capture(run, config)
     device = open_device(given["device"], number=ranks.on_machine)
     config, dataset = _open_data(config, run.parent, ranks)
+    if "data.path" in overrides:
+        check_same_data(run, config.data.path, dataset)
     for what, before, now in changes_since(run, config, device, dataset) if ranks.first else ():
         print(f"lapgs-train: {what} was {before} when {run} began and is {now}: bits may differ.", file=sys.stderr)
     resume(config, dataset, run, device=device, watch=watch, ranks=ranks, lpips=lpips)
     if ranks.first:
-        print(result_text(run))
+        say(result_text(run))
 
 
 def _others(given: dict[str, typing.Any], names: Sequence[str], keys: Iterable[str]) -> list[str]:
@@ -117,7 +122,7 @@ def _evaluate(run: Path, given: dict[str, typing.Any], overrides: dict[str, str 
     from lapgs_wgpu.train.distributed import SINGLE_PROCESS
     from lapgs_wgpu.train.presets import load_config
     from lapgs_wgpu.train.run import evaluate_run
-    from lapgs_wgpu.train.run_folder import result_text
+    from lapgs_wgpu.train.run_folder import check_same_data, result_text
 
     names = ("preset", "field", "ablate", "out", "resume", "overwrite", "view")
     others = _others(given, names, [key for key in overrides if key not in EVAL_KEYS])
@@ -132,9 +137,12 @@ def _evaluate(run: Path, given: dict[str, typing.Any], overrides: dict[str, str 
             f"--eval measures a run at its own size, so --data.size {config.data.size} cannot be given; "
             f"{run / 'config.toml'} says {size}."
         )
+    _check_capture(run, config)
     device = open_device(given["device"])
     scene = load(run / "checkpoint.ply", device)
     config, dataset = _open_data(config, run.parent, SINGLE_PROCESS, normalize="placement" in scene.metadata)
+    if "data.path" in overrides and "data.split" not in overrides:
+        check_same_data(run, config.data.path, dataset)
     try:
         training = read_json(run / "metrics.json")["training"]
     except (InputError, KeyError, TypeError):
@@ -146,7 +154,7 @@ def _evaluate(run: Path, given: dict[str, typing.Any], overrides: dict[str, str 
         plots.plot_run(run, scene)
     else:
         print(f"no plots: pip install 'lapgs-wgpu[plots]' adds them to {run / 'eval'}.", file=sys.stderr)
-    print(result_text(run))
+    say(result_text(run))
 
 
 def _lpips(given: dict[str, typing.Any]) -> Lpips | None:
@@ -173,6 +181,17 @@ def _check_files(option: str, what: str, *files: Path) -> None:
     for file in files:
         if not file.is_file():
             raise InputError(f"{file} does not exist; {option} needs the folder of {what}.")
+
+
+def _check_capture(run: Path, config: Config) -> None:
+    """Raises InputError where the capture of a run is gone."""
+    from lapgs_wgpu.data.builtin import is_builtin
+
+    if not is_builtin(config.data.path) and not Path(config.data.path).exists():
+        raise InputError(
+            f"{config.data.path}, the capture of {run / 'config.toml'}, does not exist; give --data the folder where "
+            "it is now."
+        )
 
 
 def _scene_name(config: Config) -> str:

@@ -6,10 +6,12 @@
 from __future__ import annotations
 
 import argparse
+import os
 import shlex
 import shutil
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import NoReturn
 
@@ -27,9 +29,9 @@ INTERRUPTED = 130  # the shell's code for a process that Ctrl-C ended
 
 def guarded(name: str, command: Callable[[list[str]], int | None], arguments: list[str]) -> int:
     """Run a command; what its user should know goes to stderr in one sentence. Returns the exit code."""
+    text = ""
     try:
-        code = command(arguments)
-        return code or 0
+        code = command(arguments) or 0
     except NoAdapterError as error:  # either no adapter at all, or none of the wanted name
         text, code = str(error), 2 if list_devices() else 3
     except InputError as error:
@@ -42,13 +44,22 @@ def guarded(name: str, command: Callable[[list[str]], int | None], arguments: li
         text, code = f"out of memory ({str(error).splitlines()[0]})", OUT_OF_DEVICE
     except NumericalError as error:
         text, code = str(error), NOT_FINITE
+    except BrokenPipeError:  # nobody reads any more what is printed
+        text, code = "", 0
     except OSError as error:  # such as a full disk, or missing permissions
         where = f"{error.filename}: " if error.filename is not None else ""
         text = f"{InputError(f'{where}{error.strerror or error}; check the free space, the path and the permissions')}."
         code = 2
     except KeyboardInterrupt as error:
         text, code = str(error) or "interrupted.", INTERRUPTED
-    print(f"{name}: {text}", file=sys.stderr)
+    if text:
+        with suppress(OSError):  # the terminal may be gone
+            print(f"{name}: {text}", file=sys.stderr)
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except OSError:  # so that Python does not try again, in vain, at its end
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
     return code
 
 
@@ -65,7 +76,7 @@ def print_devices() -> None:
 
 class HelpFormatter(argparse.RawDescriptionHelpFormatter):
     def __init__(self, prog: str) -> None:
-        super().__init__(prog, max_help_position=32, width=120)
+        super().__init__(prog, max_help_position=32, width=min(shutil.get_terminal_size((120, 24)).columns, 120))
 
 
 class Parser(argparse.ArgumentParser):

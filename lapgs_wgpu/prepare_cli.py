@@ -62,7 +62,12 @@ def _prepare(arguments: list[str]) -> None:
     capture = Path(given.check or given.out)
     run = Path("runs", capture.resolve().name)
     if given.train and run.exists() and (not run.is_dir() or any(run.iterdir())):  # now, not after minutes of work
-        raise InputError(f"{run} is there already, and the training would be written to it; move or remove it.")
+        from lapgs_wgpu.train.run_folder import has_state
+
+        goes_on = f"; {beside('lapgs-train')} --resume {quote(str(run))} goes on with it" if has_state(run) else ""
+        raise InputError(
+            f"{run} is there already, and the training would be written to it{goes_on}; move it, or work elsewhere."
+        )
     diagnosis = _check(capture) if given.check else _convert(given, capture)
     if given.train:
         _train(capture, run, given.minutes, diagnosis)

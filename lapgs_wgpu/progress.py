@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 import time
 from collections.abc import Callable
@@ -41,7 +42,8 @@ class Progress:
         if done == self._total or now - self._shown >= (TERMINAL_SECONDS if on_terminal else FILE_SECONDS):
             self._shown = now
             line = text() if text else self._line(now)
-            self._write(f"\r\x1b[2K{line}" if on_terminal else f"{line}\n")
+            width = shutil.get_terminal_size().columns - 1
+            self._write(f"\r\x1b[2K{line[:width]}" if on_terminal else f"{line}\n")
 
     def note(self, text: str) -> None:
         """Print a line of its own."""
@@ -60,6 +62,12 @@ class Progress:
         with suppress(OSError):  # a closed pipe or a full disk behind stderr does not stop the job
             self._stream.write(text)
             self._stream.flush()
+
+
+def say(text: str) -> None:
+    """Print a line on stdout, if somebody still reads it: a closed pipe does not stop a long job."""
+    with suppress(OSError):
+        print(text, flush=True)
 
 
 def duration(seconds: float) -> str:

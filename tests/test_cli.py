@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import shutil
 import subprocess
 import sys
@@ -261,6 +262,16 @@ def test_ctrl_c_ends_with_130(
     monkeypatch.setattr(run_module, "train", interrupted)
     assert cli.train_command(["tiny", "--data", str(scene), "--out", str(tmp_path / "out")]) == 130
     assert capsys.readouterr().err == "lapgs-train: stopped after step 1 of 2.\n"
+
+
+def test_a_pipe_that_is_closed_stops_nothing(scene: Path, tmp_path: Path) -> None:
+    """Neither a training nor a list; and nothing is said of disks."""
+    for given in (["tiny", "--data", str(scene), "--out", str(tmp_path / "out"), *FAST], ["--list-devices"]):
+        line = f"{shlex.join([sys.executable, '-m', 'lapgs_wgpu.cli', *given])} | true; exit ${{PIPESTATUS[0]}}"
+        done = subprocess.run(["bash", "-c", line], stderr=subprocess.PIPE, text=True, timeout=300)
+        assert done.returncode == 0
+        assert "pipe" not in done.stderr.lower()
+    assert (tmp_path / "out" / "metrics.json").exists()
 
 
 def test_other_commands_are_named_so_that_they_can_be_called(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

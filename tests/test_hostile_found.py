@@ -42,7 +42,7 @@ from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.run import evaluate_run, resume
-from lapgs_wgpu.train.run_folder import STATE, load_state, locked_run_folder, save_state, start_run_folder
+from lapgs_wgpu.train.run_folder import STATE, load_state, locked_folder, save_state, start_run_folder
 from lapgs_wgpu.train.step_result import StepResult
 from lapgs_wgpu.train.table_results import read_results, write_results
 from lapgs_wgpu.train.table_spec import read_spec
@@ -244,7 +244,7 @@ def test_nothing_is_written_through_a_link(tmp_path: Path) -> None:
     mine.mkdir()
     (mine / "file").write_text("precious")
     (run / ".lock").symlink_to(mine / "file")
-    with pytest.raises(OSError, match="symbolic link"), locked_run_folder(run):
+    with pytest.raises(OSError, match="symbolic link"), locked_folder(run):
         pass
     (run / ".lock").unlink()
     (run / "eval").symlink_to(mine)

@@ -23,15 +23,18 @@ from helpers.training import STEPS, configure
 
 from lapgs_wgpu import cli, load
 from lapgs_wgpu.data import Dataset
+from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io import atomic
+from lapgs_wgpu.io.safe_json_toml import read_toml
+from lapgs_wgpu.train import run as run_module
 from lapgs_wgpu.train import run_folder
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.host_threads import step_threads
 from lapgs_wgpu.train.presets import write_toml
 from lapgs_wgpu.train.run import evaluate_run, resume, train
-from lapgs_wgpu.train.run_folder import STATE, STATE_BEFORE, load_state, locked_run_folder, save_state
+from lapgs_wgpu.train.run_folder import STATE, STATE_BEFORE, load_state, locked_folder, save_state
 from lapgs_wgpu.train.trainer import Trainer
 
 KILLS = int(os.environ.get("LAPGS_SOAK_KILLS", "3"))
@@ -165,20 +168,92 @@ def test_a_run_that_was_measured_halfway_goes_on(
 
 
 def test_two_writers_are_kept_apart(tmp_path: Path) -> None:
-    with locked_run_folder(tmp_path / "run"):
+    with locked_folder(tmp_path / "run"):
         program = (
             "import sys; from pathlib import Path\n"
-            "from lapgs_wgpu.train.run_folder import locked_run_folder\n"
+            "from lapgs_wgpu.train.run_folder import locked_folder\n"
             "from lapgs_wgpu.errors import InputError\n"
-            "try:\n    with locked_run_folder(Path(sys.argv[1])): print('both')\n"
+            "try:\n    with locked_folder(Path(sys.argv[1])): print('both')\n"
             "except InputError as error: print(error)"
         )
         command = [sys.executable, "-c", program, str(tmp_path / "run")]
         told = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True).stdout
         assert told.startswith(f"{tmp_path / 'run'} is being written by another lapgs-train (process {os.getpid()})")
-    assert list((tmp_path / "run").iterdir()) == []
-    with locked_run_folder(tmp_path / "run"):
+    assert not (tmp_path / "run").exists()  # it was empty
+    with locked_folder(tmp_path / "run"):
         pass
+
+
+def test_a_training_that_began_first_is_not_replaced(
+    whole: Path, dataset: Dataset, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Though the folder was free when the other one looked."""
+    out, check = tmp_path / "run", run_folder.check_run_folder
+    looked = []
+
+    def slowly(path: Path, *, overwrite: bool) -> None:
+        check(path, overwrite=overwrite)
+        if not looked:
+            looked.append(path)
+            shutil.copytree(whole, out)
+
+    monkeypatch.setattr(run_module, "check_run_folder", slowly)
+    with pytest.raises(InputError, match="is not empty"):
+        train(configure(), dataset, out, device=device)
+    assert (out / "checkpoint.ply").read_bytes() == (whole / "checkpoint.ply").read_bytes()
+
+
+def test_overwrite_replaces_nothing_but_runs(dataset: Dataset, device: Device, tmp_path: Path) -> None:
+    (tmp_path / "eval").mkdir()
+    (tmp_path / "eval" / "thesis.txt").write_text("mine")
+    (tmp_path / "config.toml").write_text("mine = true")
+    with pytest.raises(InputError, match="holds files, but no run that --overwrite could replace"):
+        train(configure(), dataset, tmp_path, device=device, overwrite=True)
+    assert (tmp_path / "eval" / "thesis.txt").read_text() == "mine"
+
+
+def test_a_run_goes_on_with_its_own_capture_only(
+    dataset: Dataset,
+    data: Path,
+    device: Device,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    run, moved = tmp_path / "run", tmp_path / "moved"
+    with monkeypatch.context() as patched:
+        interrupt_at(4, patched)
+        with pytest.raises(KeyboardInterrupt):
+            train(configure(data__path=str(tmp_path / "gone"), schedule__steps="6"), dataset, run, device=device)
+    before = {file.name: file.read_bytes() for file in run.iterdir() if file.is_file()}
+    assert cli.train_command(["--resume", str(run)]) == 2
+    assert f"gone, the capture of {run / 'config.toml'}, does not exist; give --data" in capfd.readouterr().err
+    other = write_synthetic(tmp_path / "other", size=24, train_views=8, test_views=2)
+    for option in ("--resume", "--eval"):
+        assert cli.train_command([option, str(run), "--data", str(other)]) == 2
+        assert f"{other} is another capture than that of {run / 'config.toml'}" in capfd.readouterr().err
+    assert before == {file.name: file.read_bytes() for file in run.iterdir() if file.is_file()}
+    shutil.copytree(data, moved)
+    with monkeypatch.context() as patched:
+        interrupt_at(5, patched)
+        assert cli.train_command(["--resume", str(run), "--data", str(moved)]) == 130
+    assert cli.train_command(["--resume", str(run)]) == 0  # config.toml names the new folder
+    assert read_toml(run / "config.toml")["data"]["path"] == str(moved)
+    assert read_toml(run / "config.toml")["record"]["data"] == dataset.fingerprint
+
+
+def test_a_run_without_its_state_is_not_begun_again(
+    dataset: Dataset, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patched:
+        interrupt_at(4, patched)
+        with pytest.raises(KeyboardInterrupt):
+            train(configure(), dataset, tmp_path, device=device)
+    (tmp_path / STATE).unlink()
+    before = (tmp_path / "checkpoint.ply").read_bytes()
+    with pytest.raises(InputError, match=r"a checkpoint, but no state to go on from \(state.safetensors\)"):
+        resume(configure(), dataset, tmp_path, device=device)
+    assert (tmp_path / "checkpoint.ply").read_bytes() == before
 
 
 def test_what_has_changed_since_the_run_began_is_told(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
+import signal
 import threading
 import time
 from pathlib import Path
@@ -18,6 +19,7 @@ from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.train import plots, table
 from lapgs_wgpu.train.presets import load_config, write_toml
+from lapgs_wgpu.train.run_folder import locked_folder
 from lapgs_wgpu.train.table_results import (
     Result,
     Results,
@@ -355,6 +357,11 @@ def test_unfinished_and_changed_runs_are_trained_again(
     assert [tuple(key) for key in trained] == [("toys", "grid4d", 5)]
     assert (out / "results.before.json").read_bytes() == before
     assert "1 runs of" in capsys.readouterr().err
+    spec_file.write_text(SPEC.replace("grid4d = {", "grid4d = { field.width = 12,"))
+    assert make(spec_file, data) == 0
+    assert (out / "results.before.json").read_bytes() == before
+    assert "results.before-2.json keeps their results" in capsys.readouterr().err
+    assert len(read_results(out / "results.before-2.json").runs) == 5
 
 
 def test_measures_that_some_runs_lack_have_columns(tmp_path: Path) -> None:
@@ -453,6 +460,31 @@ def test_the_table_is_written_after_every_run(
     assert capsys.readouterr().err.endswith("lapgs-table: stopped in run 4 of 5; the same command goes on.\n")
     assert seen == [0, 1, 2, 3]
     assert "| toys | grid4d | 1 | 25.00 | - |" in (spec_file.parent / "out" / "table.md").read_text()
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
+def test_a_signal_ends_a_table_as_ctrl_c_does(
+    name: str, spec_file: Path, data: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = signal.getsignal(getattr(signal, name))
+
+    def ended(run: Run, data: Path, out: Path, launch: table.Launch) -> str | None:
+        signal.raise_signal(getattr(signal, name))
+        return "went on"
+
+    monkeypatch.setattr(table, "_train_in_process", ended)
+    assert make(spec_file, data) == command.INTERRUPTED
+    assert capsys.readouterr().err.endswith("lapgs-table: stopped in run 1 of 5; the same command goes on.\n")
+    assert signal.getsignal(getattr(signal, name)) == before
+
+
+def test_two_tables_do_not_write_to_one_folder(
+    spec_file: Path, data: Path, trained: list[RunKey], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with locked_folder(spec_file.parent / "out", "lapgs-table"):
+        assert make(spec_file, data) == 2
+    assert "out is being written by another lapgs-table (process" in capsys.readouterr().err
+    assert not trained
 
 
 def test_a_slim_table_keeps_the_figures_of_its_runs(spec_file: Path, data: Path, trained: list[RunKey]) -> None:

@@ -372,6 +372,7 @@ def test_overwriting_replaces_a_run_and_nothing_else(dataset: Dataset, device: D
     (tmp_path / "notes.txt").write_text("mine")
     (tmp_path / "eval").mkdir()
     (tmp_path / "eval" / "old.png").write_text("old")
+    (tmp_path / "config.toml").write_text("[record]\ndata = '1234'\n")
     train(configure(schedule__steps="2"), dataset, tmp_path, device=device, overwrite=True)
     assert (tmp_path / "notes.txt").read_text() == "mine"
     assert not (tmp_path / "eval" / "old.png").exists()

@@ -156,7 +156,9 @@ def _port(text: str) -> int:
 def _size(text: str) -> tuple[int, int]:
     found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text)
     if found is None or not (0 < int(found[1]) <= 16384 and 0 < int(found[2]) <= 16384):
-        raise argparse.ArgumentTypeError(f"expected WIDTHxHEIGHT in pixels, such as 1280x720, got {text!r}")
+        raise argparse.ArgumentTypeError(
+            f"expected WIDTHxHEIGHT in pixels, such as 1280x720, each at most 16384, got {text!r}"
+        )
     return int(found[1]), int(found[2])
 
 

@@ -63,6 +63,8 @@ def load_dataset(
         InputError: not a capture, or one that cannot be trained on as it is; names file and field.
     """
     folder = Path(folder)
+    if image_size is not None and image_size < 1:
+        raise InputError(f"image_size must be at least 1 pixel, got {image_size}.")
     if not folder.is_dir():
         problem = "is not a folder" if folder.exists() else "does not exist"
         raise InputError(f"{folder} {problem}; give the folder of a scene.")
@@ -77,6 +79,8 @@ def load_dataset(
     children = sorted(child for child in folder.iterdir() if child.is_dir())
     scenes = [child.name for child in children if any(reader.matches(child) for reader in READERS)]
     inside = f"; it holds the scenes {', '.join(scenes[:8])}: name one of them" if scenes else ""
+    if any(reader.matches(folder.resolve().parent) for reader in READERS):
+        inside = f"; its parent folder {folder.resolve().parent} is one: name that"
     expected = ", or ".join(f"{reader.files} ({reader.name})" for reader in READERS)
     raise InputError(f"{folder} is no scene in a known format: expected {expected}{inside}.")
 

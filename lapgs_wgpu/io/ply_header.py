@@ -62,6 +62,8 @@ def open_ply(path: PathLike) -> Iterator[tuple[BinaryIO, dict[str, Element]]]:
 def _read_header(file: BinaryIO, path: PathLike) -> dict[str, Element]:
     head = file.read(MAX_HEADER_BYTES)
     size = os.fstat(file.fileno()).st_size
+    if head[:64].lstrip().lower().startswith(b"<!doctype html"):
+        raise InputError(f"{path}: is a web page, and this is not a browser; give the checkpoint that it was made of")
     if re.match(rb"ply\r?\n", head) is None:
         what = f"begins with {head[:8]!r}" if head else "is empty (0 bytes)"
         raise InputError(f"{path}: {what}, where a PLY file begins with the line 'ply'; give a 3DGS .ply file")

@@ -69,6 +69,8 @@ def _read_text(path: PathLike, most: int, language: str) -> str:
             return file.read(found.st_size).decode("utf-8-sig" if language == "JSON" else "utf-8")
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the path.") from None
+    except InputError:
+        raise
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: cannot be read as {language}: byte {error.start} is not UTF-8.") from None
     except ValueError as error:  # a name that no file can have

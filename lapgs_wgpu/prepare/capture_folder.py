@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import errno
 import os
+import shlex
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from lapgs_wgpu.data.load import READERS
 from lapgs_wgpu.errors import InputError
 
 UNFINISHED, FINISHED, LOCK = ".unfinished", ".finished", ".lock"
@@ -47,6 +49,11 @@ def appearing(out: Path) -> Iterator[Path]:
 
 def _check_empty(out: Path) -> None:
     if out.exists() and (not out.is_dir() or {entry.name for entry in out.iterdir()} - {UNFINISHED, LOCK}):
+        if any(reader.matches(out) for reader in READERS if out.is_dir()):
+            raise InputError(
+                f"{out} is a capture already; lapgs-prepare --check {shlex.quote(str(out))} --train measures it and "
+                "trains on it; or name a new folder with --out."
+            )
         raise InputError(f"{out} is not an empty folder; name a new one with --out.")
 
 

@@ -73,11 +73,18 @@ class Camera:
 
         Returns:
             The camera.
+
+        Raises:
+            ValueError: target at the position, up along the view, or a field of view that is none.
         """
         eye = np.asarray(position, dtype=np.float64)
         forward = np.asarray(target, dtype=np.float64) - eye
+        if not np.linalg.norm(forward) > 0:
+            raise ValueError(f"Camera.looking_at: position and target must differ, got {eye.tolist()} for both")
         forward /= np.linalg.norm(forward)
         right = np.cross(forward, np.asarray(up, dtype=np.float64))
+        if not np.linalg.norm(right) > 0:
+            raise ValueError(f"Camera.looking_at: up must not lie along the view, got {np.asarray(up).tolist()}")
         right /= np.linalg.norm(right)
         R = np.stack([right, np.cross(forward, right), forward])
         T = np.eye(4)
@@ -87,5 +94,7 @@ class Camera:
 
 def intrinsics_of_fov(fov_x: float, width: int, height: int) -> NDArray[np.float64]:
     """(3, 3) K for a horizontal field of view in radians, with square pixels and a centered principal point."""
+    if not 0 < fov_x < math.pi:
+        raise ValueError(f"the field of view must be between 0 and pi radians, got {fov_x:g}")
     focal = 0.5 * width / math.tan(0.5 * fov_x)
     return np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])

@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import importlib.resources
 import json
+import os
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -43,7 +44,7 @@ def preset_names() -> list[str]:
 
 
 def load_config(
-    preset: str,
+    preset: str | os.PathLike[str],
     overrides: Mapping[str, Any] | None = None,
     *,
     method: str | None = None,
@@ -63,6 +64,7 @@ def load_config(
     Raises:
         InputError: the preset, a key or a value is not valid.
     """
+    preset = os.fspath(preset)
     known = {key.name: key.kind for key in config_keys()}
     table: Table = {}
     for key, value in (overrides or {}).items():

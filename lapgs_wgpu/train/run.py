@@ -22,6 +22,7 @@ from lapgs_wgpu.gpu.device import Device, open_device
 from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.scene import Scene4D
+from lapgs_wgpu.progress import say
 from lapgs_wgpu.train.config import Background, Config
 from lapgs_wgpu.train.distributed import SINGLE_PROCESS, Ranks
 from lapgs_wgpu.train.evaluate import evaluate, write_metrics
@@ -37,7 +38,8 @@ from lapgs_wgpu.train.run_folder import (
     drop_states,
     has_state,
     load_state,
-    locked_run_folder,
+    locked_folder,
+    note_paths,
     save_state,
     start_run_folder,
 )
@@ -89,18 +91,19 @@ def train(
         for warning in (*dataset.warnings, *found, *_precision_warnings(config)):
             print(f"warning: {warning}", file=sys.stderr, flush=True)
         if dataset.normalization is not None:
-            print(f"placement: {dataset.normalization}", flush=True)
+            say(f"placement: {dataset.normalization}")
     keep_freed_memory()
     device = device or open_device()
-    training = Trainer(config, dataset, device, ranks, parts=parts)
     if not ranks.first:
-        return _assist(training)
-    with locked_run_folder(out):
+        return _assist(Trainer(config, dataset, device, ranks, parts=parts))
+    with locked_folder(out):
+        check_run_folder(out, overwrite=overwrite)  # again: another training may have written it meanwhile
+        training = Trainer(config, dataset, device, ranks, parts=parts)
         start_run_folder(out, training.given, training.scene.device, dataset)
         if training.discovery is not None:
-            print(f"discovery: {training.discovery}; {training.discovery_seconds:.0f} s", flush=True)
+            say(f"discovery: {training.discovery}; {training.discovery_seconds:.0f} s")
         if training.config.decoder == "device":
-            print("decoder: on the device", flush=True)
+            say("decoder: on the device")
         return _run(training, out, watch, lpips)
 
 
@@ -122,8 +125,14 @@ def resume(
         raise InputError(f"{out} is finished: there is nothing to resume.")
     keep_freed_memory()
     device = device or open_device()
-    with locked_run_folder(out) if ranks.first else nullcontext():
+    with locked_folder(out) if ranks.first else nullcontext():
         state = load_state(out)
+        if state is None and (out / "checkpoint.ply").exists():
+            raise InputError(
+                f"{out} holds a checkpoint, but no state to go on from ({STATE}); copy that file, too, or train anew."
+            )
+        if ranks.first:
+            note_paths(out, config)
         training = Trainer(config, dataset, device, ranks, parts=parts, resumed=state is not None)
         if state is not None:
             try:

@@ -39,17 +39,23 @@ def check_run_folder(out: Path, *, overwrite: bool) -> None:
     """InputError where a run cannot be written there."""
     if out.exists() and not out.is_dir():
         raise InputError(f"{out} is a file; name a folder for the run with --out.")
-    if overwrite or not out.exists():
+    if not out.exists() or all(entry.name == LOCK or entry.match(".*.tmp") for entry in out.iterdir()):
         return
-    if any(entry.name != LOCK for entry in out.iterdir()):
+    if not overwrite:
         raise InputError(f"{out} is not empty; name another folder with --out, or replace its run with --overwrite.")
+    if not (out / "config.toml").is_file() or not (_recorded(out) or (out / "log.jsonl").is_file()):
+        raise InputError(
+            f"{out} holds files, but no run that --overwrite could replace; name another folder with --out."
+        )
 
 
 @contextmanager
-def locked_run_folder(out: Path) -> Iterator[None]:
-    """Create the folder if needed and lock it for one writer. Raises InputError if another process holds the lock."""
+def locked_folder(out: Path, writer: str = "lapgs-train") -> Iterator[None]:
+    """Create the folder if needed and lock it for one writer, a command; a folder that stays empty is removed again.
+    Raises InputError if another process holds the lock."""
     from filelock import FileLock, Timeout
 
+    new = not out.exists()
     out.mkdir(parents=True, exist_ok=True)
     path, lock = out / LOCK, FileLock(out / LOCK, blocking=False)  # follows no symbolic link
     try:
@@ -59,7 +65,7 @@ def locked_run_folder(out: Path) -> Iterator[None]:
         with suppress(OSError):
             who = path.read_text(encoding="ascii", errors="replace")[:20].strip()
         raise InputError(
-            f"{out} is being written by another lapgs-train (process {who if who.isdecimal() else 'unknown'}); wait "
+            f"{out} is being written by another {writer} (process {who if who.isdecimal() else 'unknown'}); wait "
             "for it, or name another folder."
         ) from None
     try:
@@ -70,6 +76,9 @@ def locked_run_folder(out: Path) -> Iterator[None]:
         with suppress(OSError):
             path.unlink(missing_ok=True)
         lock.release()
+        if new:
+            with suppress(OSError):  # it is not empty, unless something went wrong
+                out.rmdir()
 
 
 def _open_no_follow(path: str, flags: int) -> int:
@@ -79,6 +88,8 @@ def _open_no_follow(path: str, flags: int) -> int:
 def start_run_folder(out: Path, config: Config, device: Device, dataset: Dataset) -> None:
     """Free the folder of an earlier run's files, and write config.toml."""
     for name in RUN_FILES:
+        if name == "config.toml" and (out / name).is_file():
+            continue  # is replaced at once, so that a process that is killed leaves what --overwrite knows for a run
         if (out / name).is_dir() and not (out / name).is_symlink():
             shutil.rmtree(out / name)
         else:
@@ -90,15 +101,39 @@ def start_run_folder(out: Path, config: Config, device: Device, dataset: Dataset
 
 def changes_since(out: Path, config: Config, device: Device, dataset: Dataset) -> list[tuple[str, str, str]]:
     """What is not as it was when the run in this folder began, though its bits may depend on it: name, then, now."""
+    now, then = _record(config, device, dataset), _recorded(out)
+    return [(name, then[name][:200], now[name]) for name in now if then.get(name, now[name]) != now[name]]
+
+
+def check_same_data(out: Path, folder: str, dataset: Dataset) -> None:
+    """Raises InputError where a folder that was given for the capture of a run holds another capture."""
+    then = _recorded(out).get("data", dataset.fingerprint)
+    if then != dataset.fingerprint:
+        raise InputError(
+            f"{folder} is another capture than that of {out / 'config.toml'} (fingerprints {dataset.fingerprint} and "
+            f"{then[:16]}, of cameras, times and file sizes); give --data the folder of that one."
+        )
+
+
+def note_paths(out: Path, config: Config) -> None:
+    """Let config.toml name the folder where the capture is now."""
+    try:
+        known = read_toml(out / "config.toml")["data"]["path"]
+    except (InputError, KeyError, TypeError):
+        return
+    if known != config.data.path:
+        with atomic_write(out / "config.toml") as file:
+            file.write(write_toml({**dataclasses.asdict(config), "record": _recorded(out)}).encode())
+
+
+def _recorded(out: Path) -> dict[str, str]:
+    """What config.toml of a run says of how it began; empty where it says nothing."""
     try:
         record = read_toml(out / "config.toml").get("record")
     except InputError:
-        return []
-    if not isinstance(record, dict):
-        return []
-    now = _record(config, device, dataset)
-    then = {name: text for name, text in record.items() if isinstance(text, str) and text.isprintable()}
-    return [(name, then[name][:200], now[name]) for name in now if then.get(name, now[name]) != now[name]]
+        return {}
+    texts = record.items() if isinstance(record, dict) else ()
+    return {name: text for name, text in texts if isinstance(text, str) and text.isprintable()}
 
 
 def result_text(run: Path) -> str:

@@ -6,6 +6,7 @@ A process a run: the device's memory is all free again for the next one, and a r
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 import shutil
 import signal
@@ -14,7 +15,8 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from datetime import timedelta
 from pathlib import Path
 from statistics import mean
@@ -27,7 +29,7 @@ from lapgs_wgpu.gpu.device import open_device
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.train import plots
 from lapgs_wgpu.train.presets import load_config, write_toml
-from lapgs_wgpu.train.run_folder import has_state
+from lapgs_wgpu.train.run_folder import has_state, locked_folder
 from lapgs_wgpu.train.table_results import Result, Results, read_results, read_run, write_results
 from lapgs_wgpu.train.table_spec import Run, RunKey, Spec, fingerprint
 
@@ -76,14 +78,18 @@ def make_table(
     launch = Launch(device, lpips, None if hours is None else time.monotonic() + 3600 * hours - SAVING)
     if out.exists() and not out.is_dir():
         raise InputError(f"{out} is a file; name a folder for the table with --out.")
+    with locked_folder(out, "lapgs-table"), _ends_as_by_ctrl_c():
+        return _train_table(spec, data, out, known, launch, slim)
+
+
+def _train_table(spec: Spec, data: Path, out: Path, known: Sequence[Results], launch: Launch, slim: bool) -> Outcome:
     stored = [read_results(out / "results.json")] if (out / "results.json").exists() else []
     finished = _finished(spec, out, [*stored, *known])
     pending = [run for run in spec.runs if run.key not in finished]
     folders = _scene_folders(pending, data, out)
     if pending:
-        open_device(device)  # only to learn now, and not from every run, that it is not there
+        open_device(launch.device)  # only to learn now, and not from every run, that it is not there
 
-    out.mkdir(parents=True, exist_ok=True)
     _keep_others(out, stored, finished)
     _write(spec, out, finished)
     failed: dict[RunKey, str] = {}
@@ -112,6 +118,22 @@ def make_table(
             (folder / "checkpoint.ply").unlink(missing_ok=True)
             shutil.rmtree(folder / "eval", ignore_errors=True)
     return Outcome(len(finished), failed, stopped=False)
+
+
+@contextmanager
+def _ends_as_by_ctrl_c() -> Iterator[None]:
+    """SIGTERM and SIGHUP end the table as Ctrl-C does, so that the training under way saves its state and ends."""
+    before = {}
+    with suppress(ValueError):  # only the main thread may listen to signals
+        for name in ("SIGTERM", "SIGHUP"):
+            number = getattr(signal, name, None)
+            if number is not None and signal.getsignal(number) != signal.SIG_IGN:  # as by nohup
+                before[number] = signal.signal(number, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def run_folder(out: Path, key: RunKey) -> Path:
@@ -146,11 +168,14 @@ def _keep_others(out: Path, stored: Sequence[Results], finished: Mapping[RunKey,
     """results.json is about to lose the runs that the table does not want any more; keep a copy of it then."""
     others = [run for part in stored for run in part.runs if finished.get(run.key) != run]
     if others:
-        with atomic_write(out / "results.before.json") as file:
+        numbered = (f"results.before-{number}.json" for number in itertools.count(2))
+        names = itertools.chain(["results.before.json"], numbered)
+        kept = next(out / name for name in names if not (out / name).exists())
+        with atomic_write(kept) as file:
             file.write((out / "results.json").read_bytes())
         print(
             f"{len(others)} runs of {out / 'results.json'} are not wanted any more, or in another configuration, "
-            f"such as {others[0].key}; results.before.json keeps them.",
+            f"such as {others[0].key}; {kept.name} keeps their results, and new trainings replace their folders.",
             file=sys.stderr,
         )
 
@@ -235,8 +260,10 @@ def _pass_on(process: subprocess.Popen[str]) -> str:
     last = ""
     for line in process.stderr:
         last = line.strip() or last
-        sys.stderr.write(f"\r\x1b[2K{last}" if on_terminal else f"  {last}\n")
-        sys.stderr.flush()
+        with suppress(OSError):  # the terminal may be gone
+            sys.stderr.write(f"\r\x1b[2K{last}" if on_terminal else f"  {last}\n")
+            sys.stderr.flush()
     if on_terminal:
-        sys.stderr.write("\n")
+        with suppress(OSError):
+            sys.stderr.write("\n")
     return last
