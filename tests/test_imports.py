@@ -33,7 +33,19 @@ ALLOWED = {
     "doctor": {"errors", "gpu", "splat", "motion", "train"},
     "doctor_cli": {"errors", "command", "doctor"},
     "train_options": {"errors", "command", "io", "train"},
-    "cli": {"errors", "progress", "command", "gpu", "splat", "motion", "data", "io", "train", "train_options", "viewer"},
+    "cli": {
+        "errors",
+        "progress",
+        "command",
+        "gpu",
+        "splat",
+        "motion",
+        "data",
+        "io",
+        "train",
+        "train_options",
+        "viewer",
+    },
     "table_cli": {"errors", "command", "train"},
 }
 FOLDERS = {"": PACKAGE, "viewer": Path(lapgs_wgpu.viewer.__file__).parent}  # where the parts lie on the disk

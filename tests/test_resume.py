@@ -167,6 +167,21 @@ def test_a_run_that_was_measured_halfway_goes_on(
     assert json.loads((out / "metrics.json").read_text())["training"]["steps"] == STEPS
 
 
+def test_a_run_that_was_stopped_while_it_was_measured_goes_on(
+    whole: Path, dataset: Dataset, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stopped(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(run_module, "evaluate", stopped)
+        with pytest.raises(KeyboardInterrupt, match="while the test views were measured; lapgs-train --resume"):
+            train(configure(), dataset, tmp_path / "run", device=device)
+    resume(configure(), dataset, tmp_path / "run", device=device)
+    assert json.loads((tmp_path / "run" / "metrics.json").read_text())["training"]["steps"] == STEPS
+    assert (tmp_path / "run" / "checkpoint.ply").read_bytes() == (whole / "checkpoint.ply").read_bytes()
+
+
 def test_two_writers_are_kept_apart(tmp_path: Path) -> None:
     with locked_folder(tmp_path / "run"):
         program = (

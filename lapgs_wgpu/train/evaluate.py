@@ -24,6 +24,7 @@ from lapgs_wgpu.data.views import View, composite
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.motion.scene import Scene4D
+from lapgs_wgpu.progress import Progress
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train.camera_refinement import rotation_vector
 from lapgs_wgpu.train.config import BACKGROUND_LEVELS
@@ -50,6 +51,7 @@ def evaluate(
     lpips: Lpips | None = None,
     static: Scene4D | None = None,
     camera_unit: float | None = None,
+    progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Render every view and compare: the content of metrics.json.
 
@@ -65,6 +67,7 @@ def evaluate(
     stands still, and psnr_still is that of the other pixels. Absent where no moving pixel is known.
     camera_unit: extent of the cameras, world units, where training cameras were refined. `aligned` then holds the
     measures once more, after test-time alignment (`view_alignment`), labelled as such; the others stay without it.
+    progress: takes a step for each view.
     Raises InputError where there are no views, or a picture or a mask cannot be read.
     """
     _check_any(views)
@@ -94,6 +97,8 @@ def evaluate(
         if folder is not None:
             with atomic_write(folder / f"{view.name}.png") as file:
                 file.write(encode_png(side_by_side(truth, image)))
+        if progress is not None:
+            progress.step()
     motion = summarise(frames, [view.name for view in views])
     for name in MOTION_MEASURES:
         values = [row[name] for row in rows if name in row]

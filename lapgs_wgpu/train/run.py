@@ -22,7 +22,7 @@ from lapgs_wgpu.gpu.device import Device, open_device
 from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.scene import Scene4D
-from lapgs_wgpu.progress import say
+from lapgs_wgpu.progress import Progress, say
 from lapgs_wgpu.train.config import Background, Config
 from lapgs_wgpu.train.distributed import SINGLE_PROCESS, Ranks
 from lapgs_wgpu.train.evaluate import evaluate, write_metrics
@@ -224,7 +224,12 @@ def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None)
         measured["cameras"] = moved
     if training.timing is not None:
         measured["image_times"] = training.timing.report()
-    evaluate_run(out, scene, training.dataset, config.data.background, measured, lpips)
+    try:
+        evaluate_run(out, scene, training.dataset, config.data.background, measured, lpips)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(
+            f"stopped after the last step, while the test views were measured; lapgs-train --resume {out} goes on."
+        ) from None
     drop_states(out)
     return scene
 
@@ -311,7 +316,17 @@ def evaluate_run(
             raise InputError(f"{folder} is a link, and pictures are written into the run's own folder only; remove it.")
     (out / "eval").mkdir(exist_ok=True)
     unit = dataset.extent if "cameras" in training else None  # they were refined
-    metrics = evaluate(scene, dataset.test, background, out / "eval", lpips=lpips, static=static, camera_unit=unit)
+    with Progress(len(dataset.test), "test views measured") as progress:
+        metrics = evaluate(
+            scene,
+            dataset.test,
+            background,
+            out / "eval",
+            lpips=lpips,
+            static=static,
+            camera_unit=unit,
+            progress=progress,
+        )
     metrics["training"] = training
     write_metrics(out, metrics)
     return metrics
