@@ -1,6 +1,6 @@
 // Which tiles a splat touches: exactly those that hold a pixel centre inside the ellipse where its alpha reaches 1/255.
 // `project` counts with these functions and `duplicate_with_keys` writes with them. A driver may round differently in
-// the two, so `project` counts within a slightly larger ellipse: what is written is always among what was counted.
+// the two, so `project` uses a slightly larger ellipse: every tile that is written was counted.
 #import common/constants
 
 // Pixels added around the ellipse, against rounding. A tile too many costs a little time, a tile too few a hole.
