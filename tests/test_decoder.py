@@ -129,13 +129,18 @@ def make_decoder(device: Device, field: GridField, *, block: int | None = None) 
     return Decoder(device, field._encoder, field._decoder.shape, block=block)
 
 
-def test_blocks_of_gaussians_give_the_same(device: Device) -> None:
-    """Values to the last bit; gradients of weights are summed in another order."""
-    field = grid_field(device, PLAIN)
+def decoder_inputs(field: GridField) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+    """200 points, and what the decoder takes beside their features: per point, and its weights."""
     points = torch.rand(200, 3, generator=torch.Generator().manual_seed(0)) * 2 - 1
     shape = field._decoder.shape
     weights = {name: random(*size, seed=i).requires_grad_() for i, (name, size) in enumerate(shape.weights.items())}
-    beside = random(200, shape.beside).requires_grad_()
+    return points, random(200, shape.beside).requires_grad_(), weights
+
+
+def test_blocks_of_gaussians_give_the_same(device: Device) -> None:
+    """Values to the last bit; gradients of weights are summed in another order."""
+    field = grid_field(device, PLAIN)
+    points, beside, weights = decoder_inputs(field)
     learnt = [beside, *weights.values(), *(grid.table for grid in field.grids)]
     runs = []
     for block in (None, 64):
@@ -150,10 +155,7 @@ def test_blocks_of_gaussians_give_the_same(device: Device) -> None:
 def test_submitted_in_parts_the_bits_are_the_same(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     """As where a watchdog ends long submissions: after each block of the decoder and each lookup of the encoder."""
     field = grid_field(device, PLAIN)
-    points = torch.rand(200, 3, generator=torch.Generator().manual_seed(0)) * 2 - 1
-    shape = field._decoder.shape
-    weights = {name: random(*size, seed=i).requires_grad_() for i, (name, size) in enumerate(shape.weights.items())}
-    beside = random(200, shape.beside).requires_grad_()
+    points, beside, weights = decoder_inputs(field)
     learnt = [beside, *weights.values(), *(grid.table for grid in field.grids)]
     submitted, submit = [], Encoder.submit
     monkeypatch.setattr(Encoder, "submit", lambda *arguments: submitted.append(1) or submit(*arguments))
