@@ -34,6 +34,11 @@ def test_without_times_each_is_its_own_moment() -> None:
     assert [EVEN(t) for t in (-0.2, 1.2)] == [0.0, 1.0]
 
 
+def test_nan_is_no_time() -> None:
+    with pytest.raises(ValueError, match="NaN"):
+        EVEN(float("nan"))
+
+
 def test_the_text_gives_the_same_bits() -> None:
     random = np.random.default_rng(0)
     timing = Timing(np.sort(random.random(50)), np.sort(random.random(50)))

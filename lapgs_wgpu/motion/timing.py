@@ -27,7 +27,9 @@ class Timing:
     moments: NDArray[np.float64]
 
     def __call__(self, t: float) -> float:
-        """The moment at a time in [0, 1]; at others that of the nearest end."""
+        """The moment at a time in [0, 1]; at others that of the nearest end. Raises ValueError for NaN."""
+        if np.isnan(t):
+            raise ValueError("a time must be a number, got NaN")
         later = float(np.interp(t, self.times, self.moments - self.times)) if len(self.times) else 0.0
         return min(max(t + later, 0.0), 1.0)
 

@@ -72,32 +72,33 @@ def load_config(
             raise InputError(f"there is no option --{key}{did_you_mean(key, known)}")
         texts = isinstance(value, str) or (isinstance(value, list) and all(isinstance(each, str) for each in value))
         _set(table, key, checked(known[key], from_text(value, known[key]) if texts else value, f"--{key}"))
-    return build_config(preset, table, preset, method=method, ablate=ablate)
+    return build_config(preset, table, preset, shorthands(method, ablate, ("--field", "--ablate")))
 
 
-def build_config(
-    preset: str, table: Table, source: str, *, method: str | None = None, ablate: Iterable[str] = ()
-) -> Config:
-    """A preset, by name or by path, with a nested table of values laid over it; method, ablate as in `load_config`.
+def build_config(preset: str, table: Table, source: str, short: Mapping[str, Any]) -> Config:
+    """A preset, by name or by path, with `shorthands` and then a nested table of values laid over it.
 
     source: where the table stands, for the text of an InputError.
     """
     base = _read(preset)
-    for key, value in _shorthands(method, ablate).items():
+    for key, value in short.items():
         _set(base, key, value)
     return build_dataclass(Config, merge(base, table), source, advice=ADVICE)
 
 
-def _shorthands(method: str | None, ablate: Iterable[str]) -> dict[str, Any]:
-    """ConfigKey -> value of what --field and --ablate stand for."""
+def shorthands(method: str | None, ablate: Iterable[str], names: tuple[str, str]) -> dict[str, Any]:
+    """Key of the configuration -> value of what `method` and `ablate` of `load_config` stand for.
+
+    names: how the text of an InputError calls the two.
+    """
     values: dict[str, Any] = {}
     if method is not None:
-        values["field.kind"] = checked(FieldKind, method, "--field")
+        values["field.kind"] = checked(FieldKind, method, names[0])
         values |= PAPER_ONLY if method != "laplacian" else {}
     for part in ablate:
         if part not in ABLATIONS:
             hint = did_you_mean(part, ABLATIONS)
-            raise InputError(f"--ablate knows {', '.join(ABLATIONS)}, not {shown(part)}{hint}")
+            raise InputError(f"{names[1]} knows {', '.join(ABLATIONS)}, not {shown(part)}{hint}")
         _, key, value = ABLATIONS[part]
         values[key] = value
     return values

@@ -32,7 +32,7 @@ from lapgs_wgpu.errors import InputError, shown
 from lapgs_wgpu.io.dataclass_table import did_you_mean
 from lapgs_wgpu.io.safe_json_toml import read_toml
 from lapgs_wgpu.train.config import CamerasConfig, Config
-from lapgs_wgpu.train.presets import Table, build_config, load_config, merge, preset_names
+from lapgs_wgpu.train.presets import Table, build_config, load_config, merge, preset_names, shorthands
 
 MOST_RUNS = 10_000
 _NAME = re.compile(r"\w[\w .+=-]*", re.ASCII)  # becomes the name of a folder, and a cell of a Markdown table
@@ -101,6 +101,7 @@ def read_spec(path: Path) -> Spec:
         method, ablate = entry.pop("method", None), entry.pop("ablate", [])
         if not isinstance(ablate, list) or not all(isinstance(part, str) for part in ablate):
             raise InputError(f"{where}.ablate must be a list of parts, got {shown(ablate)}.")
+        short = shorthands(method, ablate, (f"{where}.method", f"{where}.ablate"))
         entry = _overrides(entry, where)
         for scene in row_scenes:
             folder, own = scenes[scene]
@@ -108,7 +109,7 @@ def read_spec(path: Path) -> Spec:
             for seed in row_seeds:
                 where = f"{path}: {scene}, {row}"
                 values = merge(overrides, {"seed": seed})
-                config = build_config(preset, values, where, method=method, ablate=ablate)
+                config = build_config(preset, values, where, short)
                 said = overrides | ({"method": method} if method else {}) | ({"ablate": ablate} if ablate else {})
                 runs.append(Run(RunKey(scene, row, seed), folder, config, said))
     # Scene by scene, so that a table of which half is made compares all rows on half of the scenes.
