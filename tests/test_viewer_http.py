@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from helpers.browser import CHROMIUM, Browser, wait_for
+from helpers.browser import CHROMIUM, Browser
+from helpers.waiting import wait_for
 from numpy.typing import NDArray
 
 from lapgs_wgpu import Scene4D
@@ -373,7 +374,7 @@ class Server:
         self.said: list[str] = []
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
-        self.url = wait_for(self._url, 120, "the server's address")
+        self.url = wait_for(self._url, "the server's address")
         self.port = int(self.url.split(":")[2].split("/")[0])
 
     def _read(self) -> None:
@@ -461,60 +462,60 @@ def test_in_a_browser(server: Server, scene: Path, device: Device, tmp_path: Pat
             return apart(browser.picture()[rows], before[rows]) > 60
 
         browser.open(server.url)
-        wait_for(lambda: browser.note() == "" and browser.value("picture.naturalWidth") == SIZE[0], 60, "a picture")
+        wait_for(lambda: browser.note() == "" and browser.value("picture.naturalWidth") == SIZE[0], "a picture")
         assert browser.value("document.title") == "moving.ply"
         assert browser.value("location.search") == "", "the token stays in the address"
         # Panels away: the picture is to the last bit what the painter draws.
         browser.key("h")
-        wait_for(lambda: shows(first), 30, "the picture at the start")
+        wait_for(lambda: shows(first), "the picture at the start")
         browser.key("h")
-        wait_for(lambda: changes(first), 30, "the panels")
+        wait_for(lambda: changes(first), "the panels")
 
         # The slider, dragged to the middle with the mouse; from there to the next whole frame.
         scene_rows, bar_rows = slice(115, 235), slice(252, 282)
         middle, row = SIZE[0] / 2, SIZE[1] - 52
         before = browser.picture()
         browser.mouse("mouseMoved", 25, row)
-        wait_for(lambda: apart(browser.picture()[bar_rows], before[bar_rows]) > 20, 30, "the slider under the mouse")
+        wait_for(lambda: apart(browser.picture()[bar_rows], before[bar_rows]) > 20, "the slider under the mouse")
         browser.mouse("mousePressed", 25, row, down=True)
         for x in np.linspace(25, middle, 6):
             browser.mouse("mouseMoved", float(x), row, down=True)
-        wait_for(lambda: changes(first, scene_rows), 30, "a later time")
+        wait_for(lambda: changes(first, scene_rows), "a later time")
         held = browser.picture()
         browser.mouse("mouseReleased", middle, row)
         # Until imgui has seen the release, it keeps the keys to itself.
-        wait_for(lambda: apart(browser.picture()[bar_rows], held[bar_rows]) > 20, 30, "the slider let go")
+        wait_for(lambda: apart(browser.picture()[bar_rows], held[bar_rows]) > 20, "the slider let go")
         browser.key(".")
         browser.key("h")
         time = (FRAMES // 2 + 1) / (FRAMES - 1)
         later = expected(scene, device, SIZE, time)
-        wait_for(lambda: shows(later), 30, "the frame after the middle")
+        wait_for(lambda: shows(later), "the frame after the middle")
 
         # Another size of the window.
         smaller = (400, 280)
         browser.resize(smaller)
         small = expected(scene, device, smaller, time)
-        wait_for(lambda: shows(small), 30, "the smaller picture")
+        wait_for(lambda: shows(small), "the smaller picture")
 
         # Space plays, and stops.
         browser.key(" ")
-        wait_for(lambda: changes(small), 30, "the playing scene")
+        wait_for(lambda: changes(small), "the playing scene")
         browser.key(" ")
         browser.key("End")
         end = expected(scene, device, smaller, 1.0)
-        wait_for(lambda: shows(end), 30, "the end")
+        wait_for(lambda: shows(end), "the end")
 
         # A second browser watches, and drives once the first one has left.
         with Browser(tmp_path / "other", SIZE) as other:
             other.open(server.url)
-            wait_for(lambda: "watches" in other.note(), 60, "the second browser's note")
+            wait_for(lambda: "watches" in other.note(), "the second browser's note")
             other.key("Home")
             browser.open("about:blank")
-            wait_for(lambda: apart(other.picture(), last) <= 1, 30, "the end, in the second browser's size")
+            wait_for(lambda: apart(other.picture(), last) <= 1, "the end, in the second browser's size")
             other.key("Home")
-            wait_for(lambda: apart(other.picture(), first) <= 1, 30, "the start")
+            wait_for(lambda: apart(other.picture(), first) <= 1, "the start")
 
             assert server.interrupt() == 130
             assert "Traceback" not in "".join(server.said)
             assert server.said[-1] == "lapgs-view: interrupted.\n"
-            wait_for(lambda: "was lost" in other.note(), 30, "the page's word of the lost connection")
+            wait_for(lambda: "was lost" in other.note(), "the page's word of the lost connection")

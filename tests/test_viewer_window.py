@@ -14,8 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers.desktop import PATIENCE, Desktop
+from helpers.desktop import Desktop
 from helpers.scene_files import CONFIG
+from helpers.waiting import PATIENCE
 from numpy.typing import NDArray
 
 from lapgs_wgpu.data import Dataset, load_dataset

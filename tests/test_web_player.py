@@ -16,9 +16,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from helpers.browser import CHROMIUM, WEBGPU, Browser, wait_for
+from helpers.browser import CHROMIUM, WEBGPU, Browser
 from helpers.scene_files import moving_scene
 from helpers.trained_scenes import CONFIGS, OURS, trained
+from helpers.waiting import wait_for
 from helpers.web_pages import (
     FRAMES,
     SIZE,
@@ -91,9 +92,9 @@ def browser(window: Browser, page: Path) -> Browser:
         open_page(window, page.as_uri() + "#")
     window.key("r")
     window.value("(lapgs.onframe = null, location.hash = '#t=1')")
-    wait_for(lambda: window.value("lapgs.time") == 1, 20, "the end")
+    wait_for(lambda: window.value("lapgs.time") == 1, "the end")
     window.value("location.hash = '#t=0&speed=1&loop=loop&background=grey'")
-    wait_for(lambda: window.value("lapgs.time") == 0, 20, "the start")
+    wait_for(lambda: window.value("lapgs.time") == 0, "the start")
     return window
 
 
@@ -329,7 +330,7 @@ def test_200_000_gaussians(window: Browser, folder: Path, device: Device) -> Non
 
 def test_play_pause_and_scrub(browser: Browser, desktop: Desktop) -> None:
     browser.key(" ")
-    wait_for(lambda: browser.value("lapgs.time") > 0.1, 60, "time goes on")
+    wait_for(lambda: browser.value("lapgs.time") > 0.1, "time goes on")
     assert browser.value("lapgs.playing")
     browser.key(" ")
     time = browser.value("lapgs.time")
@@ -368,7 +369,7 @@ def test_keys_fly_by_their_letter(browser: Browser, desktop: Desktop) -> None:
     where = {"key": "s", "code": "Semicolon"}
     browser.value("(window.seen = 0, lapgs.onframe = () => seen++)")
     browser.call("Input.dispatchKeyEvent", type="keyDown", text="s", **where)
-    wait_for(lambda: browser.value("seen") > 2, 60, "the flight")
+    wait_for(lambda: browser.value("seen") > 2, "the flight")
     browser.call("Input.dispatchKeyEvent", type="keyUp", **where)
     assert not same(browser, desktop, 0.0)
     browser.key("v")
@@ -382,7 +383,7 @@ def test_orbit_zoom_and_reset(browser: Browser, desktop: Desktop) -> None:
     browser.mouse("mouseReleased", 160, 100)
     assert same(browser, desktop, 0.0, lambda camera: camera.orbit(60 * ORBIT, 20 * ORBIT))
     browser.call("Input.dispatchMouseEvent", type="mouseWheel", x=100, y=80, deltaX=0, deltaY=-200)
-    wait_for(lambda: not same(browser, desktop, 0.0, lambda camera: camera.orbit(60 * ORBIT, 20 * ORBIT)), 20, "zoom")
+    wait_for(lambda: not same(browser, desktop, 0.0, lambda camera: camera.orbit(60 * ORBIT, 20 * ORBIT)), "zoom")
 
     def zoomed(camera: ViewCamera) -> None:
         camera.orbit(60 * ORBIT, 20 * ORBIT)
@@ -412,7 +413,7 @@ def test_focus(browser: Browser, page: Path, device: Device) -> None:
             ray = [(place[0] + 0.5 - K[0, 2]) / K[0, 0], (place[1] + 0.5 - K[1, 2]) / K[1, 1], 1.0]
             camera.focus_on(camera.position + depth * (T[:3, :3].T @ ray))
 
-        wait_for(lambda focus=focus: same(browser, desktop, 0.0, focus), 30, act)  # type: ignore[misc]
+        wait_for(lambda focus=focus: same(browser, desktop, 0.0, focus), act)  # type: ignore[misc]
         assert psnr(desktop.picture(0.0), desktop.picture(0.0, focus)) < 40
 
 
@@ -420,7 +421,7 @@ def test_pictures_while_it_plays(browser: Browser, desktop: Desktop) -> None:
     """Each is the frame on show, and says of which time; in between, frames go on."""
     browser.value("(window.seen = [], lapgs.onframe = time => seen.push(time))")
     browser.value("location.hash = '#t=0.1&speed=0.02&play'")
-    wait_for(lambda: 0.1 < (browser.value("seen.at(-1)") or 0) < 1, 60, "time goes on")  # 1: a frame asked for before
+    wait_for(lambda: 0.1 < (browser.value("seen.at(-1)") or 0) < 1, "time goes on")  # 1: a frame asked for before
     times = []
     for _ in range(3):
         width, height, time, values = browser.value(
@@ -431,7 +432,7 @@ def test_pictures_while_it_plays(browser: Browser, desktop: Desktop) -> None:
         assert psnr(found, desktop.picture(time, size=(width, height))) >= SAME
         times.append(time)
         frames = len(browser.value("seen"))
-        wait_for(lambda frames=frames: len(browser.value("seen")) > frames + 1, 60, "frames")  # type: ignore[misc]
+        wait_for(lambda frames=frames: len(browser.value("seen")) > frames + 1, "frames")  # type: ignore[misc]
     assert browser.value("lapgs.playing")
     assert 0.1 < times[0] < times[1] < times[2]
     assert set(times) <= set(browser.value("seen"))
@@ -483,12 +484,12 @@ def test_fingers(browser: Browser, desktop: Desktop) -> None:
 
 def test_resize_and_density(browser: Browser, desktop: Desktop) -> None:
     browser.resize((250, 311))
-    wait_for(lambda: browser.value("document.getElementById('canvas').width") == 250, 20, "the canvas")
+    wait_for(lambda: browser.value("document.getElementById('canvas').width") == 250, "the canvas")
     # In a narrow window the width has the field of view that the height has in a wide one: nothing is cut off.
     narrow = 2 * np.arctan(311 / 250 * np.tan(0.5 * desktop.scene.camera().fov_y))
     assert same(browser, desktop, 0.0, lambda camera: setattr(camera, "fov_y", narrow), size=(250, 311))
     browser.call("Emulation.setDeviceMetricsOverride", width=200, height=150, deviceScaleFactor=2, mobile=False)
-    wait_for(lambda: browser.value("document.getElementById('canvas').width") == 400, 20, "the canvas")
+    wait_for(lambda: browser.value("document.getElementById('canvas').width") == 400, "the canvas")
     assert same(browser, desktop, 0.0, size=(400, 300))
 
 
@@ -497,14 +498,14 @@ def test_address_and_script(window: Browser, page: Path, desktop: Desktop) -> No
     assert same(window, desktop, 0.3, background="white")
     assert window.value("[lapgs.time, lapgs.playing]") == [0.3, False]
     window.value("(window.seen = [], lapgs.onframe = time => seen.push(time), lapgs.play())")
-    wait_for(lambda: len(window.value("seen")) > 2, 60, "frames")
-    wait_for(lambda: window.value("lapgs.time") == 1 and not window.value("lapgs.playing"), 60, "the end")
+    wait_for(lambda: len(window.value("seen")) > 2, "frames")
+    wait_for(lambda: window.value("lapgs.time") == 1 and not window.value("lapgs.playing"), "the end")
     seen = window.value("seen")
     assert seen == sorted(seen)
     window.value("lapgs.play()")  # again, from the start
-    wait_for(lambda: 0 < window.value("lapgs.time") < 1, 60, "the clip's start")
+    wait_for(lambda: 0 < window.value("lapgs.time") < 1, "the clip's start")
     window.value("location.hash = '#t=0.5'")
-    wait_for(lambda: window.value("lapgs.time") == 0.5, 20, "the new address")
+    wait_for(lambda: window.value("lapgs.time") == 0.5, "the new address")
     for act in ("lapgs.setTime('x')", "lapgs.setCamera({ fovY: 4 })", "lapgs.setCamera({ position: [0, 1] })"):
         assert "Error" in window.value(f"(() => {{ try {{ {act} }} catch (error) {{ return String(error) }} }})()")
 
@@ -543,7 +544,7 @@ def test_a_dropped_file(browser: Browser, device: Device, folder: Path, desktop:
             browser.call("Input.dispatchDragEvent", type=kind, x=100, y=80, data=data)
 
     drop(folder / "scene.ply")
-    wait_for(lambda: "do not begin as a scene does" in browser.note(), 60, "the sentence")
+    wait_for(lambda: "do not begin as a scene does" in browser.note(), "the sentence")
     assert same(browser, desktop, 0.0)
     for head, reason in (
         (b"", f"its {LARGE} bytes do not begin as a scene does"),
@@ -554,12 +555,12 @@ def test_a_dropped_file(browser: Browser, device: Device, folder: Path, desktop:
             file.write(head)
             file.truncate(LARGE)
         drop(folder / "large.lapgs")
-        wait_for(lambda reason=reason: reason in browser.note(), 60, reason)  # type: ignore[misc]
+        wait_for(lambda reason=reason: reason in browser.note(), reason)  # type: ignore[misc]
         (folder / "large.lapgs").unlink()
     assert same(browser, desktop, 0.0)
     made = export_scene(trained(device, CONFIGS["no dynamics"], 200), folder, device, "dropped")
     drop(made.with_suffix(".lapgs"))
-    wait_for(lambda: browser.note() == "", 120, "the dropped scene")
+    wait_for(lambda: browser.note() == "", "the dropped scene")
     assert same(browser, Desktop(made, device), 0.0)
     browser.key("End")
     assert same(browser, Desktop(made, device), 1.0)
@@ -570,7 +571,7 @@ def test_an_adapter_that_is_too_small(window: Browser, page: Path) -> None:
     script = "Object.defineProperty(GPUSupportedLimits.prototype, 'maxBufferSize', { get: () => 2000 });"
     made = window.call("Page.addScriptToEvaluateOnNewDocument", source=script)
     window.open(page.as_uri() + "?small")
-    wait_for(lambda: "but a buffer of this adapter holds 2000" in window.note(), 60, "the sentence")
+    wait_for(lambda: "but a buffer of this adapter holds 2000" in window.note(), "the sentence")
     window.call("Page.removeScriptToEvaluateOnNewDocument", identifier=made["identifier"])
 
 
@@ -581,7 +582,7 @@ def test_what_cannot_be_fetched(window: Browser, page: Path, server: str) -> Non
         (f"{server}/{page.name}?src={page.name}", "do not begin as a scene does"),
     ):
         window.open(address)
-        wait_for(lambda reason=reason: reason in window.note(), 60, reason)  # type: ignore[misc]
+        wait_for(lambda reason=reason: reason in window.note(), reason)  # type: ignore[misc]
 
 
 def test_a_poor_server(window: Browser, page: Path, device: Device, folder: Path) -> None:
@@ -609,10 +610,10 @@ def test_a_poor_server(window: Browser, page: Path, device: Device, folder: Path
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Poor) as running:
         threading.Thread(target=running.serve_forever, daemon=True).start()
         window.open(f"http://127.0.0.1:{running.server_port}/{page.name}?src=slow.lapgs")
-        wait_for(lambda: window.note().startswith("Loading 0."), 60, "the progress")
+        wait_for(lambda: window.note().startswith("Loading 0."), "the progress")
         assert window.value("document.getElementById('poster').checkVisibility()")
         seen.set()
-        wait_for(lambda: shown(window), 120, "the scene")
+        wait_for(lambda: shown(window), "the scene")
         assert same(window, Desktop(made, device), 0.0)
         running.shutdown()
 
@@ -650,7 +651,7 @@ def test_servers_that_send_too_much_or_too_little(window: Browser, page: Path) -
         ):
             ended.clear()
             window.open(f"http://127.0.0.1:{running.server_port}/{page.name}?src={name}.lapgs")
-            wait_for(lambda reason=reason: reason in window.note(), 60, reason)  # type: ignore[misc]
+            wait_for(lambda reason=reason: reason in window.note(), reason)  # type: ignore[misc]
             assert name == "broken" or ended.wait(30)
         running.shutdown()
 
@@ -663,13 +664,13 @@ def test_in_a_frame(window: Browser, page: Path, server: str, folder: Path) -> N
     )
     window.open(f"{server}/outer.html")
     inner = "document.querySelector('iframe').contentWindow.lapgs"
-    wait_for(lambda: window.value("window.told?.length"), 120, "the scene")
+    wait_for(lambda: window.value("window.told?.length"), "the scene")
     assert window.value("told") == [{"lapgs": "ready"}]
-    wait_for(lambda: window.value(f"{inner}.time") > 0.32, 60, "time goes on")
+    wait_for(lambda: window.value(f"{inner}.time") > 0.32, "time goes on")
     window.value(f"{inner}.setTime(0.9)")
     assert window.value(f"[{inner}.time, {inner}.playing]") == [0.9, False]
     window.value("document.querySelector('iframe').src = 'scene.html?src=missing.lapgs'")
-    wait_for(lambda: window.value("told.length > 1"), 60, "the message")
+    wait_for(lambda: window.value("told.length > 1"), "the message")
     reason = "missing.lapgs cannot be fetched: the server says 404; check the address."
     assert window.value("told[1]") == {"lapgs": "failed", "reason": reason}
 
@@ -677,14 +678,14 @@ def test_in_a_frame(window: Browser, page: Path, server: str, folder: Path) -> N
 def test_a_page_that_is_held_up(browser: Browser) -> None:
     """Time goes on where it stopped, instead of leaping: a tab in the background, or a computer that slept."""
     browser.value("location.hash = '#t=0&speed=0.1&play'")  # 10 seconds
-    wait_for(lambda: browser.value("lapgs.time") > 0, 60, "time goes on")
+    wait_for(lambda: browser.value("lapgs.time") > 0, "time goes on")
     before = browser.value("lapgs.time")
     browser.call("Debugger.enable")
     browser.call("Debugger.pause")  # every script stands still
     sleep(6)
     browser.call("Debugger.resume")
     browser.call("Debugger.disable")
-    wait_for(lambda: browser.value("lapgs.time") > before, 60, "time goes on again")
+    wait_for(lambda: browser.value("lapgs.time") > before, "time goes on again")
     assert browser.value("lapgs.time") < before + 0.3
     browser.value("lapgs.pause()")
 
@@ -694,7 +695,7 @@ def test_a_device_that_is_refused(window: Browser, page: Path) -> None:
     made = window.call("Page.addScriptToEvaluateOnNewDocument", source=script)
     window.open(page.as_uri() + "?refused")
     expected = "Opening the graphics adapter failed (too few): try another browser or a newer driver."
-    wait_for(lambda: window.note() == expected, 60, "the sentence")
+    wait_for(lambda: window.note() == expected, "the sentence")
     assert window.value("document.getElementById('poster').checkVisibility()")
     window.call("Page.removeScriptToEvaluateOnNewDocument", identifier=made["identifier"])
 
@@ -724,7 +725,7 @@ def test_what_failed_is_told(window: Browser, page: Path, script: str, doing: st
     """The adapter is to blame only for its own errors."""
     made = window.call("Page.addScriptToEvaluateOnNewDocument", source=script)
     window.open(page.as_uri() + "?failing")
-    wait_for(lambda: window.note() == f"{doing}: {advice}", 60, doing)
+    wait_for(lambda: window.note() == f"{doing}: {advice}", doing)
     window.call("Page.removeScriptToEvaluateOnNewDocument", identifier=made["identifier"])
 
 
@@ -736,7 +737,7 @@ def test_a_lost_device(window: Browser, page: Path) -> None:
     page_picture(window)
     before = window.picture()
     window.value("device.destroy()")
-    wait_for(lambda: "The graphics device was lost" in window.note(), 20, "the sentence")
+    wait_for(lambda: "The graphics device was lost" in window.note(), "the sentence")
     window.key(".")
     note = int(window.value("document.getElementById('note').getBoundingClientRect().bottom")) + 1
     assert np.abs(window.picture() - before)[note : SIZE[1] - 60].max() < 3
@@ -746,6 +747,6 @@ def test_a_lost_device(window: Browser, page: Path) -> None:
 def test_without_webgpu(page: Path, tmp_path: Path) -> None:
     with Browser(tmp_path / "profile", SIZE) as browser:
         browser.open(page.as_uri())
-        wait_for(lambda: "WebGPU" in browser.note(), 60, "the sentence")
+        wait_for(lambda: "WebGPU" in browser.note(), "the sentence")
         assert browser.value("document.getElementById('poster').complete && !document.getElementById('poster').hidden")
         assert browser.picture()[: SIZE[1] // 2].std() > 10  # the poster shows the scene

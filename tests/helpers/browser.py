@@ -7,7 +7,6 @@ import contextlib
 import json
 import shutil
 import subprocess
-import time
 import urllib.request
 from pathlib import Path
 from types import TracebackType
@@ -16,6 +15,8 @@ from typing import Any
 import imageio.v3 as iio
 import numpy as np
 from numpy.typing import NDArray
+
+from .waiting import wait_for
 
 CHROMIUM = next((path for path in map(shutil.which, ("chromium", "chromium-browser", "google-chrome")) if path), None)
 _FLAGS = (
@@ -61,8 +62,8 @@ class Browser:
         )
         try:
             active = profile / "DevToolsActivePort"
-            port = int(wait_for(lambda: active.is_file() and active.read_text().split(), 60, "Chromium's port")[0])
-            page = wait_for(lambda: _page(port), 60, "Chromium's page")
+            port = int(wait_for(lambda: active.is_file() and active.read_text().split(), "Chromium's port")[0])
+            page = wait_for(lambda: _page(port), "Chromium's page")
             self._socket = self._open.enter_context(connect(page, max_size=None, open_timeout=30))
             self._calls = 0
             self.call("Page.enable")
@@ -128,17 +129,6 @@ class Browser:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait(10)
-
-
-def wait_for(look: Any, seconds: float, what: str) -> Any:
-    """The first true value that `look` returns; fails after that many seconds."""
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        found = look()
-        if found:
-            return found
-        time.sleep(0.1)
-    raise AssertionError(f"{what}: not within {seconds} seconds")
 
 
 def _page(port: int) -> str | None:

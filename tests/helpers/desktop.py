@@ -17,8 +17,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from .waiting import PATIENCE
+
 SIZE = (1024, 768)
-PATIENCE = 90.0  # seconds, on a machine that does much else
 
 
 class Desktop:

@@ -21,7 +21,8 @@ from lapgs_wgpu.viewer.frame import FrameRenderer, FrameRequest
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene, load_scene
 from lapgs_wgpu.viewer.render_modes import BACKGROUNDS
 
-from .browser import Browser, wait_for
+from .browser import Browser
+from .waiting import PATIENCE, wait_for
 
 SIZE = (320, 240)
 FRAMES = 31
@@ -49,11 +50,11 @@ def export_scene(scene: Scene4D, folder: Path, device: Device, name: str = "scen
     return folder / f"{name}.html"
 
 
-def open_page(browser: Browser, url: str, *, seconds: float = 120, first: str = "") -> None:
+def open_page(browser: Browser, url: str, *, seconds: float = PATIENCE, first: str = "") -> None:
     """Open a page and wait until it shows its scene. first: a script that runs before the page's own."""
     made = browser.call("Page.addScriptToEvaluateOnNewDocument", source=first)
     browser.open(url)
-    wait_for(lambda: shown(browser), seconds, "the scene")
+    wait_for(lambda: shown(browser), "the scene", seconds)
     browser.call("Page.removeScriptToEvaluateOnNewDocument", identifier=made["identifier"])
 
 
