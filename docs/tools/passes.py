@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import colorsys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -161,7 +162,7 @@ def blending(scene: Scene4D, camera: Camera) -> Picture:
     colors, transmittances = [], []
     for share in SHARES:
         near = order[: round(share * len(order))]
-        part = Gaussians(*(values[near].contiguous() for values in vars(gaussians).values()))
+        part = replace(gaussians, **{name: of_all[near] for name, of_all in gaussians.arrays().items()})
         image = passes_of(part, camera).image
         colors.append(eight_bit(image[:3].transpose(1, 2, 0)))
         transmittances.append(eight_bit(image[3]))
