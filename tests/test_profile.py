@@ -51,7 +51,6 @@ def test_dispatches_are_timed_beyond_a_flush(device: Device, profile: Profile, m
     names, times = zip(*profile.read(), strict=True)
     assert names == ("scan_reduce",) * 3
     assert min(times) > 0.0
-    assert max(times) == times[1]
 
 
 @pytest.mark.kernels

@@ -8,6 +8,8 @@ import shutil
 import signal
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -462,20 +464,46 @@ def test_the_table_is_written_after_every_run(
     assert "| toys | grid4d | 1 | 25.00 | - |" in (spec_file.parent / "out" / "table.md").read_text()
 
 
+@contextmanager
+def handled(number: int, handler: signal.Handlers) -> Iterator[None]:
+    before = signal.signal(number, handler)
+    try:
+        yield
+    finally:
+        signal.signal(number, before)
+
+
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
 def test_a_signal_ends_a_table_as_ctrl_c_does(
     name: str, spec_file: Path, data: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    before = signal.getsignal(getattr(signal, name))
+    number = getattr(signal, name)
 
     def ended(run: Run, data: Path, out: Path, launch: table.Launch) -> str | None:
-        signal.raise_signal(getattr(signal, name))
+        signal.raise_signal(number)
         return "went on"
 
     monkeypatch.setattr(table, "_train_in_process", ended)
-    assert make(spec_file, data) == command.INTERRUPTED
+    with handled(number, signal.SIG_DFL):  # which the tests themselves may not have, begun by nohup
+        assert make(spec_file, data) == command.INTERRUPTED
+        assert signal.getsignal(number) == signal.SIG_DFL
     assert capsys.readouterr().err.endswith("lapgs-table: stopped in run 1 of 5; the same command goes on.\n")
-    assert signal.getsignal(getattr(signal, name)) == before
+
+
+def test_a_signal_that_is_ignored_ends_no_table(
+    spec_file: Path, data: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As nohup does with SIGHUP."""
+
+    def ignored(run: Run, data: Path, out: Path, launch: table.Launch) -> str | None:
+        signal.raise_signal(signal.SIGHUP)
+        return "went on"
+
+    monkeypatch.setattr(table, "_train_in_process", ignored)
+    with handled(signal.SIGHUP, signal.SIG_IGN):
+        assert make(spec_file, data) == 1
+        assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+    assert capsys.readouterr().err.count("failed: went on") == 2 * 5, "each run, and again at the end"
 
 
 def test_two_tables_do_not_write_to_one_folder(
