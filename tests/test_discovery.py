@@ -34,8 +34,9 @@ from lapgs_wgpu.train.discovery.trajectories import find_trajectories
 from lapgs_wgpu.train.optimizer import Optimizer
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.run import train
+from lapgs_wgpu.train.start import RISE
 from lapgs_wgpu.train.suited import suited
-from lapgs_wgpu.train.trainer import RISE, Trainer
+from lapgs_wgpu.train.trainer import Trainer
 
 RADIUS, BOX = 0.2, 1.3
 QUICK = {

@@ -19,9 +19,9 @@ from lapgs_wgpu.data.motion_writer import write_motion
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.scene import load
-from lapgs_wgpu.train import trainer as training_module
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.distributed import Ranks
+from lapgs_wgpu.train.objective import Look
 from lapgs_wgpu.train.presets import write_toml
 from lapgs_wgpu.train.run import train
 from lapgs_wgpu.train.trainer import Trainer
@@ -63,11 +63,11 @@ def test_every_process_draws_the_same_numbers_and_other_views(
     dataset: Dataset, device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     looked: list[str] = []
-    original = training_module.Trainer._loss
+    original = Trainer._loss
 
-    def note(self: Trainer, look: training_module._Look, moving: bool) -> object:
+    def note(self: Trainer, look: Look) -> object:
         looked.append(look.view.name)
-        return original(self, look, moving)
+        return original(self, look)
 
     monkeypatch.setattr(Trainer, "_loss", note)
     monkeypatch.setattr(Ranks, "gather", lambda self, tensors: [[tensor] * self.count for tensor in tensors])

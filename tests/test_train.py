@@ -23,17 +23,18 @@ from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.checkpoint import read_checkpoint
 from lapgs_wgpu.motion.scene import Scene4D, load
+from lapgs_wgpu.train import objective, trainer
 from lapgs_wgpu.train import run as run_module
-from lapgs_wgpu.train import trainer
 from lapgs_wgpu.train.config import LossWeights
 from lapgs_wgpu.train.dataloader import Pictures
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
+from lapgs_wgpu.train.initial_points import initial_points
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.optimizer import Optimizer
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.run import train
 from lapgs_wgpu.train.step_result import StepResult
-from lapgs_wgpu.train.suited import with_decoder_placed
+from lapgs_wgpu.train.suited import suited, with_decoder_placed
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +71,7 @@ def test_a_run_is_whole(run: Path, dataset: Dataset) -> None:
     assert {file.name for file in run.iterdir()} == {
         "config.toml", "log.jsonl", "metrics.json", "metrics.csv", "checkpoint.ply", "eval",
     }  # fmt: skip
-    assert trainer.suited(configure(), dataset).field.components == 4  # of 8 times
+    assert suited(configure(), dataset).field.components == 4  # of 8 times
     assert load_config(str(run / "config.toml")) == dataclasses.replace(configure(), decoder="torch")
     record = (run / "config.toml").read_text().split("[record]")[1]
     assert all(f"\n{key} = " in record for key in ("lapgs_wgpu", "torch", "adapter", "driver"))
@@ -266,8 +267,8 @@ def test_another_seed_gives_another_model(run: Path, dataset: Dataset, device: D
 def test_nothing_moves_during_the_warm_up(dataset: Dataset, device: Device, tmp_path: Path) -> None:
     config = configure(schedule__steps="4")
     scene = train(config, dataset, tmp_path / "run", device=device)
-    field = trainer.suited(config, dataset).field
-    fresh = Scene4D.from_points(*trainer.initial_points(config.points, dataset, 0), field, device=device)
+    field = suited(config, dataset).field
+    fresh = Scene4D.from_points(*initial_points(config.points, dataset, 0), field, device=device)
     assert scene.field is not None
     assert fresh.field is not None
     for ours, initial in zip(scene.field.parameters(), fresh.field.parameters(), strict=True):
@@ -314,7 +315,7 @@ def test_cross_correlation_counts_once_the_warm_up_is_over(
         seen.append((arguments[4], render_loss(*arguments)))
         return seen[-1][1]
 
-    monkeypatch.setattr(trainer, "render_loss", spy)
+    monkeypatch.setattr(objective, "render_loss", spy)
     options = {"loss__pyramid": "0.2", "loss__ncc": "0.05", "data__background": "random"}
     config = configure(schedule__steps="4", schedule__warm_up="2", **options)
     train(config, dataset, tmp_path / "run", device=device)

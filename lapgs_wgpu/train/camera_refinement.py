@@ -28,10 +28,11 @@ Array = NDArray[np.float64]
 
 class RefinedCamera(NamedTuple):
     """A corrected camera; and `change` (7,), zeros whose gradient is that by a further change of it: a rotation about
-    its center along the world's axes, radians; a shift in units of the cameras' extent; the logarithm of the zoom."""
+    its center along the world's axes, radians; a shift in units of the cameras' extent; the logarithm of the zoom. None
+    where the camera is kept."""
 
     camera: Camera
-    change: Tensor
+    change: Tensor | None
 
 
 class Corrections(NamedTuple):

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 from torch import nn
 
+from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.train.densify import DensityRule, published_rule
 from lapgs_wgpu.train.learning_rate import Rate
 from lapgs_wgpu.train.loss_terms import LossTerm
+from lapgs_wgpu.train.optimizer import FrequencyOptimizer
 from lapgs_wgpu.train.step_result import StepResult
 
 
@@ -40,6 +42,30 @@ class Parts:
     rates: Mapping[str, Rate | float] = dataclasses.field(default_factory=dict)
     callbacks: Sequence[Callback] = ()
 
-    def schedules(self) -> dict[str, Rate]:
-        """Learning rate of each group in `rates`."""
-        return {name: rate if isinstance(rate, Rate) else Rate(rate, rate, 1) for name, rate in self.rates.items()}
+    def rates_of(
+        self, configured: Mapping[str, Rate], gaussians: Collection[str], groups: Collection[str]
+    ) -> dict[str, Rate]:
+        """The learning rate of each group of parameters, by name.
+
+        Args:
+            configured: those of the configuration.
+            gaussians: names of the Gaussians' parameters.
+            groups: names of the field's groups.
+
+        Raises:
+            InputError: a group has no rate, or the name of other parameters, or a rate has no group.
+        """
+        own = {name: rate if isinstance(rate, Rate) else Rate(rate, rate, 1) for name, rate in self.rates.items()}
+        rates = {**configured, **own}
+        for name in groups:
+            if name in gaussians or name == FrequencyOptimizer.name:
+                raise InputError(
+                    f"the field's group {name} has the name of parameters of the training's own; give it another."
+                )
+            if name not in rates:
+                raise InputError(f"the field's group {name} has no learning rate; give Parts(rates={{{name!r}: ...}}).")
+        for name in own:
+            if name not in gaussians and name not in groups:
+                known = ", ".join([*gaussians, *groups])
+                raise InputError(f"Parts(rates=...) names {name}, which is no group of parameters; there are {known}.")
+        return rates

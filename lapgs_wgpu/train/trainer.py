@@ -4,70 +4,50 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import os
-import sys
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device, open_device
 from lapgs_wgpu.io.initial_view import InitialView, captured_arc
 from lapgs_wgpu.motion.fields.config import MIN_SCALE
-from lapgs_wgpu.motion.fields.deformation import Moments, Nearby
-from lapgs_wgpu.motion.fields.dynamics import dynamics_loss
 from lapgs_wgpu.motion.fields.grid_field import GridField
-from lapgs_wgpu.motion.scene import Deformed, Scene4D
+from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.motion.timing import Timing, checked_timing
 from lapgs_wgpu.splat.camera import Camera
-from lapgs_wgpu.train.acceleration import acceleration_loss, draw_moments
 from lapgs_wgpu.train.camera_descent import scene_points
-from lapgs_wgpu.train.camera_refinement import CameraRefinement, Corrections
+from lapgs_wgpu.train.camera_refinement import CameraRefinement, RefinedCamera
 from lapgs_wgpu.train.config import BACKGROUND_LEVELS, Config
 from lapgs_wgpu.train.dataloader import Pictures
 from lapgs_wgpu.train.densify import Statistics
 from lapgs_wgpu.train.density_control import DensityControl
-from lapgs_wgpu.train.discovery.discover import discover
 from lapgs_wgpu.train.discovery.field_fit import keeping_rates
 from lapgs_wgpu.train.distributed import SINGLE_PROCESS, Ranks
 from lapgs_wgpu.train.evaluate import evaluate, mean_psnr
 from lapgs_wgpu.train.exposure import Exposures
-from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
+from lapgs_wgpu.train.fused_loss import RenderLoss
 from lapgs_wgpu.train.host_threads import step_threads, torch_threads
-from lapgs_wgpu.train.initial_points import initial_points
-from lapgs_wgpu.train.loss_terms import Regularizer, check_terms, weight_at
+from lapgs_wgpu.train.loss_terms import check_terms
 from lapgs_wgpu.train.nonfinite import Health, Skipped, cause, check_parameters, finite
+from lapgs_wgpu.train.objective import TERMS, Look, Objective
 from lapgs_wgpu.train.open_dataset import open_dataset, with_folder
 from lapgs_wgpu.train.optimizer import FrequencyOptimizer, Optimizer
 from lapgs_wgpu.train.parts import Parts
-from lapgs_wgpu.train.smoothness import draw_nearby
+from lapgs_wgpu.train.start import Start, note_what_rests, start
 from lapgs_wgpu.train.step_result import StepResult
 from lapgs_wgpu.train.suited import nyquist_frequency, suited, with_decoder_placed
 from lapgs_wgpu.train.timing_refinement import TimingRefinement, image_to_fit
 
 MAX_SH_DEGREE = 3
-# Terms of the configuration, and what stands beside them in the log.
-TERMS = frozenset({"l1", "mse", "ssim", "pyramid", "ncc", "smoothness", "acceleration", "dynamics", "loss", "psnr"})
-
-RISE = 200  # steps over which rates rise after discovery, where schedule.warm_up is 0
-
-
-class _Look(NamedTuple):
-    """A view of a step: the background (3,) that its image lies on; the places that the smoothness loss compares, and
-    the moments that the acceleration loss does, None in steps without them."""
-
-    view: View
-    background: Tensor
-    nearby: Nearby | None
-    moments: Moments | None
 
 
 class Trainer:
@@ -144,98 +124,45 @@ class Trainer:
             )
         self.ranks = ranks
         self.done = 0
-        self.discovery: str | None = None
-        self.discovery_seconds = 0.0
         self._threads = step_threads(config.field, device)
-        self._field_fitted = False  # by discovery
-        corrections: Corrections | None = None
-        wanted = config.discovery.enabled and config.field.kind != "static" and scene is None and not resumed
-        reason = _no_discovery(config, parts.field)
-        if wanted and reason:
-            _note(f"motion discovery is left out: {reason}", ranks)
-        if wanted and not reason:
-            with open(os.devnull, "w") as nowhere, torch_threads(self._threads):
-                found = discover(config, dataset, device, Trainer, None if ranks.first else nowhere, parts.field)
-            scene, self._field_fitted, self.discovery, corrections, self.discovery_seconds = found
+        first = start(config, dataset, device, Trainer, ranks, scene=scene, own_field=parts.field, resumed=resumed)
+        self.scene, self.discovery, self.discovery_seconds = first.scene, first.discovery, first.seconds
+        self._warm_up, self._rising = first.warm_up, first.rising
+        if not resumed:
+            note_what_rests(config, first, ranks)
         self._generator = torch.Generator().manual_seed(config.seed)
-        # What discovery found moves from the first step on, at rates that rise: Adam's first steps, all of the size of
-        # the rate, would shake off what the field knows.
-        self._warm_up, self._rising = config.schedule.warm_up, 0
-        if scene is not None:
-            self._warm_up, self._rising = 0, config.schedule.warm_up
-        if self.discovery is not None:
-            self._rising = config.schedule.warm_up or RISE
-        if scene is not None and scene.antialiased != config.antialiased:
-            raise InputError(
-                f"the scene to start from is drawn with antialiased = {scene.antialiased}, and the configuration says "
-                f"{config.antialiased}; give the configuration the scene's."
-            )
-        if scene is None:
-            scene = Scene4D.from_points(
-                *initial_points(config.points, dataset, config.seed),
-                config.field,
-                opacity=config.points.opacity,
-                antialiased=config.antialiased,
-                device=device,
-                seed=config.seed,
-                own_field=parts.field,
-            )
-        self.scene = scene
-        if self.scene.field is not None and self._warm_up >= config.schedule.steps and not resumed:
-            _note(
-                f"nothing moves in this training, since its warm-up (schedule.warm_up: {self._warm_up} steps) is not "
-                f"shorter than schedule.steps ({config.schedule.steps}).",
-                ranks,
-            )
-        if self.scene.field is not None and config.timing.refine and config.timing.start >= config.schedule.steps:
-            _note(
-                f"no times are corrected in this training, since timing.start ({config.timing.start}) is not below "
-                f"schedule.steps ({config.schedule.steps}).",
-                ranks,
-            )
-        self._start(corrections)
+        self._prepare(first)
         self.whole = True
 
-    def _start(self, corrections: Corrections | None) -> None:
+    def _prepare(self, first: Start) -> None:
+        """Make what the steps work with."""
         config, scene, dataset = self.config, self.scene, self.dataset
         if isinstance(scene.field, GridField):
             scene.field.precision = getattr(torch, config.precision)
             scene.field.on_device = config.decoder == "device"
         groups = scene.field.parameter_groups() if scene.field else {}
-        rates = config.rates.schedules() | self.parts.schedules()
-        for name in groups:
-            if name in scene.parameters or name == FrequencyOptimizer.name:
-                raise InputError(
-                    f"the field's group {name} has the name of parameters of the training's own; give it another."
-                )
-        for name in (*groups, *self.parts.rates):
-            if name not in rates or (name in self.parts.rates and name not in {*scene.parameters, *groups}):
-                known = ", ".join([*scene.parameters, *groups])
-                raise InputError(
-                    f"the field's group {name} has no learning rate; give Parts(rates={{{name!r}: ...}})."
-                    if name not in rates
-                    else f"Parts(rates=...) names {name}, which is no group of parameters; there are {known}."
-                )
+        rates = self.parts.rates_of(config.rates.schedules(), scene.parameters, groups)
         self._optimizer = Optimizer(scene.parameters, groups, rates)
-        self._limit_field_rates(fitted=self._field_fitted)
         self._frequencies = None
         if scene.spectrum is not None:
             limit = nyquist_frequency(dataset)
             self._frequencies = FrequencyOptimizer(scene.spectrum, config.rates.frequencies, limit)
         self._exposures = Exposures(len(dataset.train), config.exposure.rate) if config.exposure.enabled else None
-        self._extent = dataset.extent
+        times, extent = len(dataset.times), dataset.extent
+        self._objective = Objective(config, scene, self.parts.losses, times, extent)
+        self._limit_field_rates(fitted=first.fitted)
         self.cameras = None
         if config.cameras.refines(own_footage=dataset.own_footage):
             self.cameras = CameraRefinement(
                 dataset.cameras,
-                self._extent,
+                extent,
                 config.cameras,
                 lambda: scene_points(scene.parameters["means"], scene.parameters["opacity_logits"].sigmoid()),
-                corrections,
+                first.corrections,
             )
         self._color = torch.full((3,), BACKGROUND_LEVELS[config.data.background])  # of the evaluation
         self.timing = None
-        if config.timing.refine and scene.field is not None and len(dataset.times) > 2:
+        if config.timing.refine and scene.field is not None and times > 2:
             truth = partial(image_to_fit, color=self._color)
             self.timing = TimingRefinement(scene, dataset.train, truth, self._picture, self.ranks)
         beside = (self._frequencies, self._exposures, self.cameras)
@@ -247,18 +174,17 @@ class Trainer:
             self.parts.density,
             dataset.train,
             self._camera_of,
-            self._extent,
+            extent,
             self._generator,
         )
         self._numbers = {view.name: number for number, view in enumerate(dataset.train)}
-        self._scales = scene.parameters["log_scales"].detach().exp()
         self._health = Health()
         data = config.data
         self._pictures = Pictures(dataset.train, data.background, data.cache_gb, self._generator, scene.device)
 
     def _limit_field_rates(self, *, fitted: bool) -> None:
         """Hold the field's learning rates low where discovery has fitted it to nearly all that moves."""
-        self._field_fitted = fitted
+        self._objective.followed = fitted
         field = self.scene.field
         self._optimizer.highest = keeping_rates(field.parameter_groups()) if fitted and field else {}
 
@@ -281,7 +207,7 @@ class Trainer:
     def dead_scales(self) -> float:
         """Of the last view that was rendered, the share of the Gaussians' scales that are at the floor, where they get
         no gradient."""
-        return float((self._scales <= MIN_SCALE).float().mean())
+        return float((self._objective.scales <= MIN_SCALE).float().mean())
 
     def evaluate(self, views: Sequence[View] | None = None) -> dict[str, Any]:
         """Measure the scene on views, the test views where None: the content of metrics.json (docs/metrics.md).
@@ -336,13 +262,13 @@ class Trainer:
         # Every rank draws the numbers of all views, so that their random streams stay the same.
         chosen = [self._pictures.choose() for _ in range(config.schedule.batch)]
         drawn = self._generator.get_state()
-        looks = [_Look(*each, *self._elsewhere(each[0].time, moving)) for each in chosen]
+        looks = [self._objective.look(*each, step, self._generator, moving=moving) for each in chosen]
 
         self._zero_grad()
         seen = self._density.nothing_seen()
         renderings, totals = [], Counter[str]()
         for look in looks[ranks.rank :: ranks.count]:
-            loss, rendering, terms = self._loss(look, moving)
+            loss, rendering, terms = self._loss(look)
             (loss / len(looks)).backward()
             seen.add(rendering, look.view.camera, scale=len(looks))
             renderings.append(rendering)
@@ -379,58 +305,11 @@ class Trainer:
         terms = dict(zip(list(totals)[2:], of_terms, strict=True))
         return StepResult(step, config.schedule.steps, value, psnr, skipped, terms, pruned)
 
-    def _elsewhere(self, t: float, moving: bool) -> tuple[Nearby | None, Moments | None]:
-        config, count, generator = self.config, len(self.scene), self._generator
-        if not moving or self.done < config.smoothness.start:
-            return None, None
-        t, times = self.scene.timing(t), len(self.dataset.times)
-        nearby = draw_nearby(config.smoothness, count, t, generator)
-        # What discovery has followed through the clip has its depth from there.
-        rests = self._field_fitted or (self.done + 1) % config.acceleration.interval
-        if rests or self.scene.field is None:
-            return nearby, None
-        return nearby, draw_moments(config.acceleration, count, t, times, generator)
-
-    def _loss(self, look: _Look, moving: bool) -> tuple[Tensor, RenderLoss, dict[str, float]]:
-        """The loss of a view, all terms together, its rendering, and what each term adds."""
-        config, scene, view = self.config, self.scene, look.view
-        if moving:
-            now = scene.deformed(view.time, look.nearby, look.moments)
-        else:
-            now = Deformed(scene.canonical(), None, [])
-        gaussians = now.gaussians
-        weights = config.loss.weights(warm=moving)
-        truth = self._pictures.on_device(view)
-        correction = self.exposure_of(view)
-        weighted = [(term, weight_at(term, self.done + 1)) for term in self.parts.losses]
-        own = [(term, weight) for term, weight in weighted if weight and not isinstance(term, Regularizer)]
-        camera, change = view.camera, None
-        if self.cameras is not None:
-            camera, change = self.cameras.refined(camera)
-        rendering = render_loss(
-            gaussians, camera, truth, look.background, weights, scene.device, correction, own, change, self._extent
-        )
-        self._scales = gaussians.scales.detach()
-        beside: dict[str, Tensor] = {}
-        if now.smoothness is not None:
-            beside["smoothness"] = now.smoothness
-        if look.moments is not None:
-            weight = config.acceleration.weight * config.acceleration.interval
-            beside["acceleration"] = weight * acceleration_loss(now, scene.timing(view.time), look.moments)
-        if moving and "dynamics" in scene.parameters:
-            spread = dynamics_loss(scene.parameters["dynamics"], config.loss.dynamics_mode)
-            beside["dynamics"] = config.loss.dynamics * spread
-        for term, weight in weighted:
-            if weight and isinstance(term, Regularizer):
-                beside[term.name] = weight * term.function(scene, gaussians, view.time)
-        loss = rendering.loss
-        for value in beside.values():
-            loss = loss + value
-        factors = {**weights._asdict(), **{term.name: weight for term, weight in own}}
-        terms = {name: factors[name] * value for name, value in rendering.terms.items() if name in factors}
-        if "ssim" in terms:
-            terms["ssim"] = factors["ssim"] - terms["ssim"]
-        return loss, rendering, terms | {name: value.item() for name, value in beside.items()}
+    def _loss(self, look: Look) -> tuple[Tensor, RenderLoss, dict[str, float]]:
+        """`Objective.loss` of a view, as its camera and its colors are corrected."""
+        view = look.view
+        camera = RefinedCamera(view.camera, None) if self.cameras is None else self.cameras.refined(view.camera)
+        return self._objective.loss(look, self.done + 1, self._pictures.on_device(view), camera, self.exposure_of(view))
 
     def _camera_of(self, view: View) -> Camera:
         """The camera of a training view, corrected where it is."""
@@ -510,7 +389,7 @@ class Trainer:
                 "done": torch.tensor(self.done),
                 "warm_up": torch.tensor(self._warm_up),
                 "rising": torch.tensor(self._rising),
-                "field_fitted": torch.tensor(int(self._field_fitted)),
+                "field_fitted": torch.tensor(int(self._objective.followed)),
                 "sh_degree": torch.tensor(scene.sh_degree),
                 "random": self._generator.get_state(),
                 "order": torch.tensor(self._pictures.order, dtype=torch.int64),
@@ -565,19 +444,3 @@ class Trainer:
 def _timing_state(timing: Timing) -> dict[str, Tensor]:
     """Of a scene that began with a timing, which this training does not change."""
     return {name: torch.from_numpy(values) for name, values in vars(timing).items() if len(values)}
-
-
-def _note(text: str, ranks: Ranks) -> None:
-    """Tell, once among all ranks, what a training will not do."""
-    if ranks.first:
-        print(f"note: {text}", file=sys.stderr, flush=True)
-
-
-def _no_discovery(config: Config, own_field: nn.Module | None) -> str:
-    """Why motion discovery is left out although it is enabled, a sentence; empty where it is done."""
-    steps, needed = config.schedule.steps, config.discovery.steps
-    if steps <= needed:
-        return f"schedule.steps ({steps}) must be larger than discovery.steps ({needed})."
-    if own_field is not None and not any(each.requires_grad for each in own_field.parameters()):
-        return f"the field {type(own_field).__name__} has no parameters that could learn what it finds."
-    return ""

@@ -1,0 +1,133 @@
+"""What a step lowers: the loss of a view, all terms together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lapgs_wgpu.data.views import View
+from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.motion.fields.deformation import Moments, Nearby
+from lapgs_wgpu.motion.fields.dynamics import dynamics_loss
+from lapgs_wgpu.motion.scene import Deformed, Scene4D
+from lapgs_wgpu.train.acceleration import acceleration_loss, draw_moments
+from lapgs_wgpu.train.camera_refinement import RefinedCamera
+from lapgs_wgpu.train.config import Config
+from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
+from lapgs_wgpu.train.loss_terms import LossTerm, Regularizer, weight_at
+from lapgs_wgpu.train.smoothness import draw_nearby
+
+# Terms of the configuration, and what stands beside them in the log.
+TERMS = frozenset({"l1", "mse", "ssim", "pyramid", "ncc", "smoothness", "acceleration", "dynamics", "loss", "psnr"})
+
+
+class Look(NamedTuple):
+    """A view of a step.
+
+    Attributes:
+        view: of the training.
+        background: (3,) that its image lies on.
+        moving: whether the field moves the Gaussians.
+        nearby: the places that the smoothness loss compares; None in steps without it.
+        moments: those that the acceleration loss compares; None in steps without it.
+    """
+
+    view: View
+    background: Tensor
+    moving: bool
+    nearby: Nearby | None
+    moments: Moments | None
+
+
+class Objective:
+    """The loss of each view of a training.
+
+    own: terms beside the configuration's (docs/api.md). times: how many the training images have. extent: of the
+    cameras, world units.
+
+    Attributes:
+        followed: whether discovery has followed nearly all that moves. Its depth is known from there, and the
+            acceleration loss is left out.
+        scales: (N, 3) of the Gaussians of the last view, world units.
+    """
+
+    def __init__(self, config: Config, scene: Scene4D, own: Sequence[LossTerm], times: int, extent: float) -> None:
+        self._config, self._scene, self._own = config, scene, tuple(own)
+        self._times, self._extent = times, extent
+        self.followed = False
+        self.scales = scene.parameters["log_scales"].detach().exp()
+
+    def look(self, view: View, background: Tensor, step: int, generator: torch.Generator, *, moving: bool) -> Look:
+        """Draw what the losses of motion compare in a step, counted from 1."""
+        config, count = self._config, len(self._scene)
+        nearby = moments = None
+        if moving and step > config.smoothness.start:
+            t = self._scene.timing(view.time)
+            nearby = draw_nearby(config.smoothness, count, t, generator)
+            rests = self.followed or step % config.acceleration.interval
+            if not rests and self._scene.field is not None:
+                moments = draw_moments(config.acceleration, count, t, self._times, generator)
+        return Look(view, background, moving, nearby, moments)
+
+    def loss(
+        self,
+        look: Look,
+        step: int,
+        truth: DeviceArray,
+        camera: RefinedCamera,
+        correction: Tensor | None,
+    ) -> tuple[Tensor, RenderLoss, dict[str, float]]:
+        """The loss of a view, its rendering, and what each term adds, by name.
+
+        Args:
+            look: the view.
+            step: counted from 1.
+            truth: (H, W) of `upload_rgba`, the view's picture.
+            camera: that sees it.
+            correction: (3, 4) of the image's colors; None where they are taken as they are.
+        """
+        config, scene, time = self._config, self._scene, look.view.time
+        if look.moving:
+            now = scene.deformed(time, look.nearby, look.moments)
+        else:
+            now = Deformed(scene.canonical(), None, [])
+        gaussians = now.gaussians
+        self.scales = gaussians.scales.detach()
+        weights = config.loss.weights(warm=look.moving)
+        weighted = [(term, weight) for term in self._own if (weight := weight_at(term, step))]
+        own = [(term, weight) for term, weight in weighted if not isinstance(term, Regularizer)]
+        rendering = render_loss(
+            gaussians,
+            camera.camera,
+            truth,
+            look.background,
+            weights,
+            scene.device,
+            correction,
+            own,
+            camera.change,
+            self._extent,
+        )
+        beside: dict[str, Tensor] = {}
+        if now.smoothness is not None:
+            beside["smoothness"] = now.smoothness
+        if look.moments is not None:
+            weight = config.acceleration.weight * config.acceleration.interval
+            beside["acceleration"] = weight * acceleration_loss(now, scene.timing(time), look.moments)
+        if look.moving and "dynamics" in scene.parameters:
+            spread = dynamics_loss(scene.parameters["dynamics"], config.loss.dynamics_mode)
+            beside["dynamics"] = config.loss.dynamics * spread
+        for term, weight in weighted:
+            if isinstance(term, Regularizer):
+                beside[term.name] = weight * term.function(scene, gaussians, time)
+        loss = rendering.loss
+        for value in beside.values():
+            loss = loss + value
+        factors = {**weights._asdict(), **{term.name: weight for term, weight in own}}
+        terms = {name: factors[name] * value for name, value in rendering.terms.items() if name in factors}
+        if "ssim" in terms:
+            terms["ssim"] = factors["ssim"] - terms["ssim"]
+        return loss, rendering, terms | {name: value.item() for name, value in beside.items()}
