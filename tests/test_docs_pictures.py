@@ -44,33 +44,33 @@ def rendered(passes: ModuleType, scene: Scene4D, camera: Camera) -> NDArray[np.u
     return np.asarray(passes.eight_bit(scene.render(camera, passes.TIME).image.numpy()))
 
 
+def panels(passes: ModuleType, picture: NDArray[np.uint8], count: int) -> list[NDArray[np.int64]]:
+    """The squares of a row, which has no other pixels than them and the gaps between."""
+    side, gap = passes.SIZE, passes.GAP
+    assert picture.shape == (side, count * side + (count - 1) * gap, 3)
+    return [picture[:, i * (side + gap) :][:, :side].astype(np.int64) for i in range(count)]
+
+
 def test_each_shows_what_is_rendered(
     passes: ModuleType, scene: Scene4D, camera: Camera, rendered: NDArray[np.uint8]
 ) -> None:
-    side, gap = passes.SIZE, passes.GAP
-    outlined = passes.projected(scene, camera)
-    assert outlined.shape == (side, 3 * side + 2 * gap, 3)
-    assert np.array_equal(outlined[:, -side:], rendered)
+    assert np.array_equal(panels(passes, passes.projected(scene, camera), 3)[-1], rendered)
 
-    blended = passes.blending(scene, camera)
-    assert blended.shape == (2 * side + gap, 4 * side + 3 * gap, 3)
-    assert np.array_equal(blended[:side, -side:], rendered), "all Gaussians are the image"
-    light = blended[-side:].astype(int)
-    panels = [light[:, i * (side + gap) : i * (side + gap) + side] for i in range(4)]
-    assert all((nearer >= farther).all() for nearer, farther in itertools.pairwise(panels))
+    side, blended = passes.SIZE, passes.blending(scene, camera)
+    assert len(blended) == 2 * side + passes.GAP
+    assert np.array_equal(panels(passes, blended[:side], 4)[-1], rendered), "all Gaussians are the image"
+    light = panels(passes, blended[-side:], 4)
+    assert all((nearer >= farther).all() for nearer, farther in itertools.pairwise(light))
 
-    moved = passes.motion(scene, camera)
-    assert moved.shape == (side, 3 * side + 2 * gap, 3)
-    assert np.array_equal(moved[:, :side], passes.eight_bit(scene.render(camera, 0.0).image.numpy()))
+    moved = panels(passes, passes.motion(scene, camera), 3)
+    assert np.array_equal(moved[0], passes.eight_bit(scene.render(camera, 0.0).image.numpy()))
 
 
 def test_tiles_are_the_brighter_the_longer_their_lists(
     passes: ModuleType, scene: Scene4D, camera: Camera, rendered: NDArray[np.uint8]
 ) -> None:
-    side, gap = passes.SIZE, passes.GAP
-    picture = passes.tiles(scene, camera)
-    assert picture.shape == (side, 3 * side + 2 * gap, 3)
-    listed, drawn = (picture[:, i * (side + gap) : i * (side + gap) + side].astype(int).sum(axis=2) for i in (1, 2))
+    _, *heats = panels(passes, passes.tiles(scene, camera), 3)
+    listed, drawn = (heat.sum(axis=2) for heat in heats)
     assert (drawn <= listed).all()
     empty = rendered.sum(axis=2) == 0
     assert listed[empty].mean() < listed[~empty].mean()
