@@ -113,7 +113,7 @@ def test_an_error_of_another_kind_leaves_a_state_too(
     def fail(*_: Any) -> None:
         raise ZeroDivisionError
 
-    after_step(12, lambda: monkeypatch.setattr("lapgs_wgpu.train.trainer.draw_nearby", fail), monkeypatch)
+    after_step(12, lambda: monkeypatch.setattr("lapgs_wgpu.train.objective.draw_nearby", fail), monkeypatch)
     with pytest.raises(ZeroDivisionError):
         train(configure(), dataset, tmp_path, device=device)
     state = load_state(tmp_path)
