@@ -20,7 +20,6 @@ from .playback import Playback
 Floats = NDArray[np.floating]
 
 SAMPLES = 128  # of the clip at least; a field's spectrum has up to 16 cycles
-_MOST_SAMPLES = 1024  # of the clip at first: two of the shortest piece
 _PIECE_SAMPLES = 8  # of a piece at least
 _SHORTEST = 2.0**-9  # of the clip: shorter pieces are not halved
 _BLOCK = 1 << 21  # samples at once: 0.1 GB
@@ -77,13 +76,10 @@ def _bake(
 ) -> Pieces:
     """The pieces of some Gaussians, near enough at the samples."""
     found: list[tuple[Floats, ...]] = []
-    samples = SAMPLES
-    while samples < min(2 * len(playback.timing.times), _MOST_SAMPLES):  # motion bends where images are early or late
-        samples *= 2
-    size = _BLOCK // samples
+    size = _BLOCK // SAMPLES
     for first in range(0, len(rows), size):
         block = rows[first : first + size]
-        values = np.stack([state(playback, t, block) for t in np.linspace(0, 1, samples + 1).tolist()])
+        values = np.stack([state(playback, t, block) for t in np.linspace(0, 1, SAMPLES + 1).tolist()])
         for piece in _halve(playback, values, block, 0.0, 1.0, farthest, shade):
             found.append(piece)
             done((first + len(block) * float(piece[1].max(initial=0))) / len(rows))
@@ -98,10 +94,9 @@ def _bake(
 
 
 def piece_errors(playback: Playback, pieces: Pieces) -> Floats:
-    """(P,) largest displacement of each piece from the playback, world units, at _CHECKS times of the clip and at those
-    of its timing."""
+    """(P,) largest displacement of each piece from the playback, world units, at _CHECKS times of the clip."""
     worst = np.zeros(len(pieces.source))
-    for t in np.union1d(np.linspace(0, 1, _CHECKS), playback.timing.times).tolist():
+    for t in np.linspace(0, 1, _CHECKS).tolist():
         shown = np.flatnonzero((pieces.begin <= t) & ((t < pieces.end) | (pieces.end == 1.0)))
         way = (t - 0.5 * (pieces.begin + pieces.end)[shown])[:, None] * pieces.slopes[shown]
         moved = np.concatenate([pieces.means[shown] + way, roots_of(pieces.scales[shown], pieces.quats[shown])], axis=1)
