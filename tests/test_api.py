@@ -405,6 +405,68 @@ def test_groups_of_ones_own_field_have_rates_of_their_own(dataset: Dataset, devi
     with pytest.raises(InputError, match=r"parameter_groups\(\) of Generous lists more than once: velocity"):
         Trainer(configure(), dataset, device, parts=Parts(field=Generous()))
 
+    class AsOptimizersTakeThem(Grouped):
+        def parameter_groups(self) -> Any:
+            return [{"params": [self.velocity], "lr": 1e-3}]
+
+    with pytest.raises(InputError, match=r"must return lists of parameters by name, such as .*, got a list"):
+        Trainer(configure(), dataset, device, parts=Parts(field=AsOptimizersTakeThem()))
+
+
+def test_groups_may_be_generators(dataset: Dataset, device: Device) -> None:
+    class Generated(Drift):
+        def parameter_groups(self) -> dict[str, Any]:
+            return {"mlp": iter([self.velocity])}
+
+    module = Generated()
+    with Trainer(configure(schedule__warm_up="0"), dataset, device, parts=Parts(field=module)) as trainer:
+        trainer.step()
+    assert module.velocity.abs().max() > 0
+
+
+def test_a_scene_to_start_from_keeps_its_field(dataset: Dataset, device: Device) -> None:
+    with Trainer(configure(), dataset, device, parts=Parts(field=Drift())) as trainer:
+        scene = trainer.scene
+    with pytest.raises(InputError, match=r"keeps its own field; leave out Parts\(field=\.\.\.\)"):
+        Trainer(configure(), dataset, device, scene=scene, parts=Parts(field=Drift()))
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ({"losses": TorchLoss("mine", lambda image, truth: image.mean())}, "losses=...) must be a list, got a T"),
+        ({"losses": [print]}, "must list Regularizer, TorchLoss and WgslLoss, got a builtin_function_or_method"),
+        ({"losses": [TorchLoss("mine", lambda image: image)]}, "the loss 'mine' is called with (image, truth), which"),
+        ({"losses": [Regularizer("mine", lambda a, b: b)]}, "called with (scene, gaussians, t), which"),
+        ({"callbacks": print}, "callbacks=...) must be a list"),
+        ({"callbacks": [lambda result: None]}, "a callback is called with (trainer, result), which it does not take"),
+        ({"callbacks": [5]}, "a callback must be a function of trainer, result, got a int"),
+        ({"density": lambda: None}, "the rule of density control is called with (state), which it does not take"),
+        ({"rates": {"mlp": (1e-2, 1e-3)}}, "gives mlp the rate (0.01, 0.001); give a number of at least 0, or a Rate("),
+        ({"rates": {"mlp": -0.01}}, "gives mlp the rate -0.01"),
+    ],
+)
+def test_parts_of_another_kind_are_refused(parts: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError) as caught:
+        Parts(**parts)
+    assert message in str(caught.value)
+
+
+def test_arguments_of_another_kind_are_refused(dataset: Dataset, device: Device) -> None:
+    with pytest.raises(InputError, match="takes as config what load_config gives, got a dict"):
+        Trainer({}, dataset, device)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="takes as dataset what load_dataset gives, got a str"):
+        Trainer(configure(), "runs/synthetic", device)  # type: ignore[arg-type]
+    with Trainer(configure(), dataset, device) as trainer:
+        view = dataset.test[0]
+        with pytest.raises(InputError, match=r"a Camera, such as view\.camera, got a View"):
+            trainer.scene.render(view, 0.5)  # type: ignore[arg-type]
+        listed, tensor = ([0.25, 0.5, 1], torch.tensor([0.25, 0.5, 1]))
+        images = [trainer.scene.render(view.camera, 0.5, background=each).image for each in (listed, tensor)]
+        assert torch.equal(*images)
+        with pytest.raises(InputError, match=r"not written, since the folder .* does not exist; make it"):
+            trainer.save("nowhere/scene.ply")
+
 
 # Losses of one's own
 

@@ -241,7 +241,9 @@ def test_a_base_that_leads_back(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("key", "text", "message"),
     [
-        ("schedule.stepz", "5", "no option --schedule.stepz; did you mean schedule.steps?"),
+        ("schedule.stepz", "5", "no key 'schedule.stepz'; did you mean schedule.steps?"),
+        ("steps", "5", "no key 'steps'; did you mean schedule.steps?"),
+        ("sh_dc", "5", "no key 'sh_dc'; did you mean rates.sh_dc?"),
         ("schedule.steps", "many", "--schedule.steps must be a whole number, got 'many'"),
         ("rates.means.start", "fast", "--rates.means.start must be a number, got 'fast'"),
         ("field.kind", "grid5d", "did you mean grid4d?"),

@@ -30,6 +30,8 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         os.replace(temporary, path)
     except OSError as error:
         _remove(temporary)
+        if not path.parent.exists():
+            raise InputError(f"{path}: not written, since the folder {path.parent} does not exist; make it.") from error
         raise InputError(
             f"{path}: not written ({error.strerror or error}), and what was there before is unchanged; "
             "free some space or choose a folder that can be written to"

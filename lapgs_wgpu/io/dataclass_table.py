@@ -133,6 +133,8 @@ def field_types(cls: type) -> dict[str, Any]:
 
 
 def did_you_mean(name: str, known: Iterable[str], otherwise: str = ".") -> str:
-    """The end of a sentence about an unknown name: "; did you mean X?" if a known one is close."""
-    close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.6)
+    """The end of a sentence about an unknown name: "; did you mean X?" if a known one is close, or ends with it."""
+    known = list(known)
+    ending = [each for each in known if each.endswith(f".{name}")]
+    close = difflib.get_close_matches(name, ending, n=1, cutoff=0.0) or difflib.get_close_matches(name, known, n=1)
     return f"; did you mean {close[0]}?" if close else otherwise

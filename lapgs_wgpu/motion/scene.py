@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -259,7 +259,9 @@ class Scene4D:
             scales = scales.clamp(min=MIN_SCALE)
         return means, scales
 
-    def render(self, camera: Camera, t: float, background: Tensor | None = None, *, depth: bool = True) -> Rendering:
+    def render(
+        self, camera: Camera, t: float, background: Tensor | Sequence[float] | None = None, *, depth: bool = True
+    ) -> Rendering:
         """Render the scene, without gradients.
 
         Args:
@@ -270,7 +272,14 @@ class Scene4D:
 
         Returns:
             Rendering, on the CPU.
+
+        Raises:
+            InputError: the camera is none.
         """
+        if not isinstance(camera, Camera):
+            raise InputError(f"render takes a Camera, such as view.camera, got a {type(camera).__name__}.")
+        if background is not None:
+            background = torch.as_tensor(background, dtype=torch.float32)
         with torch.no_grad():
             now = self.at(t)
             tensors = (now.means, now.quats, now.scales, now.opacities, now.sh)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection, Mapping, Sequence
+import inspect
+import math
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -12,7 +14,7 @@ from torch import nn
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.train.densify import DensityRule, published_rule
 from lapgs_wgpu.train.learning_rate import Rate
-from lapgs_wgpu.train.loss_terms import LossTerm
+from lapgs_wgpu.train.loss_terms import LossTerm, Regularizer, TorchLoss
 from lapgs_wgpu.train.optimizer import FrequencyOptimizer
 from lapgs_wgpu.train.step_result import StepResult
 
@@ -34,6 +36,9 @@ class Parts:
         density: the rule of density control, called at the steps that the configuration plans for it.
         rates: learning rates by group of parameters: of the field's own groups, and in place of configured ones.
         callbacks: called after each step, in this order.
+
+    Raises:
+        InputError: a part is of another kind, or cannot be called as it will be.
     """
 
     field: nn.Module | None = None
@@ -41,6 +46,31 @@ class Parts:
     density: DensityRule = published_rule
     rates: Mapping[str, Rate | float] = dataclasses.field(default_factory=dict)
     callbacks: Sequence[Callback] = ()
+
+    def __post_init__(self) -> None:
+        """Raises InputError for parts of another kind."""
+        for name, values in (("losses", self.losses), ("callbacks", self.callbacks)):
+            if not isinstance(values, Sequence):
+                raise InputError(f"Parts({name}=...) must be a list, got a {type(values).__name__}.")
+        for term in self.losses:
+            if not isinstance(term, LossTerm):
+                raise InputError(
+                    f"Parts(losses=...) must list Regularizer, TorchLoss and WgslLoss, got a {type(term).__name__}."
+                )
+            if isinstance(term, Regularizer):
+                _check_call(term.function, f"the function of the loss {term.name!r}", "scene, gaussians, t")
+            if isinstance(term, TorchLoss):
+                _check_call(term.function, f"the function of the loss {term.name!r}", "image, truth")
+        for callback in self.callbacks:
+            _check_call(callback, "a callback", "trainer, result")
+        _check_call(self.density, "the rule of density control", "state")
+        for name, rate in self.rates.items():
+            number = isinstance(rate, int | float) and 0 <= rate < math.inf
+            if not number and not isinstance(rate, Rate):
+                raise InputError(
+                    f"Parts(rates=...) gives {name} the rate {rate!r}; give a number of at least 0, or a "
+                    "Rate(start, end, steps)."
+                )
 
     def rates_of(
         self, configured: Mapping[str, Rate], gaussians: Collection[str], groups: Collection[str]
@@ -69,3 +99,17 @@ class Parts:
                 known = ", ".join([*gaussians, *groups])
                 raise InputError(f"Parts(rates=...) names {name}, which is no group of parameters; there are {known}.")
         return rates
+
+
+def _check_call(function: Callable[..., object], what: str, given: str) -> None:
+    """Raises InputError where a function cannot be called with what it is given, a list of names."""
+    if not callable(function):
+        raise InputError(f"{what} must be a function of {given}, got a {type(function).__name__}.")
+    try:
+        takes = inspect.signature(function)
+    except ValueError:  # of a built-in that does not tell
+        return
+    try:
+        takes.bind(*given.split(", "))
+    except TypeError as error:
+        raise InputError(f"{what} is called with ({given}), which it does not take: {error}.") from None

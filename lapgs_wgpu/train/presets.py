@@ -69,7 +69,7 @@ def load_config(
     table: Table = {}
     for key, value in (overrides or {}).items():
         if key not in known:
-            raise InputError(f"there is no option --{key}{did_you_mean(key, known)}")
+            raise InputError(f"there is no key {key!r}{did_you_mean(key, known)}")
         texts = isinstance(value, str) or (isinstance(value, list) and all(isinstance(each, str) for each in value))
         _set(table, key, checked(known[key], from_text(value, known[key]) if texts else value, f"--{key}"))
     return build_config(preset, table, preset, shorthands(method, ablate, ("--field", "--ablate")))

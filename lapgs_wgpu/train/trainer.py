@@ -78,8 +78,8 @@ class Trainer:
         dataset: Dataset | None = None,
         device: Device | None = None,
         ranks: Ranks = SINGLE_PROCESS,
-        scene: Scene4D | None = None,
         *,
+        scene: Scene4D | None = None,
         parts: Parts | None = None,
         resumed: bool = False,
     ) -> None:
@@ -99,6 +99,11 @@ class Trainer:
             InputError: the configuration, the data and the parts do not fit each other.
         """
         parts = parts or Parts()
+        for name, kind, given in (("config", Config, config), ("dataset", Dataset | None, dataset)):
+            if not isinstance(given, kind):
+                raise InputError(f"Trainer takes as {name} what load_{name} gives, got a {type(given).__name__}.")
+        if scene is not None and parts.field is not None:
+            raise InputError("the scene to start from keeps its own field; leave out Parts(field=...).")
         if dataset is None:
             config = with_folder(config, Path("runs"))
             dataset = open_dataset(config)

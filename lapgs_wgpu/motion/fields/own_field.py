@@ -65,7 +65,10 @@ class OwnField(nn.Module):
             move = Deformation(translation=move)
         name = type(self.module).__name__
         if not isinstance(move, Deformation):
-            raise InputError(f"the field {name} must return a Tensor or a Deformation, got {type(move).__name__}.")
+            raise InputError(
+                f"the field {name}, which is called with means and then t, must return a Tensor or a Deformation, got "
+                f"{type(move).__name__}."
+            )
         for part, row in _ROWS.items():
             values = getattr(move, part)
             if values is not None and not isinstance(values, Tensor):
@@ -78,14 +81,20 @@ class OwnField(nn.Module):
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """See motion/fields/deformation.py. Raises InputError where a parameter is not in one group."""
-        grouped = getattr(self.module, "parameter_groups", None)
-        groups: dict[str, list[nn.Parameter]] = grouped() if grouped else {"mlp": list(self.parameters())}
+        grouped, name = getattr(self.module, "parameter_groups", None), type(self.module).__name__
+        given = grouped() if grouped else {"mlp": self.parameters()}
+        if not isinstance(given, Mapping):
+            raise InputError(
+                f'parameter_groups() of {name} must return lists of parameters by name, such as {{"mlp": [...]}}, got '
+                f"a {type(given).__name__}; the learning rates are given by Parts(rates=...)."
+            )
+        groups: dict[str, list[nn.Parameter]] = {group: list(each) for group, each in given.items()}
         listed = Counter(id(parameter) for group in groups.values() for parameter in group)
         missing = [name for name, each in self.module.named_parameters() if listed[id(each)] == 0]
         repeated = [name for name, each in self.module.named_parameters() if listed[id(each)] > 1]
         for fault, names in (("lacks", missing), ("lists more than once:", repeated)):
             if names:
-                raise InputError(f"parameter_groups() of {type(self.module).__name__} {fault} {', '.join(names)}.")
+                raise InputError(f"parameter_groups() of {name} {fault} {', '.join(names)}.")
         return {name: group for name, group in groups.items() if group}
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
