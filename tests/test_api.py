@@ -452,6 +452,15 @@ def test_parts_of_another_kind_are_refused(parts: dict[str, Any], message: str) 
     assert message in str(caught.value)
 
 
+def test_a_field_without_a_module_is_told_before_discovery(
+    dataset: Dataset, device: Device, capsys: pytest.CaptureFixture
+) -> None:
+    config = configure(field__kind="own", schedule__steps="900")
+    with pytest.raises(InputError, match="the field own needs a module, which only Python can give"):
+        Trainer(config, dataset, device)
+    assert capsys.readouterr().err == ""
+
+
 def test_arguments_of_another_kind_are_refused(dataset: Dataset, device: Device) -> None:
     with pytest.raises(InputError, match="takes as config what load_config gives, got a dict"):
         Trainer({}, dataset, device)  # type: ignore[arg-type]

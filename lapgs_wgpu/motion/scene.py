@@ -34,17 +34,9 @@ Field = GridField | MlpField | HexPlaneField | OwnField
 
 
 def make_field(config: FieldConfig, device: Device, seed: int = 0, own: nn.Module | None = None) -> Field | None:
-    """The field of this configuration; None for static scenes. own: the module of the field own.
-
-    Raises InputError where the field is own and no module is given, or the other way round.
-    """
-    if (config.kind == "own") != (own is not None):
-        raise InputError(
-            "the field own needs a module, which only Python can give, such as Trainer(config, parts=Parts(field=...)) "
-            "and load(path, field=...); docs/api.md says more."
-            if own is None
-            else f"the scene has the field {config.kind}, so no module can be given; leave out field=..."
-        )
+    """The field of this configuration; None for static scenes. own: the module of the field own. Raises InputError as
+    `check_own`."""
+    check_own(config, own)
     if config.kind == "static":
         return None
     if own is not None:
@@ -54,6 +46,17 @@ def make_field(config: FieldConfig, device: Device, seed: int = 0, own: nn.Modul
     if config.kind == "hexplane":
         return HexPlaneField(config, seed)
     return GridField(config, device, seed)
+
+
+def check_own(config: FieldConfig, own: nn.Module | None) -> None:
+    """Raises InputError where the field is own and no module is given, or the other way round."""
+    if (config.kind == "own") != (own is not None):
+        raise InputError(
+            "the field own needs a module, which only Python can give, such as Trainer(config, parts=Parts(field=...)) "
+            "and load(path, field=...); docs/api.md says more."
+            if own is None
+            else f"the scene has the field {config.kind}, so no module can be given; leave out field=..."
+        )
 
 
 class Deformed(NamedTuple):

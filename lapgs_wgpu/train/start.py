@@ -11,7 +11,7 @@ from torch import nn
 from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.motion.scene import Scene4D
+from lapgs_wgpu.motion.scene import Scene4D, check_own
 from lapgs_wgpu.train.camera_refinement import Corrections
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.discovery.discover import discover
@@ -72,7 +72,8 @@ def start(
         resumed: leave out discovery, since a saved state replaces the scene.
 
     Raises:
-        InputError: the images show nothing, or the scene is drawn otherwise than the configuration says.
+        InputError: the images show nothing, the field has no module, or the scene is drawn otherwise than the
+            configuration says.
     """
     warm_up = config.schedule.warm_up
     if scene is not None:
@@ -82,6 +83,7 @@ def start(
                 f"{config.antialiased}; give the configuration the scene's."
             )
         return Start(scene, 0, warm_up)
+    check_own(config.field, own_field)  # before discovery
     if config.discovery.enabled and config.field.kind != "static" and not resumed:
         reason = _no_discovery(config, own_field)
         if not reason:
