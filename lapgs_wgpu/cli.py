@@ -149,7 +149,7 @@ def _evaluate(run: Path, given: dict[str, typing.Any], overrides: dict[str, str 
         step = scene.metadata.get("step", "")
         training = {"steps": int(step[:15]) if step.isascii() and step.isdigit() else 0}
     static = _static_fit(Path(given["motion_from"]), device) if given["motion_from"] else None
-    evaluate_run(run, scene, dataset, config.data.background, training, lpips, static)
+    evaluate_run(run, scene, dataset, config.data, training, lpips, static)
     if plots.available():
         plots.plot_run(run, scene)
     else:

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from lapgs_wgpu.command import DEVICE_HELP, HelpFormatter, Parser, guarded
+from lapgs_wgpu.command import DEVICE_HELP, TIME_OVER, HelpFormatter, Parser, guarded
 from lapgs_wgpu.errors import InputError
 
 DESCRIPTION = """\
@@ -23,7 +23,7 @@ interrupted goes on from its last saved state."""
 
 
 def table_command(arguments: Sequence[str] | None = None) -> int:
-    """lapgs-table: returns the exit code, 1 where runs failed."""
+    """lapgs-table: returns the exit code: 1 where runs failed, TIME_OVER where --hours ended it."""
     return guarded("lapgs-table", _table, list(sys.argv[1:] if arguments is None else arguments))
 
 
@@ -39,9 +39,10 @@ def options() -> Parser:
         "runs are reused or, without SPEC.toml, printed")
     add("--device", metavar="NAME", help=DEVICE_HELP)
     add("--lpips-weights", metavar="FILE", help="also compute LPIPS (VGG) with the weights in FILE, a .safetensors "
-        "file (docs/metrics.md)")
-    add("--hours", type=float, metavar="H", help="stop after H hours; the current run saves its state, and the same "
-        "command continues it, also on another machine to which OUT was copied")
+        "file (docs/metrics.md); finished runs without it are measured again, if their checkpoint is there")
+    add("--hours", type=float, metavar="H", help="stop within H hours, of which half a minute is kept for saving; the "
+        "current run saves its state, and the same command continues it, also on another machine to which OUT was "
+        f"copied; while runs are left, the exit code is {TIME_OVER}")
     add("--slim", action="store_true", help="delete checkpoint.ply and eval/ of each finished run, to save disk space")
     # fmt: on
     return parser
@@ -90,4 +91,4 @@ def _table(arguments: list[str]) -> int:
     print(f"{out / 'table.md'}: {done.finished} of {len(spec.runs)} runs{over}")
     for key, reason in done.failed.items():
         print(f"lapgs-table: {key} failed: {reason}", file=sys.stderr)
-    return 1 if done.failed else 0
+    return 1 if done.failed else TIME_OVER if done.stopped else 0

@@ -32,6 +32,7 @@ from lapgs_wgpu.train.config import LossWeights
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
 from lapgs_wgpu.train.learning_rate import Rate
 from lapgs_wgpu.train.loss_terms import LossTerm, torch_loss
+from lapgs_wgpu.train.monitor import monitored_views
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.run import resume, train
 from lapgs_wgpu.train.run_folder import load_state, save_state
@@ -708,6 +709,9 @@ def test_snapshots_and_monitored_views(dataset: Dataset, device: Device, tmp_pat
     names = [view.name for view in dataset.train]
     with pytest.raises(InputError, match=r"eval\.views names 'train_00003', which is no .* did you mean train_"):
         train(config, dataset, tmp_path / "run", device=device)
+    config = configure(eval__interval="18", eval__views=dataset.test[0].name)
+    with pytest.raises(InputError, match=r"names '.*', a test view; those are measured after the training only\."):
+        train(config, dataset, tmp_path / "run", device=device)
     assert not (tmp_path / "run").exists()
     config = configure(eval__snapshots="5, 20", eval__interval="18", eval__views=f"{names[1]},{names[3]}")
     train(config, dataset, tmp_path / "run", device=device)
@@ -720,11 +724,22 @@ def test_snapshots_and_monitored_views(dataset: Dataset, device: Device, tmp_pat
     assert [(x["step"], x["val_views"]) for x in lines if "val_psnr" in x] == [
         (step, f"{names[1]},{names[3]}") for step in (18, 36)
     ]
+    assert [view.name for view in monitored_views(dataset, f"{names[1]}, {names[1]}")[1]] == [names[1]]
     blind = dataclasses.replace(dataset, val=())
     with pytest.raises(InputError, match="no views for validation"):
         train(configure(eval__interval="1", eval__views="val"), blind, tmp_path / "other", device=device)
     with pytest.raises(InputError, match="snapshots must be whole numbers, separated by commas, got '5;7'"):
         configure(eval__snapshots="5;7")
+
+
+def test_options_of_the_evaluation_without_effect_are_told(
+    dataset: Dataset, device: Device, capsys: pytest.CaptureFixture
+) -> None:
+    config = configure(eval__snapshots="5, 500", eval__views="train", timing__refine="false")
+    Trainer(config, dataset, device).close()
+    told = capsys.readouterr().err
+    assert f"note: eval.snapshots names step 500, which is none of the {STEPS} steps of schedule.steps.\n" in told
+    assert "note: eval.views has no effect, since eval.interval is 0.\n" in told
 
 
 def test_tensorboard_gets_the_figures_of_the_log(dataset: Dataset, device: Device, tmp_path: Path) -> None:

@@ -111,6 +111,12 @@ def test_ablations_add_up_and_must_be_known() -> None:
         load_config("dnerf", ablate=["laplace"])
     with pytest.raises(InputError, match="did you mean hexplane"):
         load_config("dnerf", method="hexplanes")
+    with pytest.raises(InputError, match="must be static or mlp or hexplane or grid4d or laplacian, got 'own'"):
+        load_config("dnerf", method="own")
+    assert not load_config("dnerf", method="grid4d", ablate=["hash"]).field.temporal_hash
+    for method, part in (("grid4d", "ncc"), ("static", "dynamics"), ("hexplane", "hash")):
+        with pytest.raises(InputError, match=f"{part}: only the method laplacian has this part, not {method}"):
+            load_config("dnerf", method=method, ablate=[part])
 
 
 def test_overrides() -> None:
@@ -186,7 +192,7 @@ def test_unknown_preset(preset: str, message: str) -> None:
     [
         ("steps = ", "cannot be read as TOML"),
         ("steps = 5", "no key steps"),
-        ('base = "dnerf"\n[schedule]\nstepz = 5', "no key schedule.stepz; did you mean steps?"),
+        ('base = "dnerf"\n[schedule]\nstepz = 5', "no key schedule.stepz; did you mean schedule.steps?"),
         ('base = "dnerf"\n[schedule]\nsteps = "5"', "schedule.steps must be a whole number, got '5'"),
         ('base = "dnerf"\n[schedule]\nsteps = 5.0', "schedule.steps must be a whole number, got 5.0"),
         ('base = "dnerf"\n[schedule]\nsteps = true', "schedule.steps must be a whole number, got True"),

@@ -28,7 +28,14 @@ from lapgs_wgpu.viewer import options as view_options
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 TEXTS = {str(file.relative_to(ROOT)): file.read_text(encoding="utf-8") for file in DOCUMENTS}
-LANGUAGES = {"python", "wgsl", "js", "bibtex", "text"}  # of fenced blocks; those without one are commands for a shell
+LANGUAGES = {
+    "python",
+    "wgsl",
+    "js",
+    "bibtex",
+    "text",
+    "toml",
+}  # of fenced blocks; those without one are commands for a shell
 
 
 def blocks(text: str) -> list[tuple[str, str]]:
@@ -136,6 +143,14 @@ def commands() -> list[tuple[str, str]]:
 
 
 COMMANDS = commands()
+
+
+def test_descriptions_of_tables_can_be_read(tmp_path: Path) -> None:
+    found = [block for text in TEXTS.values() for language, block in blocks(text) if language == "toml"]
+    assert found
+    for block in found:
+        (tmp_path / "spec.toml").write_text(block)
+        assert read_spec(tmp_path / "spec.toml").runs
 
 
 def train(words: list[str]) -> None:

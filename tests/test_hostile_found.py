@@ -249,7 +249,7 @@ def test_nothing_is_written_through_a_link(tmp_path: Path) -> None:
     (run / ".lock").unlink()
     (run / "eval").symlink_to(mine)
     with pytest.raises(InputError, match="eval is a link"):
-        evaluate_run(run, None, None, "black", {})  # type: ignore[arg-type]
+        evaluate_run(run, None, None, None, {})  # type: ignore[arg-type]
     for name in ("config.toml", "log.jsonl", STATE):
         (run / name).symlink_to(mine / "file")
     with pytest.MonkeyPatch.context() as patch:

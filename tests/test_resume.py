@@ -160,7 +160,7 @@ def test_a_run_that_was_measured_halfway_goes_on(
         interrupt_at(20, patched)
         with pytest.raises(KeyboardInterrupt):
             train(configure(), dataset, out, device=device)
-    evaluate_run(out, load(out / "checkpoint.ply", device), dataset, "black", {"steps": 20})
+    evaluate_run(out, load(out / "checkpoint.ply", device), dataset, configure().data, {"steps": 20})
     assert json.loads((out / "metrics.json").read_text())["training"] == {"steps": 20}
     resume(configure(), dataset, out, device=device)
     assert (out / "checkpoint.ply").read_bytes() == (whole / "checkpoint.ply").read_bytes()

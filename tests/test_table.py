@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from lapgs_wgpu import command, table_cli
+from lapgs_wgpu import cli, command, table_cli
 from lapgs_wgpu.data import motion_writer, synthetic
 from lapgs_wgpu.data.motion_scenes import MotionScene
 from lapgs_wgpu.data.synthetic import write_synthetic
@@ -125,7 +125,7 @@ MISTAKES = {
     "no seeds": ("seeds = [3, 5]\n", "", "seeds must be a list of different whole numbers from 0 up, got None"),
     "a seed twice": ("seeds = [3, 5]\n", "seeds = [3, 3]\n", "different whole numbers"),
     "unknown preset": ('"tiny"', '"tinny"', "did you mean tiny?"),
-    "unknown key of the configuration": ("width", "widht", "no key field.widht; did you mean width?"),
+    "unknown key of the configuration": ("width", "widht", "no key field.widht; did you mean field.width?"),
     "wrong value": ("steps = 3", 'steps = "3"', "schedule.steps must be a whole number, got '3'"),
     "value out of range": ("steps = 3", "steps = 0", "at least 1, got 0"),
     "wrong value in a row": ('kind = "static"', 'kind = "statik"', "did you mean static?"),
@@ -218,8 +218,8 @@ def test_the_mean_over_scenes_weighs_scenes_alike_and_counts_them() -> None:
 def test_results_say_with_what_they_were_made() -> None:
     runs = (result(), result(seed=1), result(seed=2, environment={"torch": "3"}, size=(12, 12)))
     text = markdown(Results("name", "tiny", runs))
-    assert "torch 2 (2 runs); torch 3 (1 runs)." in text
-    assert "2 test views of 24x24 (2 runs); 2 test views of 12x12 (1 runs)." in text
+    assert "torch 2 (2 runs); torch 3 (1 run)." in text
+    assert "2 test views of 24x24 (2 runs); 2 test views of 12x12 (1 run)." in text
 
 
 CURVE = ((10.0, 24.0), (20.0, 34.0), (30.0, 33.5))
@@ -298,7 +298,7 @@ def trained(monkeypatch: pytest.MonkeyPatch) -> list[RunKey]:
         metrics = {"psnr": 20.0 + run.key.seed, "ssim": 0.5, "gaussians": 50, "size": (24, 24), "views": [{}, {}]}
         (out / "metrics.json").write_text(json.dumps({**metrics, "training": training}))
 
-    monkeypatch.setattr(table, "_train_in_process", train)
+    monkeypatch.setattr(table, "_run_in_process", train)
     return done
 
 
@@ -394,10 +394,90 @@ def test_weights_for_lpips_reach_every_run_and_are_checked_first(
     assert f"--lpips-weights={tmp_path / 'vgg.safetensors'}" in commands[0]
 
 
+def with_large_images(folder: Path) -> None:
+    """The runs of the fixture `trained` are large enough for LPIPS."""
+    for file in folder.rglob("metrics.json"):
+        file.write_text(json.dumps({**json.loads(file.read_text()), "size": [64, 64]}))
+
+
+def test_finished_runs_without_lpips_are_measured_again(
+    spec_file: Path,
+    data: Path,
+    trained: list[RunKey],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    out = spec_file.parent / "out"
+    assert make(spec_file, data) == 0
+    with_large_images(out)
+    (out / "results.json").unlink()
+    (out / "toys" / "grid4d" / "seed5" / "checkpoint.ply").unlink()
+    measured: list[RunKey] = []
+
+    def measure(run: Run, data: Path, out: Path, launch: table.Launch) -> None:
+        measured.append(run.key)
+        metrics = json.loads((out / "metrics.json").read_text())
+        (out / "metrics.json").write_text(json.dumps({**metrics, "lpips": 0.25}))
+
+    monkeypatch.setattr("lapgs_wgpu.train.lpips.Lpips", lambda file: None)
+    monkeypatch.setattr(table, "_run_in_process", measure)
+    for _ in range(2):
+        assert make(spec_file, data, "--lpips-weights", str(spec_file.parent / "vgg.safetensors")) == 0
+        told = capsys.readouterr().err
+        assert "1 finished runs, such as toys, grid4d, seed 5, have no LPIPS and no checkpoint" in told
+        assert len(measured) == 4
+    runs = read_results(out / "results.json").runs
+    assert [run.lpips for run in runs] == [None if run.row == "grid4d" else 0.25 for run in runs]
+
+
+def test_a_trained_run_is_measured_on_the_views_of_the_table(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """lapgs-train --eval on other views does not make figures of theirs a table's."""
+    spec, out = tmp_path / "spec.toml", tmp_path / "out"
+    spec.write_text(SPEC.replace("seeds = [3, 5]", "seeds = [5]").replace('static = { field.kind = "static" }\n', ""))
+    shutil.copytree(data, tmp_path / "data")
+    shutil.copy(tmp_path / "data/toys/transforms_test.json", tmp_path / "data/toys/transforms_val.json")
+    assert make(spec, tmp_path / "data") == 0
+    before = (out / "table.md").read_bytes()
+    assert "2 test views of 24x24" in before.decode()
+    run = out / "toys" / "grid4d" / "seed5"
+    assert cli.train_command(["--eval", str(run), "--data.split", "val"]) == 0
+    assert "2 validation views of 24x24" in capsys.readouterr().out
+    assert json.loads((run / "metrics.json").read_text())["split"] == "val"
+    checkpoint = (run / "checkpoint.ply").stat()
+    (out / "results.json").unlink()
+    assert make(spec, tmp_path / "data") == 0
+    assert (run / "checkpoint.ply").stat() == checkpoint, "it is measured, not trained"
+    assert (out / "table.md").read_bytes() == before
+
+    spec.write_text(spec.read_text().replace("[common]", '[common]\ndata.split = "val"'))
+    assert make(spec, tmp_path / "data") == 0
+    assert "2 validation views of 24x24" in (out / "table.md").read_text()
+
+
+def test_views_to_watch_are_checked_before_any_training(
+    spec_file: Path, data: Path, trained: list[RunKey], capsys: pytest.CaptureFixture[str]
+) -> None:
+    watched = 'grid4d = { eval.interval = 1, eval.views = "r_9", '
+    spec_file.write_text(SPEC.replace("grid4d = { ", watched))
+    assert make(spec_file, data) == 2
+    assert "eval.views names 'r_9'" in capsys.readouterr().err
+    assert not trained
+
+
+def test_curves_go_with_the_table_that_had_them(spec_file: Path, data: Path, trained: list[RunKey]) -> None:
+    out = spec_file.parent / "out"
+    out.mkdir()
+    (out / "curves.png").write_bytes(b"of another table")
+    assert make(spec_file, data, "--hours", "0.001") == command.TIME_OVER
+    assert not (out / "curves.png").exists()
+
+
 def test_a_table_stops_in_time(
     spec_file: Path, data: Path, trained: list[RunKey], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert make(spec_file, data, "--hours", "0.001") == 0
+    assert make(spec_file, data, "--hours", "0.001") == command.TIME_OVER
     assert not trained
     assert capsys.readouterr().out.endswith("0 of 5 runs; the time is over, and the same command goes on\n")
     assert make(spec_file, data, "--hours", "1") == 0
@@ -427,7 +507,7 @@ def test_a_run_that_is_stopped_in_time_goes_on(
     capsys.readouterr()
     with monkeypatch.context() as patched:
         patched.setattr(table.threading, "Timer", Soon)
-        assert make(spec, data, "--hours", "1") == 0
+        assert make(spec, data, "--hours", "1") == command.TIME_OVER
     monkeypatch.undo()
     assert "0 of 1 runs; the time is over" in capsys.readouterr().out
     steps = [json.loads(line)["step"] for line in (tmp_path / "out" / log).read_text().splitlines()]
@@ -449,7 +529,7 @@ def test_the_table_is_written_after_every_run(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    original, seen = table._train_in_process, []
+    original, seen = table._run_in_process, []
 
     def look(run: Run, data: Path, out: Path, launch: table.Launch) -> str | None:
         seen.append(len(read_results(spec_file.parent / "out" / "results.json").runs))
@@ -457,7 +537,7 @@ def test_the_table_is_written_after_every_run(
             raise KeyboardInterrupt
         return original(run, data, out, launch)
 
-    monkeypatch.setattr(table, "_train_in_process", look)
+    monkeypatch.setattr(table, "_run_in_process", look)
     assert make(spec_file, data) == command.INTERRUPTED
     assert capsys.readouterr().err.endswith("lapgs-table: stopped in run 4 of 5; the same command goes on.\n")
     assert seen == [0, 1, 2, 3]
@@ -483,7 +563,7 @@ def test_a_signal_ends_a_table_as_ctrl_c_does(
         signal.raise_signal(number)
         return "went on"
 
-    monkeypatch.setattr(table, "_train_in_process", ended)
+    monkeypatch.setattr(table, "_run_in_process", ended)
     with handled(number, signal.SIG_DFL):  # which the tests themselves may not have, begun by nohup
         assert make(spec_file, data) == command.INTERRUPTED
         assert signal.getsignal(number) == signal.SIG_DFL
@@ -499,7 +579,7 @@ def test_a_signal_that_is_ignored_ends_no_table(
         signal.raise_signal(signal.SIGHUP)
         return "went on"
 
-    monkeypatch.setattr(table, "_train_in_process", ignored)
+    monkeypatch.setattr(table, "_run_in_process", ignored)
     with handled(signal.SIGHUP, signal.SIG_IGN):
         assert make(spec_file, data) == 1
         assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN

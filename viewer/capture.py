@@ -40,13 +40,15 @@ class Capture:
 
 
 def open_capture(checkpoint: Path, metadata: Mapping[str, str]) -> Capture | None:
-    """The capture that the config.toml beside a checkpoint names; None where there is none, or it is not here.
+    """The capture that the config.toml of a checkpoint's run names; None where there is none, or it is not here.
 
     metadata: of the checkpoint, empty for files of other projects; it tells whether the capture was normalized."""
     from lapgs_wgpu.data import load_dataset  # not before the first picture
 
     try:
-        data = read_toml(checkpoint.parent / "config.toml")["data"]
+        folder = checkpoint.parent
+        run = folder.parent if folder.name == "snapshots" else folder  # as eval.snapshots saves them
+        data = read_toml(run / "config.toml")["data"]
         path, size = Path(data["path"]), int(data["size"])
         dataset = load_dataset(
             path,

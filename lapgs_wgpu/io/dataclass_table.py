@@ -58,7 +58,8 @@ def build_dataclass(cls: type[T], table: Any, source: str, prefix: str = "", *, 
     for key in table:
         if key not in types:
             known = f"; known: {', '.join(types)}."
-            raise InputError(f"{source}: there is no key {prefix}{key}{did_you_mean(key, types, known)}")
+            hint = did_you_mean(f"{prefix}{key}", [f"{prefix}{each}" for each in types], known)
+            raise InputError(f"{source}: there is no key {prefix}{key}{hint}")
     values: dict[str, Any] = {}
     for field in dataclasses.fields(cls):  # type: ignore[arg-type]
         name, kind = field.name, types[field.name]

@@ -26,8 +26,10 @@ def monitored_views(dataset: Dataset, wanted: str) -> tuple[str, Sequence[View]]
     if wanted in ("auto", "train"):
         return "train", spread_views(dataset.train, SOME)
     known = {view.name: view for view in (*dataset.train, *dataset.val)}
-    names = [name.strip() for name in wanted.split(",")]
+    names = list(dict.fromkeys(name.strip() for name in wanted.split(",")))
     for name in names:
+        if name not in known and any(name == view.name for view in dataset.test):
+            raise InputError(f"eval.views names {name!r}, a test view; those are measured after the training only.")
         if name not in known:
             hint = did_you_mean(name, known, f"; they go from {next(iter(known))} to {list(known)[-1]}.")
             raise InputError(f"eval.views names {name!r}, which is no training or validation view{hint}")

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 from lapgs_wgpu.errors import InputError, shown
 from lapgs_wgpu.io.dataclass_table import build_dataclass, checked, did_you_mean, field_types, from_text
 from lapgs_wgpu.io.safe_json_toml import read_toml
-from lapgs_wgpu.motion.fields.config import FieldKind
+from lapgs_wgpu.motion.fields.config import Method
 from lapgs_wgpu.train.config import Config
 
 Table = dict[str, Any]
@@ -93,12 +93,14 @@ def shorthands(method: str | None, ablate: Iterable[str], names: tuple[str, str]
     """
     values: dict[str, Any] = {}
     if method is not None:
-        values["field.kind"] = checked(FieldKind, method, names[0])
+        values["field.kind"] = checked(Method, method, names[0])
         values |= PAPER_ONLY if method != "laplacian" else {}
     for part in ablate:
         if part not in ABLATIONS:
             hint = did_you_mean(part, ABLATIONS)
             raise InputError(f"{names[1]} knows {', '.join(ABLATIONS)}, not {shown(part)}{hint}")
+        if method not in (None, "laplacian") and (method, part) != ("grid4d", "hash"):
+            raise InputError(f"{names[1]} {part}: only the method laplacian has this part, not {method}.")
         _, key, value = ABLATIONS[part]
         values[key] = value
     return values

@@ -23,7 +23,7 @@ from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.progress import Progress, say
-from lapgs_wgpu.train.config import Background, Config
+from lapgs_wgpu.train.config import Config, DataConfig
 from lapgs_wgpu.train.distributed import SINGLE_PROCESS, Ranks
 from lapgs_wgpu.train.evaluate import evaluate, write_metrics
 from lapgs_wgpu.train.log import Log
@@ -32,6 +32,7 @@ from lapgs_wgpu.train.malloc import keep_freed_memory, return_freed_memory
 from lapgs_wgpu.train.monitor import Monitor, Snapshots, monitored_views
 from lapgs_wgpu.train.parts import Callback, Parts
 from lapgs_wgpu.train.run_folder import (
+    SPLITS,
     STATE,
     check_run_folder,
     check_state,
@@ -225,7 +226,7 @@ def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None)
     if training.timing is not None:
         measured["image_times"] = training.timing.report()
     try:
-        evaluate_run(out, scene, training.dataset, config.data.background, measured, lpips)
+        evaluate_run(out, scene, training.dataset, config.data, measured, lpips)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(
             f"stopped after the last step, while the test views were measured; lapgs-train --resume {out} goes on."
@@ -302,32 +303,33 @@ def evaluate_run(
     out: Path,
     scene: Scene4D,
     dataset: Dataset,
-    background: Background,
+    data: DataConfig,
     training: dict[str, Any],
     lpips: Lpips | None = None,
     static: Scene4D | None = None,
 ) -> dict[str, object]:
     """Evaluate on the test views; write metrics.json, metrics.csv and eval/ of a run folder; returns the metrics.
 
-    lpips, static: as `evaluate` takes them.
+    data: says which views the dataset's test views are, and on which background. lpips, static: as `evaluate` takes
+    them.
     """
     for folder in (out / "eval", out / "eval" / "plots"):
         if folder.is_symlink():
             raise InputError(f"{folder} is a link, and pictures are written into the run's own folder only; remove it.")
     (out / "eval").mkdir(exist_ok=True)
     unit = dataset.extent if "cameras" in training else None  # they were refined
-    with Progress(len(dataset.test), "test views measured") as progress:
+    with Progress(len(dataset.test), f"{SPLITS[data.split]} views measured") as progress:
         metrics = evaluate(
             scene,
             dataset.test,
-            background,
+            data.background,
             out / "eval",
             lpips=lpips,
             static=static,
             camera_unit=unit,
             progress=progress,
         )
-    metrics["training"] = training
+    metrics |= {"split": data.split, "training": training}
     write_metrics(out, metrics)
     return metrics
 

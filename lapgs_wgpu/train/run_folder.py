@@ -32,6 +32,8 @@ RUN_FILES = (
     STATE, STATE_BEFORE,
 )  # fmt: skip
 
+SPLITS = {"test": "test", "val": "validation"}  # how the views of a data.split are called
+
 State = Mapping[str, NDArray[Any]]
 
 
@@ -42,7 +44,10 @@ def check_run_folder(out: Path, *, overwrite: bool) -> None:
     if not out.exists() or all(entry.name == LOCK or entry.match(".*.tmp") for entry in out.iterdir()):
         return
     if not overwrite:
-        raise InputError(f"{out} is not empty; name another folder with --out, or replace its run with --overwrite.")
+        goes_on = ", go on with its interrupted run with --resume" if (out / STATE).is_file() else ""
+        raise InputError(
+            f"{out} is not empty; name another folder with --out{goes_on}, or replace its run with --overwrite."
+        )
     if not (out / "config.toml").is_file() or not (_recorded(out) or (out / "log.jsonl").is_file()):
         raise InputError(
             f"{out} holds files, but no run that --overwrite could replace; name another folder with --out."
@@ -139,9 +144,9 @@ def _recorded(out: Path) -> dict[str, str]:
 def result_text(run: Path) -> str:
     """What metrics.json of a finished run says, in a line."""
     metrics = json.loads((run / "metrics.json").read_text())
-    views, size = len(metrics["views"]), metrics["size"]
+    views, size = f"{len(metrics['views'])} {SPLITS[metrics.get('split', 'test')]}", metrics["size"]
     return (
-        f"{run}: {metrics['psnr']:.2f} dB PSNR, {metrics['ssim']:.4f} SSIM on {views} test views of "
+        f"{run}: {metrics['psnr']:.2f} dB PSNR, {metrics['ssim']:.4f} SSIM on {views} views of "
         f"{size[0]}x{size[1]}{_aligned(metrics)}, {metrics['gaussians']} Gaussians"
     )
 

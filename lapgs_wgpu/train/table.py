@@ -22,12 +22,15 @@ from pathlib import Path
 from statistics import mean
 from typing import NamedTuple
 
-from lapgs_wgpu.data import load_dataset
+from lapgs_wgpu.data import Dataset, load_dataset
 from lapgs_wgpu.data.builtin import is_builtin, write_builtin
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import open_device
 from lapgs_wgpu.io.atomic import atomic_write
+from lapgs_wgpu.io.safe_json_toml import read_json
 from lapgs_wgpu.train import plots
+from lapgs_wgpu.train.lpips import SMALLEST
+from lapgs_wgpu.train.monitor import monitored_views
 from lapgs_wgpu.train.presets import load_config, write_toml
 from lapgs_wgpu.train.run_folder import has_state, locked_folder
 from lapgs_wgpu.train.table_results import Result, Results, read_results, read_run, write_results
@@ -72,7 +75,8 @@ def make_table(
 
     data: the folder in which the scenes lie. known: finished runs from elsewhere, beside those of out/results.json and
     of the run folders out/SCENE/ROW/seedN. slim: drop checkpoint and pictures of each run that is done. lpips: weights
-    for it. hours: after which the run under way is stopped, so that the next call goes on with it.
+    for it; finished runs that lack it are measured again. hours: after which the run under way is stopped, so that the
+    next call goes on with it.
     An interrupted run goes on from its last saved state. Raises InputError before the first training starts.
     """
     launch = Launch(device, lpips, None if hours is None else time.monotonic() + 3600 * hours - SAVING)
@@ -85,7 +89,8 @@ def make_table(
 def _train_table(spec: Spec, data: Path, out: Path, known: Sequence[Results], launch: Launch, slim: bool) -> Outcome:
     stored = [read_results(out / "results.json")] if (out / "results.json").exists() else []
     finished = _finished(spec, out, [*stored, *known])
-    pending = [run for run in spec.runs if run.key not in finished]
+    again = _to_measure_again(spec, out, finished) if launch.lpips else []
+    pending = again + [run for run in spec.runs if run.key not in finished]
     folders = _scene_folders(pending, data, out)
     if pending:
         open_device(launch.device)  # only to learn now, and not from every run, that it is not there
@@ -96,13 +101,12 @@ def _train_table(spec: Spec, data: Path, out: Path, known: Sequence[Results], la
     for run in pending:
         if launch.seconds_left <= 0:
             return Outcome(len(finished), failed, stopped=True)
-        number = len(finished) + len(failed) + 1
-        print(
-            f"run {number} of {len(spec.runs)}: {run.key} ({_time_left(spec.runs, finished, failed)})", file=sys.stderr
-        )
+        number = len(finished.keys() | failed.keys() | {run.key})
+        what = "measured again" if run.key in finished else _time_left(spec.runs, finished, failed)
+        print(f"run {number} of {len(spec.runs)}: {run.key} ({what})", file=sys.stderr)
         folder = run_folder(out, run.key)
         try:
-            reason = _train_in_process(run, folders[run.folder], folder, launch)
+            reason = _run_in_process(run, folders[run.folder], folder, launch)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(f"stopped in run {number} of {len(spec.runs)}; the same command goes on.") from None
         result = read_run(folder, run)
@@ -151,16 +155,43 @@ def _finished(spec: Spec, out: Path, known: Sequence[Results]) -> dict[RunKey, R
     return finished
 
 
+def _to_measure_again(spec: Spec, out: Path, finished: Mapping[RunKey, Result]) -> list[Run]:
+    """The finished runs without LPIPS, those that still have a checkpoint; the others are told of."""
+    lacking = [
+        run
+        for run in spec.runs
+        if (done := finished.get(run.key)) is not None and done.lpips is None and min(done.size) >= SMALLEST
+    ]
+    again = [run for run in lacking if _is_trained(run, run_folder(out, run.key))]
+    gone = [run.key for run in lacking if run not in again]
+    if gone:
+        print(
+            f"{len(gone)} finished runs, such as {gone[0]}, have no LPIPS and no checkpoint in their folders in {out} "
+            "by which to measure it.",
+            file=sys.stderr,
+        )
+    return again
+
+
 def _scene_folders(pending: Sequence[Run], data: Path, out: Path) -> dict[str, Path]:
     """Where the scenes of these runs lie; each is opened once, so that its mistakes show before any training."""
-    folders = {}
-    names = list(dict.fromkeys(run.folder for run in pending))
-    for name in names:
-        if not is_builtin(name):
+    folders: dict[str, Path] = {}
+    datasets: dict[str, Dataset] = {}
+    for run in pending:
+        name = run.folder
+        if name not in folders and is_builtin(name):
+            folders[name] = write_builtin(name, out / ".data").resolve()  # names of scenes start with no dot
+        elif name not in folders:
             folders[name] = (data / name).resolve()
-            load_dataset(folders[name])
-    for name in filter(is_builtin, names):
-        folders[name] = write_builtin(name, out / ".data").resolve()  # names of scenes start with no dot
+            if not folders[name].exists():
+                raise InputError(
+                    f"the scene {run.key.scene} of the table: {folders[name]} does not exist; --data names the folder "
+                    "of its scenes."
+                )
+            datasets[name] = load_dataset(folders[name])
+        if run.config.eval.interval:
+            datasets[name] = datasets.get(name) or load_dataset(folders[name])
+            monitored_views(datasets[name], run.config.eval.views)
     return folders
 
 
@@ -184,7 +215,9 @@ def _write(spec: Spec, out: Path, finished: Mapping[RunKey, Result]) -> None:
     ordered = tuple(finished[run.key] for run in spec.runs if run.key in finished)
     write_results(out, Results(spec.name, spec.preset, ordered))
     curves = {str(run.key): run.curve for run in ordered if run.curve}
-    if curves and plots.available():
+    if not curves:
+        (out / "curves.png").unlink(missing_ok=True)  # of an earlier table
+    elif plots.available():
         plots.quality_curves(out / "curves.png", curves)
 
 
@@ -202,22 +235,33 @@ def _time_left(runs: Sequence[Run], finished: Mapping[RunKey, Result], failed: M
     return f"about {timedelta(seconds=round(left))} left"
 
 
-def _goes_on(run: Run, out: Path) -> bool:
-    """Whether the folder holds this very run, interrupted, with a state from which it goes on."""
+def _holds(run: Run, out: Path) -> bool:
+    """Whether the folder holds this very run."""
     try:
-        made = fingerprint(load_config(str(out / "config.toml")))
+        return fingerprint(load_config(str(out / "config.toml"))) == run.fingerprint
     except InputError:  # not there, or damaged
         return False
-    return has_state(out) and made == run.fingerprint
 
 
-def _train_in_process(run: Run, data: Path, out: Path, launch: Launch) -> str | None:
-    """lapgs-train with this configuration; what it tells goes to stderr. Returns why it failed, None if it did not."""
+def _is_trained(run: Run, out: Path) -> bool:
+    """Whether the folder holds this very run, trained to its end, with its checkpoint."""
+    try:
+        steps = read_json(out / "metrics.json")["training"]["steps"]
+    except (InputError, KeyError, TypeError):
+        return False
+    return _holds(run, out) and steps == run.config.schedule.steps and (out / "checkpoint.ply").is_file()
+
+
+def _run_in_process(run: Run, data: Path, out: Path, launch: Launch) -> str | None:
+    """lapgs-train with this configuration, or lapgs-train --eval where it was trained already; what it tells goes to
+    stderr. Returns why it failed, None if it did not."""
     with tempfile.TemporaryDirectory() as work:
         preset = Path(work) / "config.toml"
         preset.write_text(write_toml(dataclasses.asdict(run.config)), encoding="utf-8")
         command = [sys.executable, "-m", "lapgs_wgpu.cli", f"--data={data}"]
-        if _goes_on(run, out):
+        if _is_trained(run, out):
+            command += ["--eval", str(out.resolve()), f"--data.split={run.config.data.split}"]
+        elif has_state(out) and _holds(run, out):
             command += ["--resume", str(out.resolve())]
         else:
             command += [str(preset), f"--out={out.resolve()}", "--overwrite"]

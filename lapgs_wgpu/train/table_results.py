@@ -15,7 +15,9 @@ from lapgs_wgpu.errors import InputError, shown
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.io.dataclass_table import Options, build_dataclass, checked, option
 from lapgs_wgpu.io.safe_json_toml import read_json, read_toml
+from lapgs_wgpu.train.config import HeldOut
 from lapgs_wgpu.train.presets import Table, load_config
+from lapgs_wgpu.train.run_folder import SPLITS
 from lapgs_wgpu.train.table_spec import Run, RunKey, fingerprint
 
 FORMAT = "lapgs-table 1"
@@ -41,6 +43,7 @@ class Result(Options):
     views: int = option("number of test views")
     overrides: Table = option("what the configuration changed of the preset")
     environment: dict[str, str] = option("versions, adapter and driver")
+    split: HeldOut = option("which views these figures are of, as data.split", "test")
     ms_ssim: float | None = option("mean over the test views; None where it was not measured", None)
     lpips: float | None = option("mean over the test views; None where it was not measured", None)
     lpips_unscaled: float | None = option("the same of inputs in [0, 1]; None where it was not measured", None)
@@ -70,14 +73,16 @@ class Results:
 
 
 def read_run(folder: Path, run: Run) -> Result | None:
-    """What a run folder holds; None where the run is not finished, or has another configuration."""
+    """What a run folder holds; None where the run is not finished, has another configuration, or was measured on other
+    views."""
     try:
         metrics = read_json(folder / "metrics.json")
         record = read_toml(folder / "config.toml")["record"]
         made = fingerprint(load_config(str(folder / "config.toml")))
         # An interrupted run that lapgs-train --eval measured has metrics, too.
         steps, seconds = metrics["training"]["steps"], metrics["training"]["seconds"]
-        if made != run.fingerprint or steps != run.config.schedule.steps:
+        split = metrics.get("split", run.config.data.split)
+        if (made, steps, split) != (run.fingerprint, run.config.schedule.steps, run.config.data.split):
             return None
         entry = {
             **run.key._asdict(),
@@ -89,6 +94,7 @@ def read_run(folder: Path, run: Run) -> Result | None:
             "seconds": seconds,
             "size": metrics["size"],
             "views": len(metrics["views"]),
+            "split": split,
             "overrides": run.overrides,
             "environment": record,
             "curve": _curve(folder / "log.jsonl"),
@@ -137,8 +143,12 @@ def merge_results(parts: Sequence[Results]) -> Results:
     runs: dict[RunKey, Result] = {}
     for part in parts:
         for run in part.runs:
-            if runs.setdefault(run.key, run).fingerprint != run.fingerprint:
-                raise InputError(f"{run.key}: the files hold this run in two configurations; give the SPEC, too.")
+            first = runs.setdefault(run.key, run)
+            if first.fingerprint != run.fingerprint:
+                raise InputError(
+                    f"{run.key}: the files hold this run in two configurations, {shown(first.overrides)} and "
+                    f"{shown(run.overrides)} beside the preset; give the SPEC, too."
+                )
     return Results(parts[0].name, parts[0].preset, tuple(runs.values()))
 
 
@@ -190,7 +200,8 @@ def _times_to_quality(cells: Mapping[tuple[str, str], Sequence[Result]]) -> Iter
     """The table of the seconds that the runs of each scene and row took to reach each of QUALITIES, and of the best."""
     yield (
         "Seconds of training, motion discovery included, until the validation views reach a PSNR: means over the "
-        "seeds, - where a seed does not reach it."
+        "seeds, - where a seed does not reach it. best: the highest PSNR of these views. Only rows whose runs measured "
+        "the validation views."
     )
     yield ""
     columns = [f"{psnr} dB" for psnr in QUALITIES]
@@ -271,11 +282,14 @@ def _environments(results: Results) -> Iterable[str]:
     )
     if any(run.psnr_moving is not None for run in results.runs):
         yield ""
+        yield "moving PSNR is of moving pixels (docs/metrics.md)."
+    if any(run.found is not None for run in results.runs):
+        yield ""
         yield (
-            "moving PSNR is of moving pixels; found, the share of test frames with each moving object in its place; "
-            "track, the error of its position in diameters, - where it is not found (docs/metrics.md)."
+            "found is the share of test frames with each moving object in its place; track, the error of its position "
+            "in diameters, - where it is not found (docs/metrics.md)."
         )
-    sizes = Counter(f"{run.views} test views of {'x'.join(map(str, run.size))}" for run in results.runs)
+    sizes = Counter(f"{run.views} {SPLITS[run.split]} views of {'x'.join(map(str, run.size))}" for run in results.runs)
     shown = ("adapter", "driver", "system", "python", "torch", "wgpu", "lapgs_wgpu", "revision")
     made = Counter(
         ", ".join(f"{name} {run.environment[name]}" for name in shown if name in run.environment)
@@ -283,4 +297,5 @@ def _environments(results: Results) -> Iterable[str]:
     )
     for counter in (sizes, made):
         yield ""
-        yield "; ".join(f"{text} ({n} runs)" if len(counter) > 1 else text for text, n in counter.items()) + "."
+        counted = ((text, f"{n} run{'s' if n > 1 else ''}") for text, n in counter.items())
+        yield "; ".join(f"{text} ({runs})" if len(counter) > 1 else text for text, runs in counted) + "."

@@ -9,7 +9,8 @@ from ...io.dataclass_table import Options, option
 from ...splat.constants import CONSTANTS
 from .hash_grid_config import TIME, GridShape, HashConfig
 
-FieldKind = Literal["static", "mlp", "hexplane", "grid4d", "laplacian", "own"]
+Method = Literal["static", "mlp", "hexplane", "grid4d", "laplacian"]
+FieldKind = Literal[Method, "own"]
 Motion = Literal["laplacian", "mlp"]
 NegativeScales = Literal["floor", "mirror"]
 Appearance = Literal["none", "color", "color+opacity"]
