@@ -252,6 +252,9 @@ def test_a_run_goes_on_with_its_own_capture_only(
     with monkeypatch.context() as patched:
         interrupt_at(5, patched)
         assert cli.train_command(["--resume", str(run), "--data", str(moved)]) == 130
+    capfd.readouterr()
+    assert cli.train_command(["--eval", str(run)]) == 0
+    assert f"note: {run} was interrupted; its checkpoint is of step 5 of 6.\n" in capfd.readouterr().err
     assert cli.train_command(["--resume", str(run)]) == 0  # config.toml names the new folder
     assert read_toml(run / "config.toml")["data"]["path"] == str(moved)
     assert read_toml(run / "config.toml")["record"]["data"] == dataset.fingerprint

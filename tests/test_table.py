@@ -119,7 +119,7 @@ def test_the_committed_specs_are_valid(file: Path) -> None:
 
 
 MISTAKES = {
-    "motion scene": ('toys = "toys"', 'toys = "motion:pth=2"', "no key pth; did you mean path?"),
+    "motion scene": ('toys = "toys"', 'toys = "motion:pth=2"', "scenes.toys: motion:pth=2: there is no key pth; did"),
     "no TOML": ('preset = "tiny"', "preset = tiny", "cannot be read as TOML"),
     "unknown key": ("seeds = [3, 5]", "sedes = [3, 5]", "no key sedes; did you mean seeds?"),
     "no seeds": ("seeds = [3, 5]\n", "", "seeds must be a list of different whole numbers from 0 up, got None"),

@@ -177,7 +177,10 @@ def _scenes(value: Any, path: Path) -> dict[str, tuple[str, Table]]:
             )
         folder = entry.pop("folder")
         if is_builtin(folder):
-            builtin_folder(folder)  # checks its keys
+            try:
+                builtin_folder(folder)  # checks its keys
+            except InputError as error:
+                raise InputError(f"{path}: scenes.{name}: {error}") from None
         scenes[name] = (folder, _overrides(entry, f"{path}: scenes.{name}"))
     return scenes
 
