@@ -733,13 +733,12 @@ def test_snapshots_and_monitored_views(dataset: Dataset, device: Device, tmp_pat
 
 
 def test_options_of_the_evaluation_without_effect_are_told(
-    dataset: Dataset, device: Device, capsys: pytest.CaptureFixture
+    dataset: Dataset, device: Device, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
-    config = configure(eval__snapshots="5, 500", eval__views="train", timing__refine="false")
-    Trainer(config, dataset, device).close()
+    train(configure(eval__snapshots="5, 500", eval__views="train"), dataset, tmp_path / "run", device=device)
     told = capsys.readouterr().err
-    assert f"note: eval.snapshots names step 500, which is none of the {STEPS} steps of schedule.steps.\n" in told
-    assert "note: eval.views has no effect, since eval.interval is 0.\n" in told
+    assert f"warning: eval.snapshots names step 500, which is none of the {STEPS} steps of schedule.steps.\n" in told
+    assert "warning: eval.views has no effect, since eval.interval is 0.\n" in told
 
 
 def test_tensorboard_gets_the_figures_of_the_log(dataset: Dataset, device: Device, tmp_path: Path) -> None:

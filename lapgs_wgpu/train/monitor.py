@@ -9,6 +9,7 @@ from pathlib import Path
 from lapgs_wgpu.data.views import Dataset, View, spread_views
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.dataclass_table import did_you_mean
+from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.step_result import StepResult
 from lapgs_wgpu.train.trainer import Trainer
@@ -34,6 +35,16 @@ def monitored_views(dataset: Dataset, wanted: str) -> tuple[str, Sequence[View]]
             hint = did_you_mean(name, known, f"; they go from {next(iter(known))} to {list(known)[-1]}.")
             raise InputError(f"eval.views names {name!r}, which is no training or validation view{hint}")
     return wanted, [known[name] for name in names]
+
+
+def without_effect(config: Config) -> list[str]:
+    """A sentence for each option of eval that asks for what will not be done."""
+    steps, found = config.schedule.steps, []
+    if late := sorted(step for step in config.eval.snapshot_steps if not 0 < step <= steps):
+        found.append(f"eval.snapshots names step {late[0]}, which is none of the {steps} steps of schedule.steps.")
+    if config.eval.views != "auto" and not config.eval.interval:
+        found.append("eval.views has no effect, since eval.interval is 0.")
+    return found
 
 
 class Monitor:

@@ -29,7 +29,7 @@ from lapgs_wgpu.train.evaluate import evaluate, write_metrics
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.lpips import Lpips
 from lapgs_wgpu.train.malloc import keep_freed_memory, return_freed_memory
-from lapgs_wgpu.train.monitor import Monitor, Snapshots, monitored_views
+from lapgs_wgpu.train.monitor import Monitor, Snapshots, monitored_views, without_effect
 from lapgs_wgpu.train.parts import Callback, Parts
 from lapgs_wgpu.train.run_folder import (
     SPLITS,
@@ -89,7 +89,7 @@ def train(
     found += check_in_view(dataset, first_points(dataset, PROBES, config.points.box, config.seed)[0])
     if ranks.first:
         check_run_folder(out, overwrite=overwrite)
-        for warning in (*dataset.warnings, *found, *_precision_warnings(config)):
+        for warning in (*dataset.warnings, *found, *_precision_warnings(config), *without_effect(config)):
             print(f"warning: {warning}", file=sys.stderr, flush=True)
         if dataset.normalization is not None:
             say(f"placement: {dataset.normalization}")

@@ -118,11 +118,6 @@ def note_what_rests(config: Config, first: Start, ranks: Ranks) -> None:
             f"schedule.steps ({steps}).",
             ranks,
         )
-    watched = config.eval
-    if late := sorted(step for step in watched.snapshot_steps if not 0 < step <= steps):
-        _note(f"eval.snapshots names step {late[0]}, which is none of the {steps} steps of schedule.steps.", ranks)
-    if watched.views != "auto" and not watched.interval:
-        _note("eval.views has no effect, since eval.interval is 0.", ranks)
 
 
 def _note(text: str, ranks: Ranks) -> None:

@@ -177,7 +177,7 @@ def _scene_folders(pending: Sequence[Run], data: Path, out: Path) -> dict[str, P
     """Where the scenes of these runs lie; each is opened once, so that its mistakes show before any training."""
     folders: dict[str, Path] = {}
     datasets: dict[str, Dataset] = {}
-    for run in pending:
+    for run in sorted(pending, key=lambda run: is_builtin(run.folder)):  # those that are written, last
         name = run.folder
         if name not in folders and is_builtin(name):
             folders[name] = write_builtin(name, out / ".data").resolve()  # names of scenes start with no dot
