@@ -220,6 +220,7 @@ def test_results_say_with_what_they_were_made() -> None:
     text = markdown(Results("name", "tiny", runs))
     assert "torch 2 (2 runs); torch 3 (1 run)." in text
     assert "2 test views of 24x24 (2 runs); 2 test views of 12x12 (1 run)." in text
+    assert "\n2 validation views of 24x24." in markdown(Results("name", "tiny", (result(split="val"),)))
 
 
 CURVE = ((10.0, 24.0), (20.0, 34.0), (30.0, 33.5))
@@ -450,10 +451,6 @@ def test_a_trained_run_is_measured_on_the_views_of_the_table(
     assert make(spec, tmp_path / "data") == 0
     assert (run / "checkpoint.ply").stat() == checkpoint, "it is measured, not trained"
     assert (out / "table.md").read_bytes() == before
-
-    spec.write_text(spec.read_text().replace("[common]", '[common]\ndata.split = "val"'))
-    assert make(spec, tmp_path / "data") == 0
-    assert "2 validation views of 24x24" in (out / "table.md").read_text()
 
 
 def test_views_to_watch_are_checked_before_any_training(
