@@ -145,12 +145,15 @@ def commands() -> list[tuple[str, str]]:
 COMMANDS = commands()
 
 
-def test_descriptions_of_tables_can_be_read(tmp_path: Path) -> None:
+def test_configurations_and_descriptions_of_tables_can_be_read(tmp_path: Path) -> None:
     found = [block for text in TEXTS.values() for language, block in blocks(text) if language == "toml"]
     assert found
     for block in found:
-        (tmp_path / "spec.toml").write_text(block)
-        assert read_spec(tmp_path / "spec.toml").runs
+        (tmp_path / "a.toml").write_text(block)
+        if block.startswith("base ="):
+            load_config(tmp_path / "a.toml")
+        else:
+            assert read_spec(tmp_path / "a.toml").runs
 
 
 def train(words: list[str]) -> None:
