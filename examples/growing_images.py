@@ -1,4 +1,4 @@
-"""Small images first, whole ones from a step on: the same training goes on, with all that its optimizer knows.
+"""Small images first, larger ones from a step on: the same training goes on, with all that its optimizer knows.
 
 python examples/growing_images.py --data DIR --preset dnerf-400 --small 400 --until 8000
 """
@@ -11,6 +11,7 @@ parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.R
 parser.add_argument("--data", default="synthetic", help="folder of a capture, or a built-in scene")
 parser.add_argument("--preset", default="demo")
 parser.add_argument("--small", type=int, default=64, help="width of the first steps' images, pixels")
+parser.add_argument("--large", type=int, default=0, help="width of the others', 0: as they are")
 parser.add_argument("--until", type=int, default=200, help="number of steps on small images")
 parser.add_argument("--steps", type=int, default=300, help="number of all steps")
 parser.add_argument("--out", default="scene.ply")
@@ -33,13 +34,13 @@ def main() -> float:
         while small.done < given.until:
             small.step()
         state = small.state()
-    with Trainer(load_config(given.preset, {**known, "data.size": 0}), resumed=True) as whole:
-        whole.restore(state)
-        whole.callbacks.append(report)
-        for _ in whole:
+    with Trainer(load_config(given.preset, {**known, "data.size": given.large}), resumed=True) as large:
+        large.restore(state)
+        large.callbacks.append(report)
+        for _ in large:
             pass
-        psnr: float = whole.evaluate()["psnr"]
-        whole.save(given.out)
+        psnr: float = large.evaluate()["psnr"]
+        large.save(given.out)
     print(f"{given.out}: {psnr:.2f} dB on the test views")
     return psnr
 
