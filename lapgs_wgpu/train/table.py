@@ -156,7 +156,7 @@ def _finished(spec: Spec, out: Path, known: Sequence[Results]) -> dict[RunKey, R
 
 
 def _to_measure_again(spec: Spec, out: Path, finished: Mapping[RunKey, Result]) -> list[Run]:
-    """The finished runs without LPIPS, those that still have a checkpoint; the others are told of."""
+    """The finished runs that lack LPIPS and still have a checkpoint. A line on stderr counts those without one."""
     lacking = [
         run
         for run in spec.runs
