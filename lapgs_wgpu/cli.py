@@ -148,7 +148,8 @@ def _evaluate(run: Path, given: dict[str, typing.Any], overrides: dict[str, str 
     except (InputError, KeyError, TypeError):
         step = scene.metadata.get("step", "")
         training = {"steps": int(step[:15]) if step.isascii() and step.isdigit() else 0}
-    done, steps = training.get("steps") if isinstance(training, dict) else None, config.schedule.steps
+    steps = config.schedule.steps
+    done = training.get("steps") if isinstance(training, dict) else None
     if isinstance(done, int) and done < steps:
         print(f"note: {run} was interrupted; its checkpoint is of step {done} of {steps}.", file=sys.stderr)
     static = _static_fit(Path(given["motion_from"]), device) if given["motion_from"] else None

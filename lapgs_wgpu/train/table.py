@@ -162,12 +162,14 @@ def _to_measure_again(spec: Spec, out: Path, finished: Mapping[RunKey, Result]) 
         for run in spec.runs
         if (done := finished.get(run.key)) is not None and done.lpips is None and min(done.size) >= SMALLEST
     ]
-    again = [run for run in lacking if _is_trained(run, run_folder(out, run.key))]
-    gone = [run.key for run in lacking if run not in again]
+    again: list[Run] = []
+    gone: list[Run] = []
+    for run in lacking:
+        (again if _is_trained(run, run_folder(out, run.key)) else gone).append(run)
     if gone:
         print(
-            f"{len(gone)} finished runs, such as {gone[0]}, have no LPIPS and no checkpoint in their folders in {out} "
-            "by which to measure it.",
+            f"{len(gone)} finished runs, such as {gone[0].key}, have no LPIPS and no checkpoint in their folders in "
+            f"{out} by which to measure it.",
             file=sys.stderr,
         )
     return again
