@@ -158,6 +158,15 @@ def test_still_cameras_share_one_pose(rig: Path, device: Device) -> None:
         assert agreement(data, moved(frame), device, shown) > 50
 
 
+def test_folders_of_cameras_may_be_links(rig: Path) -> None:
+    """Also to places above themselves, which are entered once."""
+    expected = [view.source for view in load_dataset(rig).train]
+    (rig / "images/cam01").rename(rig / "elsewhere")
+    (rig / "images/cam01").symlink_to(rig / "elsewhere")
+    (rig / "elsewhere/up").symlink_to(rig / "images")
+    assert [view.source for view in load_dataset(rig).train] == expected
+
+
 def test_pictures_without_a_pose_are_left_out_with_a_warning(toy: Path) -> None:
     shutil.copyfile(toy / "images/frame_0001.png", toy / "images/frame_0099.png")
     data = load_dataset(toy)
@@ -277,7 +286,7 @@ BAD: dict[str, tuple[Spoil, list[str]]] = {
     "no images in it": (lambda f: (f / "sparse/0/images.txt").write_text("#\n"), ["sparse/0", "no image"]),
     "not text": (lambda f: (f / "sparse/0/images.txt").write_bytes(b"\xff\xfe"), ["images.txt", "not text"]),
     "sizes mixed": (picture((32, 24)), ["frame_0002.png", "32x24", "64x48"]),
-    "no numbers": (renamed(lambda i: "abcdefg"[i] + ".png"), ["b.png", "0 numbers", "times.json"]),
+    "no numbers": (renamed(lambda i: "abcdefg"[i] + ".png"), ["b.png", "no numbers", "times.json"]),
     "two numbers": (renamed(lambda i: f"a{i}_{i * i}.png"), ["a1_1.png", "differ in 2 numbers", "times.json"]),
     "some numbers": (renamed(lambda i: f"a{i}.png" if i != 3 else "a.png"), ["a.png", "0", "times.json"]),
     "a number twice": (renamed(lambda i: f"{'ab'[i % 2]}{i // 2}.png"), ["frame number 1"]),

@@ -264,6 +264,8 @@ BAD: dict[str, tuple[Callable[[Path, Scene], Any], list[str]]] = {
     "focal length of a frame": (frame_with(fl_x=1e9), [*FRAME, "fl_x is 1e+09"]),
     "principal point of text": (scene_with(cx="middle"), ["cx", '"middle"']),
     "fourth radial coefficient": (scene_with(k4=0.1), ["k4 is 0.1", "undistort"]),
+    "fisheye": (scene_with(camera_model="OPENCV_FISHEYE"), ["camera_model", "OPENCV_FISHEYE", "undistort"]),
+    "upright size of a wide picture": (scene_with(w=8, h=12), ["12x8", "8x12", "proportions"]),
     "angle of NaN": (scene_with(camera_angle_x=math.nan), ["camera_angle_x", "nan"]),
     "no frames": (lambda folder, scene: scene["train"].pop("frames"), ["no field frames"]),
     "empty frames": (scene_with(frames=[]), ["frames", "at least one"]),

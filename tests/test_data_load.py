@@ -11,7 +11,7 @@ from helpers.captures import HEIGHT, WIDTH, cameras
 from lapgs_wgpu.data import Dataset, load, load_dataset
 from lapgs_wgpu.data.frames import Capture, Frame, Reader
 from lapgs_wgpu.data.images import ImageFile, check_image, decode, encode_png
-from lapgs_wgpu.data.timestamps import ImageName
+from lapgs_wgpu.data.timestamps import ImageName, frame_numbers
 from lapgs_wgpu.data.undistort import Lens
 from lapgs_wgpu.errors import InputError
 
@@ -53,6 +53,27 @@ def test_a_new_reader_gets_everything_else(folder: Path) -> None:
     assert camera.K[0, 0] > cameras(1)[0].K[0, 0] / 2, "undistorting zooms in"
     np.testing.assert_allclose(camera.position, data.normalization.points(cameras(COUNT)[0].position), atol=1e-9)
     assert data.train[0].load().shape == (HEIGHT // 2, WIDTH // 2, 3)
+
+
+def test_undistorting_leaves_the_color_of_transparent_pixels_behind() -> None:
+    """A white disk on black that is transparent: all that is left of it is white."""
+    lens = Lens(cameras(1)[0].K, WIDTH, HEIGHT, (-0.2, 0.0, 0.0))
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    disk = np.hypot(x - WIDTH / 2, y - HEIGHT / 2) < HEIGHT / 3
+    image = np.where(disk[..., None], 255, 0).astype(np.uint8).repeat(4, axis=2)
+    straight = lens.undistort(image, lens.pinhole("here"))
+    alpha = straight[..., 3]
+    assert ((alpha > 0) & (alpha < 255)).sum() > 50
+    assert (straight[alpha > 0] >= 254)[:, :3].all()
+    np.testing.assert_array_equal(alpha, lens.undistort(image[..., :3], lens.pinhole("here"))[..., 0])
+
+
+def test_a_name_without_a_frame_number_is_told_beside_one_with() -> None:
+    names = [ImageName(f"images/{name}.png") for name in ("clip", "clip_1", "clip_2")]
+    with pytest.raises(InputError, match=r"clip\.png does not state .*: images/clip_1\.png has 1 numbers and it has 0"):
+        frame_numbers(names)
+    with pytest.raises(InputError, match=r"images/clip\.png does not state a frame number: it has no numbers"):
+        frame_numbers(names[:1])
 
 
 def test_an_image_that_changes_its_size_is_named(folder: Path) -> None:

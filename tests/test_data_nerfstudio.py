@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import shutil
 from collections.abc import Callable
@@ -28,7 +29,6 @@ def pictures(device: Device, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def make(pictures: Path, tmp_path: Path) -> Callable[[Callable[[dict[str, Any]], Any] | None], Path]:
     """A good capture whose transforms.json is changed."""
-    import json
 
     def make(change: Callable[[dict[str, Any]], Any] | None = None) -> Path:
         toy = Path(shutil.copytree(pictures, tmp_path / "toy"))
@@ -72,9 +72,63 @@ def test_the_file_may_say_what_is_held_out(make: Any) -> None:
     assert [Path(view.source).name for view in data.test] == ["frame_00001.png", "frame_00003.png"]
 
 
+def test_lists_of_all_three_splits(make: Any) -> None:
+    """What is in none of them was taken out by somebody."""
+    names = [f"images/frame_{i:05d}.png" for i in range(1, 7)]
+    lists = {"train_filenames": names[:3], "val_filenames": names[3:4], "test_filenames": names[4:5]}
+    data = load_dataset(make(lambda data: data.update(lists)))
+    assert [len(views) for views in (data.train, data.val, data.test)] == [3, 1, 1]
+    assert any("1 of 6 images, such as images/frame_00006.png" in text for text in data.warnings)
+
+
 def test_without_times_the_names_tell(make: Any) -> None:
     data = load_dataset(make(lambda data: [frame.pop("time") for frame in data["frames"]]))
     np.testing.assert_allclose([view.time for view in data.train], [0, 0.2, 0.4, 0.6, 1])
+
+
+@pytest.mark.parametrize("folder", ["", "images/"])
+def test_listed_times_name_images_below_the_capture_or_below_images(folder: str, make: Any) -> None:
+    toy = make(lambda data: [frame.pop("time") for frame in data["frames"]])
+    times = {f"{folder}frame_{i:05d}.png": time for i, time in enumerate((0, 1, 2, 3, 5, 10), 1)}
+    (toy / "times.json").write_text(json.dumps(times))
+    np.testing.assert_allclose([view.time for view in load_dataset(toy).train], [0, 0.1, 0.2, 0.3, 1])
+
+
+def test_masks_that_the_file_names_leave_out_what_is_black(make: Any) -> None:
+    def masked(data: dict[str, Any]) -> None:
+        for entry in data["frames"]:
+            entry["mask_path"] = entry["file_path"].replace("images", "masks")
+
+    toy = make(masked)
+    with pytest.raises(InputError, match=r"frame_00001\.png does not exist, but .*frame 0 names it as its mask_path"):
+        load_dataset(toy)
+    (toy / "masks").mkdir()
+    mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    mask[:10, :20] = 0
+    for image in (toy / "images").iterdir():
+        Image.fromarray(mask).save(toy / "masks" / image.name)
+    data = load_dataset(toy)
+    for view in data.train:
+        ignored = view.load_ignored()
+        assert ignored is not None
+        np.testing.assert_array_equal(ignored, mask == 0)
+    assert all(view.ignored is None for view in data.test)
+
+
+def test_names_as_windows_writes_them(make: Any) -> None:
+    def backslashes(data: dict[str, Any]) -> None:
+        for entry in data["frames"]:
+            entry["file_path"] = ".\\" + entry["file_path"].replace("/", "\\")
+
+    data = load_dataset(make(backslashes))
+    assert [Path(view.source).name for view in data.test] == ["frame_00005.png"]
+
+
+def test_a_picture_of_another_type(make: Any) -> None:
+    toy = make(frame(file_path="images/a.webp"))
+    Image.new("RGB", (WIDTH, HEIGHT)).save(toy / "images/a.webp")
+    with pytest.raises(InputError, match=r"a\.webp is neither PNG nor JPEG, but .*frame 1 names it as file_path"):
+        load_dataset(toy)
 
 
 def test_a_binary_cloud(make: Any) -> None:
@@ -146,6 +200,7 @@ BAD: dict[str, tuple[Callable[[dict[str, Any]], Any], list[str]]] = {
     "w 0": (top(w=0), ["w is 0"]),
     "w half": (top(w=32), ["64x48", "32x48", "frame 0"]),
     "fisheye": (top(camera_model="OPENCV_FISHEYE"), ["camera_model", "OPENCV_FISHEYE", "PINHOLE"]),
+    "fisheye of instant-ngp": (top(is_fisheye=True), ["is_fisheye", "undistort"]),
     "k4": (top(k4=0.1), ["k4 is 0.1"]),
     "wild lens": (top(k1=-90), ["frame 0", "distortion (-90", "4 times"]),
     "time absent": (frame(time=None), ["frame 1", "no field time", "5 of 6"]),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import shutil
 import sys
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,9 @@ from helpers.captures import (
     write_nerfies,
     write_neu3d,
     write_points,
+    write_video,
 )
+from helpers.films import turn_film
 from PIL import Image
 
 from lapgs_wgpu.data import load_dataset, video_frames
@@ -109,6 +112,8 @@ def test_cameras_and_frames_go_by_number(device: Device, tmp_path: Path) -> None
         (toy / camera / "images/0000.png").rename(toy / camera / "images/frame_9.png")
         (toy / camera / "images/0001.png").rename(toy / camera / "images/frame_10.png")
     data = load_dataset(toy)
+    (warning,) = [text for text in data.warnings if "order" in text]
+    assert "row 0 is of cam2; if they are in the order of the names, in which it is of cam10" in warning
     assert [view.name for view in data.test] == ["test_cam2_00000", "test_cam2_00001"]
     for frame in range(2):
         assert agreement(data, moved(frame), device, frame_of([*data.train, *data.test], frame)) > 50
@@ -173,11 +178,45 @@ def test_a_video_that_breaks_off_leaves_nothing(clip: Path, cache: Path, monkeyp
     assert not list(cache.rglob("*.partial"))
 
 
-def test_a_video_with_fewer_frames_than_it_announces(clip: Path) -> None:
+def test_a_video_with_fewer_frames_than_packets(clip: Path) -> None:
     recording = video_frames.Video(clip / "cam01.mp4")
     recording.frames = 4
-    with pytest.raises(InputError, match=r"cam01\.mp4 announces 4 frames and holds 3"):
+    with pytest.raises(InputError, match=r"cam01\.mp4 has 4 frames, and 3 can be decoded"):
         recording.read(0, (WIDTH, HEIGHT))
+
+
+@pytest.mark.parametrize("degrees", [90, 180, 270])
+def test_a_video_of_a_turned_camera_is_upright(clip: Path, degrees: int) -> None:
+    """The header's rotation, by which players and COLMAP's images are upright."""
+    path = clip / "cam01.mp4"
+    before = video_frames.Video(path).read(2, (WIDTH, HEIGHT))
+    turn_film(path, degrees)
+    video = video_frames.Video(path)
+    assert video.size == ((WIDTH, HEIGHT) if degrees == 180 else (HEIGHT, WIDTH))
+    np.testing.assert_array_equal(video.read(2, video.size), np.rot90(before, -degrees // 90))
+
+
+def test_frames_that_an_edit_list_cuts_off_are_none(tmp_path: Path) -> None:
+    """A film that was cut without being encoded again begins before what it shows."""
+    levels = [20 * i for i in range(10)]
+    path = tmp_path / "cut.mp4"
+    write_video(path, [np.full((HEIGHT, WIDTH, 3), level, np.uint8) for level in levels], cut=0.1)
+    video = video_frames.Video(path)
+    assert video.frames == 7
+    shown = [video.read(i, (WIDTH, HEIGHT)).mean() for i in range(7)]
+    np.testing.assert_allclose(shown, levels[3:], atol=2)
+
+
+def test_pixels_that_are_not_square_are_refused(clip: Path) -> None:
+    av = pytest.importorskip("av")
+    with av.open(str(clip / "cam01.mp4"), "w") as file:
+        stream = file.add_stream("libx264", rate=30)
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+        stream.codec_context.sample_aspect_ratio = Fraction(4, 3)
+        for packet in [*stream.encode(av.VideoFrame(WIDTH, HEIGHT, "yuv420p")), *stream.encode()]:
+            file.mux(packet)
+    with pytest.raises(InputError, match=r"cam01\.mp4 has frames of 64x48 pixels, each 1\.33 times as wide as high"):
+        load_dataset(clip)
 
 
 def test_without_pyav(clip: Path, toy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -405,13 +444,13 @@ def test_found_in_videos(clip: Path) -> None:
 def test_videos_have_bounds(clip: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     recording = video_frames.Video(clip / "cam01.mp4")
     recording.size = (2 * WIDTH, HEIGHT)
-    with pytest.raises(InputError, match=f"frame 0 has {WIDTH}x{HEIGHT} pixels, and its header says {2 * WIDTH}x"):
+    with pytest.raises(InputError, match=f"frame 0 has {WIDTH}x{HEIGHT} pixels, and the first has {2 * WIDTH}x"):
         recording.read(0, (WIDTH, HEIGHT))
     monkeypatch.setattr(video_frames, "LARGEST_FRAME", WIDTH * HEIGHT - 1)
-    with pytest.raises(InputError, match=r"cam00\.mp4 has 3 frames of 64x48 pixels, and at most 3,071 pixels"):
+    with pytest.raises(InputError, match=r"cam00\.mp4 has frames of 64x48 pixels, and at most 3,071 pixels"):
         load_dataset(clip)
     recording = video_frames.Video.__new__(video_frames.Video)
-    recording.path, recording.frames, recording.size = clip / "cam02.mp4", 3, (WIDTH, HEIGHT)
+    recording.path, recording.frames, recording.size, recording._turns = clip / "cam02.mp4", 3, (WIDTH, HEIGHT), 0
     with pytest.raises(InputError, match=r"cam02\.mp4"):  # the decoder has the bound, too
         recording.read(0, (WIDTH, HEIGHT))
 

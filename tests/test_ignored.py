@@ -130,6 +130,32 @@ def test_masks_of_a_folder(masked: tuple[Path, Path]) -> None:
     assert all(view.ignored is None for view in load_dataset(capture).train)
 
 
+@pytest.mark.parametrize("level", [0, 1, 255])
+def test_masks_of_one_level(masked: tuple[Path, Path], level: int) -> None:
+    """As when they were saved as 0 and 1, or mean the opposite."""
+    capture, masks = masked
+    for path in masks.iterdir():
+        Image.new("L", (WIDTH, HEIGHT), level).save(path)
+    if level == 255:
+        with pytest.raises(InputError, match=r"leave out everything: in 5 of 5 .* every pixel is white"):
+            load_dataset(capture, masks=masks)
+    else:
+        (warning,) = (text for text in load_dataset(capture, masks=masks).warnings if text.startswith("the masks"))
+        assert "leave out nothing: in 5 of 5" in warning
+        assert f"levels are {level} to {level}" in warning
+
+
+def test_any_color_is_white_enough(masked: tuple[Path, Path]) -> None:
+    """Palettes give objects colors of their own."""
+    capture, masks = masked
+    for path in masks.iterdir():
+        Image.new("RGB", (WIDTH, HEIGHT), (0, 128, 0)).save(path)
+    Image.new("RGB", (WIDTH, HEIGHT), (0, 127, 0)).save(path)
+    ignored = {Path(view.source).stem: view.load_ignored() for view in load_dataset(capture, masks=masks).train}
+    assert {name for name, pixels in ignored.items() if pixels is not None and not pixels.any()} <= {path.stem}
+    assert sum(pixels is not None and pixels.all() for pixels in ignored.values()) >= 4
+
+
 def test_bad_masks_are_refused(masked: tuple[Path, Path], tmp_path: Path) -> None:
     capture, masks = masked
     trained = Path(load_dataset(capture).train[0].source)

@@ -39,6 +39,7 @@ class Frame:
     label: suffix of the view's name; None to number the views.
     depths: nearest and furthest depth, the capture's units.
     mask: image of the pixels that the masked metrics measure, of any size; white is measured.
+    black: image of the pixels that the training leaves out, of any size; black is left out.
     objects: moving objects of a generated scene.
     """
 
@@ -52,6 +53,7 @@ class Frame:
     label: str | None = None
     depths: tuple[float, float] | None = None
     mask: Path | None = None
+    black: Path | None = None
     objects: Sequence[ObjectRecord] = ()
 
 

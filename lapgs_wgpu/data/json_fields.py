@@ -78,10 +78,18 @@ def image_path(entry: dict[str, Any], folder: Path, where: str, hint: str, *, su
     if not isinstance(name, str) or not name:
         raise InputError(f"{where}: file_path must be the path of an image, got {kind(name)}.")
     check_inside(name, "file_path", where)
-    file = folder / (name if name.lower().endswith(SUFFIXES) else name + suffix)
-    if not os.path.isfile(file):  # Path.is_file raises for names that are too long
-        raise InputError(f"{file} does not exist, but {where} names it as its file_path.")
-    return name, file
+    for written in dict.fromkeys((name, name.replace("\\", "/"))):  # as it stands, or as Windows writes it
+        file = folder / (written if written.lower().endswith(SUFFIXES) else written + suffix)
+        if os.path.isfile(file):  # Path.is_file raises for names that are too long
+            return written, file
+    raise InputError(absent(folder / name if os.path.isfile(folder / name) else file, f"{where} names it as file_path"))
+
+
+def absent(file: Path, named: str) -> str:
+    """Why there is no image of this name, for an error. named: what names it."""
+    if os.path.isfile(file):
+        return f"{file} is neither PNG nor JPEG, but {named}; convert it."
+    return f"{file} does not exist, but {named}."
 
 
 def kind(value: Any) -> str:

@@ -17,7 +17,7 @@ from lapgs_wgpu.data.cloud import Cloud, points_in_view
 from lapgs_wgpu.data.covisible import read_mask
 from lapgs_wgpu.data.focus import are_parallel, focus_of
 from lapgs_wgpu.data.frames import Capture, Frame, ImageSource, Reader, Split
-from lapgs_wgpu.data.ignored import find_ignored, read_ignored
+from lapgs_wgpu.data.ignored import check_ignored, find_ignored, read_ignored
 from lapgs_wgpu.data.images import Pixels, Size, shrink, shrunk_size
 from lapgs_wgpu.data.normalize import BOX, Cube, cube_in_view, cube_of_points
 from lapgs_wgpu.data.readers import colmap, dnerf, endonerf, hypernerf, nerfstudio, neu3d, polycam, record3d
@@ -115,7 +115,10 @@ def _dataset(folder: Path, capture: Capture, image_size: int | None, normalize: 
     if cloud is not None and capture.own_footage:
         cloud = _filled(cloud, training)
     order = _film_order(frames, times, warnings) if capture.own_footage else range(len(frames))
-    ignored = {} if masks is None else find_ignored(masks, [frame.name.file for frame in frames], splits, stored)
+    ignored = {frame.name.file: frame.black for frame in frames if frame.black is not None}
+    if masks is not None:
+        ignored = find_ignored(masks, [frame.name.file for frame in frames], splits)
+    warnings += check_ignored(ignored, stored, black=masks is None)
     placed = {id(camera): camera if fit is None else fit.camera(camera) for camera in cameras}
 
     def views(split: Split) -> tuple[View, ...]:
@@ -132,8 +135,8 @@ def _dataset(folder: Path, capture: Capture, image_size: int | None, normalize: 
                 else partial(read_mask, path, undistortions[i], stored, size),
                 objects=tuple(record.seen_by(cameras[i]) for record in frames[i].objects),
                 ignored=None
-                if (path := ignored.get(frames[i].name.file)) is None
-                else partial(read_ignored, path, undistortions[i], stored, size),
+                if split != "train" or (path := ignored.get(frames[i].name.file)) is None
+                else partial(read_ignored, path, undistortions[i], stored, size, black=masks is None),
             )
             for index, i in enumerate(chosen)
         )

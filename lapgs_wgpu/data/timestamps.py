@@ -70,14 +70,15 @@ def in_step(names: Sequence[ImageName], values: Sequence[float]) -> list[float]:
 
 def _listed(names: Sequence[ImageName], path: Path) -> list[float]:
     times = read_json(path, "a time for each image")
-    missing = [name.file for name in names if name.file not in times]
+    listed = [file if (file := name.file) in times else file.removeprefix("images/") for name in names]
+    missing = [file for file in listed if file not in times]
     if missing:
         example = f", such as {next(iter(times))[:80]}" if times else ""
         raise InputError(
             f"{path} has {len(times)} times{example}, but none for {len(missing)} of {len(names)} images, such "
             f"as {missing[0]}; name each image by its path below images/."
         )
-    return [finite(times[name.file], f"the time of {name.file}", path) for name in names]
+    return [finite(times[file], f"the time of {file}", path) for file in listed]
 
 
 def frame_numbers(names: Sequence[ImageName]) -> list[int]:
@@ -92,10 +93,14 @@ def frame_numbers(names: Sequence[ImageName]) -> list[int]:
         rows = [[int(digits) for digits in re.findall(r"\d+", Path(file).stem)] for file in files]
         lengths = {len(row) for row in rows}
         if lengths == {0} or len(lengths) > 1:
-            odd = next(i for i, row in enumerate(rows) if len(row) != max(lengths) or not row)
+            fewest = min(range(len(rows)), key=lambda i: len(rows[i]))
+            most = max(range(len(rows)), key=lambda i: len(rows[i]))
+            why = "it has no numbers"
+            if rows[most]:
+                why = f"{files[most]} has {len(rows[most])} numbers and it has {len(rows[fewest])}"
             raise InputError(
-                f"the name {files[odd]} does not state a frame number: {files[0]} has {len(rows[0])} numbers and it "
-                f"has {len(rows[odd])}; write the times into {TIMES}, or number the frames."
+                f"the name {files[fewest]} does not state a frame number: {why}; write the times into {TIMES}, or "
+                "number the frames."
             )
         varying = [column for column in range(len(rows[0])) if len({row[column] for row in rows}) > 1]
         if len(varying) > 1:

@@ -6,7 +6,7 @@ The lens model is that of nerfies and of Brown (1966): three radial and two tang
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,18 +94,29 @@ class Lens:
         return self._zoomed(high)
 
     def undistort(self, image: Pixels, K: Array) -> Pixels:
-        """Resample an image (H, W, C) bilinearly to that of a pinhole camera with intrinsics K (3, 3), same size."""
+        """Resample an image (H, W, C) bilinearly to that of a pinhole camera with intrinsics K (3, 3), same size.
+
+        Colors weigh by their alpha, so that those of transparent pixels do not bleed into edges.
+        """
         from scipy.ndimage import map_coordinates  # takes most of a second to import
 
         height, width = image.shape[:2]
         columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
         source = self.project(_rays(K, np.stack([columns, rows], axis=-1))) - 0.5
         where = [source[..., 1], source[..., 0]]
-        out = np.empty_like(image)
-        for channel in range(image.shape[2]):
-            values = map_coordinates(image[..., channel], where, np.float32, order=1, mode="nearest")
-            out[..., channel] = np.floor(values + 0.5)
-        return out
+
+        def resampled(channel: NDArray[Any]) -> NDArray[np.float32]:
+            return map_coordinates(channel, where, np.float32, order=1, mode="nearest")
+
+        channels = np.moveaxis(image, -1, 0)
+        if len(channels) == 3:
+            values = np.stack([resampled(channel) for channel in channels])
+        else:
+            weight = channels[3].astype(np.float32)
+            alpha = resampled(weight)
+            covered = np.where(alpha > 0, alpha, 1)
+            values = np.stack([*(resampled(channel * weight) / covered for channel in channels[:3]), alpha])
+        return np.floor(np.moveaxis(values, 0, -1) + 0.5).astype(np.uint8)
 
     def _unfolds(self, rays: Array) -> bool:
         """Whether the radial distortion is monotonic up to these rays (N, 2)."""

@@ -17,25 +17,29 @@ from pathlib import Path
 from threading import Lock
 from typing import Any, NamedTuple
 
-from lapgs_wgpu.data.images import LANCZOS, ImageFile, Pixels, Size, encode_png, resize
+import numpy as np
+
+from lapgs_wgpu.data.images import LANCZOS, ImageFile, Pixels, Size, encode_png, resize, size_text
 from lapgs_wgpu.errors import InputError
 
 # Flags of swscale: bicubic, accurate rounding, chroma interpolated along rows. Its default darkens by 1 or 2 levels.
 EXACT_COLORS = 0x4 | 0x40000 | 0x2000
 COMPRESSION = 1  # of PNG: the next levels take twice as long for a tenth of the bytes
 LARGEST_FRAME = 8192 * 8192  # pixels; the decoder holds several frames
+WIDEST = 4.0  # width by height of a pixel, or height by width; what a header states beyond it is no such ratio
 WRITERS = min(8, os.cpu_count() or 1)  # threads that shrink and write the frames of the video that is being unpacked
 _unpacking = Lock()  # one video at a time, with all processors, which bounds memory
 
 
 class Video:
-    """A video file whose header was checked. frames: their number. size: (width, height) in pixels."""
+    """A video file whose packets were counted. frames: their number. size: (width, height) in pixels, upright."""
 
     def __init__(self, path: Path) -> None:
-        """Read the header; count the packets if it does not state the number of frames. Raises InputError, also if PyAV
-        is missing."""
+        """Read the header, the first frame, which says whether the camera was turned, and all packets: those that an
+        edit list cuts off are no frames, though the header counts them. Raises InputError, also if PyAV is missing."""
         av = import_av(path)
         self.path = path
+        first, self.frames = None, 0
         try:
             with av.open(str(path), metadata_errors="replace") as file:
                 if not file.streams.video:
@@ -43,17 +47,34 @@ class Video:
                 stream = file.streams.video[0]
                 if stream.codec_context is None:
                     raise InputError(f"{path} is in a format that PyAV cannot decode; record or convert it to H.264.")
-                self.size = (int(stream.width), int(stream.height))
-                self.frames = stream.frames or sum(packet.size > 0 for packet in file.demux(stream))
+                self._check_header(stream)
+                stream.codec_context.options = {"max_pixels": str(LARGEST_FRAME)}  # whatever the header states
+                for packet in file.demux(stream):
+                    first = first or next(iter(packet.decode()), None)
+                    self.frames += packet.size > 0 and not packet.is_discard
         except (av.error.FFmpegError, OSError) as error:
             raise InputError(f"{path} is not a readable video ({error}); copy or record it again.") from None
-        what = f"{path} has {self.frames} frames of {self.size[0]}x{self.size[1]} pixels"
-        if self.frames < 1 or min(self.size) < 1:
-            raise InputError(f"{what}; none is usable.")
-        if self.size[0] * self.size[1] > LARGEST_FRAME:
+        if first is None:
+            raise InputError(f"{path} has {self.frames} frames; none is usable.")
+        self._turns = round(first.rotation / 90) % 4
+        self.size = (first.height, first.width) if self._turns % 2 else (first.width, first.height)
+
+    def _check_header(self, stream: Any) -> None:
+        """Raises InputError for frames that are too many, too large, or not of square pixels."""
+        what = f"{self.path} has frames of {stream.width}x{stream.height} pixels"
+        if stream.width * stream.height > LARGEST_FRAME:
             raise InputError(f"{what}, and at most {LARGEST_FRAME:,} pixels a frame are allowed; shrink it.")
-        if self.frames > path.stat().st_size:
-            raise InputError(f"{what}, it states, in {path.stat().st_size} bytes; copy it again.")
+        if stream.frames > self.path.stat().st_size:
+            raise InputError(
+                f"{self.path} has {stream.frames} frames, it states, in {self.path.stat().st_size} bytes; copy it "
+                "again."
+            )
+        aspect = pixel_aspect(stream)
+        if abs(aspect - 1) > 0.01:
+            raise InputError(
+                f"{what}, each {aspect:.3g} times as wide as high; convert it to square pixels, which the one focal "
+                "length of its camera is for."
+            )
 
     def read(self, frame: int, size: Size) -> Pixels:
         """Return a frame, counted from 0, shrunk to (width, height): (H, W, 3) RGB. Thread-safe.
@@ -74,7 +95,7 @@ class Video:
         except OSError as error:
             raise InputError(f"{self.path} cannot be read any more ({error.strerror}); put it back.") from None
         path = self.path.resolve()
-        state = f"{stat.st_size:x}-{stat.st_mtime_ns:x}"
+        state = f"{stat.st_size:x}-{stat.st_mtime_ns:x}" + (f"-turned-{self._turns}" if self._turns else "")
         place = "-".join(path.parent.parts[-2:]).strip("/")
         return cache_folder() / "frames" / place / f"{path.stem}-{size[0]}x{size[1]}-{state}"
 
@@ -96,12 +117,13 @@ class Video:
                 stream.thread_type = "AUTO"
                 stream.codec_context.options = {"max_pixels": str(LARGEST_FRAME)}  # whatever the header states
                 for frame in file.decode(stream):
-                    if (frame.width, frame.height) != self.size:
-                        raise InputError(
-                            f"{self.path}: frame {count} has {frame.width}x{frame.height} pixels, and its header says "
-                            f"{self.size[0]}x{self.size[1]}; record it with one size."
-                        )
                     image = frame.to_ndarray(format="rgb24", interpolation=EXACT_COLORS)
+                    image = np.ascontiguousarray(np.rot90(image, self._turns))
+                    if image.shape[1::-1] != self.size:
+                        raise InputError(
+                            f"{self.path}: frame {count} has {size_text(image.shape[1::-1])} pixels, and the first has "
+                            f"{size_text(self.size)}; record it with one size."
+                        )
                     if len(written) == 2 * WRITERS:  # the decoder is ahead of the writers: bound the frames in memory
                         written.popleft().result()
                     written.append(pool.submit(_write, image, size, unfinished / f"{count:05d}.png"))
@@ -109,7 +131,7 @@ class Video:
                 for each in written:
                     each.result()
             if count != self.frames:
-                raise InputError(f"{self.path} announces {self.frames} frames and holds {count}; copy it again.")
+                raise InputError(f"{self.path} has {self.frames} frames, and {count} can be decoded; copy it again.")
             unfinished.rename(folder)
         except av.error.FFmpegError as error:
             raise InputError(f"{self.path} cannot be decoded ({error}); copy or record it again.") from None
@@ -146,6 +168,12 @@ class VideoFrame(NamedTuple):
 def cache_folder() -> Path:
     """The folder of caches: lapgs_wgpu in XDG_CACHE_HOME, else in ~/.cache."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "lapgs_wgpu"
+
+
+def pixel_aspect(stream: Any) -> float:
+    """Width by height of a pixel; 1 where the film states nothing, or nothing possible."""
+    aspect = float(stream.sample_aspect_ratio or 1)
+    return aspect if 1 / WIDEST <= aspect <= WIDEST else 1.0
 
 
 def _write(image: Pixels, size: Size, path: Path) -> None:

@@ -12,13 +12,12 @@ from numpy.typing import NDArray
 
 from lapgs_wgpu.data.images import Pixels, Size, shrunk_size, size_text
 from lapgs_wgpu.data.thumbnails import THUMBNAIL
-from lapgs_wgpu.data.video_frames import EXACT_COLORS, LARGEST_FRAME, import_av
+from lapgs_wgpu.data.video_frames import EXACT_COLORS, LARGEST_FRAME, import_av, pixel_aspect
 from lapgs_wgpu.errors import InputError
 
 from .hdr import Transfer, to_sdr, transfer_of
 
 _FAST_BILINEAR = 0x1  # of swscale: exact enough for a thumbnail
-WIDEST = 4.0  # width by height of a pixel, or height by width; what a header states beyond it is no such ratio
 _ATTACHED_PICTURE = 0x400  # libavformat's flag of a cover image
 
 
@@ -69,7 +68,7 @@ class Film:
                 if stream.codec_context is None:
                     raise InputError(f"{path} is in a format that PyAV cannot decode; convert it to H.264.")
                 coded = (int(stream.width), int(stream.height))
-                self._aspect = _pixel_aspect(stream)
+                self._aspect = pixel_aspect(stream)
                 self.seconds = _seconds(stream, file)
         except (av.error.FFmpegError, OSError) as error:
             raise InputError(f"{path} is not a readable film ({error}); copy or record it again.") from None
@@ -145,12 +144,6 @@ def _seconds(stream: Any, file: Any) -> float:
     if stream.duration is not None and stream.time_base is not None:
         return float(stream.duration * stream.time_base)
     return file.duration / 1e6 if file.duration is not None else 0.0  # of the container: microseconds
-
-
-def _pixel_aspect(stream: Any) -> float:
-    """Width by height of a pixel; 1 where the film states nothing, or nothing possible."""
-    aspect = float(stream.sample_aspect_ratio or 1)
-    return aspect if 1 / WIDEST <= aspect <= WIDEST else 1.0
 
 
 def _squared(coded: Size, aspect: float) -> Size:

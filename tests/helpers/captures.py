@@ -201,16 +201,20 @@ def moved(frame: int) -> Blobs:
     return blobs._replace(means=blobs.means + torch.tensor([0.15 * frame, 0, 0]))
 
 
-def write_video(path: Path, pictures: Sequence[np.ndarray]) -> None:
-    """H.264 with colors at full resolution, almost lossless; one keyframe, at the beginning."""
+def write_video(path: Path, pictures: Sequence[np.ndarray], *, cut: float = 0.0) -> None:
+    """H.264 with colors at full resolution, almost lossless; one keyframe, at the beginning.
+
+    cut: seconds at the beginning that an edit list leaves out.
+    """
     av = __import__("av")
-    with av.open(str(path), "w") as file:
+    options = {"avoid_negative_ts": "disabled", "use_editlist": "1"} if cut else {}
+    with av.open(str(path), "w", options=options) as file:
         stream = file.add_stream("libx264", rate=30, options={"crf": "4"})
         stream.width, stream.height, stream.pix_fmt = pictures[0].shape[1], pictures[0].shape[0], "yuv444p"
-        for picture in pictures:
-            for packet in stream.encode(av.VideoFrame.from_ndarray(picture, "rgb24")):
-                file.mux(packet)
-        for packet in stream.encode():
+        frames = [av.VideoFrame.from_ndarray(picture, "rgb24") for picture in pictures]
+        for packet in [*(packet for frame in frames for packet in stream.encode(frame)), *stream.encode()]:
+            packet.pts -= round(cut / packet.time_base)
+            packet.dts -= round(cut / packet.time_base)
             file.mux(packet)
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from lapgs_wgpu.data.cloud import Cloud
 from lapgs_wgpu.data.frames import Capture, Frame, Reader
 from lapgs_wgpu.data.images import SUFFIXES, Size, check_image
+from lapgs_wgpu.data.json_fields import absent
 from lapgs_wgpu.data.poses import check_rotation, rotation
 from lapgs_wgpu.data.timestamps import ImageName, natural_key
 from lapgs_wgpu.data.undistort import Lens
@@ -46,7 +47,7 @@ def _read(folder: Path, image_size: int | None) -> Capture:
     files = _files(images)
     for image in model.images:
         if image.name not in files:
-            raise InputError(f"{images / image.name} does not exist, but {image.where} names it.")
+            raise InputError(absent(images / image.name, f"{image.where} names it"))
     frames, warnings = _frames(model, images, files, where)
     if len(models) > 1:
         sizes = ", ".join(f"{path.name} with {count}" for path, count in models.items())
@@ -77,7 +78,10 @@ def _models(folder: Path) -> list[Path]:
 def _files(images: Path) -> dict[str, Path]:
     """All image files below images/, by their relative paths."""
     found = {}
-    for parent, _, names in os.walk(images):
+    entered: set[str] = set()
+    for parent, folders, names in os.walk(images, followlinks=True):
+        entered.add(os.path.realpath(parent))
+        folders[:] = [name for name in folders if os.path.realpath(os.path.join(parent, name)) not in entered]
         for name in names:
             if name.lower().endswith(SUFFIXES):
                 path = Path(parent, name)

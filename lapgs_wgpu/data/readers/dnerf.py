@@ -81,7 +81,8 @@ def _read_split(folder: Path, split: Split) -> list[Frame]:
             raise InputError(f"{where}: time must lie in [0, 1], got {time:g}; divide by the clip's duration.")
         image = check_image(file)
         lens = _lens(entry, data, image.size, where, path)
-        lens = lenses.setdefault((*lens.K.ravel(), *lens.radial, *lens.tangential), lens)
+        key = (*lens.K.ravel(), lens.width, lens.height, *lens.radial, *lens.tangential)
+        lens = lenses.setdefault(key, lens)
         name, label = ImageName(file_path), f"{index:03d}"
         frames.append(Frame(image, lens, T_cam_world, where, name, time=time, split=split, label=label))
     if split != "train":
@@ -91,23 +92,22 @@ def _read_split(folder: Path, split: Split) -> list[Frame]:
 
 
 def _lens(entry: dict[str, Any], shared: dict[str, Any], size: Size, where: str, path: Path) -> Lens:
-    """The lens of a frame, for images of this size."""
+    """The lens of a frame, at the size that it states, else that of its image, (width, height) `size`."""
     values = intrinsics(entry, shared, where, path)
-    across, down = size[0] / values.get("w", size[0]), size[1] / values.get("h", size[1])
+    width, height = int(values.get("w", size[0])), int(values.get("h", size[1]))
     if "fl_x" in values:
-        focal = values["fl_x"] * across
-        K = np.array([[focal, 0.0, size[0] / 2], [0.0, focal, size[1] / 2], [0.0, 0.0, 1.0]])
+        K = np.array([[values["fl_x"], 0.0, width / 2], [0.0, values["fl_x"], height / 2], [0.0, 0.0, 1.0]])
     else:
         source, at = (entry, where) if "camera_angle_x" in entry else (shared, str(path))
         fov_x = number(required(source, "camera_angle_x", at, NEEDED), "camera_angle_x", at)
         if not 1e-6 < fov_x < math.pi:
             raise InputError(f"{at}: camera_angle_x must be an angle in radians between 0 and pi, got {fov_x:g}.")
-        K = intrinsics_of_fov(fov_x, *size)
-    for name, row, column, scale in (("fl_y", 1, 1, down), ("cx", 0, 2, across), ("cy", 1, 2, down)):
+        K = intrinsics_of_fov(fov_x, width, height)
+    for name, row, column in (("fl_y", 1, 1), ("cx", 0, 2), ("cy", 1, 2)):
         if name in values:
-            K[row, column] = values[name] * scale
+            K[row, column] = values[name]
     k1, k2, k3, p1, p2 = (values.get(name, 0.0) for name in ("k1", "k2", "k3", "p1", "p2"))
-    return Lens(K, *size, (k1, k2, k3), (p1, p2))
+    return Lens(K, width, height, (k1, k2, k3), (p1, p2))
 
 
 READER = Reader("D-NeRF", "transforms_train.json and transforms_test.json", _matches, _read)

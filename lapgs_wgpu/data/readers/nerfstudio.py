@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from lapgs_wgpu.data.cloud import read_cloud
-from lapgs_wgpu.data.frames import Capture, Frame, Reader
+from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
 from lapgs_wgpu.data.images import check_image
 from lapgs_wgpu.data.json_fields import check_inside, finite, image_path, kind, read_json, required
 from lapgs_wgpu.data.poses import opengl_pose
@@ -26,7 +26,6 @@ from lapgs_wgpu.errors import InputError
 from .transforms import frame_entries, intrinsics
 
 NEEDED = "which a capture in nerfstudio's layout needs"
-MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 PINHOLE = ("w", "h", "fl_x", "fl_y", "cx", "cy")  # fields of a camera without distortion
 AXES = "transform_matrix must be camera to world in OpenGL's axes (y up, z backward), and it may be in OpenCV's"
 
@@ -53,49 +52,51 @@ def _read(folder: Path, image_size: int | None) -> Capture:
         time = None if stated is None else finite(stated, field, where)
         normal = PurePosixPath(name_in_file)
         name = ImageName(str(normal), str(normal.parent))
-        frames.append(Frame(check_image(file), lens, T_cam_world, where, name, time))
+        black = _file(entry["mask_path"], "mask_path", folder, where) if entry.get("mask_path") is not None else None
+        frames.append(Frame(check_image(file), lens, T_cam_world, where, name, time, black=black))
     names = [frame.name.file for frame in frames]
     if len(set(names)) < len(names):
         twice = next(name for i, name in enumerate(names) if name in names[:i])
         raise InputError(f"{path}: {len(names)} frames name {len(set(names))} images; {twice} is there twice.")
-    tested = _tested(data, names, path)
-    if tested is not None:
+    splits = _splits(data, names, path)
+    if splits:
         frames = [
-            dataclasses.replace(frame, split="test" if frame.name.file in tested else "train") for frame in frames
+            dataclasses.replace(frame, split=splits[frame.name.file]) for frame in frames if frame.name.file in splits
         ]
-    cloud = _cloud_file(data, folder, path)
+    warnings = []
+    if len(frames) < len(names):
+        left_out = next(name for name in names if name not in splits)
+        warnings.append(
+            f"{path}: {len(names) - len(frames)} of {len(names)} images, such as {left_out}, are in none of "
+            "train_filenames, val_filenames and test_filenames, and are left out."
+        )
+    ply = data.get("ply_file_path")
+    cloud = None if ply is None else _file(ply, "ply_file_path", folder, str(path))
     return Capture(
         frames,
         None if cloud is None else read_cloud(cloud),
         source=cloud or path,
+        warnings=warnings,
         time_source=f"{field} in {path}",
         own_footage=True,
         axes_hint=AXES,
     )
 
 
-def _cloud_file(data: dict[str, Any], folder: Path, path: Path) -> Path | None:
-    ply = data.get("ply_file_path")
-    if ply is None:
-        return None
-    if isinstance(ply, str):
-        check_inside(ply, "ply_file_path", path)
-    if not isinstance(ply, str) or not os.path.isfile(folder / ply):
+def _file(name: Any, field: str, folder: Path, where: str) -> Path:
+    """The existing file that an optional field names. Raises InputError."""
+    if isinstance(name, str):
+        check_inside(name, field, where)
+    if not isinstance(name, str) or not os.path.isfile(folder / name):
         raise InputError(
-            f"{folder / ply if isinstance(ply, str) else kind(ply)} does not exist, but {path} names it as its "
-            "ply_file_path; without that field, the capture opens."
+            f"{folder / name if isinstance(name, str) else kind(name)} does not exist, but {where} names it as its "
+            f"{field}; without that field, the capture opens."
         )
-    return folder / ply
+    return folder / name
 
 
 def _intrinsics(entry: dict[str, Any], shared: dict[str, Any], where: str, path: Path) -> dict[str, float]:
     """The fields of a pinhole camera, which are required, and those of its distortion. Raises InputError."""
-    model = entry.get("camera_model", shared.get("camera_model", "OPENCV"))
-    if model not in MODELS:
-        raise InputError(
-            f"{where}: camera_model {kind(model)} is not among those that are read ({', '.join(MODELS)}); undistort "
-            "the images first."
-        )
     values: dict[str, float] = intrinsics(entry, shared, where, path)
     for name in PINHOLE:
         required(values, name, f"{where} and the file", NEEDED)
@@ -109,20 +110,31 @@ def _lens(values: dict[str, float]) -> Lens:
     return Lens(K, int(width), int(height), (k1, k2, k3), (p1, p2))
 
 
-def _tested(data: dict[str, Any], names: list[str], path: Path) -> set[str] | None:
-    """The names of the test images that the file states (test_filenames, else val_filenames); None without."""
-    for field in ("test_filenames", "val_filenames"):
-        listed = data.get(field)
-        if not listed:
-            continue
-        if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
-            raise InputError(f"{path}: {field} must be a list of names, got {kind(listed)}.")
-        tested = {str(PurePosixPath(name)): name for name in listed}
-        unknown = [name for normal, name in tested.items() if normal not in names]
-        if unknown:
-            raise InputError(f"{path}: {field} names {unknown[0][:80]}, which is none of its {len(names)} frames.")
-        return set(tested)
-    return None
+def _splits(data: dict[str, Any], names: list[str], path: Path) -> dict[str, Split]:
+    """The split of each image, as the file's lists state it; {} if they hold nothing out.
+
+    An image in no list is for training, but missing here if the file lists those for training.
+    """
+    tested, validated = _listed(data, "test_filenames", names, path), _listed(data, "val_filenames", names, path)
+    trained = _listed(data, "train_filenames", names, path)
+    if not tested:  # one list is enough to measure by
+        tested, validated = validated, []
+    if not tested:
+        return {}
+    splits: dict[str, Split] = dict.fromkeys(trained or names, "train")
+    return splits | dict.fromkeys(validated, "val") | dict.fromkeys(tested, "test")
+
+
+def _listed(data: dict[str, Any], field: str, names: list[str], path: Path) -> list[str]:
+    """The names of images in a list of the file. Raises InputError, also for one that is no image's."""
+    listed = data.get(field) or []
+    if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
+        raise InputError(f"{path}: {field} must be a list of names, got {kind(listed)}.")
+    normal = [str(PurePosixPath(name)) for name in listed]
+    unknown = next((name for name in normal if name not in names), None)
+    if unknown is not None:
+        raise InputError(f"{path}: {field} names {unknown[:80]}, which is none of its {len(names)} frames.")
+    return normal
 
 
 READER = Reader("nerfstudio", "transforms.json", _matches, _read)

@@ -37,6 +37,15 @@ def _read(folder: Path, image_size: int | None) -> Capture:
     path = folder / POSES
     recordings = _recordings(folder)
     rows = read_rows(path, [recording.name for recording in recordings], "recordings")
+    names = [recording.stem for recording in recordings]
+    warnings = []
+    if names != sorted(names):
+        odd = next(i for i, name in enumerate(sorted(names)) if name != names[i])
+        warnings.append(
+            f"{path}: its rows are taken in the order of the cameras' numbers, so row {odd} is of {names[odd]}; if "
+            f"they are in the order of the names, in which it is of {sorted(names)[odd]}, number the cameras with "
+            "leading zeros."
+        )
     (first, images), *others = recordings.items()
     for other, found in others:
         if len(found) != len(images):
@@ -65,6 +74,7 @@ def _read(folder: Path, image_size: int | None) -> Capture:
         frames,
         None if cloud is None else read_cloud(cloud),
         source=cloud or path,
+        warnings=warnings,
         time_source=f"the number of frames in {others[0][0]}",
         time_range=(0.0, float(len(images))),
     )

@@ -9,6 +9,7 @@ from typing import Any
 from lapgs_wgpu.data.json_fields import finite, kind, number, required
 from lapgs_wgpu.errors import InputError
 
+MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 INTRINSICS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2")  # pixels of an image w x h
 LARGEST = 1e6  # of them
 LIMITS = {"w": (1, 1e5), "h": (1, 1e5), "fl_x": (1e-9, LARGEST), "fl_y": (1e-9, LARGEST)}
@@ -35,7 +36,15 @@ def frame_entries(
 
 
 def intrinsics(entry: dict[str, Any], shared: dict[str, Any], where: str, path: Path) -> dict[str, float]:
-    """The values of INTRINSICS that a frame states, or else its file. Raises InputError."""
+    """The values of INTRINSICS that a frame states, or else its file. Raises InputError, also for other lens models."""
+    model = entry.get("camera_model", shared.get("camera_model", "OPENCV"))
+    if model not in MODELS:
+        raise InputError(
+            f"{where}: camera_model {kind(model)} is not among those that are read ({', '.join(MODELS)}); undistort "
+            "the images first."
+        )
+    if entry.get("is_fisheye", shared.get("is_fisheye")):
+        raise InputError(f"{where}: is_fisheye is set, and no lens of that kind is read; undistort the images first.")
     values: dict[str, float] = {}
     for name in INTRINSICS:
         source, at = (entry, where) if name in entry else (shared, str(path))
