@@ -1,4 +1,5 @@
 // Marks where each tile's list begins and ends among the sorted intersections. Each lane looks at four of them.
+// The lanes that find the two write single words: a write to a component of a vector may write the whole vector.
 #import common/count
 #import common/frame
 #import common/index
@@ -7,7 +8,7 @@
 @group(0) @binding(1) var<uniform> needed: Count;   // intersections
 // sorted
 #table 2 tile_keys: vec4<u32>
-@group(0) @binding(3) var<storage, read_write> ranges: array<vec4<u32>>;   // first, one past the last; rasterize: drawn, unfinished
+@group(0) @binding(3) var<storage, read_write> ranges: array<u32>;   // 4 a tile: first, one past the last; rasterize: drawn, unfinished
 #ifdef LISTED
 @group(0) @binding(4) var<storage, read_write> listed_tiles: array<u32>;   // those with splats, in any order
 @group(0) @binding(5) var<storage, read_write> workgroups: array<atomic<u32>>;   // that draw them
@@ -24,7 +25,7 @@ fn main(
     if (4u * quad >= count) {
         return;
     }
-    let tiles = arrayLength(&ranges) - 1u;   // the key of a pad
+    let tiles = arrayLength(&ranges) / 4u - 1u;   // the key of a pad
     let keys = tile_keys_at(quad);
     // No key is so large: a list begins at the first element in any case.
     var before = select(tile_keys_at(max(quad, 1u) - 1u).w, 0xffffffffu, quad == 0u);
@@ -34,13 +35,13 @@ fn main(
         let tile = keys[$k];
         if (i < count && tile != before) {
             if (tile < tiles) {
-                ranges[tile].x = i;
+                ranges[4u * tile] = i;
 #ifdef LISTED
                 listed_tiles[atomicAdd(&workgroups[0], 1u)] = tile;
 #endif
             }
             if (before < tiles) {
-                ranges[before].y = i;
+                ranges[4u * before + 1u] = i;
             }
         }
         before = tile;
@@ -48,6 +49,6 @@ fn main(
 #end
     let last = keys[(count - 1u) % 4u];
     if (4u * quad + 4u >= count && last < tiles) {
-        ranges[last].y = count;
+        ranges[4u * last + 1u] = count;
     }
 }

@@ -169,7 +169,7 @@ def test_submitted_in_parts_the_bits_are_the_same(device: Device, monkeypatch: p
         counts.append(len(submitted))
     assert all(map(torch.equal, *runs))
     assert counts[0] == 2
-    assert counts[1] == 2 + 4 + 2  # 4 blocks; the static grid, and the slices of the temporal ones
+    assert counts[1] == 2 + 4 + 4 + 2  # 4 blocks, both ways; the static grid, and the slices of the temporal ones
 
 
 @pytest.mark.parametrize("in_torch", [False, True])

@@ -14,6 +14,7 @@ from helpers.stages import watch
 from lapgs_wgpu.gpu import shader
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.splat import drawing_plan
+from lapgs_wgpu.splat import rasterizer as rasterizer_module
 from lapgs_wgpu.splat.rasterize import rasterize, rasterizer_of
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 
@@ -229,6 +230,22 @@ def test_bands_draw_the_same_image(
     again = banded(device, use, total // share)
     same(one_step(scene, device), found)
     assert again.plan.bands == rasterizer.plan.bands
+
+
+def test_bands_are_no_larger_than_need_be(
+    device: Device, use: Use, scene: Scene, expected: Step, total: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Bindings may hold more than memory and watchdogs bear; a row of tiles still has all that a binding holds."""
+    monkeypatch.setattr(rasterizer_module, "_BAND_CAPACITY", total // 3)
+    rasterizer = use(Rasterizer(device, capacity=64))
+    assert one_step(scene, device).bits["image"] == expected.bits["image"]
+    assert 3 < rasterizer.plan.bands < -(-CAMERA.height // rasterizer.config.tile_height)
+    assert rasterizer.plan.capacity <= total // 3
+    monkeypatch.setattr(rasterizer_module, "_BAND_CAPACITY", 16)
+    rasterizer = use(Rasterizer(device, capacity=16))
+    assert one_step(scene, device).bits["image"] == expected.bits["image"]
+    assert rasterizer.plan.bands == -(-CAMERA.height // rasterizer.config.tile_height)
+    assert rasterizer.plan.capacity > 16
 
 
 def test_bands_with_backward_after_another_image(device: Device, use: Use, scene: Scene, total: int) -> None:

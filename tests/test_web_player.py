@@ -41,6 +41,7 @@ from lapgs_wgpu.motion.timing import Timing
 from lapgs_wgpu.train.open_dataset import open_dataset, with_folder
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.run import train
+from lapgs_wgpu.viewer import web_page
 from lapgs_wgpu.viewer.camera import ViewCamera
 from lapgs_wgpu.viewer.controls import ORBIT, ZOOM
 from lapgs_wgpu.viewer.export import export_compact
@@ -292,6 +293,23 @@ def test_a_browser_that_looks_only_where_something_is_submitted(window: Browser,
     assert before > 0
     sleep(0.3)
     assert window.value("empty") == before
+
+
+def test_room_that_no_picture_needs_is_given_back(
+    window: Browser, folder: Path, device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Passes dispatch workgroups for all the room that there is. After 8 pictures here, not 256."""
+
+    def workgroups() -> int:
+        return next(columns * rows for name, columns, rows, _ in call(window, "passes", 0.5) if name == "tile_ranges")
+
+    script, watched = web_page.module_script, "const WATCHED = 256;"
+    assert watched in script("rasterizer")
+    monkeypatch.setattr(web_page, "module_script", lambda name: script(name).replace(watched, "const WATCHED = 8;"))
+    open_page(window, export_scene(trained(device, OURS, 300), folder, device, "room").as_uri())
+    rooms = [workgroups() for _ in range(10)]
+    assert rooms[0] == 256
+    assert rooms[-1] < 128
 
 
 def test_workgroups_that_are_no_subgroups(window: Browser, page: Path, desktop: Desktop) -> None:

@@ -55,8 +55,9 @@ class Profile:
         if not self._names:
             return []
         ticks = self._ticks.rows(0, len(self._names)).read()
-        # Subtract first: a timestamp has more digits than a float.
-        milliseconds = (ticks[:, 1] - ticks[:, 0]).astype(np.float64) * self._tick_nanoseconds * 1e-6
+        # Subtract first: a timestamp has more digits than a float. WebGPU lets clocks go back.
+        elapsed = np.maximum((ticks[:, 1] - ticks[:, 0]).view(np.int64), 0)
+        milliseconds = elapsed.astype(np.float64) * self._tick_nanoseconds * 1e-6
         names, self._names = self._names, []
         return list(zip(names, milliseconds.tolist(), strict=True))
 

@@ -29,6 +29,7 @@ from .splat_layout import SPLAT_FLOATS
 
 _RECORD_FLOATS = 8  # rasterize_bwd.wgsl
 _DEPTH_BITS = 32
+_BAND_CAPACITY = 1 << 24  # intersections: 1 GB of buffers in a training, and no submission that a watchdog would end
 _LANES = 64  # workgroup size of the passes over Gaussians and intersections
 
 
@@ -123,14 +124,15 @@ class Rasterizer:
             self.plan = replace(plan, rounds=2 * plan.rounds)
             return True
         bands = plan.bands
-        if most > self.max_capacity:
-            rows, _ = self._tiles(drawing.camera)
+        rows, _ = self._tiles(drawing.camera)
+        limit = min(self.max_capacity, _BAND_CAPACITY) if bands < rows else self.max_capacity
+        if most > limit:
             if bands >= rows:
                 raise DeviceMemoryError(
-                    f"one row of tiles holds {most} intersections, but the device's bindings hold {self.max_capacity}"
+                    f"one row of tiles holds {most} intersections, but the device's bindings hold {limit}"
                 )
-            bands = min(rows, max(bands + 1, -(-5 * sum(totals) // (4 * self.max_capacity))))
-        self.plan = replace(plan, capacity=min(self.max_capacity, roomy(most)), bands=bands)
+            bands = min(rows, max(bands + 1, -(-5 * sum(totals) // (4 * limit))))
+        self.plan = replace(plan, capacity=min(limit, roomy(most)), bands=bands)
         return True
 
     def _draw_band(self, commands: Commands, drawing: Drawing, band: int) -> TileLists:

@@ -186,8 +186,8 @@ export class Playback {
         gpu.device.queue.writeBuffer(this.weights.buffer, 0, this.headsAt(t));
         const time = 0.5 * ((2 * t - 1) * field.timeScale + 1);
         const coefficients = (shDegree + 1) ** 2;
-        const commands = new Commands(gpu, log);
         this.blocks.forEach(({ first, count, points, still, moving, rows }, number) => {
+            const commands = new Commands(gpu, log); // a submission each: all together may take longer than watchdogs allow
             this.encoder.record(commands, number, { points, rows, encoding: moving, tables: this.tables, n: count, time });
             const deform = pool.uniform(`deform ${number}`, gpu.kernel(this.deform), "deform", {
                 gaussians: count, first, rows: this.rowsAt, rounds: this.rounds, still_quads: this.stillQuads,
@@ -198,8 +198,8 @@ export class Playback {
                 deform, still, moving, weights: this.weights, means: range(out.means, 12), quats: range(out.quats, 16),
                 scales: range(out.scales, 12), opacities: range(out.opacities, 4), colors: range(out.sh, 12 * coefficients),
             });
+            commands.submit();
         });
-        commands.submit();
     }
 }
 

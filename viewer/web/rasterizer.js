@@ -9,7 +9,10 @@ const DEPTH_BITS = 32;
 const SPLAT_BYTES = 48;
 const RECORD_BYTES = 32; // of the desktop's backward pass: plans are made alike
 const FIRST_CAPACITY = 1 << 16;
+const BAND_CAPACITY = 1 << 24;
+const WATCHED = 256; // drawings, after which a plan that is too large for all of them shrinks
 
+const roomy = intersections => Math.floor((Math.floor(5 * intersections / 4) + 4095) / 4096) * 4096;
 const groups = count => Math.ceil(count / LANES);
 
 export class Rasterizer {
@@ -22,6 +25,7 @@ export class Rasterizer {
         this.depth = raster.depth;
         this.pool = new Pool(gpu);
         this.plan = { capacity: FIRST_CAPACITY, bands: 1 };
+        this.watched = this.most = 0; // drawings by this plan, and the most intersections of a band
         this.maxCapacity = Math.floor(gpu.maxBinding / RECORD_BYTES);
         this.size = "";
         this.flagsScan = new Scan(gpu, this.pool, "visible", "FLAGS");
@@ -35,6 +39,7 @@ export class Rasterizer {
     draw(gaussians, camera, background, log = null, depth = false) {
         if (this.size !== `${camera.width}x${camera.height}`) { // the bands of another size would slow this one down
             this.plan = { capacity: this.plan.capacity, bands: 1 };
+            this.watched = this.most = 0;
             this.size = `${camera.width}x${camera.height}`;
         }
         const { bands } = this.plan;
@@ -63,20 +68,33 @@ export class Rasterizer {
         }
         const totals = Array.from({ length: plan.bands }, (_, band) => counts[3 * band]);
         const most = Math.max(...totals);
-        if (most <= plan.capacity) return true;
+        if (most <= plan.capacity) {
+            if (plan === this.plan) this.fitted(most);
+            return true;
+        }
         let { bands } = plan;
-        if (most > this.maxCapacity) {
-            const [rows] = this.tiles(drawing.camera);
+        const [rows] = this.tiles(drawing.camera);
+        const limit = bands < rows ? Math.min(this.maxCapacity, BAND_CAPACITY) : this.maxCapacity;
+        if (most > limit) {
             if (bands >= rows) {
-                throw new Refusal(`A row of the picture needs ${most} entries, but this adapter's buffers hold ${this.maxCapacity}: `
+                throw new Refusal(`A row of the picture needs ${most} entries, but this adapter's buffers hold ${limit}: `
                     + "make the window smaller.");
             }
             const all = totals.reduce((sum, each) => sum + each, 0);
-            bands = Math.min(rows, Math.max(bands + 1, Math.ceil(5 * all / (4 * this.maxCapacity))));
+            bands = Math.min(rows, Math.max(bands + 1, Math.ceil(5 * all / (4 * limit))));
         }
-        const capacity = Math.min(this.maxCapacity, Math.floor((Math.floor(5 * most / 4) + 4095) / 4096) * 4096);
-        this.plan = { capacity, bands };
+        this.plan = { capacity: Math.min(limit, roomy(most)), bands };
+        this.watched = this.most = 0;
         return false;
+    }
+
+    // After a close look the passes would go on with all the room that it took (splat/drawing_plan.py).
+    fitted(most) {
+        this.watched += 1;
+        this.most = Math.max(this.most, most);
+        if (this.watched < WATCHED) return;
+        if (2 * roomy(this.most) <= this.plan.capacity) this.plan = { ...this.plan, capacity: roomy(this.most) };
+        this.watched = this.most = 0;
     }
 
     tiles(camera) {

@@ -99,6 +99,7 @@ class DecoderPasses:
             _, features = self._activate(commands, first, count, inputs, weights)
             target = Matrix.of(outputs.rows(first, count))
             self._product(commands, f"outputs {first}", features, Matrix.of(weights["heads"]).transpose, target)
+            commands.flush()  # all blocks together may take longer than a watchdog allows
 
     def decode_bwd(
         self,

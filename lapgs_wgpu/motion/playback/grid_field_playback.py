@@ -239,6 +239,7 @@ class GridFieldPlayback:
                     weights=self._weights,
                     **outputs,
                 )
+                commands.flush()  # all blocks together may take longer than a watchdog allows
 
 
 def _fill_geometry(quads: NDArray[np.float32], outputs: NDArray[np.floating]) -> None:
