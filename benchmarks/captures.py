@@ -94,7 +94,7 @@ def draw(folder: Path, cache_gb: float, steps: int, step: float) -> dict[str, fl
 
     from lapgs_wgpu.data import load_dataset
     from lapgs_wgpu.gpu.device import open_device
-    from lapgs_wgpu.train.dataloader import Pictures
+    from lapgs_wgpu.train.dataloader import ImageLoader
 
     start = time.perf_counter()
     data = load_dataset(folder)
@@ -103,7 +103,9 @@ def draw(folder: Path, cache_gb: float, steps: int, step: float) -> dict[str, fl
     for frame in data.train[:: len(data.times)]:
         frame.load()
     unpacking, after_unpacking = time.perf_counter() - start, megabytes()
-    with closing(Pictures(data.train, "black", cache_gb, torch.Generator().manual_seed(0), open_device())) as pictures:
+    with closing(
+        ImageLoader(data.train, "black", cache_gb, torch.Generator().manual_seed(0), open_device())
+    ) as pictures:
         waits, decodes = [], []
         get = pictures._cache.get
 

@@ -70,7 +70,7 @@ def _train(arguments: list[str]) -> None:
     out = Path(default if given["out"] is None else given["out"])
     if ranks.first:
         check_run_folder(out, overwrite=given["overwrite"])
-    device = open_device(given["device"], number=ranks.on_machine)
+    device = open_device(given["device"], number=ranks.local_rank)
     config, dataset = _open_data(config, out.parent, ranks)
     train(config, dataset, out, device=device, overwrite=given["overwrite"], watch=watch, ranks=ranks, lpips=lpips)
     if ranks.first:
@@ -97,7 +97,7 @@ def _resume(
     _check_files("--resume", "a run", run / "config.toml")
     config = load_config(str(run / "config.toml"), overrides)
     _check_capture(run, config)
-    device = open_device(given["device"], number=ranks.on_machine)
+    device = open_device(given["device"], number=ranks.local_rank)
     config, dataset = _open_data(config, run.parent, ranks)
     if "data.path" in overrides:
         check_same_data(run, config.data.path, dataset)
@@ -209,13 +209,13 @@ def _scene_name(config: Config) -> str:
 def _open_data(config: Config, parent: Path, ranks: Ranks, *, normalize: bool = True) -> tuple[Config, Dataset]:
     """The dataset, and the configuration with its folder. parent: folder for built-in scenes, which the first of
     several processes writes. normalize: of `load_dataset`."""
-    from lapgs_wgpu.train.open_dataset import open_dataset, with_folder
+    from lapgs_wgpu.train.open_dataset import open_dataset, resolve_data
 
     if not ranks.first:
-        ranks.any(False)  # waits for the first process, which writes the scene
-    config = with_folder(config, parent)
+        ranks.barrier()  # waits for the first process, which writes the scene
+    config = resolve_data(config, parent)
     if ranks.first:
-        ranks.any(False)
+        ranks.barrier()
     return config, open_dataset(config, normalize=normalize)
 
 

@@ -104,7 +104,7 @@ def _convert(given: argparse.Namespace, out: Path) -> Diagnosis:
     for measure in done.diagnosis.measures:
         if measure.good is False:
             print(measure, file=sys.stderr)
-    then = "" if given.train else f"; {beside('lapgs-train')} {done.preset} --data {quote(str(done.folder))}"
+    then = "" if given.train else f"; {beside('lapgs-prepare')} --check {quote(str(done.folder))} --train"
     print(f"{done.folder}: {done.images} images, {done.placed} of {done.cameras} cameras placed{then}", flush=True)
     return done.diagnosis
 

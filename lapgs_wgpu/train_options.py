@@ -24,7 +24,7 @@ Train a 4D Gaussian splatting model of a moving scene on a folder of images. Run
   lapgs-train tiny --data motion:path=4         built-in scene that measures motion (docs/metrics.md)
   lapgs-train tiny --data DIR                   D-NeRF scene at 200x200 pixels, with settings for a CPU
   lapgs-train dnerf --data DIR --out RUN        D-NeRF scene as in the paper (800x800 pixels)
-  lapgs-train dnerf-400 --data DIR              D-NeRF scene at 400x400 pixels, an hour or two on two CPU cores
+  lapgs-train dnerf-400 --data DIR              D-NeRF scene at 400x400 pixels, some hours on two CPU cores
   lapgs-train hypernerf --data DIR              Nerfies or HyperNeRF capture; for a CPU: hypernerf-tiny
   lapgs-train neu3d --data DIR                  several static cameras; for a CPU: neu3d-tiny
   lapgs-train hypernerf-tiny --data DIR         your own film, converted by lapgs-prepare (see its --help)
@@ -84,7 +84,7 @@ def parse_options(arguments: list[str]) -> dict[str, typing.Any]:
     add("--lpips-weights", metavar="FILE", help="also compute LPIPS (VGG) in the evaluation with the weights in FILE, "
         "a .safetensors file (docs/metrics.md)")
     add("--motion-from", metavar="RUN", help="with --eval: find the moving pixels, for their metrics, by comparing the "
-        "test images with the renderings of RUN, a static model of the same capture (--field static; docs/metrics.md), "
+        "test images with the renderings of RUN, a static fit of the same capture (--field static; docs/metrics.md), "
         "in place of the median of still cameras")
     # fmt: on
     groups: dict[str, argparse._ArgumentGroup] = {}

@@ -138,7 +138,7 @@ def test_it_rests_where_discovery_explains_what_moves(dataset: Dataset, device: 
         configure(acceleration__weight="1", acceleration__interval="1", schedule__warm_up="0"), dataset, device
     ) as training:
         assert training.step().terms["acceleration"] > 0
-        training._objective.followed = True
+        training._objective.field_fitted = True
         assert "acceleration" not in training.step().terms
 
 

@@ -28,9 +28,9 @@ from scipy.spatial import cKDTree
 
 from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.data.cloud import views_of
-from lapgs_wgpu.data.poses import rotation
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.splat.camera import rotation_matrix
 
 
 @pytest.fixture(scope="module")
@@ -115,7 +115,7 @@ def test_a_sparse_cloud_is_filled_up_where_cameras_look(toy: Path) -> None:
 def test_rotations_are_quaternions_wxyz() -> None:
     for camera in cameras(3):
         R = camera.T_cam_world[:3, :3]
-        np.testing.assert_allclose(rotation(quaternion(R)), R, atol=1e-12)
+        np.testing.assert_allclose(rotation_matrix(quaternion(R)), R, atol=1e-12)
 
 
 def stems(views: Any) -> list[str]:

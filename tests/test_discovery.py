@@ -25,7 +25,7 @@ from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.discovery.acceptance import explained_share, rows_with, tracks_in_images
 from lapgs_wgpu.train.discovery.discover import discover
-from lapgs_wgpu.train.discovery.field_fit import fit_field, keeping_rates
+from lapgs_wgpu.train.discovery.field_fit import fit_field, max_rates_after_fit
 from lapgs_wgpu.train.discovery.residual import Residual, moving_pixels
 from lapgs_wgpu.train.discovery.static_fit import static_config, static_fit
 from lapgs_wgpu.train.discovery.surface_points import PointClouds, Points, surface_points
@@ -33,9 +33,9 @@ from lapgs_wgpu.train.discovery.tracks import Tracks, find_tracks
 from lapgs_wgpu.train.discovery.trajectories import find_trajectories
 from lapgs_wgpu.train.optimizer import Optimizer
 from lapgs_wgpu.train.presets import load_config
+from lapgs_wgpu.train.resolve_config import resolve_for_dataset
 from lapgs_wgpu.train.run import train
 from lapgs_wgpu.train.start import RISE
-from lapgs_wgpu.train.suited import suited
 from lapgs_wgpu.train.trainer import Trainer
 
 RADIUS, BOX = 0.2, 1.3
@@ -445,7 +445,7 @@ def test_a_field_that_moves_nothing_starts_from_the_static_fit(dataset: Dataset,
 
 
 def test_discovery_starts_a_training_which_goes_on_to_the_same_bits(dataset: Dataset, device: Device) -> None:
-    config = suited(configure(), dataset)
+    config = resolve_for_dataset(configure(), dataset)
     found = discover(config, dataset, device, Trainer)
     assert "moving parts" in found.summary
     with closing(Trainer(config, dataset, device, scene=found.scene)) as whole:
@@ -507,14 +507,14 @@ def test_rates_rise_after_discovery(
 
 def test_a_field_that_knows_the_tracks_learns_slowly_also_when_resumed(dataset: Dataset, device: Device) -> None:
     config = configure()
-    assert config.rates.mlp.start > keeping_rates(["mlp"])["mlp"]
+    assert config.rates.mlp.start > max_rates_after_fit(["mlp"])["mlp"]
     with closing(Trainer(config, dataset, device)) as training:
-        assert training._optimizer.highest == keeping_rates(["hash", "mlp"])
+        assert training._optimizer.highest == max_rates_after_fit(["hash", "mlp"])
         state = training.state()
     with closing(Trainer(config, dataset, device, resumed=True)) as resumed:
         assert resumed._optimizer.highest == {}
         resumed.restore(state)
-        assert resumed._optimizer.highest == keeping_rates(["hash", "mlp"])
+        assert resumed._optimizer.highest == max_rates_after_fit(["hash", "mlp"])
     with closing(Trainer(configure(discovery__least="1"), dataset, device)) as training:
         assert training._optimizer.highest == {}  # nothing was added
 

@@ -21,7 +21,7 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.scene import load
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.distributed import Ranks
-from lapgs_wgpu.train.objective import Look
+from lapgs_wgpu.train.objective import Sample
 from lapgs_wgpu.train.presets import write_toml
 from lapgs_wgpu.train.run import train
 from lapgs_wgpu.train.trainer import Trainer
@@ -35,7 +35,7 @@ def test_gradients_of_a_step_are_the_mean_over_its_views(
     for views in ([0], [1], [0, 1]):
         config = configure(schedule__batch=str(len(views)), schedule__warm_up="0", smoothness__share="0")
         training = Trainer(config, dataset, device)
-        training._pictures.order = list(views)
+        training._images.order = list(views)
         monkeypatch.setattr(training._optimizer, "step", lambda step, share: None)
         training.step()
         gradients = {name: [g.clone() for g in group] for name, group in training._gradients().items()}
@@ -65,9 +65,9 @@ def test_every_process_draws_the_same_numbers_and_other_views(
     looked: list[str] = []
     original = Trainer._loss
 
-    def note(self: Trainer, look: Look) -> object:
-        looked.append(look.view.name)
-        return original(self, look)
+    def note(self: Trainer, sample: Sample) -> object:
+        looked.append(sample.view.name)
+        return original(self, sample)
 
     monkeypatch.setattr(Trainer, "_loss", note)
     monkeypatch.setattr(Ranks, "gather", lambda self, tensors: [[tensor] * self.count for tensor in tensors])
@@ -90,7 +90,7 @@ import atexit, os, pathlib, torch
 atexit.register(lambda: print([task.read_text() for task in pathlib.Path("/proc/self/task").glob("*/comm")]))
 from lapgs_wgpu.train.distributed import join_ranks
 ranks = join_ranks()
-ranks.any(False)
+ranks.barrier()
 weight = torch.ones(3, requires_grad=True)
 torch.optim.Adam([weight])
 """

@@ -23,8 +23,9 @@ from lapgs_wgpu.motion.playback.grid_field_playback import (
     runs_on_device,
 )
 from lapgs_wgpu.motion.playback.playback import activate
-from lapgs_wgpu.motion.scene import Scene4D, rotate
+from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.gaussians import Gaussians
+from lapgs_wgpu.splat.rotation import rotate
 
 pytestmark = pytest.mark.kernels
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.captures import write_colmap, write_nerfies, write_nerfstudio, write_neu3d
-from helpers.doors import write_endonerf, write_polycam, write_record3d
+from helpers.external_captures import write_endonerf, write_polycam, write_record3d
 from helpers.hostile import (
     ByteEdits,
     TreeEdits,

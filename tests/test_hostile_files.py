@@ -59,7 +59,7 @@ from lapgs_wgpu.train.run_folder import STATE, check_state, load_state, save_sta
 from lapgs_wgpu.train.table_results import Results, markdown, read_results, read_run, write_results
 from lapgs_wgpu.train.table_spec import read_spec
 from lapgs_wgpu.train.trainer import Trainer
-from lapgs_wgpu.viewer.capture import open_capture
+from lapgs_wgpu.viewer.ground_truth import open_ground_truth
 from lapgs_wgpu.viewer.path_file import read_path
 
 
@@ -287,7 +287,7 @@ def test_finished_runs(
         write_results(folder, Results("a", "tiny", (result,)))
         read_results(folder / "results.json")
     refused_or(lambda: changes_since_without_device(folder))
-    open_capture(folder / "checkpoint.ply", {})
+    open_ground_truth(folder / "checkpoint.ply", {})
 
 
 def read_spec_text(folder: Path, config: Config) -> Any:

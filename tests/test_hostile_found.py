@@ -47,7 +47,7 @@ from lapgs_wgpu.train.step_result import StepResult
 from lapgs_wgpu.train.table_results import read_results, write_results
 from lapgs_wgpu.train.table_spec import read_spec
 from lapgs_wgpu.train.trainer import Trainer
-from lapgs_wgpu.viewer.capture import open_capture
+from lapgs_wgpu.viewer.ground_truth import open_ground_truth
 from lapgs_wgpu.viewer.path_file import read_path
 
 FOUND_TOML = {
@@ -182,7 +182,7 @@ def test_found_in_a_run_folder(tmp_path: Path) -> None:
     (tmp_path / "config.toml").write_text('record = "x"\n')
     assert changes_since_without_device(tmp_path) == []
     (tmp_path / "config.toml").write_text(f'[data]\npath = "{tmp_path}"\nsize = inf\n')
-    assert open_capture(tmp_path / "checkpoint.ply", {}) is None
+    assert open_ground_truth(tmp_path / "checkpoint.ply", {}) is None
 
 
 # Names that lead elsewhere -------------------------------------------------------------------------------------------

@@ -204,7 +204,7 @@ def test_a_step_is_that_of_the_rasteriser_and_the_references(device: Device, ant
         {
             "l1": loss_reference.l1(image, truth).item(),
             "mse": (image - truth).square().mean().item(),
-            "ssim": image_metrics.ssim(image, truth.double()).item(),
+            "ssim": 1 - image_metrics.ssim(image, truth.double()).item(),
             "pyramid": loss_reference.pyramid_loss(image, truth).item(),
             "ncc": loss_reference.ncc_loss(image, truth.double()).item(),
         },

@@ -78,10 +78,10 @@ def test_long_products_are_sums_of_parts(device: Device, inner: int, monkeypatch
     runs = []
     for _ in range(2):
         with Commands(device) as commands:
-            product.long(commands, "fresh", of_a.transpose, of_b, fresh)
+            product.split_k(commands, "fresh", of_a.transpose, of_b, fresh)
         runs.append(read(fresh))
     with Commands(device) as commands:
-        product.long(commands, "added", of_a.transpose, of_b, added, add=True)
+        product.split_k(commands, "added", of_a.transpose, of_b, added, add=True)
     exact = a.double().T @ b.double()
     assert torch.equal(*runs)
     assert relative(runs[0], exact) < 1e-6
@@ -94,5 +94,5 @@ def test_long_sums_are_accurate(device: Device) -> None:
     total = on_device(device, torch.zeros(1, 1))
     column = Matrix.of(on_device(device, ones))
     with Commands(device) as commands:
-        Matmul(device, BufferPool(device)).long(commands, "sum", column.transpose, column, total)
+        Matmul(device, BufferPool(device)).split_k(commands, "sum", column.transpose, column, total)
     assert float(read(total)) == pytest.approx(20_000 * float(np.float32(0.1)) ** 2, rel=2e-5)

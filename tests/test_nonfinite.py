@@ -22,7 +22,7 @@ from lapgs_wgpu.train import objective
 from lapgs_wgpu.train.adaptive_split import adaptive_split
 from lapgs_wgpu.train.densify import Statistics, densify
 from lapgs_wgpu.train.fused_loss import RenderLoss
-from lapgs_wgpu.train.nonfinite import IN_A_ROW, SHARE, Health, Skipped, describe, finite
+from lapgs_wgpu.train.nonfinite import IN_A_ROW, SHARE, SkipCounter, Skipped, describe, finite
 from lapgs_wgpu.train.run import resume, train
 from lapgs_wgpu.train.run_folder import STATE, load_state
 from lapgs_wgpu.train.trainer import Trainer
@@ -176,7 +176,7 @@ def test_a_bad_parameter_stops_the_training_and_leaves_the_older_state(
 
 
 def test_repeated_and_frequent_skips_end_a_training() -> None:
-    health = Health()
+    health = SkipCounter()
     for _ in range(IN_A_ROW - 1):
         health.note(BAD)
     health.note(None)
@@ -184,13 +184,13 @@ def test_repeated_and_frequent_skips_end_a_training() -> None:
         health.note(BAD)
     with pytest.raises(NumericalError, match=r"10 steps in a row .*; the last: step 3 was skipped: on view r_003"):
         health.note(BAD)
-    health = Health()
+    health = SkipCounter()
     for _ in range(SHARE - 1):
         for each in (BAD, None, None):
             health.note(each)
     with pytest.raises(NumericalError, match=f"{SHARE} of the last .* steps had values that are not finite"):
         health.note(BAD)
-    health = Health()
+    health = SkipCounter()
     for _ in range(1000):  # one in five
         for each in (BAD, None, None, None, None):
             health.note(each)

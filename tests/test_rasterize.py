@@ -269,7 +269,7 @@ def test_workgroups_are_checked_when_a_tile_is_drawn(device: Device, use: Callab
     expected = step(scene, camera, device)
     rasterizer = use(Rasterizer(device, config=replace(gpu_config(32), subgroups=True, listed=True)))
     step(scene | {"opacities": torch.zeros(500)}, camera, device)
-    assert not rasterizer.config.torn
+    assert not rasterizer.config.split_passes
     found = step(scene, camera, device)
     assert not rasterizer.config.shuffles("rasterize")
     assert torch.equal(found.image, expected.image)
@@ -303,7 +303,7 @@ def test_only_the_backward_pass_is_cut(
     expected = step(scene, camera, device)
     defines = RasterConfig.raster_defines
     rasterizer = use(Rasterizer(device, config=replace(gpu_config(32), subgroups=True)))
-    torn = rasterizer._subgroup_mismatch
+    mismatch = rasterizer._subgroup_mismatch
 
     def forward_without(self: RasterConfig, name: str = "rasterize", *, depth: bool) -> dict[str, int]:
         found = defines(self, name, depth=depth)
@@ -314,7 +314,9 @@ def test_only_the_backward_pass_is_cut(
     monkeypatch.setattr(RasterConfig, "raster_defines", forward_without)
     asked: list[tuple[str, bool]] = []
     monkeypatch.setattr(
-        rasterizer, "_subgroup_mismatch", lambda name, drawn: asked.append((name, torn(name, drawn))) or asked[-1][1]
+        rasterizer,
+        "_subgroup_mismatch",
+        lambda name, drawn: asked.append((name, mismatch(name, drawn))) or asked[-1][1],
     )
     found = step(scene, camera, device)
     assert asked == [("rasterize", False), ("rasterize_bwd", True), ("rasterize_bwd", False)]
@@ -351,10 +353,10 @@ def test_a_processors_backward_pass_is_cut(device: Device, use: Callable[[Raster
     use(Rasterizer(device, config=cpu_config(0, 255)))
     expected = step(scene, camera, device)
     rasterizer = use(Rasterizer(device, config=cpu_config(8, 255)))
-    torn = iter([True])
+    mismatches = iter([True])
 
     def mismatch(name: str, drawn: Drawing) -> bool:
-        if name == "rasterize" or not next(torn, False):
+        if name == "rasterize" or not next(mismatches, False):
             return False
         rasterizer.config = rasterizer.config.without_subgroups(name)
         return True

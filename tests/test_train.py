@@ -26,15 +26,15 @@ from lapgs_wgpu.motion.scene import Scene4D, load
 from lapgs_wgpu.train import objective, trainer
 from lapgs_wgpu.train import run as run_module
 from lapgs_wgpu.train.config import LossWeights
-from lapgs_wgpu.train.dataloader import Pictures
+from lapgs_wgpu.train.dataloader import ImageLoader
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
 from lapgs_wgpu.train.initial_points import initial_points
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.optimizer import Optimizer
 from lapgs_wgpu.train.presets import load_config
+from lapgs_wgpu.train.resolve_config import resolve_decoder, resolve_for_dataset
 from lapgs_wgpu.train.run import train
 from lapgs_wgpu.train.step_result import StepResult
-from lapgs_wgpu.train.suited import suited, with_decoder_placed
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +71,7 @@ def test_a_run_is_whole(run: Path, dataset: Dataset) -> None:
     assert {file.name for file in run.iterdir()} == {
         "config.toml", "log.jsonl", "metrics.json", "metrics.csv", "checkpoint.ply", "eval",
     }  # fmt: skip
-    assert suited(configure(), dataset).field.components == 4  # of 8 times
+    assert resolve_for_dataset(configure(), dataset).field.components == 4  # of 8 times
     assert load_config(str(run / "config.toml")) == dataclasses.replace(configure(), decoder="torch")
     record = (run / "config.toml").read_text().split("[record]")[1]
     assert all(f"\n{key} = " in record for key in ("lapgs_wgpu", "torch", "adapter", "driver"))
@@ -226,7 +226,7 @@ def test_where_the_decoder_works_follows_from_the_device(
 ) -> None:
     monkeypatch.setattr(device, "is_cpu", is_cpu)
     config = configure(**given)
-    assert with_decoder_placed(config, device) == dataclasses.replace(config, decoder=place)
+    assert resolve_decoder(config, device) == dataclasses.replace(config, decoder=place)
 
 
 def test_the_place_of_the_decoder_is_told_and_recorded(
@@ -267,7 +267,7 @@ def test_another_seed_gives_another_model(run: Path, dataset: Dataset, device: D
 def test_nothing_moves_during_the_warm_up(dataset: Dataset, device: Device, tmp_path: Path) -> None:
     config = configure(schedule__steps="4")
     scene = train(config, dataset, tmp_path / "run", device=device)
-    field = suited(config, dataset).field
+    field = resolve_for_dataset(config, dataset).field
     fresh = Scene4D.from_points(*initial_points(config.points, dataset, 0), field, device=device)
     assert scene.field is not None
     assert fresh.field is not None
@@ -323,7 +323,7 @@ def test_cross_correlation_counts_once_the_warm_up_is_over(
     for weights, done in seen:
         assert weights[:3] == pytest.approx((0.8, 0.2, 0.2))
         terms = {"ncc": 0.0} | done.terms
-        loss = 0.8 * terms["l1"] + 0.2 * (1 - terms["ssim"]) + 0.2 * terms["pyramid"] + weights.ncc * terms["ncc"]
+        loss = 0.8 * terms["l1"] + 0.2 * terms["ssim"] + 0.2 * terms["pyramid"] + weights.ncc * terms["ncc"]
         assert done.loss.item() == pytest.approx(loss, rel=1e-5)
 
 
@@ -380,7 +380,7 @@ def test_overwriting_replaces_a_run_and_nothing_else(dataset: Dataset, device: D
 
 
 def test_every_picture_is_drawn_once_an_epoch(dataset: Dataset, device: Device) -> None:
-    with closing(Pictures(dataset.train, "black", 1.0, torch.Generator().manual_seed(3), device)) as pictures:
+    with closing(ImageLoader(dataset.train, "black", 1.0, torch.Generator().manual_seed(3), device)) as pictures:
         epochs = [[pictures.choose()[0].name for _ in dataset.train] for _ in range(3)]
     assert all(sorted(epoch) == sorted(view.name for view in dataset.train) for epoch in epochs)
     assert epochs[0] != epochs[1]
@@ -391,7 +391,7 @@ def test_memory_and_device_share_one_bound_where_they_are_one(dataset: Dataset, 
     picture = 32 * 32 * 4
     for pictures_held, decoded_again in ((1, True), (4, True), (100, False)):
         bound = pictures_held * picture / 1e9
-        with closing(Pictures(dataset.train, "random", bound, torch.Generator().manual_seed(3), device)) as pictures:
+        with closing(ImageLoader(dataset.train, "random", bound, torch.Generator().manual_seed(3), device)) as pictures:
             for _ in range(3 * len(dataset.train)):
                 truth = pictures.on_device(pictures.choose()[0])
                 held = pictures._truths.used_bytes
@@ -406,7 +406,7 @@ def test_memory_and_device_share_one_bound_where_they_are_one(dataset: Dataset, 
 def test_pictures_lie_on_their_background(background: str, dataset: Dataset, device: Device) -> None:
     """On a fixed background they lie before they are uploaded, on a random one in the loss's first pass."""
     generator = torch.Generator().manual_seed(3)
-    with closing(Pictures(dataset.train, background, 1.0, generator, device)) as pictures:  # type: ignore[arg-type]
+    with closing(ImageLoader(dataset.train, background, 1.0, generator, device)) as pictures:  # type: ignore[arg-type]
         drawn = [(view, pictures.on_device(view), color) for view, color in (pictures.choose() for _ in range(4))]
     for view, truth, color in drawn:
         picture = truth.read().view(np.uint8).reshape(32, 32, 4)

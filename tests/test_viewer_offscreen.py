@@ -24,9 +24,9 @@ from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.rasterize import rasterize
 from lapgs_wgpu.train.evaluate import to_8_bit
 from lapgs_wgpu.viewer import offscreen as offscreen_module
-from lapgs_wgpu.viewer.capture import open_capture
 from lapgs_wgpu.viewer.cli import view_command
 from lapgs_wgpu.viewer.export import export_compact
+from lapgs_wgpu.viewer.ground_truth import open_ground_truth
 from lapgs_wgpu.viewer.loaded_scene import load_scene
 from lapgs_wgpu.viewer.offscreen import framed
 from lapgs_wgpu.viewer.path import CameraPath, KeyFrame, Pose
@@ -464,9 +464,9 @@ def test_the_capture_opens_as_the_training_opened_it(
         "lapgs_wgpu.data.load_dataset", lambda path, **given: opened.append(given) or SimpleNamespace(test=(), train=())
     )
     (tmp_path / "config.toml").write_text(f'[data]\npath = "{tmp_path}"\nsize = 200\n{line}\n')
-    assert open_capture(tmp_path / "checkpoint.ply", {}) is not None
+    assert open_ground_truth(tmp_path / "checkpoint.ply", {}) is not None
     assert opened == [{"image_size": 200, "normalize": True, "undistort": expected}]
-    assert open_capture(tmp_path / "snapshots" / "step_000005.ply", {}) is not None
+    assert open_ground_truth(tmp_path / "snapshots" / "step_000005.ply", {}) is not None
 
 
 @pytest.mark.parametrize("compare", ["side", "split", "error"])

@@ -32,7 +32,7 @@ from lapgs_wgpu.gpu.wgpu_errors import TranslatedErrors
 from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.rasterize import rasterizer_of
-from lapgs_wgpu.train.dataloader import Pictures
+from lapgs_wgpu.train.dataloader import ImageLoader
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.run import resume, train
 from lapgs_wgpu.train.run_folder import STATE, load_state
@@ -158,13 +158,13 @@ def test_a_half_step_whose_error_is_kept_is_not_saved_either(
 def test_nothing_is_saved_before_the_first_step(
     dataset: Dataset, doomed: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    original = Pictures.choose
+    original = ImageLoader.choose
 
-    def choose(self: Pictures) -> Any:
+    def choose(self: ImageLoader) -> Any:
         doomed.wgpu_device.destroy()
         return original(self)
 
-    monkeypatch.setattr(Pictures, "choose", choose)
+    monkeypatch.setattr(ImageLoader, "choose", choose)
     with pytest.raises(DeviceLostError, match=r"was lost, .*; nothing was saved yet\."):
         train(configure(), dataset, tmp_path, device=doomed)
     assert not (tmp_path / STATE).exists()

@@ -29,8 +29,8 @@ class InitialState(NamedTuple):
             state.mode = self.mode
         if self.view is not None:
             name = find_view(state.scene, self.view).name
-            assert state.capture is not None
-            state.stand_at([view.name for view in state.capture.views].index(name))
+            assert state.ground_truth is not None
+            state.stand_at([view.name for view in state.ground_truth.views].index(name))
         if self.background is not None:
             state.background = self.background
         if self.time is not None:

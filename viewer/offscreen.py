@@ -13,8 +13,8 @@ from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.splat.camera import Camera
 
-from .capture import open_capture
 from .frame import FrameRenderer, FrameRequest
+from .ground_truth import open_ground_truth
 from .loaded_scene import LoadedScene
 from .present import Offscreen
 from .render_modes import Mode
@@ -47,7 +47,7 @@ def check_mode(scene: LoadedScene, renderer: FrameRenderer, mode: Mode) -> None:
 def find_view(scene: LoadedScene, wanted: str) -> View:
     """The view of the capture beside the file with this number (the held-out ones come first) or name. Raises
     InputError."""
-    capture = open_capture(scene.path, scene.playback.metadata) if scene.path else None
+    capture = open_ground_truth(scene.path, scene.playback.metadata) if scene.path else None
     if capture is None:
         raise InputError(
             f"--view {wanted}: {scene.path} stands beside no config.toml that names a capture which is here."

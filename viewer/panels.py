@@ -129,7 +129,7 @@ class Panels:
             imgui.text_colored(_ACCENT, "flying: W A S D Q E, V ends")
         if state.training is not None:
             self._training(state.training)
-        if state.capture is not None:
+        if state.ground_truth is not None:
             self._capture()
         draw_path(state, self.viewport)
         self._files.draw()
@@ -150,9 +150,9 @@ class Panels:
 
     def _capture(self) -> None:
         state = self.state
-        assert state.capture is not None
+        assert state.ground_truth is not None
         imgui.separator_text("Capture")
-        names = [view.name for view in state.capture.views]
+        names = [view.name for view in state.ground_truth.views]
         imgui.set_next_item_width(-70)
         changed, chosen = imgui.combo("camera", -1 if state.view is None else state.view, names)
         if changed:

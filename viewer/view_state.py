@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from .capture import Capture, open_capture
 from .clock import LOOPS, SPEEDS
 from .frame import FrameRenderer
+from .ground_truth import GroundTruth, open_ground_truth
 from .loaded_scene import LoadedScene
 from .path import Pose
 from .path_editor import PathEditor
@@ -43,36 +43,36 @@ class ViewState:
         self.path = PathEditor()
         self.background = scene.background
         self.show_transport = scene.playback.moves if self._transport is None else self._transport
-        self._capture: Capture | None = None
-        self._capture_sought = False
+        self._ground_truth: GroundTruth | None = None
+        self._ground_truth_sought = False
         self.view: int | None = None
         if self.mode not in self.renderer.modes():
             self.mode = "rgb"
         self.message: str | None = None if scene.playback.moves else "no motion data in this file"
 
     @property
-    def capture(self) -> Capture | None:
+    def ground_truth(self) -> GroundTruth | None:
         """The capture that the scene was trained on, where it is available. Opened at first use: the first frame does
         not wait for it."""
-        if not self._capture_sought:
+        if not self._ground_truth_sought:
             scene = self.scene
-            self._capture = open_capture(scene.path, scene.playback.metadata) if scene.path else None
-            self._capture_sought = True
-        return self._capture
+            self._ground_truth = open_ground_truth(scene.path, scene.playback.metadata) if scene.path else None
+            self._ground_truth_sought = True
+        return self._ground_truth
 
     def comparing(self) -> Compare:
         """The comparison in effect: off where the capture has no image of the present camera and time."""
-        if self.view is None or self.camera.exact is None or self.mode != "rgb" or self.capture is None:
+        if self.view is None or self.camera.exact is None or self.mode != "rgb" or self.ground_truth is None:
             return "off"
-        return self.compare if abs(self.clock.time - self.capture.views[self.view].time) < 1e-6 else "off"
+        return self.compare if abs(self.clock.time - self.ground_truth.views[self.view].time) < 1e-6 else "off"
 
     def stand_at(self, view: int) -> None:
         """Go to a camera of the capture and to its time."""
-        assert self.capture is not None
+        assert self.ground_truth is not None
         self.view = view
-        self.camera.snap(self.capture.views[view].camera)
+        self.camera.snap(self.ground_truth.views[view].camera)
         self.clock.playing = False
-        self.clock.seek(self.capture.views[view].time)
+        self.clock.seek(self.ground_truth.views[view].time)
 
     def stand_on(self, pose: Pose, time: float) -> None:
         """Go to a pose of a camera path and to a time."""
@@ -120,11 +120,11 @@ class ViewState:
         self.flying = not self.flying
 
     def next_view(self) -> None:
-        if self.capture is not None:
-            self.stand_at((self.view + 1 if self.view is not None else 0) % len(self.capture.views))
+        if self.ground_truth is not None:
+            self.stand_at((self.view + 1 if self.view is not None else 0) % len(self.ground_truth.views))
 
     def next_compare(self) -> None:
-        if self.capture is None:
+        if self.ground_truth is None:
             self.message = "nothing to compare with: the run folder beside this file names no capture that is here"
             return
         if self.view is None or self.camera.exact is None:

@@ -124,10 +124,10 @@ class Viewport:
         """What `Placed` has to know of the image that is compared with, if any. One that cannot be read ends the
         comparison, with a message."""
         state = self.state
-        if state.comparing() == "off" or state.capture is None or state.view is None:
+        if state.comparing() == "off" or state.ground_truth is None or state.view is None:
             return {}
         try:
-            return state.capture.truth(state.view, state.background, self.device)
+            return state.ground_truth.truth(state.view, state.background, self.device)
         except InputError as error:
             state.compare, state.message = "off", str(error)
             self.canvas.request_draw()

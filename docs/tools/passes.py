@@ -24,8 +24,8 @@ from lapgs_wgpu.train.discovery.acceptance import tracks_in_images
 from lapgs_wgpu.train.discovery.static_fit import static_fit
 from lapgs_wgpu.train.discovery.surface_points import surface_points
 from lapgs_wgpu.train.discovery.tracks import find_tracks
-from lapgs_wgpu.train.open_dataset import open_dataset, with_folder
-from lapgs_wgpu.train.suited import suited
+from lapgs_wgpu.train.open_dataset import open_dataset, resolve_data
+from lapgs_wgpu.train.resolve_config import resolve_for_dataset
 
 Picture = NDArray[np.uint8]
 Floats = NDArray[np.float32]
@@ -197,9 +197,9 @@ def discovery(scenes: Path) -> Picture:
 
     scenes: folder of built-in scenes.
     """
-    given = with_folder(load_config("demo", {"data.path": "synthetic"}), scenes)
+    given = resolve_data(load_config("demo", {"data.path": "synthetic"}), scenes)
     dataset = open_dataset(given)
-    config, device = suited(given, dataset), open_device()
+    config, device = resolve_for_dataset(given, dataset), open_device()
     meter = Progress(config.discovery.steps, "steps of the static fit", None)
     fit = static_fit(config, dataset, device, Trainer, meter.at)
     static, images = fit.scene, fit.images

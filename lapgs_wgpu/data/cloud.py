@@ -86,11 +86,10 @@ def views_of(points: Array, cameras: Sequence[Camera], near: float = 0.0, far: f
 
 def in_view(points: NDArray[np.floating], camera: Camera) -> tuple[NDArray[np.floating], NDArray[np.bool_]]:
     """Project points (N, 3): their depths (N,), NaN behind the camera, and a mask (N,) of those inside the image."""
-    local = points @ camera.T_cam_world[:3, :3].T + camera.T_cam_world[:3, 3]
-    depths = np.where(local[:, 2] > 0, local[:, 2], np.nan)
-    pixels = (local @ camera.K.T)[:, :2] / depths[:, None]
+    pixels, depths = camera.project(points)
+    ahead = depths > 0
     within = (pixels >= 0) & (pixels < [camera.width, camera.height])
-    return depths, within[:, 0] & within[:, 1]
+    return np.where(ahead, depths, np.nan), ahead & within[:, 0] & within[:, 1]
 
 
 def points_in_view(cameras: Sequence[Camera], near: float, far: float, count: int, seed: int) -> Array:

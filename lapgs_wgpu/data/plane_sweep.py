@@ -144,10 +144,9 @@ def _places(camera: Camera, depths: Array) -> Array:
 
 def _pixels(places: Array, camera: Camera) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Where points (N, 3) are in a camera's image, x and y (N,) in pixels, and whether they are inside it."""
-    local = places @ camera.T_cam_world[:3, :3].T + camera.T_cam_world[:3, 3]
-    ahead = local[:, 2] > 1e-9
-    x, y = (local @ camera.K.T)[:, :2].T / np.where(ahead, local[:, 2], 1.0)
-    inside = ahead & (x >= 0.5) & (y >= 0.5) & (x <= camera.width - 0.5) & (y <= camera.height - 0.5)
+    pixels, depths = camera.project(places)
+    x, y = pixels.T
+    inside = (depths > 1e-9) & (x >= 0.5) & (y >= 0.5) & (x <= camera.width - 0.5) & (y <= camera.height - 0.5)
     return np.where(inside, x, 0.5), np.where(inside, y, 0.5), inside
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -33,18 +32,6 @@ def check_rotation(R: Array, name: str) -> None:
         )
     if np.linalg.det(R) < 0:
         raise InputError(f"{name} is left-handed (determinant -1, must be 1); flip one of its axes.")
-
-
-def rotation(quaternion: Sequence[float] | Array) -> Array:
-    """(3, 3) of a unit quaternion wxyz."""
-    w, x, y, z = quaternion
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
 
 
 def world_to_camera(R_world_cam: Array, position: Array) -> Array:

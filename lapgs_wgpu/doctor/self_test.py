@@ -101,7 +101,7 @@ def _run(device_name: str | None) -> None:
         subgroup=lanes,
         shape=f"tiles of {config.tile_width}x{config.tile_height} pixels, {config.lanes} lanes, "
         f"{'with' if config.subgroups else 'without'} subgroups"
-        + "".join(f", but not in {name}" for name in sorted(config.torn)),
+        + "".join(f", but not in {name}" for name in sorted(config.split_passes)),
         exchange=f"{'mapped buffers' if device.mappable else 'staged copies'}, "
         f"tables in {'textures' if device.textures else 'buffers'}",
     )

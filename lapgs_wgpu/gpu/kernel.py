@@ -16,7 +16,7 @@ from .buffer import Buffer
 from .device import Device
 from .native import Encoder, raising
 from .profile import Profile
-from .shader import Binding, Defines, ShaderError, compose, pack, present, reflect
+from .shader import Binding, Defines, ShaderError, compose, enabled, pack, reflect
 from .wgpu_errors import TranslatedErrors, is_lost
 
 _LAYOUT_TYPE = {"uniform": "uniform", "read": "read-only-storage", "read_write": "storage"}
@@ -64,8 +64,8 @@ class Kernel:
 
     @staticmethod
     def get(device: Device, name: str, **defines: int) -> Kernel:
-        """The kernel with these defines (`shader.present`), compiled once per device."""
-        defines = present(defines)
+        """The kernel with these defines (`shader.enabled`), compiled once per device."""
+        defines = enabled(defines)
         if device.textures:
             defines["TEXTURES"] = 1
         key = (name, tuple(sorted(defines.items())))

@@ -10,7 +10,7 @@ from .kernel import Commands, Kernel
 from .pool import BufferPool
 
 _TILE = 64  # matmul.wgsl
-_SPLIT = 1 << 11  # inner elements of a partial sum of a long product
+_SPLIT = 1 << 11  # inner elements of a partial sum where the inner dimension is split
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Matmul:
         """c = a b, or c += a b with `add`. c must not be transposed."""
         self._dispatch(commands, name, a, b, c, a.columns, add=add)
 
-    def long(
+    def split_k(
         self, commands: Commands, name: str, a: Matrix, b: Matrix, total: DeviceArray, *, add: bool = False
     ) -> None:
         """total = a b, or total += a b with `add`, for a long inner dimension.

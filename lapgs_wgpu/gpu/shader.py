@@ -84,14 +84,14 @@ def _package_text(name: str) -> str:
     return file.read_text(encoding="utf-8")
 
 
-def present(defines: Defines) -> dict[str, int]:
+def enabled(defines: Defines) -> dict[str, int]:
     """The defines that are there: False stands for one that is absent."""
     return {define: int(value) for define, value in defines.items() if value is not False}
 
 
 def compose(name: str, defines: Defines) -> str:
     """The WGSL of shaders/<name>.wgsl with the given defines, complete."""
-    defines = present(defines)
+    defines = enabled(defines)
     imported: set[str] = set()
 
     def expand(file: str) -> list[str]:

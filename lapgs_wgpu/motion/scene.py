@@ -19,7 +19,7 @@ from ..splat.camera import Camera
 from ..splat.constants import CONSTANTS
 from ..splat.gaussians import Gaussians
 from ..splat.rasterize import Rendering, rasterize
-from ..splat.rotation import multiply, rotate
+from ..splat.rotation import multiply
 from .fields.config import MIN_SCALE, FieldConfig
 from .fields.deformation import Deformation, Moments, Nearby
 from .fields.grid_field import GridField
@@ -251,16 +251,12 @@ class Scene4D:
 
     def _placed(self, move: Deformation, means: Tensor, scales: Tensor) -> tuple[Tensor, Tensor]:
         """Means and scales after a move."""
-        if move.rotation is not None:
-            means = rotate(move.rotation, means)
-        if move.translation is not None:
-            means = means + move.translation
         if move.d_scales is not None:
             scales = scales + move.d_scales
             if self.field_config.negative_scales == "mirror":
                 scales = scales.abs()
             scales = scales.clamp(min=MIN_SCALE)
-        return means, scales
+        return move.apply_to_means(means), scales
 
     def render(
         self, camera: Camera, t: float, background: Tensor | Sequence[float] | None = None, *, depth: bool = True

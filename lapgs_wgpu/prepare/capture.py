@@ -34,13 +34,12 @@ ADVICE = "film slower, with more texture and overlap, and walk around what moves
 
 @dataclass(frozen=True)
 class Prepared:
-    """A finished capture. images: their number. placed: cameras with a pose, of `cameras`. preset: that fits it."""
+    """A finished capture. images: their number. placed: cameras with a pose, of `cameras`."""
 
     folder: Path
     images: int
     placed: int
     cameras: int
-    preset: str
     diagnosis: Diagnosis
 
 
@@ -95,8 +94,7 @@ def prepare(
         diagnosis = replace(diagnosis, folder=out, dataset=replace(diagnosis.dataset, warnings=told))
         write_report(diagnosis, folder / REPORT, out.resolve().name)
         shutil.rmtree(folder / "colmap", ignore_errors=True)
-    preset = "neu3d-tiny" if still else "hypernerf-tiny"
-    return Prepared(out, len(pictures), placed, wanted, preset, diagnosis)
+    return Prepared(out, len(pictures), placed, wanted, diagnosis)
 
 
 def extract_all(films: Sequence[Film], images: Path, fps: float | None, longer_side: int) -> list[Extraction]:

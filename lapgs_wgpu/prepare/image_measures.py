@@ -103,9 +103,7 @@ def _nanmedian(values: Floats, axis: int) -> Floats:
 
 def _pixels(points: Floats, camera: Camera, seen: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Column and row of the pixels that show points."""
-    local = points[seen] @ camera.T_cam_world[:3, :3].T + camera.T_cam_world[:3, 3]
-    place = local @ camera.K.T
-    place = place[:, :2] / place[:, 2:]
+    pixels, _ = camera.project(points[seen])
     most = [camera.width - 1, camera.height - 1]
-    column, row = np.clip(np.floor(place).astype(np.int64), 0, most).T
+    column, row = np.clip(np.floor(pixels).astype(np.int64), 0, most).T
     return column, row

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +47,12 @@ class Camera:
         """(3,) camera center in world coordinates."""
         R, t = self.T_cam_world[:3, :3], self.T_cam_world[:3, 3]
         return -R.T @ t
+
+    def project(self, points: NDArray[np.floating]) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+        """Pixel coordinates (N, 2) and depths (N,) of points (N, 3), world units; infinite or NaN at depth 0."""
+        local = points @ self.T_cam_world[:3, :3].T + self.T_cam_world[:3, 3]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return (local @ self.K.T)[:, :2] / local[:, 2:], local[:, 2]
 
     def resized(self, width: int, height: int) -> Camera:
         """The same camera for an image of another size: width and height in pixels."""
@@ -90,6 +98,16 @@ class Camera:
         T = np.eye(4)
         T[:3, :3], T[:3, 3] = R, -R @ eye
         return Camera(intrinsics_of_fov(fov_x, width, height), T, width, height)
+
+
+def rotation_matrix(quaternion: NDArray[np.floating] | Sequence[float]) -> NDArray[Any]:
+    """(3, 3) of a unit quaternion (4,) wxyz; (3, 3, N) of (4, N)."""
+    w, x, y, z = quaternion
+    return np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ])  # fmt: skip
 
 
 def intrinsics_of_fov(fov_x: float, width: int, height: int) -> NDArray[np.float64]:

@@ -22,7 +22,7 @@ class RasterConfig:
     """A workgroup of `lanes` draws a tile of tile_width x tile_height pixels, each lane `rows` pixels of a column.
 
     subgroups: the lanes form one subgroup and exchange values by shuffles instead of workgroup memory.
-    torn: passes whose workgroups the driver splits into several subgroups nevertheless; they use workgroup memory.
+    split_passes: whose workgroups the driver splits into several subgroups nevertheless; they use workgroup memory.
     lane_runs: use the radix sort for CPU devices, and a polynomial for exp2, which is slow there.
     round_splats: maximum number of splats of a list that one dispatch draws, on devices that limit loops; else None.
     listed: only tiles with splats get a workgroup; the rest of the image is copied from one without splats before.
@@ -36,7 +36,7 @@ class RasterConfig:
     lane_runs: bool
     round_splats: int | None = None
     listed: bool = False
-    torn: tuple[str, ...] = ()
+    split_passes: tuple[str, ...] = ()
 
     @property
     def rows(self) -> int:
@@ -48,13 +48,13 @@ class RasterConfig:
 
     def shuffles(self, name: str) -> bool:
         """Whether a pass, rasterize or rasterize_bwd, uses subgroups."""
-        return self.subgroups and name not in self.torn
+        return self.subgroups and name not in self.split_passes
 
     def without_subgroups(self, name: str) -> RasterConfig:
         """The same for a driver that splits the workgroups of a pass. Where lists are drawn in rounds, both passes do
         without subgroups, as they share the rounds, which are then shorter, as loops are longer."""
         if self.round_splats is None:
-            return replace(self, torn=(*self.torn, name))
+            return replace(self, split_passes=(*self.split_passes, name))
         return replace(self, subgroups=False, round_splats=self.round_splats * SUBGROUP_TURNS // PLAIN_TURNS)
 
     def raster_defines(self, name: str = "rasterize", *, depth: bool) -> dict[str, int]:

@@ -74,7 +74,7 @@ class PointsConfig(Options):
 
     count: int = option(
         "number of initial Gaussians; if the capture has a point cloud, the maximum number taken from it; with "
-        "discovery, of the Gaussians that its static model starts from",
+        "discovery, of the Gaussians that its static fit starts from",
         at_least=1,
     )
     box: float = option(
@@ -83,7 +83,7 @@ class PointsConfig(Options):
         above=0,
     )
     opacity: float = option(
-        "initial opacity of each Gaussian, between 0 and 1; with discovery, of those that its static model starts from",
+        "initial opacity of each Gaussian, between 0 and 1; with discovery, of those that its static fit starts from",
         above=0,
         below=1,
     )
@@ -106,7 +106,7 @@ class ScheduleConfig(Options):
     )
     sh_interval: int = option(
         "the degree of the spherical harmonics increases by one every this many steps, up to 3; it starts at 0, with "
-        "discovery at the degree of its static model (2)",
+        "discovery at the degree of its static fit (2)",
         at_least=1,
     )
     save_interval: int = option(
@@ -302,19 +302,19 @@ class DiscoveryConfig(Options):
     """Motion discovery before the training (train/discovery). Has defaults, since older config.toml files lack it."""
 
     enabled: bool = option(
-        "before training, fit a static model, search for objects that move farther than their own size, and start from "
+        "before training, fit a static fit, search for objects that move farther than their own size, and start from "
         "both; skipped for the field static and if schedule.steps is at most discovery.steps. If what it finds "
         "explains at least 80% of what moves, the field's rates stay at 0.005 (hash) and 0.001 (mlp) or less",
         False,
     )
     steps: int = option(
-        "training steps of the static model, which also separates what moves from what does not", 800, at_least=1
+        "training steps of the static fit, which also separates what moves from what does not", 800, at_least=1
     )
-    size: int = option("longer side of the images for the static model and the search, pixels", 100, at_least=16)
+    size: int = option("longer side of the images for the static fit and the search, pixels", 100, at_least=16)
     field_steps: int = option("steps that fit the deformation field to the motion that was found", 1500, at_least=1)
     least: float = option(
         "add moving Gaussians only if their tracks explain at least this fraction, between 0 and 1, of the surface "
-        "points at which images differ from the static model",
+        "points at which images differ from the static fit",
         0.05,
         at_most=1,
     )
@@ -342,7 +342,7 @@ class CamerasConfig(Options):
         "off",
     )
     rate: Rate = option(
-        "learning rate of the corrections, radians of image motion per step (with discovery, its static model goes "
+        "learning rate of the corrections, radians of image motion per step (with discovery, its static fit goes "
         "from .start to .end in discovery.steps, the training stays at .end, and .steps has no effect)",
         Rate(4e-3, 2e-4, 3_000),
     )
@@ -354,7 +354,7 @@ class CamerasConfig(Options):
     )
     focal: bool = option("correct the focal length, too: one factor for all training cameras", True)
     start: int = option(
-        "first step that moves cameras; the scene forms before it; with discovery: the first step of its static model "
+        "first step that moves cameras; the scene forms before it; with discovery: the first step of its static fit "
         "that does, an eighth of discovery.steps at the latest; the training then moves cameras from step 1 on",
         300,
         at_least=1,

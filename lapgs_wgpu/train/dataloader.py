@@ -20,7 +20,7 @@ AHEAD = 8  # pictures that are decoded before they are needed
 DECODERS = min(4, os.cpu_count() or 1)  # threads that decode them
 
 
-class Pictures:
+class ImageLoader:
     """Training views in random order without replacement, epoch after epoch.
 
     generator: where the order, and random backgrounds, are drawn from. cache_gb: bound on what is kept on the device

@@ -18,17 +18,17 @@ from lapgs_wgpu.errors import InputError
 
 @dataclass(frozen=True)
 class Ranks:
-    """This process is number `rank` of `count`, and number `on_machine` of those on its machine."""
+    """This process is number `rank` of `count`, and number `local_rank` of those on its machine."""
 
     rank: int = 0
     count: int = 1
-    on_machine: int = 0
+    local_rank: int = 0
 
-    def sums(self, tensors: Sequence[Tensor]) -> list[Tensor]:
+    def all_reduce_sum(self, tensors: Sequence[Tensor]) -> list[Tensor]:
         """For each tensor, which every rank has in the same shape and type, the sum over the ranks in their order."""
-        return [functools.reduce(torch.add, parts) for parts in self.gather(tensors)]
+        return [functools.reduce(torch.add, parts) for parts in self.all_gather(tensors)]
 
-    def gather(self, tensors: Sequence[Tensor]) -> list[list[Tensor]]:
+    def all_gather(self, tensors: Sequence[Tensor]) -> list[list[Tensor]]:
         """For each tensor, which every rank has in the same shape and type, those of all ranks in their order."""
         if self.count == 1:
             return [[tensor] for tensor in tensors]
@@ -44,7 +44,11 @@ class Ranks:
         """Whether this is the process that writes files and tells of the progress."""
         return self.rank == 0
 
-    def any(self, here: bool) -> bool:
+    def barrier(self) -> None:
+        """Wait for all ranks."""
+        self.any_rank(False)
+
+    def any_rank(self, here: bool) -> bool:
         """Whether it is so on any rank."""
         if self.count == 1:
             return here

@@ -96,8 +96,6 @@ def render_loss(
     names = ("l1", "mse", "ssim", "pyramid", "ncc", *(term.name for term, _ in own))
     used = (True, True, weights.ssim, weights.pyramid, weights.ncc, *[True] * len(own))
     terms = {name: value for name, value, use in zip(names, computed.tolist(), used, strict=True) if use}
-    if "ssim" in terms:
-        terms["ssim"] = 1.0 - terms["ssim"]
     return RenderLoss(loss, terms, radii, probe)
 
 

@@ -60,7 +60,7 @@ def cause(loss: float, terms: Sequence[Mapping[str, float]], gradients: Tensors)
     return "; ".join([*bad, *describe("gradient", gradients)] or ["the gradients together are too large"])
 
 
-class Health:
+class SkipCounter:
     """Counts the steps that were skipped."""
 
     def __init__(self) -> None:

@@ -24,8 +24,8 @@ from lapgs_wgpu.train.smoothness import draw_nearby
 TERMS = frozenset({"l1", "mse", "ssim", "pyramid", "ncc", "smoothness", "acceleration", "dynamics", "loss", "psnr"})
 
 
-class Look(NamedTuple):
-    """A view of a step.
+class Sample(NamedTuple):
+    """A view of a step, and what the losses of motion compare there.
 
     Attributes:
         view: of the training.
@@ -49,32 +49,32 @@ class Objective:
     cameras, world units.
 
     Attributes:
-        followed: whether discovery has followed nearly all that moves. Its depth is known from there, and the
-            acceleration loss is left out.
+        field_fitted: whether discovery has fitted the field to nearly all that moves. Its depth is known from there,
+            and the acceleration loss is left out.
         scales: (N, 3) of the Gaussians of the last view, world units.
     """
 
     def __init__(self, config: Config, scene: Scene4D, own: Sequence[LossTerm], times: int, extent: float) -> None:
         self._config, self._scene, self._own = config, scene, tuple(own)
         self._times, self._extent = times, extent
-        self.followed = False
+        self.field_fitted = False
         self.scales = scene.parameters["log_scales"].detach().exp()
 
-    def look(self, view: View, background: Tensor, step: int, generator: torch.Generator, *, moving: bool) -> Look:
+    def sample(self, view: View, background: Tensor, step: int, generator: torch.Generator, *, moving: bool) -> Sample:
         """Draw what the losses of motion compare in a step, counted from 1."""
         config, count = self._config, len(self._scene)
         nearby = moments = None
         if moving and step > config.smoothness.start:
             t = self._scene.timing(view.time)
             nearby = draw_nearby(config.smoothness, count, t, generator)
-            rests = self.followed or step % config.acceleration.interval
+            rests = self.field_fitted or step % config.acceleration.interval
             if not rests and self._scene.field is not None:
                 moments = draw_moments(config.acceleration, count, t, self._times, generator)
-        return Look(view, background, moving, nearby, moments)
+        return Sample(view, background, moving, nearby, moments)
 
     def loss(
         self,
-        look: Look,
+        sample: Sample,
         step: int,
         truth: DeviceArray,
         camera: RefinedCamera,
@@ -83,27 +83,27 @@ class Objective:
         """The loss of a view, its rendering, and what each term adds, by name.
 
         Args:
-            look: the view.
+            sample: the view.
             step: counted from 1.
             truth: (H, W) of `upload_rgba`, the view's picture.
             camera: that sees it.
             correction: (3, 4) of the image's colors; None where they are taken as they are.
         """
-        config, scene, time = self._config, self._scene, look.view.time
-        if look.moving:
-            now = scene.deformed(time, look.nearby, look.moments)
+        config, scene, time = self._config, self._scene, sample.view.time
+        if sample.moving:
+            now = scene.deformed(time, sample.nearby, sample.moments)
         else:
             now = Deformed(scene.canonical(), None, [])
         gaussians = now.gaussians
         self.scales = gaussians.scales.detach()
-        weights = config.loss.weights(warm=look.moving)
+        weights = config.loss.weights(warm=sample.moving)
         weighted = [(term, weight) for term in self._own if (weight := weight_at(term, step))]
         own = [(term, weight) for term, weight in weighted if not isinstance(term, Regularizer)]
         rendering = render_loss(
             gaussians,
             camera.camera,
             truth,
-            look.background,
+            sample.background,
             weights,
             scene.device,
             correction,
@@ -114,10 +114,10 @@ class Objective:
         beside: dict[str, Tensor] = {}
         if now.smoothness is not None:
             beside["smoothness"] = now.smoothness
-        if look.moments is not None:
+        if sample.moments is not None:
             weight = config.acceleration.weight * config.acceleration.interval
-            beside["acceleration"] = weight * acceleration_loss(now, scene.timing(time), look.moments)
-        if look.moving and "dynamics" in scene.parameters:
+            beside["acceleration"] = weight * acceleration_loss(now, scene.timing(time), sample.moments)
+        if sample.moving and "dynamics" in scene.parameters:
             spread = dynamics_loss(scene.parameters["dynamics"], config.loss.dynamics_mode)
             beside["dynamics"] = config.loss.dynamics * spread
         for term, weight in weighted:
@@ -128,6 +128,4 @@ class Objective:
             loss = loss + value
         factors = {**weights._asdict(), **{term.name: weight for term, weight in own}}
         terms = {name: factors[name] * value for name, value in rendering.terms.items() if name in factors}
-        if "ssim" in terms:
-            terms["ssim"] = factors["ssim"] - terms["ssim"]
         return loss, rendering, terms | {name: value.item() for name, value in beside.items()}

@@ -11,7 +11,7 @@ from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.train.config import Config
 
 
-def with_folder(config: Config, scenes: Path) -> Config:
+def resolve_data(config: Config, scenes: Path) -> Config:
     """The configuration with the absolute paths of its data. scenes: folder into which built-in scenes are written,
     unless they are there. Raises InputError."""
     path = config.data.path

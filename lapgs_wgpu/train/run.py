@@ -92,7 +92,7 @@ def train(
         for warning in (*dataset.warnings, *found, *_precision_warnings(config), *without_effect(config)):
             print(f"warning: {warning}", file=sys.stderr, flush=True)
         if dataset.normalization is not None:
-            say(f"placement: {dataset.normalization}")
+            say(f"normalization: {dataset.normalization}")
     keep_freed_memory()
     device = device or open_device()
     if not ranks.first:
@@ -183,7 +183,7 @@ def _assist(training: Trainer) -> Scene4D:
 
 def _goes_on(training: Trainer, interrupted: threading.Event) -> bool:
     """Whether a step is left, and no process was interrupted."""
-    return training.done < training.config.schedule.steps and not training.ranks.any(interrupted.is_set())
+    return training.done < training.config.schedule.steps and not training.ranks.any_rank(interrupted.is_set())
 
 
 def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None) -> Scene4D:

@@ -30,7 +30,7 @@ class Start(NamedTuple):
         scene: the first Gaussians, and the field.
         warm_up: number of the first steps without motion.
         rising: number of the first steps over which the learning rates rise from 0.
-        fitted: whether discovery has fitted the field to nearly all that moves.
+        field_fitted: whether discovery has fitted the field to nearly all that moves.
         corrections: of the training cameras, by discovery; None where it left them.
         discovery: what discovery found, a sentence; None where it was left out.
         seconds: that discovery took.
@@ -39,7 +39,7 @@ class Start(NamedTuple):
     scene: Scene4D
     warm_up: int
     rising: int
-    fitted: bool = False
+    field_fitted: bool = False
     corrections: Corrections | None = None
     discovery: str | None = None
     seconds: float = 0.0
@@ -62,7 +62,7 @@ def start(
     Adam's first steps, all of the size of the rate, would shake off what the field knows.
 
     Args:
-        config: suited to the dataset.
+        config: resolved for the dataset.
         dataset: the capture.
         device: that trains.
         trainer: makes the training of discovery's static fit.
@@ -89,7 +89,8 @@ def start(
         if not reason:
             with open(os.devnull, "w") as nowhere, torch_threads(step_threads(config.field, device)):
                 found = discover(config, dataset, device, trainer, None if ranks.first else nowhere, own_field)
-            return Start(found.scene, 0, warm_up or RISE, found.fitted, found.corrections, found.summary, found.seconds)
+            of_discovery = (found.field_fitted, found.corrections, found.summary, found.seconds)
+            return Start(found.scene, 0, warm_up or RISE, *of_discovery)
         _note(f"motion discovery is left out: {reason}", ranks)
     points = Scene4D.from_points(
         *initial_points(config.points, dataset, config.seed),
@@ -103,7 +104,7 @@ def start(
     return Start(points, warm_up, 0)
 
 
-def note_what_rests(config: Config, first: Start, ranks: Ranks) -> None:
+def warn_unused_settings(config: Config, first: Start, ranks: Ranks) -> None:
     """Tell what a training will not do, because its schedule ends before."""
     steps, moves = config.schedule.steps, first.scene.field is not None
     if moves and first.warm_up >= steps:

@@ -64,7 +64,7 @@ class TimingRefinement:
         for row in range(len(mine))[self._ranks.rank :: self._ranks.count]:
             views = self._views[row]
             mine[row] = torch.tensor(self._fit(views[number % len(views)], float(self._moments[row])))
-        shifts, mended = self._ranks.sums([mine])[0].numpy().T
+        shifts, mended = self._ranks.all_reduce_sum([mine])[0].numpy().T
         shifts = shifts - running_median(shifts, AROUND)
         shifts[shifts**2 * mended < LEAST] = 0.0
         moved = self._moments + self._gap * shifts.clip(-REACH, REACH)

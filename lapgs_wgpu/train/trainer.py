@@ -27,24 +27,24 @@ from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train.camera_descent import scene_points
 from lapgs_wgpu.train.camera_refinement import CameraRefinement, RefinedCamera
 from lapgs_wgpu.train.config import BACKGROUND_LEVELS, Config
-from lapgs_wgpu.train.dataloader import Pictures
+from lapgs_wgpu.train.dataloader import ImageLoader
 from lapgs_wgpu.train.densify import Statistics
 from lapgs_wgpu.train.density_control import DensityControl
-from lapgs_wgpu.train.discovery.field_fit import keeping_rates
+from lapgs_wgpu.train.discovery.field_fit import max_rates_after_fit
 from lapgs_wgpu.train.distributed import SINGLE_PROCESS, Ranks
 from lapgs_wgpu.train.evaluate import evaluate, mean_psnr
 from lapgs_wgpu.train.exposure import Exposures
 from lapgs_wgpu.train.fused_loss import RenderLoss
 from lapgs_wgpu.train.host_threads import step_threads, torch_threads
 from lapgs_wgpu.train.loss_terms import check_terms
-from lapgs_wgpu.train.nonfinite import Health, Skipped, cause, check_parameters, finite
-from lapgs_wgpu.train.objective import TERMS, Look, Objective
-from lapgs_wgpu.train.open_dataset import open_dataset, with_folder
+from lapgs_wgpu.train.nonfinite import SkipCounter, Skipped, cause, check_parameters, finite
+from lapgs_wgpu.train.objective import TERMS, Objective, Sample
+from lapgs_wgpu.train.open_dataset import open_dataset, resolve_data
 from lapgs_wgpu.train.optimizer import FrequencyOptimizer, Optimizer
 from lapgs_wgpu.train.parts import Parts
-from lapgs_wgpu.train.start import Start, note_what_rests, start
+from lapgs_wgpu.train.resolve_config import nyquist_frequency, resolve_decoder, resolve_for_dataset
+from lapgs_wgpu.train.start import Start, start, warn_unused_settings
 from lapgs_wgpu.train.step_result import StepResult
-from lapgs_wgpu.train.suited import nyquist_frequency, suited, with_decoder_placed
 from lapgs_wgpu.train.timing_refinement import TimingRefinement, image_to_fit
 
 MAX_SH_DEGREE = 3
@@ -57,8 +57,8 @@ class Trainer:
 
     Attributes:
         scene: as the last step left it.
-        config: the configuration, suited to the data and the device.
-        given: the same before it was suited to the data, but for the decoder's place; config.toml holds it.
+        config: the configuration, resolved for the data and the device.
+        given: the same before it was resolved for the data, but for the decoder's place; config.toml holds it.
         dataset: its test views are not touched by any step.
         parts: own field, losses, density control, learning rates and callbacks.
         done: number of the steps so far.
@@ -105,7 +105,7 @@ class Trainer:
         if scene is not None and parts.field is not None:
             raise InputError("the scene to start from keeps its own field; leave out Parts(field=...).")
         if dataset is None:
-            config = with_folder(config, Path("runs"))
+            config = resolve_data(config, Path("runs"))
             dataset = open_dataset(config)
         device = device or open_device()
         check_terms(tuple(parts.losses), TERMS)
@@ -116,8 +116,8 @@ class Trainer:
                 raise InputError(f"{error}.") from None
         if scene is not None:
             config = dataclasses.replace(config, field=scene.field_config)
-        self.given = with_decoder_placed(config, device)
-        config = suited(self.given, dataset)
+        self.given = resolve_decoder(config, device)
+        config = resolve_for_dataset(self.given, dataset)
         if scene is not None:  # whose field does not change its shape any more
             config = dataclasses.replace(config, field=scene.field_config)
         self.config = config
@@ -134,7 +134,7 @@ class Trainer:
         self.scene, self.discovery, self.discovery_seconds = first.scene, first.discovery, first.seconds
         self._warm_up, self._rising = first.warm_up, first.rising
         if not resumed:
-            note_what_rests(config, first, ranks)
+            warn_unused_settings(config, first, ranks)
         self._generator = torch.Generator().manual_seed(config.seed)
         self._prepare(first)
         self.whole = True
@@ -155,7 +155,7 @@ class Trainer:
         self._exposures = Exposures(len(dataset.train), config.exposure.rate) if config.exposure.enabled else None
         times, extent = len(dataset.times), dataset.extent
         self._objective = Objective(config, scene, self.parts.losses, times, extent)
-        self._limit_field_rates(fitted=first.fitted)
+        self._limit_field_rates(field_fitted=first.field_fitted)
         self.cameras = None
         if config.cameras.refines(own_footage=dataset.own_footage):
             self.cameras = CameraRefinement(
@@ -183,19 +183,19 @@ class Trainer:
             self._generator,
         )
         self._numbers = {view.name: number for number, view in enumerate(dataset.train)}
-        self._health = Health()
+        self._skips = SkipCounter()
         data = config.data
-        self._pictures = Pictures(dataset.train, data.background, data.cache_gb, self._generator, scene.device)
+        self._images = ImageLoader(dataset.train, data.background, data.cache_gb, self._generator, scene.device)
 
-    def _limit_field_rates(self, *, fitted: bool) -> None:
+    def _limit_field_rates(self, *, field_fitted: bool) -> None:
         """Hold the field's learning rates low where discovery has fitted it to nearly all that moves."""
-        self._objective.followed = fitted
+        self._objective.field_fitted = field_fitted
         field = self.scene.field
-        self._optimizer.highest = keeping_rates(field.parameter_groups()) if fitted and field else {}
+        self._optimizer.highest = max_rates_after_fit(field.parameter_groups()) if field_fitted and field else {}
 
     def close(self) -> None:
         """End what goes on beside the steps."""
-        self._pictures.close()
+        self._images.close()
 
     def __enter__(self) -> Trainer:
         return self
@@ -247,14 +247,14 @@ class Trainer:
         control's state stay as they were; what the schedule plans for this step is done. Raises NumericalError where
         too many are skipped, or where a parameter is not finite, and DeviceError.
         """
-        random, order = self._generator.get_state(), list(self._pictures.order)
+        random, order = self._generator.get_state(), list(self._images.order)
         try:
             with torch_threads(self._threads):
                 result = self._step()
         except Exception:
             if self.whole:  # the device gave out: as if the step had not begun
                 self._generator.set_state(random)
-                self._pictures.order = order
+                self._images.order = order
             raise
         for callback in self.callbacks:
             callback(self, result)
@@ -265,25 +265,25 @@ class Trainer:
         step = self.done + 1
         moving = step > self._warm_up
         # Every rank draws the numbers of all views, so that their random streams stay the same.
-        chosen = [self._pictures.choose() for _ in range(config.schedule.batch)]
+        chosen = [self._images.choose() for _ in range(config.schedule.batch)]
         drawn = self._generator.get_state()
-        looks = [self._objective.look(*each, step, self._generator, moving=moving) for each in chosen]
+        samples = [self._objective.sample(*each, step, self._generator, moving=moving) for each in chosen]
 
         self._zero_grad()
         seen = self._density.nothing_seen()
         renderings, totals = [], Counter[str]()
-        for look in looks[ranks.rank :: ranks.count]:
-            loss, rendering, terms = self._loss(look)
-            (loss / len(looks)).backward()
-            seen.add(rendering, look.view.camera, scale=len(looks))
+        for sample in samples[ranks.rank :: ranks.count]:
+            loss, rendering, terms = self._loss(sample)
+            (loss / len(samples)).backward()
+            seen.add(rendering, sample.view.camera, scale=len(samples))
             renderings.append(rendering)
             totals.update({"loss": loss.item(), "psnr": rendering.psnr, **terms})
         if ranks.count > 1:
             self._put_together()
-        sums = ranks.sums([torch.tensor(list(totals.values()), dtype=torch.float64)])[0] / len(looks)
+        sums = ranks.all_reduce_sum([torch.tensor(list(totals.values()), dtype=torch.float64)])[0] / len(samples)
         value, psnr, *of_terms = sums.tolist()
 
-        names = ", ".join(look.view.name for look in looks)
+        names = ", ".join(sample.view.name for sample in samples)
         skipped = self._examine(renderings, value, step, names)
         moments, corrections = None, config.timing.corrections(config.schedule.steps)
         if self.timing is not None and moving and step in corrections:
@@ -306,15 +306,15 @@ class Trainer:
             scene.sh_degree = min(scene.sh_degree + 1, MAX_SH_DEGREE)
         self.done = step
         self.whole = True
-        self._health.note(skipped)
+        self._skips.note(skipped)
         terms = dict(zip(list(totals)[2:], of_terms, strict=True))
         return StepResult(step, config.schedule.steps, value, psnr, skipped, terms, pruned)
 
-    def _loss(self, look: Look) -> tuple[Tensor, RenderLoss, dict[str, float]]:
+    def _loss(self, sample: Sample) -> tuple[Tensor, RenderLoss, dict[str, float]]:
         """`Objective.loss` of a view, as its camera and its colors are corrected."""
-        view = look.view
+        view = sample.view
         camera = RefinedCamera(view.camera, None) if self.cameras is None else self.cameras.refined(view.camera)
-        return self._objective.loss(look, self.done + 1, self._pictures.on_device(view), camera, self.exposure_of(view))
+        return self._objective.loss(sample, self.done + 1, self._images.on_device(view), camera, self.exposure_of(view))
 
     def _camera_of(self, view: View) -> Camera:
         """The camera of a training view, corrected where it is."""
@@ -352,11 +352,11 @@ class Trainer:
     def _put_together(self) -> None:
         """Every rank's gradients become the sums over the ranks."""
         mine = [gradient for group in self._gradients().values() for gradient in group]
-        for gradient, total in zip(mine, self.ranks.sums(mine), strict=True):
+        for gradient, total in zip(mine, self.ranks.all_reduce_sum(mine), strict=True):
             gradient.copy_(total)
 
     def _seen_by_all(self, seen: Statistics) -> list[Statistics]:
-        return [Statistics(*values) for values in zip(*self.ranks.gather(list(vars(seen).values())), strict=True)]
+        return [Statistics(*values) for values in zip(*self.ranks.all_gather(list(vars(seen).values())), strict=True)]
 
     def _examine(self, renderings: list[RenderLoss], loss: float, step: int, views: str) -> Skipped | None:
         """Whether the step of these gradients is to be skipped, and why. Raises NumericalError for a parameter, whose
@@ -365,7 +365,7 @@ class Trainer:
         parameters |= {each.name: [each.values] for each in self._beside}
         places = [each.means2d.grad for each in renderings if each.means2d.grad is not None]
         gradients |= {"the places in the image": places} if places else {}
-        if not self.ranks.any(not (math.isfinite(loss) and finite(parameters, gradients))):
+        if not self.ranks.any_rank(not (math.isfinite(loss) and finite(parameters, gradients))):
             return None
         self.whole = False
         check_parameters(parameters)
@@ -394,10 +394,10 @@ class Trainer:
                 "done": torch.tensor(self.done),
                 "warm_up": torch.tensor(self._warm_up),
                 "rising": torch.tensor(self._rising),
-                "field_fitted": torch.tensor(int(self._objective.followed)),
+                "field_fitted": torch.tensor(int(self._objective.field_fitted)),
                 "sh_degree": torch.tensor(scene.sh_degree),
                 "random": self._generator.get_state(),
-                "order": torch.tensor(self._pictures.order, dtype=torch.int64),
+                "order": torch.tensor(self._images.order, dtype=torch.int64),
             },
         }
         return {
@@ -441,9 +441,9 @@ class Trainer:
         self._rising = int(own.get("rising", self.config.schedule.warm_up - self._warm_up))
         if self._rising < 0:
             raise ValueError("its rates rise over a negative number of steps")
-        self._limit_field_rates(fitted=bool(own.get("field_fitted", False)))
+        self._limit_field_rates(field_fitted=bool(own.get("field_fitted", False)))
         self._generator.set_state(own["random"])
-        self._pictures.order = own["order"].tolist()
+        self._images.order = own["order"].tolist()
 
 
 def _timing_state(timing: Timing) -> dict[str, Tensor]:

@@ -54,8 +54,7 @@ def without(pixels: NDArray[np.uint8], ignored: NDArray[np.bool_] | None) -> NDA
     """
     if ignored is None and pixels.shape[2] == 3:
         return pixels
-    rgba = np.full((*pixels.shape[:2], 4), 255, np.uint8)
-    rgba[..., : pixels.shape[2]] = pixels
+    rgba = _rgba(pixels)
     rgba[rgba[..., 3] == 0] = 0
     if ignored is not None:
         rgba[ignored] = LEFT_OUT
@@ -64,6 +63,11 @@ def without(pixels: NDArray[np.uint8], ignored: NDArray[np.bool_] | None) -> NDA
 
 def upload_rgba(device: Device, pixels: NDArray[np.uint8]) -> DeviceArray:
     """(H, W) uint32 on the device, red in the lowest byte, of (H, W, 3) RGB or (H, W, 4) straight RGBA in 8 bits."""
+    return DeviceArray.upload(device, "truth", _rgba(pixels).view(np.uint32)[..., 0])
+
+
+def _rgba(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """A new array (H, W, 4), opaque where the pixels (H, W, 3 or 4) have no alpha."""
     rgba = np.full((*pixels.shape[:2], 4), 255, np.uint8)
     rgba[..., : pixels.shape[2]] = pixels
-    return DeviceArray.upload(device, "truth", rgba.view(np.uint32)[..., 0])
+    return rgba

@@ -27,7 +27,7 @@ function advice() {
     return "Chrome, Edge, Firefox and Safari have it in their present versions.";
 }
 
-export class Gpu {
+class Gpu {
     constructor(device, kernels, subgroups, name) {
         this.device = device;
         this.name = name; // of the adapter

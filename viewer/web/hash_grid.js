@@ -4,7 +4,7 @@ const SLICE_CELLS = 1 << 14;
 const TEMPORAL_AXES = [[0, 1, TIME], [1, 2, TIME], [0, 2, TIME]];
 
 // Levels of a grid: the resolution grows geometrically along each axis.
-export function makeLevels(config) {
+function makeLevels(config) {
     const levels = [];
     let first = 0;
     for (let number = 0; number < config.levels; number++) {

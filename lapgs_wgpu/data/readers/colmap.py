@@ -18,10 +18,11 @@ from lapgs_wgpu.data.cloud import Cloud
 from lapgs_wgpu.data.frames import Capture, Frame, Reader
 from lapgs_wgpu.data.images import SUFFIXES, Size, check_image
 from lapgs_wgpu.data.json_fields import absent
-from lapgs_wgpu.data.poses import check_rotation, rotation
+from lapgs_wgpu.data.poses import check_rotation
 from lapgs_wgpu.data.timestamps import ImageName, natural_key
 from lapgs_wgpu.data.undistort import Lens
 from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.splat.camera import rotation_matrix
 
 from .colmap_model import ColmapCamera, ColmapImage, ColmapModel, count_images, is_model, read_model
 
@@ -145,7 +146,7 @@ def _uncropped(stated: Size, image: Size) -> Size:
 
 def _pose(image: ColmapImage) -> np.ndarray:
     T = np.eye(4)
-    T[:3, :3], T[:3, 3] = rotation(image.quaternion), image.translation
+    T[:3, :3], T[:3, 3] = rotation_matrix(image.quaternion), image.translation
     check_rotation(T[:3, :3], image.where)
     return T
 

@@ -15,10 +15,11 @@ import numpy as np
 from lapgs_wgpu.data.frames import Capture, Frame, Reader
 from lapgs_wgpu.data.images import SUFFIXES, check_image
 from lapgs_wgpu.data.json_fields import finite, kind, read_json, required, vector
-from lapgs_wgpu.data.poses import LARGEST_ENTRY, OPENGL_TO_OPENCV, rotation, world_to_camera
+from lapgs_wgpu.data.poses import LARGEST_ENTRY, OPENGL_TO_OPENCV, world_to_camera
 from lapgs_wgpu.data.timestamps import ImageName
 from lapgs_wgpu.data.undistort import Lens
 from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.splat.camera import rotation_matrix
 
 NEEDED = "which an export of Record3D needs"
 LAYOUTS = (("metadata.json", "rgb"), ("metadata", "rgbd"), ("metadata.json", "rgbd"))
@@ -103,7 +104,7 @@ def _pose(value: Any, where: str) -> np.ndarray:
             f"{where}: the pose must be a quaternion of length 1 and a position of at most {LARGEST_ENTRY:g}, got the "
             f"length {length:.4g} and {', '.join(f'{each:g}' for each in position)}."
         )
-    R_world_cam = rotation(np.array([w, x, y, z]) / length)
+    R_world_cam = rotation_matrix(np.array([w, x, y, z]) / length)
     return world_to_camera(R_world_cam @ OPENGL_TO_OPENCV, np.array(position))
 
 

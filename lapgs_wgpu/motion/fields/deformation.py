@@ -12,6 +12,8 @@ from typing import NamedTuple
 
 from torch import Tensor
 
+from ...splat.rotation import rotate
+
 
 class Nearby(NamedTuple):
     """Second sample points of the smoothness loss, which compares features at nearby points.
@@ -61,3 +63,9 @@ class Deformation(NamedTuple):
     d_opacity: Tensor | None = None
     smoothness: Tensor | None = None
     orientation: Tensor | None = None
+
+    def apply_to_means(self, means: Tensor) -> Tensor:
+        """Rotated and shifted means (N, 3)."""
+        if self.rotation is not None:
+            means = rotate(self.rotation, means)
+        return means if self.translation is None else means + self.translation

@@ -11,14 +11,14 @@ from torch.utils.checkpoint import checkpoint
 from ...gpu.device import Device
 from ..passes.decoder_passes import decoder_shape
 from .config import GEOMETRY, TEMPORAL_AXES, FieldConfig
-from .decoder import Decoder
-from .decoder_layers import KEPT, DecoderWeights, decode
 from .deformation import Deformation, Moments, Nearby
+from .device_decoder import Decoder
 from .gate import gated
 from .hash_encoder import HashEncoder, HashGrid
 from .laplacian import LaplacianMotion, TimeMotion
 from .layers import linear, product, zero_head
 from .parameter_shapes import parameter_shapes
+from .torch_decoder import KEPT, DecoderWeights, decode
 
 _BLOCK = 1 << 13  # Gaussians per block decoded by hidden layers
 

@@ -113,12 +113,14 @@ class DecoderPasses:
         for first, count in self._blocks(d_outputs):
             layers, features = self._activate(commands, first, count, inputs, weights)
             d = Matrix.of(d_outputs.rows(first, count))
-            self._product.long(commands, f"d heads {first}", d.transpose, features, d_weights["heads"], add=first > 0)
+            self._product.split_k(
+                commands, f"d heads {first}", d.transpose, features, d_weights["heads"], add=first > 0
+            )
             self._product(commands, f"d features {first}", d, Matrix.of(weights["heads"]), features)
             self._gate("gate_bwd", commands, first, count, d_features=features.array, layers=layers.array)
             for name, (_, channel, channels) in self.shape.inputs.items():
                 given, own = Matrix.of(inputs[name].rows(first, count)), layers.from_column(channel, channels)
-                self._product.long(
+                self._product.split_k(
                     commands, f"d weights {name} {first}", own.transpose, given, d_weights[name], add=first > 0
                 )
                 self._product(commands, f"d {name} {first}", own, Matrix.of(weights[name]), given)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...gpu.array import read_all
+from ...splat.camera import rotation_matrix
 from ...splat.constants import CONSTANTS
 from .playback import Playback
 
@@ -116,12 +117,7 @@ def state(playback: Playback, t: float, rows: NDArray[np.integer]) -> Floats:
 
 def roots_of(scales: Floats, quats: Floats) -> Floats:
     """(N, 6) weighted entries of the square roots of covariances. quats: (N, 4) xyzw, of any length."""
-    x, y, z, w = (quats / np.linalg.norm(quats, axis=1, keepdims=True)).T
-    axes = np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ])  # fmt: skip
+    axes = rotation_matrix(np.roll(quats / np.linalg.norm(quats, axis=1, keepdims=True), 1, axis=1).T)
     return np.einsum("ikn,ikn,nk->ni", axes[_ROWS], axes[_COLUMNS], scales) * _WEIGHTS
 
 

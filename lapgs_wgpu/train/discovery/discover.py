@@ -30,11 +30,14 @@ SHOWN = 2.0 / 255  # least difference from the background of an image that shows
 
 
 class Discovery(NamedTuple):
-    """scene: to start from. fitted: whether its field knows nearly all that moves. summary: what was found, a line.
-    corrections: of the dataset's cameras; None where they are kept. seconds: that it took."""
+    """What discovery leaves.
+
+    scene: to start from. field_fitted: whether its field knows nearly all that moves. summary: what was found, a line.
+    corrections: of the dataset's cameras; None where they are kept. seconds: that it took.
+    """
 
     scene: Scene4D
-    fitted: bool
+    field_fitted: bool
     summary: str
     corrections: Corrections | None
     seconds: float
@@ -92,8 +95,8 @@ def discover(
         scene.parameters[name] = torch.nn.Parameter(values.detach()[order])
     meter.clear()
     summary = f"a static fit of {len(static)} Gaussians; {found}"
-    fitted = tracks is not None and share >= NEARLY_ALL
-    return Discovery(scene, fitted, summary, corrections, time.perf_counter() - started)
+    field_fitted = tracks is not None and share >= NEARLY_ALL
+    return Discovery(scene, field_fitted, summary, corrections, time.perf_counter() - started)
 
 
 def scene_with(

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lapgs_wgpu.motion.scene import Scene4D, rotate
+from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.optimizer import ADAM_EPS
 
 from .tracks import Tracks
@@ -56,8 +56,7 @@ def fit_field(
         means = scene.parameters["means"].detach()[rows]
         dynamics = scene.parameters["dynamics"].detach()[rows] if "dynamics" in scene.parameters else None
         move = field(means, float(times[at]), dynamics, None)
-        moved = means if move.rotation is None else rotate(move.rotation, means)
-        moved = moved if move.translation is None else moved + move.translation
+        moved = move.apply_to_means(means)
         weights = torch.cat([supported[at].float(), torch.ones(len(staying), device=device)])
         squared = (moved - torch.cat([paths[at], means[len(moving) :]])).square().sum(dim=1)
         loss = (weights * (squared + SOFTENING**2).sqrt()).mean()
@@ -78,7 +77,7 @@ def fit_field(
     return float(np.mean(last)) if last else 0.0
 
 
-def keeping_rates(groups: Iterable[str]) -> dict[str, float]:
+def max_rates_after_fit(groups: Iterable[str]) -> dict[str, float]:
     """The highest learning rate of each group of a field's parameters at which it keeps what it learned here."""
     return {name: KEEPING * rate for name, rate in _rates(groups).items()}
 

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.captures import HEIGHT, WIDTH, Blobs, agreement
-from helpers.doors import (
+from helpers.external_captures import (
     COUNT,
     write_arkit,
     write_endonerf,
@@ -36,7 +36,7 @@ from lapgs_wgpu.prepare.report import write_report
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.trainer import Trainer
 
-DOORS: dict[str, Callable[[Path, Device], Path]] = {
+PROGRAMS: dict[str, Callable[[Path, Device], Path]] = {
     "Record3D": write_record3d,
     "Polycam": write_polycam,
     "ARKit": write_arkit,
@@ -45,21 +45,23 @@ DOORS: dict[str, Callable[[Path, Device], Path]] = {
 }
 
 
-@pytest.mark.parametrize("door", DOORS)
-def test_cameras_see_what_the_images_show(door: str, device: Device, tmp_path: Path) -> None:
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_cameras_see_what_the_images_show(program: str, device: Device, tmp_path: Path) -> None:
     """In JPEG, or PNG."""
-    data = load_dataset(DOORS[door](tmp_path / "toy", device))
+    data = load_dataset(PROGRAMS[program](tmp_path / "toy", device))
     assert len(data.train) + len(data.test) == COUNT
     assert data.own_footage
-    assert agreement(data, Blobs.random(), device) > (30 if door in ("Record3D", "Polycam") else 45)
+    assert agreement(data, Blobs.random(), device) > (30 if program in ("Record3D", "Polycam") else 45)
     times = sorted(view.time for view in (*data.train, *data.test))
-    np.testing.assert_allclose(times, [0, 1 / 6, 1 / 3, 0.5, 2 / 3, 1] if door == "Record3D" else np.linspace(0, 1, 6))
+    np.testing.assert_allclose(
+        times, [0, 1 / 6, 1 / 3, 0.5, 2 / 3, 1] if program == "Record3D" else np.linspace(0, 1, 6)
+    )
 
 
-@pytest.mark.parametrize("door", [*DOORS, "EndoNeRF"])
-def test_a_training_gets_closer(door: str, device: Device, tmp_path: Path) -> None:
+@pytest.mark.parametrize("program", [*PROGRAMS, "EndoNeRF"])
+def test_a_training_gets_closer(program: str, device: Device, tmp_path: Path) -> None:
     """In 50 steps."""
-    folder = (DOORS | {"EndoNeRF": write_endonerf})[door](tmp_path / "toy", device)
+    folder = (PROGRAMS | {"EndoNeRF": write_endonerf})[program](tmp_path / "toy", device)
     small = {
         "data.path": str(folder),
         "data.size": 64,
@@ -151,14 +153,14 @@ def test_a_camera_that_stands_still(depth: bool, device: Device, tmp_path: Path)
     assert np.abs(image[row, column].numpy() - data.cloud.colors[:4000]).mean() < 0.02
 
 
-@pytest.mark.parametrize("door", [*DOORS, "EndoNeRF"])
-def test_their_worth_is_measured(door: str, device: Device, tmp_path: Path) -> None:
-    found = diagnose((DOORS | {"EndoNeRF": write_endonerf})[door](tmp_path / "toy", device))
+@pytest.mark.parametrize("program", [*PROGRAMS, "EndoNeRF"])
+def test_their_worth_is_measured(program: str, device: Device, tmp_path: Path) -> None:
+    found = diagnose((PROGRAMS | {"EndoNeRF": write_endonerf})[program](tmp_path / "toy", device))
     parallax = found.measure("parallax")
-    assert found.still is (door == "EndoNeRF")
-    assert parallax.good is not (door == "EndoNeRF")
-    assert (parallax.number > 10) is (door != "EndoNeRF")
-    write_report(found, tmp_path / "report.html", door)
+    assert found.still is (program == "EndoNeRF")
+    assert parallax.good is not (program == "EndoNeRF")
+    assert (parallax.number > 10) is (program != "EndoNeRF")
+    write_report(found, tmp_path / "report.html", program)
     assert (tmp_path / "report.html").read_text().count("<svg") == 2
 
 

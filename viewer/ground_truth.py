@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from lapgs_wgpu.data import View
 
 
-class Capture:
+class GroundTruth:
     """views: those held out first, then the training's."""
 
     def __init__(self, views: tuple[View, ...]) -> None:
@@ -39,7 +39,7 @@ class Capture:
         return self._held[1]
 
 
-def open_capture(checkpoint: Path, metadata: Mapping[str, str]) -> Capture | None:
+def open_ground_truth(checkpoint: Path, metadata: Mapping[str, str]) -> GroundTruth | None:
     """The capture that the config.toml of a checkpoint's run names; None where there is none, or it is not here.
 
     metadata: of the checkpoint, empty for files of other projects; it tells whether the capture was normalized."""
@@ -58,4 +58,4 @@ def open_capture(checkpoint: Path, metadata: Mapping[str, str]) -> Capture | Non
         )
     except (OSError, ValueError, KeyError, TypeError, OverflowError):  # InputError is a ValueError
         return None
-    return Capture((*dataset.test, *dataset.train))
+    return GroundTruth((*dataset.test, *dataset.train))

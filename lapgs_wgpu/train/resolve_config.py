@@ -1,4 +1,4 @@
-"""The configuration, suited to the data and the device."""
+"""What a configuration leaves to the data and to the device."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.train.config import Config
 
 
-def suited(config: Config, dataset: Dataset) -> Config:
+def resolve_for_dataset(config: Config, dataset: Dataset) -> Config:
     """The configuration with lengths in world units, and no more frequencies than the training times can tell apart."""
     field = config.field
     if config.data.units == "capture":
@@ -35,7 +35,7 @@ def nyquist_frequency(dataset: Dataset) -> float:
     return (len(times) - 1) / 2 / float(times[-1] - times[0]) if len(times) > 1 else 0.0
 
 
-def with_decoder_placed(config: Config, device: Device) -> Config:
+def resolve_decoder(config: Config, device: Device) -> Config:
     """The configuration with the decoder's place, which "auto" leaves open, decided.
 
     It is the device where kernels for it exist, but for CPU devices: they share torch's processor, which torch makes

@@ -17,8 +17,8 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.native import Encoder
 from lapgs_wgpu.motion.fields.config import FieldConfig
-from lapgs_wgpu.motion.fields.decoder import Decoder
 from lapgs_wgpu.motion.fields.deformation import Nearby
+from lapgs_wgpu.motion.fields.device_decoder import Decoder
 from lapgs_wgpu.motion.fields.gate import gated
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.passes.decoder_passes import DecoderShape

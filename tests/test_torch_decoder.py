@@ -9,9 +9,9 @@ import torch
 from helpers.matrices import random
 from torch import Tensor
 
-from lapgs_wgpu.motion.fields import decoder_layers
-from lapgs_wgpu.motion.fields.decoder_layers import DecoderWeights, decode
+from lapgs_wgpu.motion.fields import torch_decoder
 from lapgs_wgpu.motion.fields.gate import gated
+from lapgs_wgpu.motion.fields.torch_decoder import DecoderWeights, decode
 
 SHAPES = {
     "static": 6,
@@ -75,7 +75,7 @@ def differentiated(function: object, inputs: Inputs, weights: DecoderWeights, dt
 @pytest.mark.parametrize("lacks", LACKS.values(), ids=LACKS)
 @pytest.mark.parametrize("count", [1, 37, 1500])
 def test_decode(count: int, lacks: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(decoder_layers, "LARGEST", 400)
+    monkeypatch.setattr(torch_decoder, "LARGEST", 400)
     inputs, weights = problem(count, lacks)
     expected = differentiated(decode_reference, inputs, weights, torch.float64)
     for found, exact in zip(differentiated(decode, inputs, weights, torch.float64), expected, strict=True):
@@ -93,11 +93,11 @@ def test_no_gaussians() -> None:
 
 @pytest.mark.parametrize("most", [1, 3, 8])
 def test_the_number_of_threads_changes_no_bit(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(decoder_layers, "LARGEST", 300)
+    monkeypatch.setattr(torch_decoder, "LARGEST", 300)
     inputs, weights = problem(2000)
     expected = differentiated(decode, inputs, weights, torch.float32)
     with ThreadPoolExecutor(most, initializer=torch.set_num_threads, initargs=(1,)) as threads:
-        monkeypatch.setattr(decoder_layers, "_threads", lambda: threads)
+        monkeypatch.setattr(torch_decoder, "_threads", lambda: threads)
         found = differentiated(decode, inputs, weights, torch.float32)
     assert all(torch.equal(a, b) for a, b in zip(found, expected, strict=True))
 
@@ -107,7 +107,7 @@ def test_many_gaussians_keep_no_activations(monkeypatch: pytest.MonkeyPatch) -> 
     inputs, weights = problem(1200)
     found, kept = [], []
     for most in (1200, 1199):
-        monkeypatch.setattr(decoder_layers, "KEPT", most)
+        monkeypatch.setattr(torch_decoder, "KEPT", most)
         shapes: list[tuple[int, ...]] = []
         static = inputs[0].clone().requires_grad_()
         with torch.autograd.graph.saved_tensors_hooks(lambda x, to=shapes: to.append(tuple(x.shape)) or x, lambda x: x):
