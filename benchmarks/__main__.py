@@ -76,7 +76,7 @@ def options() -> argparse.ArgumentParser:
         "--compare", type=Path, nargs=2, metavar=("OLD", "NEW"), help="set two such files against each other, and stop"
     )
     parser.add_argument(
-        "--save-scene", type=Path, metavar="FILE", help="write the first scene as .npz for other rasterisers, and stop"
+        "--save-scene", type=Path, metavar="FILE", help="write the first scene as .npz for other rasterizers, and stop"
     )
     return parser
 
@@ -208,7 +208,7 @@ def print_passes(report: PassTimes | None) -> None:
 def print_raster(name: str, report: RasterReport) -> None:
     counts = report.counts
     print_header(
-        f"rasteriser, {name}: {counts.visible:,} splats visible, {counts.intersections:,} intersections with tiles, "
+        f"rasterizer, {name}: {counts.visible:,} splats visible, {counts.intersections:,} intersections with tiles, "
         f"{counts.drawn:,} of them drawn"
     )
     print_passes(report.passes)

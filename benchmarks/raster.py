@@ -1,4 +1,4 @@
-"""The rasteriser: each pass by the device's own clock, the whole from outside."""
+"""The rasterizer: each pass by the device's own clock, the whole from outside."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The scenes that are timed, the same for every rasteriser that is compared: a ball of Gaussians, in the order in which
+"""The scenes that are timed, the same for every rasterizer that is compared: a ball of Gaussians, in the order in which
 a training keeps them, and what a training left in its checkpoint."""
 
 from __future__ import annotations
@@ -130,6 +130,6 @@ def make_scene(size: SceneSize) -> tuple[dict[str, NDArray[np.float32]], Camera]
 
 
 def save_scene(path: Path, arrays: dict[str, NDArray[np.float32]], camera: Camera) -> None:
-    """Write it as .npz, with K (3, 3), T_cam_world (4, 4), width and height, for other rasterisers to read."""
+    """Write it as .npz, with K (3, 3), T_cam_world (4, 4), width and height, for other rasterizers to read."""
     K, T_cam_world = camera.K.astype(np.float32), camera.T_cam_world.astype(np.float32)
     np.savez(path, K=K, T_cam_world=T_cam_world, width=camera.width, height=camera.height, **arrays)

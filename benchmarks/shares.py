@@ -29,8 +29,8 @@ from lapgs_wgpu.train.run import train
 
 VIEWS = 8
 WARM_UP = 10  # steps that are not counted: kernels are compiled, and each image is decoded
-RASTER, ENCODER, LOSSES = "rasteriser", "hash encoder", "image losses"
-TRANSFERS, OPTIMISER, REST = "transfers", "optimiser", "torch: decoder, activations, their gradients"
+RASTER, ENCODER, LOSSES = "rasterizer", "hash encoder", "image losses"
+TRANSFERS, OPTIMISER, REST = "transfers", "optimizer", "torch: decoder, activations, their gradients"
 ORDER = (RASTER, ENCODER, LOSSES, TRANSFERS, OPTIMISER, REST)
 
 

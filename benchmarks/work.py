@@ -1,4 +1,4 @@
-"""What the passes of rasteriser and hash encoder have to do at least, counted from the scene: bytes, operations, powers
+"""What the passes of rasterizer and hash encoder have to do at least, counted from the scene: bytes, operations, powers
 of two.
 
 Bytes are those that a pass asks for: what each Gaussian, visible splat, intersection, pixel or tile makes it load and

@@ -1,4 +1,4 @@
-"""The rasteriser alone: Gaussians before a camera that stands still learn an image.
+"""The rasterizer alone: Gaussians before a camera that stands still learn an image.
 
 python examples/fit_image.py --image docs/pictures/modes.png --out fitted.png
 """

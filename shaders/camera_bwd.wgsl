@@ -1,5 +1,5 @@
 // Sums over a workgroup's Gaussians what moves all of them alike, which is what moves the camera the other way round.
-// Before color_bwd: the gradients of a rotation of all Gaussians about the camera's centre (the colours do not change
+// Before color_bwd: the gradients of a rotation of all Gaussians about the camera's centre (the colors do not change
 // with it), and of the logarithm of the focal length. With FORCE, after color_bwd: of a shift of all Gaussians.
 #import common/frame
 #import common/index

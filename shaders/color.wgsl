@@ -1,4 +1,4 @@
-// Writes the colour of each splat that touches a tile: given, or spherical harmonics seen from the camera.
+// Writes the color of each splat that touches a tile: given, or spherical harmonics seen from the camera.
 #import common/constants
 #import common/frame
 #import common/index
@@ -6,7 +6,7 @@
 #import common/sh
 #endif
 
-struct Part { first: u32, count: u32 }   // the Gaussians whose colours are bound
+struct Part { first: u32, count: u32 }   // the Gaussians whose colors are bound
 
 @group(0) @binding(0) var<uniform> frame: Frame;
 @group(0) @binding(1) var<uniform> part: Part;

@@ -1,5 +1,5 @@
-// From the gradient of each splat's colour to that of its spherical harmonics, and of its mean, since the direction of
-// view depends on it. Where the colour was cut off at zero there is no gradient.
+// From the gradient of each splat's color to that of its spherical harmonics, and of its mean, since the direction of
+// view depends on it. Where the color was cut off at zero there is no gradient.
 #import common/constants
 #import common/frame
 #import common/index
@@ -40,7 +40,7 @@ fn main(
     let distance = length(offset);
     let direction = offset / distance;
     let basis = sh_basis(direction);
-    // The colour again, since in bands the splats hold only that of the last band's.
+    // The color again, since in bands the splats hold only that of the last band's.
     var coefficients: array<vec3<f32>, SH_COUNT>;
     var color = vec3(SH_OFFSET);
 #unroll c $SH_COUNT

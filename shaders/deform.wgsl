@@ -1,7 +1,7 @@
 // Moves Gaussians to a time: the decoder of their features, its heads, and what these do to means, quaternions, scales,
-// opacities and colours. A lane holds POINTS Gaussians and goes through the decoder's channels, QUADS quads of them a round,
+// opacities and colors. A lane holds POINTS Gaussians and goes through the decoder's channels, QUADS quads of them a round,
 // so that a weight that is read serves several Gaussians and a feature several channels.
-// MOTION: with the Laplacian motion, whose second layer and spectrum are folded into the heads. COLOR: colours change, too.
+// MOTION: with the Laplacian motion, whose second layer and spectrum are folded into the heads. COLOR: colors change, too.
 #import common/constants
 #import common/gate
 #import common/index
@@ -18,12 +18,12 @@ struct Deform {
 }
 
 const POINTS: u32 = $POINTS;
-const HEADS: u32 = $HEADS;   // quads of outputs: turn; quaternion; shift, opacity; scales; and with COLOR colour
+const HEADS: u32 = $HEADS;   // quads of outputs: turn; quaternion; shift, opacity; scales; and with COLOR color
 const CANONICAL = 4u;        // quads of a Gaussian before its still features
 const LANES = 64u;
 
 @group(0) @binding(0) var<uniform> deform: Deform;
-// rows of: mean, opacity logit; quaternion; scales, 1 where negative ones count as their magnitude, else 0; colour, -; then
+// rows of: mean, opacity logit; quaternion; scales, 1 where negative ones count as their magnitude, else 0; color, -; then
 // the features that do not depend on time
 #table 1 still: vec4<f32>
 // rows of the others

@@ -1,4 +1,4 @@
-// A rendered image with the colours that the camera of a picture would have given it. A workgroup takes a row.
+// A rendered image with the colors that the camera of a picture would have given it. A workgroup takes a row.
 #import common/exposure
 
 @group(0) @binding(0) var<uniform> exposure: Exposure;
@@ -10,9 +10,9 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index
     let count = exposure.size.x * exposure.size.y;
     for (var column = lane; column < exposure.size.x; column += u32($LANES)) {
         let i = group.y * exposure.size.x + column;
-        let colour = vec4(image_at(i), image_at(count + i), image_at(2u * count + i), 1.0);
-        exposed[i] = dot(exposure.red, colour);
-        exposed[count + i] = dot(exposure.green, colour);
-        exposed[2u * count + i] = dot(exposure.blue, colour);
+        let color = vec4(image_at(i), image_at(count + i), image_at(2u * count + i), 1.0);
+        exposed[i] = dot(exposure.red, color);
+        exposed[count + i] = dot(exposure.green, color);
+        exposed[2u * count + i] = dot(exposure.blue, color);
     }
 }

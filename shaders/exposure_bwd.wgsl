@@ -16,11 +16,11 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index
     var sums = array<vec4<f32>, 3>();
     for (var column = lane; column < exposure.size.x; column += u32($LANES)) {
         let i = group.y * exposure.size.x + column;
-        let colour = vec4(image_at(i), image_at(count + i), image_at(2u * count + i), 1.0);
+        let color = vec4(image_at(i), image_at(count + i), image_at(2u * count + i), 1.0);
         let d = vec3(d_exposed_at(i), d_exposed_at(count + i), d_exposed_at(2u * count + i));
-        sums[0] += d.x * colour;
-        sums[1] += d.y * colour;
-        sums[2] += d.z * colour;
+        sums[0] += d.x * color;
+        sums[1] += d.y * color;
+        sums[2] += d.z * color;
         let back = d.x * exposure.red + d.y * exposure.green + d.z * exposure.blue;
         d_image[i] = back.x;
         d_image[count + i] = back.y;

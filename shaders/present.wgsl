@@ -1,4 +1,4 @@
-// Puts a drawn picture on a window or a texture: its colours, or one of its values by a scale of colours; enlarged
+// Puts a drawn picture on a window or a texture: its colors, or one of its values by a scale of colors; enlarged
 // where it was drawn smaller; and beside it, or split with it, the ground truth of the same view.
 struct Present {
     heat0: vec4<f32>, heat1: vec4<f32>, heat2: vec4<f32>, heat3: vec4<f32>, heat4: vec4<f32>, heat5: vec4<f32>,
@@ -7,7 +7,7 @@ struct Present {
     size: vec2<f32>,
     picture: vec2<u32>,      // size of the picture as drawn, and of the ground truth
     truth: vec2<u32>,
-    value: u32,              // what is shown: 0 colour, 1 alpha, 2 depth, 3 the colour's first channel as a value
+    value: u32,              // what is shown: 0 color, 1 alpha, 2 depth, 3 the color's first channel as a value
     low: f32,                // the values at the two ends of the scale
     high: f32,
     truth_until: f32,        // left of this part of the width stands the ground truth

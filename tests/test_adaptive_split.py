@@ -290,26 +290,26 @@ def test_dynamics_and_their_moments_survive_clone_split_and_prune() -> None:
     rows["log_scales"][:10] = -9.0
     rows["opacity_logits"][20:30] = -9.0  # pruned
     gaussians = {name: nn.Parameter(row.clone()) for name, row in rows.items()}
-    optimiser = Optimizer(gaussians, {}, {name: Rate(1e-3, 1e-3, 1) for name in gaussians})
+    optimizer = Optimizer(gaussians, {}, {name: Rate(1e-3, 1e-3, 1) for name in gaussians})
     torch.stack([parameter.square().sum() for parameter in gaussians.values()]).sum().backward()
-    optimiser.step(1)
+    optimizer.step(1)
 
     before = gaussians["dynamics"].detach().clone()
-    moments = {key: moment.clone() for key, moment in optimiser.moments("dynamics").items()}
+    moments = {key: moment.clone() for key, moment in optimizer.moments("dynamics").items()}
     result = change(gaussians, torch.ones(60))
     assert len(result.added["means"]) > 10
     assert not result.keep[20:30].any()
     assert 0 < int(result.keep.sum()) < 60
-    optimiser.edit_rows(result.keep, result.added)
+    optimizer.edit_rows(result.keep, result.added)
     kept = int(result.keep.sum())
     after = gaussians["dynamics"]
     assert after.shape == (kept + len(result.added["means"]), 16)
     assert torch.equal(after[:kept], before[result.keep])
     assert torch.equal(after[kept : kept + 10], before[:10]), "clones"
-    for key, moment in optimiser.moments("dynamics").items():
+    for key, moment in optimizer.moments("dynamics").items():
         assert moment[:kept].count_nonzero() > 0
         assert torch.equal(moment[:kept], moments[key][result.keep])
         assert moment[kept:].count_nonzero() == 0
         assert len(moment) == len(after)
     after.square().sum().backward()
-    optimiser.step(2)
+    optimizer.step(2)

@@ -111,7 +111,7 @@ def test_the_bytes_of_a_step_add_up_and_each_has_its_purpose(results: dict, deco
     assert crossings["all else"]["up"] + crossings["all else"]["down"] < 1024
 
 
-def test_the_scene_can_be_saved_for_other_rasterisers(tmp_path: Path) -> None:
+def test_the_scene_can_be_saved_for_other_rasterizers(tmp_path: Path) -> None:
     bench("--save-scene", tmp_path / "scene.npz")
     scene = np.load(tmp_path / "scene.npz")
     assert scene["means"].shape == (300, 3)
@@ -129,7 +129,7 @@ def test_the_machine_is_told(results: dict) -> None:
     assert told <= results["machine"].keys()
 
 
-def test_what_the_rasteriser_has_to_do_is_counted(results: dict) -> None:
+def test_what_the_rasterizer_has_to_do_is_counted(results: dict) -> None:
     counts = raster(results)["counts"]
     assert counts["gaussians"] == 300
     assert 0 < counts["visible"] <= 300

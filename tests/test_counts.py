@@ -149,7 +149,7 @@ def test_bytes_that_cross_over_in_a_step(device: Device, scene: Scene, truths: T
 
 
 def test_rasterize_reads_back_twice(device: Device, scene: Scene, events: list[Event]) -> None:
-    """The rasteriser alone: one wait for the image, one for the gradients, each of several buffers."""
+    """The rasterizer alone: one wait for the image, one for the gradients, each of several buffers."""
     torch_step(scene, CAMERA, device, sh_degree=DEGREE)
     assert waits(events) == 2
     dispatched = [i for i, event in enumerate(events) if event.kind == "dispatch"]
@@ -188,7 +188,7 @@ def test_a_decoder_on_the_device_keeps_its_features_there(device: Device, events
 def test_no_buffer_is_made_for_nothing(
     device: Device, use: Callable[[Rasterizer], Rasterizer], scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A pass works with each buffer that the rasteriser holds."""
+    """A pass works with each buffer that the rasterizer holds."""
     rasterizer = use(Rasterizer(device))
     bound: set[Buffer] = set()
     check, copy = Kernel.check, Commands.copy

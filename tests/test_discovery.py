@@ -221,7 +221,7 @@ def test_a_trajectory_leaps_over_times_without_points() -> None:
     assert (np.linalg.norm(found.centers - center, axis=1) < 1.5 * RADIUS).all()
 
 
-def test_a_trajectory_does_not_change_over_to_another_colour_at_a_crossing() -> None:
+def test_a_trajectory_does_not_change_over_to_another_color_at_a_crossing() -> None:
     t = np.linspace(-1, 1, 60)
     one, other = np.stack([0.9 * t, 0.25 + 0 * t, 0 * t], axis=1), np.stack([0 * t, 0.9 * t - 0.3, 0 * t], axis=1)
     found = find_trajectories(balls(one, other), LINK, BOX)

@@ -108,7 +108,7 @@ def test_no_contributing_pixel_is_missed(monkeypatch: pytest.MonkeyPatch, device
     emitted = duplicated(monkeypatch, device, scene, camera)
     seen = emitted.splats[:, 10] > 0
     assert seen.sum() > 20
-    for dtype in (np.float64, np.float32):  # exactly, and about as the rasteriser rounds
+    for dtype in (np.float64, np.float32):  # exactly, and about as the rasterizer rounds
         reached = log_alphas(emitted.splats, camera, dtype) >= np.log2(ALPHA_MIN)
         missed = by_tile(reached & seen[:, None, None], emitted) & ~emitted.touched
         assert not missed.any(), f"splats {np.unique(missed.nonzero()[0])} miss tiles in {dtype.__name__}"

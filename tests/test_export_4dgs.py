@@ -156,7 +156,7 @@ def test_roots_of_covariances() -> None:
         assert np.linalg.norm(root) == pytest.approx(np.linalg.norm(matrix))
 
 
-# Colours
+# Colors
 
 
 def test_the_basis_is_that_of_the_reference() -> None:

@@ -79,7 +79,7 @@ def test_exposure(device: Device, size: tuple[int, int]) -> None:
 
 
 @pytest.mark.kernels
-def test_a_step_is_that_of_the_rasteriser_and_the_references(device: Device) -> None:
+def test_a_step_is_that_of_the_rasterizer_and_the_references(device: Device) -> None:
     scene, other = gaussians(), gaussians()
     mine, theirs = (CORRECTION.clone().requires_grad_() for _ in range(2))
     done = render_loss(scene, CAMERA, upload_rgba(device, TRUTH), BACKGROUND, WEIGHTS["all"], device, mine)

@@ -125,16 +125,16 @@ def test_gradients_reach_every_parameter(device: Device) -> None:
 def test_at_the_start_only_the_heads_learn(device: Device) -> None:
     """Zero heads hide everything before them; after one step of theirs all else has gradients, too."""
     field = GridField(SMALL, device, seed=0)
-    optimiser = torch.optim.SGD(field.parameters(), lr=0.1)
+    optimizer = torch.optim.SGD(field.parameters(), lr=0.1)
     target = torch.ones(40, 3)
     for expected in (False, True):
-        optimiser.zero_grad(set_to_none=False)
+        optimizer.zero_grad(set_to_none=False)
         (field(POINTS, 0.3).translation - target).square().sum().backward()
         assert field.heads.weight.grad is not None
         assert field.heads.bias.grad is not None
         assert field.heads.bias.grad.any()
         assert all(bool(grid.table.grad.any()) == expected for grid in field.grids if grid.table.grad is not None)
-        optimiser.step()
+        optimizer.step()
 
 
 def test_the_gradient_is_the_derivative(device: Device) -> None:

@@ -183,11 +183,11 @@ def test_a_term_of_weight_0_runs_no_passes(device: Device, monkeypatch: pytest.M
     assert names == ["loss_pixels", "loss_sums", "loss_gradient"]
 
 
-# With the rasteriser
+# With the rasterizer
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_a_step_is_that_of_the_rasteriser_and_the_references(device: Device, antialiased: bool) -> None:
+def test_a_step_is_that_of_the_rasterizer_and_the_references(device: Device, antialiased: bool) -> None:
     scene, other = (gaussians(antialiased=antialiased) for _ in range(2))
     done = step(device, scene)
     done.loss.backward()

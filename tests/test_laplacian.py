@@ -121,7 +121,7 @@ def test_the_gradient_is_asked_for_too_early() -> None:
         motion().frequency_gradient()
 
 
-# The optimiser of the frequencies
+# The optimizer of the frequencies
 
 STEADY = Rate(1e-3, 1e-3, 1)
 

@@ -143,7 +143,7 @@ def test_one_bad_step_does_not_stop_a_run(
 def test_a_bad_parameter_stops_the_training_and_leaves_the_older_state(
     dataset: Dataset, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Nobody else would see it: the rasteriser culls such a Gaussian, and it has no gradient."""
+    """Nobody else would see it: the rasterizer culls such a Gaussian, and it has no gradient."""
     original, calls = objective.render_loss, 0
 
     def render(gaussians: Any, *rest: Any) -> RenderLoss:

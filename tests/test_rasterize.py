@@ -1,4 +1,4 @@
-"""The whole rasteriser, forward and backward, against its float64 reference."""
+"""The whole rasterizer, forward and backward, against its float64 reference."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def test_thin_splats(device: Device) -> None:
 
 def test_very_long_thin_splats(device: Device) -> None:
     """300 pixels long and half a pixel wide: float32 loses digits in the exponent, and most of the small gradient by
-    the length, as in every rasteriser that takes it from the conic; but nothing that the eye or a step would see."""
+    the length, as in every rasterizer that takes it from the conic; but nothing that the eye or a step would see."""
     camera = front_camera(101, 61)
     scene = needles(40, 1, camera, length=300.0)
     weights = Weights.random(camera).without(fragile_pixels(scene, camera))

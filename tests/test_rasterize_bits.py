@@ -44,7 +44,7 @@ def one_step(scene: Scene, device: Device) -> Step:
 
 @pytest.fixture(scope="module")
 def expected(scene: Scene, device: Device) -> Step:
-    """The step on the device's own rasteriser."""
+    """The step on the device's own rasterizer."""
     return one_step(scene, device)
 
 

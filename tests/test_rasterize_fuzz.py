@@ -218,7 +218,7 @@ PATTERNS = {
 
 
 def poison(rasterizer: Rasterizer, pattern: np.ndarray) -> int:
-    """Overwrite every buffer that the rasteriser keeps, but for what it knows to be constant."""
+    """Overwrite every buffer that the rasterizer keeps, but for what it knows to be constant."""
     poisoned = 0
     for name, buffer in rasterizer.pool._buffers.items():
         if not name.startswith("constant "):

@@ -1,4 +1,4 @@
-"""The camera that the mouse and the keys move, and how it becomes the rasteriser's."""
+"""The camera that the mouse and the keys move, and how it becomes the rasterizer's."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ class ViewCamera:
         self.exact = None
 
     def camera(self, width: int, height: int) -> Camera:
-        """The rasteriser's camera for a picture of this size; at an exact camera it keeps that one's aspect, and is
+        """The rasterizer's camera for a picture of this size; at an exact camera it keeps that one's aspect, and is
         as large as fits."""
         if self.exact is not None:
             scale = min(width / self.exact.width, height / self.exact.height)

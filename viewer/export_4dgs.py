@@ -23,7 +23,7 @@ from .export import check_free
 from .loaded_scene import LoadedScene
 
 MAX_ERROR = 0.5  # pixels, without --max-error
-_SHADE = 4 / 255  # largest change of opacity and colour within a piece
+_SHADE = 4 / 255  # largest change of opacity and color within a piece
 _OF_LINES = 0.85  # share of the error that straight lines may use up; the rest is for rounding
 _TICKS = 1 << 12  # of the clip: middles of pieces lie on them
 _PROGRESS = 1000
@@ -109,7 +109,7 @@ def _harmonics(playback: Playback) -> NDArray[np.float32]:
 
 
 def _colored(pieces: Pieces, sh: NDArray[np.float32], seconds: float) -> LinearPieces:
-    """The pieces on the clock of the file, their colours as linear light."""
+    """The pieces on the clock of the file, their colors as linear light."""
     colors = sh[pieces.source].astype(np.float64)
     colors[:, 0] = pieces.dc
     light = linear_harmonics(colors, best_degree(colors))
@@ -127,9 +127,9 @@ def _colored(pieces: Pieces, sh: NDArray[np.float32], seconds: float) -> LinearP
 
 
 def best_degree(sh: NDArray[np.floating]) -> int:
-    """The degree whose harmonics, as bytes of linear light, come nearest to the displayed colours of sh (N, K, 3).
+    """The degree whose harmonics, as bytes of linear light, come nearest to the displayed colors of sh (N, K, 3).
 
-    Bytes are coarse (fourdgs_file.harmonics_bytes), and most so in the dark: where colours hardly depend on the
+    Bytes are coarse (fourdgs_file.harmonics_bytes), and most so in the dark: where colors hardly depend on the
     direction, fewer harmonics are nearer to them than all.
     """
     some = sh[:: max(1, len(sh) // 2000)]

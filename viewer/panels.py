@@ -146,7 +146,7 @@ class Panels:
         imgui.same_line()
         if imgui.button("Step", (66, 0)):
             training.step()
-        _tip("one step of the optimiser, then pause")
+        _tip("one step of the optimizer, then pause")
 
     def _capture(self) -> None:
         state = self.state

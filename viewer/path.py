@@ -26,7 +26,7 @@ class Pose(NamedTuple):
     fov_y: float
 
     def camera(self, width: int, height: int) -> Camera:
-        """The rasteriser's camera for a picture of this size."""
+        """The rasterizer's camera for a picture of this size."""
         f = 0.5 * height / math.tan(0.5 * self.fov_y)
         K = np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]])
         return Camera(K, world_to_camera(self.rotation.T, self.position), width, height)

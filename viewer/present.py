@@ -29,7 +29,7 @@ OFFSCREEN_FORMAT = "rgba8unorm"
 class Placed(NamedTuple):
     """A picture and where it stands on the target.
 
-    planes: as the rasteriser draws them, (4 or 5, height, width). origin, size: in pixels of the target.
+    planes: as the rasterizer draws them, (4 or 5, height, width). origin, size: in pixels of the target.
     shows: one of VALUES; low, high: the values at the ends of the scale, for depth and value.
     truth: (height, width) uint32 on the device, red in the lowest byte, of truth_size; shown left of `truth_until`
     (a share of the width), or, with error_gain, its absolute difference times this.

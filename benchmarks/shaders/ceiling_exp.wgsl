@@ -1,4 +1,4 @@
-// The rasteriser's own power of two, in chains as in ceiling_fma: x = -2^x.
+// The rasterizer's own power of two, in chains as in ceiling_fma: x = -2^x.
 struct Factors { multiply: f32, add: f32, turns: u32 }
 
 @group(0) @binding(0) var<uniform> factors: Factors;

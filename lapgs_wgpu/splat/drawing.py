@@ -55,7 +55,7 @@ class Drawing:
 
 
 def sh_defines(degree: int | None) -> dict[str, int]:
-    """Defines of color and color_bwd for harmonics of this degree, or for colours (None)."""
+    """Defines of color and color_bwd for harmonics of this degree, or for colors (None)."""
     if degree is None:
         return {}
     return {"SH": 1, "SH_COUNT": (degree + 1) ** 2} | {f"SH_{d}": 1 for d in range(1, degree + 1)}

@@ -1,4 +1,4 @@
-"""Spherical harmonics of linear light, fitted over all directions to those of displayed colours (sRGB)."""
+"""Spherical harmonics of linear light, fitted over all directions to those of displayed colors (sRGB)."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def directions(count: int) -> Floats:
 
 
 def display_colors(sh: Floats, basis: Floats) -> Floats:
-    """(N, D, 3) colours in [0, 1] of harmonics (N, K, 3) in the directions of a basis (D, K)."""
+    """(N, D, 3) colors in [0, 1] of harmonics (N, K, 3) in the directions of a basis (D, K)."""
     return np.clip(np.einsum("dk,nkc->ndc", basis, sh) + CONSTANTS["SH_OFFSET"], 0, 1)
 
 
@@ -50,7 +50,7 @@ def to_display(linear: Floats) -> Floats:
 
 
 def linear_harmonics(sh: Floats, degree: int) -> Floats:
-    """(N, (degree + 1)^2, 3) harmonics of linear light, without an offset, that fit the colours of sh (N, K, 3)."""
+    """(N, (degree + 1)^2, 3) harmonics of linear light, without an offset, that fit the colors of sh (N, K, 3)."""
     around = directions(64)
     seen, fit = sh_basis(around, int(sh.shape[1] ** 0.5) - 1), np.linalg.pinv(sh_basis(around, degree))
     found = [

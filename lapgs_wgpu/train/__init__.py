@@ -1,1 +1,1 @@
-"""The trainer: configuration, losses, optimiser, density control, evaluation."""
+"""The trainer: configuration, losses, optimizer, density control, evaluation."""

@@ -74,7 +74,7 @@ class PointsConfig(Options):
 
     count: int = option(
         "number of initial Gaussians; if the capture has a point cloud, the maximum number taken from it; with "
-        "discovery, of the Gaussians that its static fit starts from",
+        "discovery, of those at the start of its static fit",
         at_least=1,
     )
     box: float = option(
@@ -83,7 +83,7 @@ class PointsConfig(Options):
         above=0,
     )
     opacity: float = option(
-        "initial opacity of each Gaussian, between 0 and 1; with discovery, of those that its static fit starts from",
+        "initial opacity of each Gaussian, between 0 and 1; with discovery, of those at the start of its static fit",
         above=0,
         below=1,
     )
@@ -284,8 +284,7 @@ class AccelerationConfig(Options):
     )
     share: float = option("fraction of the Gaussians that it samples each time, between 0 and 1", 0.25, at_most=1)
     interval: int = option(
-        "compute it every so many steps, then with so many times the weight: most of its time is the same for few "
-        "Gaussians as for many",
+        "compute it every N steps with N times the weight; its cost hardly depends on the number of Gaussians",
         1,
         at_least=1,
     )
@@ -444,9 +443,9 @@ class Config(Options):
     discovery: DiscoveryConfig = option("", DiscoveryConfig())
     eval: EvalConfig = option("", EvalConfig())
     antialiased: bool = option(
-        "draw each Gaussian as much fainter as the rasterizer's low-pass filter makes it larger in the image, so that "
-        "what is thin looks as thin at every distance and from every side; not of the paper; viewers that draw without "
-        "it show the scene a little thicker",
+        "scale each Gaussian's opacity by the ratio of its areas in the image before and after the rasterizer's "
+        "low-pass filter (gsplat's antialiased), so that what is thin stays thin at every distance; not of the paper; "
+        "viewers that draw without it show the scene a little thicker",
         False,
     )
     precision: Precision = option(

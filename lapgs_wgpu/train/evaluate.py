@@ -73,27 +73,21 @@ def evaluate(
     _check_any(views)
     start = time.perf_counter()
     color = torch.full((3,), BACKGROUND_LEVELS[background])
-    rows = []
-    frames = []
-    fitted: list[dict[str, Any]] = []
+    rows, frames, aligned = [], [], []
     listed = any(view.objects for view in views)
     medians = still_backgrounds(views, partial(_on, color)) if not listed and static is None else [None] * len(views)
-    for view, still in zip(views, medians, strict=True):
-        truth = _on(color, view)
-        image = _render(scene, view, color)
+    for view, median in zip(views, medians, strict=True):
+        truth, image = _on(color, view), _render(scene, view, color)
         row: dict[str, Any] = {"view": view.name, "time": view.time}
         row |= _measures(_unit(image), _unit(truth), view.load_mask(), lpips)
-        frames.append(measure_objects(image, truth, view.objects, color.numpy()))
-        if not listed:
-            if static is not None:
-                row |= _moving(image, truth, differs_from_static(truth, _render(static, view, color)))
-            elif still is not None:
-                row |= _moving(image, truth, differs_from_median(truth, still))
+        if not listed and static is not None:
+            row |= _moving(image, truth, differs_from_static(truth, _render(static, view, color)))
+        elif median is not None:
+            row |= _moving(image, truth, differs_from_median(truth, median))
         rows.append(row)
+        frames.append(measure_objects(image, truth, view.objects, color.numpy()))
         if camera_unit is not None:
-            near = aligned_view(scene, view, color, camera_unit)
-            moved = _measures(_unit(_render(scene, near, color)), _unit(truth), view.load_mask(), lpips)
-            fitted.append({"view": view.name} | moved | _apart(view.camera, near.camera, camera_unit))
+            aligned.append(_aligned_row(scene, view, truth, color, camera_unit, lpips))
         if folder is not None:
             with atomic_write(folder / f"{view.name}.png") as file:
                 file.write(encode_png(side_by_side(truth, image)))
@@ -107,7 +101,7 @@ def evaluate(
     return {
         **{name: _mean([row[name] for row in rows]) for name in MEASURES},
         **motion,
-        **({"aligned": _aligned(fitted)} if fitted else {}),
+        **({"aligned": _aligned(aligned)} if aligned else {}),
         "gaussians": len(scene),
         "field": scene.field_config.kind,
         "size": [views[0].camera.width, views[0].camera.height],
@@ -116,6 +110,15 @@ def evaluate(
         "seconds": round(time.perf_counter() - start, 3),
         "environment": environment(scene.device),
     }
+
+
+def _aligned_row(
+    scene: Scene4D, view: View, truth: NDArray[np.uint8], color: Tensor, unit: float, lpips: Lpips | None
+) -> dict[str, Any]:
+    """The measures of a view after test-time alignment, and how far it moved the camera."""
+    near = aligned_view(scene, view, color, unit)
+    measures = _measures(_unit(_render(scene, near, color)), _unit(truth), view.load_mask(), lpips)
+    return {"view": view.name} | measures | _apart(view.camera, near.camera, unit)
 
 
 def _aligned(rows: list[dict[str, Any]]) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from lapgs_wgpu.errors import NumericalError
 IN_A_ROW = 10  # steps skipped one after the other that end a training
 WINDOW, SHARE = 100, 25  # and so many of the last hundred
 
-Tensors = Mapping[str, Sequence[Tensor]]  # by name of a group, such as an optimiser's
+Tensors = Mapping[str, Sequence[Tensor]]  # by name of a group, such as an optimizer's
 
 
 class Skipped(NamedTuple):

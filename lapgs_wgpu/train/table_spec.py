@@ -21,7 +21,7 @@ import dataclasses
 import hashlib
 import json
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -117,6 +117,36 @@ def read_spec(path: Path) -> Spec:
     return Spec(path.stem, preset, tuple(sorted(runs, key=lambda run: order.index(run.key.scene))))
 
 
+# Keys that are younger than results worth keeping, and the value at which they change nothing: of themselves, or of
+# the key that decides whether they do anything.
+_YOUNGER: tuple[tuple[str, Any, str], ...] = (
+    ("schedule.batch", 1, ""),
+    ("antialiased", False, ""),
+    ("exposure", False, "exposure.enabled"),
+    ("timing", False, "timing.refine"),
+    ("discovery", False, "discovery.enabled"),
+    ("field.unit", 1, ""),
+    ("field.negative_scales", "floor", ""),
+    ("density.limit", 0, ""),
+    ("density.contribution_interval", 0, "density.min_contribution"),
+    ("density.min_contribution", 0, ""),
+    ("data.split", "test", ""),
+    ("data.masks", "", ""),
+    ("data.units", "world", ""),
+    ("data.undistort", True, ""),
+    ("smoothness.start", 0, ""),
+    ("acceleration", 0, "acceleration.weight"),
+    ("precision", "float32", ""),
+)
+
+
+def _at(values: Mapping[str, Any], keys: str) -> Any:
+    """The value at dotted keys."""
+    for key in keys.split("."):
+        values = values[key]
+    return values
+
+
 @lru_cache(maxsize=1)
 def _usual_cameras() -> frozenset[CamerasConfig]:
     """How the presets refine cameras."""
@@ -128,41 +158,12 @@ def fingerprint(config: Config) -> str:
     decoder runs, which changes last bits and follows from the device."""
     values = dataclasses.asdict(config)
     del values["data"]["path"], values["schedule"]["save_interval"], values["eval"], values["decoder"]
-    # These keys are younger than results that are worth keeping.
-    if values["schedule"]["batch"] == 1:
-        del values["schedule"]["batch"]
-    if not config.antialiased:
-        del values["antialiased"]
-    if not config.exposure.enabled:
-        del values["exposure"]
     if config.cameras in _usual_cameras():
         del values["cameras"]
-    if not config.timing.refine:
-        del values["timing"]
-    if not config.discovery.enabled:
-        del values["discovery"]
-    if config.field.unit == 1:
-        del values["field"]["unit"]
-    if config.density.limit == 0:
-        del values["density"]["limit"]
-    if config.density.min_contribution == 0:
-        del values["density"]["min_contribution"], values["density"]["contribution_interval"]
-    if config.data.split == "test":
-        del values["data"]["split"]
-    if not config.data.masks:
-        del values["data"]["masks"]
-    if config.field.negative_scales == "floor":
-        del values["field"]["negative_scales"]
-    if config.smoothness.start == 0:
-        del values["smoothness"]["start"]
-    if config.acceleration.weight == 0:
-        del values["acceleration"]
-    if config.data.units == "world":
-        del values["data"]["units"]
-    if config.data.undistort:
-        del values["data"]["undistort"]
-    if config.precision == "float32":
-        del values["precision"]
+    for keys, value, decides in _YOUNGER:
+        if _at(values, decides or keys) == value:
+            section, _, last = keys.rpartition(".")
+            del (values[section] if section else values)[last]
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:16]
 
 

@@ -99,34 +99,17 @@ class Trainer:
             InputError: the configuration, the data and the parts do not fit each other.
         """
         parts = parts or Parts()
-        for name, kind, given in (("config", Config, config), ("dataset", Dataset | None, dataset)):
-            if not isinstance(given, kind):
-                raise InputError(f"Trainer takes as {name} what load_{name} gives, got a {type(given).__name__}.")
-        if scene is not None and parts.field is not None:
-            raise InputError("the scene to start from keeps its own field; leave out Parts(field=...).")
+        _check_given(config, dataset, scene, parts, ranks)
         if dataset is None:
             config = resolve_data(config, Path("runs"))
             dataset = open_dataset(config)
         device = device or open_device()
-        check_terms(tuple(parts.losses), TERMS)
-        if parts.field is not None:
-            try:
-                config = dataclasses.replace(config, field=dataclasses.replace(config.field, kind="own"))
-            except ValueError as error:
-                raise InputError(f"{error}.") from None
-        if scene is not None:
-            config = dataclasses.replace(config, field=scene.field_config)
-        self.given = resolve_decoder(config, device)
+        self.given = resolve_decoder(_with_field(config, scene, parts), device)
         config = resolve_for_dataset(self.given, dataset)
         if scene is not None:  # whose field does not change its shape any more
             config = dataclasses.replace(config, field=scene.field_config)
         self.config = config
         self.dataset, self.parts, self.callbacks = dataset, parts, list(parts.callbacks)
-        if config.schedule.batch % ranks.count:
-            raise InputError(
-                f"{ranks.count} processes cannot share {config.schedule.batch} views a step evenly; give --batch "
-                f"{ranks.count}, or a multiple of it."
-            )
         self.ranks = ranks
         self.done = 0
         self._threads = step_threads(config.field, device)
@@ -241,9 +224,9 @@ class Trainer:
         self.scene.save(path, metadata)
 
     def step(self) -> StepResult:
-        """One step of the optimiser, on `schedule.batch` pictures, whose losses count as their mean; then callbacks.
+        """One step of the optimizer, on `schedule.batch` pictures, whose losses count as their mean; then callbacks.
 
-        A step whose loss or gradients are not finite moves nothing: parameters, the optimisers' and the density
+        A step whose loss or gradients are not finite moves nothing: parameters, the optimizers' and the density
         control's state stay as they were; what the schedule plans for this step is done. Raises NumericalError where
         too many are skipped, or where a parameter is not finite, and DeviceError.
         """
@@ -293,7 +276,7 @@ class Trainer:
             self._optimizer.step(step, min(1.0, step / self._rising) if self._rising else 1.0)
             for beside in self._beside:
                 beside.step(step)
-            # After the optimiser's step, so that no gradient is lost with the rows that change.
+            # After the optimizer's step, so that no gradient is lost with the rows that change.
             if step < config.density.stop:
                 self._density.statistics.merge(self._seen_by_all(seen))
         else:
@@ -449,3 +432,30 @@ class Trainer:
 def _timing_state(timing: Timing) -> dict[str, Tensor]:
     """Of a scene that began with a timing, which this training does not change."""
     return {name: torch.from_numpy(values) for name, values in vars(timing).items() if len(values)}
+
+
+def _check_given(config: Config, dataset: Dataset | None, scene: Scene4D | None, parts: Parts, ranks: Ranks) -> None:
+    """Raises InputError for arguments of another kind, or that exclude each other."""
+    for name, kind, given in (("config", Config, config), ("dataset", Dataset | None, dataset)):
+        if not isinstance(given, kind):
+            raise InputError(f"Trainer takes as {name} what load_{name} gives, got a {type(given).__name__}.")
+    if scene is not None and parts.field is not None:
+        raise InputError("the scene to start from keeps its own field; leave out Parts(field=...).")
+    check_terms(tuple(parts.losses), TERMS)
+    if config.schedule.batch % ranks.count:
+        raise InputError(
+            f"{ranks.count} processes cannot share {config.schedule.batch} views a step evenly; give --batch "
+            f"{ranks.count}, or a multiple of it."
+        )
+
+
+def _with_field(config: Config, scene: Scene4D | None, parts: Parts) -> Config:
+    """The configuration with the field that the scene or the parts bring. Raises InputError."""
+    if scene is not None:
+        return dataclasses.replace(config, field=scene.field_config)
+    if parts.field is None:
+        return config
+    try:
+        return dataclasses.replace(config, field=dataclasses.replace(config.field, kind="own"))
+    except ValueError as error:
+        raise InputError(f"{error}.") from None

@@ -20,7 +20,7 @@ const SH_C3_1: f32 = 2.890611442640554;         // 1/2 sqrt(105/pi): xyz
 const SH_C3_2: f32 = 0.4570457994644658;        // 1/4 sqrt(21/(2 pi)): y (4zz - xx - yy), x (4zz - xx - yy)
 const SH_C3_3: f32 = 0.3731763325901154;        // 1/4 sqrt(7/pi): z (2zz - 3xx - 3yy)
 const SH_C3_4: f32 = 1.445305721320277;         // 1/4 sqrt(105/pi): z (xx - yy)
-const SH_OFFSET: f32 = 0.5;                     // colour = max(SH + this, 0): zero coefficients mean mid grey
+const SH_OFFSET: f32 = 0.5;                     // color = max(SH + this, 0): zero coefficients mean mid grey
 
 // Image losses.
 const SSIM_C1: f32 = 1e-4;                      // 0.01^2, of the luminance

@@ -1,4 +1,4 @@
-// The affine colour correction of a picture, which is applied to the rendered image before the losses.
+// The affine color correction of a picture, which is applied to the rendered image before the losses.
 struct Exposure {
     red: vec4<f32>,     // a row of the matrix each, its offset last
     green: vec4<f32>,

@@ -1,4 +1,4 @@
-// What the rasteriser's two passes share: a workgroup draws one tile, each lane ROWS pixels of one column, and a batch of
+// What the rasterizer's two passes share: a workgroup draws one tile, each lane ROWS pixels of one column, and a batch of
 // as many splats as lanes is loaded at once, one a lane, then handed round. With SUBGROUPS the workgroup lies in one
 // subgroup and splats are handed round by shuffles, otherwise through workgroup memory. A driver may choose narrower
 // subgroups for one pipeline than for another: then the pass says so behind the ranges of all tiles (z: rasterize, w:
@@ -41,7 +41,7 @@ fn power_of_two(x: f32) -> f32 {
 struct Blend {
     unclamped: f32,
     alpha: f32,
-    weight: f32,          // of the splat's colour; 0 where the pixel stops
+    weight: f32,          // of the splat's color; 0 where the pixel stops
     transmittance: f32,   // behind the splat; its sign turns negative where the pixel stops
     stop: bool,
 }

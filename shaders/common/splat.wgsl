@@ -1,4 +1,4 @@
-// A projected Gaussian, as `project` and `color` leave it and the rasteriser reads it: three vec4.
+// A projected Gaussian, as `project` and `color` leave it and the rasterizer reads it: three vec4.
 //   0: mean x, mean y (pixels), conic a, conic b
 //   1: conic c, log2 opacity, red, green
 //   2: blue, depth (camera z), radius (pixels; 0: invisible), determinant of the covariance

@@ -1,4 +1,4 @@
-"""The rasteriser in plain torch: slow, simple, differentiable by autograd; in float64 the oracle of the kernels.
+"""The rasterizer in plain torch: slow, simple, differentiable by autograd; in float64 the oracle of the kernels.
 
 One function per pass, named as its shader. Conventions (gsplat's) and numbers come from shaders/common/constants.wgsl.
 """

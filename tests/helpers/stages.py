@@ -1,4 +1,4 @@
-"""Looking between the passes of the rasteriser."""
+"""Looking between the passes of the rasterizer."""
 
 from __future__ import annotations
 

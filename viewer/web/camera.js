@@ -86,7 +86,7 @@ export class ViewCamera {
         return Math.min(height, width / this.narrowest);
     }
 
-    // What the rasteriser takes for a picture of this size; view is column by column.
+    // What the rasterizer takes for a picture of this size; view is column by column.
     camera(width, height) {
         const [x, y, z] = this.rotation;
         const f = 0.5 * this.pictureHeight(width, height) / Math.tan(0.5 * this.fovY);

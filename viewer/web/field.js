@@ -153,7 +153,7 @@ export class Playback {
             if (laplacian) folded.forEach((value, j) => (out[column(j) + 4 * heads + place] = value));
         });
         for (let output = 0; output < appearance; output++) {
-            const place = output < 3 ? 16 + output : 11; // of the colour's quad; the opacity's, behind the shift
+            const place = output < 3 ? 16 + output : 11; // of the color's quad; the opacity's, behind the shift
             out[place] = APPEARANCE_SCALE * p["appearance.bias"][output];
             for (let k = 0; k < width; k++) out[column(k) + place] = APPEARANCE_SCALE * p["appearance.weight"][output * width + k];
         }

@@ -60,7 +60,7 @@ class FieldConfig(Options):
         below=1e6,
     )
     unit: float = option(
-        "length that an output of 1 of the field's heads means, for shifts and changes of the scales, world units; the "
+        "factor of the heads' outputs for translations and changes of the scales, world units; the "
         "heads learn at a rate of their own, so this sets how fast things move while training; field own: not used",
         1.0,
         above=0,

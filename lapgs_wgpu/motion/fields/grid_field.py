@@ -240,7 +240,7 @@ class GridField(nn.Module):
         return self.heads.bias.new_tensor(self.config.head_factors)
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        """See motion/fields/deformation.py. The spectrum's frequencies, in no group, have their own optimiser."""
+        """See motion/fields/deformation.py. The spectrum's frequencies, in no group, have their own optimizer."""
         tables = [grid.table for grid in self.grids]
         apart = {id(table) for table in tables}
         if isinstance(self.motion, LaplacianMotion):

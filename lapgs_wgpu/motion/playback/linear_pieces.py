@@ -1,6 +1,6 @@
 """The motion of a playback as pieces of straight lines, for files that hold no field.
 
-A piece is halved until a line and one shape, colour and opacity are near enough to all that the field says of it.
+A piece is halved until a line and one shape, color and opacity are near enough to all that the field says of it.
 Shapes are compared by the square roots of their covariances, whose columns lie on the ellipsoid of one standard
 deviation: unlike quaternions they do not turn where the ellipsoid looks the same.
 """
@@ -26,7 +26,7 @@ _SHORTEST = 2.0**-9  # of the clip: shorter pieces are not halved
 _BLOCK = 1 << 21  # samples at once: 0.1 GB
 _CHECKS = 97  # moments at which finished pieces are compared; none but a few is one of those they were made of
 _REPAIRS = 4  # times that what is still too far is baked again, twice as finely
-_MEAN, _ROOT, _REST = slice(0, 3), slice(3, 9), slice(9, 13)  # columns of a state: mean, root; opacity and colour
+_MEAN, _ROOT, _REST = slice(0, 3), slice(3, 9), slice(9, 13)  # columns of a state: mean, root; opacity and color
 _ROWS, _COLUMNS = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]  # entries of a root
 _WEIGHTS = np.array([1, 1, 1, 2, 2, 2]) ** 0.5  # so that the norm of the six is that of the matrix
 
@@ -56,7 +56,7 @@ def linear_pieces(
     """Bake a playback.
 
     farthest: largest distance of a point of an ellipsoid of one standard deviation from where it should be, world
-    units. shade: largest change of opacity and colour, both in [0, 1]. Gaussians that no pass draws during a piece are
+    units. shade: largest change of opacity and color, both in [0, 1]. Gaussians that no pass draws during a piece are
     left out of it. done: called with the share that is done, now and then.
     """
     pieces = _bake(playback, np.arange(playback.count), farthest, shade, done)
@@ -107,7 +107,7 @@ def piece_errors(playback: Playback, pieces: Pieces) -> Floats:
 
 
 def state(playback: Playback, t: float, rows: NDArray[np.integer]) -> Floats:
-    """(rows, 13) of Gaussians at a time: mean, root of the covariance, opacity, colour of degree 0."""
+    """(rows, 13) of Gaussians at a time: mean, root of the covariance, opacity, color of degree 0."""
     now = playback.at(t)
     arrays = read_all([now.means, now.quats, now.scales, now.opacities, now.sh])
     means, quats, scales, opacities, sh = (values[rows] for values in arrays)

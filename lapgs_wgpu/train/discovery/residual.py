@@ -15,10 +15,10 @@ from lapgs_wgpu.splat.camera import Camera
 Floats = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-THRESHOLD = 0.1  # least residual of a moving pixel; colours are in [0, 1]
+THRESHOLD = 0.1  # least residual of a moving pixel; colors are in [0, 1]
 REACH = 2  # pixels; texture that the static fit blurs or shifts by less is no residual
 FALLOFF = 1.5  # pixels; standard deviation of the mask's soft border
-BLUR = 2.0  # pixels; standard deviation of the colours that views are compared by
+BLUR = 2.0  # pixels; standard deviation of the colors that views are compared by
 
 
 class Samples(NamedTuple):
@@ -64,7 +64,7 @@ class Residual:
 
     @cached_property
     def _blurred(self) -> Floats:
-        """(H, W, 3): mean colour of the moving pixels nearby."""
+        """(H, W, 3): mean color of the moving pixels nearby."""
         weight = ndimage.gaussian_filter(self.mask.astype(np.float32), BLUR)[..., None]
         colors = ndimage.gaussian_filter(self.image * self.mask[..., None], (BLUR, BLUR, 0))
         return (colors / np.maximum(weight, 1e-3)).astype(np.float32)
@@ -100,7 +100,7 @@ def moving_pixels(image: Floats, still: Floats) -> Mask:
 
 
 def interval_residual(image: Floats, still: Floats) -> Floats:
-    """(H, W): distance of an image's colours (H, W, 3) to the range of the static fit's colours within REACH pixels,
+    """(H, W): distance of an image's colors (H, W, 3) to the range of the static fit's colors within REACH pixels,
     the largest over the channels."""
     size = (2 * REACH + 1, 2 * REACH + 1, 1)
     low, high = ndimage.minimum_filter(still, size), ndimage.maximum_filter(still, size)

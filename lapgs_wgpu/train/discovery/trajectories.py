@@ -26,7 +26,7 @@ AGAIN = 0.1  # worth of a group that is on an earlier path
 LEAST_WORTH = 8.0  # of a path
 MOST = 8  # paths
 COLOR_SPREAD = 0.15
-SHARP = 2.0  # highest cost of a bend, and of a change of colour
+SHARP = 2.0  # highest cost of a bend, and of a change of color
 WINDOW = 1.0  # time steps; standard deviation of the weights by which a path is smoothed
 # In half sides of the box:
 BEND = 0.3  # standard deviation of a group's center around the straight continuation of its path
