@@ -70,8 +70,8 @@ def test_every_process_draws_the_same_numbers_and_other_views(
         return original(self, sample)
 
     monkeypatch.setattr(Trainer, "_loss", note)
-    monkeypatch.setattr(Ranks, "gather", lambda self, tensors: [[tensor] * self.count for tensor in tensors])
-    monkeypatch.setattr(Ranks, "any", lambda self, here: here)
+    monkeypatch.setattr(Ranks, "all_gather", lambda self, tensors: [[tensor] * self.count for tensor in tensors])
+    monkeypatch.setattr(Ranks, "any_rank", lambda self, here: here)
     states, views = [], []
     for rank in range(2):
         training = Trainer(configure(schedule__batch="2", schedule__warm_up="0"), dataset, device, Ranks(rank, 2))

@@ -262,7 +262,7 @@ class Trainer:
             renderings.append(rendering)
             totals.update({"loss": loss.item(), "psnr": rendering.psnr, **terms})
         if ranks.count > 1:
-            self._put_together()
+            self._all_reduce_gradients()
         sums = ranks.all_reduce_sum([torch.tensor(list(totals.values()), dtype=torch.float64)])[0] / len(samples)
         value, psnr, *of_terms = sums.tolist()
 
@@ -332,7 +332,7 @@ class Trainer:
         for each in self._beside:
             each.values.grad = None
 
-    def _put_together(self) -> None:
+    def _all_reduce_gradients(self) -> None:
         """Every rank's gradients become the sums over the ranks."""
         mine = [gradient for group in self._gradients().values() for gradient in group]
         for gradient, total in zip(mine, self.ranks.all_reduce_sum(mine), strict=True):
