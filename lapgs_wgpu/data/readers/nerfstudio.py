@@ -130,7 +130,8 @@ def _listed(data: dict[str, Any], field: str, names: list[str], path: Path) -> l
     listed = data.get(field) or []
     if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
         raise InputError(f"{path}: {field} must be a list of names, got {kind(listed)}.")
-    normal = [str(PurePosixPath(name)) for name in listed]
+    posix = {name: str(PurePosixPath(name)) for name in listed}
+    normal = [posix[name] if posix[name] in names else str(PurePosixPath(name.replace("\\", "/"))) for name in listed]
     unknown = next((name for name in normal if name not in names), None)
     if unknown is not None:
         raise InputError(f"{path}: {field} names {unknown[:80]}, which is none of its {len(names)} frames.")
