@@ -288,7 +288,7 @@ def test_one_film(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     out = tmp_path / "out"
     assert prepare_command([str(path), "--out", str(out)]) == 0
     said = capsys.readouterr()
-    assert f"{COUNT} of {COUNT} cameras placed; {beside('lapgs-train')} hypernerf-tiny" in said.out
+    assert f"{COUNT} of {COUNT} cameras placed; {beside('lapgs-prepare')} --check " in said.out
     assert "10 images of 10 frames" in said.err
     times = json.loads((out / "times.json").read_text())
     assert times == {f"{100 * i:08d}.jpg": i / 10 for i in range(COUNT)}
@@ -310,7 +310,7 @@ def test_films_of_still_cameras(tmp_path: Path, capsys: pytest.CaptureFixture) -
     out = tmp_path / "out"
     assert prepare_command([*map(str, films), "--out", str(out), "--fps", "10"]) == 0
     said = capsys.readouterr()
-    assert f"4 of 4 cameras placed; {beside('lapgs-train')} neu3d-tiny" in said.out
+    assert f"4 of 4 cameras placed; {beside('lapgs-prepare')} --check " in said.out
     assert "the films are 0.50 to 0.70 s long; all are cut to 0.50 s" in said.err
     assert len(json.loads((out / "times.json").read_text())) == 4 * 6
     data = load_dataset(out)
