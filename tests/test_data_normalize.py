@@ -205,7 +205,7 @@ def test_the_placement_is_told_kept_and_used_again(tmp_path: Path, capsys: pytes
     fast = ["--steps", "2", "--points.count", "50", "--points.box", "1.7", "--field", "static"]
     assert cli.train_command(["tiny", "--data", str(folder), "--out", str(run), *fast]) == 0
     out = capsys.readouterr().out
-    assert out.startswith("placement: the cube of half side 64."), out
+    assert out.startswith("normalization: the cube of half side 64."), out
     assert "around (100, -70, 30) in the capture's files becomes [-1.3, 1.3]^3" in out
     metrics = json.loads((run / "metrics.json").read_text())
     scene = load(run / "checkpoint.ply")
