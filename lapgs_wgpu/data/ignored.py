@@ -84,8 +84,8 @@ def read_ignored(
 ) -> NDArray[np.bool_]:
     """Decode the mask of an image of (width, height) `stored` that is undistorted and shrunk to `size`: (H, W).
 
-    A pixel is ignored where any of the pixels mixed into it is. black: what is black is ignored, not what is white.
-    Raises InputError.
+    An output pixel is ignored if any of the mask's pixels that it covers is. black: whether black pixels are ignored,
+    or white ones. Raises InputError.
     """
     level = resize(decode(path)[..., :3], stored, NEAREST).max(axis=2, keepdims=True)
     ignored: Pixels = np.repeat(np.where((level < WHITE) == black, 255, 0).astype(np.uint8), 3, axis=2)
