@@ -441,7 +441,7 @@ def test_a_field_that_moves_nothing_starts_from_the_static_fit(dataset: Dataset,
     found = discover(config, dataset, device, Trainer, own_field=Fading())
     assert "the field moves nothing: nothing is added" in found.summary
     assert f"a static fit of {len(found.scene)} Gaussians" in found.summary
-    assert not found.fitted
+    assert not found.field_fitted
 
 
 def test_discovery_starts_a_training_which_goes_on_to_the_same_bits(dataset: Dataset, device: Device) -> None:
@@ -526,7 +526,7 @@ def test_a_field_that_knows_nearly_all_that_moves_keeps_it(
     monkeypatch.setattr("lapgs_wgpu.train.discovery.discover.NEARLY_ALL", nearly_all)
     found = discover(configure(discovery__field_steps="20"), dataset, device, Trainer)
     assert "moving parts" in found.summary
-    assert found.fitted == (nearly_all == 0)
+    assert found.field_fitted == (nearly_all == 0)
 
 
 def test_without_parts_to_follow_the_static_fit_starts_a_training(dataset: Dataset, device: Device) -> None:
