@@ -5,8 +5,7 @@ export function applyAddress(hash, { clock, backgrounds, setBackground }) {
         const value = given.get(name) ? Number(given.get(name)) : NaN;
         return value >= low && value <= high ? value : null;
     };
-    const t = number("t", 0, 1);
-    if (t !== null) clock.seek(t);
+    clock.seek(number("t", 0, 1) ?? clock.time);
     clock.speed = number("speed", 0.01, 100) ?? clock.speed;
     clock.fps = number("fps", 0.1, 1000) ?? clock.fps;
     if (clock.loops.includes(given.get("loop"))) clock.loop = given.get("loop");

@@ -64,13 +64,12 @@ export class ViewCamera {
     }
 
     turn(right, down) {
-        let rotation = this.rotation.map(row => turned(row, this.up, right));
+        const rotation = this.rotation.map(row => turned(row, this.up, right));
         let across = cross(rotation[2], this.up);
         across = Math.hypot(...across) > 1e-6 ? unit(across) : rotation[0];
         const pitch = Math.asin(Math.min(1, Math.max(-1, dot(rotation[2], this.up))));
         const wanted = Math.min(STEEPEST, Math.max(-STEEPEST, pitch - down));
-        rotation = rotation.map(row => turned(row, across, pitch - wanted));
-        this.rotation = rotation;
+        this.rotation = rotation.map(row => turned(row, across, pitch - wanted));
     }
 
     level(forward) {

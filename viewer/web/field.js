@@ -130,8 +130,7 @@ export class Playback {
 
     // Biases and, by channel, weights of the heads; with the Laplacian motion at a time folded in.
     headsAt(t) {
-        const { field: { width, laplacian, appearance, unit }, parameters: p } = this.scene;
-        const { heads } = this;
+        const { heads, scene: { field: { width, laplacian, appearance, unit }, parameters: p } } = this;
         const row = laplacian ? heads + 4 : heads;
         const out = new Float32Array(4 * (heads + 4 * this.rounds * row));
         const column = channel => 4 * (heads + channel * row);

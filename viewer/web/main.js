@@ -176,8 +176,7 @@ function start(gpu, { scene, playback, rasterizer }, state, data) {
             resize();
             if (!await viewport.draw(now)) return;
         } catch (error) {
-            fail(error);
-            return;
+            return fail(error);
         }
         if (viewport.scale === 1 && !clock.playing) canvas.toBlob(keep); // now: a canvas holds its picture for this task
         find("poster").hidden = true;

@@ -14,6 +14,8 @@ const WATCHED = 256; // drawings, after which a plan that is too large for all o
 
 const roomy = intersections => Math.floor((Math.floor(5 * intersections / 4) + 4095) / 4096) * 4096;
 const groups = count => Math.ceil(count / LANES);
+// drawings: that went by the plan, most: intersections that one of their bands had.
+const newPlan = (capacity, bands) => ({ capacity, bands, drawings: 0, most: 0 });
 
 export class Rasterizer {
     // raster: tile sizes and kernel keys (viewer/web_page.py).
@@ -24,8 +26,7 @@ export class Rasterizer {
         this.plain = raster.plain;
         this.depth = raster.depth;
         this.pool = new Pool(gpu);
-        this.plan = { capacity: FIRST_CAPACITY, bands: 1 };
-        this.watched = this.most = 0; // drawings by this plan, and the most intersections of a band
+        this.plan = newPlan(FIRST_CAPACITY, 1);
         this.maxCapacity = Math.floor(gpu.maxBinding / RECORD_BYTES);
         this.size = "";
         this.flagsScan = new Scan(gpu, this.pool, "visible", "FLAGS");
@@ -38,8 +39,7 @@ export class Rasterizer {
     // gaussians: {count, degree, antialiased, means, quats, scales, opacities, sh}. camera: see camera.js. depth: as a fifth plane.
     draw(gaussians, camera, background, log = null, depth = false) {
         if (this.size !== `${camera.width}x${camera.height}`) { // the bands of another size would slow this one down
-            this.plan = { capacity: this.plan.capacity, bands: 1 };
-            this.watched = this.most = 0;
+            this.plan = newPlan(this.plan.capacity, 1);
             this.size = `${camera.width}x${camera.height}`;
         }
         const { bands } = this.plan;
@@ -83,30 +83,28 @@ export class Rasterizer {
             const all = totals.reduce((sum, each) => sum + each, 0);
             bands = Math.min(rows, Math.max(bands + 1, Math.ceil(5 * all / (4 * limit))));
         }
-        this.plan = { capacity: Math.min(limit, roomy(most)), bands };
-        this.watched = this.most = 0;
+        this.plan = newPlan(Math.min(limit, roomy(most)), bands);
         return false;
     }
 
     // After a close look the passes would go on with all the room that it took (splat/drawing_plan.py).
     fitted(most) {
-        this.watched += 1;
-        this.most = Math.max(this.most, most);
-        if (this.watched < WATCHED) return;
-        if (2 * roomy(this.most) <= this.plan.capacity) this.plan = { ...this.plan, capacity: roomy(this.most) };
-        this.watched = this.most = 0;
+        const { plan } = this;
+        plan.most = Math.max(plan.most, most);
+        if (++plan.drawings < WATCHED) return;
+        const least = roomy(plan.most);
+        this.plan = newPlan(2 * least <= plan.capacity ? least : plan.capacity, plan.bands);
     }
 
     tiles(camera) {
         return [Math.ceil(camera.height / this.tile[1]), Math.ceil(camera.width / this.tile[0])];
     }
 
-    drawBand(commands, { gaussians, camera, background, plan, rasterize, image, splats }, band) {
+    drawBand(commands, { gaussians, camera, background, plan: { capacity, bands }, rasterize, image, splats }, band) {
         const { gpu, pool } = this;
         const { count: n, antialiased, means, quats, scales, opacities } = gaussians;
-        const { capacity } = plan;
         const [rows, columns] = this.tiles(camera);
-        const [top, bottom] = [Math.floor(rows * band / plan.bands), Math.floor(rows * (band + 1) / plan.bands)];
+        const [top, bottom] = [Math.floor(rows * band / bands), Math.floor(rows * (band + 1) / bands)];
         const tiles = (bottom - top) * columns;
         const frame = pool.uniform(`frame ${band}`, gpu.kernel("compact"), "frame", {
             view: camera.view, focal: camera.focal, center: camera.center, position: camera.position, gaussians: n,
