@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from lapgs_wgpu.command import guarded, print_devices
-from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.errors import InputError, pip_install
 from lapgs_wgpu.progress import say
 from lapgs_wgpu.train_options import parse_options
 
@@ -157,7 +157,7 @@ def _evaluate(run: Path, given: dict[str, typing.Any], overrides: dict[str, str 
     if plots.available():
         plots.plot_run(run, scene)
     else:
-        print(f"no plots: pip install 'lapgs-wgpu[plots]' adds them to {run / 'eval'}.", file=sys.stderr)
+        print(f"no plots: {pip_install('plots')} adds them to {run / 'eval'}.", file=sys.stderr)
     say(result_text(run))
 
 

@@ -7,8 +7,8 @@ time was over before all its runs were done.
 from __future__ import annotations
 
 import argparse
+import io
 import os
-import shlex
 import shutil
 import sys
 from collections.abc import Callable
@@ -16,7 +16,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import NoReturn
 
-from lapgs_wgpu.errors import DeviceError, InputError, NoAdapterError, NumericalError
+from lapgs_wgpu.errors import DeviceError, InputError, NoAdapterError, NumericalError, quoted
 from lapgs_wgpu.gpu.device import list_devices
 
 DEVICE_HELP = (
@@ -30,6 +30,9 @@ INTERRUPTED = 130  # the shell's code for a process that Ctrl-C ended
 
 def guarded(name: str, command: Callable[[list[str]], int | None], arguments: list[str]) -> int:
     """Run a command; what its user should know goes to stderr in one sentence. Returns the exit code."""
+    if isinstance(sys.stdout, io.TextIOWrapper):  # letters that its encoding lacks are escaped, as on stderr
+        utf8 = sys.platform == "win32" and not sys.stdout.isatty()
+        sys.stdout.reconfigure(encoding="utf-8" if utf8 else None, errors="backslashreplace")
     text = ""
     try:
         code = command(arguments) or 0
@@ -66,7 +69,7 @@ def guarded(name: str, command: Callable[[list[str]], int | None], arguments: li
 
 def beside(name: str) -> str:
     """How another of the commands is called: by its name where the shell finds it, otherwise as this one was."""
-    return name if shutil.which(name) else shlex.quote(str(Path(sys.argv[0]).with_name(name)))
+    return name if shutil.which(name) else quoted(Path(sys.argv[0]).with_name(name))
 
 
 def print_devices() -> None:

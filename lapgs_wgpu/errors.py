@@ -1,5 +1,9 @@
 """The errors that a user can cause or meet. The commands print their text alone, without a traceback."""
 
+import shlex
+import subprocess
+import sys
+
 _MOST = 2000  # characters of a text
 
 
@@ -45,3 +49,13 @@ def shown(value: object) -> str:
     except (ValueError, RecursionError):  # a number of thousands of digits, a thousand lists in each other
         text = f"a {type(value).__name__} too large to show"
     return text if len(text) <= 80 else f"{text[:77]}..."
+
+
+def quoted(path: object) -> str:
+    """A path as one word of a command that can be pasted."""
+    return subprocess.list2cmdline([str(path)]) if sys.platform == "win32" else shlex.quote(str(path))
+
+
+def pip_install(extra: str) -> str:
+    """The command that adds an extra. In double quotes: Windows' cmd.exe knows no others."""
+    return f'pip install "lapgs-wgpu[{extra}]"'

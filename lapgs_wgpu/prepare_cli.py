@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from shlex import quote
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 from lapgs_wgpu.command import HelpFormatter, Parser, beside, guarded
-from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.errors import InputError, quoted
+from lapgs_wgpu.io.listing import listed
 
 if TYPE_CHECKING:
     from lapgs_wgpu.prepare.diagnosis import Diagnosis
 
 DESCRIPTION = """\
 Convert films to a capture for lapgs-train: choose images and reconstruct the cameras. Needs no other programs, but the
-extra prepare: pip install 'lapgs-wgpu[prepare]'.
+extra prepare: pip install "lapgs-wgpu[prepare]".
 
   lapgs-prepare walk.mp4 --out DIR              one moving camera: a pose for each image
   lapgs-prepare a.mp4 b.mp4 c.mp4 --out DIR     several static cameras: a pose for each film; all films must start at
@@ -61,15 +62,17 @@ def _prepare(arguments: list[str]) -> None:
     check_options(given)
     capture = Path(given.check or given.out)
     run = Path("runs", capture.resolve().name)
-    if given.train and run.exists() and (not run.is_dir() or any(run.iterdir())):  # now, not after minutes of work
+    if given.train and run.exists() and (not run.is_dir() or listed(run)):  # now, not after minutes of work
         from lapgs_wgpu.train.run_folder import has_state
 
-        goes_on = f"; {beside('lapgs-train')} --resume {quote(str(run))} goes on with it" if has_state(run) else ""
+        goes_on = f"; {beside('lapgs-train')} --resume {quoted(run)} goes on with it" if has_state(run) else ""
         raise InputError(
             f"{run} is there already, and the training would be written to it{goes_on}; move it, or work elsewhere."
         )
     diagnosis = _check(capture) if given.check else _convert(given, capture)
-    if given.train:
+    if given.train and not given.check and sys.platform == "darwin":
+        _train_anew(capture, given.minutes)
+    elif given.train:
         _train(capture, run, given.minutes, diagnosis)
 
 
@@ -104,7 +107,7 @@ def _convert(given: argparse.Namespace, out: Path) -> Diagnosis:
     for measure in done.diagnosis.measures:
         if measure.good is False:
             print(measure, file=sys.stderr)
-    then = "" if given.train else f"; {beside('lapgs-prepare')} --check {quote(str(done.folder))} --train"
+    then = "" if given.train else f"; {beside('lapgs-prepare')} --check {quoted(done.folder)} --train"
     print(f"{done.folder}: {done.images} images, {done.placed} of {done.cameras} cameras placed{then}", flush=True)
     return done.diagnosis
 
@@ -137,7 +140,16 @@ def _train(capture: Path, run: Path, minutes: float | None, diagnosis: Diagnosis
     print(plan.text, flush=True)
     train(plan.config, plan.dataset, run, device=device)
     print(result_text(run))
-    print(f"{beside('lapgs-view')} {quote(str(run / 'checkpoint.ply'))}")
+    print(f"{beside('lapgs-view')} {quoted(run / 'checkpoint.ply')}")
+
+
+def _train_anew(capture: Path, minutes: float | None) -> NoReturn:
+    """Train in a process that takes the place of this one: on macOS, COLMAP's library and torch each bring an OpenMP of
+    their own, and the second one that is loaded ends the process."""
+    command = [sys.executable, "-m", "lapgs_wgpu.prepare_cli", "--check", str(capture), "--train"]
+    command += ["--minutes", str(minutes)] if minutes is not None else []
+    sys.stdout.flush()
+    os.execv(sys.executable, command)
 
 
 if __name__ == "__main__":

@@ -42,17 +42,17 @@ class Progress:
         if done == self._total or now - self._shown >= (TERMINAL_SECONDS if on_terminal else FILE_SECONDS):
             self._shown = now
             line = text() if text else self._line(now)
-            width = shutil.get_terminal_size().columns - 1
-            self._write(f"\r\x1b[2K{line[:width]}" if on_terminal else f"{line}\n")
+            self._write(in_place(line) if on_terminal else f"{line}\n")
 
     def note(self, text: str) -> None:
         """Print a line of its own."""
-        self._write(f"\r\x1b[2K{text}\n" if self._stream.isatty() else f"{text}\n")
+        self.clear()
+        self._write(f"{text}\n")
 
     def clear(self) -> None:
         """Remove the line from a terminal."""
         if self._stream.isatty():
-            self._write("\r\x1b[2K")
+            self._write(in_place("") + "\r")
 
     def _line(self, now: float) -> str:
         left = (now - self._start) / self._done * (self._total - self._done)
@@ -62,6 +62,12 @@ class Progress:
         with suppress(OSError):  # a closed pipe or a full disk behind stderr does not stop the job
             self._stream.write(text)
             self._stream.flush()
+
+
+def in_place(line: str) -> str:
+    """What shows a line in place of the terminal's last one, cut to its width. Older consoles know no escape codes."""
+    width = shutil.get_terminal_size().columns - 1
+    return f"\r{line[:width]:<{width}}"
 
 
 def say(text: str) -> None:

@@ -18,7 +18,7 @@ SHORTCUTS = {
 }
 USAGE = "lapgs-train PRESET --data DIR [--out RUN] [--KEY VALUE ...]"
 DESCRIPTION = """\
-Train a 4D Gaussian splatting model of a moving scene on a folder of images. Runs on any Vulkan adapter.
+Train a 4D Gaussian splatting model of a moving scene on a folder of images, on any Vulkan, Metal or D3D12 adapter.
 
   lapgs-train demo --data synthetic             built-in scene; takes minutes on a CPU
   lapgs-train tiny --data motion:path=4         built-in scene that measures motion (docs/metrics.md)

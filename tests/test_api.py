@@ -760,6 +760,6 @@ def test_without_tensorboard_a_run_that_asks_for_it_does_not_start(
     dataset: Dataset, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(__import__("sys").modules, "torch.utils.tensorboard", None)
-    with pytest.raises(InputError, match=r"pip install 'lapgs-wgpu\[tensorboard\]'"):
+    with pytest.raises(InputError, match=r'pip install "lapgs-wgpu\[tensorboard\]"'):
         train(configure(eval__tensorboard="true"), dataset, tmp_path / "run", device=device)
     assert not (tmp_path / "run").exists()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import shlex
 import shutil
@@ -13,10 +14,25 @@ import pytest
 
 from lapgs_wgpu import cli, command
 from lapgs_wgpu.data.synthetic import write_synthetic
-from lapgs_wgpu.errors import NoAdapterError
+from lapgs_wgpu.errors import NoAdapterError, quoted
 from lapgs_wgpu.gpu import device as device_module
 
 FAST = ["--steps", "3", "--points.count", "50", "--field", "static"]
+
+
+def test_letters_that_the_terminal_lacks_end_no_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    output = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(output, encoding="cp1252"))
+    assert command.guarded("lapgs-train", lambda arguments: print("runs/łódź"), []) == 0
+    assert output.getvalue().strip() == rb"runs/\u0142\xf3d\u017a".replace(rb"\xf3", b"\xf3")
+
+
+@pytest.mark.parametrize("platform", ["linux", "win32"])
+def test_commands_can_be_pasted(platform: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "platform", platform)
+    path = "my films\\walk"
+    assert quoted(path) == ('"my films\\walk"' if platform == "win32" else "'my films\\walk'")
+    assert quoted("runs") == "runs"
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ import math
 import shutil
 import sys
 from fractions import Fraction
-from pathlib import Path
+from pathlib import Path, PurePath, PurePosixPath, PureWindowsPath
 from typing import Any
 
 import numpy as np
@@ -34,6 +34,7 @@ from lapgs_wgpu.data import load_dataset, video_frames
 from lapgs_wgpu.data.initial_gaussians import first_points
 from lapgs_wgpu.data.readers import neu3d
 from lapgs_wgpu.data.readers.poses_bounds import read_rows
+from lapgs_wgpu.data.video_frames import _place
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 
@@ -221,7 +222,7 @@ def test_pixels_that_are_not_square_are_refused(clip: Path) -> None:
 
 def test_without_pyav(clip: Path, toy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(InputError, match=r"cam00\.mp4 needs PyAV.*pip install 'lapgs-wgpu\[prepare\]'.*images/\*\.png"):
+    with pytest.raises(InputError, match=r'cam00\.mp4 needs PyAV.*pip install "lapgs-wgpu\[prepare\]".*images/\*\.png'):
         load_dataset(clip)
     assert len(load_dataset(toy).train) == 9
 
@@ -486,3 +487,18 @@ def test_rows_are_llffs(tmp_path: Path) -> None:
     np.testing.assert_array_equal(R, [[1, 0, 0], [0, -1, 0], [0, 0, -1]])
     np.testing.assert_array_equal(found.lens.K, [[80, 0, 32], [0, 80, 24], [0, 0, 1]])
     assert (found.lens.width, found.lens.height, found.depths) == (64, 48, (1, 9))
+
+
+@pytest.mark.parametrize(
+    ("folder", "place"),
+    [
+        (PurePosixPath("/"), ""),
+        (PurePosixPath("/home/me/films/dance"), "films-dance"),
+        (PureWindowsPath("D:\\dance"), "dance"),
+        (PureWindowsPath("\\\\nas\\films\\dance"), "dance"),
+        (PureWindowsPath("C:\\Users\\me\\dance"), "me-dance"),
+    ],
+)
+def test_unpacked_films_stay_in_the_cache(folder: PurePath, place: str) -> None:
+    assert _place(folder) == place
+    assert not type(folder)(place).anchor

@@ -123,6 +123,18 @@ def test_a_crash_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert not done.passed
 
 
+def test_messages_in_other_encodings_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Windows' paths and drivers' texts come in the language's code page."""
+    text = "b'Users\\\\J\\xfcrgen: no such driver\\n'"
+    program = f"import os\nos.write(1, {text})\nos.write(2, {text})\nos._exit(5)\n"
+    (tmp_path / "torch.py").write_text(program)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    (line,) = self_test.self_test(None)
+    assert "ended with code 5 at: import of torch" in line["problem"]
+    assert "rgen: no such driver" in line["problem"]
+    assert self_test._code(0xC0000005) == "0xc0000005"
+
+
 def test_a_hanging_driver_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "torch.py").write_text("import time\ntime.sleep(600)\n")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))

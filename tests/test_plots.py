@@ -182,7 +182,7 @@ def test_evaluation_plots_and_does_without_matplotlib(
         assert cli.train_command(["--eval", str(run)]) == 0
     progress, told = capsys.readouterr().err.splitlines()
     assert progress.startswith("2/2 test views measured")
-    assert "pip install 'lapgs-wgpu[plots]'" in told
+    assert 'pip install "lapgs-wgpu[plots]"' in told
     assert not (run / "eval" / "plots").exists()
 
     assert cli.train_command(["--eval", str(run)]) == 0

@@ -7,8 +7,10 @@ import os
 import stat
 import subprocess
 import sys
+import time
 import tracemalloc
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -304,6 +306,69 @@ def test_folder_that_cannot_be_forced_to_the_disk(tmp_path: Path, monkeypatch: p
     with pytest.raises(InputError, match="written, but its folder could not be forced to the disk"):
         write_ply(path, random_still(2))
     assert_same(read_ply(path), random_still(2))
+
+
+@pytest.mark.parametrize("code", [errno.EINVAL, errno.ENOTSUP])
+def test_file_systems_that_force_no_folder_to_the_disk(
+    code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Some of networks and of virtual machines do not."""
+    real = os.fsync
+
+    def refuse_folders(descriptor: int) -> None:
+        if stat.S_ISDIR(os.fstat(descriptor).st_mode):
+            raise OSError(code, os.strerror(code))
+        real(descriptor)
+
+    monkeypatch.setattr(os, "fsync", refuse_folders)
+    write_ply(tmp_path / "a.ply", random_still(2))
+    assert_same(read_ply(tmp_path / "a.ply"), random_still(2))
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_macos_forces_more_than_the_drives_memory(known: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fcntl = pytest.importorskip("fcntl")
+    calls = []
+
+    def full_fsync(descriptor: int, command: int) -> None:
+        calls.append(("full", command))
+        if not known:
+            raise OSError(errno.ENOTSUP, "unknown")
+
+    monkeypatch.setattr(sys, "platform", "darwin")
+    monkeypatch.setattr(fcntl, "F_FULLFSYNC", 51, raising=False)
+    monkeypatch.setattr(fcntl, "fcntl", full_fsync)
+    monkeypatch.setattr(os, "fsync", lambda descriptor: calls.append("fsync"))
+    with atomic_write(tmp_path / "a") as file:
+        file.write(b"new")
+    assert calls == [("full", 51)] + ["fsync"] * (1 if known else 2)  # the last one is of the folder
+
+
+@pytest.mark.parametrize(
+    ("winerror", "failures", "moved"), [(5, 3, True), (32, 1, True), (32, 99, False), (80, 1, False)]
+)
+def test_a_file_that_another_program_holds_for_moments(
+    winerror: int, failures: int, moved: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As Windows' virus scanners do."""
+    real, waits = os.replace, []
+
+    def held(source: Path, target: Path) -> None:
+        if len(waits) < failures:
+            error = PermissionError(errno.EACCES, "Access is denied")
+            error.winerror = winerror
+            raise error
+        real(source, target)
+
+    monkeypatch.setattr(os, "replace", held)
+    monkeypatch.setattr(time, "sleep", waits.append)
+    path = tmp_path / "a"
+    path.write_bytes(b"old")
+    with nullcontext() if moved else pytest.raises(InputError, match="Access is denied"), atomic_write(path) as file:
+        file.write(b"new")
+    assert path.read_bytes() == (b"new" if moved else b"old")
+    assert len(waits) == (failures if moved else 0 if winerror == 80 else 6)
+    assert os.listdir(tmp_path) == ["a"]
 
 
 def test_folders_that_cannot_be_written_to(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ import pytest
 from helpers.films import Board, drawn, pose_errors, turn_film, walk, write_film
 from PIL import Image
 
+from lapgs_wgpu import prepare_cli
 from lapgs_wgpu.command import beside
 from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.errors import InputError
@@ -21,12 +22,12 @@ from lapgs_wgpu.prepare.capture_folder import appearing
 from lapgs_wgpu.prepare.extract import Extraction, Picture, common_moments, extract, images_per_second
 from lapgs_wgpu.prepare.film import Film
 from lapgs_wgpu.prepare.hdr import to_sdr
-from lapgs_wgpu.prepare.reconstruct import neighbouring_pairs
+from lapgs_wgpu.prepare.reconstruct import _logging_to, neighbouring_pairs
 from lapgs_wgpu.prepare_cli import prepare_command
 from lapgs_wgpu.train.log import resident_bytes
 
 av = pytest.importorskip("av")
-pytest.importorskip("pycolmap")
+pycolmap = pytest.importorskip("pycolmap")
 
 
 def noise(count: int, width: int = 64, height: int = 48, seed: int = 0) -> list[np.ndarray]:
@@ -408,14 +409,14 @@ def test_a_capture_appears_where_it_was_asked_for(kind: str, tmp_path: Path, mon
 
 
 def test_what_is_finished_is_never_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(self: Path, target: Path) -> Path:
-        if self.name == "times.json":
+    def fail(source: Path, target: Path) -> None:
+        if source.name == "times.json":
             raise OSError(5, "Input/output error")
-        return rename(self, target)
+        replace(source, target)
 
-    out, rename = tmp_path / "out", Path.rename
+    out, replace = tmp_path / "out", os.replace
     with monkeypatch.context() as patched:
-        patched.setattr(Path, "rename", fail)
+        patched.setattr(os, "replace", fail)
         with pytest.raises(InputError, match=r"\.finished holds the finished capture"):
             finish(out)
     assert (out / ".finished" / "times.json").is_file()
@@ -434,6 +435,39 @@ def test_two_processes_do_not_write_to_one_folder(tmp_path: Path) -> None:
     assert [child.name for child in out.iterdir()] == ["images"]
 
 
+def test_files_of_the_desktop_fill_no_folder(tmp_path: Path) -> None:
+    for name in (".DS_Store", "._out", "desktop.ini", "Thumbs.db"):
+        (tmp_path / name).touch()
+    finish(tmp_path)
+    assert (tmp_path / "times.json").is_file()
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="lists open files by Linux's /proc")
+def test_the_log_of_colmap_is_closed(tmp_path: Path) -> None:
+    """Windows moves no folder in which a file is open."""
+    with _logging_to(pycolmap, tmp_path):
+        for number in range(40):  # after a file that could not be opened, glog tries again at some later message
+            pycolmap.logging.info(f"message {number}")
+        assert list(tmp_path.glob("colmap.log.*"))
+    opened = [os.readlink(file) for file in Path("/proc/self/fd").iterdir() if os.path.lexists(file)]
+    assert not [file for file in opened if file.startswith(str(tmp_path))]
+
+
+@pytest.mark.parametrize("minutes", [[], ["--minutes", "3.0"]])
+def test_macos_trains_in_a_process_of_its_own(
+    minutes: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two libraries with an OpenMP each do not get along there."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "platform", "darwin")
+    monkeypatch.setattr(prepare_cli, "_convert", lambda given, out: None)
+    called: list[list[str]] = []
+    monkeypatch.setattr(os, "execv", lambda program, command: called.append([program, *command]))
+    assert prepare_command(["film.mp4", "--out", "out", "--train", *minutes]) == 0
+    command = [sys.executable, "-m", "lapgs_wgpu.prepare_cli", "--check", "out", "--train", *minutes]
+    assert called == [[sys.executable, *command]]
+
+
 def test_what_a_killed_process_left_is_removed(tmp_path: Path) -> None:
     (tmp_path / ".unfinished").mkdir()
     (tmp_path / ".unfinished" / "old").touch()
@@ -448,7 +482,7 @@ def test_without_the_extra(
 ) -> None:
     film = write_film(tmp_path / "film.mkv", noise(3))
     monkeypatch.setitem(sys.modules, missing, None)
-    assert "pip install 'lapgs-wgpu[prepare]'" in refused([str(film), "--out", str(tmp_path / "out")], capsys)
+    assert 'pip install "lapgs-wgpu[prepare]"' in refused([str(film), "--out", str(tmp_path / "out")], capsys)
 
 
 def test_no_other_program_is_needed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

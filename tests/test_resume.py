@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from helpers.interrupts import interrupt_at
+from helpers.interrupts import handled, interrupt_at
 from helpers.training import STEPS, configure
 
 from lapgs_wgpu import cli, load
@@ -54,8 +54,11 @@ def test_an_interrupted_run_goes_on_to_the_same_bytes(
     at: int, whole: Path, dataset: Dataset, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patched:
-        interrupt_at(at, patched, signal.SIGTERM if at == 11 else signal.SIGINT)
-        with pytest.raises(KeyboardInterrupt, match=f"after step {at} of {STEPS}"):
+        interrupt_at(at, patched, {11: signal.SIGTERM, 20: signal.SIGHUP}.get(at, signal.SIGINT))
+        with (
+            handled(signal.SIGHUP, signal.SIG_DFL),
+            pytest.raises(KeyboardInterrupt, match=f"after step {at} of {STEPS}"),
+        ):
             train(configure(), dataset, tmp_path / "run", device=device)
     assert not (tmp_path / "run" / "metrics.json").exists()
     resume(configure(), dataset, tmp_path / "run", device=device)

@@ -8,11 +8,10 @@ import shutil
 import signal
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from helpers.interrupts import handled
 
 from lapgs_wgpu import cli, command, table_cli
 from lapgs_wgpu.data import motion_writer, synthetic
@@ -139,6 +138,13 @@ MISTAKES = {
     "a row that is no table": ("grid4d = {", "x = 3\ngrid4d = {", "rows.x must be a table"),
     "a scene without a folder": ('folder = "toys"', "points.box = 1", "scenes.others must be a folder, or"),
     "a name that is no folder": ("grid4d = {", '"../up" = {', "'../up' must be a name of letters"),
+    "a name that Windows cuts": ("grid4d = {", '"v1." = {', "'v1.' cannot be the name of a folder on Windows"),
+    "a device of Windows": ("grid4d = {", '"aux.2" = {', "'aux.2' cannot be the name of a folder on Windows"),
+    "names that share a folder": (
+        "grid4d = {",
+        "Static = {}\ngrid4d = {",
+        "and another name differ in capital letters",
+    ),
     "the seed in a row": ('kind = "static"', 'kind = "static", seed = 1', "must set neither seed nor data.path"),
     "the path in common": ("points.count", 'data.path = "x"\npoints.count', "must set neither seed nor data.path"),
     "missing folder": ('\ntoys = "toys"', '\ntoys = "toyz"', "toyz does not exist"),
@@ -539,15 +545,6 @@ def test_the_table_is_written_after_every_run(
     assert capsys.readouterr().err.endswith("lapgs-table: stopped in run 4 of 5; the same command goes on.\n")
     assert seen == [0, 1, 2, 3]
     assert "| toys | grid4d | 1 | 25.00 | - |" in (spec_file.parent / "out" / "table.md").read_text()
-
-
-@contextmanager
-def handled(number: int, handler: signal.Handlers) -> Iterator[None]:
-    before = signal.signal(number, handler)
-    try:
-        yield
-    finally:
-        signal.signal(number, before)
 
 
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])

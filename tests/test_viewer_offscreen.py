@@ -272,7 +272,7 @@ def test_without_pyav_one_sentence_says_what_to_install(
 ) -> None:
     monkeypatch.setitem(__import__("sys").modules, "av", None)
     assert view_command([str(run / "checkpoint.ply"), "--video", str(tmp_path / "a.mp4")]) == 2
-    assert capsys.readouterr().err == "lapgs-view: writing mp4 needs PyAV: pip install 'lapgs-wgpu[video]'\n"
+    assert capsys.readouterr().err == 'lapgs-view: writing mp4 needs PyAV: pip install "lapgs-wgpu[video]"\n'
     assert list(tmp_path.iterdir()) == []
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.atomic import atomic_write
+from lapgs_wgpu.io.listing import listed
 from lapgs_wgpu.io.ply import write_ply
 from lapgs_wgpu.motion.playback.playback import DevicePlayback
 from lapgs_wgpu.motion.scene_file import compact_bytes, read_scene
@@ -72,7 +73,7 @@ def export_frames(scene: LoadedScene, folder: Path, frames: int, *, overwrite: b
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        held = list(folder.iterdir())
+        held = listed(folder)
     except OSError as error:
         raise InputError(f"{folder}: cannot be used as a folder ({error.strerror or error}).") from error
     if held and not overwrite:

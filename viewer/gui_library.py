@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
+import sys
 
-from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.errors import InputError, pip_install
 
 PACKAGES = "libx11-6 libxext6"  # Debian's and Ubuntu's, of libX11.so.6 and libXext.so.6
 
@@ -14,11 +15,11 @@ def check_imgui() -> None:
     try:
         import imgui_bundle  # noqa: F401
     except ModuleNotFoundError:
-        raise InputError("the viewer needs imgui-bundle: pip install 'lapgs-wgpu[viewer]'.") from None
+        raise InputError(f"the viewer needs imgui-bundle: {pip_install('viewer')}.") from None
     except ImportError as error:
         raise InputError(
-            f"the viewer's package imgui-bundle cannot be loaded ({error}); install the system's library, on Debian "
-            f"and Ubuntu: sudo apt-get install -y {PACKAGES}."
+            f"the viewer's package imgui-bundle cannot be loaded ({error}); install the system's library that it lacks"
+            + (f", on Debian and Ubuntu: sudo apt-get install -y {PACKAGES}." if sys.platform == "linux" else ".")
         ) from None
 
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.io.atomic import move
 
 from .camera import ViewCamera
 from .path import CameraPath, KeyFrame, Pose
@@ -88,7 +88,7 @@ class PathEditor:
         if file.exists() and file != self._known:
             kept = file.with_name(f"{file.stem}.before.json")
             try:
-                os.replace(file, kept)
+                move(file, kept)
             except OSError as error:
                 raise InputError(f"{file}: another path is there and cannot be kept ({error.strerror}).") from error
         write_path(file, PathFile(path, size, fps))

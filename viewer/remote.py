@@ -11,7 +11,7 @@ import sys
 from importlib import resources
 from typing import Any, NamedTuple
 
-from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.errors import InputError, pip_install
 
 from .auth import LOCAL, Application, AuthMiddleware, Receive, Scope, Send, answer, check_entry
 from .gui_library import check_imgui
@@ -60,7 +60,7 @@ def open_entry(host: str, port: int, token: str | None) -> Entry:
     check_entry(host, token)
     missing = [name for name in ("uvicorn", "websockets", "imgui_bundle") if importlib.util.find_spec(name) is None]
     if missing:
-        raise InputError(f"--backend http needs {', '.join(missing)}: pip install 'lapgs-wgpu[remote]'.")
+        raise InputError(f"--backend http needs {', '.join(missing)}: {pip_install('remote')}.")
     check_imgui()
     address = "127.0.0.1" if host == "localhost" else host
     family = socket.AF_INET6 if ":" in address else socket.AF_INET

@@ -11,7 +11,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.errors import InputError, pip_install
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.progress import Progress
 from lapgs_wgpu.splat.camera import Camera
@@ -88,7 +88,7 @@ def write_video(
     try:
         import av
     except ImportError as error:
-        raise InputError("writing mp4 needs PyAV: pip install 'lapgs-wgpu[video]'") from error
+        raise InputError(f"writing mp4 needs PyAV: {pip_install('video')}") from error
     rate = Fraction(fps).limit_denominator(65535)
     with atomic_write(file) as target:
         sink = _Sink(target)

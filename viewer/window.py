@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.errors import InputError, pip_install
 
 from .app import App
 from .gui_library import check_imgui
@@ -95,7 +95,7 @@ def _glfw_lacks() -> str | None:
     try:
         import glfw
     except ImportError:
-        return "glfw is not installed: pip install 'lapgs-wgpu[viewer]'"
+        return f"glfw is not installed: {pip_install('viewer')}"
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # it warns, and a window without this check would abort the process
         if glfw.init():

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from lapgs_wgpu.data.images import encode_png
 from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.io.atomic import move
 from lapgs_wgpu.splat.camera import Camera
 
 
@@ -81,7 +82,7 @@ def _new_folder(folder: Path) -> Iterator[Path]:
         yield unfinished
         if folder.is_dir():
             folder.rmdir()  # it is empty
-        unfinished.rename(folder)
+        move(unfinished, folder)
     except OSError as error:
         raise InputError(f"{folder} cannot be written: {error}.") from None
     finally:

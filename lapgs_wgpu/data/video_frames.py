@@ -13,14 +13,15 @@ import sys
 import tempfile
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
-from pathlib import Path
+from pathlib import Path, PurePath
 from threading import Lock
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from lapgs_wgpu.data.images import LANCZOS, ImageFile, Pixels, Size, encode_png, resize, size_text
-from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.errors import InputError, pip_install
+from lapgs_wgpu.io.atomic import move
 
 # Flags of swscale: bicubic, accurate rounding, chroma interpolated along rows. Its default darkens by 1 or 2 levels.
 EXACT_COLORS = 0x4 | 0x40000 | 0x2000
@@ -96,8 +97,7 @@ class Video:
             raise InputError(f"{self.path} cannot be read any more ({error.strerror}); put it back.") from None
         path = self.path.resolve()
         state = f"{stat.st_size:x}-{stat.st_mtime_ns:x}" + (f"-turned-{self._turns}" if self._turns else "")
-        place = "-".join(path.parent.parts[-2:]).strip("/")
-        return cache_folder() / "frames" / place / f"{path.stem}-{size[0]}x{size[1]}-{state}"
+        return cache_folder() / "frames" / _place(path.parent) / f"{path.stem}-{size[0]}x{size[1]}-{state}"
 
     def _unpack(self, folder: Path, size: Size) -> None:
         """Write every frame as PNG into a new folder, atomically."""
@@ -132,7 +132,7 @@ class Video:
                     each.result()
             if count != self.frames:
                 raise InputError(f"{self.path} has {self.frames} frames, and {count} can be decoded; copy it again.")
-            unfinished.rename(folder)
+            move(unfinished, folder)
         except av.error.FFmpegError as error:
             raise InputError(f"{self.path} cannot be decoded ({error}); copy or record it again.") from None
         except OSError as error:
@@ -170,6 +170,11 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "lapgs_wgpu"
 
 
+def _place(folder: PurePath) -> str:
+    """The last two names of a folder; neither a drive nor a share among them, which would lead out of the cache."""
+    return "-".join([part for part in folder.parts if part != folder.anchor][-2:])
+
+
 def pixel_aspect(stream: Any) -> float:
     """Width by height of a pixel; 1 where the film states nothing, or nothing possible."""
     aspect = float(stream.sample_aspect_ratio or 1)
@@ -187,7 +192,7 @@ def import_av(path: Path) -> Any:
         import av
     except ImportError:
         raise InputError(
-            f"{path} needs PyAV to be decoded: pip install 'lapgs-wgpu[prepare]', or extract its frames into "
+            f"{path} needs PyAV to be decoded: {pip_install('prepare')}, or extract its frames into "
             f"{path.with_suffix('')}/images/*.png."
         ) from None
     return av

@@ -27,7 +27,9 @@ def self_test(device_name: str | None) -> Iterator[Line]:
     or "broken" (problem), if the child ended early.
     """
     command = [sys.executable, "-m", "lapgs_wgpu.doctor.self_test", json.dumps(device_name)]
-    child = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, encoding="utf-8")
+    child = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, encoding="utf-8", errors="replace"
+    )
     assert child.stdout is not None
     assert child.stderr is not None
     errors = list[str]()
@@ -56,10 +58,15 @@ def self_test(device_name: str | None) -> Iterator[Line]:
             yield {"kind": "broken", "problem": f"no result within {_HANGING:.0f} s at: {at}"}
         elif code != 0:
             last = next((text.strip() for text in reversed(errors) if text.strip()), "no message")
-            yield {"kind": "broken", "problem": f"the process ended with code {code} at: {at} ({last})"}
+            yield {"kind": "broken", "problem": f"the process ended with code {_code(code)} at: {at} ({last})"}
     finally:
         child.kill()
         child.wait()
+
+
+def _code(code: int) -> str:
+    """Windows' codes of crashes as they are known, such as 0xc0000005."""
+    return f"{code:#x}" if code > 0xFFFF else str(code)
 
 
 def _run(device_name: str | None) -> None:

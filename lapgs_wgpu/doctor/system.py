@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+import subprocess
 from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
@@ -57,6 +58,10 @@ def _processor() -> str:
             name, _, text = line.partition(":")
             if name.strip() == "model name" and text.strip():
                 return text.strip()
+    if platform.system() == "Darwin":  # Python knows the architecture alone
+        with suppress(OSError, subprocess.SubprocessError):
+            told = ["/usr/sbin/sysctl", "-n", "machdep.cpu.brand_string"]
+            return subprocess.run(told, capture_output=True, text=True, timeout=5, check=True).stdout.strip()
     return platform.processor() or platform.machine()  # ARM's Linux tells no name
 
 

@@ -29,10 +29,12 @@ _RAISED_LIMITS = ("max-storage-buffer-binding-size", "max-buffer-size", "max-sto
 # Mesa's software driver silently ends an invocation after this many iterations of all its loops together.
 SOFTWARE_LOOP_TURNS = 65_535
 
-INSTALL_HINT = (
-    "install a Vulkan driver for your graphics card, or Mesa's software driver: "
-    "sudo apt-get install -y mesa-vulkan-drivers libvulkan1"
-)
+INSTALL_HINT = "install the newest driver of your graphics card"
+if sys.platform == "linux":
+    INSTALL_HINT = (
+        "install a Vulkan driver for your graphics card, or Mesa's software driver, on Debian and Ubuntu: "
+        "sudo apt-get install -y mesa-vulkan-drivers libvulkan1"
+    )
 _WITHOUT_DXC = "; D3D12 adapters need dxcompiler.dll (Microsoft's DirectX Shader Compiler) in a folder of PATH"
 
 

@@ -2,14 +2,25 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import secrets
+import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
 from lapgs_wgpu.errors import InputError
+
+_HELD_OPEN = (5, 32, 33)  # Windows' errors: access denied, sharing violation, lock violation
+_WAITS = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6)  # seconds
+_NO_FOLDERS = (
+    errno.EINVAL,
+    errno.ENOTSUP,
+    errno.EOPNOTSUPP,
+)  # of network file systems that force no folder to the disk
 
 
 @contextmanager
@@ -26,8 +37,8 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         with open(temporary, "xb") as file:  # x: do not follow a symbolic link that another user created
             yield file
             file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
+            _sync(file.fileno())
+        move(temporary, path)
     except OSError as error:
         _remove(temporary)
         if not path.parent.exists():
@@ -40,6 +51,32 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         _remove(temporary)
         raise
     _sync_folder(path)
+
+
+def move(source: Path, target: Path) -> None:
+    """os.replace, of a file or a folder. Raises OSError.
+
+    On Windows it fails while another program, such as a virus scanner, holds a file open; so it is tried again there
+    for three seconds.
+    """
+    for wait in (*_WAITS, None):
+        try:
+            return os.replace(source, target)
+        except PermissionError as error:
+            if wait is None or getattr(error, "winerror", None) not in _HELD_OPEN:
+                raise
+            time.sleep(wait)
+
+
+def _sync(file: int) -> None:
+    """Force a file to the disk."""
+    if sys.platform == "darwin":  # whose fsync leaves it in the drive's own memory
+        import fcntl
+
+        with suppress(OSError):  # the file system does not know it
+            fcntl.fcntl(file, fcntl.F_FULLFSYNC)
+            return
+    os.fsync(file)
 
 
 def _remove(path: Path) -> None:
@@ -58,6 +95,8 @@ def _sync_folder(path: Path) -> None:
         finally:
             os.close(folder)
     except OSError as error:
+        if error.errno in _NO_FOLDERS:
+            return
         raise InputError(
             f"{path}: written, but its folder could not be forced to the disk ({error.strerror or error}), "
             "so a power cut may bring the old file back; check the disk"

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import errno
 import os
-import shlex
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from lapgs_wgpu.data.load import READERS
-from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.errors import InputError, quoted
+from lapgs_wgpu.io.atomic import move
+from lapgs_wgpu.io.listing import listed
 
 UNFINISHED, FINISHED, LOCK = ".unfinished", ".finished", ".lock"
 
@@ -48,10 +49,10 @@ def appearing(out: Path) -> Iterator[Path]:
 
 
 def _check_empty(out: Path) -> None:
-    if out.exists() and (not out.is_dir() or {entry.name for entry in out.iterdir()} - {UNFINISHED, LOCK}):
+    if out.exists() and (not out.is_dir() or {entry.name for entry in listed(out)} - {UNFINISHED, LOCK}):
         if any(reader.matches(out) for reader in READERS if out.is_dir()):
             raise InputError(
-                f"{out} is a capture already; lapgs-prepare --check {shlex.quote(str(out))} --train measures it and "
+                f"{out} is a capture already; lapgs-prepare --check {quoted(out)} --train measures it and "
                 "trains on it; or name a new folder with --out."
             )
         raise InputError(f"{out} is not an empty folder; name a new one with --out.")
@@ -80,11 +81,12 @@ def _move_up(partial: Path, out: Path) -> None:
     """Move what is finished to `out`; where that fails it stays, and the error says where."""
     held = partial
     try:
-        held = partial.rename(out / FINISHED)
+        move(partial, out / FINISHED)
+        held = out / FINISHED
         for child in sorted(held.iterdir()):
             if os.path.lexists(out / child.name):
                 raise FileExistsError(errno.EEXIST, f"{child.name} is there already")
-            child.rename(out / child.name)
+            move(child, out / child.name)
         held.rmdir()
     except OSError as error:
         raise InputError(

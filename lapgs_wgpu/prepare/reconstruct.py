@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.errors import InputError, pip_install
 from lapgs_wgpu.progress import Progress
 
 FEATURE_SIDE = 1600  # longer side, pixels: larger images are shrunk to find features
@@ -151,7 +151,7 @@ def import_pycolmap() -> Any:
         import pycolmap
     except ImportError:
         raise InputError(
-            "pycolmap, which finds out where the cameras stood, is not installed: pip install 'lapgs-wgpu[prepare]'."
+            f"pycolmap, which finds out where the cameras stood, is not installed: {pip_install('prepare')}."
         ) from None
     return pycolmap
 
@@ -163,7 +163,10 @@ def _logging_to(colmap: Any, folder: Path) -> Iterator[None]:
     colmap.logging.logtostderr = False
     colmap.logging.alsologtostderr = False
     colmap.logging.stderrthreshold = int(colmap.logging.FATAL)
-    yield
+    try:
+        yield
+    finally:
+        colmap.logging.set_log_destination(colmap.logging.INFO, "")  # closes the file, so that its folder can be moved
 
 
 def _chunks(items: Sequence[Any], size: int) -> Iterator[list[Any]]:

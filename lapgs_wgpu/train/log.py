@@ -19,7 +19,7 @@ from typing import Any, BinaryIO, Protocol, TextIO
 
 import torch
 
-from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.errors import InputError, quoted
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.motion.scene import Scene4D
@@ -149,7 +149,7 @@ class Log:
         except OSError as error:
             raise InputError(
                 f"{self._path}: not written ({error.strerror or error}); free some space or check the disk, then "
-                f"lapgs-train --resume {self._path.parent} goes on from the last saved state"
+                f"lapgs-train --resume {quoted(self._path.parent)} goes on from the last saved state"
             ) from error
 
     def tell(self, text: str) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import platform
+import sys
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # glibc's malloc.h
 _LARGEST = 2**31 - 1
@@ -17,7 +18,7 @@ def keep_freed_memory() -> None:
     every page anew, which took most of the time of torch's part on a CPU. Larger ones, of which a step has few, still
     go back: kept, they would leave holes that nothing fits into. Other C libraries are left alone.
     """
-    if platform.libc_ver()[0] == "glibc":
+    if _is_glibc():
         library = ctypes.CDLL(None)
         library.mallopt(_M_MMAP_THRESHOLD, _LARGEST_THRESHOLD)
         library.mallopt(_M_TRIM_THRESHOLD, _LARGEST)
@@ -25,5 +26,9 @@ def keep_freed_memory() -> None:
 
 def return_freed_memory() -> None:
     """Give the system back what `keep_freed_memory` kept: what follows asks for blocks of other sizes."""
-    if platform.libc_ver()[0] == "glibc":
+    if _is_glibc():
         ctypes.CDLL(None).malloc_trim(0)
+
+
+def _is_glibc() -> bool:
+    return sys.platform == "linux" and platform.libc_ver()[0] == "glibc"

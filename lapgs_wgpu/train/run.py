@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 from types import FrameType
@@ -17,12 +16,13 @@ import torch
 from lapgs_wgpu.data.initial_gaussians import first_points
 from lapgs_wgpu.data.validation import check_in_view, check_times
 from lapgs_wgpu.data.views import Dataset
-from lapgs_wgpu.errors import DeviceError, InputError, NumericalError
+from lapgs_wgpu.errors import DeviceError, InputError, NumericalError, quoted
 from lapgs_wgpu.gpu.device import Device, open_device
 from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.progress import Progress, say
+from lapgs_wgpu.stop_signals import on_stop_signals
 from lapgs_wgpu.train.config import Config, DataConfig
 from lapgs_wgpu.train.distributed import SINGLE_PROCESS, Ranks
 from lapgs_wgpu.train.evaluate import evaluate, write_metrics
@@ -218,7 +218,7 @@ def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None)
     if done < all_steps:
         raise KeyboardInterrupt(
             f"stopped after step {done} of {all_steps}; {out / 'checkpoint.ply'} holds it, and "
-            f"lapgs-train --resume {out} goes on."
+            f"lapgs-train --resume {quoted(out)} goes on."
         )
     measured: dict[str, Any] = {"steps": done, "seconds": round(seconds, 3)}
     if (moved := training.camera_report()) is not None:
@@ -229,7 +229,8 @@ def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None)
         evaluate_run(out, scene, training.dataset, config.data, measured, lpips)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(
-            f"stopped after the last step, while the test views were measured; lapgs-train --resume {out} goes on."
+            "stopped after the last step, while the test views were measured; "
+            f"lapgs-train --resume {quoted(out)} goes on."
         ) from None
     drop_states(out)
     return scene
@@ -275,9 +276,9 @@ def _saved(training: Trainer, out: Path) -> str:
             save_state(out, training.state())
         except InputError as error:  # no second trouble instead of the first
             return f" (and {error})"
-        return f"; stopped after step {training.done}, from which lapgs-train --resume {out} goes on."
+        return f"; stopped after step {training.done}, from which lapgs-train --resume {quoted(out)} goes on."
     if (out / STATE).exists():
-        return f"; lapgs-train --resume {out} goes on from the state that was saved last."
+        return f"; lapgs-train --resume {quoted(out)} goes on from the state that was saved last."
     return "; nothing was saved yet."
 
 
@@ -336,19 +337,15 @@ def evaluate_run(
 
 @contextmanager
 def _interruptible() -> Iterator[threading.Event]:
-    """An event that Ctrl-C and SIGTERM set, instead of an exception in the middle of a step; the second one is one."""
+    """An event that Ctrl-C and its like set, instead of an exception in the middle of a step; a second one is one."""
     interrupted = threading.Event()
+    asked = set[int]()
 
-    def note(signum: int, frame: FrameType | None) -> None:
+    def note(number: int, frame: FrameType | None) -> None:
+        if number in asked:
+            raise KeyboardInterrupt
+        asked.add(number)
         interrupted.set()
-        signal.signal(signum, signal.default_int_handler)
 
-    before = {}
-    with suppress(ValueError):  # only the main thread may listen to signals
-        for number in (signal.SIGINT, signal.SIGTERM):
-            before[number] = signal.signal(number, note)
-    try:
+    with on_stop_signals(note):
         yield interrupted
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

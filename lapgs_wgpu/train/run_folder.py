@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.io.atomic import atomic_write
+from lapgs_wgpu.io.atomic import atomic_write, move
+from lapgs_wgpu.io.listing import listed
 from lapgs_wgpu.io.safe_json_toml import read_toml
 from lapgs_wgpu.io.safetensors_file import pack_tensors, unpack_tensors
 from lapgs_wgpu.train.config import Config
@@ -41,7 +42,7 @@ def check_run_folder(out: Path, *, overwrite: bool) -> None:
     """InputError where a run cannot be written there."""
     if out.exists() and not out.is_dir():
         raise InputError(f"{out} is a file; name a folder for the run with --out.")
-    if not out.exists() or all(entry.name == LOCK or entry.match(".*.tmp") for entry in out.iterdir()):
+    if not out.exists() or all(entry.name == LOCK or entry.match(".*.tmp") for entry in listed(out)):
         return
     if not overwrite:
         goes_on = ", go on with its interrupted run with --resume" if (out / STATE).is_file() else ""
@@ -171,7 +172,7 @@ def save_state(out: Path, state: State) -> None:
             file.write(buffer)
         file.flush()
         if (out / STATE).exists():
-            os.replace(out / STATE, out / STATE_BEFORE)
+            move(out / STATE, out / STATE_BEFORE)
 
 
 def has_state(out: Path) -> bool:

@@ -15,12 +15,13 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from datetime import timedelta
+from functools import partial
 from pathlib import Path
 from statistics import mean
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from lapgs_wgpu.data import Dataset, load_dataset
 from lapgs_wgpu.data.builtin import is_builtin, write_builtin
@@ -28,6 +29,8 @@ from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import open_device
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.io.safe_json_toml import read_json
+from lapgs_wgpu.progress import in_place
+from lapgs_wgpu.stop_signals import on_stop_signals
 from lapgs_wgpu.train import plots
 from lapgs_wgpu.train.lpips import SMALLEST
 from lapgs_wgpu.train.monitor import monitored_views
@@ -36,6 +39,10 @@ from lapgs_wgpu.train.run_folder import has_state, locked_folder
 from lapgs_wgpu.train.table_results import Result, Results, read_results, read_run, write_results
 from lapgs_wgpu.train.table_spec import Run, RunKey, Spec, fingerprint
 
+# Of a run: Ctrl-C is for the table's process, which then asks the run's, once, to save its state.
+_OWN_GROUP: dict[str, Any] = {"process_group": 0}
+if sys.platform == "win32":
+    _OWN_GROUP = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
 SAVING = 30.0  # seconds that a run has to save its state when it is stopped
 
 
@@ -82,7 +89,8 @@ def make_table(
     launch = Launch(device, lpips, None if hours is None else time.monotonic() + 3600 * hours - SAVING)
     if out.exists() and not out.is_dir():
         raise InputError(f"{out} is a file; name a folder for the table with --out.")
-    with locked_folder(out, "lapgs-table"), _ends_as_by_ctrl_c():
+    # Each ends the table as Ctrl-C does, so that the training under way saves its state.
+    with locked_folder(out, "lapgs-table"), on_stop_signals(signal.default_int_handler):
         return _train_table(spec, data, out, known, launch, slim)
 
 
@@ -122,22 +130,6 @@ def _train_table(spec: Spec, data: Path, out: Path, known: Sequence[Results], la
             (folder / "checkpoint.ply").unlink(missing_ok=True)
             shutil.rmtree(folder / "eval", ignore_errors=True)
     return Outcome(len(finished), failed, stopped=False)
-
-
-@contextmanager
-def _ends_as_by_ctrl_c() -> Iterator[None]:
-    """SIGTERM and SIGHUP end the table as Ctrl-C does, so that the training under way saves its state and ends."""
-    before = {}
-    with suppress(ValueError):  # only the main thread may listen to signals
-        for name in ("SIGTERM", "SIGHUP"):
-            number = getattr(signal, name, None)
-            if number is not None and signal.getsignal(number) != signal.SIG_IGN:  # as by nohup
-                before[number] = signal.signal(number, signal.default_int_handler)
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def run_folder(out: Path, key: RunKey) -> Path:
@@ -275,17 +267,16 @@ def _run_in_process(run: Run, data: Path, out: Path, launch: Launch) -> str | No
             stderr=subprocess.PIPE,
             text=True,
             errors="replace",
-            # Ctrl-C is for this process, which then asks the other one, once, to save its state.
-            process_group=0 if sys.platform != "win32" else None,
+            **_OWN_GROUP,
         )
-        timer = threading.Timer(min(launch.seconds_left, threading.TIMEOUT_MAX), process.terminate)
+        timer = threading.Timer(min(launch.seconds_left, threading.TIMEOUT_MAX), partial(_ask_to_stop, process))
         timer.daemon = True
         timer.start()
         try:
             last = _pass_on(process)
             code = process.wait()
         except BaseException:
-            process.terminate()
+            _ask_to_stop(process)
             try:
                 process.wait(SAVING)
             finally:
@@ -299,6 +290,14 @@ def _run_in_process(run: Run, data: Path, out: Path, launch: Launch) -> str | No
     return (last.removeprefix("lapgs-train: ") or f"exit code {code}") if code else None
 
 
+def _ask_to_stop(process: subprocess.Popen[str]) -> None:
+    """Ask a training to save its state and to end."""
+    if sys.platform == "win32":  # whose `terminate` asks nothing
+        process.send_signal(signal.CTRL_BREAK_EVENT)
+    else:
+        process.terminate()
+
+
 def _pass_on(process: subprocess.Popen[str]) -> str:
     """Show the lines of a process, on a terminal all in one place; returns the last one."""
     assert process.stderr is not None
@@ -307,7 +306,7 @@ def _pass_on(process: subprocess.Popen[str]) -> str:
     for line in process.stderr:
         last = line.strip() or last
         with suppress(OSError):  # the terminal may be gone
-            sys.stderr.write(f"\r\x1b[2K{last}" if on_terminal else f"  {last}\n")
+            sys.stderr.write(in_place(last) if on_terminal else f"  {last}\n")
             sys.stderr.flush()
     if on_terminal:
         with suppress(OSError):

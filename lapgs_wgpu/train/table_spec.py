@@ -36,6 +36,8 @@ from lapgs_wgpu.train.presets import Table, build_config, load_config, merge, pr
 
 MOST_RUNS = 10_000
 _NAME = re.compile(r"\w[\w .+=-]*", re.ASCII)  # becomes the name of a folder, and a cell of a Markdown table
+# Names of devices on Windows.
+_RESERVED = {"CON", "PRN", "AUX", "NUL", *(f"{port}{number}" for port in ("COM", "LPT") for number in range(1, 10))}
 
 
 class RunKey(NamedTuple):
@@ -192,6 +194,15 @@ def _named_tables(value: Any, where: str) -> Table:
     for name in value:
         if not _NAME.fullmatch(name):
             raise InputError(f"{where}: {name!r} must be a name of letters, digits, spaces and . + = _ - only.")
+        if name.endswith((".", " ")) or name.split(".")[0].rstrip().upper() in _RESERVED:
+            raise InputError(f"{where}: {name!r} cannot be the name of a folder on Windows; take another.")
+    folders = [name.casefold() for name in value]
+    if len(set(folders)) < len(folders):
+        same = next(name for name in value if folders.count(name.casefold()) > 1)
+        raise InputError(
+            f"{where}: {same!r} and another name differ in capital letters alone, and so share a folder on macOS and "
+            "Windows; rename one."
+        )
     return value
 
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.errors import InputError, pip_install
 
 
 def check_tensorboard() -> None:
@@ -15,7 +15,7 @@ def check_tensorboard() -> None:
         import torch.utils.tensorboard  # noqa: F401
     except ImportError:
         raise InputError(
-            "eval.tensorboard needs the package tensorboard: pip install 'lapgs-wgpu[tensorboard]', or leave it out; "
+            f"eval.tensorboard needs the package tensorboard: {pip_install('tensorboard')}, or leave it out; "
             "log.jsonl has the same figures."
         ) from None
 

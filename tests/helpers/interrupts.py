@@ -1,8 +1,10 @@
-"""Interrupts a training."""
+"""Interrupts a training, and handles signals for a while."""
 
 from __future__ import annotations
 
 import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import pytest
@@ -20,3 +22,12 @@ def interrupt_at(at: int, monkeypatch: pytest.MonkeyPatch, number: signal.Signal
             signal.raise_signal(number)
 
     monkeypatch.setattr(Log, "step", interrupt)
+
+
+@contextmanager
+def handled(number: int, handler: signal.Handlers) -> Iterator[None]:
+    before = signal.signal(number, handler)
+    try:
+        yield
+    finally:
+        signal.signal(number, before)

@@ -24,6 +24,7 @@ from lapgs_wgpu.data.poses import world_to_camera
 from lapgs_wgpu.data.timestamps import ImageName, natural_key
 from lapgs_wgpu.data.undistort import Lens
 from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.io.listing import listed
 
 from .poses_bounds import POSES, read_rows
 
@@ -48,7 +49,7 @@ def _matches(folder: Path) -> bool:
 
 def _read(folder: Path, image_size: int | None) -> Capture:
     path = folder / POSES
-    found = (file for file in (folder / IMAGES).iterdir() if file.suffix.lower() in SUFFIXES)
+    found = (file for file in listed(folder / IMAGES) if file.suffix.lower() in SUFFIXES)
     images = [check_image(file) for file in sorted(found, key=lambda file: natural_key(file.name))]
     if not images:
         raise InputError(f"{folder / IMAGES} holds no images (.png or .jpg); extract the camera's frames into it.")
@@ -85,7 +86,8 @@ def _cloud(folder: Path, frames: list[Frame]) -> Cloud | None:
     """Points at the depths of some of the maps, in their images' colors; None without maps."""
     if not (folder / DEPTH).is_dir():
         return None
-    maps = sorted((folder / DEPTH).glob("*.png"), key=lambda file: natural_key(file.name))
+    found = (file for file in listed(folder / DEPTH) if file.suffix == ".png")
+    maps = sorted(found, key=lambda file: natural_key(file.name))
     if len(maps) != len(frames):
         raise InputError(
             f"{folder / DEPTH} holds {len(maps)} depth maps (.png) for {len(frames)} images; each image needs one, or "

@@ -22,6 +22,7 @@ from lapgs_wgpu.data.poses import world_to_camera
 from lapgs_wgpu.data.timestamps import ImageName
 from lapgs_wgpu.data.video_frames import Video, VideoFrame
 from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.io.listing import listed
 
 from .poses_bounds import POSES, PoseRow, read_rows
 
@@ -110,7 +111,7 @@ def _video(path: Path) -> list[ImageSource]:
 
 def _images(folder: Path) -> list[ImageSource]:
     """The images in camXX/images in the order of their numbers: 2.png comes before 10.png."""
-    files = [file for file in (folder / "images").iterdir() if file.suffix.lower() in SUFFIXES]
+    files = [file for file in listed(folder / "images") if file.suffix.lower() in SUFFIXES]
     if not files:
         raise InputError(f"{folder / 'images'} holds no images (.png or .jpg); extract the camera's frames into it.")
     numbers: dict[int, Path] = {}

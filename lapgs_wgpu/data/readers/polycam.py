@@ -19,6 +19,7 @@ from lapgs_wgpu.data.poses import opengl_pose
 from lapgs_wgpu.data.timestamps import ImageName, natural_key
 from lapgs_wgpu.data.undistort import Lens
 from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.io.listing import listed
 
 NEEDED = "which raw data of Polycam need"
 AXES = "t_00 ... t_23 must be camera to world in ARKit's axes (y up, z backward)"
@@ -44,8 +45,9 @@ def _read(folder: Path, image_size: int | None) -> Capture:
     assert cameras is not None
     if images is None:
         raise InputError(f"{folder / 'keyframes'} has no images/; export raw data from Polycam again.")
-    files = {file.stem: file for file in images.iterdir() if file.suffix.lower() in SUFFIXES}
-    described = sorted((file for file in cameras.glob("*.json")), key=lambda file: natural_key(file.stem))
+    files = {file.stem: file for file in listed(images) if file.suffix.lower() in SUFFIXES}
+    found = (file for file in listed(cameras) if file.suffix == ".json")
+    described = sorted(found, key=lambda file: natural_key(file.stem))
     if not described:
         raise InputError(f"{cameras} holds no camera (.json); export raw data from Polycam again.")
     lenses: dict[tuple[float, ...], Lens] = {}
