@@ -23,6 +23,8 @@ from lapgs_wgpu.motion.fields.deformation import Deformation
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train.config import Config
+from lapgs_wgpu.train.discovery import discover as discover_module
+from lapgs_wgpu.train.discovery import static_fit as static_fit_module
 from lapgs_wgpu.train.discovery.acceptance import explained_share, rows_with, tracks_in_images
 from lapgs_wgpu.train.discovery.discover import discover
 from lapgs_wgpu.train.discovery.field_fit import fit_field, max_rates_after_fit
@@ -344,11 +346,11 @@ def test_parts_must_show_where_something_moves(device: Device) -> None:
     there = np.array([[-0.9 + 0.12 * i, 0.0, 0.3] for i in range(3)])
     elsewhere = there * [-1, 1, 1]
     times = np.array([0.0, 0.5, 1.0])
-    kept = tracks_in_images(tracks_along(elsewhere, there), times, images, static, 0.0)
+    kept = tracks_in_images(tracks_along(elsewhere, there), times, images, static, 0.0, together=False)
     assert kept is not None
     assert np.array_equal(kept.paths, tracks_along(there).paths)
-    for together in (1, 2):
-        assert tracks_in_images(tracks_along(elsewhere), times, images * together, static, 0.0) is None
+    for together in (False, True):
+        assert tracks_in_images(tracks_along(elsewhere), times, images, static, 0.0, together=together) is None
 
 
 def test_parts_of_several_cameras_may_bring_the_images_nearer_instead(device: Device) -> None:
@@ -358,10 +360,10 @@ def test_parts_of_several_cameras_may_bring_the_images_nearer_instead(device: De
     scene = Scene4D(rows_with(static, part), static.field_config, device, sh_degree=static.sh_degree)
     change = scene.render(camera, 0.5, torch.zeros(3)).image.numpy(force=True) - still
     core = np.where(change > 0.5 * change.max(), change, 0.0)
-    for strength, together, keeps in ((1.0, 1, False), (1.0, 2, True), (0.5, 2, False)):
-        images = [Residual(camera, i / 2, still + np.float32(strength) * core, still) for i in range(3)] * together
+    for strength, together, keeps in ((1.0, False, False), (1.0, True, True), (0.5, True, False)):
+        images = [Residual(camera, i / 2, still + np.float32(strength) * core, still) for i in range(3)]
         assert images[0].mask.sum() < 0.5 * (change > 2 / 255).any(axis=2).sum()
-        kept = tracks_in_images(part, np.array([0.0, 0.5, 1.0]), images, static, 0.0)
+        kept = tracks_in_images(part, np.array([0.0, 0.5, 1.0]), images, static, 0.0, together=together)
         assert (kept is not None) == keeps
 
 
@@ -422,6 +424,21 @@ def test_every_field_learns_tracks(device: Device, kind: str) -> None:
     times, generator = np.linspace(0, 1, 20), torch.Generator().manual_seed(0)
     error = fit_field(scene, tracks, times, 0, 250, generator, lambda step: None)
     assert error < {"laplacian": 0.35, "grid4d": 0.35, "hexplane": 0.65, "mlp": 0.65}[kind] * at_rest
+
+
+def test_a_long_clip_of_several_cameras_is_still_one(
+    dataset: Dataset, device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of its images discovery looks at some, no two of one time perhaps; the capture says how many cameras see each."""
+    told: list[bool] = []
+    monkeypatch.setattr(discover_module, "find_tracks", lambda clouds, half_side: object())
+    monkeypatch.setattr(discover_module, "tracks_in_images", lambda *_, together: told.append(together))
+    again = tuple(dataclasses.replace(view, name=f"{view.name} again") for view in dataset.train)
+    monkeypatch.setattr(static_fit_module, "MOST_VIEWS", len(dataset.train))
+    for views in (dataset.train, dataset.train + again):
+        config = configure(discovery__steps="4", discovery__field_steps="2")
+        discover(config, dataclasses.replace(dataset, train=views), device, Trainer)
+    assert told == [False, True]
 
 
 class Fading(nn.Module):

@@ -72,6 +72,7 @@ def test_every_process_draws_the_same_numbers_and_other_views(
     monkeypatch.setattr(Trainer, "_loss", note)
     monkeypatch.setattr(Ranks, "all_gather", lambda self, tensors: [[tensor] * self.count for tensor in tensors])
     monkeypatch.setattr(Ranks, "any_rank", lambda self, here: here)
+    monkeypatch.setattr(Ranks, "of_first", lambda self, value: value)
     states, views = [], []
     for rank in range(2):
         training = Trainer(configure(schedule__batch="2", schedule__warm_up="0"), dataset, device, Ranks(rank, 2))
@@ -83,6 +84,21 @@ def test_every_process_draws_the_same_numbers_and_other_views(
     assert torch.equal(states[0], states[1])
     assert len(views[0]) == len(views[1]) == 1
     assert views[0] != views[1]
+
+
+def test_all_start_as_the_first_one_does(dataset: Dataset, device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Devices of different makers would not find the same."""
+    config = configure(schedule__batch="2")
+    with Trainer(dataclasses.replace(config, seed=7), dataset, device) as other:
+        for _ in range(3):
+            other.step()
+        first = other.state()
+    monkeypatch.setattr(Ranks, "of_first", lambda self, value: first)
+    with Trainer(config, dataset, device, Ranks(1, 2)) as training:
+        found = training.state()
+    assert training.done == 3
+    assert found.keys() == first.keys()
+    assert all(np.array_equal(found[name], first[name]) for name in first)
 
 
 GROUP_OF_ONE = """

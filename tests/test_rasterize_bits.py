@@ -260,6 +260,18 @@ def test_bands_with_backward_after_another_image(device: Device, use: Use, scene
         assert torch.equal(leaf.grad, expected.gradients[name])
 
 
+def test_pictures_that_are_looked_at_change_no_gradients(
+    device: Device, use: Use, scene: Scene, expected: Step, total: int
+) -> None:
+    rasterizer = banded(device, use, 2 * total)
+    rasterizer.plans.set_bands((CAMERA.width, CAMERA.height, False), 3)
+    with torch.no_grad():
+        rasterize(**scene, camera=CAMERA, sh_degree=DEGREE, background=BACKGROUND, device=device)
+    assert rasterizer.plan.bands == 3
+    same(one_step(scene, device), expected)
+    assert rasterizer.plan.bands == 1
+
+
 def test_bands_do_not_outlive_images_of_a_size(device: Device, use: Use, scene: Scene, total: int) -> None:
     rasterizer = banded(device, use, total // 3)
     expected = one_step(scene, device)

@@ -16,6 +16,7 @@ from helpers.training import STEPS, configure
 from torch import Tensor, nn
 
 from lapgs_wgpu.data import Dataset
+from lapgs_wgpu.data.timestamps import time_step
 from lapgs_wgpu.data.views import View
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
@@ -23,7 +24,7 @@ from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.fields.deformation import Deformation
 from lapgs_wgpu.motion.scene import Scene4D, load
 from lapgs_wgpu.motion.timing import EVEN, Timing
-from lapgs_wgpu.train import trainer
+from lapgs_wgpu.train import resolve_config, trainer
 from lapgs_wgpu.train.distributed import SINGLE_PROCESS, Ranks
 from lapgs_wgpu.train.run import resume, train
 from lapgs_wgpu.train.timing_refinement import FARTHEST, TimingRefinement, image_to_fit, running_median
@@ -67,7 +68,7 @@ def refinement(
     def picture(view: View) -> Tensor:
         return scene.render(view.camera, view.time).image
 
-    return TimingRefinement(scene, views_at(times), truth, picture, ranks)
+    return TimingRefinement(scene, views_at(times), truth, picture, time_step(np.asarray(times)), ranks)
 
 
 def refine(scene: Scene4D, truth: Callable[[View], Tensor]) -> None:
@@ -79,6 +80,15 @@ def film(scene: Scene4D, moments: np.ndarray = MOMENTS) -> Callable[[View], Tens
     """Images at the times TIMES that show the scene at these moments."""
     images = {t: scene.render(CAMERA, m).image for t, m in zip(TIMES.tolist(), moments.tolist(), strict=True)}
     return lambda view: images[view.time]
+
+
+def test_more_times_than_a_checkpoint_holds_are_refused_at_once(
+    dataset: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(resolve_config, "MOST_TIMES", len(dataset.times) - 1)
+    config = configure(timing__refine="true")
+    with pytest.raises(InputError, match=rf"has {len(dataset.times)} times, .* give --timing.refine false"):
+        resolve_config.resolve_for_dataset(config, dataset)
 
 
 def test_it_finds_which_moments_a_film_shows(device: Device) -> None:
@@ -100,7 +110,7 @@ def test_one_step_is_that_of_least_squares(device: Device) -> None:
         return torch.full((2, 2, 3), scene.timing(view.time))
 
     found = TimingRefinement(
-        scene, views_at(TIMES), lambda view: torch.full((2, 2, 3), shown[view.time]), picture, SINGLE_PROCESS
+        scene, views_at(TIMES), lambda view: torch.full((2, 2, 3), shown[view.time]), picture, 0.1, SINGLE_PROCESS
     )
     found.set(found.fitted(0))
     expected = TIMES.copy()

@@ -18,6 +18,7 @@ from lapgs_wgpu.data.cloud import Cloud
 from lapgs_wgpu.data.focus import focus_of, spread
 from lapgs_wgpu.data.normalize import BOX, Normalization
 from lapgs_wgpu.data.objects import ObjectTruth
+from lapgs_wgpu.data.timestamps import time_step
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
 
@@ -148,6 +149,11 @@ class Dataset:
         the largest number of images of one camera."""
         most = max(Counter(id(view.camera) for view in self.train).values())
         return most if len(self.cameras) <= most else len(self.times)
+
+    @property
+    def time_gap(self) -> float:
+        """The usual distance in time from one moment to the next."""
+        return time_step(self.times) if self.moments == len(self.times) else 1 / (self.moments - 1)
 
     @cached_property
     def times(self) -> NDArray[np.float64]:

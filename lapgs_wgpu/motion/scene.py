@@ -122,7 +122,7 @@ class Scene4D:
         """Make a scene of Gaussians and a field that is new.
 
         Args:
-            parameters: as the attribute; tensors are copied where they are not float32 and contiguous.
+            parameters: as the attribute; copied.
             field_config: configuration of the field.
             device: that renders.
             sh_degree: degree of the harmonics in use, 0 to 3.
@@ -134,7 +134,8 @@ class Scene4D:
             InputError: own_field is missing or superfluous for field_config.kind.
         """
         self.parameters = {
-            name: nn.Parameter(parameters[name].detach().float().contiguous()) for name in row_shapes(field_config)
+            name: nn.Parameter(parameters[name].detach().float().contiguous().clone())
+            for name in row_shapes(field_config)
         }
         self.field_config = field_config
         self.device = device

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-_WATCHED = 256  # drawings of one size, after which a plan that is too large for all of them shrinks
-_SIZES = 32  # of images, whose plans are kept
+_WATCHED = 256  # drawings of one kind, after which a plan that is too large for all of them shrinks
+_KINDS = 32  # of images, whose plans are kept
 
 
 @dataclass(frozen=True)
 class Plan:
-    """How an image is drawn. The plan does not change the result.
+    """How an image is drawn. Bands change the last bits of gradients; else the plan does not change the result.
 
     capacity: maximum number of intersections (tile, splat). bands: number of bands of tile rows, which are drawn one
     after another. rounds: number of dispatches that draw the tiles' lists.
@@ -27,38 +27,51 @@ def roomy(intersections: int) -> int:
     return (5 * intersections // 4 + 4095) // 4096 * 4096
 
 
-class Plans:
-    """The plan of each size of images: passes cost as much as there is room, so small images need one of their own.
+# A kind of images: width and height in pixels, and whether their gradients are wanted.
+Kind = tuple[int, int, bool]
 
-    now: the plan of the size that is drawn. capacity: of the first one.
+
+class Plans:
+    """The plan of each kind of images. Passes cost as much as there is room, so small images need one of their own. And
+    the number of bands decides in which order gradients are added, so images that are only looked at must not raise it.
+
+    now: the plan of the kind that is drawn. capacity: of the first one.
     """
 
     def __init__(self, capacity: int) -> None:
         self.now = Plan(capacity)
         self._first_capacity = capacity
-        self._size: tuple[int, int] | None = None
-        self._others: dict[tuple[int, int], Plan] = {}  # by size, the latest last
+        self._kind: Kind | None = None
+        self._others: dict[Kind, Plan] = {}  # the latest last
         self._watched, self._most = 0, 0  # drawings by this plan, and the most intersections of a band
 
-    def turn_to(self, size: tuple[int, int]) -> None:
-        """Images of this size, (width, height), come next."""
-        if self._size is not None and self._size != size:
-            self._others[self._size] = self.now
+    def turn_to(self, kind: Kind) -> None:
+        """Images of this kind come next."""
+        if self._kind is not None and self._kind != kind:
+            self._others[self._kind] = self.now
             # Small splats lie on one tile at any size, large ones on as many more as there are pixels.
-            share = math.sqrt(math.prod(size) / math.prod(self._size))
+            share = math.sqrt(math.prod(kind[:2]) / math.prod(self._kind[:2]))
             guess = min(self.now.capacity, max(self._first_capacity, round(share * self.now.capacity)))
-            self.now = self._others.pop(size, Plan(guess))
-            if len(self._others) > _SIZES:
+            self.now = self._others.pop(kind, Plan(guess))
+            if len(self._others) > _KINDS:
                 self._others.pop(next(iter(self._others)))
             self._watched = self._most = 0
-        self._size = size
+        self._kind = kind
+
+    def bands(self, kind: Kind) -> int:
+        """Of images of this kind."""
+        return self.now.bands if kind == self._kind else self._others.get(kind, Plan(0)).bands
+
+    def set_bands(self, kind: Kind, bands: int) -> None:
+        """Draw images of this kind, which come next, in so many bands."""
+        self.turn_to(kind)
+        self.now = replace(self.now, bands=bands)
 
     def fitted(self, most: int) -> None:
         """An image fitted, with at most so many intersections in a band. From time to time this shrinks a plan that was
         too large for all.
 
-        Bands stay: their number decides in which order gradients are added, and so must not depend on what came before
-        more than it has to.
+        Bands stay, and a training's state holds their number, on which its bits depend.
         """
         self._watched, self._most = self._watched + 1, max(self._most, most)
         if self._watched < _WATCHED:

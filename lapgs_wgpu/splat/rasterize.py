@@ -126,7 +126,9 @@ class _Rasterize(torch.autograd.Function):
             ctx.mark_non_differentiable(radii)
             return image, empty, empty.clone(), radii, probe.detach().clone()
         gaussians = Gaussians(*tensors, antialiased=antialiased)
-        ctx.drawing, planes, splats = _draw(rasterizer, gaussians, background, camera, depth)
+        ctx.drawing, planes, splats = _draw(
+            rasterizer, gaussians, background, camera, depth=depth, gradient=probe.requires_grad
+        )
         # By numpy: each operator of torch of this size wakes its threads, and they and the driver's take turns. By
         # planes: three times as fast as a transposed copy.
         rgb, z = np.stack(list(planes[:3]), axis=-1), planes[4].copy() if depth else np.zeros_like(planes[3])
@@ -150,7 +152,7 @@ class _Rasterize(torch.autograd.Function):
         rasterizer: Rasterizer = ctx.rasterizer
         if not rasterizer.holds(ctx.drawing):  # another image was drawn in between
             gaussians = Gaussians(*tensors, antialiased=ctx.antialiased)
-            ctx.drawing, _, _ = _draw(rasterizer, gaussians, background, ctx.camera, ctx.depth)
+            ctx.drawing, _, _ = _draw(rasterizer, gaussians, background, ctx.camera, depth=ctx.depth, gradient=True)
         planes = np.zeros((5 if ctx.depth else 4, *transmittance.shape), np.float32)
         if d_image is not None:
             planes[:3] = d_image.numpy(force=True).transpose(2, 0, 1)
@@ -164,13 +166,19 @@ class _Rasterize(torch.autograd.Function):
 
 
 def _draw(
-    rasterizer: Rasterizer, gaussians: Gaussians[Tensor], background: Tensor, camera: Camera, depth: bool
+    rasterizer: Rasterizer,
+    gaussians: Gaussians[Tensor],
+    background: Tensor,
+    camera: Camera,
+    *,
+    depth: bool,
+    gradient: bool,
 ) -> tuple[Drawing, NDArray[np.float32], NDArray[np.float32]]:
     """Upload, draw until the buffers are large enough, and read back planes (4 or 5, H, W) and splats."""
     arrays = upload_gaussians(rasterizer.pool, gaussians)
     red, green, blue = background.tolist()
     while True:
-        drawing = rasterizer.draw(arrays, camera, (red, green, blue), depth=depth)
+        drawing = rasterizer.draw(arrays, camera, (red, green, blue), depth=depth, gradient=gradient)
         planes, splats, *needed = read_all([drawing.image, drawing.splats, *drawing.needed])
         if not rasterizer.grow_on_overflow(drawing, needed):
             return drawing, planes, splats

@@ -47,7 +47,7 @@ class Rasterizer:
         self.device = device
         self.config = config or raster_config(device)
         self.pool = BufferPool(device)
-        self._plans = Plans(capacity)
+        self.plans = Plans(capacity)
         self.max_capacity = device.max_binding // (4 * _RECORD_FLOATS)
         self._flags_scan = Scan(device, self.pool, "visible", "flags")
         self._offset_scan = Scan(device, self.pool, "offsets", "gather")
@@ -60,11 +60,11 @@ class Rasterizer:
     @property
     def plan(self) -> Plan:
         """Of the images that are drawn now."""
-        return self._plans.now
+        return self.plans.now
 
     @plan.setter
     def plan(self, plan: Plan) -> None:
-        self._plans.now = plan
+        self.plans.now = plan
 
     # Forward ---------------------------------------------------------------------------------------------------------
 
@@ -75,10 +75,14 @@ class Rasterizer:
         background: tuple[float, float, float] = (0.0, 0.0, 0.0),
         *,
         depth: bool = False,
+        gradient: bool = False,
         profile: Profile | None = None,
     ) -> Drawing:
-        """Submit the passes that draw an image, which is valid once `grow_on_overflow` has returned False."""
-        self._plans.turn_to((camera.width, camera.height))
+        """Submit the passes that draw an image, which is valid once `grow_on_overflow` has returned False.
+
+        gradient: whether `backward` may follow.
+        """
+        self.plans.turn_to((camera.width, camera.height, gradient))
         if self.config.round_splats:
             rows, columns = self._tiles(camera)
             bands = max(self.plan.bands, -(-rows // max(1, MAX_BAND_TILES // columns)))
@@ -99,7 +103,7 @@ class Rasterizer:
             with Commands(self.device, profile) as commands:
                 drawing.lists = self._draw_band(commands, drawing, band)
             if self._subgroup_mismatch("rasterize", drawing):
-                return self.draw(gaussians, camera, background, depth=depth, profile=profile)
+                return self.draw(gaussians, camera, background, depth=depth, gradient=gradient, profile=profile)
         return drawing
 
     def holds(self, drawing: Drawing) -> bool:
@@ -119,7 +123,7 @@ class Rasterizer:
         if most <= plan.capacity:
             if not self.config.round_splats or not any(count[2] for count in counts):
                 if plan == self.plan:
-                    self._plans.fitted(most)
+                    self.plans.fitted(most)
                 return False
             self.plan = replace(plan, rounds=2 * plan.rounds)
             return True
@@ -318,7 +322,7 @@ class Rasterizer:
     def _draw_again(self, drawing: Drawing) -> None:
         """Make a drawing one of the present config."""
         while True:
-            again = self.draw(drawing.gaussians, drawing.camera, drawing.background, depth=drawing.depth)
+            again = self.draw(drawing.gaussians, drawing.camera, drawing.background, depth=drawing.depth, gradient=True)
             if not self.grow_on_overflow(again):
                 vars(drawing).update(vars(again))
                 return

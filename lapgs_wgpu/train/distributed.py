@@ -9,11 +9,16 @@ import importlib
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import timedelta
+from typing import TypeVar
 
 import torch
 from torch import Tensor, distributed
 
 from lapgs_wgpu.errors import InputError
+
+T = TypeVar("T")
+PATIENCE = timedelta(days=1)  # of ranks with one that is busy: the first one alone searches for what moves
 
 
 @dataclass(frozen=True)
@@ -38,6 +43,13 @@ class Ranks:
             distributed.all_gather(parts, tensor.contiguous())
             found.append(parts)
         return found
+
+    def of_first(self, value: T) -> T:
+        """The first rank's value, on all ranks: devices of different makers do not compute the same bits."""
+        values = [value]
+        if self.count > 1:
+            distributed.broadcast_object_list(values)
+        return values[0]
 
     @property
     def first(self) -> bool:
@@ -70,7 +82,7 @@ def join_ranks() -> Ranks:
         # The group of the time when this module is first imported stays in defaults of its functions, and so would
         # outlive its end. Optimizers import it.
         importlib.import_module("torch.distributed.nn.functional")
-        distributed.init_process_group("gloo")
+        distributed.init_process_group("gloo", timeout=PATIENCE)
         # Otherwise gloo's threads may still run when Python ends, and abort the process.
         atexit.register(distributed.destroy_process_group)
     return Ranks(distributed.get_rank(), distributed.get_world_size(), int(os.environ["LOCAL_RANK"]))

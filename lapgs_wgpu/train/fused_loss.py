@@ -110,7 +110,7 @@ class _FusedLoss(torch.autograd.Function):
         rasterizer, losses, exposing = rasterizer_of(device), image_loss_of(device), exposure_of(device)
         gaussians = upload_gaussians(rasterizer.pool, Gaussians(*tensors, antialiased=antialiased))
         while True:
-            drawing = rasterizer.draw(gaussians, camera, background)
+            drawing = rasterizer.draw(gaussians, camera, background, gradient=wanted)
             d_rows, d_gaussians = [], []
             with Commands(device) as commands:
                 image = drawing.image if correction is None else exposing.record(commands, drawing.image, correction)

@@ -45,7 +45,7 @@ class Sample(NamedTuple):
 class Objective:
     """The loss of each view of a training.
 
-    own: terms beside the configuration's (docs/api.md). times: how many the training images have. extent: of the
+    own: terms beside the configuration's (docs/api.md). moments: how many the clip has. extent: of the
     cameras, world units.
 
     Attributes:
@@ -54,9 +54,9 @@ class Objective:
         scales: (N, 3) of the Gaussians of the last view, world units.
     """
 
-    def __init__(self, config: Config, scene: Scene4D, own: Sequence[LossTerm], times: int, extent: float) -> None:
+    def __init__(self, config: Config, scene: Scene4D, own: Sequence[LossTerm], moments: int, extent: float) -> None:
         self._config, self._scene, self._own = config, scene, tuple(own)
-        self._times, self._extent = times, extent
+        self._moments, self._extent = moments, extent
         self.field_fitted = False
         self.scales = scene.parameters["log_scales"].detach().exp()
 
@@ -69,7 +69,7 @@ class Objective:
             nearby = draw_nearby(config.smoothness, count, t, generator)
             rests = self.field_fitted or step % config.acceleration.interval
             if not rests and self._scene.field is not None:
-                moments = draw_moments(config.acceleration, count, t, self._times, generator)
+                moments = draw_moments(config.acceleration, count, t, self._moments, generator)
         return Sample(view, background, moving, nearby, moments)
 
     def loss(

@@ -6,12 +6,22 @@ import dataclasses
 import math
 
 from lapgs_wgpu.data.views import Dataset
+from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.motion.timing import MOST_TIMES
 from lapgs_wgpu.train.config import Config
 
 
 def resolve_for_dataset(config: Config, dataset: Dataset) -> Config:
-    """The configuration with lengths in world units, and no more frequencies than the training times can tell apart."""
+    """The configuration with lengths in world units, and no more frequencies than the training times can tell apart.
+
+    Raises InputError where the data do not allow it.
+    """
+    if config.timing.refine and len(dataset.times) > MOST_TIMES:
+        raise InputError(
+            f"{dataset.name} has {len(dataset.times)} times, and timing.refine takes {MOST_TIMES} at most; give "
+            "--timing.refine false."
+        )
     field = config.field
     if config.data.units == "capture":
         scale, means = dataset.scale, config.rates.means

@@ -163,7 +163,7 @@ def _outside(scene: Scene4D) -> str:
         return ""
     return (
         f"warning: {count} of {len(scene)} Gaussians lie outside the field's box of half side {bound:g}, where it "
-        "cannot tell one from another; that is right for a background that stands still, but if something moves there, "
+        "cannot tell one from another and moves all alike; where something moves there, or a background trembles, "
         "raise field.bound."
     )
 

@@ -16,7 +16,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lapgs_wgpu.data.timestamps import time_step
 from lapgs_wgpu.data.views import View, composite
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.motion.timing import EVEN, Timing
@@ -38,6 +37,7 @@ class TimingRefinement:
         views: of the training.
         truth: the image (H, W, 3) of a view; NaN where it does not count.
         picture: the scene's picture (H, W, 3) of a view, which is compared with it.
+        gap: the usual distance in time of two images of a camera.
         ranks: which share the work.
     """
 
@@ -47,12 +47,13 @@ class TimingRefinement:
         views: Sequence[View],
         truth: Callable[[View], Tensor],
         picture: Callable[[View], Tensor],
+        gap: float,
         ranks: Ranks,
     ) -> None:
         self._scene, self._truth, self._picture, self._ranks = scene, truth, picture, ranks
         self._times = np.unique([view.time for view in views])
         self._views = [[view for view in views if view.time == t] for t in self._times.tolist()]
-        self._gap = time_step(self._times)
+        self._gap = gap
         self._moments = np.array([scene.timing(t) for t in self._times.tolist()])
 
     def fitted(self, number: int) -> NDArray[np.float64]:

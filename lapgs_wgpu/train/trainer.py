@@ -24,6 +24,7 @@ from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.motion.timing import Timing, checked_timing
 from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.splat.rasterize import rasterizer_of
 from lapgs_wgpu.train.camera_descent import scene_points
 from lapgs_wgpu.train.camera_refinement import CameraRefinement, RefinedCamera
 from lapgs_wgpu.train.config import BACKGROUND_LEVELS, Config
@@ -113,13 +114,16 @@ class Trainer:
         self.ranks = ranks
         self.done = 0
         self._threads = step_threads(config.field, device)
-        first = start(config, dataset, device, Trainer, ranks, scene=scene, own_field=parts.field, resumed=resumed)
+        known = resumed or not ranks.first  # the first rank's start replaces those of the others
+        first = start(config, dataset, device, Trainer, ranks, scene=scene, own_field=parts.field, resumed=known)
         self.scene, self.discovery, self.discovery_seconds = first.scene, first.discovery, first.seconds
         self._warm_up, self._rising = first.warm_up, first.rising
         if not resumed:
             warn_unused_settings(config, first, ranks)
         self._generator = torch.Generator().manual_seed(config.seed)
         self._prepare(first)
+        if ranks.count > 1 and not resumed:
+            self.restore(ranks.of_first(self.state()))
         self.whole = True
 
     def _prepare(self, first: Start) -> None:
@@ -136,8 +140,8 @@ class Trainer:
             limit = nyquist_frequency(dataset)
             self._frequencies = FrequencyOptimizer(scene.spectrum, config.rates.frequencies, limit)
         self._exposures = Exposures(len(dataset.train), config.exposure.rate) if config.exposure.enabled else None
-        times, extent = len(dataset.times), dataset.extent
-        self._objective = Objective(config, scene, self.parts.losses, times, extent)
+        extent = dataset.extent
+        self._objective = Objective(config, scene, self.parts.losses, dataset.moments, extent)
         self._limit_field_rates(field_fitted=first.field_fitted)
         self.cameras = None
         if config.cameras.refines(own_footage=dataset.own_footage):
@@ -150,9 +154,9 @@ class Trainer:
             )
         self._color = torch.full((3,), BACKGROUND_LEVELS[config.data.background])  # of the evaluation
         self.timing = None
-        if config.timing.refine and scene.field is not None and times > 2:
+        if config.timing.refine and scene.field is not None and len(dataset.times) > 2:
             truth = partial(image_to_fit, color=self._color)
-            self.timing = TimingRefinement(scene, dataset.train, truth, self._picture, self.ranks)
+            self.timing = TimingRefinement(scene, dataset.train, truth, self._picture, dataset.time_gap, self.ranks)
         beside = (self._frequencies, self._exposures, self.cameras)
         self._beside = [each for each in beside if each is not None]
         self._density = DensityControl(
@@ -164,11 +168,15 @@ class Trainer:
             self._camera_of,
             extent,
             self._generator,
+            self.ranks,
         )
         self._numbers = {view.name: number for number, view in enumerate(dataset.train)}
         self._skips = SkipCounter()
         data = config.data
         self._images = ImageLoader(dataset.train, data.background, data.cache_gb, self._generator, scene.device)
+        self._plans, camera = rasterizer_of(scene.device).plans, dataset.train[0].camera
+        self._drawn = (camera.width, camera.height, True)  # the kind of images that the steps draw
+        self._plans.set_bands(self._drawn, 1)
 
     def _limit_field_rates(self, *, field_fitted: bool) -> None:
         """Hold the field's learning rates low where discovery has fitted it to nearly all that moves."""
@@ -234,8 +242,8 @@ class Trainer:
         try:
             with torch_threads(self._threads):
                 result = self._step()
-        except Exception:
-            if self.whole:  # the device gave out: as if the step had not begun
+        except BaseException:
+            if self.whole:  # the device gave out, or somebody broke it off: as if the step had not begun
                 self._generator.set_state(random)
                 self._images.order = order
             raise
@@ -381,6 +389,7 @@ class Trainer:
                 "sh_degree": torch.tensor(scene.sh_degree),
                 "random": self._generator.get_state(),
                 "order": torch.tensor(self._images.order, dtype=torch.int64),
+                "bands": torch.tensor(self._plans.bands(self._drawn)),
             },
         }
         return {
@@ -427,6 +436,7 @@ class Trainer:
         self._limit_field_rates(field_fitted=bool(own.get("field_fitted", False)))
         self._generator.set_state(own["random"])
         self._images.order = own["order"].tolist()
+        self._plans.set_bands(self._drawn, int(own.get("bands", 1)))
 
 
 def _timing_state(timing: Timing) -> dict[str, Tensor]:

@@ -44,17 +44,21 @@ def rows_with(static: Scene4D, tracks: Tracks) -> dict[str, Tensor]:
 
 
 def tracks_in_images(
-    tracks: Tracks, times: NDArray[np.float64], images: Sequence[Residual], static: Scene4D, background: float
+    tracks: Tracks,
+    times: NDArray[np.float64],
+    images: Sequence[Residual],
+    static: Scene4D,
+    background: float,
+    *,
+    together: bool,
 ) -> Tracks | None:
     """The parts that, each by itself, show where something moves; None where there are none.
 
-    Where several images show each time, their depths agree whatever moves, and a part that brings the static fit nearer
-    to the images is kept, too.
-
-    times: (T,), of the tracks. background: level of its channels.
+    times: (T,), of the tracks. background: level of its channels. together: whether several images of the capture show
+    each time. Their depths then agree whatever moves, and a part that brings the static fit nearer to the images is
+    kept, too.
     """
     judges = evenly(images, IMAGES)
-    together = 2 * len(times) <= len(images)
     kept = np.zeros(int(tracks.part.max()) + 1, bool)
     for k in range(len(kept)):
         part = tracks.of_parts(np.arange(len(kept)) == k)

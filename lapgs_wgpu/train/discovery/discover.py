@@ -72,7 +72,9 @@ def discover(
     half_side = config.points.box
     clouds = surface_points(images, half_side)
     tracks = find_tracks(clouds, half_side)
-    tracks = None if tracks is None else tracks_in_images(tracks, clouds.times, images, static, background)
+    if tracks is not None:
+        together = 2 * len(dataset.times) <= len(dataset.train)
+        tracks = tracks_in_images(tracks, clouds.times, images, static, background, together=together)
     share = 0.0 if tracks is None else explained_share(clouds, tracks, half_side)
     if share < config.discovery.least:
         tracks = None

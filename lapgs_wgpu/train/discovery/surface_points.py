@@ -24,7 +24,7 @@ from .residual import Floats, Residual
 
 RAYS = 300  # of an image, at most
 DEPTHS = 64  # that are tried along a ray
-NEIGHBORS = 6  # images of the nearest times that vote on a depth
+NEIGHBORS = 6  # images that vote on a depth, those nearest in time
 SPAN = 1.0  # time steps, at which a vote counts half
 COLOR_SPREAD = 0.25  # standard deviation of the colors of one surface in several images
 COLOR_SHARE = 0.7  # of a vote that depends on the color
@@ -89,7 +89,7 @@ class _Neighbor(NamedTuple):
 
 
 def _neighbors(images: Sequence[Residual], of: int) -> list[_Neighbor]:
-    """The images of the nearest times."""
+    """The images that are nearest in time."""
     times = np.array([image.time for image in images])
     distinct = np.unique(times)
     step = float(np.diff(distinct).mean()) if len(distinct) > 1 else 1.0
