@@ -45,7 +45,7 @@ def test_the_poster_is_as_high_as_the_field_of_view() -> None:
     look = InitialView(Camera(np.diag([900.0, 900, 1]), np.eye(4), 540, 960), np.ones(3), np.ones(3), 30)
     assert look.narrowest == 0.5625
     upright = page_html(b"", "walk", np.zeros((4, 6, 3), np.uint8), narrowest=look.narrowest)
-    assert "height: min(100vh, 100vw / 0.5625); top: calc(50vh - min(50vh, 50vw / 0.5625))" in upright
+    assert "height: min(100%, 100vw / 0.5625)" in upright
     assert "{{" not in part(upright, r"<style>(.*?)</style>")
 
 

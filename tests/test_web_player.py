@@ -50,6 +50,7 @@ from lapgs_wgpu.viewer.web_page import player_data
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt-get install chromium")
 
+BAR = 106  # pixels at the bottom of a window of SIZE, which the time slider and its buttons cover
 SAME = 90.0  # dB: less is another picture
 TIMES = (0.0, 0.37, 1.0)
 OWN_DEVICE = "const own = GPUAdapter.prototype.requestDevice;"
@@ -157,8 +158,8 @@ def test_the_canvas_shows_it(browser: Browser, desktop: Desktop) -> None:
     """What is on the screen, but for the bar and rounding to 8 bits."""
     call(browser, "setTime", 0.37)
     page_picture(browser)
-    screen = browser.picture()[: SIZE[1] - 60]
-    expected = 255 * desktop.picture(0.37).clip(0, 1)[: SIZE[1] - 60]
+    screen = browser.picture()[: SIZE[1] - BAR]
+    expected = 255 * desktop.picture(0.37).clip(0, 1)[: SIZE[1] - BAR]
     assert np.abs(screen - expected).max() < 2.5
 
 
@@ -381,6 +382,53 @@ def test_keys(browser: Browser, desktop: Desktop) -> None:
     assert same(browser, desktop, 0.0, background="black")
 
 
+def test_a_key_that_is_held_counts_once(browser: Browser) -> None:
+    """But for those that go from frame to frame."""
+    for key, held in ((" ", 0), (".", 3)):
+        browser.value("lapgs.setTime(0)")
+        event = f"new KeyboardEvent('keydown', {{ key: '{key}', repeat: true, bubbles: true }})"
+        browser.value(f"for (let i = 0; i < 3; i++) document.getElementById('canvas').dispatchEvent({event})")
+        assert browser.value("lapgs.playing") is False
+        assert browser.value("lapgs.time") == pytest.approx(held / (FRAMES - 1))
+
+
+def test_space_on_a_button_presses_it(browser: Browser) -> None:
+    browser.value("document.getElementById('more').focus()")
+    browser.key(" ")
+    assert browser.value("lapgs.playing") is False
+    browser.value("document.getElementById('canvas').focus()")
+    browser.key(" ")
+    assert browser.value("lapgs.playing") is True
+    browser.key(" ")
+    assert browser.value("lapgs.playing") is False
+    if not browser.value("document.getElementById('help').hidden"):
+        browser.key("?")
+
+
+def test_the_reset_button(browser: Browser, desktop: Desktop) -> None:
+    browser.mouse("mousePressed", 100, 80, down=True)
+    browser.mouse("mouseMoved", 160, 100, down=True)
+    browser.mouse("mouseReleased", 160, 100)
+    assert not same(browser, desktop, 0.0)
+    browser.value("document.getElementById('home').click()")
+    assert same(browser, desktop, 0.0)
+
+
+def test_a_picture_is_kept_only_at_rest(browser: Browser) -> None:
+    """To compress one takes longer than to draw it."""
+    count = "const own = HTMLCanvasElement.prototype.toBlob; window.kept = 0;"
+    count += "HTMLCanvasElement.prototype.toBlob = function (take) { kept++; return own.call(this, take); };"
+    browser.value(f"(() => {{ {count} }})()")
+    for i in range(20):
+        browser.value(f"lapgs.setTime({i / 20})")
+        sleep(0.1)
+    assert browser.value("kept") <= 1  # of before
+    page_picture(browser)
+    wait_for(lambda: browser.value("kept") > 0, "the picture")
+    sleep(2)
+    assert browser.value("kept") <= 2
+
+
 def test_keys_fly_by_their_letter(browser: Browser, desktop: Desktop) -> None:
     """Of a Dvorak keyboard, whose S lies where others have their semicolon."""
     browser.key("v")
@@ -433,6 +481,24 @@ def test_focus(browser: Browser, page: Path, device: Device) -> None:
 
         wait_for(lambda focus=focus: same(browser, desktop, 0.0, focus), act)  # type: ignore[misc]
         assert psnr(desktop.picture(0.0), desktop.picture(0.0, focus)) < 40
+
+
+def test_focus_while_it_plays(browser: Browser) -> None:
+    """It does not wait for the end of the clip."""
+    browser.key("r")
+    browser.value("location.hash = '#t=0.1&speed=0.01&play'")  # a hundred seconds
+    wait_for(lambda: browser.value("lapgs.time") > 0.1, "time goes on")
+    count = "const own = GPUComputePassEncoder.prototype.setPipeline; window.depths = 0;"
+    count += "GPUComputePassEncoder.prototype.setPipeline = function (pipeline)"
+    count += " { depths += pipeline.label === 'rasterize DEPTH'; return own.call(this, pipeline); };"
+    browser.value(f"(() => {{ {count} }})()")
+    browser.mouse("mouseMoved", 190, 130)
+    browser.key("f")
+    wait_for(lambda: browser.value("depths") > 0, "the depth at the pointer")
+    page_picture(browser)
+    assert browser.value("lapgs.playing") is True
+    browser.value("lapgs.pause()")
+    browser.key("r")
 
 
 def test_pictures_while_it_plays(browser: Browser, desktop: Desktop) -> None:
@@ -524,6 +590,8 @@ def test_address_and_script(window: Browser, page: Path, desktop: Desktop) -> No
     wait_for(lambda: 0 < window.value("lapgs.time") < 1, "the clip's start")
     window.value("location.hash = '#t=0.5'")
     wait_for(lambda: window.value("lapgs.time") == 0.5, "the new address")
+    window.value("location.hash = '#speed=0.3'")  # none of the listed ones
+    wait_for(lambda: window.value("document.getElementById('speed').value") == "0.3x", "the speed")
     for act in ("lapgs.setTime('x')", "lapgs.setCamera({ fovY: 4 })", "lapgs.setCamera({ position: [0, 1] })"):
         assert "Error" in window.value(f"(() => {{ try {{ {act} }} catch (error) {{ return String(error) }} }})()")
 
@@ -630,8 +698,11 @@ def test_a_poor_server(window: Browser, page: Path, device: Device, folder: Path
         window.open(f"http://127.0.0.1:{running.server_port}/{page.name}?src=slow.lapgs")
         wait_for(lambda: window.note().startswith("Loading 0."), "the progress")
         assert window.value("document.getElementById('poster').checkVisibility()")
+        window.value("(window.files = new DataTransfer()).items.add(new File(['no scene'], 'a.txt')) && 1")
+        window.value("dispatchEvent(new DragEvent('drop', { dataTransfer: files, cancelable: true })) || 1")
+        wait_for(lambda: "do not begin as a scene does" in window.note(), "the refusal")  # which ends no other one
         seen.set()
-        wait_for(lambda: shown(window), "the scene")
+        wait_for(lambda: window.note() == "", "the scene")
         assert same(window, Desktop(made, device), 0.0)
         running.shutdown()
 
@@ -753,13 +824,36 @@ def test_a_lost_device(window: Browser, page: Path) -> None:
     script += " { return window.device = await own.apply(this, given); };"
     open_page(window, page.as_uri() + "?lost", first=OWN_DEVICE + script)
     page_picture(window)
+    kept = "document.getElementById('poster').src.startsWith('blob:')"
+    wait_for(lambda: window.value(kept), "the picture that is kept")
     before = window.picture()
     window.value("device.destroy()")
     wait_for(lambda: "The graphics device was lost" in window.note(), "the sentence")
     window.key(".")
     note = int(window.value("document.getElementById('note').getBoundingClientRect().bottom")) + 1
-    assert np.abs(window.picture() - before)[note : SIZE[1] - 60].max() < 3
+    assert np.abs(window.picture() - before)[note : SIZE[1] - BAR].max() < 3
     assert window.value("lapgs.time") == 0
+
+
+def test_a_device_that_is_lost_later_is_opened_again(
+    window: Browser, device: Device, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As phones take it from pages out of sight. Time and camera stay, and a script is not kept waiting."""
+    script, steady = web_page.module_script, "const STEADY = 10_000;"
+    assert steady in script("main")
+    monkeypatch.setattr(web_page, "module_script", lambda name: script(name).replace(steady, "const STEADY = 0;"))
+    made = export_scene(trained(device, OURS, 200), folder, device, "again")
+    first = "GPUAdapter.prototype.requestDevice = async function (...given)"
+    first += " { return window.device = await own.apply(this, given); };"
+    open_page(window, made.as_uri() + "#t=0.1", first=OWN_DEVICE + first)
+    call(window, "setTime", 0.4)
+    window.key("ArrowLeft")
+    page_picture(window)
+    window.value("(window.former = lapgs, window.lost = device, device.destroy())")
+    assert "was lost" in window.value("former.picture().catch(error => error.message)")
+    wait_for(lambda: window.note() == "" and window.value("lapgs !== former && device !== lost"), "another device")
+    assert window.value("lapgs.time") == 0.4
+    assert same(window, Desktop(made, device), 0.4)
 
 
 def test_without_webgpu(page: Path, tmp_path: Path) -> None:

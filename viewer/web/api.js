@@ -37,14 +37,8 @@ export function makeApi(state, viewport, wake) {
             state.camera.place({ position: finite(position, 3), focus: finite(focus, 3), fovY });
             wake();
         },
-        play() {
-            state.clock.play();
-            wake();
-        },
-        pause() {
-            state.clock.playing = false;
-            wake();
-        },
+        play() { state.clock.play(); wake(); },
+        pause() { state.clock.playing = false; wake(); },
         // {width, height, time, values}: of the frame on show while the clip plays, else of the final one.
         picture: () => viewport.planes(),
         // The dispatches of the final picture of a time: [pass, columns, rows, {binding: [offset, bytes]}] each.

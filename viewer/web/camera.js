@@ -48,9 +48,7 @@ export class ViewCamera {
         this.shift(add(this.rotation[0].map(x => reach * right * x), this.rotation[1], reach * down));
     }
 
-    zoom(factor) {
-        this.position = add(this.focus, add(this.position, this.focus, -1), factor);
-    }
+    zoom(factor) { this.position = add(this.focus, add(this.position, this.focus, -1), factor); }
 
     // By these lengths along the camera's axes.
     fly(right, down, forward) {
@@ -81,9 +79,7 @@ export class ViewCamera {
     }
 
     // What fovY spans on a canvas of this size.
-    pictureHeight(width, height) {
-        return Math.min(height, width / this.narrowest);
-    }
+    pictureHeight(width, height) { return Math.min(height, width / this.narrowest); }
 
     // What the rasterizer takes for a picture of this size; view is column by column.
     camera(width, height) {

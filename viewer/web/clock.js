@@ -8,9 +8,7 @@ export class Clock {
 
     get seconds() { return Math.max(1, this.frames - 1) / this.fps; }
 
-    seek(time) {
-        this.time = Math.min(Math.max(time, 0), 1);
-    }
+    seek(time) { this.time = Math.min(Math.max(time, 0), 1); }
 
     // Play, from the start where the clip has ended; what has one moment only does not play.
     play() {
@@ -18,26 +16,18 @@ export class Clock {
         if (this.playing && this.loop === "once" && this.time >= 1) this.time = 0;
     }
 
-    toggle() {
-        return this.playing ? (this.playing = false) : this.play();
-    }
+    toggle() { return this.playing ? (this.playing = false) : this.play(); }
 
     step(frames) {
         this.playing = false;
         this.seek((this.frame + frames) / Math.max(1, this.frames - 1));
     }
 
-    slower() {
-        this.speed = this.speeds.findLast(speed => speed < this.speed) ?? this.speeds[0];
-    }
+    slower() { this.speed = this.speeds.findLast(speed => speed < this.speed) ?? this.speeds[0]; }
 
-    faster() {
-        this.speed = this.speeds.find(speed => speed > this.speed) ?? this.speeds.at(-1);
-    }
+    faster() { this.speed = this.speeds.find(speed => speed > this.speed) ?? this.speeds.at(-1); }
 
-    nextLoop() {
-        this.loop = this.loops[(this.loops.indexOf(this.loop) + 1) % this.loops.length];
-    }
+    nextLoop() { this.loop = this.loops[(this.loops.indexOf(this.loop) + 1) % this.loops.length]; }
 
     // Let that much of the visitor's time pass.
     advance(seconds) {

@@ -20,7 +20,8 @@ export class Controls {
         listen("dblclick", event => this.actions.focus(event.clientX, event.clientY));
         listen("contextmenu", event => event.preventDefault());
         addEventListener("keydown", event => this.keyDown(event), { signal });
-        addEventListener("keyup", event => this.held.delete(event.code), { signal });
+        // macOS tells of no key that is let go while Command is down.
+        addEventListener("keyup", event => event.key === "Meta" ? this.held.clear() : this.held.delete(event.code), { signal });
         addEventListener("blur", () => this.held.clear(), { signal });
     }
 
@@ -54,9 +55,7 @@ export class Controls {
         return Math.max(Math.hypot(a[0] - b[0], a[1] - b[1]), 1);
     }
 
-    pointerUp(event) {
-        this.pointers.delete(event.pointerId);
-    }
+    pointerUp(event) { this.pointers.delete(event.pointerId); }
 
     wheel(event) {
         event.preventDefault();
@@ -65,14 +64,14 @@ export class Controls {
     }
 
     keyDown(event) {
-        if (event.ctrlKey || event.metaKey || event.target.closest?.("select")) return;
+        if (event.ctrlKey || event.metaKey || event.target.closest?.(event.key === " " ? "select, button" : "select")) return;
         const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
         if (this.flying && (key in this.fly || key === "Shift" || key === "Alt")) {
             this.held.set(event.code, key);
         } else {
             const action = this.actions[this.keys.get(event.key) ?? this.keys.get(key)];
             if (!action) return;
-            action(...this.pointer);
+            if (!event.repeat || key === "," || key === ".") action(...this.pointer);
         }
         event.preventDefault();
         this.wake();

@@ -48,9 +48,7 @@ class Gpu {
         }));
     }
 
-    kernel(key) {
-        return this.kernels.get(key);
-    }
+    kernel(key) { return this.kernels.get(key); }
 }
 
 class Kernel {

@@ -17,7 +17,10 @@ const find = name => document.getElementById(name);
 const LONGEST_STEP = 0.25; // seconds that the clock goes on at once, after a tab was in the background
 const OPENING = "Opening the graphics adapter";
 let shown = null; // ends what is on the page
+const KEPT = 1000; // milliseconds at rest, after which a picture is kept
+const STEADY = 10_000; // milliseconds on show, after which a scene whose device is lost is opened again
 let wanted = 0; // number of the scene that was asked for last
+let newest = 0; // number of the scene on show
 
 // Keep a picture for the time when there is no device to draw another.
 function keep(blob) {
@@ -47,50 +50,54 @@ const tell = message => parent !== window && parent.postMessage(message, "*");
 
 async function embedded() {
     const text = find("scene").textContent.trim();
-    const bytes = Uint8Array.from(atob(text), letter => letter.charCodeAt(0));
+    const letters = atob(text);
+    const bytes = Uint8Array.from({ length: letters.length }, (_, i) => letters.charCodeAt(i));
     if (!bytes.length) throw new Refusal("This page carries no scene: drop a scene.lapgs on it.");
     return bytes;
 }
 
-async function fetched(address) {
+async function fetched(address, progress) {
     const answer = await fetch(address).catch(() => {
         throw new Refusal(`${address} cannot be fetched: only files beside this page on its own server can, and none from file://.`);
     });
     if (!answer.ok) throw new Refusal(`${address} cannot be fetched: the server says ${answer.status}; check the address.`);
-    return streamed(answer.body, Number(answer.headers.get("Content-Length")) || 0);
+    return streamed(answer.body, Number(answer.headers.get("Content-Length")) || 0, progress);
 }
 
-function streamed(stream, length) {
+function streamed(stream, length, progress) {
     const total = length ? ` of ${(length / 1e6).toFixed(1)}` : "";
-    return readStream(stream, length, size => say(`Loading ${(size / 1e6).toFixed(1)}${total} MB`));
+    return readStream(stream, length, size => progress(`Loading ${(size / 1e6).toFixed(1)}${total} MB`));
 }
 
-// Show the scene whose bytes `load` gives, in place of the present one; where it fails the present one stays.
-async function open(load, data) {
+// Show the scene whose bytes `load` gives, in place of the present one; where it fails the present one stays. Of several
+// that are opened at once the last one stays. state: to go on in.
+async function open(load, data, state = null) {
     const number = ++wanted;
+    const progress = text => number === wanted && say(text);
     let gpu;
     let doing = OPENING;
     try {
-        say("Loading");
+        progress("Loading");
         gpu = await openGpu(data.kernels); // first: without WebGPU there is nothing to wait for
         doing = "Reading the scene";
-        const scene = await readScene(await load());
+        const scene = await readScene(await load(progress));
         doing = "Preparing the scene";
-        const next = await prepare(gpu, scene, data);
-        if (number !== wanted) return gpu.device.destroy();
+        const next = await prepare(gpu, scene, data, state, progress);
+        if (number < newest) return gpu.device.destroy();
+        newest = number;
         shown?.();
-        const { api, stop } = next();
+        const { api, stop } = next(present => open(load, data, present));
         shown = stop;
         window.lapgs = api;
         say("");
         tell({ lapgs: "ready" });
     } catch (error) {
         gpu?.device.destroy();
-        if (number === wanted) report(error, doing);
+        if (number > newest) report(error, doing);
     }
 }
 
-async function prepare(gpu, scene, data) {
+async function prepare(gpu, scene, data, former, progress) {
     const rasterizer = new Rasterizer(gpu, data.raster);
     const keys = [...data.always, data.raster.plain, rasterizer.rasterize, `color SH ${scene.shDegree}`];
     gpu.device.pushErrorScope("out-of-memory");
@@ -100,25 +107,32 @@ async function prepare(gpu, scene, data) {
     }
     if (scene.field) keys.push(...data.field, playback.deform);
     let compiled = 0;
-    await gpu.compile([...new Set(keys)], () => say(`Compiling ${++compiled} of ${new Set(keys).size} passes`));
+    await gpu.compile([...new Set(keys)], () => progress(`Compiling ${++compiled} of ${new Set(keys).size} passes`));
     const first = firstView(scene.metadata.view, scene.gaussians.means);
     const clock = new Clock(scene.field ? first.frames : 1, data.loops, data.speeds);
     const trained = scene.metadata.background; // on it
     const background = data.backgrounds[Object.hasOwn(data.backgrounds, trained) ? trained : "black"];
-    const state = { camera: new ViewCamera(first), clock, background };
-    return () => start(gpu, { scene, playback, rasterizer }, state, data);
+    delete scene.gaussians; // the device has them now
+    const state = former ?? { camera: new ViewCamera(first), clock, background, fresh: true };
+    return reopen => start(gpu, { scene, playback, rasterizer }, state, data, reopen);
 }
 
-function start(gpu, { scene, playback, rasterizer }, state, data) {
+function start(gpu, { scene, playback, rasterizer }, state, data, reopen) {
     const canvas = find("canvas");
     const ended = new AbortController();
     const { signal } = ended;
     const { clock, camera } = state;
-    let last = performance.now();
+    const begun = performance.now();
+    let last = begun;
+    let kept = null; // the frame of which a picture is kept
     const wake = () => transport.update();
+    const stop = reason => {
+        ended.abort(reason);
+        gpu.device.destroy();
+    };
     const fail = error => {
         if (signal.aborted) return;
-        ended.abort();
+        stop(error);
         find("poster").hidden = false;
         report(error, "Drawing the scene");
     };
@@ -149,7 +163,8 @@ function start(gpu, { scene, playback, rasterizer }, state, data) {
         applyAddress(location.hash, { clock, backgrounds: data.backgrounds, setBackground });
         wake();
     };
-    address();
+    if (state.fresh) address();
+    state.fresh = false;
     addEventListener("hashchange", address, { signal });
 
     const resize = () => {
@@ -157,10 +172,14 @@ function start(gpu, { scene, playback, rasterizer }, state, data) {
         if (size[0] !== canvas.width || size[1] !== canvas.height) [canvas.width, canvas.height] = size;
     };
     const presenter = new Presenter(gpu, canvas, data.present);
-    const viewport = new Viewport(canvas, state, { playback, rasterizer, presenter, numbers: data.viewport });
+    const viewport = new Viewport(canvas, state, { playback, rasterizer, presenter, numbers: data.viewport, signal });
     const api = makeApi(state, viewport, wake);
-    gpu.device.lost.then(({ message }) => fail(new Refusal(
-        `The graphics device was lost (${message.split("\n")[0].slice(0, 120) || "no reason given"}): load the page again.`)));
+    gpu.device.lost.then(({ message }) => {
+        const again = !signal.aborted && performance.now() - begun > STEADY;
+        fail(new Refusal(
+            `The graphics device was lost (${message.split("\n")[0].slice(0, 120) || "no reason given"}): load the page again.`));
+        if (again) reopen(state); // phones take it from pages that are out of sight
+    });
     gpu.device.addEventListener("uncapturederror", ({ error }) => fail(error), { signal });
 
     async function tick(now) {
@@ -174,11 +193,15 @@ function start(gpu, { scene, playback, rasterizer }, state, data) {
                 wake();
             }
             resize();
-            if (!await viewport.draw(now)) return;
+            if (!await viewport.draw(now)) {
+                if (kept === viewport.frame || !viewport.atRest || now - viewport.movedAt < KEPT) return;
+                kept = viewport.frame;
+                presenter.present(kept); // a canvas holds its picture for this task alone
+                return canvas.toBlob(keep);
+            }
         } catch (error) {
             return fail(error);
         }
-        if (viewport.scale === 1 && !clock.playing) canvas.toBlob(keep); // now: a canvas holds its picture for this task
         find("poster").hidden = true;
         const { width, height } = viewport.frame.camera;
         find("overlay").textContent = `${(1 / viewport.seconds).toFixed(1)} frames a second\n${Math.round(1000 * viewport.seconds)} ms `
@@ -190,25 +213,17 @@ function start(gpu, { scene, playback, rasterizer }, state, data) {
         tick(now);
         requestAnimationFrame(loop);
     })(last);
-    const stop = () => {
-        ended.abort();
-        gpu.device.destroy();
-    };
     return { api, stop };
 }
 
 const after = (choices, present) => choices[(choices.findIndex(each => String(each) === String(present)) + 1) % choices.length];
 
-function run() {
-    const data = JSON.parse(find("player").textContent);
-    const source = new URLSearchParams(location.search).get("src");
-    addEventListener("dragover", event => event.preventDefault());
-    addEventListener("drop", event => {
-        event.preventDefault();
-        const [file] = event.dataTransfer.files;
-        if (file) open(() => streamed(file.stream(), file.size), data);
-    });
-    return open(source ? () => fetched(source) : embedded, data);
-}
-
-run();
+const data = JSON.parse(find("player").textContent);
+const source = new URLSearchParams(location.search).get("src");
+addEventListener("dragover", event => event.preventDefault());
+addEventListener("drop", event => {
+    event.preventDefault();
+    const [file] = event.dataTransfer.files;
+    if (file) open(progress => streamed(file.stream(), file.size, progress), data);
+});
+open(source ? progress => fetched(source, progress) : embedded, data);

@@ -11,6 +11,7 @@ export class Transport {
         }, { signal });
         change(this.button, "click", actions.toggle_playing);
         change(this.more, "click", actions.toggle_help);
+        change(root.getElementById("home"), "click", actions.reset_camera);
         change(this.slider, "input", () => {
             clock.playing = false;
             clock.seek(Number(this.slider.value));
@@ -25,6 +26,10 @@ export class Transport {
         this.button.textContent = clock.playing ? "Pause" : "Play";
         this.slider.value = clock.time;
         this.label.textContent = `${clock.time.toFixed(3)}  frame ${clock.frame} of ${clock.frames - 1}`;
+        if (!clock.speeds.includes(clock.speed)) { // by the page's address
+            clock.speeds = [...clock.speeds, clock.speed].sort((a, b) => a - b);
+            this.speed.add(new Option(`${clock.speed}x`), clock.speeds.indexOf(clock.speed));
+        }
         this.speed.selectedIndex = clock.speeds.indexOf(clock.speed);
         this.loop.selectedIndex = clock.loops.indexOf(clock.loop);
     }

@@ -14,19 +14,13 @@ export function canvasSize(width, height, density, { maxTextureDimension2D, maxS
 }
 
 export class Viewport {
-    // state: {camera, clock, background}. numbers: settled and target seconds, smallest scale.
-    constructor(canvas, state, { playback, rasterizer, presenter, numbers }) {
-        Object.assign(this, { canvas, state, playback, rasterizer, presenter, ...numbers });
-        this.scale = 1; // of the frame on show; 1 is the full resolution
-        this.movingScale = 1;
-        this.drawn = ""; // all that the last frame depends on
-        this.movedAt = 0;
-        this.busy = false;
-        this.held = 0; // pictures that are waited for
-        this.frame = null; // on show
-        this.time = NaN; // in the clip, of the frame on show
-        this.seconds = NaN; // that the last one took
-        this.log = null;
+    // state: {camera, clock, background}. numbers: settled and target seconds, smallest scale. signal: ends it.
+    constructor(canvas, state, { playback, rasterizer, presenter, numbers, signal }) {
+        Object.assign(this, { canvas, state, playback, rasterizer, presenter, signal, ...numbers });
+        // frame: on show. scale: of it; 1 is the full resolution. time: of it, in the clip. seconds: that it took. drawn: all
+        // that it depends on. held: how many wait for a picture.
+        Object.assign(this, { frame: null, scale: 1, movingScale: 1, time: NaN, seconds: NaN, drawn: "", movedAt: 0 });
+        Object.assign(this, { busy: false, held: 0, log: null });
     }
 
     // Whether the picture on show is that of the state, in full resolution.
@@ -85,7 +79,7 @@ export class Viewport {
 
     // Turn about the surface under a point of the canvas from now on; x and y are CSS pixels.
     async focus(x, y) {
-        while (this.busy) await new Promise(requestAnimationFrame);
+        await this.until(() => !this.busy);
         if (!this.frame) return;
         this.busy = true;
         try {
@@ -106,11 +100,16 @@ export class Viewport {
         }
     }
 
+    // Wait, while no other frame begins: while the clip plays there is no pause between them. Raises what ended it all.
+    async until(done) {
+        for (this.held++; !done() && !this.signal.aborted;) await new Promise(requestAnimationFrame);
+        this.held--;
+        this.signal.throwIfAborted();
+    }
+
     // The picture on show as float planes: red, green, blue, transmittance, row by row.
     async planes() {
-        this.held++; // no other frame begins: while the clip plays there is no pause between them
-        while (!this.readable) await new Promise(requestAnimationFrame);
-        this.held--;
+        await this.until(() => this.readable);
         const { time, frame: { image, camera: { width, height } } } = this;
         return { width, height, time, values: new Float32Array(await new Commands(this.playback.gpu).read([image])) };
     }
