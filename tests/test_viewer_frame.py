@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import importlib
 import re
 import signal
 from collections.abc import Callable, Coroutine, Iterator
@@ -18,7 +19,7 @@ from helpers.playback import open_playback
 from helpers.still_scenes import CAMERA, KINDS, half_still
 from helpers.trained_scenes import GRID4D, OURS, trained
 
-from lapgs_wgpu.errors import NumericalError
+from lapgs_wgpu.errors import DeviceLostError, NumericalError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.motion.playback.torch_playback import TorchPlayback
@@ -140,6 +141,44 @@ def test_a_file_that_cannot_be_shown_leaves_the_scene_as_it_is(
     assert opened is not before["frame"]
     canvas.draw()
     assert app.viewport.frame is opened  # drawn once
+
+
+@pytest.mark.triangles
+def test_a_device_that_fails_ends_the_viewer(device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """rendercanvas logs exceptions and goes on. And the clip does not leap where the window could not be drawn."""
+    offscreen = pytest.importorskip("rendercanvas.offscreen")
+    pytest.importorskip("imgui_bundle")
+    from lapgs_wgpu.viewer import app as app_module
+    from lapgs_wgpu.viewer.loaded_scene import load_scene
+
+    half_still(device, tmp_path)
+    now = [50.0]
+    monkeypatch.setattr(app_module, "time", SimpleNamespace(perf_counter=lambda: now[0]))
+    canvas = offscreen.RenderCanvas(size=(64, 48), pixel_ratio=1)
+    loop = SimpleNamespace(call_later=lambda seconds, callback: None)
+    app = app_module.App(canvas, loop, load_scene(tmp_path / "scene.ply", lambda: device))
+    app.state.clock.playing = True
+    canvas.draw()
+    begun = app.state.clock.time
+    now[0] += 30
+    canvas.draw()
+    assert 0 < app.state.clock.time - begun <= 0.25 / app.state.clock.seconds + 1e-6
+    imgui = importlib.import_module("imgui_bundle").imgui
+    canvas.submit_event({"event_type": "pointer_down", "button": 1, "buttons": (1,), "x": 21, "y": 13})
+    canvas._events.flush()
+    for _ in range(2):
+        canvas.draw()
+    assert tuple(imgui.get_mouse_pos()) == (21, 13)  # of a finger, which comes without a move
+    ended: list[None] = []
+    app.end = lambda: ended.append(None)
+
+    def give_out(*_: object, **__: object) -> None:
+        raise DeviceLostError("the device is gone")
+
+    monkeypatch.setattr(app.viewport, "draw", give_out)
+    canvas.draw()
+    assert str(app.failed) == "the device is gone"
+    assert ended == [None]
 
 
 @pytest.mark.parametrize("mode", ["motion", "dynamics", "scale"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,19 @@ from .view_state import ViewState
 from .viewport import SETTLED, Viewport
 
 _GUI_DRAWS = 3  # after an event, until the panels have found their sizes and colors
+_LONGEST_STEP = 0.25  # seconds that the clip and a flight go on at once, after the window could not be drawn
+
+
+def window_title(path: object) -> str:
+    """Of a window that shows a file."""
+    return f"{path} - lapgs-view"
 
 
 class App:
-    """A viewer on a rendercanvas and its event loop. drawing_seconds: spent on drawing so far, GUI included."""
+    """A viewer on a rendercanvas and its event loop.
+
+    drawing_seconds: spent on drawing so far, GUI included. failed: what ended it, if the device did. end: called then.
+    """
 
     def __init__(self, canvas: Any, loop: Any, scene: LoadedScene, *, transport: bool | None = None) -> None:
         self.canvas, self.loop = canvas, loop
@@ -28,6 +38,8 @@ class App:
         self.controls = Controls(self.state, self.viewport, covered=self._covered, wake=self._wake)
         self._drawn_at, self._running = time.perf_counter(), False
         self.drawing_seconds = 0.0
+        self.failed: DeviceError | None = None
+        self.end: Callable[[], None] = canvas.close
         canvas.request_draw(self._draw)
 
     def open(self, path: Path) -> None:
@@ -42,12 +54,21 @@ class App:
             if not isinstance(error, InputError):
                 error = InputError(f"{path} cannot be shown: {str(error) or 'out of memory'}.")
             self.state.message = str(error)
+        else:
+            self.canvas.set_title(window_title(path))
         self.canvas.request_draw()
 
     def _draw(self) -> None:
+        try:
+            self._draw_frame()
+        except DeviceError as error:  # rendercanvas would log it, and go on with a window that stands still
+            self.failed = self.failed or error
+            self.end()
+
+    def _draw_frame(self) -> None:
         state, now = self.state, time.perf_counter()
         # Time passes between two frames of something that runs, not while the window was idle before it.
-        passed = now - self._drawn_at if self._running else 0.0
+        passed = min(now - self._drawn_at, _LONGEST_STEP) if self._running else 0.0
         self._drawn_at, self._running = now, state.clock.playing or self.controls.flying
         state.clock.advance(passed)
         self.controls.fly(passed)

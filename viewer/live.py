@@ -8,6 +8,7 @@ or the time moves, when the pictures come first.
 from __future__ import annotations
 
 import signal
+import sys
 import time
 from collections.abc import Iterator
 from types import FrameType
@@ -83,3 +84,5 @@ def watch(scene: Scene4D, look: InitialView, steps: Iterator[TrainingStep]) -> N
     loop.run()
     if failed:
         raise failed[0]
+    if app.failed is not None:
+        print(f"the window was closed: {app.failed}", file=sys.stderr)

@@ -31,7 +31,11 @@ _COMPARE_NAMES = ("no comparison", "side by side", "split", "error, 4 times")
 
 class _Renderer(ImguiRenderer):
     """wgpu's, but keys are kept from the viewer only while text is typed: after a click on a panel, imgui would
-    otherwise hold on to them."""
+    otherwise hold on to them. And a button goes down where its event says: a finger is there without a move."""
+
+    def _on_mouse(self, event: dict[str, Any]) -> None:
+        self.backend.io.add_mouse_pos_event(event["x"], event["y"])
+        super()._on_mouse(event)
 
     def _on_key(self, event: dict[str, Any]) -> None:
         passed_on = dict(event)
@@ -74,6 +78,8 @@ class Panels:
         self._covered.clear()
         if state.show_help:
             self._help()
+        if state.message:
+            self._message(state.message)
         if not state.show_panels:
             return
         self._view()
@@ -86,8 +92,6 @@ class Panels:
             imgui.begin("transport", None, _BAR)
             draw_time_slider(state)
             self._end()
-        if state.message:
-            self._message(state.message)
 
     # The panel at the left -------------------------------------------------------------------------------------------
 
@@ -113,9 +117,10 @@ class Panels:
         if changed:
             state.background = colors[chosen]
         _tip("background")
+        dropped = "; one can also be dropped on the window" if state.takes_drops else ""
         for text, action, tip in (
             ("Reset", state.reset_camera, "camera back to where it started (R)"),
-            ("Open", self._files.toggle, "another .ply or .lapgs file; one can also be dropped on the window"),
+            ("Open", self._files.toggle, "another .ply or .lapgs file" + dropped),
             ("Help", state.toggle_help, "keys and mouse (?)"),
         ):
             if text == "Open" and state.training is not None:  # there would be no way back to the training

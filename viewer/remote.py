@@ -8,6 +8,7 @@ import html
 import importlib.util
 import socket
 import sys
+from functools import partial
 from importlib import resources
 from typing import Any, NamedTuple
 
@@ -107,8 +108,11 @@ def run_remote(scene: Any, entry: Entry, *, transport: bool | None, start: Initi
         timeout_graceful_shutdown=2,
     )
     print(entry.welcome(str(scene.path or name)), file=sys.stderr, flush=True)
-    asyncio.run(uvicorn.Server(config).serve(sockets=[entry.listening]))
-    del viewer
+    server = uvicorn.Server(config)
+    viewer.end = partial(setattr, server, "should_exit", True)
+    asyncio.run(server.serve(sockets=[entry.listening]))
+    if viewer.failed is not None:
+        raise viewer.failed
     raise KeyboardInterrupt  # nothing else ends the server, but on a busy machine it may come to end without a word
 
 

@@ -28,6 +28,7 @@ class ViewState:
         self.split = 0.5
         self.show_panels = self.show_overlay = True
         self.show_help = False
+        self.takes_drops = False  # of files, as windows do
         self.show_path = False  # opens the panel's section at the next draw
         self.flying = False
         self.profiling = False

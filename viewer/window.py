@@ -12,7 +12,7 @@ from typing import Any
 
 from lapgs_wgpu.errors import InputError, pip_install
 
-from .app import App
+from .app import App, window_title
 from .gui_library import check_imgui
 from .initial_state import InitialState
 from .loaded_scene import LoadedScene
@@ -43,15 +43,18 @@ def run_window(
 ) -> None:
     """Show it until the window is closed. backend: what choose_backend returned. size: of the picture, logical pixels.
     transport: whether the time slider is shown; where the scene moves, by default. start: what else the window begins
-    with. Raises InputError where the scene has no such thing."""
+    with. Raises InputError where the scene has no such thing, and DeviceError where the device is lost or full."""
 
     def drop(path: Path) -> None:
         app.open(path)
 
-    canvas, loop = make_canvas(backend, f"{scene.path} - lapgs-view", size, drop)
+    canvas, loop = make_canvas(backend, window_title(scene.path), size, drop)
     app = App(canvas, loop, scene, transport=transport)
+    app.state.takes_drops = True
     start.apply(app.state)
     loop.run()
+    if app.failed is not None:
+        raise app.failed
 
 
 def make_canvas(

@@ -18,6 +18,16 @@ let address = null // of the picture on show
 let size = null // the last resize event, for whoever drives next
 const held = new Set()
 
+// Of several fingers the first one counts: renderview.js takes them all for one pointer, which leaps between them.
+for (const name of ['pointerdown', 'pointermove', 'pointerup', 'pointercancel']) {
+  window.addEventListener(name, event => { if (!event.isPrimary) { event.stopImmediatePropagation() } }, true)
+}
+
+// A file that is dropped here would take the place of the viewer.
+for (const name of ['dragover', 'drop']) {
+  window.addEventListener(name, event => event.preventDefault())
+}
+
 class View extends window.BaseRenderView {
   onEvent (event) {
     if (event.type === 'resize') {
