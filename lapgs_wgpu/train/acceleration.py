@@ -18,16 +18,16 @@ EPSILON = 1e-12  # world units squared: keeps the gradient of a distance of 0 fi
 
 
 def draw_moments(
-    config: AccelerationConfig, count: int, t: float, of_clip: int, generator: torch.Generator
+    config: AccelerationConfig, count: int, t: float, clip_moments: int, generator: torch.Generator
 ) -> Moments | None:
     """Where the acceleration loss of `count` Gaussians looks in a step at time t; None where it is off. At an end of
-    the clip one of the times is t itself, and the loss 0. of_clip: how many moments the clip has; with two,
+    the clip one of the times is t itself, and the loss 0. clip_moments: how many moments the clip has; with two,
     both are ends."""
     chosen = round(config.share * count)
-    if chosen == 0 or config.weight == 0 or of_clip < 3:
+    if chosen == 0 or config.weight == 0 or clip_moments < 3:
         return None
     rows = torch.randint(count, (chosen,), generator=generator)
-    reach = config.frames / (of_clip - 1) * (1 + float(torch.rand((), generator=generator))) / 2
+    reach = config.frames / (clip_moments - 1) * (1 + float(torch.rand((), generator=generator))) / 2
     return Moments(rows, (max(t - reach, 0.0), min(t + reach, 1.0)))
 
 
