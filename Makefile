@@ -13,7 +13,7 @@ READY := .venv/.ready
 PYTEST = $(BIN)/pytest
 export XDG_RUNTIME_DIR ?= /tmp
 
-.PHONY: setup demo test test-shapes test-viewer test-all test-swiftshader soak bench lint pictures docs
+.PHONY: setup demo test test-shapes test-viewer test-programs test-all test-swiftshader soak bench lint pictures docs
 setup: $(READY)
 
 # torch first: where there is no CUDA device, by exact version, so that an index with CPU builds can offer its own
@@ -86,8 +86,8 @@ lint: $(READY)
 # runs each configuration that can fail alone once (test-shapes): all kernels as on a GPU (its shapes, staging and
 # WebGPU's default limits at once: tests/conftest.py), and the two passes that use subgroups without them and, on Mesa's
 # software driver, in the two widths that are not this processor's own (its shader cache ignores the width).
-# The viewer's tests follow these in one process, all others run in another: compiling shaders, torch and Python take one
-# core each. The closing line of each comes last.
+# The viewer's tests and those that start programs of their own follow these in one process, all others run in another:
+# compiling shaders, torch and Python take one core each. The closing line of each comes last.
 # What runs in the background ignores Ctrl-C, so the whole group is ended.
 # `test-all` runs all kernels in every configuration, each alone; CI does so every night.
 WIDTHS = $(shell $(BIN)/python -c 'from lapgs_wgpu import list_devices; name = list_devices()[0].name; \
@@ -97,16 +97,21 @@ widths = echo "== $(1) tests, vectors of $$width bits"; \
   LP_NATIVE_VECTOR_WIDTH=$$width MESA_SHADER_CACHE_DISABLE=true $(PYTEST) -m $(1)
 
 VIEWER_TESTS = $(wildcard tests/test_viewer_*.py tests/test_web_*.py tests/test_hostile_pages.py)
+PROGRAM_TESTS = tests/test_bench.py tests/test_distributed.py tests/test_examples.py
 test: $(READY)
 	@logs=$$(mktemp -d); trap 'rm -rf "$$logs"' EXIT; trap 'rm -rf "$$logs"; trap - TERM; kill 0' INT TERM; \
-	$(MAKE) -k --no-print-directory test-shapes test-viewer > "$$logs/beside" 2>&1 & beside=$$!; \
-	echo "== all tests but the viewer's"; \
-	{ $(PYTEST) $(VIEWER_TESTS:%=--ignore=%); echo $$? > "$$logs/code"; } 2>&1 | tee "$$logs/suite"; \
+	$(MAKE) -k --no-print-directory test-shapes test-viewer test-programs > "$$logs/beside" 2>&1 & beside=$$!; \
+	echo "== all tests but the viewer's and those of programs"; \
+	{ $(PYTEST) $(VIEWER_TESTS:%=--ignore=%) $(PROGRAM_TESTS:%=--ignore=%); echo $$? > "$$logs/code"; } 2>&1 | tee "$$logs/suite"; \
 	wait $$beside; code=$$?; cat "$$logs/beside"; tail -n 1 "$$logs/suite"; exit $$((code || $$(cat "$$logs/code")))
 
 test-viewer: $(READY)
 	@echo "== the viewer's tests"
 	@$(PYTEST) $(VIEWER_TESTS)
+
+test-programs: $(READY)
+	@echo "== tests of programs"
+	@$(PYTEST) $(PROGRAM_TESTS)
 
 test-shapes: $(READY)
 	@$(call kernels,gpu,kernels)
