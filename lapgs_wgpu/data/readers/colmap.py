@@ -22,7 +22,7 @@ from lapgs_wgpu.data.poses import check_rotation
 from lapgs_wgpu.data.timestamps import ImageName, natural_key
 from lapgs_wgpu.data.undistort import Lens
 from lapgs_wgpu.errors import InputError
-from lapgs_wgpu.io.listing import is_desktops
+from lapgs_wgpu.io.listing import is_desktop_file
 from lapgs_wgpu.splat.camera import rotation_matrix
 
 from .colmap_model import ColmapCamera, ColmapImage, ColmapModel, count_images, is_model, read_model
@@ -85,7 +85,7 @@ def _files(images: Path) -> dict[str, Path]:
         entered.add(os.path.realpath(parent))
         folders[:] = [name for name in folders if os.path.realpath(os.path.join(parent, name)) not in entered]
         for name in names:
-            if name.lower().endswith(SUFFIXES) and not is_desktops(name):
+            if name.lower().endswith(SUFFIXES) and not is_desktop_file(name):
                 path = Path(parent, name)
                 found[path.relative_to(images).as_posix()] = path
     return dict(sorted(found.items(), key=lambda item: natural_key(item[0])))
