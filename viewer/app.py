@@ -54,6 +54,7 @@ class App:
             if not isinstance(error, InputError):
                 error = InputError(f"{path} cannot be shown: {str(error) or 'out of memory'}.")
             self.state.message = str(error)
+            self.state.show_panels = True  # which tell of it
         else:
             self.canvas.set_title(window_title(path))
         self.canvas.request_draw()

@@ -78,8 +78,6 @@ class Panels:
         self._covered.clear()
         if state.show_help:
             self._help()
-        if state.message:
-            self._message(state.message)
         if not state.show_panels:
             return
         self._view()
@@ -92,6 +90,8 @@ class Panels:
             imgui.begin("transport", None, _BAR)
             draw_time_slider(state)
             self._end()
+        if state.message:
+            self._message(state.message)
 
     # The panel at the left -------------------------------------------------------------------------------------------
 
