@@ -43,21 +43,26 @@ def test_the_first_frame_of_a_mode_is_of_its_own_time(device: Device, tmp_path: 
     np.testing.assert_array_equal(first, second)
 
 
-@pytest.mark.triangles
-def test_the_window_rests_on_the_exact_frame(device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def app_by_the_clock(file: Path, device: Device, monkeypatch: pytest.MonkeyPatch) -> tuple[Any, Any, list[float]]:
+    """A canvas without a window, the viewer on it, and what its clock shows, in seconds: a list of one number."""
     offscreen = pytest.importorskip("rendercanvas.offscreen")
     pytest.importorskip("imgui_bundle")
     from lapgs_wgpu.viewer import app as app_module
     from lapgs_wgpu.viewer import viewport as viewport_module
     from lapgs_wgpu.viewer.loaded_scene import load_scene
 
-    half_still(device, tmp_path)
     now = [50.0]
     for module in (app_module, viewport_module):
         monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=lambda: now[0]))
     canvas = offscreen.RenderCanvas(size=(64, 48), pixel_ratio=1)
     loop = SimpleNamespace(call_later=lambda seconds, callback: None)
-    app = app_module.App(canvas, loop, load_scene(tmp_path / "scene.ply", lambda: device))
+    return canvas, app_module.App(canvas, loop, load_scene(file, lambda: device)), now
+
+
+@pytest.mark.triangles
+def test_the_window_rests_on_the_exact_frame(device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    half_still(device, tmp_path)
+    canvas, app, now = app_by_the_clock(tmp_path / "scene.ply", device, monkeypatch)
     exact = FrameRenderer(open_playback(tmp_path / "scene.ply", device))
     passing = []
     for t in [*((np.arange(16) + 0.5) / 16), 0.3, 0.31]:
@@ -95,20 +100,9 @@ TROUBLE = {
 def test_a_file_that_cannot_be_shown_leaves_the_scene_as_it_is(
     device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
 ) -> None:
-    offscreen = pytest.importorskip("rendercanvas.offscreen")
-    pytest.importorskip("imgui_bundle")
-    from lapgs_wgpu.viewer import app as app_module
-    from lapgs_wgpu.viewer import viewport as viewport_module
-    from lapgs_wgpu.viewer.loaded_scene import load_scene
-
     trained(device, GRID4D, 100).save(tmp_path / "small.ply")
     trained(device, KINDS["mlp"], 1000).save(tmp_path / "large.ply")  # whose buffers are made when it is drawn
-    now = [50.0]
-    for module in (app_module, viewport_module):
-        monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=lambda: now[0]))
-    canvas = offscreen.RenderCanvas(size=(64, 48), pixel_ratio=1)
-    loop = SimpleNamespace(call_later=lambda seconds, callback: None)
-    app = app_module.App(canvas, loop, load_scene(tmp_path / "small.ply", lambda: device))
+    canvas, app, now = app_by_the_clock(tmp_path / "small.ply", device, monkeypatch)
     app.state.clock.seek(0.3)
     canvas.draw()
     before = vars(app.state) | vars(app.viewport) | {"message": None}
@@ -146,17 +140,8 @@ def test_a_file_that_cannot_be_shown_leaves_the_scene_as_it_is(
 @pytest.mark.triangles
 def test_a_device_that_fails_ends_the_viewer(device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """rendercanvas logs exceptions and goes on. And the clip does not leap where the window could not be drawn."""
-    offscreen = pytest.importorskip("rendercanvas.offscreen")
-    pytest.importorskip("imgui_bundle")
-    from lapgs_wgpu.viewer import app as app_module
-    from lapgs_wgpu.viewer.loaded_scene import load_scene
-
     half_still(device, tmp_path)
-    now = [50.0]
-    monkeypatch.setattr(app_module, "time", SimpleNamespace(perf_counter=lambda: now[0]))
-    canvas = offscreen.RenderCanvas(size=(64, 48), pixel_ratio=1)
-    loop = SimpleNamespace(call_later=lambda seconds, callback: None)
-    app = app_module.App(canvas, loop, load_scene(tmp_path / "scene.ply", lambda: device))
+    canvas, app, now = app_by_the_clock(tmp_path / "scene.ply", device, monkeypatch)
     app.state.clock.playing = True
     canvas.draw()
     begun = app.state.clock.time
