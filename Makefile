@@ -1,5 +1,5 @@
 # Everything lives in .venv; `make` or `make setup` makes it, and the other goals call that first.
-#   make demo   trains the built-in scene         make test   all tests        make lint   ruff and mypy
+#   make demo   trains the built-in scene         make test   tests        make lint   ruff and mypy
 #   make test-all  all tests, with all kernels in every configuration of the device (CI: every night)
 #   make test-swiftshader  all kernel tests on a second Vulkan driver, SwiftShader, which comes with Chromium
 #   make soak   what takes hours: 10,000 hostile files a format, failing disks, 20 kills, large scenes, 30 minutes of training
@@ -11,9 +11,10 @@
 BIN := .venv/bin
 READY := .venv/.ready
 PYTEST = $(BIN)/pytest
+PARALLEL = $(PYTEST) -n auto --dist loadfile
 export XDG_RUNTIME_DIR ?= /tmp
 
-.PHONY: setup demo test test-shapes test-viewer test-programs test-all test-swiftshader soak bench lint pictures docs
+.PHONY: setup demo test test-all test-swiftshader soak bench lint pictures docs
 setup: $(READY)
 
 # torch first: where there is no CUDA device, by exact version, so that an index with CPU builds can offer its own
@@ -82,47 +83,21 @@ lint: $(READY)
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 
-# What the kernels compute must not depend on the device's shape. Besides the whole suite on the device as it is, `test`
-# runs each configuration that can fail alone once (test-shapes): all kernels as on a GPU (its shapes, staging and
-# WebGPU's default limits at once: tests/conftest.py), and the two passes that use subgroups without them and, on Mesa's
-# software driver, in the two widths that are not this processor's own (its shader cache ignores the width).
-# The viewer's tests and those that start programs of their own follow these in one process, all others run in another:
-# compiling shaders, torch and Python take one core each. The closing line of each comes last.
-# What runs in the background ignores Ctrl-C, so the whole group is ended.
-# `test-all` runs all kernels in every configuration, each alone; CI does so every night.
-WIDTHS = $(shell $(BIN)/python -c 'from lapgs_wgpu import list_devices; name = list_devices()[0].name; \
-  print(*(w for w in (128, 256, 512) if "llvmpipe" in name and f" {w} bits" not in name))')
-kernels = echo "== $(2) tests, $(1)"; LAPGS_TEST_DEVICE=$(1) $(PYTEST) -m $(2)
-widths = echo "== $(1) tests, vectors of $$width bits"; \
-  LP_NATIVE_VECTOR_WIDTH=$$width MESA_SHADER_CACHE_DISABLE=true $(PYTEST) -m $(1)
+# What the kernels compute must not depend on the device's shape: `test-all` runs them in every configuration of
+# tests/conftest.py, and on Mesa's software driver at each vector width (its shader cache ignores the width). `test`
+# leaves that to it, and the tests marked `nightly`. Each processor runs the modules of one worker.
+LLVMPIPE = $(shell $(BIN)/python -c 'from lapgs_wgpu import list_devices; print("llvmpipe" in list_devices()[0].name)')
+kernels = echo "== kernel tests, $(1)"; LAPGS_TEST_DEVICE=$(1) $(PARALLEL) -m kernels
 
-VIEWER_TESTS = $(wildcard tests/test_viewer_*.py tests/test_web_*.py tests/test_hostile_pages.py)
-PROGRAM_TESTS = tests/test_bench.py tests/test_distributed.py tests/test_examples.py
 test: $(READY)
-	@logs=$$(mktemp -d); trap 'rm -rf "$$logs"' EXIT; trap 'rm -rf "$$logs"; trap - TERM; kill 0' INT TERM; \
-	$(MAKE) -k --no-print-directory test-shapes test-viewer test-programs > "$$logs/beside" 2>&1 & beside=$$!; \
-	echo "== all tests but the viewer's and those of programs"; \
-	{ $(PYTEST) $(VIEWER_TESTS:%=--ignore=%) $(PROGRAM_TESTS:%=--ignore=%); echo $$? > "$$logs/code"; } 2>&1 | tee "$$logs/suite"; \
-	wait $$beside; code=$$?; cat "$$logs/beside"; tail -n 1 "$$logs/suite"; exit $$((code || $$(cat "$$logs/code")))
-
-test-viewer: $(READY)
-	@echo "== the viewer's tests"
-	@$(PYTEST) $(VIEWER_TESTS)
-
-test-programs: $(READY)
-	@echo "== tests of programs"
-	@$(PYTEST) $(PROGRAM_TESTS)
-
-test-shapes: $(READY)
-	@$(call kernels,gpu,kernels)
-	@$(call kernels,no-subgroups,subgroups)
-	@for width in $(WIDTHS); do $(call widths,subgroups) || exit 1; done
+	@$(PARALLEL) -m "not nightly"
 
 test-all: $(READY)
-	@for width in $(if $(WIDTHS),128 256 512); do $(call widths,kernels) || exit 1; done
-	@for name in no-subgroups default-limits gpu-shape; do $(call kernels,$$name,kernels) || exit 1; done
+	@for name in gpu no-subgroups default-limits gpu-shape; do $(call kernels,$$name) || exit 1; done
+	@for width in $(if $(filter True,$(LLVMPIPE)),128 256 512); do echo "== kernel tests, vectors of $$width bits"; \
+	  LP_NATIVE_VECTOR_WIDTH=$$width MESA_SHADER_CACHE_DISABLE=true $(PARALLEL) -m kernels || exit 1; done
 	@echo "== all tests"
-	@$(PYTEST)
+	@$(PARALLEL)
 
 # Debian's package has the driver's description; other builds of Chromium name it alike.
 SWIFTSHADER ?= /usr/lib/chromium/vk_swiftshader_icd.json

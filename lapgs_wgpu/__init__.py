@@ -8,19 +8,19 @@ import os
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .data.load import load_dataset
-    from .gpu.device import list_devices, open_device
-    from .motion.fields.deformation import Deformation
-    from .motion.scene import Scene4D, load
-    from .splat.camera import Camera
-    from .splat.gaussians import Gaussians
-    from .splat.rasterize import Rendering, rasterize
-    from .train.densify import Change, DensityState, published_rule
-    from .train.loss_terms import Regularizer, TorchLoss, WgslLoss
-    from .train.parts import Parts
-    from .train.presets import load_config
-    from .train.step_result import StepResult
-    from .train.trainer import Trainer
+    from lapgs_wgpu.data.load import load_dataset
+    from lapgs_wgpu.gpu.device import list_devices, open_device
+    from lapgs_wgpu.motion.fields.deformation import Deformation
+    from lapgs_wgpu.motion.scene import Scene4D, load
+    from lapgs_wgpu.splat.camera import Camera
+    from lapgs_wgpu.splat.gaussians import Gaussians
+    from lapgs_wgpu.splat.rasterize import Rendering, rasterize
+    from lapgs_wgpu.train.densify import Change, DensityState, published_rule
+    from lapgs_wgpu.train.loss_terms import Regularizer, TorchLoss, WgslLoss
+    from lapgs_wgpu.train.parts import Parts
+    from lapgs_wgpu.train.presets import load_config
+    from lapgs_wgpu.train.step_result import StepResult
+    from lapgs_wgpu.train.trainer import Trainer
 
 # torch's OpenMP threads otherwise spin while they wait, which takes the processor from a software Vulkan driver: a
 # training step there is three to ten times slower. It has no effect where torch was imported before.

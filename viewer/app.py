@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from lapgs_wgpu.errors import DeviceError, InputError
-
-from .controls import Controls
-from .loaded_scene import LoadedScene, load_scene
-from .view_state import ViewState
-from .viewport import SETTLED, Viewport
+from lapgs_wgpu.viewer.controls import Controls
+from lapgs_wgpu.viewer.loaded_scene import LoadedScene, load_scene
+from lapgs_wgpu.viewer.view_state import ViewState
+from lapgs_wgpu.viewer.viewport import SETTLED, Viewport
 
 _GUI_DRAWS = 3  # after an event, until the panels have found their sizes and colors
 _LONGEST_STEP = 0.25  # seconds that the clip and a flight go on at once, after the window could not be drawn
@@ -79,7 +78,7 @@ class App:
         self.viewport.draw(now)
         self.viewport.present()
         if self._gui is None:
-            from .panels import Panels
+            from lapgs_wgpu.viewer.panels import Panels
 
             self._gui = Panels(state, self.viewport, self.open)
         else:

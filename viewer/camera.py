@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lapgs_wgpu.splat.camera import Camera
-
-from .path import Pose
+from lapgs_wgpu.viewer.path import Pose
 
 Vector = NDArray[np.float64]
 _STEEPEST = math.radians(89)  # of the line of sight, up or down: beyond it the picture would turn over

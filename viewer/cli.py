@@ -10,14 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 from lapgs_wgpu.command import guarded, print_devices
 from lapgs_wgpu.errors import InputError
-
-from .options import NEW_TOKEN, parse_options
-from .render_modes import BACKGROUNDS
+from lapgs_wgpu.viewer.options import NEW_TOKEN, parse_options
+from lapgs_wgpu.viewer.render_modes import BACKGROUNDS
 
 if TYPE_CHECKING:
     from lapgs_wgpu.gpu.device import Device
-
-    from .loaded_scene import LoadedScene
+    from lapgs_wgpu.viewer.loaded_scene import LoadedScene
 
 _WINDOW_SIZE = (1280, 720)
 
@@ -39,7 +37,7 @@ def _view(arguments: list[str]) -> None:
         device = other.submit(_warm_device, given.device)
         # Before the scene is read, which may take a while: whether there is a place to show it.
         place = _place(given) if job == "window" else None
-        from .loaded_scene import load_scene
+        from lapgs_wgpu.viewer.loaded_scene import load_scene
 
         scene = load_scene(Path(given.file), device.result)
     if not scene.playback.moves:
@@ -54,8 +52,7 @@ def _view(arguments: list[str]) -> None:
 
 def _warm_device(name: str | None) -> Device:
     from lapgs_wgpu.gpu.device import open_device
-
-    from .frame import warm_up
+    from lapgs_wgpu.viewer.frame import warm_up
 
     device = open_device(name)
     warm_up(device)
@@ -68,13 +65,13 @@ def _place(given: Any) -> Any:
         for option in ("host", "port", "token"):
             if getattr(given, option) is not None:
                 raise InputError(f"--{option} goes with --backend http.")
-        from .window import choose_backend
+        from lapgs_wgpu.viewer.window import choose_backend
 
         return choose_backend(given.backend or "auto")
     if given.size is not None:
         raise InputError("--size has no use with --backend http: the picture has the size of the browser's window.")
-    from .auth import new_token
-    from .remote import DEFAULT_HOST, DEFAULT_PORT, open_entry
+    from lapgs_wgpu.viewer.auth import new_token
+    from lapgs_wgpu.viewer.remote import DEFAULT_HOST, DEFAULT_PORT, open_entry
 
     port = DEFAULT_PORT if given.port is None else given.port
     token = new_token() if given.token == NEW_TOKEN else given.token
@@ -82,7 +79,7 @@ def _place(given: Any) -> Any:
 
 
 def _window(given: Any, scene: LoadedScene, place: Any) -> None:
-    from .initial_state import InitialState
+    from lapgs_wgpu.viewer.initial_state import InitialState
 
     start = InitialState(
         time=given.time,
@@ -95,18 +92,18 @@ def _window(given: Any, scene: LoadedScene, place: Any) -> None:
         view=given.view,
     )
     if isinstance(place, str):
-        from .window import run_window
+        from lapgs_wgpu.viewer.window import run_window
 
         size = given.size or _WINDOW_SIZE
         run_window(scene, backend=place, size=size, transport=given.time_slider, start=start)
     else:
-        from .remote import run_remote
+        from lapgs_wgpu.viewer.remote import run_remote
 
         run_remote(scene, place, transport=given.time_slider, start=start)
 
 
 def _screenshot(given: Any, scene: LoadedScene) -> None:
-    from .offscreen import OffscreenRenderer, find_view, framed, write_png
+    from lapgs_wgpu.viewer.offscreen import OffscreenRenderer, find_view, framed, write_png
 
     file = _named(given.screenshot, ".png", "--screenshot")
     view = find_view(scene, given.view) if given.view is not None else None
@@ -121,10 +118,10 @@ def _screenshot(given: Any, scene: LoadedScene) -> None:
 
 
 def _video(given: Any, scene: LoadedScene) -> None:
-    from . import video
-    from .camera import ViewCamera
-    from .offscreen import OffscreenRenderer, find_view, framed
-    from .path_file import read_path
+    from lapgs_wgpu.viewer import video
+    from lapgs_wgpu.viewer.camera import ViewCamera
+    from lapgs_wgpu.viewer.offscreen import OffscreenRenderer, find_view, framed
+    from lapgs_wgpu.viewer.path_file import read_path
 
     file = _named(given.video, ".mp4", "--video")
     moves = scene.playback.moves
@@ -179,7 +176,7 @@ def _export(given: Any, scene: LoadedScene) -> None:
 
 
 def _write_export(given: Any, scene: LoadedScene) -> None:
-    from .export import export_compact, export_frames, export_still
+    from lapgs_wgpu.viewer.export import export_compact, export_frames, export_still
 
     overwrite = bool(given.overwrite)
     ending = Path(given.export).suffix.lower()
@@ -191,7 +188,7 @@ def _write_export(given: Any, scene: LoadedScene) -> None:
                 raise InputError(f"--{name} has no use with --export {given.export}, which holds the whole clip.")
         file = Path(given.export)
         if ending == ".4dgs":
-            from .export_4dgs import MAX_ERROR, export_4dgs
+            from lapgs_wgpu.viewer.export_4dgs import MAX_ERROR, export_4dgs
 
             baked = export_4dgs(scene, file, given.max_error or MAX_ERROR, overwrite=overwrite)
             print(

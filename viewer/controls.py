@@ -6,9 +6,9 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from .key_bindings import FLY, KEYS
-from .view_state import ViewState
-from .viewport import Viewport
+from lapgs_wgpu.viewer.key_bindings import FLY, KEYS
+from lapgs_wgpu.viewer.view_state import ViewState
+from lapgs_wgpu.viewer.viewport import Viewport
 
 _ACTIONS = {key.key: key.action for key in KEYS} | {"/": "toggle_help"}  # where "?" is told as "/" with Shift
 ORBIT = 0.008  # radians a pixel of dragging

@@ -15,10 +15,9 @@ from lapgs_wgpu.io.ply import write_ply
 from lapgs_wgpu.motion.playback.playback import DevicePlayback
 from lapgs_wgpu.motion.scene_file import compact_bytes, read_scene
 from lapgs_wgpu.progress import Progress
-
-from .loaded_scene import LoadedScene, stamp_of
-from .offscreen import OffscreenRenderer
-from .web_page import page_html
+from lapgs_wgpu.viewer.loaded_scene import LoadedScene, stamp_of
+from lapgs_wgpu.viewer.offscreen import OffscreenRenderer
+from lapgs_wgpu.viewer.web_page import page_html
 
 _FRAME = re.compile(r"frame_\d+\.ply")
 MOST_FRAMES = 100_000

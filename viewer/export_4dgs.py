@@ -18,9 +18,8 @@ from lapgs_wgpu.motion.playback.playback import Playback
 from lapgs_wgpu.progress import Progress
 from lapgs_wgpu.splat.constants import CONSTANTS
 from lapgs_wgpu.splat.linear_light import directions, display_colors, linear_harmonics, sh_basis, to_display
-
-from .export import check_free
-from .loaded_scene import LoadedScene
+from lapgs_wgpu.viewer.export import check_free
+from lapgs_wgpu.viewer.loaded_scene import LoadedScene
 
 MAX_ERROR = 0.5  # pixels, without --max-error
 _SHADE = 4 / 255  # largest change of opacity and color within a piece

@@ -17,9 +17,8 @@ from lapgs_wgpu.motion.playback.playback import Playback
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterizer import Rasterizer
-
-from .present import Placed
-from .render_modes import MODES, Mode
+from lapgs_wgpu.viewer.present import Placed
+from lapgs_wgpu.viewer.render_modes import MODES, Mode
 
 _MOMENTS = 9  # times at which the Gaussians' places are compared
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from .clock import Loop
-from .offscreen import check_mode, find_view
-from .render_modes import Mode
-from .view_state import ViewState
+from lapgs_wgpu.viewer.clock import Loop
+from lapgs_wgpu.viewer.offscreen import check_mode, find_view
+from lapgs_wgpu.viewer.render_modes import Mode
+from lapgs_wgpu.viewer.view_state import ViewState
 
 
 class InitialState(NamedTuple):

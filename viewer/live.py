@@ -18,11 +18,10 @@ from rendercanvas.utils.asyncs import sleep
 from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.motion.playback.torch_playback import TorchPlayback
 from lapgs_wgpu.motion.scene import Scene4D
-
-from .app import App
-from .loaded_scene import LoadedScene
-from .training_control import TrainingControl, TrainingStep
-from .window import choose_backend, make_canvas
+from lapgs_wgpu.viewer.app import App
+from lapgs_wgpu.viewer.loaded_scene import LoadedScene
+from lapgs_wgpu.viewer.training_control import TrainingControl, TrainingStep
+from lapgs_wgpu.viewer.window import choose_backend, make_canvas
 
 SHARE = 0.02  # of the time may go into pictures while nobody moves anything
 _OPENING = 4.0  # seconds after the first step, in which the window draws what it begins with: shaders are compiled

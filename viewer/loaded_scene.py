@@ -14,10 +14,9 @@ from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.motion.playback.playback import Playback, playback_of
 from lapgs_wgpu.motion.scene_file import read_scene
 from lapgs_wgpu.splat.camera import Camera
-
-from .camera import ViewCamera
-from .clock import Clock
-from .render_modes import BACKGROUNDS
+from lapgs_wgpu.viewer.camera import ViewCamera
+from lapgs_wgpu.viewer.clock import Clock
+from lapgs_wgpu.viewer.render_modes import BACKGROUNDS
 
 Stamp = tuple[int, int, int]
 

@@ -12,12 +12,11 @@ from lapgs_wgpu.data.images import encode_png
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.splat.camera import Camera
-
-from .frame import FrameRenderer, FrameRequest
-from .ground_truth import open_ground_truth
-from .loaded_scene import LoadedScene
-from .present import Offscreen
-from .render_modes import Mode
+from lapgs_wgpu.viewer.frame import FrameRenderer, FrameRequest
+from lapgs_wgpu.viewer.ground_truth import open_ground_truth
+from lapgs_wgpu.viewer.loaded_scene import LoadedScene
+from lapgs_wgpu.viewer.present import Offscreen
+from lapgs_wgpu.viewer.render_modes import Mode
 
 Color = tuple[float, float, float]
 

@@ -9,9 +9,8 @@ from typing import Any
 
 from lapgs_wgpu.command import DEVICE_HELP, LIST_DEVICES_HELP, HelpFormatter, Parser
 from lapgs_wgpu.errors import InputError
-
-from .clock import LOOPS
-from .render_modes import BACKGROUNDS, MODES
+from lapgs_wgpu.viewer.clock import LOOPS
+from lapgs_wgpu.viewer.render_modes import BACKGROUNDS, MODES
 
 DESCRIPTION = """\
 Display a trained scene, or any 3DGS .ply file, at any time and from any viewpoint.
@@ -176,7 +175,7 @@ def _number(low: float, high: float) -> Callable[[str], float]:
 
 
 def _count(text: str) -> int:
-    from .export import MOST_FRAMES
+    from lapgs_wgpu.viewer.export import MOST_FRAMES
 
     if re.fullmatch(r"\d{1,9}", text) is None or not 1 <= int(text) <= MOST_FRAMES:
         raise argparse.ArgumentTypeError(f"expected a whole number from 1 to {MOST_FRAMES}, got {text!r}")

@@ -9,16 +9,16 @@ from typing import Any
 from imgui_bundle import imgui
 from wgpu.utils.imgui import ImguiRenderer
 
-from .file_browser import FileBrowser
-from .gui_library import printable
-from .key_bindings import KEYS, MOUSE
-from .path_panel import draw_path
-from .present import HEAT
-from .render_modes import BACKGROUNDS, COMPARES, MODES
-from .time_slider import draw_time_slider
-from .training_control import TrainingControl
-from .view_state import ViewState
-from .viewport import Viewport
+from lapgs_wgpu.viewer.file_browser import FileBrowser
+from lapgs_wgpu.viewer.gui_library import printable
+from lapgs_wgpu.viewer.key_bindings import KEYS, MOUSE
+from lapgs_wgpu.viewer.path_panel import draw_path
+from lapgs_wgpu.viewer.present import HEAT
+from lapgs_wgpu.viewer.render_modes import BACKGROUNDS, COMPARES, MODES
+from lapgs_wgpu.viewer.time_slider import draw_time_slider
+from lapgs_wgpu.viewer.training_control import TrainingControl
+from lapgs_wgpu.viewer.view_state import ViewState
+from lapgs_wgpu.viewer.viewport import Viewport
 
 _FIXED = imgui.WindowFlags_.no_move | imgui.WindowFlags_.no_resize | imgui.WindowFlags_.no_saved_settings
 _BAR = _FIXED | imgui.WindowFlags_.no_title_bar | imgui.WindowFlags_.no_scrollbar

@@ -6,10 +6,9 @@ from pathlib import Path
 
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.atomic import move
-
-from .camera import ViewCamera
-from .path import CameraPath, KeyFrame, Pose
-from .path_file import PathFile, read_path, write_path
+from lapgs_wgpu.viewer.camera import ViewCamera
+from lapgs_wgpu.viewer.path import CameraPath, KeyFrame, Pose
+from lapgs_wgpu.viewer.path_file import PathFile, read_path, write_path
 
 _STEP = 2.0  # seconds from the last key-frame to a new one
 _CLOSEST = 0.05  # seconds between two key-frames

@@ -14,8 +14,7 @@ from lapgs_wgpu.data.poses import OPENGL_TO_OPENCV
 from lapgs_wgpu.errors import InputError, shown
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.io.safe_json_toml import read_json
-
-from .path import CameraPath, KeyFrame, Pose
+from lapgs_wgpu.viewer.path import CameraPath, KeyFrame, Pose
 
 _MOST_KEYS = 100_000
 _MOST_SECONDS = 24 * 3600.0

@@ -8,11 +8,10 @@ from pathlib import Path
 from imgui_bundle import imgui
 
 from lapgs_wgpu.errors import InputError
-
-from .gui_library import printable
-from .path_editor import path_file_of
-from .view_state import ViewState
-from .viewport import Viewport
+from lapgs_wgpu.viewer.gui_library import printable
+from lapgs_wgpu.viewer.path_editor import path_file_of
+from lapgs_wgpu.viewer.view_state import ViewState
+from lapgs_wgpu.viewer.viewport import Viewport
 
 
 def draw_path(state: ViewState, viewport: Viewport) -> None:

@@ -13,10 +13,9 @@ from importlib import resources
 from typing import Any, NamedTuple
 
 from lapgs_wgpu.errors import InputError, pip_install
-
-from .auth import LOCAL, Application, AuthMiddleware, Receive, Scope, Send, answer, check_entry
-from .gui_library import check_imgui
-from .initial_state import InitialState
+from lapgs_wgpu.viewer.auth import LOCAL, Application, AuthMiddleware, Receive, Scope, Send, answer, check_entry
+from lapgs_wgpu.viewer.gui_library import check_imgui
+from lapgs_wgpu.viewer.initial_state import InitialState
 
 DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 8080
 _EVERYWHERE = ("0.0.0.0", "::")
@@ -82,8 +81,8 @@ def run_remote(scene: Any, entry: Entry, *, transport: bool | None, start: Initi
     import uvicorn
     from rendercanvas.http import asgi, loop
 
-    from .app import App
-    from .remote_canvas import RemoteCanvas
+    from lapgs_wgpu.viewer.app import App
+    from lapgs_wgpu.viewer.remote_canvas import RemoteCanvas
 
     # rendercanvas takes Ctrl-C from uvicorn when its loop starts, closes the canvas and leaves the server running.
     loop._BaseLoop__setup_interrupt_hooks = dict

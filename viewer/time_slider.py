@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from imgui_bundle import imgui
 
-from .clock import LOOPS, SPEEDS
-from .view_state import ViewState
+from lapgs_wgpu.viewer.clock import LOOPS, SPEEDS
+from lapgs_wgpu.viewer.view_state import ViewState
 
 
 def draw_time_slider(state: ViewState) -> None:

@@ -15,9 +15,8 @@ from lapgs_wgpu.errors import InputError, pip_install
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.progress import Progress
 from lapgs_wgpu.splat.camera import Camera
-
-from .camera import ViewCamera
-from .path import CameraPath
+from lapgs_wgpu.viewer.camera import ViewCamera
+from lapgs_wgpu.viewer.path import CameraPath
 
 TimedCamera = tuple[Camera, float]  # a camera and a time in the clip
 PATHS = ("time", "view", "both")

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
-from .clock import LOOPS, SPEEDS
-from .frame import FrameRenderer
-from .ground_truth import GroundTruth, open_ground_truth
-from .loaded_scene import LoadedScene
-from .path import Pose
-from .path_editor import PathEditor
-from .render_modes import BACKGROUNDS, COMPARES, Compare, Mode
-from .training_control import TrainingControl
+from lapgs_wgpu.viewer.clock import LOOPS, SPEEDS
+from lapgs_wgpu.viewer.frame import FrameRenderer
+from lapgs_wgpu.viewer.ground_truth import GroundTruth, open_ground_truth
+from lapgs_wgpu.viewer.loaded_scene import LoadedScene
+from lapgs_wgpu.viewer.path import Pose
+from lapgs_wgpu.viewer.path_editor import PathEditor
+from lapgs_wgpu.viewer.render_modes import BACKGROUNDS, COMPARES, Compare, Mode
+from lapgs_wgpu.viewer.training_control import TrainingControl
 
 
 class ViewState:

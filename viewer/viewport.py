@@ -9,10 +9,9 @@ from typing import Any
 
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
-
-from .frame import Frame, FrameRequest
-from .present import Placed, Presenter
-from .view_state import ViewState
+from lapgs_wgpu.viewer.frame import Frame, FrameRequest
+from lapgs_wgpu.viewer.present import Placed, Presenter
+from lapgs_wgpu.viewer.view_state import ViewState
 
 SETTLED = 0.2  # seconds without a change after which the full resolution is drawn
 MARGIN = (0.11, 0.11, 0.12)  # color around an image that does not fill the canvas

@@ -20,12 +20,11 @@ from lapgs_wgpu.gpu.shader import Binding, Defines, browser_source, compose, ref
 from lapgs_wgpu.motion.fields.config import MIN_SCALE
 from lapgs_wgpu.splat.drawing import sh_defines
 from lapgs_wgpu.splat.raster_config import gpu_config
-
-from .clock import LOOPS, SPEEDS
-from .controls import FLY_REACH, LOOK, ORBIT, ZOOM
-from .key_bindings import FLY, KEYS, MOUSE, KeyBinding
-from .render_modes import BACKGROUNDS
-from .viewport import SETTLED, SMALLEST_SCALE, TARGET_SECONDS
+from lapgs_wgpu.viewer.clock import LOOPS, SPEEDS
+from lapgs_wgpu.viewer.controls import FLY_REACH, LOOK, ORBIT, ZOOM
+from lapgs_wgpu.viewer.key_bindings import FLY, KEYS, MOUSE, KeyBinding
+from lapgs_wgpu.viewer.render_modes import BACKGROUNDS
+from lapgs_wgpu.viewer.viewport import SETTLED, SMALLEST_SCALE, TARGET_SECONDS
 
 # The player's modules, each after those that it imports.
 MODULES = (

@@ -11,11 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from lapgs_wgpu.errors import InputError, pip_install
-
-from .app import App, window_title
-from .gui_library import check_imgui
-from .initial_state import InitialState
-from .loaded_scene import LoadedScene
+from lapgs_wgpu.viewer.app import App, window_title
+from lapgs_wgpu.viewer.gui_library import check_imgui
+from lapgs_wgpu.viewer.initial_state import InitialState
+from lapgs_wgpu.viewer.loaded_scene import LoadedScene
 
 _OTHERWISE = "take --backend http to look in a browser (also from another machine), or --screenshot FILE.png"
 

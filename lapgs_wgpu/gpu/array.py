@@ -9,10 +9,10 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from .buffer import Buffer
-from .device import Device
-from .native import READ, mapping
-from .wgpu_errors import TranslatedErrors
+from lapgs_wgpu.gpu.buffer import Buffer
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.native import READ, mapping
+from lapgs_wgpu.gpu.wgpu_errors import TranslatedErrors
 
 _ITEM_BYTES = {"float32": 4, "uint32": 4, "int16": 2, "uint8": 1, "uint64": 8}
 

@@ -11,12 +11,12 @@ import numpy as np
 import wgpu
 from numpy.typing import NDArray
 
-from ..errors import DeviceMemoryError
-from .bind_group import BindGroup
-from .device import Device
-from .native import WRITE, Encoder, TextureCopies, mapping
-from .shader import TABLE_TYPES, TABLE_WIDTH
-from .wgpu_errors import TranslatedErrors
+from lapgs_wgpu.errors import DeviceMemoryError
+from lapgs_wgpu.gpu.bind_group import BindGroup
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.native import WRITE, Encoder, TextureCopies, mapping
+from lapgs_wgpu.gpu.shader import TABLE_TYPES, TABLE_WIDTH
+from lapgs_wgpu.gpu.wgpu_errors import TranslatedErrors
 
 _STORAGE = wgpu.BufferUsage.STORAGE | wgpu.BufferUsage.UNIFORM | wgpu.BufferUsage.COPY_SRC | wgpu.BufferUsage.COPY_DST
 _SMALL = 1 << 16  # bytes that go through the queue where buffers are not mapped

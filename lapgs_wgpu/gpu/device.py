@@ -9,8 +9,8 @@ import sys
 from dataclasses import dataclass
 from typing import Any
 
-from ..errors import NoAdapterError
-from .cffi_patch import parse_named_types_only
+from lapgs_wgpu.errors import NoAdapterError
+from lapgs_wgpu.gpu.cffi_patch import parse_named_types_only
 
 # Optional features; each has a fallback.
 _WANTED_FEATURES = ("subgroup", "mappable-primary-buffers", "timestamp-query")

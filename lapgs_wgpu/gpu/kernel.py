@@ -9,15 +9,15 @@ from typing import Any
 
 import wgpu
 
-from ..errors import DeviceMemoryError
-from .array import DeviceArray
-from .bind_group import BindGroup
-from .buffer import Buffer
-from .device import Device
-from .native import Encoder, raising
-from .profile import Profile
-from .shader import Binding, Defines, ShaderError, compose, enabled, pack, reflect
-from .wgpu_errors import TranslatedErrors, is_lost
+from lapgs_wgpu.errors import DeviceMemoryError
+from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.bind_group import BindGroup
+from lapgs_wgpu.gpu.buffer import Buffer
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.native import Encoder, raising
+from lapgs_wgpu.gpu.profile import Profile
+from lapgs_wgpu.gpu.shader import Binding, Defines, ShaderError, compose, enabled, pack, reflect
+from lapgs_wgpu.gpu.wgpu_errors import TranslatedErrors, is_lost
 
 _LAYOUT_TYPE = {"uniform": "uniform", "read": "read-only-storage", "read_write": "storage"}
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from .array import DeviceArray
-from .device import Device
-from .kernel import Commands, Kernel
-from .pool import BufferPool
+from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.kernel import Commands, Kernel
+from lapgs_wgpu.gpu.pool import BufferPool
 
 _TILE = 64  # matmul.wgsl
 _SPLIT = 1 << 11  # inner elements of a partial sum where the inner dimension is split

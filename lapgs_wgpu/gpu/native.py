@@ -20,8 +20,8 @@ from wgpu.backends.wgpu_native import ffi, lib
 from wgpu.backends.wgpu_native._api import error_handler
 from wgpu.backends.wgpu_native._helpers import ERROR_TYPES
 
-from ..errors import DeviceLostError
-from .device import Device
+from lapgs_wgpu.errors import DeviceLostError
+from lapgs_wgpu.gpu.device import Device
 
 READ, WRITE = lib.WGPUMapMode_Read, lib.WGPUMapMode_Write
 # The longest wait for a device that is polled, seconds: macOS kills work long before, and the library tells nobody.

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .array import DeviceArray
-from .buffer import Buffer
-from .device import Device
+from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.buffer import Buffer
+from lapgs_wgpu.gpu.device import Device
 
 
 class BufferPool:

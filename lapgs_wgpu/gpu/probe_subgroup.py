@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import functools
 
-from .array import DeviceArray
-from .device import Device
-from .kernel import Commands, Kernel
+from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.kernel import Commands, Kernel
 
 _LANES = 64  # of a workgroup, as many as the raster passes have at most
 

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import wgpu
 
-from .array import DeviceArray
-from .device import Device
+from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.device import Device
 
 
 class Profile:

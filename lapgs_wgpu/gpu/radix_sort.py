@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import struct
 
-from .array import DeviceArray
-from .device import Device
-from .kernel import Commands, Kernel
-from .pool import BufferPool
-from .scan import Scan
+from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.kernel import Commands, Kernel
+from lapgs_wgpu.gpu.pool import BufferPool
+from lapgs_wgpu.gpu.scan import Scan
 
 _SORT_BLOCK_ITEMS = 2048  # common/sort.wgsl: 128 lanes x 16 elements
 FEW_OWNERS = 32  # of runs: adding up their counters in each lane takes less time than the dispatches of a scan

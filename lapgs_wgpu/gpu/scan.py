@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from .array import DeviceArray
-from .device import Device
-from .kernel import Commands, Kernel
-from .pool import BufferPool
+from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.kernel import Commands, Kernel
+from lapgs_wgpu.gpu.pool import BufferPool
 
 _BLOCK_ITEMS = 2048  # common/block.wgsl
 

@@ -13,8 +13,8 @@ from typing import Any
 
 import wgpu
 
-from ..errors import DeviceError, DeviceLostError, DeviceMemoryError
-from .device import Device
+from lapgs_wgpu.errors import DeviceError, DeviceLostError, DeviceMemoryError
+from lapgs_wgpu.gpu.device import Device
 
 _NO_MEMORY = "Not enough memory left"
 _LOST = "device is lost"

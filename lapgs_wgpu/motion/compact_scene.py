@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
-from ..splat.constants import CONSTANTS
-from .fields.config import MIN_SCALE, FieldConfig, static_grid, temporal_grids
-from .fields.parameter_shapes import parameter_shapes
-from .quantize import dequantize, quantize
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.motion.fields.config import MIN_SCALE, FieldConfig, static_grid, temporal_grids
+from lapgs_wgpu.motion.fields.parameter_shapes import parameter_shapes
+from lapgs_wgpu.motion.quantize import dequantize, quantize
+from lapgs_wgpu.splat.constants import CONSTANTS
 
 Floats = NDArray[np.float32]
 Arrays = dict[str, Floats]

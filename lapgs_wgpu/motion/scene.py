@@ -11,24 +11,24 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from ..errors import InputError
-from ..gpu.device import Device, open_device
-from ..io.checkpoint import write_checkpoint
-from ..io.ply import GaussianSnapshot
-from ..splat.camera import Camera
-from ..splat.constants import CONSTANTS
-from ..splat.gaussians import Gaussians
-from ..splat.rasterize import Rendering, rasterize
-from ..splat.rotation import multiply
-from .fields.config import MIN_SCALE, FieldConfig
-from .fields.deformation import Deformation, Moments, Nearby
-from .fields.grid_field import GridField
-from .fields.hexplane_field import HexPlaneField
-from .fields.laplacian import LaplacianMotion
-from .fields.mlp_field import MlpField
-from .fields.own_field import OwnField
-from .scene_file import SceneFile, read_scene, row_shapes, scene_header
-from .timing import EVEN, Timing
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.gpu.device import Device, open_device
+from lapgs_wgpu.io.checkpoint import write_checkpoint
+from lapgs_wgpu.io.ply import GaussianSnapshot
+from lapgs_wgpu.motion.fields.config import MIN_SCALE, FieldConfig
+from lapgs_wgpu.motion.fields.deformation import Deformation, Moments, Nearby
+from lapgs_wgpu.motion.fields.grid_field import GridField
+from lapgs_wgpu.motion.fields.hexplane_field import HexPlaneField
+from lapgs_wgpu.motion.fields.laplacian import LaplacianMotion
+from lapgs_wgpu.motion.fields.mlp_field import MlpField
+from lapgs_wgpu.motion.fields.own_field import OwnField
+from lapgs_wgpu.motion.scene_file import SceneFile, read_scene, row_shapes, scene_header
+from lapgs_wgpu.motion.timing import EVEN, Timing
+from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.splat.constants import CONSTANTS
+from lapgs_wgpu.splat.gaussians import Gaussians
+from lapgs_wgpu.splat.rasterize import Rendering, rasterize
+from lapgs_wgpu.splat.rotation import multiply
 
 Field = GridField | MlpField | HexPlaneField | OwnField
 

@@ -12,15 +12,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
-from ..io.checkpoint import read_checkpoint
-from ..io.dataclass_table import build_dataclass
-from ..io.lapgs_file import is_lapgs, pack_lapgs, read_lapgs
-from ..io.safe_json_toml import parse_json
-from .compact_scene import compress, expand
-from .fields.config import FieldConfig
-from .fields.parameter_shapes import parameter_shapes
-from .timing import EVEN, Timing, timing_of_text
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.io.checkpoint import read_checkpoint
+from lapgs_wgpu.io.dataclass_table import build_dataclass
+from lapgs_wgpu.io.lapgs_file import is_lapgs, pack_lapgs, read_lapgs
+from lapgs_wgpu.io.safe_json_toml import parse_json
+from lapgs_wgpu.motion.compact_scene import compress, expand
+from lapgs_wgpu.motion.fields.config import FieldConfig
+from lapgs_wgpu.motion.fields.parameter_shapes import parameter_shapes
+from lapgs_wgpu.motion.timing import EVEN, Timing, timing_of_text
 
 _MAX_DEGREE = 3
 _SHAPES = {

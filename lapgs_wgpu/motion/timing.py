@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..io.safe_json_toml import parse_json
+from lapgs_wgpu.io.safe_json_toml import parse_json
 
 _MOST = 1_000_000  # times
 MOST_TIMES = 20_000  # that the header of a checkpoint has room for

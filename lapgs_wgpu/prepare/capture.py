@@ -15,15 +15,22 @@ from lapgs_wgpu.data.images import check_image
 from lapgs_wgpu.data.readers.colmap import IMAGES, SPARSE
 from lapgs_wgpu.data.timestamps import write_times
 from lapgs_wgpu.errors import InputError
-
-from .capture_folder import appearing
-from .diagnosis import Diagnosis, diagnose
-from .extract import LONGER_SIDE, Extraction, common_end, common_moments, extract, images_per_second, shortened
-from .film import Film
-from .masks import MASKS, check_folder, read_masks, write_masks
-from .moving import World, area, remove_matches, rim, solve_world
-from .reconstruct import Reconstruction, all_pairs, import_pycolmap, merged, neighbouring_pairs
-from .report import REPORT, write_report
+from lapgs_wgpu.prepare.capture_folder import appearing
+from lapgs_wgpu.prepare.diagnosis import Diagnosis, diagnose
+from lapgs_wgpu.prepare.extract import (
+    LONGER_SIDE,
+    Extraction,
+    common_end,
+    common_moments,
+    extract,
+    images_per_second,
+    shortened,
+)
+from lapgs_wgpu.prepare.film import Film
+from lapgs_wgpu.prepare.masks import MASKS, check_folder, read_masks, write_masks
+from lapgs_wgpu.prepare.moving import World, area, remove_matches, rim, solve_world
+from lapgs_wgpu.prepare.reconstruct import Reconstruction, all_pairs, import_pycolmap, merged, neighbouring_pairs
+from lapgs_wgpu.prepare.report import REPORT, write_report
 
 MOMENTS = 8  # at which still cameras are compared
 # Square pixels: a lens with more freedom bends until things that move seem to stand still.

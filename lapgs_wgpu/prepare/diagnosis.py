@@ -15,13 +15,12 @@ from lapgs_wgpu.data.cloud import points_in_view
 from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.data.images import check_image, decode
 from lapgs_wgpu.data.readers.colmap import IMAGES
+from lapgs_wgpu.prepare.geometry_measures import gaps, motion, parallax
+from lapgs_wgpu.prepare.image_measures import blur_measure, exposure
+from lapgs_wgpu.prepare.masks import MASKS, Mask
+from lapgs_wgpu.prepare.measure import Floats, Look, Measure, distinct_cameras, gray
 from lapgs_wgpu.progress import Progress
 from lapgs_wgpu.splat.camera import Camera
-
-from .geometry_measures import gaps, motion, parallax
-from .image_measures import blur_measure, exposure
-from .masks import MASKS, Mask
-from .measure import Floats, Look, Measure, distinct_cameras, gray
 
 SIZE = 320  # longer side of the images that are looked at, pixels
 MOST_VIEWS = 96  # of a capture that are looked at, evenly chosen over the clip

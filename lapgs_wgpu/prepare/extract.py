@@ -12,9 +12,8 @@ from PIL import Image
 
 from lapgs_wgpu.data.thumbnails import blurred, repeats, sharpness
 from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.prepare.film import Film, FilmFrame
 from lapgs_wgpu.progress import Progress
-
-from .film import Film, FilmFrame
 
 FRAMES_PER_SECOND = 10.0  # of one moving camera: poses change slowly
 STILL_FRAMES_PER_SECOND = 30.0  # of cameras on tripods, which need one pose for all their frames

@@ -14,8 +14,7 @@ from lapgs_wgpu.data.images import Pixels, Size, shrunk_size, size_text
 from lapgs_wgpu.data.thumbnails import THUMBNAIL
 from lapgs_wgpu.data.video_frames import EXACT_COLORS, LARGEST_FRAME, import_av, pixel_aspect
 from lapgs_wgpu.errors import InputError
-
-from .hdr import Transfer, to_sdr, transfer_of
+from lapgs_wgpu.prepare.hdr import Transfer, to_sdr, transfer_of
 
 _FAST_BILINEAR = 0x1  # of swscale: exact enough for a thumbnail
 _ATTACHED_PICTURE = 0x400  # libavformat's flag of a cover image

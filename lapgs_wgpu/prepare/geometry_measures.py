@@ -10,10 +10,9 @@ from lapgs_wgpu.data.cloud import in_view
 from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.data.validation import GAP, GAP_FACTOR
 from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.prepare.masks import Mask
+from lapgs_wgpu.prepare.measure import Floats, Look, Measure
 from lapgs_wgpu.splat.camera import Camera
-
-from .masks import Mask
-from .measure import Floats, Look, Measure
 
 MOST_CAMERAS = 48  # between which angles are measured
 PARALLAX = 5.0  # degrees; half a pixel of a phone's image is then 1 % of the depth

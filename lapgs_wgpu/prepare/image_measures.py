@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.data.cloud import in_view
+from lapgs_wgpu.prepare.measure import Floats, Look, Measure, distinct_cameras, gray
 from lapgs_wgpu.splat.camera import Camera
-
-from .measure import Floats, Look, Measure, distinct_cameras, gray
 
 BLUR = 0.45  # Crete et al.'s measure, of images of 320 pixels
 STOPS = 0.3  # of exposure, between the darkest and the brightest images

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from lapgs_wgpu.data import View
 from lapgs_wgpu.data.images import Pixels
+from lapgs_wgpu.prepare.masks import Mask
 from lapgs_wgpu.splat.camera import Camera
-
-from .masks import Mask
 
 Floats = NDArray[np.float64]
 

@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 
 from lapgs_wgpu.data.images import Size
 from lapgs_wgpu.errors import InputError
-
-from .masks import Mask
-from .measure import Floats
-from .reconstruct import Reconstruction, import_pycolmap
+from lapgs_wgpu.prepare.masks import Mask
+from lapgs_wgpu.prepare.measure import Floats
+from lapgs_wgpu.prepare.reconstruct import Reconstruction, import_pycolmap
 
 Ints = NDArray[np.int64]
 

@@ -17,10 +17,9 @@ from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.data.images import Pixels
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.atomic import atomic_write
-
-from .diagnosis import Diagnosis
-from .masks import Mask
-from .measure import Look, Measure
+from lapgs_wgpu.prepare.diagnosis import Diagnosis
+from lapgs_wgpu.prepare.masks import Mask
+from lapgs_wgpu.prepare.measure import Look, Measure
 
 REPORT = "report.html"
 THUMBNAILS = 24  # evenly chosen from the views that were looked at

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from ..gpu.shader import shader_text
+from lapgs_wgpu.gpu.shader import shader_text
 
 CONSTANTS = {
     name: float(value)

@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..gpu.array import DeviceArray
-from .camera import Camera
-from .drawing_plan import Plan
-from .gaussians import Gaussians
+from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.splat.drawing_plan import Plan
+from lapgs_wgpu.splat.gaussians import Gaussians
 
 
 class TileLists(NamedTuple):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from .constants import CONSTANTS
+from lapgs_wgpu.splat.constants import CONSTANTS
 
 Floats = NDArray[np.floating]
 

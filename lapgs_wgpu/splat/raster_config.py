@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from ..gpu.device import SOFTWARE_LOOP_TURNS, Device
-from ..gpu.probe_subgroup import subgroup_size
+from lapgs_wgpu.gpu.device import SOFTWARE_LOOP_TURNS, Device
+from lapgs_wgpu.gpu.probe_subgroup import subgroup_size
 
 # Per band, on devices that limit loops: loops over the tiles of a splat take one iteration per tile, and a splat may
 # cover all. Below the `max_loop_turns` of every device, and below the workgroups of one dimension, which a counted

@@ -10,15 +10,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..gpu.array import DeviceArray, read_all
-from ..gpu.device import Device, open_device
-from ..gpu.pool import BufferPool
-from .camera import Camera
-from .constants import CONSTANTS
-from .drawing import Drawing
-from .gaussians import Gaussians
-from .rasterizer import Rasterizer
-from .splat_layout import COLOR, MEAN, OPACITY, RADIUS
+from lapgs_wgpu.gpu.array import DeviceArray, read_all
+from lapgs_wgpu.gpu.device import Device, open_device
+from lapgs_wgpu.gpu.pool import BufferPool
+from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.splat.constants import CONSTANTS
+from lapgs_wgpu.splat.drawing import Drawing
+from lapgs_wgpu.splat.gaussians import Gaussians
+from lapgs_wgpu.splat.rasterizer import Rasterizer
+from lapgs_wgpu.splat.splat_layout import COLOR, MEAN, OPACITY, RADIUS
 
 
 class Rendering(NamedTuple):

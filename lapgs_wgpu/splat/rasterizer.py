@@ -12,20 +12,20 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import DeviceMemoryError
-from ..gpu.array import DeviceArray, read_all
-from ..gpu.device import Device
-from ..gpu.kernel import Commands, Kernel
-from ..gpu.pool import BufferPool
-from ..gpu.profile import Profile
-from ..gpu.radix_sort import RadixSort
-from ..gpu.scan import Scan
-from .camera import Camera
-from .drawing import Drawing, GaussianGradients, TileLists
-from .drawing_plan import Plan, Plans, roomy
-from .gaussians import Gaussians
-from .raster_config import MAX_BAND_TILES, RasterConfig, raster_config
-from .splat_layout import SPLAT_FLOATS
+from lapgs_wgpu.errors import DeviceMemoryError
+from lapgs_wgpu.gpu.array import DeviceArray, read_all
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.kernel import Commands, Kernel
+from lapgs_wgpu.gpu.pool import BufferPool
+from lapgs_wgpu.gpu.profile import Profile
+from lapgs_wgpu.gpu.radix_sort import RadixSort
+from lapgs_wgpu.gpu.scan import Scan
+from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.splat.drawing import Drawing, GaussianGradients, TileLists
+from lapgs_wgpu.splat.drawing_plan import Plan, Plans, roomy
+from lapgs_wgpu.splat.gaussians import Gaussians
+from lapgs_wgpu.splat.raster_config import MAX_BAND_TILES, RasterConfig, raster_config
+from lapgs_wgpu.splat.splat_layout import SPLAT_FLOATS
 
 _RECORD_FLOATS = 8  # rasterize_bwd.wgsl
 _DEPTH_BITS = 32

@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from lapgs_wgpu.splat.camera import Camera
-
-from .camera_descent import CameraDescent, ScenePoints, image_motion, whitening
-from .config import CamerasConfig
-from .row_adam import RowAdam, restore_rows
+from lapgs_wgpu.train.camera_descent import CameraDescent, ScenePoints, image_motion, whitening
+from lapgs_wgpu.train.config import CamerasConfig
+from lapgs_wgpu.train.row_adam import RowAdam, restore_rows
 
 ZOOM_DECAY = 0.99  # of Adam's second moment
 Array = NDArray[np.float64]

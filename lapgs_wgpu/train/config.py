@@ -13,8 +13,7 @@ from typing import Literal, NamedTuple
 
 from lapgs_wgpu.io.dataclass_table import Options, option
 from lapgs_wgpu.motion.fields.config import DynamicsMode, FieldConfig
-
-from .learning_rate import Rate, RatesConfig
+from lapgs_wgpu.train.learning_rate import Rate, RatesConfig
 
 Background = Literal["black", "white", "random"]
 BACKGROUND_LEVELS = {"black": 0.0, "white": 1.0, "random": 0.0}  # under views that are measured

@@ -14,12 +14,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from ..gpu.array import DeviceArray
-from ..gpu.device import Device
-from ..gpu.kernel import Commands, Kernel
-from ..gpu.pool import BufferPool
-from .learning_rate import Rate
-from .row_adam import RowAdam, restore_rows
+from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.kernel import Commands, Kernel
+from lapgs_wgpu.gpu.pool import BufferPool
+from lapgs_wgpu.train.learning_rate import Rate
+from lapgs_wgpu.train.row_adam import RowAdam, restore_rows
 
 SQUARE_DECAY = 0.999  # Adam's
 

@@ -10,18 +10,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..gpu.array import DeviceArray, read_all
-from ..gpu.device import Device
-from ..gpu.kernel import Commands
-from ..splat.camera import Camera
-from ..splat.drawing import camera_gradient
-from ..splat.gaussians import Gaussians
-from ..splat.rasterize import gradient_tensors, radii_and_centres, rasterizer_of, upload_gaussians
-from .config import LossWeights
-from .exposure import ExposurePasses
-from .image_loss import ImageLoss
-from .image_metrics import psnr_of
-from .loss_terms import TorchLoss, WgslLoss, torch_loss
+from lapgs_wgpu.gpu.array import DeviceArray, read_all
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.kernel import Commands
+from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.splat.drawing import camera_gradient
+from lapgs_wgpu.splat.gaussians import Gaussians
+from lapgs_wgpu.splat.rasterize import gradient_tensors, radii_and_centres, rasterizer_of, upload_gaussians
+from lapgs_wgpu.train.config import LossWeights
+from lapgs_wgpu.train.exposure import ExposurePasses
+from lapgs_wgpu.train.image_loss import ImageLoss
+from lapgs_wgpu.train.image_metrics import psnr_of
+from lapgs_wgpu.train.loss_terms import TorchLoss, WgslLoss, torch_loss
 
 
 class RenderLoss(NamedTuple):

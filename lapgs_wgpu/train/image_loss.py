@@ -10,11 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..gpu.array import DeviceArray
-from ..gpu.device import Device
-from ..gpu.kernel import Commands, Kernel
-from ..gpu.pool import BufferPool
-from .config import LossWeights
+from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.kernel import Commands, Kernel
+from lapgs_wgpu.gpu.pool import BufferPool
+from lapgs_wgpu.train.config import LossWeights
 
 TERMS = 5  # in the buffer that `record` leaves
 PYRAMID_BANDS = 3  # band-pass levels; below them lies the residual

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from ..splat.constants import CONSTANTS
+from lapgs_wgpu.splat.constants import CONSTANTS
 
 SSIM_WINDOW = 11
 SSIM_SIGMA = 1.5  # pixels

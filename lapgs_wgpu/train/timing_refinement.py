@@ -19,8 +19,7 @@ from torch import Tensor
 from lapgs_wgpu.data.views import View, composite
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.motion.timing import EVEN, Timing
-
-from .distributed import Ranks
+from lapgs_wgpu.train.distributed import Ranks
 
 # Of gaps between images (the usual one), before and after: at which pictures are compared, and the largest step.
 REACH = 0.5

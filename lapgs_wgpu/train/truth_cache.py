@@ -8,8 +8,8 @@ from collections.abc import Callable, Hashable
 import numpy as np
 from numpy.typing import NDArray
 
-from ..gpu.array import DeviceArray
-from ..gpu.device import Device
+from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.device import Device
 
 LEFT_OUT = (1, 0, 0, 0)  # RGBA of a pixel that the losses leave out
 

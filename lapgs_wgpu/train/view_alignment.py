@@ -14,13 +14,12 @@ from torch import Tensor
 
 from lapgs_wgpu.data.views import View
 from lapgs_wgpu.motion.scene import Scene4D
-
-from .camera_descent import CameraDescent, image_motion, scene_points, whitening
-from .camera_refinement import changed_camera
-from .config import LossWeights
-from .fused_loss import render_loss
-from .learning_rate import Rate
-from .truth_cache import upload_rgba, without
+from lapgs_wgpu.train.camera_descent import CameraDescent, image_motion, scene_points, whitening
+from lapgs_wgpu.train.camera_refinement import changed_camera
+from lapgs_wgpu.train.config import LossWeights
+from lapgs_wgpu.train.fused_loss import render_loss
+from lapgs_wgpu.train.learning_rate import Rate
+from lapgs_wgpu.train.truth_cache import upload_rgba, without
 
 STEPS = 24
 RATE = Rate(4e-3, 2e-4, STEPS)  # radians of image motion: 1.5 degrees together

@@ -14,9 +14,8 @@ from typing import Any
 
 import imageio.v3 as iio
 import numpy as np
+from helpers.waiting import wait_for
 from numpy.typing import NDArray
-
-from .waiting import wait_for
 
 CHROMIUM = next((path for path in map(shutil.which, ("chromium", "chromium-browser", "google-chrome")) if path), None)
 _FLAGS = (

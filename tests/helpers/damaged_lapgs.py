@@ -7,9 +7,8 @@ import struct
 import zlib
 from collections.abc import Sequence
 
+from helpers.hostile import ByteEdits, TreeEdits, byte_edits, edit_bytes, edit_tree, json_text, tree_edits
 from hypothesis import strategies as st
-
-from .hostile import ByteEdits, TreeEdits, byte_edits, edit_bytes, edit_tree, json_text, tree_edits
 
 CompactDamage = tuple[int, str, ByteEdits, TreeEdits]
 _TIMING = '{"times": [0.0, 0.5, 1.0], "moments": [0.1, 0.5, 0.9]}'

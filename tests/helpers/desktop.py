@@ -15,9 +15,8 @@ from types import TracebackType
 
 import numpy as np
 import pytest
+from helpers.waiting import PATIENCE
 from numpy.typing import NDArray
-
-from .waiting import PATIENCE
 
 SIZE = (1024, 768)
 

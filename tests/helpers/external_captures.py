@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from helpers.captures import HEIGHT, NEAR, WIDTH, cameras, film, moved, quaternion, write_colmap
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.splat.camera import Camera
-
-from .captures import HEIGHT, NEAR, WIDTH, cameras, film, moved, quaternion, write_colmap
 
 COUNT = 6
 GL = np.diag([1.0, -1.0, -1.0, 1.0])

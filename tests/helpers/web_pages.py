@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 import torch
+from helpers.browser import Browser
+from helpers.waiting import PATIENCE, wait_for
 from numpy.typing import NDArray
 
 from lapgs_wgpu.gpu.device import Device
@@ -20,9 +22,6 @@ from lapgs_wgpu.viewer.export import export_compact
 from lapgs_wgpu.viewer.frame import FrameRenderer, FrameRequest
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene, load_scene
 from lapgs_wgpu.viewer.render_modes import BACKGROUNDS
-
-from .browser import Browser
-from .waiting import PATIENCE, wait_for
 
 SIZE = (320, 240)
 FRAMES = 31

@@ -19,13 +19,19 @@ from lapgs_wgpu.data.frames import Capture, Frame, Reader
 from lapgs_wgpu.data.images import SUFFIXES, Size, check_image
 from lapgs_wgpu.data.json_fields import absent
 from lapgs_wgpu.data.poses import check_rotation
+from lapgs_wgpu.data.readers.colmap_model import (
+    ColmapCamera,
+    ColmapImage,
+    ColmapModel,
+    count_images,
+    is_model,
+    read_model,
+)
 from lapgs_wgpu.data.timestamps import ImageName, natural_key
 from lapgs_wgpu.data.undistort import Lens
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.listing import is_desktop_file
 from lapgs_wgpu.splat.camera import rotation_matrix
-
-from .colmap_model import ColmapCamera, ColmapImage, ColmapModel, count_images, is_model, read_model
 
 IMAGES, SPARSE = "images", "sparse"
 MEGASAM_PIXELS = 384 * 512

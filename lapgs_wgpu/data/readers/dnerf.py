@@ -23,13 +23,12 @@ from lapgs_wgpu.data.images import Size, check_image
 from lapgs_wgpu.data.json_fields import image_path, number, read_json, required
 from lapgs_wgpu.data.objects import read_objects
 from lapgs_wgpu.data.poses import opengl_pose
+from lapgs_wgpu.data.readers.transforms import frame_entries, intrinsics
 from lapgs_wgpu.data.timestamps import ImageName
 from lapgs_wgpu.data.undistort import Lens
 from lapgs_wgpu.data.validation import check_frames
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import intrinsics_of_fov
-
-from .transforms import frame_entries, intrinsics
 
 NEEDED = "which a D-NeRF scene needs"
 CLOUDS = ("fused.ply", "points3d.ply", "points3D.ply")

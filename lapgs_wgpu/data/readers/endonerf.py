@@ -21,12 +21,11 @@ from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.data.frames import Capture, Frame, Reader
 from lapgs_wgpu.data.images import ERRORS, SUFFIXES, check_image, decode, size_text
 from lapgs_wgpu.data.poses import world_to_camera
+from lapgs_wgpu.data.readers.poses_bounds import POSES, read_rows
 from lapgs_wgpu.data.timestamps import ImageName, natural_key
 from lapgs_wgpu.data.undistort import Lens
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.listing import listed
-
-from .poses_bounds import POSES, read_rows
 
 IMAGES, DEPTH = "images", "depth"
 EVERY, FIRST = 8, 1  # images that are tested

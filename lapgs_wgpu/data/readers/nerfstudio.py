@@ -19,11 +19,10 @@ from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
 from lapgs_wgpu.data.images import check_image
 from lapgs_wgpu.data.json_fields import check_inside, finite, image_path, kind, read_json, required
 from lapgs_wgpu.data.poses import opengl_pose
+from lapgs_wgpu.data.readers.transforms import frame_entries, intrinsics
 from lapgs_wgpu.data.timestamps import ImageName
 from lapgs_wgpu.data.undistort import Lens
 from lapgs_wgpu.errors import InputError
-
-from .transforms import frame_entries, intrinsics
 
 NEEDED = "which a capture in nerfstudio's layout needs"
 PINHOLE = ("w", "h", "fl_x", "fl_y", "cx", "cy")  # fields of a camera without distortion

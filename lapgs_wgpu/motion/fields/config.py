@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from ...io.dataclass_table import Options, option
-from ...splat.constants import CONSTANTS
-from .hash_grid_config import TIME, GridShape, HashConfig
+from lapgs_wgpu.io.dataclass_table import Options, option
+from lapgs_wgpu.motion.fields.hash_grid_config import TIME, GridShape, HashConfig
+from lapgs_wgpu.splat.constants import CONSTANTS
 
 Method = Literal["static", "mlp", "hexplane", "grid4d", "laplacian"]
 FieldKind = Literal[Method, "own"]

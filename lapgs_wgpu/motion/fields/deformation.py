@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from ...splat.rotation import rotate
+from lapgs_wgpu.splat.rotation import rotate
 
 
 class Nearby(NamedTuple):

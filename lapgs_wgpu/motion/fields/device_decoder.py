@@ -12,13 +12,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...gpu.array import DeviceArray, read_all
-from ...gpu.device import Device
-from ...gpu.kernel import Commands, Kernel
-from ...gpu.pool import BufferPool
-from ...splat.rasterize import upload
-from ..passes.decoder_passes import DecoderPasses, DecoderShape
-from .hash_encoder import Encoded, HashEncoder, Place
+from lapgs_wgpu.gpu.array import DeviceArray, read_all
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.kernel import Commands, Kernel
+from lapgs_wgpu.gpu.pool import BufferPool
+from lapgs_wgpu.motion.fields.hash_encoder import Encoded, HashEncoder, Place
+from lapgs_wgpu.motion.passes.decoder_passes import DecoderPasses, DecoderShape
+from lapgs_wgpu.splat.rasterize import upload
 
 
 class Decoded(NamedTuple):

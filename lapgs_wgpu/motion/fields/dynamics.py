@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .config import DynamicsMode
+from lapgs_wgpu.motion.fields.config import DynamicsMode
 
 # Tolerance: distances that are equal except for rounding are no outliers.
 ROUNDING = 1e-6

@@ -8,17 +8,17 @@ import torch
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
-from ...gpu.device import Device
-from ..passes.decoder_passes import decoder_shape
-from .config import GEOMETRY, TEMPORAL_AXES, FieldConfig
-from .deformation import Deformation, Moments, Nearby
-from .device_decoder import Decoder
-from .gate import gated
-from .hash_encoder import HashEncoder, HashGrid
-from .laplacian import LaplacianMotion, TimeMotion
-from .layers import linear, product, zero_head
-from .parameter_shapes import parameter_shapes
-from .torch_decoder import KEPT, DecoderWeights, decode
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.motion.fields.config import GEOMETRY, TEMPORAL_AXES, FieldConfig
+from lapgs_wgpu.motion.fields.deformation import Deformation, Moments, Nearby
+from lapgs_wgpu.motion.fields.device_decoder import Decoder
+from lapgs_wgpu.motion.fields.gate import gated
+from lapgs_wgpu.motion.fields.hash_encoder import HashEncoder, HashGrid
+from lapgs_wgpu.motion.fields.laplacian import LaplacianMotion, TimeMotion
+from lapgs_wgpu.motion.fields.layers import linear, product, zero_head
+from lapgs_wgpu.motion.fields.parameter_shapes import parameter_shapes
+from lapgs_wgpu.motion.fields.torch_decoder import KEPT, DecoderWeights, decode
+from lapgs_wgpu.motion.passes.decoder_passes import decoder_shape
 
 _BLOCK = 1 << 13  # Gaussians per block decoded by hidden layers
 

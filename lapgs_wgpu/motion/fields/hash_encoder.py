@@ -11,12 +11,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from ...gpu.array import DeviceArray, read_all
-from ...gpu.device import Device
-from ...gpu.kernel import Commands
-from ...gpu.pool import BufferPool
-from ..passes.hash_encoder_passes import HashEncoderPasses, PointSet
-from .hash_grid_config import GridShape, HashConfig
+from lapgs_wgpu.gpu.array import DeviceArray, read_all
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.kernel import Commands
+from lapgs_wgpu.gpu.pool import BufferPool
+from lapgs_wgpu.motion.fields.hash_grid_config import GridShape, HashConfig
+from lapgs_wgpu.motion.passes.hash_encoder_passes import HashEncoderPasses, PointSet
 
 Place = tuple[Tensor, float]  # points (N, 3), world units, and a time in [0, 1]
 _NUMPY = {torch.float32: "float32", torch.bfloat16: "int16"}  # the dtype of arrays, which have no bfloat16

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from ...io.dataclass_table import Options, option
+from lapgs_wgpu.io.dataclass_table import Options, option
 
 _SLICE_CELLS = 1 << 14  # a level with more cells per plane is not sliced
 TIME = 3  # the axis number of time

@@ -7,8 +7,8 @@ import math
 import torch
 from torch import Tensor, nn
 
-from .layers import linear
-from .parameter_shapes import laplacian_motion, time_motion
+from lapgs_wgpu.motion.fields.layers import linear
+from lapgs_wgpu.motion.fields.parameter_shapes import laplacian_motion, time_motion
 
 VARIANCE_FLOOR = 1e-4
 VARIANCE_SPREAD = (

@@ -7,10 +7,10 @@ import math
 import torch
 from torch import Tensor, nn
 
-from .config import MLP_LAYERS, MLP_OUTPUTS, MLP_SKIP, PLACE_OCTAVES, TIME_OCTAVES, FieldConfig
-from .deformation import Deformation, Nearby
-from .layers import linear, zero_head
-from .parameter_shapes import parameter_shapes
+from lapgs_wgpu.motion.fields.config import MLP_LAYERS, MLP_OUTPUTS, MLP_SKIP, PLACE_OCTAVES, TIME_OCTAVES, FieldConfig
+from lapgs_wgpu.motion.fields.deformation import Deformation, Nearby
+from lapgs_wgpu.motion.fields.layers import linear, zero_head
+from lapgs_wgpu.motion.fields.parameter_shapes import parameter_shapes
 
 
 class MlpField(nn.Module):

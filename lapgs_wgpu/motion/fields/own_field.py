@@ -10,8 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ...errors import InputError
-from .deformation import Deformation, Nearby
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.motion.fields.deformation import Deformation, Nearby
 
 _ROWS = {
     "rotation": (4,), "orientation": (4,), "translation": (3,), "d_quats": (4,), "d_scales": (3,), "d_dc": (3,),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from .config import (
+from lapgs_wgpu.motion.fields.config import (
     GEOMETRY,
     HEXPLANE_HEADS,
     MLP_LAYERS,

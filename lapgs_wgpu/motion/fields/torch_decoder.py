@@ -17,7 +17,7 @@ from typing import Any, NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
-from .gate import opening
+from lapgs_wgpu.motion.fields.gate import opening
 
 FEWEST = 1 << 9  # Gaussians from which on there is more than one block
 LARGEST = 1 << 13  # Gaussians of a block

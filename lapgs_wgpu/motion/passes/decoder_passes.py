@@ -10,12 +10,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-from ...gpu.array import DeviceArray
-from ...gpu.device import Device
-from ...gpu.kernel import Commands, Kernel
-from ...gpu.matmul import Matmul, Matrix
-from ...gpu.pool import BufferPool
-from ..fields.config import GEOMETRY, FieldConfig, static_grid, temporal_grids
+from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.kernel import Commands, Kernel
+from lapgs_wgpu.gpu.matmul import Matmul, Matrix
+from lapgs_wgpu.gpu.pool import BufferPool
+from lapgs_wgpu.motion.fields.config import GEOMETRY, FieldConfig, static_grid, temporal_grids
 
 _BLOCK = 1 << 14  # Gaussians per block: its layers and features take 80 MB at a width of 256
 

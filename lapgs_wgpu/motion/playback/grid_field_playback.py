@@ -12,13 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...gpu.array import DeviceArray
-from ...gpu.device import Device
-from ...gpu.kernel import Commands, Kernel
-from ...gpu.pool import BufferPool
-from ...splat.gaussians import Gaussians
-from ..fields.config import GEOMETRY, FieldConfig, static_grid, temporal_grids
-from ..passes.hash_encoder_passes import HashEncoderPasses, PointSet
+from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.kernel import Commands, Kernel
+from lapgs_wgpu.gpu.pool import BufferPool
+from lapgs_wgpu.motion.fields.config import GEOMETRY, FieldConfig, static_grid, temporal_grids
+from lapgs_wgpu.motion.passes.hash_encoder_passes import HashEncoderPasses, PointSet
+from lapgs_wgpu.splat.gaussians import Gaussians
 
 Floats = NDArray[np.float32]
 

@@ -13,10 +13,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...gpu.array import read_all
-from ...splat.camera import rotation_matrix
-from ...splat.constants import CONSTANTS
-from .playback import Playback
+from lapgs_wgpu.gpu.array import read_all
+from lapgs_wgpu.motion.playback.playback import Playback
+from lapgs_wgpu.splat.camera import rotation_matrix
+from lapgs_wgpu.splat.constants import CONSTANTS
 
 Floats = NDArray[np.floating]
 

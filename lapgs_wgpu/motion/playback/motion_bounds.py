@@ -10,8 +10,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ...splat.camera import Camera
-from ...splat.constants import CONSTANTS
+from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.splat.constants import CONSTANTS
 
 Floats = NDArray[np.float32]
 

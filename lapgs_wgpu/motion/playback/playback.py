@@ -10,18 +10,18 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ...gpu.array import DeviceArray, read_all
-from ...gpu.device import Device
-from ...gpu.pool import BufferPool
-from ...io.ply import GaussianSnapshot
-from ...splat.camera import Camera
-from ...splat.gaussians import Gaussians
-from ..fields.config import MIN_SCALE, FieldConfig
-from ..scene_file import SceneFile
-from ..timing import Timing
-from .grid_field_playback import GridFieldPlayback, runs_on_device
-from .motion_bounds import MotionBounds
-from .seen_moments import SeenMoments
+from lapgs_wgpu.gpu.array import DeviceArray, read_all
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.pool import BufferPool
+from lapgs_wgpu.io.ply import GaussianSnapshot
+from lapgs_wgpu.motion.fields.config import MIN_SCALE, FieldConfig
+from lapgs_wgpu.motion.playback.grid_field_playback import GridFieldPlayback, runs_on_device
+from lapgs_wgpu.motion.playback.motion_bounds import MotionBounds
+from lapgs_wgpu.motion.playback.seen_moments import SeenMoments
+from lapgs_wgpu.motion.scene_file import SceneFile
+from lapgs_wgpu.motion.timing import Timing
+from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.splat.gaussians import Gaussians
 
 Floats = NDArray[np.float32]
 
@@ -74,8 +74,8 @@ def playback_of(file: SceneFile, device: Device) -> Playback:
     """
     if file.field_config.kind == "static" or runs_on_device(file.field_config, device):
         return DevicePlayback(file, device)
-    from ..scene import scene_of
-    from .torch_playback import TorchPlayback
+    from lapgs_wgpu.motion.playback.torch_playback import TorchPlayback
+    from lapgs_wgpu.motion.scene import scene_of
 
     return TorchPlayback(scene_of(file, device))
 

@@ -10,14 +10,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ...gpu.array import DeviceArray
-from ...gpu.pool import BufferPool
-from ...io.ply import GaussianSnapshot
-from ...splat.camera import Camera
-from ...splat.gaussians import Gaussians
-from ...splat.rasterize import upload_gaussians
-from ..scene import Scene4D
-from ..timing import Timing
+from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.pool import BufferPool
+from lapgs_wgpu.io.ply import GaussianSnapshot
+from lapgs_wgpu.motion.scene import Scene4D
+from lapgs_wgpu.motion.timing import Timing
+from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.splat.gaussians import Gaussians
+from lapgs_wgpu.splat.rasterize import upload_gaussians
 
 
 class _Shown(NamedTuple):

@@ -17,12 +17,11 @@ from lapgs_wgpu.progress import Progress
 from lapgs_wgpu.splat.morton import morton_order
 from lapgs_wgpu.train.camera_refinement import Corrections
 from lapgs_wgpu.train.config import BACKGROUND_LEVELS, Config
-
-from .acceptance import explained_share, rows_with, tracks_in_images
-from .field_fit import fit_field
-from .static_fit import MakeTrainer, static_fit
-from .surface_points import surface_points
-from .tracks import Tracks, find_tracks
+from lapgs_wgpu.train.discovery.acceptance import explained_share, rows_with, tracks_in_images
+from lapgs_wgpu.train.discovery.field_fit import fit_field
+from lapgs_wgpu.train.discovery.static_fit import MakeTrainer, static_fit
+from lapgs_wgpu.train.discovery.surface_points import surface_points
+from lapgs_wgpu.train.discovery.tracks import Tracks, find_tracks
 
 DYNAMICS = 0.5  # standard deviation of the dynamics attribute of a discovered Gaussian, which it shares with its part
 NEARLY_ALL = 0.8  # share of the surface points that tracks explain, above which the field has little left to learn

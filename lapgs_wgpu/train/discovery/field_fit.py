@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lapgs_wgpu.motion.scene import Scene4D
+from lapgs_wgpu.train.discovery.tracks import Tracks
 from lapgs_wgpu.train.optimizer import ADAM_EPS
-
-from .tracks import Tracks
 
 STILL = 300  # Gaussians of the static fit that a step asks to stay where they are
 HASH_RATE, MLP_RATE = 1e-2, 2e-3  # learning rates, half of those of the preset tiny

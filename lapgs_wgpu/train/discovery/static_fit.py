@@ -16,10 +16,9 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.camera_refinement import CameraRefinement, Corrections
 from lapgs_wgpu.train.config import BACKGROUND_LEVELS, Config
+from lapgs_wgpu.train.discovery.residual import Residual
 from lapgs_wgpu.train.exposure import without_exposure
 from lapgs_wgpu.train.learning_rate import Rate
-
-from .residual import Residual
 
 MOST_VIEWS = 400  # of a capture, evenly chosen over the clip
 # The schedule, in shares of its steps, and the rates are its own: what the static fit is sure of decides what is found.
