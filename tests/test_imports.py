@@ -39,8 +39,8 @@ ALLOWED = {
     "viewer": {"errors", "command", "progress", "gpu", "splat", "motion", "data", "io"},
     "prepare": {"errors", "progress", "data", "splat.camera", "io.atomic", "io.listing"},
     "prepare_cli": {"errors", "command", "gpu", "prepare", "train", "io.listing"},
-    "doctor": {"errors", "gpu", "splat", "motion", "train"},
-    "doctor_cli": {"errors", "command", "doctor"},
+    "doctor": {"errors", "command", "gpu", "splat"},
+    "doctor_cli": {"errors", "command", "gpu", "doctor"},
     "train_options": {"errors", "command", "io", "train"},
     "cli": {
         "errors",
