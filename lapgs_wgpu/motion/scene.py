@@ -202,9 +202,12 @@ class Scene4D:
             antialiased=self.antialiased,
         )
 
-    def at(self, t: float) -> Gaussians:
-        """The Gaussians at time t in [0, 1], activated. Differentiable in `parameters` and the field's parameters."""
-        return self.deformed(t)[0]
+    def at(self, t: float, *, timing: Timing | None = None) -> Gaussians:
+        """The Gaussians at time t in [0, 1], activated. Differentiable in `parameters` and the field's parameters.
+
+        timing: takes the place of the scene's; with EVEN, t is the field's own time.
+        """
+        return self._deformed(t, timing or self.timing, None, None).gaussians
 
     def deformed(self, t: float, nearby: Nearby | None = None, moments: Moments | None = None) -> Deformed:
         """The Gaussians at time t in [0, 1], with what the losses of motion compare.
@@ -217,11 +220,14 @@ class Scene4D:
         Returns:
             Deformed. Differentiable in `parameters` and the field's parameters.
         """
+        return self._deformed(t, self.timing, nearby, moments)
+
+    def _deformed(self, t: float, timing: Timing, nearby: Nearby | None, moments: Moments | None) -> Deformed:
         p = self.parameters
         still = self._activated(p)
         if self.field is None or len(self) == 0:
             return Deformed(still, None, [])
-        move, *others = self._moves(self.timing(t), nearby, moments)
+        move, *others = self._moves(timing(t), nearby, moments)
         quats, sh, opacities = still.quats, still.sh, still.opacities
         if move.orientation is not None:
             quats = multiply(move.orientation, quats)
@@ -260,7 +266,13 @@ class Scene4D:
         return move.apply_to_means(means), scales
 
     def render(
-        self, camera: Camera, t: float, background: Tensor | Sequence[float] | None = None, *, depth: bool = True
+        self,
+        camera: Camera,
+        t: float,
+        background: Tensor | Sequence[float] | None = None,
+        *,
+        depth: bool = True,
+        timing: Timing | None = None,
     ) -> Rendering:
         """Render the scene, without gradients.
 
@@ -269,6 +281,7 @@ class Scene4D:
             t: time in [0, 1].
             background: (3,); None for black.
             depth: whether to render depth, see `rasterize`.
+            timing: takes the place of the scene's, as in `at`; None for the scene's.
 
         Returns:
             Rendering, on the CPU.
@@ -281,7 +294,7 @@ class Scene4D:
         if background is not None:
             background = torch.as_tensor(background, dtype=torch.float32)
         with torch.no_grad():
-            now = self.at(t)
+            now = self.at(t, timing=timing)
             tensors = (now.means, now.quats, now.scales, now.opacities, now.sh)
             return rasterize(
                 *tensors,
