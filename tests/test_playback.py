@@ -13,7 +13,7 @@ import torch
 from helpers.playback import open_playback
 from helpers.ply_files import columns_of, ply_bytes, random_still
 from helpers.scene_files import DAMAGE, moving_scene, rewrite
-from helpers.still_scenes import CAMERA, KINDS, half_still
+from helpers.still_scenes import CAMERA, KINDS
 from helpers.trained_scenes import CONFIGS, GRID4D, OURS, trained
 from helpers.training import configure
 
@@ -40,12 +40,11 @@ TIMES = (0.0, 0.37, 1.0)
 ON_DEVICE = {"static", *CONFIGS}
 
 
-def picture(playback: Playback, t: float, camera: Camera = CAMERA, *, passing: bool = False) -> np.ndarray:
+def picture(playback: Playback, t: float, camera: Camera = CAMERA) -> np.ndarray:
     """(height, width, 3), drawn from the buffers as a viewer does."""
     rasterizer = Rasterizer(playback.device)
     while True:
-        now = playback.at(t, camera if passing else None)
-        drawing = rasterizer.draw(now, camera, (0.1, 0.2, 0.3))
+        drawing = rasterizer.draw(playback.at(t), camera, (0.1, 0.2, 0.3))
         if not rasterizer.grow_on_overflow(drawing):
             return drawing.image.read()[:3].transpose(1, 2, 0)
 
@@ -112,7 +111,7 @@ def test_a_time_that_is_shown_is_not_computed_again(
     assert isinstance(playback, DevicePlayback)
     assert playback._field is not None
     times: list[float] = []
-    monkeypatch.setattr(playback._field, "move", lambda t, out, rows: times.append(t))
+    monkeypatch.setattr(playback._field, "move", lambda t, out: times.append(t))
     for t in (0.1, 0.1, 0.2, 0.1):
         playback.at(t)
     assert times == [0.1, 0.2, 0.1]
@@ -237,42 +236,6 @@ def test_blocks_make_no_difference(device: Device, tmp_path: Path) -> None:
 def contents(now: Gaussians[DeviceArray]) -> list[np.ndarray]:
     """As words, so that equal means equal bits."""
     return [values.view(np.uint32) for values in read_all(list(now.arrays().values()))]
-
-
-@pytest.mark.kernels
-def test_a_passing_picture_is_the_exact_one_for_less(
-    device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    playback, other = half_still(device, tmp_path), half_still(device, tmp_path)
-    assert playback._field is not None
-    moved: list[int] = []
-    move = playback._field.move
-    monkeypatch.setattr(playback._field, "move", lambda t, out, rows: (moved.append(len(rows)), move(t, out, rows)))
-    left, right = (
-        Camera.looking_at([x, -6, 0], [x, 0, 0], up=[0, 0, 1], fov_x=0.6, width=64, height=48) for x in (-2, 2)
-    )
-    for t in (np.arange(16) + 0.5) / 16:
-        playback.at(float(t), right)
-        assert playback.exact  # too little was seen so far
-    assert moved == 16 * [300]
-    moved.clear()
-    for t, camera in ((0.4, right), (0.45, right), (0.45, left), (0.1, right), (0.85, left)):
-        shown = picture(playback, t, camera, passing=True)
-        assert np.ptp(shown) > 0.3
-        assert playback.exact == (not device.mappable)
-        assert np.abs(shown - picture(other, t, camera)).max() < 0.05  # a part of a pixel on an edge
-    if device.mappable:
-        assert 0 < sum(moved) < 80  # of five times 300: those alone that are of no use as they are
-    else:
-        assert moved == 4 * [300]
-
-    for found, expected in zip(contents(playback.at(0.85)), contents(other.at(0.85)), strict=True):
-        np.testing.assert_array_equal(found, expected)
-    assert playback.exact
-    moved.clear()
-    playback.at(0.85, right)
-    assert playback.exact
-    assert moved == []
 
 
 SHOW = """

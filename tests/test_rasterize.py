@@ -218,8 +218,6 @@ def shapes(device: Device) -> list[RasterConfig]:
     found = [cpu_config(0), RasterConfig(16, 16, 32, subgroups=False, lane_runs=False), gpu_config(0)]
     if subgroup_size(device):
         found += [cpu_config(subgroup_size(device)), gpu_config(subgroup_size(device))]
-    if device.textures:
-        found += [replace(config, listed=True) for config in found if config.round_splats]
     return list(dict.fromkeys(found))
 
 
@@ -258,39 +256,6 @@ def test_workgroups_that_are_cut_into_subgroups_are_noticed(device: Device, use:
         assert torch.equal(other.image, steps[0].image)
         for name, gradient in steps[0].gradients.items():
             assert torch.equal(other.gradients[name], gradient)
-
-
-def test_workgroups_are_checked_when_a_tile_is_drawn(device: Device, use: Callable[[Rasterizer], Any]) -> None:
-    """Not by an image without splats, in which none runs where only tiles with splats are drawn."""
-    if not 0 < subgroup_size(device) < 32 or not device.textures:
-        pytest.skip("this device has no subgroups, or none of fewer than 32 lanes, or draws all tiles")
-    scene, camera = random_scene(500, 8, size=0.08), oblique_camera(101, 61)
-    use(Rasterizer(device, config=gpu_config(0)))
-    expected = step(scene, camera, device)
-    rasterizer = use(Rasterizer(device, config=replace(gpu_config(32), subgroups=True, listed=True)))
-    step(scene | {"opacities": torch.zeros(500)}, camera, device)
-    assert not rasterizer.config.split_passes
-    found = step(scene, camera, device)
-    assert not rasterizer.config.shuffles("rasterize")
-    assert torch.equal(found.image, expected.image)
-
-
-def test_workgroups_are_checked_in_each_band(device: Device, use: Callable[[Rasterizer], Any]) -> None:
-    """Also where the last band has no splat."""
-    if not 0 < subgroup_size(device) < 32 or not device.textures:
-        pytest.skip("this device has no subgroups, or none of fewer than 32 lanes, or draws all tiles")
-    scene, camera = random_scene(500, 8, size=0.02), oblique_camera(101, 61)
-    use(Rasterizer(device, config=gpu_config(0)))
-    whole = rasterize(**scene, camera=camera, device=device)
-    upper = (whole.radii > 0) & (whole.means2d[:, 1] + whole.radii < 24)
-    assert upper.any()
-    scene = scene | {"opacities": torch.where(upper, scene["opacities"], 0.0)}
-    expected = step(scene, camera, device)
-    rasterizer = use(Rasterizer(device, config=replace(gpu_config(32), subgroups=True, listed=True)))
-    rasterizer.plan = replace(rasterizer.plan, bands=2)
-    found = step(scene, camera, device)
-    assert not rasterizer.config.shuffles("rasterize")
-    assert torch.equal(found.image, expected.image)
 
 
 def test_only_the_backward_pass_is_cut(

@@ -13,7 +13,7 @@ from helpers.stages import watch
 
 from lapgs_wgpu.gpu import shader
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.splat import drawing_plan
+from lapgs_wgpu.splat import buffer_plan
 from lapgs_wgpu.splat import rasterizer as rasterizer_module
 from lapgs_wgpu.splat.rasterize import rasterize, rasterizer_of
 from lapgs_wgpu.splat.rasterizer import Rasterizer
@@ -181,7 +181,7 @@ def test_a_small_image_does_not_pay_for_a_large_one(device: Device, use: Use, sc
 def test_a_plan_shrinks_when_no_image_needs_it(
     device: Device, use: Use, monkeypatch: pytest.MonkeyPatch, scene: Scene, expected: Step, total: int
 ) -> None:
-    monkeypatch.setattr(drawing_plan, "_WATCHED", 3)
+    monkeypatch.setattr(buffer_plan, "_WATCHED", 3)
     rasterizer = use(Rasterizer(device, capacity=100 * total))
     if rasterizer.config.round_splats:
         rasterizer.plan = dataclasses.replace(rasterizer.plan, rounds=2)

@@ -136,12 +136,6 @@ class Encoder:
         lib.wgpuComputePassEncoderSetBindGroup(self._pass, 0, bind_group._internal, 0, ffi.NULL)
         lib.wgpuComputePassEncoderDispatchWorkgroups(self._pass, columns, rows, 1)
 
-    def dispatch_counted(self, pipeline: Any, bind_group: Any, counts: Any, offset: int) -> None:
-        """The same, with as many workgroups as three words of a buffer say."""
-        lib.wgpuComputePassEncoderSetPipeline(self._pass, pipeline._internal)
-        lib.wgpuComputePassEncoderSetBindGroup(self._pass, 0, bind_group._internal, 0, ffi.NULL)
-        lib.wgpuComputePassEncoderDispatchWorkgroupsIndirect(self._pass, counts._internal, offset)
-
     def clear(self, buffer: Any, offset: int, nbytes: int) -> None:
         """Set bytes of a buffer to zero."""
         self.end_pass()

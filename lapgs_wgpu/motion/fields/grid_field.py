@@ -12,10 +12,9 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.config import GEOMETRY, TEMPORAL_AXES, FieldConfig
 from lapgs_wgpu.motion.fields.deformation import Deformation, Moments, Nearby
 from lapgs_wgpu.motion.fields.device_decoder import Decoder
-from lapgs_wgpu.motion.fields.gate import gated
 from lapgs_wgpu.motion.fields.hash_encoder import HashEncoder, HashGrid
 from lapgs_wgpu.motion.fields.laplacian import LaplacianMotion, TimeMotion
-from lapgs_wgpu.motion.fields.layers import linear, product, zero_head
+from lapgs_wgpu.motion.fields.layers import linear, zero_head
 from lapgs_wgpu.motion.fields.parameter_shapes import parameter_shapes
 from lapgs_wgpu.motion.fields.torch_decoder import KEPT, DecoderWeights, decode
 from lapgs_wgpu.motion.passes.decoder_passes import decoder_shape
@@ -32,8 +31,6 @@ class GridField(nn.Module):
 
     on_device: compute the decoder by kernels if gradients are needed; the configuration must be one that
     `decodes_on_device`. Otherwise, and without gradients, torch computes it.
-    precision: torch.float32 or torch.bfloat16; data type of features and of the decoder's products in torch if
-    gradients are needed. Parameters, outputs of the heads, and everything without gradients are float32.
     """
 
     def __init__(self, config: FieldConfig, device: Device, seed: int) -> None:
@@ -42,7 +39,6 @@ class GridField(nn.Module):
         ours = config.kind == "laplacian"
         width = config.width
         self.config = config
-        self.precision = torch.float32
         self.static_grid = HashGrid(config.static, (0, 1, 2), generator)
         axes = TEMPORAL_AXES if config.temporal_hash else ()
         self.temporal_grids = nn.ModuleList(HashGrid(config.temporal, three, generator) for three in axes)
@@ -126,20 +122,36 @@ class GridField(nn.Module):
             their_means, their_dynamics = moments.chosen(means, dynamics)
             places += [(their_means, self.config.grid_time(time)) for time in moments.times]
             decoded += [(time, their_dynamics) for time in moments.times]
-        precision = self.precision if torch.is_grad_enabled() else torch.float32
-        here, *others = self._encoder.encode_all(places, precision)
+        here, *others = self._encoder.encode_all(places)
         apart = []
         if nearby is not None:
             near, *others = others
-            apart = [(b - a[nearby.rows]).float().square().sum() for a, b in zip(here, near, strict=True)]
+            apart = [(b - a[nearby.rows]).square().sum() for a, b in zip(here, near, strict=True)]
         outputs = [self._decode(*given, *each) for given, each in zip(decoded, [here, *others], strict=True)]
         return [*outputs, torch.stack(apart) if apart else means.new_zeros(0)]
 
     def _decode(self, t: float, dynamics: Tensor | None, static: Tensor, temporal: Tensor | None = None) -> Tensor:
         """Outputs of the geometry heads (N, 14) and, in further columns, of the appearance head."""
-        if len(self.hidden):
-            return self._decode_blocks(t, dynamics, static, *([] if temporal is None else [temporal]))
-        return decode(static, temporal, dynamics if self.config.dynamics_size else None, self._weights(t))
+        inputs = static, temporal, dynamics if self.config.dynamics_size else None
+        if not len(self.hidden):
+            return decode(*inputs, self._weights(t))
+        # In blocks, which avoids large allocations. For many Gaussians the backward pass computes them again: the
+        # activations, 4 KB per Gaussian at a width of 256, would be most of a training's memory.
+        decode_block = self._decode_hidden
+        if len(static) > KEPT:
+            decode_block = partial(checkpoint, decode_block, use_reentrant=False, preserve_rng_state=False)
+        count = -(-len(static) // _BLOCK) or 1
+        blocks = zip(*([None] * count if part is None else part.split(_BLOCK) for part in inputs), strict=True)
+        return torch.cat([decode_block(t, *block) for block in blocks])
+
+    def _decode_hidden(self, t: float, static: Tensor, temporal: Tensor | None, dynamics: Tensor | None) -> Tensor:
+        """The same through the hidden layers: `decode` gives what these read, and the gated channels, which the
+        appearance head reads."""
+        fused, *gated = decode(static, temporal, dynamics, self._weights(t)).split(self.config.width, dim=1)
+        outputs = [self.heads(self.hidden(fused))]
+        if self.appearance is not None:
+            outputs.append(self.appearance(*gated))
+        return torch.cat(outputs, dim=1) * self._head_factors()
 
     def _on_device(
         self, means: Tensor, t: float, dynamics: Tensor | None, nearby: Nearby | None, moments: Moments | None
@@ -178,20 +190,27 @@ class GridField(nn.Module):
         return [outputs + w.heads_bias, *others, apart]
 
     def _weights(self, t: float) -> DecoderWeights:
-        """The decoder's weights at a time. The second layer of the motion, which only linear heads follow, is folded
-        into these, and all heads are one matrix, so that the features' gradient (N, width) is written once."""
+        """The decoder's weights at a time. The second layer of the motion, which only linear layers follow, is folded
+        into the heads, and all heads are one matrix, so that the features' gradient (N, width) is written once. Before
+        hidden layers the heads are the identity."""
         size = self.config.dynamics_size
-        layers = [self.heads] if self.appearance is None else [self.heads, self.appearance]
-        factors = self._head_factors()
-        heads = torch.cat([head.weight for head in layers]) * factors[:, None]
-        bias = torch.cat([head.bias for head in layers]) * factors
+        if len(self.hidden):
+            identity = torch.eye(self.config.width)
+            heads = torch.cat([identity] if self.appearance is None else [identity, identity])
+            bias = heads.new_zeros(len(heads))
+            first, following = identity, len(heads) - len(identity)
+        else:
+            layers = [self.heads] if self.appearance is None else [self.heads, self.appearance]
+            factors = self._head_factors()
+            heads = torch.cat([head.weight for head in layers]) * factors[:, None]
+            bias = torch.cat([head.bias for head in layers]) * factors
+            first, following = heads[: sum(GEOMETRY)], self.config.appearance_size
         inner = inner_bias = motion_heads = None
         if self.motion is not None:
             (inner, inner_bias), second = self.motion.layers(t)
-            rest = len(heads) - sum(GEOMETRY)
-            folded, shift = (heads[: sum(GEOMETRY)] @ factor for factor in second)
-            motion_heads = nn.functional.pad(folded, (0, 0, 0, rest))
-            bias = bias + nn.functional.pad(shift, (0, rest))
+            folded, shift = (first @ factor for factor in second)
+            motion_heads = nn.functional.pad(folded, (0, 0, 0, following))
+            bias = bias + nn.functional.pad(shift, (0, following))
         return DecoderWeights(
             spatial=0.5 * self.spatial.weight,
             spatial_bias=0.5 * self.spatial.bias,
@@ -204,37 +223,6 @@ class GridField(nn.Module):
             motion_heads=motion_heads,
             heads_bias=bias,
         )
-
-    def _decode_blocks(self, t: float, dynamics: Tensor | None, *features: Tensor) -> Tensor:
-        """`_decode_hidden` in blocks, which avoids large allocations. For many Gaussians the backward pass recomputes
-        it: the activations, 4 KB per Gaussian at a width of 256, would be most of a training's memory."""
-        decode_block = self._decode_hidden
-        if len(features[0]) > KEPT:
-            decode_block = partial(checkpoint, decode_block, use_reentrant=False, preserve_rng_state=False)
-        blocks = [part.split(_BLOCK) for part in features]
-        of_dynamics = [None] * len(blocks[0]) if dynamics is None else dynamics.split(_BLOCK)
-        return torch.cat([decode_block(t, *block) for block in zip(of_dynamics, *blocks, strict=True)])
-
-    def _decode_hidden(
-        self, t: float, dynamics: Tensor | None, static: Tensor, temporal: Tensor | None = None
-    ) -> Tensor:
-        """Outputs of the geometry heads (N, 14) and, in further columns, of the appearance head, by hidden layers."""
-        half = product(static, 0.5 * self.spatial.weight, 0.5 * self.spatial.bias)
-        size, bias, weight = self.config.dynamics_size, self.temporal.bias, self.temporal.weight
-        moving = bias.to(static.dtype).expand(len(static), -1)
-        if size and dynamics is not None:
-            moving = product(dynamics.to(static.dtype), weight[:, :size], bias)
-        if temporal is not None:
-            moving = torch.addmm(moving, temporal, weight[:, size:].to(temporal.dtype).T)
-        features = gated(moving, half)
-        fused = features
-        if self.motion is not None:
-            first, second = self.motion.layers(t)
-            fused = fused + product(torch.relu(product(static, *first)), *second)
-        outputs = self.heads(self.hidden(fused.float()))
-        if self.appearance is not None:
-            outputs = torch.cat([outputs, self.appearance(features.float())], dim=1)
-        return outputs * self._head_factors()
 
     def _head_factors(self) -> Tensor:
         return self.heads.bias.new_tensor(self.config.head_factors)

@@ -1,4 +1,4 @@
-"""How much room an image is drawn with, by the images before it."""
+"""Buffer capacities of an image, predicted from earlier images."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ _KINDS = 32  # of images, whose plans are kept
 
 
 @dataclass(frozen=True)
-class Plan:
+class BufferPlan:
     """How an image is drawn. Bands change the last bits of gradients; else the plan does not change the result.
 
     capacity: maximum number of intersections (tile, splat). bands: number of bands of tile rows, which are drawn one
@@ -31,7 +31,7 @@ def roomy(intersections: int) -> int:
 Kind = tuple[int, int, bool]
 
 
-class Plans:
+class BufferPlans:
     """The plan of each kind of images. Passes cost as much as there is room, so small images need one of their own. And
     the number of bands decides in which order gradients are added, so images that are only looked at must not raise it.
 
@@ -39,10 +39,10 @@ class Plans:
     """
 
     def __init__(self, capacity: int) -> None:
-        self.now = Plan(capacity)
+        self.now = BufferPlan(capacity)
         self._first_capacity = capacity
         self._kind: Kind | None = None
-        self._others: dict[Kind, Plan] = {}  # the latest last
+        self._others: dict[Kind, BufferPlan] = {}  # the latest last
         self._watched, self._most = 0, 0  # drawings by this plan, and the most intersections of a band
 
     def turn_to(self, kind: Kind) -> None:
@@ -52,7 +52,7 @@ class Plans:
             # Small splats lie on one tile at any size, large ones on as many more as there are pixels.
             share = math.sqrt(math.prod(kind[:2]) / math.prod(self._kind[:2]))
             guess = min(self.now.capacity, max(self._first_capacity, round(share * self.now.capacity)))
-            self.now = self._others.pop(kind, Plan(guess))
+            self.now = self._others.pop(kind, BufferPlan(guess))
             if len(self._others) > _KINDS:
                 self._others.pop(next(iter(self._others)))
             self._watched = self._most = 0
@@ -60,7 +60,7 @@ class Plans:
 
     def bands(self, kind: Kind) -> int:
         """Of images of this kind."""
-        return self.now.bands if kind == self._kind else self._others.get(kind, Plan(0)).bands
+        return self.now.bands if kind == self._kind else self._others.get(kind, BufferPlan(0)).bands
 
     def set_bands(self, kind: Kind, bands: int) -> None:
         """Draw images of this kind, which come next, in so many bands."""
