@@ -179,7 +179,7 @@ def test_rows_beyond_a_binding_are_taken_in_blocks(
 
 
 @both_shapes
-@pytest.mark.parametrize("count", [0, 1, 2, 63, 64, 65, 511, 512, 513])
+@pytest.mark.parametrize("count", [0, 1, 65, 513])
 def test_any_number_of_points(device: Device, lane_levels: bool, count: int) -> None:
     encoder = HashEncoder(device, apart(make_grids("sliced", "hashed")), BOUND, lane_levels=lane_levels)
     check(encoder, 0.5 * random_points(count, seed=count), 0.9)
@@ -304,7 +304,7 @@ def test_both_shapes_agree(device: Device) -> None:
         assert relative(b, a) < 1e-6
 
 
-@pytest.mark.parametrize("size", [1e-30, 1e-12, 1.0, 1e12, 1e30])
+@pytest.mark.parametrize("size", [1e-30, 1e30])
 @both_shapes
 def test_gradients_of_any_size(device: Device, lane_levels: bool, size: float) -> None:
     encoder = HashEncoder(device, apart(make_grids("sliced", "hashed")), BOUND, lane_levels=lane_levels)
