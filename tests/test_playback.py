@@ -80,7 +80,7 @@ def test_it_shows_the_scene(device: Device, tmp_path: Path, name: str) -> None:
 def test_the_still_is_that_of_the_scene(device: Device, tmp_path: Path, name: str) -> None:
     scene, path = saved(device, tmp_path, KINDS[name])
     for t in (0.0, 0.6):
-        found, exact = open_playback(path, device).still(t), scene.still(t)
+        found, exact = open_playback(path, device).snapshot(t), scene.snapshot(t)
         write_ply(tmp_path / "still.ply", found)
         for part in ("means", "sh", "quats", "log_scales", "opacity_logits"):
             # Logits near their ends magnify float32's rounding of opacities.
@@ -206,7 +206,7 @@ def test_a_foreign_ply_stands_still(device: Device, tmp_path: Path, degree: int)
     assert (playback.moves, playback.count, playback.sh_degree, playback.metadata) == (False, 40, degree, {})
     drawn = load(tmp_path / "foreign.ply", device).render(CAMERA, 0.0, torch.tensor([0.1, 0.2, 0.3])).image.numpy()
     assert np.abs(picture(playback, 0.7) - drawn).max() < 1e-4
-    found: GaussianSnapshot = playback.still(0.3)
+    found: GaussianSnapshot = playback.snapshot(0.3)
     np.testing.assert_array_equal(found.means, still.means)
     np.testing.assert_array_equal(found.sh[:, : still.sh.shape[1]], still.sh)
     np.testing.assert_array_equal(found.opacity_logits, still.opacity_logits)
@@ -255,7 +255,7 @@ while True:
     if not rasterizer.grow_on_overflow(drawing):
         break
 assert drawing.image.read()[3].min() < 0.99
-playback.means(0.5), playback.dynamics(), playback.still(0.2)
+playback.means(0.5), playback.dynamics(), playback.snapshot(0.2)
 print("torch" in sys.modules)
 """
 

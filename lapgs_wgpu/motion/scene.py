@@ -28,7 +28,7 @@ from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.constants import CONSTANTS
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterize import Rendering, rasterize
-from lapgs_wgpu.splat.rotation import multiply
+from lapgs_wgpu.splat.rotation import quat_multiply
 
 Field = GridField | MlpField | HexPlaneField | OwnField
 
@@ -190,9 +190,7 @@ class Scene4D:
 
     def canonical(self) -> Gaussians:
         """The Gaussians without motion, activated. Differentiable in `parameters`."""
-        return self._activated(self.parameters)
-
-    def _activated(self, p: Mapping[str, Tensor]) -> Gaussians:
+        p = self.parameters
         return Gaussians(
             p["means"],
             nn.functional.normalize(p["quats"], dim=1),
@@ -207,56 +205,61 @@ class Scene4D:
 
         timing: takes the place of the scene's; with EVEN, t is the field's own time.
         """
-        return self._deformed(t, timing or self.timing, None, None).gaussians
+        return self.deformed(t, timing=timing).gaussians
 
-    def deformed(self, t: float, nearby: Nearby | None = None, moments: Moments | None = None) -> Deformed:
+    def deformed(
+        self,
+        t: float,
+        nearby: Nearby | None = None,
+        moments: Moments | None = None,
+        *,
+        timing: Timing | None = None,
+    ) -> Deformed:
         """The Gaussians at time t in [0, 1], with what the losses of motion compare.
 
         Args:
             t: time in [0, 1].
             nearby: where the smoothness loss looks; None without it.
-            moments: some of the Gaussians and further moments of the motion.
+            moments: some of the Gaussians and further times of the field.
+            timing: takes the place of the scene's; None for the scene's.
 
         Returns:
             Deformed. Differentiable in `parameters` and the field's parameters.
         """
-        return self._deformed(t, self.timing, nearby, moments)
-
-    def _deformed(self, t: float, timing: Timing, nearby: Nearby | None, moments: Moments | None) -> Deformed:
         p = self.parameters
-        still = self._activated(p)
+        canonical = self.canonical()
         if self.field is None or len(self) == 0:
-            return Deformed(still, None, [])
-        move, *others = self._moves(timing(t), nearby, moments)
-        quats, sh, opacities = still.quats, still.sh, still.opacities
+            return Deformed(canonical, None, [])
+        move, *others = self._moves((timing or self.timing)(t), nearby, moments)
+        quats, sh, opacities = canonical.quats, canonical.sh, canonical.opacities
         if move.orientation is not None:
-            quats = multiply(move.orientation, quats)
+            quats = quat_multiply(move.orientation, quats)
         if move.d_quats is not None:
             quats = nn.functional.normalize(quats + move.d_quats, dim=1)
         if move.d_dc is not None:
             sh = torch.cat([sh[:, :1] + move.d_dc[:, None], sh[:, 1:]], dim=1)
         if move.d_opacity is not None:
             opacities = (p["opacity_logits"] + move.d_opacity).sigmoid()
-        means, scales = self._placed(move, still.means, still.scales)
-        placed = []
+        means, scales = self._moved(move, canonical.means, canonical.scales)
+        at_times = []
         if moments is not None:
-            of_rows = p["means"][moments.rows], still.scales[moments.rows]
-            placed = [self._placed(each, *of_rows) for each in others]
-        moved = Gaussians(means, quats, scales, opacities, sh, antialiased=self.antialiased)
-        return Deformed(moved, move.smoothness, placed)
+            rows = p["means"][moments.rows], canonical.scales[moments.rows]
+            at_times = [self._moved(other, *rows) for other in others]
+        gaussians = Gaussians(means, quats, scales, opacities, sh, antialiased=self.antialiased)
+        return Deformed(gaussians, move.smoothness, at_times)
 
     def _moves(self, t: float, nearby: Nearby | None, moments: Moments | None) -> list[Deformation]:
         field, means, dynamics = self.field, self.parameters["means"], self.parameters.get("dynamics")
         assert field is not None
         if isinstance(field, GridField):
-            return field.at_moments(means, t, dynamics, nearby, moments)
+            return field.at_times(means, t, dynamics, nearby, moments)
         move = field(means, t, dynamics, nearby)
         if moments is None:
             return [move]
-        their_means, their_dynamics = moments.chosen(means, dynamics)
-        return [move, *(field(their_means, time, their_dynamics) for time in moments.times)]
+        rows = moments.chosen(means, dynamics)
+        return [move, *(field(rows[0], time, rows[1]) for time in moments.times)]
 
-    def _placed(self, move: Deformation, means: Tensor, scales: Tensor) -> tuple[Tensor, Tensor]:
+    def _moved(self, move: Deformation, means: Tensor, scales: Tensor) -> tuple[Tensor, Tensor]:
         """Means and scales after a move."""
         if move.d_scales is not None:
             scales = scales + move.d_scales
@@ -306,20 +309,20 @@ class Scene4D:
                 device=self.device,
             )
 
-    def still(self, t: float) -> GaussianSnapshot:
+    def snapshot(self, t: float) -> GaussianSnapshot:
         """The Gaussians at time t in [0, 1] before their activations, as 3DGS viewers read them."""
         with torch.no_grad():
-            still = self.at(t)
-            sh = torch.cat([still.sh[:, :1], self.parameters["sh_rest"]], dim=1)
+            now = self.at(t)
+            sh = torch.cat([now.sh[:, :1], self.parameters["sh_rest"]], dim=1)
             logits = self.parameters["opacity_logits"].detach()
-            if not torch.equal(still.opacities, logits.sigmoid()):
-                logits = still.opacities.logit(eps=1e-7)
+            if not torch.equal(now.opacities, logits.sigmoid()):
+                logits = now.opacities.logit(eps=1e-7)
         return GaussianSnapshot(
-            means=still.means.numpy(force=True),
+            means=now.means.numpy(force=True),
             sh=sh.numpy(force=True),
             opacity_logits=logits.numpy(force=True),
-            log_scales=still.scales.log().numpy(force=True),
-            quats=still.quats.numpy(force=True),
+            log_scales=now.scales.log().numpy(force=True),
+            quats=now.quats.numpy(force=True),
         )
 
     def save(self, path: str | os.PathLike[str], metadata: Mapping[str, str] | None = None) -> None:
@@ -332,7 +335,7 @@ class Scene4D:
         Raises:
             InputError: the file system failed, or a value cannot be stored; an older file is then unchanged.
         """
-        arrays = self.still(0.0)
+        arrays = self.snapshot(0.0)
         tensors = {f"gaussians.{name}": value.numpy(force=True) for name, value in self.parameters.items()}
         if self.field is not None:
             tensors |= {f"field.{name}": value.numpy(force=True) for name, value in self.field.state_dict().items()}

@@ -17,7 +17,7 @@ def rotation_matrices(quats: Tensor) -> Tensor:
     return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
 
 
-def multiply(first: Tensor, second: Tensor) -> Tensor:
+def quat_multiply(first: Tensor, second: Tensor) -> Tensor:
     """Products (N, 4) of quaternions wxyz (N, 4): the rotation `second`, followed by the rotation `first`."""
     w, axis = first[:, :1], first[:, 1:]
     v, other = second[:, :1], second[:, 1:]

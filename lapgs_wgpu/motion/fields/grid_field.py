@@ -76,9 +76,9 @@ class GridField(nn.Module):
         self, means: Tensor, t: float, dynamics: Tensor | None = None, nearby: Nearby | None = None
     ) -> Deformation:
         """See motion/fields/deformation.py."""
-        return self.at_moments(means, t, dynamics, nearby)[0]
+        return self.at_times(means, t, dynamics, nearby)[0]
 
-    def at_moments(
+    def at_times(
         self,
         means: Tensor,
         t: float,
@@ -91,8 +91,8 @@ class GridField(nn.Module):
         All are encoded together, which takes much less time than one after another.
         """
         evaluate = self._on_device if self.on_device and torch.is_grad_enabled() else self._in_torch
-        now, *others, apart = evaluate(means, t, dynamics, nearby, moments)
-        smoothness = _smoothness(apart, nearby) if nearby is not None else None
+        now, *others, sq_distances = evaluate(means, t, dynamics, nearby, moments)
+        smoothness = _smoothness(sq_distances, nearby) if nearby is not None else None
         return [self._deformation(now)._replace(smoothness=smoothness), *map(self._deformation, others)]
 
     def _deformation(self, outputs: Tensor) -> Deformation:
@@ -123,12 +123,12 @@ class GridField(nn.Module):
             places += [(their_means, self.config.grid_time(time)) for time in moments.times]
             decoded += [(time, their_dynamics) for time in moments.times]
         here, *others = self._encoder.encode_all(places)
-        apart = []
+        sq_distances = []
         if nearby is not None:
             near, *others = others
-            apart = [(b - a[nearby.rows]).square().sum() for a, b in zip(here, near, strict=True)]
+            sq_distances = [(b - a[nearby.rows]).square().sum() for a, b in zip(here, near, strict=True)]
         outputs = [self._decode(*given, *each) for given, each in zip(decoded, [here, *others], strict=True)]
-        return [*outputs, torch.stack(apart) if apart else means.new_zeros(0)]
+        return [*outputs, torch.stack(sq_distances) if sq_distances else means.new_zeros(0)]
 
     def _decode(self, t: float, dynamics: Tensor | None, static: Tensor, temporal: Tensor | None = None) -> Tensor:
         """Outputs of the geometry heads (N, 14) and, in further columns, of the appearance head."""
@@ -186,8 +186,8 @@ class GridField(nn.Module):
             "temporal": self.temporal.weight[:, size:],
             "heads": heads,
         }
-        outputs, apart = self._decoder((means, time), beside, weights, compared)
-        return [outputs + w.heads_bias, *others, apart]
+        outputs, sq_distances = self._decoder((means, time), beside, weights, compared)
+        return [outputs + w.heads_bias, *others, sq_distances]
 
     def _weights(self, t: float) -> DecoderWeights:
         """The decoder's weights at a time. The second layer of the motion, which only linear layers follow, is folded
@@ -195,22 +195,22 @@ class GridField(nn.Module):
         hidden layers the heads are the identity."""
         size = self.config.dynamics_size
         if len(self.hidden):
-            identity = torch.eye(self.config.width)
+            identity, moved = torch.eye(self.config.width), self.config.width
             heads = torch.cat([identity] if self.appearance is None else [identity, identity])
             bias = heads.new_zeros(len(heads))
-            first, following = identity, len(heads) - len(identity)
         else:
             layers = [self.heads] if self.appearance is None else [self.heads, self.appearance]
             factors = self._head_factors()
             heads = torch.cat([head.weight for head in layers]) * factors[:, None]
             bias = torch.cat([head.bias for head in layers]) * factors
-            first, following = heads[: sum(GEOMETRY)], self.config.appearance_size
+            moved = sum(GEOMETRY)  # heads that the motion reaches
         inner = inner_bias = motion_heads = None
         if self.motion is not None:
             (inner, inner_bias), second = self.motion.layers(t)
-            folded, shift = (first @ factor for factor in second)
-            motion_heads = nn.functional.pad(folded, (0, 0, 0, following))
-            bias = bias + nn.functional.pad(shift, (0, following))
+            folded, shift = (heads[:moved] @ factor for factor in second)
+            rest = len(heads) - moved
+            motion_heads = nn.functional.pad(folded, (0, 0, 0, rest))
+            bias = bias + nn.functional.pad(shift, (0, rest))
         return DecoderWeights(
             spatial=0.5 * self.spatial.weight,
             spatial_bias=0.5 * self.spatial.bias,
@@ -230,13 +230,13 @@ class GridField(nn.Module):
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """See motion/fields/deformation.py. The spectrum's frequencies, in no group, have their own optimizer."""
         tables = [grid.table for grid in self.grids]
-        apart = {id(table) for table in tables}
+        excluded = {id(table) for table in tables}
         if isinstance(self.motion, LaplacianMotion):
-            apart.add(id(self.motion.frequencies))
-        return {"hash": tables, "mlp": [p for p in self.parameters() if id(p) not in apart]}
+            excluded.add(id(self.motion.frequencies))
+        return {"hash": tables, "mlp": [p for p in self.parameters() if id(p) not in excluded]}
 
 
-def _smoothness(apart: Tensor, nearby: Nearby) -> Tensor:
+def _smoothness(sq_distances: Tensor, nearby: Nearby) -> Tensor:
     """Grid4D's smoothness loss: the mean squared distance between the features of near places, static and temporal."""
-    weights = apart.new_tensor([nearby.static_weight, nearby.temporal_weight][: len(apart)])
-    return (weights * apart).sum() / max(1, len(nearby.rows))
+    weights = sq_distances.new_tensor([nearby.static_weight, nearby.temporal_weight][: len(sq_distances)])
+    return (weights * sq_distances).sum() / max(1, len(nearby.rows))

@@ -81,5 +81,5 @@ class HexPlaneField(nn.Module):
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """See motion/fields/deformation.py."""
         planes = list(self.planes)
-        apart = {id(plane) for plane in planes}
-        return {"hash": planes, "mlp": [p for p in self.parameters() if id(p) not in apart]}
+        excluded = {id(plane) for plane in planes}
+        return {"hash": planes, "mlp": [p for p in self.parameters() if id(p) not in excluded]}

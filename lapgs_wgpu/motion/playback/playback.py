@@ -51,7 +51,7 @@ class Playback(Protocol):
     def dynamics(self) -> Floats | None:
         """(count, D) dynamics attributes; None for fields without them."""
 
-    def still(self, t: float) -> GaussianSnapshot:
+    def snapshot(self, t: float) -> GaussianSnapshot:
         """All Gaussians at a time, as 3DGS viewers read them. `Scene4D.save` writes those at time 0."""
 
 
@@ -108,7 +108,7 @@ class DevicePlayback:
     def dynamics(self) -> Floats | None:
         return self._stored.get("dynamics")
 
-    def still(self, t: float) -> GaussianSnapshot:
+    def snapshot(self, t: float) -> GaussianSnapshot:
         now = self.at(t)
         means, quats, scales, opacities, colors = read_all([now.means, now.quats, now.scales, now.opacities, now.sh])
         logits = self._stored["opacity_logits"]

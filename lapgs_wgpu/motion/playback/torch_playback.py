@@ -87,5 +87,5 @@ class TorchPlayback:
         d = self.scene.parameters.get("dynamics")
         return None if d is None else np.array(d.numpy(force=True))
 
-    def still(self, t: float) -> GaussianSnapshot:
-        return self.scene.still(t)
+    def snapshot(self, t: float) -> GaussianSnapshot:
+        return self.scene.snapshot(t)
