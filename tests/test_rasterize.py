@@ -311,6 +311,7 @@ def test_a_gpus_other_pass_keeps_its_subgroups() -> None:
         assert not any(map(both.shuffles, passes))
 
 
+@pytest.mark.nightly
 def test_a_processors_backward_pass_is_cut(device: Device, use: Callable[[Rasterizer], Any]) -> None:
     """It then has more rounds than the drawing."""
     if subgroup_size(device) < 8:

@@ -99,6 +99,7 @@ def test_lists_beyond_a_round_are_drawn_in_more(device: Device, use: Use) -> Non
     assert rasterizer.plan.rounds > 1
 
 
+@pytest.mark.nightly
 @pytest.mark.kernels
 @pytest.mark.subgroups
 @pytest.mark.parametrize("depth", [False, True])

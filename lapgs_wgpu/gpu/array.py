@@ -60,7 +60,7 @@ class DeviceArray:
 
     @property
     def resource(self) -> dict[str, Any]:
-        """What wgpu binds."""
+        """The resource that wgpu binds."""
         return {"buffer": self.buffer.wgpu_buffer, "offset": self.offset, "size": self.bound_bytes}
 
     def rows(self, first: int, count: int) -> DeviceArray:

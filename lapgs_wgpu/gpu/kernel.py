@@ -99,7 +99,7 @@ class Kernel:
                 )
 
     def bind(self, arrays: dict[str, DeviceArray], textures: dict[str, Any]) -> Any:
-        """wgpu's bind group for arrays; `textures` replace some of them. Raises as `check` does."""
+        """Return wgpu's bind group for arrays; `textures` replace some of them. Raises as `check` does."""
         key = tuple((name, array.key, id(textures.get(name))) for name, array in arrays.items())
         group = self._groups.get(key)
         if group is None:

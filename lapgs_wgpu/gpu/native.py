@@ -51,7 +51,7 @@ def _mapped(status: int, _message: Any, number: Any, _second: Any) -> None:
 
 
 class _Callback(threading.local):
-    """What a thread passes for the mapping that it begins: the library copies it."""
+    """Each thread's callback info for a mapping; the library copies it."""
 
     def __init__(self) -> None:
         self.info = ffi.new("WGPUBufferMapCallbackInfo *")
@@ -161,7 +161,7 @@ class Encoder:
 
 
 class TextureCopies:
-    """How `texels` of a buffer, from a byte on, are copied to a texture: full rows, then the rest of one."""
+    """Descriptors of the copies of `texels` from a buffer offset to a texture: full rows, then the rest of one."""
 
     def __init__(self, buffer: Any, offset: int, texture: Any, width: int, texel_bytes: int, texels: int) -> None:
         pitch = width * texel_bytes

@@ -11,7 +11,7 @@ _KINDS = 32  # of images, whose plans are kept
 
 @dataclass(frozen=True)
 class BufferPlan:
-    """How an image is drawn. Bands change the last bits of gradients; else the plan does not change the result.
+    """Buffer capacities of an image. Only the number of bands changes the result, in the last bits of gradients.
 
     capacity: maximum number of intersections (tile, splat). bands: number of bands of tile rows, which are drawn one
     after another. rounds: number of dispatches that draw the tiles' lists.
@@ -23,7 +23,7 @@ class BufferPlan:
 
 
 def roomy(intersections: int) -> int:
-    """A capacity with room for a quarter more."""
+    """Return a capacity with room for a quarter more intersections."""
     return (5 * intersections // 4 + 4095) // 4096 * 4096
 
 
@@ -32,8 +32,9 @@ Kind = tuple[int, int, bool]
 
 
 class BufferPlans:
-    """The plan of each kind of images. Passes cost as much as there is room, so small images need one of their own. And
-    the number of bands decides in which order gradients are added, so images that are only looked at must not raise it.
+    """The plan of each kind of images. The cost of a pass grows with the capacity, so small images have plans of their
+    own. The number of bands decides the order in which gradients are added, so images without gradients must not
+    raise it.
 
     now: the plan of the kind that is drawn. capacity: of the first one.
     """
@@ -46,7 +47,7 @@ class BufferPlans:
         self._watched, self._most = 0, 0  # drawings by this plan, and the most intersections of a band
 
     def turn_to(self, kind: Kind) -> None:
-        """Images of this kind come next."""
+        """Make the plan of this kind of images the current one."""
         if self._kind is not None and self._kind != kind:
             self._others[self._kind] = self.now
             # Small splats lie on one tile at any size, large ones on as many more as there are pixels.
@@ -59,17 +60,17 @@ class BufferPlans:
         self._kind = kind
 
     def bands(self, kind: Kind) -> int:
-        """Of images of this kind."""
+        """Return the number of bands of images of this kind."""
         return self.now.bands if kind == self._kind else self._others.get(kind, BufferPlan(0)).bands
 
     def set_bands(self, kind: Kind, bands: int) -> None:
-        """Draw images of this kind, which come next, in so many bands."""
+        """Make the plan of this kind of images the current one, with this number of bands."""
         self.turn_to(kind)
         self.now = replace(self.now, bands=bands)
 
     def fitted(self, most: int) -> None:
-        """An image fitted, with at most so many intersections in a band. From time to time this shrinks a plan that was
-        too large for all.
+        """Record that an image fitted, with at most `most` intersections in a band. After _WATCHED images this shrinks
+        a plan that was too large for all of them.
 
         Bands stay, and a training's state holds their number, on which its bits depend.
         """

@@ -57,7 +57,7 @@ class Rasterizer:
 
     @property
     def plan(self) -> BufferPlan:
-        """Of the images that are drawn now."""
+        """The plan of the current kind of images."""
         return self.plans.now
 
     @plan.setter
@@ -105,12 +105,12 @@ class Rasterizer:
         return drawing
 
     def holds(self, drawing: Drawing) -> bool:
-        """Whether the arrays still hold this drawing: no other image was drawn since."""
+        """Return whether the arrays still hold this drawing: no other image was drawn since."""
         return drawing.number == self._drawings
 
     def grow_on_overflow(self, drawing: Drawing, needed: list[NDArray[np.uint32]] | None = None) -> bool:
-        """Whether the intersections overflowed the plan. The drawing is then invalid and has to be drawn again, with a
-        plan that now has larger buffers, more bands or more rounds.
+        """Return whether the intersections overflowed the plan. The drawing is then invalid and has to be drawn again,
+        with a plan that now has larger buffers, more bands or more rounds.
 
         needed: content of `drawing.needed`; None reads it and waits for the device.
         Raises DeviceMemoryError if a row of tiles does not fit into the largest buffers.
@@ -199,7 +199,7 @@ class Rasterizer:
         return parts
 
     def _tiles(self, camera: Camera) -> tuple[int, int]:
-        """Number of rows and columns of tiles."""
+        """Return the numbers of rows and columns of tiles."""
         return -(-camera.height // self.config.tile_height), -(-camera.width // self.config.tile_width)
 
     def _band_rows(self, drawing: Drawing, band: int) -> tuple[int, int]:

@@ -58,7 +58,7 @@ class HexPlaneField(nn.Module):
         return Deformation(None, self.unit * shift, d_quats, self.unit * d_scales, smoothness=smoothness)
 
     def _features(self, unit: Tensor, first: int) -> Tensor:
-        """(N, F) features at points and time (N, 4) in [-1, 1], from six planes starting with number `first`."""
+        """Return features (N, F) at points and times (N, 4) in [-1, 1], of the six planes from number `first` on."""
         product: Tensor | None = None
         for plane, pair in zip(list(self.planes)[first : first + len(PLANES)], PLANES, strict=True):
             at = unit[None, None, :, list(pair)]

@@ -66,7 +66,7 @@ def decode(static: Tensor, temporal: Tensor | None, dynamics: Tensor | None, wei
 
 
 class _Inputs(NamedTuple):
-    """As `decode` takes them; or their gradients."""
+    """The inputs of `decode`, or their gradients."""
 
     static: Tensor
     temporal: Tensor | None
@@ -81,7 +81,7 @@ class _Inputs(NamedTuple):
 
 
 class _Activations(NamedTuple):
-    """What the backward pass of a block needs, (n, W) each: gated is the product of gate and moving."""
+    """Activations of a block that the backward pass needs, (n, W) each; gated is the product of gate and moving."""
 
     gate: Tensor
     moving: Tensor

@@ -134,7 +134,7 @@ class GridFieldPlayback:
                 encoder.encode(commands, PointSet(number, block.points, block.count, 0.0), [table], block.still)
 
     def static_features(self) -> Floats:
-        """(N, F) H_s: the static grid's features at the canonical means."""
+        """Return the spatial features H_s, (N, F): the static grid's at the canonical means."""
         parts = [block.still.read()[:, _CANONICAL : _CANONICAL + self._sizes.static] for block in self._blocks]
         return np.concatenate(parts)
 
@@ -147,7 +147,7 @@ class GridFieldPlayback:
         return padded.reshape(self._rounds, self._channels // 4, 4, quads, 4).transpose(0, 3, 1, 4, 2)
 
     def _stream(self) -> Floats:
-        """(vectors, 4) biases and layers of the decoder, in the order in which the pass reads them."""
+        """Return the vectors (V, 4) of biases and layers of the decoder, in the order in which the pass reads them."""
         p, sizes, rounds = self._parameters, self._sizes, self._rounds
         p = p | {name: np.float32(0.5) * p[name] for name in ("spatial.weight", "spatial.bias")}  # see common/gate.wgsl
         moving = np.zeros((sizes.width, sizes.first_temporal + sizes.temporal), np.float32)
@@ -162,7 +162,7 @@ class GridFieldPlayback:
         return np.concatenate([part.reshape(rounds, -1, 4) for part in parts], axis=1).reshape(-1, 4)
 
     def _heads(self, t: float) -> Floats:
-        """(vectors, 4) biases and, by channel, weights of the heads, with the Laplacian motion at a time folded in."""
+        """Return the vectors (V, 4) of the heads: biases, and weights by channel; the Laplacian motion is folded in."""
         p, width = self._parameters, self._sizes.width
         factors = np.array(self._config.head_factors, np.float32)
         of_geometry, of_look = np.split(factors, [sum(GEOMETRY)])

@@ -46,13 +46,13 @@ class Playback(Protocol):
         """The activated Gaussians at a time, on the device. Does not wait for it. Valid until the next call."""
 
     def means(self, t: float) -> Floats:
-        """(count, 3) means at a time, world units."""
+        """Return the means (count, 3) at a time, world units."""
 
     def dynamics(self) -> Floats | None:
-        """(count, D) dynamics attributes; None for fields without them."""
+        """Return the dynamics attributes (count, D); None for fields without them."""
 
     def snapshot(self, t: float) -> GaussianSnapshot:
-        """All Gaussians at a time, as 3DGS viewers read them. `Scene4D.save` writes those at time 0."""
+        """Return all Gaussians at a time, as 3DGS viewers read them. `Scene4D.save` writes those at time 0."""
 
 
 def playback_of(file: SceneFile, device: Device) -> Playback:
@@ -99,7 +99,7 @@ class DevicePlayback:
         return self._now
 
     def static_features(self) -> Floats | None:
-        """(count, F) what a compact scene holds in place of the static table; None where nothing moves."""
+        """Return the features (count, F) of a compact scene, which replace the static table; None in static scenes."""
         return self._field.static_features() if self._field else None
 
     def means(self, t: float) -> Floats:
