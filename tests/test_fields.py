@@ -16,8 +16,8 @@ from lapgs_wgpu.motion.fields.config import PLANES, FieldConfig, FieldKind
 from lapgs_wgpu.motion.fields.deformation import Deformation
 from lapgs_wgpu.motion.fields.hexplane_field import HexPlaneField
 from lapgs_wgpu.motion.fields.laplacian import LaplacianMotion, TimeMotion
+from lapgs_wgpu.motion.fields.make_field import make_field
 from lapgs_wgpu.motion.fields.mlp_field import MlpField, octaves
-from lapgs_wgpu.motion.scene import make_field
 
 KINDS: tuple[FieldKind, ...] = ("mlp", "hexplane", "grid4d", "laplacian")
 

@@ -18,10 +18,8 @@ from lapgs_wgpu.io.ply import GaussianSnapshot
 from lapgs_wgpu.motion.fields.config import MIN_SCALE, FieldConfig
 from lapgs_wgpu.motion.fields.deformation import Deformation, Moments, Nearby
 from lapgs_wgpu.motion.fields.grid_field import GridField
-from lapgs_wgpu.motion.fields.hexplane_field import HexPlaneField
 from lapgs_wgpu.motion.fields.laplacian import LaplacianMotion
-from lapgs_wgpu.motion.fields.mlp_field import MlpField
-from lapgs_wgpu.motion.fields.own_field import OwnField
+from lapgs_wgpu.motion.fields.make_field import Field, check_own, make_field
 from lapgs_wgpu.motion.scene_file import SceneFile, read_scene, row_shapes, scene_header
 from lapgs_wgpu.motion.timing import EVEN, Timing
 from lapgs_wgpu.splat.camera import Camera
@@ -29,34 +27,6 @@ from lapgs_wgpu.splat.constants import CONSTANTS
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterize import Rendering, rasterize
 from lapgs_wgpu.splat.rotation import quat_multiply
-
-Field = GridField | MlpField | HexPlaneField | OwnField
-
-
-def make_field(config: FieldConfig, device: Device, seed: int = 0, own: nn.Module | None = None) -> Field | None:
-    """The field of this configuration; None for static scenes. own: the module of the field own. Raises InputError as
-    `check_own`."""
-    check_own(config, own)
-    if config.kind == "static":
-        return None
-    if own is not None:
-        return OwnField(own)
-    if config.kind == "mlp":
-        return MlpField(config, seed)
-    if config.kind == "hexplane":
-        return HexPlaneField(config, seed)
-    return GridField(config, device, seed)
-
-
-def check_own(config: FieldConfig, own: nn.Module | None) -> None:
-    """Raises InputError where the field is own and no module is given, or the other way round."""
-    if (config.kind == "own") != (own is not None):
-        raise InputError(
-            "the field own needs a module, which only Python can give, such as Trainer(config, parts=Parts(field=...)) "
-            "and load(path, field=...); docs/api.md says more."
-            if own is None
-            else f"the scene has the field {config.kind}, so no module can be given; leave out field=..."
-        )
 
 
 class Deformed(NamedTuple):
@@ -133,6 +103,7 @@ class Scene4D:
         Raises:
             InputError: own_field is missing or superfluous for field_config.kind.
         """
+        check_own(field_config, own_field)
         self.parameters = {
             name: nn.Parameter(parameters[name].detach().float().contiguous().clone())
             for name in row_shapes(field_config)
