@@ -26,8 +26,6 @@ from lapgs_wgpu.viewer.frame import FrameRenderer, FrameRequest
 
 SIZE = (640, 480)
 SHARES = (1.0, 0.5, 0.25)  # of the window's width and height
-CLIP = 64  # frames, when the clip is shown once
-SEEN = "100%, in passing, the clip seen once"
 Scenes = tuple[tuple[str, int], ...]
 SCENES: Scenes = (("tiny", 20_000), ("tiny", 50_000), ("dnerf", 20_000), ("dnerf", 50_000))
 
@@ -35,7 +33,7 @@ SCENES: Scenes = (("tiny", 20_000), ("tiny", 50_000), ("dnerf", 20_000), ("dnerf
 @dataclass(frozen=True)
 class ViewerReport:
     """Milliseconds. window: from the command to the first picture in a window; None without Xvfb. screenshot: of the
-    whole command. scrub: a frame at another time than the one before, by share of the window's size; and SEEN."""
+    whole command. scrub: a frame at another time than the one before, by share of the window's size."""
 
     window: Timing | None
     screenshot: Timing
@@ -91,14 +89,6 @@ def _scrub(device: Device, file: Path, repeat: int) -> dict[str, Timing]:
         camera = look.camera.resized(*(round(share * side) for side in SIZE))
         frames = [renderer.draw(FrameRequest(camera, next(times), "rgb", (0, 0, 0))) for _ in range(repeat + 1)]
         found[f"{share:.0%}"] = summary([1e3 * frame.seconds for frame in frames[1:]])
-
-    def passing(moment: float) -> float:
-        request = FrameRequest(look.camera.resized(*SIZE), moment, "rgb", (0, 0, 0))
-        return 1e3 * renderer.draw(request, passing=True).seconds
-
-    for moment in np.linspace(0, 1, CLIP).tolist():
-        passing(moment)
-    found[SEEN] = summary([passing(moment) for moment in np.random.default_rng(0).random(repeat).tolist()])
     return found
 
 

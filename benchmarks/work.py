@@ -96,7 +96,7 @@ def raster_work(scene: SceneCounts, rasterizer: Rasterizer) -> dict[str, Work]:
     counters = scene.bands * (depth.passes * depth.counters + tile.passes * tile.counters)
     scanned = scene.bands * sum(sort.passes * sort.counters for sort in (depth, tile) if sort.scanned)
     places = scene.bands * sum(sort.passes * sort.counters * sort.readers for sort in (depth, tile))
-    written = scene.filled if rasterizer.config.listed else scene.pixels
+    written = scene.pixels
     draw = {
         "project": Work(44 * n + 52 * n + 52 * v, 20 * n + 145 * v + 55 * rows),
         "color": Work(4 * n + 24 * v),

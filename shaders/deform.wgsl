@@ -7,9 +7,7 @@
 #import common/index
 
 struct Deform {
-    gaussians: u32,    // to be moved: `rows` names them
-    first: u32,        // place of the first of them in `rows`
-    rows: u32,         // where `rows` begins in `weights`
+    gaussians: u32,
     rounds: u32,       // times 4 x QUADS channels: the decoder's width
     still_quads: u32,  // of features
     moving_quads: u32,
@@ -28,8 +26,7 @@ const LANES = 64u;
 #table 1 still: vec4<f32>
 // rows of the others
 #table 2 moving: vec4<f32>
-// heads' biases; heads, by channel; then for each round biases and columns of the layers, in the order in which they are used;
-// then rows of the Gaussians, four in a vector: a table of their own would be one storage buffer too many
+// heads' biases; heads, by channel; then for each round biases and columns of the layers, in the order in which they are used
 #table 3 weights: vec4<f32>
 @group(0) @binding(4) var<storage, read_write> means: array<f32>;
 @group(0) @binding(5) var<storage, read_write> quats: array<vec4<f32>>;
@@ -41,12 +38,6 @@ const LANES = 64u;
 
 fn unit(v: vec4<f32>) -> vec4<f32> {
     return v / max(length(v), 1e-12);
-}
-
-// Of the Gaussian in `still`, `moving` and the outputs; exact as a float, since a binding holds fewer than 2^24 of them.
-fn row_of(n: u32) -> u32 {
-    let place = deform.first + n;
-    return u32(weights_at(deform.rows + place / 4u)[place % 4u]);
 }
 
 @compute @workgroup_size(64)
@@ -61,7 +52,7 @@ fn main(
     }
     let still_row = CANONICAL + deform.still_quads;
 #unroll p $POINTS
-    let i$p = row_of(min(first + $(p)u * LANES, deform.gaussians - 1u));
+    let i$p = min(first + $(p)u * LANES, deform.gaussians - 1u);
     let still$p = i$p * still_row;
     let moving$p = i$p * deform.moving_quads;
 #end
@@ -183,9 +174,8 @@ fn main(
 #end
     }
     for (var p = 0u; p < POINTS; p++) {
-        let n = first + p * LANES;
-        if (n < deform.gaussians) {
-            let i = row_of(n);
+        let i = first + p * LANES;
+        if (i < deform.gaussians) {
             let row = i * still_row;
             let mean = still_at(row);
             let q = unit(heads[0] + vec4(1.0, 0.0, 0.0, 0.0));

@@ -1,7 +1,5 @@
 // Encodes points: two features a level, interpolated between the corners of the cell in which a point lies.
-// ROWS: of some of the points only, into their own rows of the encoding.
 // LONG_LANES, for devices of few wide cores: a lane takes more points.
-#import common/bfloat16
 #import common/hashgrid
 #import common/index
 
@@ -11,15 +9,7 @@
 #table 2 points: vec4<f32>
 // a grid's table, or the slices of all grids
 #table 3 features: vec2<f32>
-#ifdef BFLOAT16
-@group(0) @binding(4) var<storage, read_write> encoding: array<u32>;         // (N, all levels), two features in each
-#else
-@group(0) @binding(4) var<storage, read_write> encoding: array<f32>;         // (N, 2 x all levels)
-#endif
-#ifdef ROWS
-// ascending, grid.points of them
-#table 5 rows: u32
-#endif
+@group(0) @binding(4) var<storage, read_write> encoding: array<f32>;   // (N, 2 x all levels)
 
 const LANES = 64u;
 // so that a level's description is loaded once for several points
@@ -51,25 +41,16 @@ fn main(
     let first = level.first;
 #endif
     for (var k = 0u; k < LANE_POINTS; k++) {
-        let n = (block * LANE_POINTS + k) * LANES + lane;
-        if (n < grid.points) {
-#ifdef ROWS
-            let i = rows_at(n);
-#else
-            let i = n;
-#endif
+        let i = (block * LANE_POINTS + k) * LANES + lane;
+        if (i < grid.points) {
             let cell = find_cell(unit_point(points_at(i).xyz, level, grid), level);
             var sum = vec2(0.0);
 #unroll c $CORNERS
             sum += cell.weight[$c] * features_at(first + cell.index[$c]);
 #end
             let at = i * grid.all_levels + level.number;
-#ifdef BFLOAT16
-            encoding[at] = pack_bfloat16(sum);
-#else
             encoding[2u * at] = sum.x;
             encoding[2u * at + 1u] = sum.y;
-#endif
         }
     }
 }

@@ -2,7 +2,6 @@
 // last bit on every run:
 // LANE_LEVELS, for devices of few wide cores: a lane owns a level and adds the points in their order.
 // Otherwise: a lane owns a point and adds in 64-bit fixed point, whose sum does not depend on the order.
-#import common/d_encoding
 #import common/fixed_scale
 #import common/hashgrid
 #import common/index
@@ -11,6 +10,9 @@
 @group(0) @binding(1) var<storage, read> levels: array<Level>;
 // (N, 4): x, y, z, -
 #table 2 points: vec4<f32>
+// (N, all levels): the gradient of two features of a point
+#table 3 d_encoding: vec2<f32>
+
 fn first_entry(level: Level) -> u32 {
 #ifdef SLICED
     return level.first_sliced;
@@ -37,7 +39,7 @@ fn main(
     let first = first_entry(level);
     for (var i = 0u; i < grid.points; i++) {
         let cell = find_cell(unit_point(points_at(i).xyz, level, grid), level);
-        let gradient = gradient_at(i * grid.all_levels + level.number);
+        let gradient = d_encoding_at(i * grid.all_levels + level.number);
 #unroll c $CORNERS
         d_features[first + cell.index[$c]] += cell.weight[$c] * gradient;
 #end
@@ -76,7 +78,7 @@ fn main(
     let level = levels[number / blocks];
     let first = first_entry(level);
     let cell = find_cell(unit_point(points_at(i).xyz, level, grid), level);
-    let gradient = gradient_at(i * grid.all_levels + level.number);
+    let gradient = d_encoding_at(i * grid.all_levels + level.number);
     let scale = fixed_scale(largest, grid.all_points);
 #unroll c $CORNERS
     add_fixed(4u * (first + cell.index[$c]), cell.weight[$c] * gradient.x, scale);

@@ -1,10 +1,11 @@
 // The largest absolute value of the gradient of an encoding: the bits of a float that is not negative grow as it does.
-#import common/d_encoding
 #import common/hashgrid
 #import common/index
 
 @group(0) @binding(0) var<uniform> grid: Grid;
 @group(0) @binding(1) var<storage, read_write> largest: atomic<u32>;   // zero before
+// (N, all levels): the gradient of two features of a point
+#table 3 d_encoding: vec2<f32>
 
 const LANES = 64u;
 const LANE_PAIRS = 32u;
@@ -22,7 +23,7 @@ fn main(
     for (var k = 0u; k < LANE_PAIRS; k++) {
         let i = first + k * LANES;
         if (i < grid.points * grid.all_levels) {
-            most = max(most, bitcast<vec2<u32>>(abs(gradient_at(i))));
+            most = max(most, bitcast<vec2<u32>>(abs(d_encoding_at(i))));
         }
     }
     of_lane[lane] = max(most.x, most.y);

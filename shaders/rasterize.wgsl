@@ -10,9 +10,6 @@
 // lies in the image, the background not yet under it, and the sign of the transmittance says whether a pixel has stopped.
 @group(0) @binding(6) var<storage, read_write> needed: array<u32>;
 #endif
-#ifdef LISTED
-@group(0) @binding(7) var<storage, read> listed_tiles: array<u32>;   // those with splats: a workgroup each
-#endif
 #import common/index
 #import common/raster
 
@@ -36,14 +33,10 @@ fn main(
         ranges[arrayLength(&ranges) - 1u].z = 1u;
     }
 #endif
-#ifdef LISTED
-    let tile = listed_tiles[workgroup_number(group, groups)];
-#else
     let tile = workgroup_number(group, groups);
     if (tile >= (frame.band.y - frame.band.x) * frame.tiles.x) {
         return;
     }
-#endif
     let my = place(lane);
     let corner = vec2(tile % frame.tiles.x * u32($TILE_W), (tile / frame.tiles.x + frame.band.x) * u32($TILE_H));
     let origin = vec2<f32>(corner) + 0.5;

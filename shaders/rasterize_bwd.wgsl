@@ -29,9 +29,6 @@
 struct Piece { number: u32, state: u32 }   // the place of the state among the tails
 @group(0) @binding(9) var<uniform> piece: Piece;
 #endif
-#ifdef LISTED
-@group(0) @binding(10) var<storage, read> listed_tiles: array<u32>;   // those with splats: a workgroup each
-#endif
 #import common/index
 #import common/raster
 
@@ -77,14 +74,10 @@ fn main(
         ranges[arrayLength(&ranges) - 1u].w = 1u;
     }
 #endif
-#ifdef LISTED
-    let tile = listed_tiles[workgroup_number(group, groups)];
-#else
     let tile = workgroup_number(group, groups);
     if (tile >= (frame.band.y - frame.band.x) * frame.tiles.x) {
         return;
     }
-#endif
     let range = ranges[tile];
 #ifdef ROUNDS
     let begin = range.x + piece.number * u32($ROUND_SPLATS);

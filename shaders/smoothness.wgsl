@@ -18,8 +18,8 @@ fn main(
     }
     var sum = 0.0;
     for (var k = 0u; k < smoothness.features; k++) {
-        let apart = there[pair * smoothness.features + k] - here[pair * smoothness.features + k];
-        sum += apart * apart;
+        let difference = there[pair * smoothness.features + k] - here[pair * smoothness.features + k];
+        sum += difference * difference;
     }
     sums[pair] = sum;
 }

@@ -9,10 +9,6 @@
 // sorted
 #table 2 tile_keys: vec4<u32>
 @group(0) @binding(3) var<storage, read_write> ranges: array<u32>;   // 4 a tile: first, one past the last; rasterize: drawn, unfinished
-#ifdef LISTED
-@group(0) @binding(4) var<storage, read_write> listed_tiles: array<u32>;   // those with splats, in any order
-@group(0) @binding(5) var<storage, read_write> workgroups: array<atomic<u32>>;   // that draw them
-#endif
 
 @compute @workgroup_size(64)
 fn main(
@@ -36,9 +32,6 @@ fn main(
         if (i < count && tile != before) {
             if (tile < tiles) {
                 ranges[4u * tile] = i;
-#ifdef LISTED
-                listed_tiles[atomicAdd(&workgroups[0], 1u)] = tile;
-#endif
             }
             if (before < tiles) {
                 ranges[4u * before + 1u] = i;

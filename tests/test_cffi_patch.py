@@ -47,20 +47,6 @@ def test_the_same_types(text: str) -> None:
     quick.new("Descriptor *", {"flags": 3, "kind": 2, "words": [{"whole": 1}]})
 
 
-def test_what_is_not_declared_is_refused_as_before() -> None:
-    for ffi in (declared(True), declared(False)):
-        with pytest.raises(cffi.CDefError):
-            ffi.typeof("Nothing *")
-
-
-def test_a_type_that_a_text_declares_stays() -> None:
-    ffi = declared(True)
-    pointer = ffi.typeof("struct Later *")
-    ffi.cdef("struct Later { int a; };")
-    assert ffi.typeof("struct Later *") is pointer
-    assert pointer.item.fields[0][0] == "a"
-
-
 def test_only_what_is_named_is_parsed(monkeypatch: pytest.MonkeyPatch) -> None:
     """In wgpu's own FFI, which is quick once a device was looked for."""
     from wgpu.backends.wgpu_native import ffi

@@ -116,10 +116,6 @@ def test_a_machine_without_a_driver_really_has_no_adapter() -> None:
     assert run.stdout.startswith("refused: no Vulkan, Metal or D3D12 adapter")
 
 
-def test_opengl_is_left_out() -> None:
-    assert {info.backend for info in list_devices()} <= {"Vulkan", "Metal", "D3D12"}
-
-
 class _Adapter:
     """What an adapter of wgpu says of itself."""
 
@@ -135,29 +131,18 @@ class _Adapter:
 
 
 def test_adapters_are_ordered(monkeypatch: pytest.MonkeyPatch) -> None:
-    kinds = [("soft", "CPU"), ("odd", "Unknown"), ("big", "DiscreteGPU"), ("small", "IntegratedGPU")]
+    """The default first; Vulkan before the same card through D3D12."""
+    big, small = "DiscreteGPU", "IntegratedGPU"
+    kinds = [("soft", "CPU"), ("odd", "Unknown"), ("big", big, "D3D12"), ("big", big), ("small", small)]
     adapters = [_Adapter(*kind) for kind in kinds]
     instance = type("Instance", (), {"enumerate_adapters_sync": lambda self: adapters})()
     monkeypatch.setattr(module, "_instance", lambda: instance)
     assert [(info.name, info.kind, info.backend) for info in list_devices()] == [
         ("big", "discrete", "Vulkan"),
+        ("big", "discrete", "D3D12"),
         ("small", "integrated", "Vulkan"),
         ("odd", "other", "Vulkan"),
         ("soft", "cpu", "Vulkan"),
-    ]
-
-
-def test_vulkan_comes_before_the_same_card_through_d3d12(monkeypatch: pytest.MonkeyPatch) -> None:
-    there = [("card", "DiscreteGPU", "D3D12"), ("card", "DiscreteGPU", "Vulkan"), ("chip", "IntegratedGPU", "Vulkan")]
-    adapters = [_Adapter(*each[:2]) for each in there]
-    for adapter, each in zip(adapters, there, strict=True):
-        adapter.info = {**adapter.info, "backend_type": each[2]}
-    instance = type("Instance", (), {"enumerate_adapters_sync": lambda self: adapters})()
-    monkeypatch.setattr(module, "_instance", lambda: instance)
-    assert [(info.kind, info.backend) for info in list_devices()] == [
-        ("discrete", "Vulkan"),
-        ("discrete", "D3D12"),
-        ("integrated", "Vulkan"),
     ]
 
 
@@ -202,12 +187,6 @@ def test_only_cpu_devices_are_mapped() -> None:
 
 
 # This machine's
-
-
-def test_this_machine_has_an_adapter() -> None:
-    found = list_devices()
-    assert found
-    assert all(info.kind in ("discrete", "integrated", "other", "cpu") for info in found)
 
 
 def test_one_device_a_name(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from helpers.decoder_reference import gated
 from helpers.fields import DYNAMICS, NEARBY, OURS, POINTS, grid_field, parts
 from helpers.matrices import on_device, random, read
 from helpers.scenes import relative
@@ -19,7 +20,6 @@ from lapgs_wgpu.gpu.native import Encoder
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.fields.deformation import Nearby
 from lapgs_wgpu.motion.fields.device_decoder import Decoder
-from lapgs_wgpu.motion.fields.gate import gated
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.passes.decoder_passes import DecoderShape
 
@@ -38,7 +38,7 @@ FIELDS = {
 
 def gate_reference(layers: Tensor, *, motion: bool) -> Tensor:
     """(N, layers, width) -> (N, features, width)."""
-    features = gated(layers[:, -1], layers[:, 0])
+    features = gated(layers[:, -1], 2 * layers[:, 0])
     return torch.stack([features, torch.relu(layers[:, 1])], dim=1) if motion else features[:, None]
 
 

@@ -103,9 +103,16 @@ all_scenes = pytest.mark.parametrize("name", SCENES)
 
 
 @all_scenes
-def test_no_contributing_pixel_is_missed(monkeypatch: pytest.MonkeyPatch, device: Device, name: str) -> None:
+def test_the_lists_of_tiles(monkeypatch: pytest.MonkeyPatch, device: Device, name: str) -> None:
     scene, camera = SCENES[name]
     emitted = duplicated(monkeypatch, device, scene, camera)
+    check_none_missed(emitted, camera)
+    check_few_in_vain(emitted)
+    check_counts(emitted)
+
+
+def check_none_missed(emitted: Emitted, camera: Camera) -> None:
+    """Each tile with a pixel that a splat reaches is in its list."""
     seen = emitted.splats[:, 10] > 0
     assert seen.sum() > 20
     for dtype in (np.float64, np.float32):  # exactly, and about as the rasterizer rounds
@@ -114,11 +121,8 @@ def test_no_contributing_pixel_is_missed(monkeypatch: pytest.MonkeyPatch, device
         assert not missed.any(), f"splats {np.unique(missed.nonzero()[0])} miss tiles in {dtype.__name__}"
 
 
-@all_scenes
-def test_few_tiles_are_listed_in_vain(monkeypatch: pytest.MonkeyPatch, device: Device, name: str) -> None:
-    """None whose rectangle of pixel centres, a little larger than the padding makes it, the ellipse does not meet."""
-    scene, camera = SCENES[name]
-    emitted = duplicated(monkeypatch, device, scene, camera)
+def check_few_in_vain(emitted: Emitted) -> None:
+    """The ellipse meets the rectangle of the pixel centres of each tile, a little larger than the padding makes it."""
     vain = emitted.touched & (least_distance(emitted, grown=0.03) > 2 * np.log(2) * log_reach(emitted)[:, None, None])
     assert not vain.any(), f"splats {np.unique(vain.nonzero()[0])} are listed in tiles that they do not reach"
 
@@ -148,11 +152,8 @@ def least_distance(emitted: Emitted, grown: float) -> NDArray[Any]:
     return least
 
 
-@all_scenes
-def test_what_is_written_was_counted(monkeypatch: pytest.MonkeyPatch, device: Device, name: str) -> None:
+def check_counts(emitted: Emitted) -> None:
     """No tile twice, and few pads, at the end; each splat's slots side by side, splats from front to back."""
-    scene, camera = SCENES[name]
-    emitted = duplicated(monkeypatch, device, scene, camera)
     columns, rows = emitted.tiles
     pads = emitted.tile == rows * columns
     assert emitted.tile.max(initial=0) <= rows * columns
@@ -187,6 +188,7 @@ def counted_within(padding: str) -> tuple[str, str, str]:
     return "common/tile", "COUNTED_PADDING: f32 = 0.025", f"COUNTED_PADDING: f32 = {padding}"
 
 
+@pytest.mark.nightly
 @all_scenes
 def test_a_driver_that_rounds_otherwise_loses_no_tile(
     monkeypatch: pytest.MonkeyPatch, device: Device, name: str
@@ -202,7 +204,8 @@ def test_a_driver_that_rounds_otherwise_loses_no_tile(
     assert np.array_equal(*touched)
 
 
-@pytest.mark.parametrize("name", ["small", "large", "faint", "needles"])
+@pytest.mark.nightly
+@pytest.mark.parametrize("name", ["small", "faint"])
 def test_pads_change_no_bit(monkeypatch: pytest.MonkeyPatch, device: Device, name: str) -> None:
     """Neither of the image nor of a gradient: as if exactly what is written had been counted, or far more."""
     scene, camera = SCENES[name]

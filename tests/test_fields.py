@@ -6,18 +6,18 @@ from dataclasses import replace
 
 import pytest
 import torch
+from helpers.decoder_reference import decode_reference
 from helpers.encoder_reference import encode_reference
 from helpers.fields import COUNT, DYNAMICS, NEARBY, OURS, POINTS, ROWS, grid_field, made, parts, stirred
-from torch import Tensor
 
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields import grid_field as grid_field_module
-from lapgs_wgpu.motion.fields.config import PLANES, FieldKind
+from lapgs_wgpu.motion.fields.config import PLANES, FieldConfig, FieldKind
 from lapgs_wgpu.motion.fields.deformation import Deformation
 from lapgs_wgpu.motion.fields.hexplane_field import HexPlaneField
 from lapgs_wgpu.motion.fields.laplacian import LaplacianMotion, TimeMotion
+from lapgs_wgpu.motion.fields.make_field import make_field
 from lapgs_wgpu.motion.fields.mlp_field import MlpField, octaves
-from lapgs_wgpu.motion.scene import make_field
 
 KINDS: tuple[FieldKind, ...] = ("mlp", "hexplane", "grid4d", "laplacian")
 
@@ -117,60 +117,36 @@ def test_without_its_additions_it_is_grid4d(device: Device) -> None:
         assert float((ours(POINTS, 0.3, DYNAMICS).translation - b.translation).detach().abs().max()) > 1e-3
 
 
-@pytest.mark.parametrize("depth", [0, 1])
-def test_the_decoder_written_out(device: Device, depth: int) -> None:
+WRITTEN_OUT = {
+    "grid4d": {"kind": "grid4d"},
+    "laplacian": {},
+    "opacity": {"appearance": "color+opacity"},
+    "one hidden layer": {"depth": 1, "appearance": "color+opacity"},
+    "two hidden layers": {"depth": 2, "kind": "grid4d"},
+}
+
+
+@pytest.mark.parametrize("name", WRITTEN_OUT)
+def test_the_decoder_written_out(device: Device, name: str) -> None:
     """Equations 6, 8 and 9, from the tables to the heads."""
-    field, t = grid_field(device, replace(OURS, depth=depth, appearance="color+opacity")), 0.3
-    weights = dict(field.named_parameters())
-    time = field.config.grid_time(t)
-    static, *temporal = (
-        encode_reference(grid, grid.table.double(), POINTS, time, OURS.bound).float() for grid in field.grids
-    )
-
-    def layer(name: str, x: Tensor) -> Tensor:
-        return x @ weights[f"{name}.weight"].T + weights[f"{name}.bias"]
-
-    hash_features = torch.cat([DYNAMICS, *temporal], dim=1)
-    gated = torch.relu(layer("temporal", hash_features)) * (2 * torch.sigmoid(layer("spatial", static)) - 1)
-    assert isinstance(field.motion, LaplacianMotion)
-    spectral = field.motion.series(t) * layer("motion.second", torch.relu(layer("motion.first", static)))
-    hidden = gated + spectral
-    for i in range(depth):
-        hidden = torch.relu(layer(f"hidden.{2 * i}", hidden))
-    heads, look = layer("heads", hidden), 0.1 * layer("appearance", gated)
-    turn = heads[:, :4] + torch.tensor([1.0, 0, 0, 0])
-    expected = [
-        turn / turn.norm(dim=1, keepdim=True),
-        heads[:, 4:7],
-        heads[:, 7:11],
-        heads[:, 11:],
-        look[:, :3],
-        look[:, 3],
-    ]
-    for found, wanted in zip(parts(field(POINTS, t, DYNAMICS)), expected, strict=True):
-        torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-4)
+    field = grid_field(device, replace(OURS, unit=0.5, **WRITTEN_OUT[name]))
+    for t in (0.0, 0.3, 1.0):
+        heads, look = decode_reference(field, POINTS, DYNAMICS, t)
+        turn = heads[:, :4] + heads.new_tensor([1.0, 0, 0, 0])
+        expected = [turn / turn.norm(dim=1, keepdim=True), heads[:, 4:7], heads[:, 7:11], heads[:, 11:]]
+        if look.shape[1]:
+            expected.append(look[:, :3])
+        expected += look[:, 3:].unbind(1)
+        for found, wanted in zip(parts(field(POINTS, t, DYNAMICS)), expected, strict=True):
+            torch.testing.assert_close(found.double(), wanted, rtol=1e-4, atol=1e-4)
 
 
-def test_bfloat16_rounds_features_and_not_what_the_heads_give(device: Device) -> None:
-    """With gradients alone: without, and after the training, everything is float32."""
-    field, d = grid_field(device, replace(OURS, width=256)), DYNAMICS.clone().requires_grad_()
-    found, grads = {}, {}
-    for precision in (torch.float32, torch.bfloat16):
-        field.precision = precision
-        move = field(POINTS, 0.3, d, NEARBY)
-        assert {part.dtype for part in parts(move)} == {torch.float32}
-        learnt = [*field.parameters(), d]
-        grads[precision] = torch.autograd.grad(sum(part.square().sum() for part in parts(move)), learnt)
-        found[precision] = torch.cat([part.detach() for part in parts(move) if part.ndim == 2], dim=1)
-        with torch.no_grad():
-            still = field(POINTS, 0.3, d)
-        assert torch.equal(still.translation, found[torch.float32][:, 4:7])
-    exact, rounded = found[torch.float32], found[torch.bfloat16]
-    assert 1e-5 < float((rounded - exact).norm() / exact.norm()) < 4e-3  # a bfloat16 has 8 bits: 2e-3 on average
-    assert not torch.equal(rounded, rounded.bfloat16().float())
-    for a, b in zip(grads[torch.bfloat16], grads[torch.float32], strict=True):
-        assert a.dtype == torch.float32
-        assert float((a - b).norm() / b.norm()) < 0.05
+def test_static_scenes_have_no_field(device: Device) -> None:
+    assert make_field(FieldConfig(kind="static"), device) is None
+
+
+def test_time_fills_a_share_of_its_axis() -> None:
+    assert [OURS.grid_time(t) for t in (0.0, 0.5, 1.0)] == pytest.approx([0.05, 0.5, 0.95])
 
 
 @pytest.mark.parametrize("kind", ["grid4d", "laplacian"])

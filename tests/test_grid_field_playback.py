@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from helpers.encoder_reference import encode_reference
+from helpers.decoder_reference import decode_reference
 from helpers.trained_scenes import CONFIGS, GRID4D, OURS, trained
 from torch import Tensor, nn
 
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.fields.parameter_shapes import parameter_shapes
@@ -35,28 +33,12 @@ def expected(scene: Scene4D, t: float) -> dict[str, Tensor]:
     field, config = scene.field, scene.field_config
     assert isinstance(field, GridField)
     p = {name: value.detach().double() for name, value in scene.parameters.items()}
-    w = {name: value.detach().double() for name, value in field.named_parameters()}
-    time = 0.5 * ((2 * t - 1) * config.time_scale + 1)
-    means = scene.parameters["means"].detach()
-    static, *temporal = (encode_reference(g, g.table.detach().double(), means, time, config.bound) for g in field.grids)
-
-    def layer(name: str, x: Tensor) -> Tensor:
-        return x @ w[f"{name}.weight"].T + w[f"{name}.bias"]
-
-    inputs = [p["dynamics"], *temporal] if config.dynamics_size else temporal
-    fused = torch.cat(inputs, dim=1) if inputs else means.new_zeros(len(means), 1).double()
-    hidden = torch.relu(layer("temporal", fused)) * (2 * torch.sigmoid(layer("spatial", static)) - 1)
-    look = 0.1 * layer("appearance", hidden) if config.appearance_size else None
-    if config.kind == "laplacian":
-        phase = 2 * math.pi * t * w["motion.frequencies"]
-        series = phase.cos() @ w["motion.alpha"] + phase.sin() @ w["motion.beta"]
-        hidden = hidden + series * layer("motion.second", torch.relu(layer("motion.first", static)))
-    turn, shift, d_quats, d_scales = layer("heads", hidden).split((4, 3, 4, 3), dim=1)
-    shift, d_scales = config.unit * shift, config.unit * d_scales
+    heads, look = decode_reference(field, scene.parameters["means"].detach(), p.get("dynamics"), t)
+    turn, shift, d_quats, d_scales = heads.split((4, 3, 4, 3), dim=1)
     unit = nn.functional.normalize
     turn = unit(turn + turn.new_tensor([1.0, 0, 0, 0]), dim=1)
     dc, logits = p["sh_dc"], p["opacity_logits"]
-    if look is not None:
+    if look.shape[1]:
         dc = dc + look[:, None, :3]
         logits = logits + look[:, 3] if look.shape[1] == 4 else logits
     changed = p["log_scales"].exp().clamp(min=1e-7) + d_scales
@@ -129,55 +111,6 @@ def test_the_same_bits_again(device: Device) -> None:
         field.move(t, out)
         found.append(out.means.read().tobytes())
     assert found[0] == found[2] != found[1]
-
-
-CHOSEN = {
-    "none": [],
-    "one": [299],
-    "all": list(range(300)),
-    "those of one block": list(range(70, 120)),
-    "any": np.flatnonzero(np.random.default_rng(0).random(300) < 0.4).tolist(),
-}
-
-
-@pytest.mark.parametrize("block", [None, 64, 192])
-@pytest.mark.parametrize("name", ["grid4d", "laplacian", "color", "dynamics alone"])
-def test_some_are_moved_and_the_others_left(device: Device, name: str, block: int | None) -> None:
-    """To the bit as when all are moved."""
-    scene = trained(device, CONFIGS[name], 300)
-    field, out = device_field(scene, block)
-    field.move(0.7, out)
-    after = contents(out)
-    for rows in (np.array(rows, np.int64) for rows in CHOSEN.values()):
-        field.move(0.2, out)
-        before = contents(out)
-        field.move(0.7, out, rows)
-        for part, found in contents(out).items():
-            expected = before[part].copy()
-            expected[rows] = after[part][rows]
-            np.testing.assert_array_equal(found, expected, err_msg=part)
-
-
-def contents(out: Gaussians[DeviceArray]) -> dict[str, np.ndarray]:
-    """As words, so that equal means equal bits."""
-    return {part: array.read().view(np.uint32) for part, array in out.arrays().items()}
-
-
-def test_work_goes_with_the_number_of_those_moved(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    field, out = device_field(trained(device, GRID4D, 40_000))
-    groups: dict[str, int] = {}
-
-    def dispatch(self: Commands, kernel: Kernel, number: int, **buffers: object) -> None:
-        groups[kernel.name] = groups.get(kernel.name, 0) + number
-
-    monkeypatch.setattr(Commands, "dispatch", dispatch)
-    field.move(0.5, out)
-    whole = groups.copy()
-    groups.clear()
-    field.move(0.5, out, np.arange(0, 40_000, 10))
-    assert groups.keys() == whole.keys() == {"hashgrid", "deform"}
-    for name in groups:
-        assert groups[name] <= 0.11 * whole[name] + 1
 
 
 @pytest.mark.parametrize("name", CONFIGS)

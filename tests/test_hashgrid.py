@@ -147,18 +147,17 @@ def test_several_grids_at_once(device: Device, lane_levels: bool) -> None:
 
 
 @both_shapes
-@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_grids_of_a_group_lie_beside_one_another(device: Device, lane_levels: bool, dtype: torch.dtype) -> None:
+def test_grids_of_a_group_lie_beside_one_another(device: Device, lane_levels: bool) -> None:
     names = ("dense", "sliced", "sliced and hashed", "hashed")
     points, time = random_points(900), 0.613
     encodings, upstream, gradients = [], [], []
     for group in (apart, lambda grids: [grids[:1], grids[1:]]):
         encoder = HashEncoder(device, group(make_grids(*names)), BOUND, lane_levels=lane_levels)
-        found = encoder(points, time, dtype)
+        found = encoder(points, time)
         encodings.append(torch.cat(found, dim=1))
         generator = torch.Generator().manual_seed(0)
         upstream = list(torch.randn(encodings[0].shape, generator=generator).split([e.shape[1] for e in found], dim=1))
-        gradients.append(encoder.backward([(points, time)], [d.to(dtype) for d in upstream]))
+        gradients.append(encoder.backward([(points, time)], upstream))
     assert torch.equal(*encodings)
     for a, b in zip(*gradients, strict=True):
         assert torch.equal(a, b) if lane_levels else relative(a, b) < 1e-6  # fixed point has a scale for each group
@@ -180,22 +179,7 @@ def test_rows_beyond_a_binding_are_taken_in_blocks(
 
 
 @both_shapes
-def test_bfloat16_is_float32_rounded(device: Device, lane_levels: bool) -> None:
-    """To the nearest, ties to even, as torch does it; and gradients in bfloat16 are taken as they are."""
-    encoder = HashEncoder(device, [make_grids("dense", "sliced"), make_grids("hashed")], BOUND, lane_levels=lane_levels)
-    places = [(random_points(700), 0.37), (random_points(70, seed=1), 0.9)]
-    full, rounded = encoder.encode_all(places), encoder.encode_all(places, torch.bfloat16)
-    for a, b in zip(full, rounded, strict=True):
-        assert all(torch.equal(y, x.bfloat16()) for x, y in zip(a, b, strict=True))
-    d_rounded = [torch.randn(e.shape).bfloat16() for encodings in rounded for e in encodings]
-    expected = encoder.backward(places, [d.float() for d in d_rounded])
-    for found, exact in zip(encoder.backward(places, d_rounded), expected, strict=True):
-        assert found.dtype == torch.float32
-        assert torch.equal(found, exact)
-
-
-@both_shapes
-@pytest.mark.parametrize("count", [0, 1, 2, 63, 64, 65, 511, 512, 513])
+@pytest.mark.parametrize("count", [0, 1, 65, 513])
 def test_any_number_of_points(device: Device, lane_levels: bool, count: int) -> None:
     encoder = HashEncoder(device, apart(make_grids("sliced", "hashed")), BOUND, lane_levels=lane_levels)
     check(encoder, 0.5 * random_points(count, seed=count), 0.9)
@@ -320,7 +304,7 @@ def test_both_shapes_agree(device: Device) -> None:
         assert relative(b, a) < 1e-6
 
 
-@pytest.mark.parametrize("size", [1e-30, 1e-12, 1.0, 1e12, 1e30])
+@pytest.mark.parametrize("size", [1e-30, 1e30])
 @both_shapes
 def test_gradients_of_any_size(device: Device, lane_levels: bool, size: float) -> None:
     encoder = HashEncoder(device, apart(make_grids("sliced", "hashed")), BOUND, lane_levels=lane_levels)

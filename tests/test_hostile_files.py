@@ -160,7 +160,7 @@ def shown_at_all_times(file: Path, device: Device) -> None:
     playback = open_playback(file, device)
     InitialView.from_json(playback.metadata.get("view", ""))
     assert playback.means(0.5).shape == (playback.count, 3)
-    assert len(playback.still(1.0)) == playback.count
+    assert len(playback.snapshot(1.0)) == playback.count
 
 
 # The state of a training ---------------------------------------------------------------------------------------------

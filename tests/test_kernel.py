@@ -228,7 +228,7 @@ def test_clearing_all_or_the_beginning(device: Device) -> None:
     assert b.read().tolist() == [0, 0, 0, 4, 5, 6, 7, 8]
 
 
-@pytest.mark.parametrize("groups", [0, 1, 65_535, 65_536, 70_001, 131_071])
+@pytest.mark.parametrize("groups", [0, 1, 65_536, 131_071])
 def test_more_groups_than_one_dimension_holds(device: Device, wgsl: dict[str, str], groups: int) -> None:
     wgsl["visit"] = """
 #import common/index
@@ -249,7 +249,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
 # Tables
 
 
-@pytest.mark.parametrize("count", [1, 4095, 4096, 4097, 20_000])
+@pytest.mark.parametrize("count", [1, 4097, 20_000])
 @pytest.mark.parametrize("kind", ["f32", "u32", "vec2<f32>", "vec4<u32>"])
 def test_tables_hold_what_the_buffer_holds(device: Device, wgsl: dict[str, str], kind: str, count: int) -> None:
     """Through textures where the device reads tables so: whole rows and a rest, and again after each kind of change."""
@@ -326,7 +326,7 @@ fn main() { target_[0] = source_at(0u); }
 # Reading and writing
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 5, 16_384, 16_385, 100_001])
+@pytest.mark.parametrize("count", [1, 3, 16_384, 16_385, 100_001])
 def test_what_is_written_is_read(either: Device, count: int) -> None:
     """Up to 64 KiB, and beyond, where a staged write takes another way."""
     values = np.random.default_rng(count).integers(0, 1 << 32, count, dtype=np.uint32)
@@ -359,13 +359,6 @@ def test_types_and_shapes_are_kept(either: Device) -> None:
     for wrong in (values.astype(np.float64), values[:6], values.view(np.uint32)):
         with pytest.raises(ValueError, match=r"values: .* is not float32 of \(7, 3\)"):
             array.write(wrong)
-
-
-def test_what_is_read_is_a_copy(either: Device) -> None:
-    buffer = numbers(either, [1, 2, 3, 4])
-    first = buffer.read()
-    buffer.write(np.array([9, 9, 9, 9], np.uint32))
-    assert first.tolist() == [1, 2, 3, 4]
 
 
 def test_several_buffers_are_read_at_once(either: Device) -> None:

@@ -13,7 +13,7 @@ from helpers.stages import watch
 
 from lapgs_wgpu.gpu import shader
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.splat import drawing_plan
+from lapgs_wgpu.splat import buffer_plan
 from lapgs_wgpu.splat import rasterizer as rasterizer_module
 from lapgs_wgpu.splat.rasterize import rasterize, rasterizer_of
 from lapgs_wgpu.splat.rasterizer import Rasterizer
@@ -70,6 +70,7 @@ def test_the_same_step_again(device: Device, use: Use, scene: Scene, expected: S
     same(one_step(scene, device), expected)
 
 
+@pytest.mark.nightly
 def test_after_other_images(device: Device, scene: Scene, expected: Step) -> None:
     """More and fewer Gaussians, another size, another kind of color, nothing at all."""
     for other, camera, degree in (
@@ -123,32 +124,16 @@ def total(device: Device, expected: Step) -> int:
     return needed(rasterizer_of(device))
 
 
-@pytest.mark.parametrize("factor", [1, 4])
-def test_capacity_does_not_matter(
-    device: Device, use: Use, scene: Scene, expected: Step, total: int, factor: int
-) -> None:
-    """1: not one place to spare."""
-    rasterizer = use(Rasterizer(device, capacity=factor * total))
-    same(one_step(scene, device), expected)
-    assert rasterizer.plan.capacity == factor * total
+def test_capacity_does_not_matter(device: Device, use: Use, scene: Scene, expected: Step, total: int) -> None:
+    """Too few places, which are drawn again with more, one too few, not one to spare, and many too many."""
+    for capacity in (16, total - 1, total, 4 * total):
+        rasterizer = use(Rasterizer(device, capacity=capacity))
+        same(one_step(scene, device), expected)
+        assert rasterizer.plan.capacity == capacity if capacity >= total else rasterizer.plan.capacity >= total
+        assert rasterizer.plan.bands == 1
 
 
-@pytest.mark.parametrize("capacity", [1, 16, 1000])
-def test_an_overflow_is_drawn_again(
-    device: Device, use: Use, scene: Scene, expected: Step, total: int, capacity: int
-) -> None:
-    rasterizer = use(Rasterizer(device, capacity=capacity))
-    same(one_step(scene, device), expected)
-    assert rasterizer.plan.capacity >= total
-    assert rasterizer.plan.bands == 1
-
-
-def test_one_place_too_few(device: Device, use: Use, scene: Scene, expected: Step, total: int) -> None:
-    rasterizer = use(Rasterizer(device, capacity=total - 1))
-    same(one_step(scene, device), expected)
-    assert rasterizer.plan.capacity >= total
-
-
+@pytest.mark.nightly
 def test_growing_on_a_later_image(device: Device, use: Use, scene: Scene, expected: Step) -> None:
     """Small images first; then an overflow between a forward pass and its backward pass."""
     use(Rasterizer(device, capacity=64))
@@ -178,10 +163,11 @@ def test_a_small_image_does_not_pay_for_a_large_one(device: Device, use: Use, sc
     assert rasterizer._drawings == drawings + 2  # none was drawn twice
 
 
+@pytest.mark.nightly
 def test_a_plan_shrinks_when_no_image_needs_it(
     device: Device, use: Use, monkeypatch: pytest.MonkeyPatch, scene: Scene, expected: Step, total: int
 ) -> None:
-    monkeypatch.setattr(drawing_plan, "_WATCHED", 3)
+    monkeypatch.setattr(buffer_plan, "_WATCHED", 3)
     rasterizer = use(Rasterizer(device, capacity=100 * total))
     if rasterizer.config.round_splats:
         rasterizer.plan = dataclasses.replace(rasterizer.plan, rounds=2)
@@ -196,6 +182,7 @@ def test_a_plan_shrinks_when_no_image_needs_it(
     assert rasterizer.plan == kept
 
 
+@pytest.mark.nightly
 def test_passes_folded_into_two_dimensions(device: Device, use: Use, monkeypatch: pytest.MonkeyPatch) -> None:
     """As if a dimension held 130 workgroups and not 65,535: Gaussians, intersections and tiles all need more."""
     scene, camera = random_scene(20_000, 8, size=0.01), oblique_camera(200, 160)
@@ -214,7 +201,7 @@ def banded(device: Device, use: Use, most: int) -> Rasterizer:
     return rasterizer
 
 
-@pytest.mark.parametrize("share", [2, 5])
+@pytest.mark.parametrize("share", [2, pytest.param(5, marks=pytest.mark.nightly)])
 def test_bands_draw_the_same_image(
     device: Device, use: Use, scene: Scene, expected: Step, total: int, share: int
 ) -> None:
@@ -232,6 +219,7 @@ def test_bands_draw_the_same_image(
     assert again.plan.bands == rasterizer.plan.bands
 
 
+@pytest.mark.nightly
 def test_bands_are_no_larger_than_need_be(
     device: Device, use: Use, scene: Scene, expected: Step, total: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -248,6 +236,7 @@ def test_bands_are_no_larger_than_need_be(
     assert rasterizer.plan.capacity > 16
 
 
+@pytest.mark.nightly
 def test_bands_with_backward_after_another_image(device: Device, use: Use, scene: Scene, total: int) -> None:
     banded(device, use, total // 3)
     expected = one_step(scene, device)
@@ -321,6 +310,7 @@ def test_the_passes_are_the_same_each_time(
     assert rounds[0] == rounds[1]
 
 
+@pytest.mark.nightly
 def test_tiles_that_were_counted_and_not_found(device: Device, use: Use, monkeypatch: pytest.MonkeyPatch) -> None:
     """Should a driver round differently in the passes that count tiles and that list them: the slots that are left over
     have no record, and take none of an earlier image."""

@@ -70,17 +70,19 @@ def check_rest(bad: Scene, rows: torch.Tensor, good: Scene, device: Device, **ho
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
-@pytest.mark.parametrize("name", UNSEEN)
-def test_an_invisible_gaussian_disturbs_nobody(device: Device, name: str, antialiased: bool) -> None:
+def test_invisible_gaussians_disturb_nobody(device: Device, antialiased: bool) -> None:
+    """All kinds at once, among others that are seen: first, between and last."""
     good = in_front(40, 1)
-    rows = torch.zeros(43, dtype=torch.bool)
-    rows[[0, 20, 42]] = True  # first, between, last
+    rows = torch.zeros(40 + 3 * len(UNSEEN), dtype=torch.bool)
+    rows[: len(UNSEEN)] = rows[-len(UNSEEN) :] = rows[30 : 30 + len(UNSEEN)] = True
+    kinds = list(UNSEEN.values()) * 3
     bad = {}
     for group, values in good.items():
-        bad[group] = torch.empty(43, *values.shape[1:])
-        bad[group][~rows], bad[group][rows] = values, values[:3]
-        if group in UNSEEN[name]:
-            bad[group][rows] = torch.tensor(UNSEEN[name][group])
+        bad[group] = torch.empty(len(rows), *values.shape[1:])
+        bad[group][~rows], bad[group][rows] = values, values[torch.arange(len(kinds)) % len(values)]
+        for row, kind in zip(rows.nonzero()[:, 0].tolist(), kinds, strict=True):
+            if group in kind:
+                bad[group][row] = torch.tensor(kind[group])
     check_rest(bad, rows, good, device, antialiased=antialiased)
 
 
@@ -109,7 +111,7 @@ def test_only_invisible_gaussians(device: Device) -> None:
 @pytest.mark.parametrize(
     ("name", "changes"),
     [
-        ("huge scale", {"scales": 1e3}),
+        pytest.param("huge scale", {"scales": 1e3}, marks=pytest.mark.nightly),
         ("one huge axis", {"scales": torch.tensor([1e4, 1e-3, 1e-3])}),
         ("no scale", {"scales": 0.0}),
         ("denormal scale", {"scales": 1e-40}),
@@ -138,6 +140,7 @@ def test_extremes_are_finite_and_as_in_float64(device: Device, name: str, change
         assert gradient.isfinite().all(), group
 
 
+@pytest.mark.nightly
 @settings(max_examples=30, deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 10_000),
@@ -192,7 +195,7 @@ def test_no_gaussians(device: Device, sh_degree: int | None) -> None:
     torch.testing.assert_close(found.gradients["background"], expected.gradients["background"])
 
 
-@pytest.mark.parametrize("size", [(1, 1), (1, 40), (40, 1), (8, 8), (16, 16), (9, 17), (65, 3)])
+@pytest.mark.parametrize("size", [(1, 1), (1, 40), (9, 17), (65, 3)])
 def test_all_image_sizes(device: Device, size: tuple[int, int]) -> None:
     """Nothing is drawn past the border, and the border is drawn."""
     scene, camera = in_front(20, 5), front_camera(*size, focal=10.0)
@@ -229,7 +232,11 @@ def poison(rasterizer: Rasterizer, pattern: np.ndarray) -> int:
 
 @pytest.mark.parametrize(
     ("pattern", "count", "sh_degree"),
-    [*((pattern, 300, 1) for pattern in PATTERNS), ("all bits", 300, None), ("NaN", 1, None)],
+    [
+        ("all bits", 300, 1),
+        *(pytest.param(pattern, 300, 1, marks=pytest.mark.nightly) for pattern in PATTERNS if pattern != "all bits"),
+        pytest.param("NaN", 1, None, marks=pytest.mark.nightly),
+    ],
 )
 def test_poisoned_buffers_do_not_change_a_bit(
     device: Device, use: Use, pattern: str, count: int, sh_degree: int | None
@@ -245,6 +252,7 @@ def test_poisoned_buffers_do_not_change_a_bit(
         assert drawn(scene, device, sh_degree=sh_degree).bits == expected.bits
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("pattern", ["all bits", "NaN"])
 def test_buffers_poisoned_between_the_bands(device: Device, use: Use, pattern: str) -> None:
     scene = in_front(300, 8)
@@ -255,17 +263,6 @@ def test_buffers_poisoned_between_the_bands(device: Device, use: Use, pattern: s
     assert rasterizer.plan.bands > 1
     poison(rasterizer, PATTERNS[pattern])
     assert drawn(scene, device).bits == expected.bits
-
-
-def test_buffers_poisoned_before_an_overflow(device: Device, use: Use) -> None:
-    scene = in_front(300, 9)
-    expected = drawn(scene, device)
-    rasterizer = use(Rasterizer(device, capacity=64))
-    drawn(in_front(1, 10), device)
-    assert rasterizer.plan.capacity == 64
-    poison(rasterizer, PATTERNS["all bits"])
-    assert drawn(scene, device).bits == expected.bits
-    assert rasterizer.plan.capacity > 64
 
 
 def test_a_picture_without_gradients_leaves_none(device: Device) -> None:

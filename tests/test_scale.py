@@ -99,6 +99,7 @@ def test_lists_beyond_a_round_are_drawn_in_more(device: Device, use: Use) -> Non
     assert rasterizer.plan.rounds > 1
 
 
+@pytest.mark.nightly
 @pytest.mark.kernels
 @pytest.mark.subgroups
 @pytest.mark.parametrize("depth", [False, True])
@@ -143,21 +144,12 @@ def test_large_images_are_cut_so_that_a_splat_has_few_enough_tiles(
     assert torch.equal(found["image"], expected["image"])
 
 
-@pytest.mark.kernels
-@pytest.mark.parametrize("count", [0, 1])
-def test_none_or_one_through_losses_and_gradients(count: int, device: Device) -> None:
-    scene = random_scene(count, 3, size=1.0)
-    scene["means"][:] = torch.tensor([0.0, 0.0, 3.0])
-    found = drawn(scene, front_camera(20, 12), device)
-    assert all(value.isfinite().all() for value in found.values())
-    assert found["d means"].shape == (count, 3)
-
-
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return load_dataset(write_synthetic(tmp_path_factory.mktemp("data") / "s", size=16, train_views=4, test_views=1))
 
 
+@pytest.mark.nightly
 def test_a_training_from_one_gaussian(dataset: Dataset, device: Device, tmp_path: Path) -> None:
     few = {"points__count": "1", "schedule__steps": "12", "density__start": "100"}
     assert len(train(configure(**few), dataset, tmp_path / "run", device=device)) == 1
@@ -167,6 +159,7 @@ def test_a_training_from_one_gaussian(dataset: Dataset, device: Device, tmp_path
 NONE_BORN = {"density__max_world_size": "0", "density__max_screen_radius": "0", "density__gradient": "1"}
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(("key", "value"), [("max_world_size", "1e-6"), ("max_screen_radius", "1")])
 def test_a_training_that_loses_all_gaussians_says_so(
     key: str, value: str, dataset: Dataset, device: Device, tmp_path: Path

@@ -104,7 +104,6 @@ def test_the_fingerprint_is_that_of_the_training_not_of_the_machine(tmp_path: Pa
     assert fingerprint(dataclasses.replace(config, seed=1)) != fingerprint(config)
     exposed = dataclasses.replace(config.exposure, enabled=True)
     assert fingerprint(dataclasses.replace(config, exposure=exposed)) != fingerprint(config)
-    assert fingerprint(dataclasses.replace(config, precision="bfloat16")) != fingerprint(config)
     assert fingerprint(dataclasses.replace(config, decoder="device")) == fingerprint(config), "as a GPU has it"
     kept = dataclasses.replace(config.cameras, refine="off")
     assert fingerprint(dataclasses.replace(config, cameras=kept)) != fingerprint(config)
@@ -716,7 +715,7 @@ def test_why_a_run_failed_is_told(
     assert "No run is finished yet." in (spec_file.parent / "out" / "table.md").read_text()
 
 
-@pytest.mark.parametrize("name", ["method", "precision"])
+@pytest.mark.parametrize("name", ["method"])
 def test_measured_runs_keep_their_fingerprints(name: str) -> None:
     """Keys that are added to the configuration leave results as they are where their value is that of before."""
     folder = Path(__file__).parents[1] / "docs" / "tables"

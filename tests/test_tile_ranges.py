@@ -39,41 +39,6 @@ def test_ranges_are_where_the_sorted_keys_change(
     np.testing.assert_array_equal(ranges[~filled, :2], 0)
 
 
-def test_only_tiles_with_splats_are_drawn(monkeypatch: pytest.MonkeyPatch, device: Device) -> None:
-    """Each once, on devices where a workgroup that does nothing costs as much as one that does."""
-    shape = rasterizer_of(device).config
-    if not shape.listed:
-        pytest.skip("this device draws all tiles")
-    scene, camera = random_scene(40, 3, size=0.02), oblique_camera(101, 61)
-    copies = capture(monkeypatch, "tile_ranges", "ranges", "listed_tiles", "workgroups")
-    for scale in (1.0, 100.0, 0.0):
-        rasterize(**(scene | {"scales": scale * scene["scales"]}), camera=camera, device=device)
-        groups = all_of(copies[-1]["workgroups"])
-        listed = all_of(copies[-1]["listed_tiles"])[: groups[0]]
-        first, last = copies[-1]["ranges"].read()[:-1, :2].T
-        np.testing.assert_array_equal(np.sort(listed), np.flatnonzero(last > first))
-        np.testing.assert_array_equal(groups[1:], 1)
-
-
-def test_each_image_lies_on_its_own_background(device: Device) -> None:
-    """Also where no splat is, at another size than before, and with and without depth."""
-    scene = random_scene(3, 2, size=0.02)
-    for background, size, depth in (
-        ((0.0, 0.0, 0.0), (101, 61), True),
-        ((1.0, 0.5, 0.25), (101, 61), True),
-        ((1.0, 0.5, 0.25), (61, 101), False),
-        ((0.25, 1.0, 0.5), (61, 101), False),
-        ((0.25, 1.0, 0.5), (61, 101), True),
-    ):
-        drawn = rasterize(
-            **scene, camera=oblique_camera(*size), background=torch.tensor(background), depth=depth, device=device
-        )
-        empty = drawn.alpha == 0
-        assert empty.float().mean() > 0.5
-        assert torch.equal(drawn.image[empty], torch.tensor(background).expand(int(empty.sum()), 3))
-        assert not drawn.depth[empty].any()
-
-
 def test_lists_are_left_where_nothing_behind_is_seen(monkeypatch: pytest.MonkeyPatch, device: Device) -> None:
     """The drawn part of each list ends early behind opaque splats, and only there."""
     camera = oblique_camera(101, 61)

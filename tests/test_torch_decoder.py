@@ -6,11 +6,11 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
+from helpers.decoder_reference import gated
 from helpers.matrices import random
 from torch import Tensor
 
 from lapgs_wgpu.motion.fields import torch_decoder
-from lapgs_wgpu.motion.fields.gate import gated
 from lapgs_wgpu.motion.fields.torch_decoder import DecoderWeights, decode
 
 SHAPES = {
@@ -56,7 +56,7 @@ def decode_reference(
         moving = moving + temporal @ weights.temporal.T
     if dynamics is not None:
         moving = moving + dynamics @ weights.dynamics.T
-    features = gated(moving.expand(len(static), -1), static @ weights.spatial.T + weights.spatial_bias)
+    features = gated(moving.expand(len(static), -1), 2 * (static @ weights.spatial.T + weights.spatial_bias))
     outputs = features @ weights.heads.T + weights.heads_bias
     if weights.inner is not None:
         inner = torch.relu(static @ weights.inner.T + weights.inner_bias)

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.playback import open_playback
-from helpers.still_scenes import CAMERA, KINDS, half_still
+from helpers.still_scenes import CAMERA, KINDS, saved_scene
 from helpers.trained_scenes import GRID4D, OURS, trained
 
 from lapgs_wgpu.errors import DeviceLostError, NumericalError
@@ -60,27 +60,19 @@ def app_by_the_clock(file: Path, device: Device, monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.mark.triangles
-def test_the_window_rests_on_the_exact_frame(device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    half_still(device, tmp_path)
+def test_the_window_rests_on_the_full_frame(device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    saved_scene(device, tmp_path)
     canvas, app, now = app_by_the_clock(tmp_path / "scene.ply", device, monkeypatch)
-    exact = FrameRenderer(open_playback(tmp_path / "scene.ply", device))
-    passing = []
-    for t in [*((np.arange(16) + 0.5) / 16), 0.3, 0.31]:
+    alone = FrameRenderer(open_playback(tmp_path / "scene.ply", device))
+    for t in (0.1, 0.3, 0.31):
         now[0] += 0.1
-        app.state.clock.seek(float(t))
+        app.state.clock.seek(t)
         canvas.draw()
-        assert app.viewport.frame is not None
-        passing.append(app.viewport.frame.exact)
-    assert all(passing[:16])
-    assert passing[16:] == 2 * [not device.mappable]
-    now[0] += 0.1
+    now[0] += 0.3
     canvas.draw()
-    assert app.viewport.frame.exact == (not device.mappable)  # it may move on
-    now[0] += 0.2
-    canvas.draw()
-    assert app.viewport.frame.exact
+    assert app.viewport.at_rest
     assert app.viewport.scale == 1
-    np.testing.assert_array_equal(planes(app.viewport.frame), planes(exact.draw(app.viewport.frame.request)))
+    np.testing.assert_array_equal(planes(app.viewport.frame), planes(alone.draw(app.viewport.frame.request)))
     rests = app.viewport.frame
     now[0] += 5
     canvas.draw()
@@ -140,7 +132,7 @@ def test_a_file_that_cannot_be_shown_leaves_the_scene_as_it_is(
 @pytest.mark.triangles
 def test_a_device_that_fails_ends_the_viewer(device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """rendercanvas logs exceptions and goes on. And the clip does not leap where the window could not be drawn."""
-    half_still(device, tmp_path)
+    saved_scene(device, tmp_path)
     canvas, app, now = app_by_the_clock(tmp_path / "scene.ply", device, monkeypatch)
     app.state.clock.playing = True
     canvas.draw()

@@ -6,7 +6,7 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -29,8 +29,6 @@ from lapgs_wgpu.gpu.buffer import Buffer
 from lapgs_wgpu.gpu.device import _DEFAULT_LIMITS, _RAISED_LIMITS, Device, DeviceInfo
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.wgpu_errors import TranslatedErrors
-from lapgs_wgpu.io.initial_view import InitialView
-from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.rasterize import rasterizer_of
 from lapgs_wgpu.train.dataloader import ImageLoader
 from lapgs_wgpu.train.log import Log
@@ -74,7 +72,7 @@ def fail_to_allocate(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     rasterizer.plan = replace(rasterizer.plan, capacity=4 * rasterizer.plan.capacity)
 
 
-@pytest.mark.parametrize("how", ["lost", "memory"])
+@pytest.mark.parametrize("how", ["lost", pytest.param("memory", marks=pytest.mark.nightly)])
 def test_a_training_whose_device_fails_goes_on_later_to_the_same_bytes(
     how: str,
     whole: bytes,
@@ -107,20 +105,7 @@ def test_a_training_whose_device_fails_goes_on_later_to_the_same_bytes(
     assert (out / "checkpoint.ply").read_bytes() == whole
 
 
-def test_an_error_of_another_kind_leaves_a_state_too(
-    dataset: Dataset, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(*_: Any) -> None:
-        raise ZeroDivisionError
-
-    after_step(12, lambda: monkeypatch.setattr("lapgs_wgpu.train.objective.draw_nearby", fail), monkeypatch)
-    with pytest.raises(ZeroDivisionError):
-        train(configure(), dataset, tmp_path, device=device)
-    state = load_state(tmp_path)
-    assert state is not None
-    assert state["training.done"] == 12
-
-
+@pytest.mark.nightly
 def test_a_step_that_broke_off_halfway_is_not_saved(
     dataset: Dataset, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -136,25 +121,7 @@ def test_a_step_that_broke_off_halfway_is_not_saved(
     assert state["training.done"] == 8
 
 
-def test_a_half_step_whose_error_is_kept_is_not_saved_either(
-    dataset: Dataset, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(*_: Any, **__: Any) -> None:
-        raise MemoryError
-
-    def keep(scene: Scene4D, look: InitialView, steps: Iterator[StepResult]) -> None:
-        with pytest.raises(MemoryError):
-            list(steps)
-
-    monkeypatch.setattr("lapgs_wgpu.train.densify.densify", fail)
-    with pytest.raises(RuntimeError, match="step 10 broke off halfway"):
-        train(configure(schedule__save_interval="4", density__start="9"), dataset, tmp_path, device=device, watch=keep)
-    state = load_state(tmp_path)
-    assert state is not None
-    assert state["training.done"] == 8
-    assert not (tmp_path / "checkpoint.ply").exists()
-
-
+@pytest.mark.nightly
 def test_nothing_is_saved_before_the_first_step(
     dataset: Dataset, doomed: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -282,6 +249,7 @@ sys.exit(guarded("test", fill, []))
 """
 
 
+@pytest.mark.nightly
 @pytest.mark.skipif(sys.platform != "linux", reason="limits the memory of a process")
 def test_memory_that_really_is_used_up() -> None:
     done = subprocess.run([sys.executable, "-c", REAL], capture_output=True, text=True, timeout=100)

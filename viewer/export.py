@@ -33,7 +33,7 @@ def export_still(scene: LoadedScene, file: Path, time: float, *, overwrite: bool
     if scene.path is not None and file.exists() and file.samefile(scene.path):
         raise InputError(f"{file}: is the opened file, and a still holds no motion; take another name.")
     check_free(file, overwrite)
-    write_ply(file, scene.playback.still(time))
+    write_ply(file, scene.playback.snapshot(time))
 
 
 def export_compact(scene: LoadedScene, file: Path, *, overwrite: bool = False) -> None:
@@ -85,5 +85,5 @@ def export_frames(scene: LoadedScene, folder: Path, frames: int, *, overwrite: b
     digits = max(4, len(str(frames - 1)))
     with Progress(frames, "frames") as progress:
         for number, time in enumerate(np.linspace(0, 1, frames).tolist()):
-            write_ply(folder / f"frame_{number:0{digits}}.ply", scene.playback.still(time))
+            write_ply(folder / f"frame_{number:0{digits}}.ply", scene.playback.snapshot(time))
             progress.step()

@@ -35,15 +35,13 @@ class FrameRequest(NamedTuple):
 @dataclasses.dataclass(frozen=True, eq=False)
 class Frame:
     """A drawn frame. placed: for the presenter, at the origin in its own size. seconds: it took, all passes waited for.
-    splats: how many touched the picture. passes: milliseconds of each pass, where they were asked for. exact: see
-    Playback."""
+    splats: how many touched the picture. passes: milliseconds of each pass, where they were asked for."""
 
     request: FrameRequest
     placed: Placed
     seconds: float
     splats: int
     passes: dict[str, float]
-    exact: bool
 
 
 def warm_up(device: Device) -> None:
@@ -76,16 +74,14 @@ class FrameRenderer:
             missing.add("dynamics")
         return [mode for mode in MODES if mode not in missing]
 
-    def draw(self, request: FrameRequest, *, passing: bool = False, profile: bool = False) -> Frame:
-        """Draw, and wait until it is done. passing: while something moves; Gaussians may then be of other times where
-        nobody sees it. profile: take the time of each pass, where the device can."""
+    def draw(self, request: FrameRequest, *, profile: bool = False) -> Frame:
+        """Draw, and wait until it is done. profile: take the time of each pass, where the device can."""
         start = time.perf_counter()
         camera, mode = request.camera, request.mode
         low, high, background = 0.0, 1.0, request.background
         # Before the Gaussians: measuring may take them to other times.
         value = self._value(mode, request.time) if mode in ("motion", "dynamics", "scale") else None
-        gaussians = self.playback.at(request.time, camera if passing else None)
-        exact = self.playback.exact
+        gaussians = self.playback.at(request.time)
         if value is not None:
             colors, low, high = value
             gaussians = dataclasses.replace(gaussians, sh=colors)
@@ -104,7 +100,7 @@ class FrameRenderer:
         shows = {"rgb": "color", "alpha": "alpha", "depth": "depth"}.get(mode, "value")
         size = (camera.width, camera.height)
         placed = Placed(drawing.image, size, (0, 0), size, request.background, shows, low, high)
-        return Frame(request, placed, time.perf_counter() - start, int(visible[0]), passes, exact)
+        return Frame(request, placed, time.perf_counter() - start, int(visible[0]), passes)
 
     def depth_at(self, frame: Frame, column: int, row: int) -> float | None:
         """Depth along the camera's axis of what a pixel shows, world units; None where it shows next to nothing."""

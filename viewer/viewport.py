@@ -52,8 +52,8 @@ class Viewport:
 
     @property
     def at_rest(self) -> bool:
-        """Whether the frame on show is final: full resolution and every Gaussian exact."""
-        return self.scale == 1 and self.frame is not None and self.frame.exact
+        """Whether the frame on show is final, at full resolution."""
+        return self.scale == 1 and self.frame is not None
 
     def refresh(self) -> None:
         """The scene itself has changed: draw it again."""
@@ -62,7 +62,7 @@ class Viewport:
         self.canvas.request_draw()
 
     def draw(self, now: float) -> None:
-        """Draw the scene where something changed: at a lower resolution and approximately while it changes, in full
+        """Draw the scene where something changed: at a lower resolution while it changes, in full
         once nothing has changed for SETTLED seconds. now: seconds of `time.perf_counter`."""
         state, full = self.state, self._full_camera()
         key = (*_camera_key(full), state.clock.time, state.mode, state.background, state.profiling, state.renderer)
@@ -82,8 +82,7 @@ class Viewport:
         if self.scale < 1:
             camera = full.resized(max(1, round(self.scale * full.width)), max(1, round(self.scale * full.height)))
         request = FrameRequest(camera, state.clock.time, state.mode, state.background)
-        passing = moving and state.comparing() == "off"
-        self.frame = state.renderer.draw(request, passing=passing, profile=state.profiling)
+        self.frame = state.renderer.draw(request, profile=state.profiling)
         self._drawn, self.stale = key, False
         self._times.append(time.perf_counter())
         if moving:

@@ -50,13 +50,13 @@ PASSES: dict[str, tuple[str, Defines]] = {
     "sort_scatter": ("sort_scatter", {}),
     "sort_scatter IOTA": ("sort_scatter", {"IOTA": 1}),
     "hashgrid_slice": ("hashgrid_slice", {}),
-    "hashgrid SLICED ROWS": ("hashgrid", {"SLICED": 1, "CORNERS": 4, "ROWS": 1}),
-    "hashgrid ROWS": ("hashgrid", {"CORNERS": 8, "ROWS": 1}),
+    "hashgrid SLICED": ("hashgrid", {"SLICED": 1, "CORNERS": 4}),
+    "hashgrid": ("hashgrid", {"CORNERS": 8}),
     "deform": ("deform", _HEADS | {"HEADS": 4}),
     "deform MOTION": ("deform", _HEADS | {"HEADS": 4, "MOTION": 1}),
     "deform COLOR MOTION": ("deform", _HEADS | {"HEADS": 5, "MOTION": 1, "COLOR": 1}),
 }  # fmt: skip
-_FIELD = ("hashgrid_slice", "hashgrid SLICED ROWS", "hashgrid ROWS")  # beside one of deform
+_FIELD = ("hashgrid_slice", "hashgrid SLICED", "hashgrid")  # beside one of deform
 _CHOSEN = ("color", "rasterize", "deform")  # one of each
 _DESKTOP_ACTIONS = ("next_mode", "next_view", "next_compare", "add_key_frame", "toggle_pause", "step_training")
 

@@ -14,14 +14,14 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.native import READ, mapping
 from lapgs_wgpu.gpu.wgpu_errors import TranslatedErrors
 
-_ITEM_BYTES = {"float32": 4, "uint32": 4, "int16": 2, "uint8": 1, "uint64": 8}
+_ITEM_BYTES = {"float32": 4, "uint32": 4, "uint8": 1, "uint64": 8}
 
 
 @dataclass(frozen=True, eq=False)
 class DeviceArray:
     """A contiguous array in a buffer.
 
-    dtype: float32, uint32, int16 (pairs of bfloat16), uint8 or uint64. offset: in bytes, from the buffer's start.
+    dtype: float32, uint32, uint8 or uint64. offset: in bytes, from the buffer's start.
     """
 
     buffer: Buffer
@@ -60,7 +60,7 @@ class DeviceArray:
 
     @property
     def resource(self) -> dict[str, Any]:
-        """What wgpu binds."""
+        """The resource that wgpu binds."""
         return {"buffer": self.buffer.wgpu_buffer, "offset": self.offset, "size": self.bound_bytes}
 
     def rows(self, first: int, count: int) -> DeviceArray:

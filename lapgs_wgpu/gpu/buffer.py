@@ -55,11 +55,9 @@ class Buffer:
     On CPU devices the buffer is mapped itself, and the processor reads and writes it with one copy. Others use staging
     buffers of the same size. The one for reading is kept; the one for writing is kept from the second write on, so that
     write-once buffers do not take their memory twice.
-
-    counts: whether a dispatch may read its number of workgroups from it.
     """
 
-    def __init__(self, device: Device, nbytes: int, label: str, *, counts: bool = False) -> None:
+    def __init__(self, device: Device, nbytes: int, label: str) -> None:
         self.device = device
         self.label = label
         self.nbytes = max(16, (nbytes + 15) & ~15)
@@ -68,8 +66,7 @@ class Buffer:
             raise DeviceMemoryError(
                 f"buffer {label!r} needs {self.nbytes} bytes, but a buffer of this device holds {limit}"
             )
-        usage = _STORAGE | (_MAPPABLE if device.mappable else 0)
-        self.wgpu_buffer = self._create(usage | wgpu.BufferUsage.INDIRECT if counts else usage)
+        self.wgpu_buffer = self._create(_STORAGE | (_MAPPABLE if device.mappable else 0))
         self.number = next(_numbers)  # unique, also among freed buffers
         # Bind groups keep device memory alive: they are dropped with the buffer.
         self.bound: weakref.WeakSet[BindGroup] = weakref.WeakSet()

@@ -96,7 +96,7 @@ def _dxc() -> str | None:
 
 @functools.cache
 def _instance() -> Any:
-    """wgpu's instance, without the validation that wgpu otherwise runs before each indirect dispatch."""
+    """Return wgpu's instance, with the backends of `instance_options`."""
     os.environ.setdefault("XDG_RUNTIME_DIR", "/tmp")  # otherwise Mesa prints a warning
     import wgpu
     from wgpu.backends.wgpu_native import ffi
@@ -129,7 +129,7 @@ def list_devices() -> list[DeviceInfo]:
 
 
 def adapter_details() -> list[AdapterDetails]:
-    """As `list_devices`, with features and limits."""
+    """List the adapters as `list_devices` does, with features and limits."""
     found = []
     for info, adapter in _adapters():
         limits = {name: int(adapter.limits[name]) for name in dict.fromkeys((*_DEFAULT_LIMITS, *_RAISED_LIMITS))}

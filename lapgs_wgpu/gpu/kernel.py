@@ -99,7 +99,7 @@ class Kernel:
                 )
 
     def bind(self, arrays: dict[str, DeviceArray], textures: dict[str, Any]) -> Any:
-        """wgpu's bind group for arrays; `textures` replace some of them. Raises as `check` does."""
+        """Return wgpu's bind group for arrays; `textures` replace some of them. Raises as `check` does."""
         key = tuple((name, array.key, id(textures.get(name))) for name, array in arrays.items())
         group = self._groups.get(key)
         if group is None:
@@ -140,23 +140,19 @@ class Commands:
         self._raising = raising("commands")
         self._copied: list[Buffer] = []
 
-    def dispatch(self, kernel: Kernel, groups: int | DeviceArray, **arrays: DeviceArray) -> None:
-        """Run `groups` workgroups, in two dimensions if there are too many for one (common/index.wgsl), or as many as
-        an array of `BufferPool.workgroups` says by then."""
-        if isinstance(groups, DeviceArray):
-            self.dispatch_grid(kernel, groups, **arrays)
-            return
+    def dispatch(self, kernel: Kernel, groups: int, **arrays: DeviceArray) -> None:
+        """Run `groups` workgroups, in two dimensions if there are too many for one (common/index.wgsl)."""
         limit = self.device.limits["max-compute-workgroups-per-dimension"]
         rows = max(1, -(-groups // limit))
         self.dispatch_grid(kernel, (-(-groups // rows), rows), **arrays)
 
-    def run(self, kernel: Kernel, groups: int | DeviceArray, arrays: Mapping[str, Any]) -> None:
+    def run(self, kernel: Kernel, groups: int, arrays: Mapping[str, Any]) -> None:
         """`dispatch` with those of the arrays that the shader binds."""
         self.dispatch(kernel, groups, **{name: arrays[name] for name in kernel.bindings})
 
-    def dispatch_grid(self, kernel: Kernel, groups: tuple[int, int] | DeviceArray, **arrays: DeviceArray) -> None:
+    def dispatch_grid(self, kernel: Kernel, groups: tuple[int, int], **arrays: DeviceArray) -> None:
         """Run columns x rows workgroups on arrays, given by the names of the shader's bindings."""
-        if isinstance(groups, tuple) and min(groups) <= 0:
+        if min(groups) <= 0:
             return
         if arrays.keys() != kernel.bindings.keys() or not all(
             isinstance(array, DeviceArray) for array in arrays.values()
@@ -165,10 +161,7 @@ class Commands:
         textures = {name: self._texture(arrays[name], texels) for name, texels in kernel.textures.items()}
         group = kernel.bind(arrays, textures)
         self._encoder.begin_pass(None if self._profile is None else self._profile.record(kernel.name))
-        if isinstance(groups, DeviceArray):
-            self._encoder.dispatch_counted(kernel.pipeline, group, groups.buffer.wgpu_buffer, groups.offset)
-        else:
-            self._encoder.dispatch(kernel.pipeline, group, *groups)
+        self._encoder.dispatch(kernel.pipeline, group, *groups)
         for name in kernel.written:
             arrays[name].buffer.version += 1
 

@@ -53,13 +53,13 @@ class Matmul:
         self._device, self._pool = device, pool
 
     def __call__(self, commands: Commands, name: str, a: Matrix, b: Matrix, c: Matrix, *, add: bool = False) -> None:
-        """c = a b, or c += a b with `add`. c must not be transposed."""
+        """Record c = a b, or c += a b with `add`. c must not be transposed."""
         self._dispatch(commands, name, a, b, c, a.columns, add=add)
 
     def split_k(
         self, commands: Commands, name: str, a: Matrix, b: Matrix, total: DeviceArray, *, add: bool = False
     ) -> None:
-        """total = a b, or total += a b with `add`, for a long inner dimension.
+        """Record total = a b, or total += a b with `add`, for a long inner dimension.
 
         The dimension is split, which occupies the device and keeps partial sums short, hence accurate.
         """

@@ -51,7 +51,7 @@ def _mapped(status: int, _message: Any, number: Any, _second: Any) -> None:
 
 
 class _Callback(threading.local):
-    """What a thread passes for the mapping that it begins: the library copies it."""
+    """Each thread's callback info for a mapping; the library copies it."""
 
     def __init__(self) -> None:
         self.info = ffi.new("WGPUBufferMapCallbackInfo *")
@@ -136,12 +136,6 @@ class Encoder:
         lib.wgpuComputePassEncoderSetBindGroup(self._pass, 0, bind_group._internal, 0, ffi.NULL)
         lib.wgpuComputePassEncoderDispatchWorkgroups(self._pass, columns, rows, 1)
 
-    def dispatch_counted(self, pipeline: Any, bind_group: Any, counts: Any, offset: int) -> None:
-        """The same, with as many workgroups as three words of a buffer say."""
-        lib.wgpuComputePassEncoderSetPipeline(self._pass, pipeline._internal)
-        lib.wgpuComputePassEncoderSetBindGroup(self._pass, 0, bind_group._internal, 0, ffi.NULL)
-        lib.wgpuComputePassEncoderDispatchWorkgroupsIndirect(self._pass, counts._internal, offset)
-
     def clear(self, buffer: Any, offset: int, nbytes: int) -> None:
         """Set bytes of a buffer to zero."""
         self.end_pass()
@@ -167,7 +161,7 @@ class Encoder:
 
 
 class TextureCopies:
-    """How `texels` of a buffer, from a byte on, are copied to a texture: full rows, then the rest of one."""
+    """Descriptors of the copies of `texels` from a buffer offset to a texture: full rows, then the rest of one."""
 
     def __init__(self, buffer: Any, offset: int, texture: Any, width: int, texel_bytes: int, texels: int) -> None:
         pitch = width * texel_bytes

@@ -32,13 +32,6 @@ class BufferPool:
             buffer = self._buffers[name] = Buffer(self.device, nbytes, name)
         return DeviceArray(buffer, shape, dtype)
 
-    def workgroups(self, name: str) -> DeviceArray:
-        """An array (3,) uint32 of the numbers of workgroups that `Commands.dispatch` runs in each dimension, of which
-        none may exceed the device's limit."""
-        if name not in self._buffers:
-            self._buffers[name] = Buffer(self.device, 12, name, counts=True)
-        return DeviceArray(self._buffers[name], (3,), "uint32")
-
     def upload(self, name: str, values: NDArray[Any]) -> DeviceArray:
         """A copy of `values`, with their shape and dtype, in the buffer of this name."""
         array = self.array(name, values.shape, values.dtype.name)

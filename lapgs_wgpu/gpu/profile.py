@@ -32,7 +32,7 @@ class Profile:
         self._tick_nanoseconds = _timestamp_period(device)
 
     def record(self, name: str) -> dict[str, Any]:
-        """wgpu's `timestamp_writes` for a compute pass of this name."""
+        """Return wgpu's `timestamp_writes` for a compute pass of this name."""
         first = 2 * len(self._names)
         if len(self._names) == self.capacity:
             raise RuntimeError(f"a Profile of {self.capacity} dispatches is full: read() it earlier, or make it larger")

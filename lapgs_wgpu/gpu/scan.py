@@ -34,7 +34,7 @@ class Scan:
         total: DeviceArray,
         indices: DeviceArray | None = None,
     ) -> None:
-        """prefix[i] = sum of the first i elements, total[0] = sum of all; elements = length[0] <= capacity."""
+        """Record prefix[i] = sum of the first i elements, total[0] = sum of all; elements = length[0] <= capacity."""
         count = max(1, -(-capacity // _BLOCK_ITEMS))
         sums = self._pool.array(f"{self._name} block sums", (count,), "uint32")
         source = {"length": length, "values": values} | ({} if indices is None else {"indices": indices})

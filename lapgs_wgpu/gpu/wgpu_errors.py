@@ -46,7 +46,7 @@ class TranslatedErrors:
 
 
 def is_lost(native: Any) -> bool:
-    """Whether wgpu's device can no longer be used."""
+    """Return whether wgpu's device is lost."""
     try:
         native.create_buffer(size=16, usage=wgpu.BufferUsage.COPY_DST)
     except wgpu.GPUError as error:

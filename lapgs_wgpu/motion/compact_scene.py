@@ -123,7 +123,7 @@ def expand(
 
 
 def _table_starts(config: FieldConfig) -> list[int]:
-    """First entries of the levels of a temporal grid."""
+    """Return the first entries of the levels of a temporal grid."""
     grids = temporal_grids(config)
     return [level.first for level in grids[0].levels] if grids else [0]
 
@@ -146,7 +146,7 @@ class _Reader:
         return array
 
     def columns(self, name: str, rows: int, columns: int, starts: Sequence[int] = (0,)) -> Floats:
-        """(rows, columns)."""
+        """Return a dequantized tensor (rows, columns)."""
         whole = self.tensor(name, (columns, rows), "u1", "u2")
         ranges = self.tensor(f"{name}.range", (len(starts), columns, 2), "f4")
         with np.errstate(over="ignore"):

@@ -18,45 +18,15 @@ from lapgs_wgpu.io.ply import GaussianSnapshot
 from lapgs_wgpu.motion.fields.config import MIN_SCALE, FieldConfig
 from lapgs_wgpu.motion.fields.deformation import Deformation, Moments, Nearby
 from lapgs_wgpu.motion.fields.grid_field import GridField
-from lapgs_wgpu.motion.fields.hexplane_field import HexPlaneField
 from lapgs_wgpu.motion.fields.laplacian import LaplacianMotion
-from lapgs_wgpu.motion.fields.mlp_field import MlpField
-from lapgs_wgpu.motion.fields.own_field import OwnField
+from lapgs_wgpu.motion.fields.make_field import Field, check_own, make_field
 from lapgs_wgpu.motion.scene_file import SceneFile, read_scene, row_shapes, scene_header
 from lapgs_wgpu.motion.timing import EVEN, Timing
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.constants import CONSTANTS
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterize import Rendering, rasterize
-from lapgs_wgpu.splat.rotation import multiply
-
-Field = GridField | MlpField | HexPlaneField | OwnField
-
-
-def make_field(config: FieldConfig, device: Device, seed: int = 0, own: nn.Module | None = None) -> Field | None:
-    """The field of this configuration; None for static scenes. own: the module of the field own. Raises InputError as
-    `check_own`."""
-    check_own(config, own)
-    if config.kind == "static":
-        return None
-    if own is not None:
-        return OwnField(own)
-    if config.kind == "mlp":
-        return MlpField(config, seed)
-    if config.kind == "hexplane":
-        return HexPlaneField(config, seed)
-    return GridField(config, device, seed)
-
-
-def check_own(config: FieldConfig, own: nn.Module | None) -> None:
-    """Raises InputError where the field is own and no module is given, or the other way round."""
-    if (config.kind == "own") != (own is not None):
-        raise InputError(
-            "the field own needs a module, which only Python can give, such as Trainer(config, parts=Parts(field=...)) "
-            "and load(path, field=...); docs/api.md says more."
-            if own is None
-            else f"the scene has the field {config.kind}, so no module can be given; leave out field=..."
-        )
+from lapgs_wgpu.splat.rotation import quat_multiply
 
 
 class Deformed(NamedTuple):
@@ -133,6 +103,7 @@ class Scene4D:
         Raises:
             InputError: own_field is missing or superfluous for field_config.kind.
         """
+        check_own(field_config, own_field)
         self.parameters = {
             name: nn.Parameter(parameters[name].detach().float().contiguous().clone())
             for name in row_shapes(field_config)
@@ -190,9 +161,7 @@ class Scene4D:
 
     def canonical(self) -> Gaussians:
         """The Gaussians without motion, activated. Differentiable in `parameters`."""
-        return self._activated(self.parameters)
-
-    def _activated(self, p: Mapping[str, Tensor]) -> Gaussians:
+        p = self.parameters
         return Gaussians(
             p["means"],
             nn.functional.normalize(p["quats"], dim=1),
@@ -202,55 +171,66 @@ class Scene4D:
             antialiased=self.antialiased,
         )
 
-    def at(self, t: float) -> Gaussians:
-        """The Gaussians at time t in [0, 1], activated. Differentiable in `parameters` and the field's parameters."""
-        return self.deformed(t)[0]
+    def at(self, t: float, *, timing: Timing | None = None) -> Gaussians:
+        """The Gaussians at time t in [0, 1], activated. Differentiable in `parameters` and the field's parameters.
 
-    def deformed(self, t: float, nearby: Nearby | None = None, moments: Moments | None = None) -> Deformed:
+        timing: takes the place of the scene's; with EVEN, t is the field's own time.
+        """
+        return self.deformed(t, timing=timing).gaussians
+
+    def deformed(
+        self,
+        t: float,
+        nearby: Nearby | None = None,
+        moments: Moments | None = None,
+        *,
+        timing: Timing | None = None,
+    ) -> Deformed:
         """The Gaussians at time t in [0, 1], with what the losses of motion compare.
 
         Args:
             t: time in [0, 1].
             nearby: where the smoothness loss looks; None without it.
-            moments: some of the Gaussians and further moments of the motion.
+            moments: some of the Gaussians and further times of the field.
+            timing: takes the place of the scene's; None for the scene's.
 
         Returns:
             Deformed. Differentiable in `parameters` and the field's parameters.
         """
         p = self.parameters
-        still = self._activated(p)
+        canonical = self.canonical()
         if self.field is None or len(self) == 0:
-            return Deformed(still, None, [])
-        move, *others = self._moves(self.timing(t), nearby, moments)
-        quats, sh, opacities = still.quats, still.sh, still.opacities
+            return Deformed(canonical, None, [])
+        move, *others = self._moves((timing or self.timing)(t), nearby, moments)
+        quats, sh, opacities = canonical.quats, canonical.sh, canonical.opacities
         if move.orientation is not None:
-            quats = multiply(move.orientation, quats)
+            quats = quat_multiply(move.orientation, quats)
         if move.d_quats is not None:
             quats = nn.functional.normalize(quats + move.d_quats, dim=1)
         if move.d_dc is not None:
             sh = torch.cat([sh[:, :1] + move.d_dc[:, None], sh[:, 1:]], dim=1)
         if move.d_opacity is not None:
             opacities = (p["opacity_logits"] + move.d_opacity).sigmoid()
-        means, scales = self._placed(move, still.means, still.scales)
-        placed = []
+        means, scales = self._moved(move, canonical.means, canonical.scales)
+        at_times = []
         if moments is not None:
-            of_rows = p["means"][moments.rows], still.scales[moments.rows]
-            placed = [self._placed(each, *of_rows) for each in others]
-        moved = Gaussians(means, quats, scales, opacities, sh, antialiased=self.antialiased)
-        return Deformed(moved, move.smoothness, placed)
+            rows = p["means"][moments.rows], canonical.scales[moments.rows]
+            at_times = [self._moved(other, *rows) for other in others]
+        gaussians = Gaussians(means, quats, scales, opacities, sh, antialiased=self.antialiased)
+        return Deformed(gaussians, move.smoothness, at_times)
 
     def _moves(self, t: float, nearby: Nearby | None, moments: Moments | None) -> list[Deformation]:
         field, means, dynamics = self.field, self.parameters["means"], self.parameters.get("dynamics")
         assert field is not None
         if isinstance(field, GridField):
-            return field.at_moments(means, t, dynamics, nearby, moments)
+            return field.at_times(means, t, dynamics, nearby, moments)
         move = field(means, t, dynamics, nearby)
         if moments is None:
             return [move]
-        their_means, their_dynamics = moments.chosen(means, dynamics)
-        return [move, *(field(their_means, time, their_dynamics) for time in moments.times)]
+        rows = moments.chosen(means, dynamics)
+        return [move, *(field(rows[0], time, rows[1]) for time in moments.times)]
 
-    def _placed(self, move: Deformation, means: Tensor, scales: Tensor) -> tuple[Tensor, Tensor]:
+    def _moved(self, move: Deformation, means: Tensor, scales: Tensor) -> tuple[Tensor, Tensor]:
         """Means and scales after a move."""
         if move.d_scales is not None:
             scales = scales + move.d_scales
@@ -260,7 +240,13 @@ class Scene4D:
         return move.apply_to_means(means), scales
 
     def render(
-        self, camera: Camera, t: float, background: Tensor | Sequence[float] | None = None, *, depth: bool = True
+        self,
+        camera: Camera,
+        t: float,
+        background: Tensor | Sequence[float] | None = None,
+        *,
+        depth: bool = True,
+        timing: Timing | None = None,
     ) -> Rendering:
         """Render the scene, without gradients.
 
@@ -269,6 +255,7 @@ class Scene4D:
             t: time in [0, 1].
             background: (3,); None for black.
             depth: whether to render depth, see `rasterize`.
+            timing: takes the place of the scene's, as in `at`; None for the scene's.
 
         Returns:
             Rendering, on the CPU.
@@ -281,7 +268,7 @@ class Scene4D:
         if background is not None:
             background = torch.as_tensor(background, dtype=torch.float32)
         with torch.no_grad():
-            now = self.at(t)
+            now = self.at(t, timing=timing)
             tensors = (now.means, now.quats, now.scales, now.opacities, now.sh)
             return rasterize(
                 *tensors,
@@ -293,20 +280,20 @@ class Scene4D:
                 device=self.device,
             )
 
-    def still(self, t: float) -> GaussianSnapshot:
+    def snapshot(self, t: float) -> GaussianSnapshot:
         """The Gaussians at time t in [0, 1] before their activations, as 3DGS viewers read them."""
         with torch.no_grad():
-            still = self.at(t)
-            sh = torch.cat([still.sh[:, :1], self.parameters["sh_rest"]], dim=1)
+            now = self.at(t)
+            sh = torch.cat([now.sh[:, :1], self.parameters["sh_rest"]], dim=1)
             logits = self.parameters["opacity_logits"].detach()
-            if not torch.equal(still.opacities, logits.sigmoid()):
-                logits = still.opacities.logit(eps=1e-7)
+            if not torch.equal(now.opacities, logits.sigmoid()):
+                logits = now.opacities.logit(eps=1e-7)
         return GaussianSnapshot(
-            means=still.means.numpy(force=True),
+            means=now.means.numpy(force=True),
             sh=sh.numpy(force=True),
             opacity_logits=logits.numpy(force=True),
-            log_scales=still.scales.log().numpy(force=True),
-            quats=still.quats.numpy(force=True),
+            log_scales=now.scales.log().numpy(force=True),
+            quats=now.quats.numpy(force=True),
         )
 
     def save(self, path: str | os.PathLike[str], metadata: Mapping[str, str] | None = None) -> None:
@@ -319,7 +306,7 @@ class Scene4D:
         Raises:
             InputError: the file system failed, or a value cannot be stored; an older file is then unchanged.
         """
-        arrays = self.still(0.0)
+        arrays = self.snapshot(0.0)
         tensors = {f"gaussians.{name}": value.numpy(force=True) for name, value in self.parameters.items()}
         if self.field is not None:
             tensors |= {f"field.{name}": value.numpy(force=True) for name, value in self.field.state_dict().items()}

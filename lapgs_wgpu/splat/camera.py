@@ -44,18 +44,18 @@ class Camera:
 
     @property
     def position(self) -> NDArray[np.float64]:
-        """(3,) camera center in world coordinates."""
+        """The camera center (3,) in world coordinates."""
         R, t = self.T_cam_world[:3, :3], self.T_cam_world[:3, 3]
         return -R.T @ t
 
     def project(self, points: NDArray[np.floating]) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-        """Pixel coordinates (N, 2) and depths (N,) of points (N, 3), world units; infinite or NaN at depth 0."""
+        """Return pixel coordinates (N, 2) and depths (N,) of points (N, 3), world units; infinite or NaN at depth 0."""
         local = points @ self.T_cam_world[:3, :3].T + self.T_cam_world[:3, 3]
         with np.errstate(divide="ignore", invalid="ignore"):
             return (local @ self.K.T)[:, :2] / local[:, 2:], local[:, 2]
 
     def resized(self, width: int, height: int) -> Camera:
-        """The same camera for an image of another size: width and height in pixels."""
+        """Return the same camera for an image of another size: width and height in pixels."""
         scale = np.diag([width / self.width, height / self.height, 1.0])
         return Camera(scale @ self.K, self.T_cam_world, width, height)
 
@@ -101,7 +101,7 @@ class Camera:
 
 
 def rotation_matrix(quaternion: NDArray[np.floating] | Sequence[float]) -> NDArray[Any]:
-    """(3, 3) of a unit quaternion (4,) wxyz; (3, 3, N) of (4, N)."""
+    """Return the rotation matrix (3, 3) of a unit quaternion (4,) wxyz; (3, 3, N) of (4, N)."""
     w, x, y, z = quaternion
     return np.array([
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -111,7 +111,7 @@ def rotation_matrix(quaternion: NDArray[np.floating] | Sequence[float]) -> NDArr
 
 
 def intrinsics_of_fov(fov_x: float, width: int, height: int) -> NDArray[np.float64]:
-    """(3, 3) K for a horizontal field of view in radians, with square pixels and a centered principal point."""
+    """Return K (3, 3) for a horizontal field of view in radians, with square pixels and a centered principal point."""
     if not 0 < fov_x < math.pi:
         raise ValueError(f"the field of view must be between 0 and pi radians, got {fov_x:g}")
     focal = 0.5 * width / math.tan(0.5 * fov_x)

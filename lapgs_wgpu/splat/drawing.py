@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.splat.buffer_plan import BufferPlan
 from lapgs_wgpu.splat.camera import Camera
-from lapgs_wgpu.splat.drawing_plan import Plan
 from lapgs_wgpu.splat.gaussians import Gaussians
 
 
@@ -24,8 +24,6 @@ class TileLists(NamedTuple):
     slot_ids: DeviceArray  # (capacity,) uint32, the Gaussian of each slot
     slots: DeviceArray  # (capacity,) uint32, by tile and depth
     ranges: DeviceArray  # (tiles + 1, 4) uint32: first, end and drawn end of a tile's part of `slots`; then flags
-    workgroups: DeviceArray | int  # how many draw the tiles
-    listed_tiles: DeviceArray | None  # (tiles,) uint32, in any order: those with splats, where only they are drawn
 
 
 @dataclass(eq=False)
@@ -41,7 +39,7 @@ class Drawing:
     camera: Camera
     background: tuple[float, float, float]
     depth: bool
-    plan: Plan
+    plan: BufferPlan
     number: int
     image: DeviceArray
     splats: DeviceArray

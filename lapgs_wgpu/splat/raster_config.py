@@ -25,8 +25,6 @@ class RasterConfig:
     split_passes: whose workgroups the driver splits into several subgroups nevertheless; they use workgroup memory.
     lane_runs: use the radix sort for CPU devices, and a polynomial for exp2, which is slow there.
     round_splats: maximum number of splats of a list that one dispatch draws, on devices that limit loops; else None.
-    listed: only tiles with splats get a workgroup; the rest of the image is copied from one without splats before.
-    Software drivers run all of a workgroup's instructions, whether it returns early or not.
     """
 
     tile_width: int
@@ -35,7 +33,6 @@ class RasterConfig:
     subgroups: bool
     lane_runs: bool
     round_splats: int | None = None
-    listed: bool = False
     split_passes: tuple[str, ...] = ()
 
     @property
@@ -65,18 +62,18 @@ class RasterConfig:
             "LANES_16": self.lanes > 8,
             "LANES_32": self.lanes > 16,
         }
-        values = {"LANES": self.lanes, "ROWS": self.rows, "POLYNOMIAL_EXP2": self.lane_runs, "LISTED": self.listed}
+        values = {"LANES": self.lanes, "ROWS": self.rows, "POLYNOMIAL_EXP2": self.lane_runs}
         if self.round_splats:
             values["ROUND_SPLATS"] = self.round_splats
         return self.tile_defines | values | flags
 
 
-def cpu_config(subgroup_size: int, max_loop_turns: int = SOFTWARE_LOOP_TURNS, *, listed: bool = False) -> RasterConfig:
+def cpu_config(subgroup_size: int, max_loop_turns: int = SOFTWARE_LOOP_TURNS) -> RasterConfig:
     """A workgroup is one vector of the processor, so that no barrier waits."""
     lanes = 16 if subgroup_size == 16 else 8
     subgroups = subgroup_size >= lanes
     round_splats = (max_loop_turns + 1) // (SUBGROUP_TURNS if subgroups else PLAIN_TURNS)
-    return RasterConfig(8, 8, lanes, subgroups, lane_runs=True, round_splats=round_splats, listed=listed)
+    return RasterConfig(8, 8, lanes, subgroups, lane_runs=True, round_splats=round_splats)
 
 
 def gpu_config(subgroup_size: int) -> RasterConfig:
@@ -88,7 +85,4 @@ def gpu_config(subgroup_size: int) -> RasterConfig:
 def raster_config(device: Device) -> RasterConfig:
     """The configuration for this adapter."""
     size = subgroup_size(device)
-    if device.max_loop_turns is None:
-        return gpu_config(size)
-    # With tables in buffers the list would be one storage buffer too many.
-    return cpu_config(size, device.max_loop_turns, listed=device.textures)
+    return gpu_config(size) if device.max_loop_turns is None else cpu_config(size, device.max_loop_turns)

@@ -1,12 +1,11 @@
 """The rasterizer's forward and backward passes on arrays of a device (docs/architecture.md lists them in order).
 
-Only `grow_on_overflow` and, until a pass has drawn a tile, `Rasterizer._subgroup_mismatch` wait for the device.
+Only `grow_on_overflow` and, the first time that a pass runs, `Rasterizer._subgroup_mismatch` wait for the device.
 """
 
 from __future__ import annotations
 
 import math
-import struct
 from dataclasses import replace
 
 import numpy as np
@@ -20,9 +19,9 @@ from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.gpu.profile import Profile
 from lapgs_wgpu.gpu.radix_sort import RadixSort
 from lapgs_wgpu.gpu.scan import Scan
+from lapgs_wgpu.splat.buffer_plan import BufferPlan, BufferPlans, roomy
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.drawing import Drawing, GaussianGradients, TileLists
-from lapgs_wgpu.splat.drawing_plan import Plan, Plans, roomy
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.raster_config import MAX_BAND_TILES, RasterConfig, raster_config
 from lapgs_wgpu.splat.splat_layout import SPLAT_FLOATS
@@ -40,30 +39,29 @@ def _groups(count: int) -> int:
 class Rasterizer:
     """Draws images on one device. Buffers and plan are reused from image to image.
 
-    capacity: of the plan of the first image, see Plan.
+    capacity: of the plan of the first image, see BufferPlan.
     """
 
     def __init__(self, device: Device, *, config: RasterConfig | None = None, capacity: int = 1 << 16) -> None:
         self.device = device
         self.config = config or raster_config(device)
         self.pool = BufferPool(device)
-        self.plans = Plans(capacity)
+        self.plans = BufferPlans(capacity)
         self.max_capacity = device.max_binding // (4 * _RECORD_FLOATS)
         self._flags_scan = Scan(device, self.pool, "visible", "flags")
         self._offset_scan = Scan(device, self.pool, "offsets", "gather")
         self._depth_sort = RadixSort(device, self.pool, "depth sort", lane_runs=self.config.lane_runs)
         self._tile_sort = RadixSort(device, self.pool, "tile sort", lane_runs=self.config.lane_runs)
         self._drawings = 0
-        self._blank_of: tuple[int, int, tuple[float, float, float]] | None = None
         self._trusted: set[tuple[str, bool, bool]] = set()  # passes whose subgroups were checked
 
     @property
-    def plan(self) -> Plan:
-        """Of the images that are drawn now."""
+    def plan(self) -> BufferPlan:
+        """The plan of the current kind of images."""
         return self.plans.now
 
     @plan.setter
-    def plan(self, plan: Plan) -> None:
+    def plan(self, plan: BufferPlan) -> None:
         self.plans.now = plan
 
     # Forward ---------------------------------------------------------------------------------------------------------
@@ -107,12 +105,12 @@ class Rasterizer:
         return drawing
 
     def holds(self, drawing: Drawing) -> bool:
-        """Whether the arrays still hold this drawing: no other image was drawn since."""
+        """Return whether the arrays still hold this drawing: no other image was drawn since."""
         return drawing.number == self._drawings
 
     def grow_on_overflow(self, drawing: Drawing, needed: list[NDArray[np.uint32]] | None = None) -> bool:
-        """Whether the intersections overflowed the plan. The drawing is then invalid and has to be drawn again, with a
-        plan that now has larger buffers, more bands or more rounds.
+        """Return whether the intersections overflowed the plan. The drawing is then invalid and has to be drawn again,
+        with a plan that now has larger buffers, more bands or more rounds.
 
         needed: content of `drawing.needed`; None reads it and waits for the device.
         Raises DeviceMemoryError if a row of tiles does not fit into the largest buffers.
@@ -153,9 +151,6 @@ class Rasterizer:
         arrays |= {"splats": drawing.splats, "image": drawing.image}
         arrays |= {"tile_counts": tile_counts, "ids": ids, "keys": keys, "prefix": offsets, "visible": visible}
         arrays |= {"offsets": offsets, "tile_keys": tile_keys, "slot_ids": slot_ids, "ranges": ranges}
-        if config.listed:
-            arrays |= self._begin_list(commands, drawing, band)
-        workgroups = arrays.get("workgroups", tiles)
         if config.round_splats:
             commands.clear(needed)
         commands.run(Kernel.get(device, "project", **config.tile_defines), _groups(n), arrays)
@@ -173,34 +168,13 @@ class Rasterizer:
             commands, length=needed, capacity=capacity, bits=bits, keys=tile_keys, payload=None
         )
         commands.clear(ranges)
-        commands.run(Kernel.get(device, "tile_ranges", LISTED=config.listed), _groups(-(-capacity // 4)), arrays)
+        commands.run(Kernel.get(device, "tile_ranges"), _groups(-(-capacity // 4)), arrays)
         for number in range(drawing.plan.rounds):
             defines = config.raster_defines(depth=drawing.depth)
             if config.round_splats:
                 defines |= {"CONTINUED": number > 0, "LAST_ROUND": number == drawing.plan.rounds - 1}
-            commands.run(Kernel.get(device, "rasterize", **defines), workgroups, arrays)
-        ids, slots, listed_tiles = arrays["ids"], arrays["slots"], arrays.get("listed_tiles")
-        return TileLists(tile_counts, visible, ids, offsets, slot_ids, slots, ranges, workgroups, listed_tiles)
-
-    def _begin_list(self, commands: Commands, drawing: Drawing, band: int) -> dict[str, DeviceArray]:
-        """The list of tiles to draw, empty, and how many they are. All others are as in an image without splats."""
-        if band == 0:
-            commands.copy(self._blank(drawing), drawing.image)
-        workgroups = self.pool.workgroups("tile workgroups")
-        commands.copy(self.pool.constant("no workgroups", struct.pack("<3I", 0, 1, 1)), workgroups)
-        listed_tiles = self.pool.array("listed tiles", (self._band_tiles(drawing, band),), "uint32")
-        return {"listed_tiles": listed_tiles, "workgroups": workgroups}
-
-    def _blank(self, drawing: Drawing) -> DeviceArray:
-        """The image without a splat."""
-        planes, height, width = drawing.image.shape
-        if self._blank_of != (height, width, drawing.background):
-            self._blank_of = None
-            blank = np.zeros((5, height, width), np.float32)
-            blank[:3], blank[3] = np.reshape(drawing.background, (3, 1, 1)), 1
-            self.pool.upload("blank", blank)
-            self._blank_of = height, width, drawing.background
-        return self.pool.array("blank", (5, height, width)).rows(0, planes)
+            commands.run(Kernel.get(device, "rasterize", **defines), tiles, arrays)
+        return TileLists(tile_counts, visible, arrays["ids"], offsets, slot_ids, arrays["slots"], ranges)
 
     def _color(self, commands: Commands, drawing: Drawing, frame: DeviceArray, tile_counts: DeviceArray) -> None:
         kernel = Kernel.get(self.device, "color", **drawing.sh_defines)
@@ -225,7 +199,7 @@ class Rasterizer:
         return parts
 
     def _tiles(self, camera: Camera) -> tuple[int, int]:
-        """Number of rows and columns of tiles."""
+        """Return the numbers of rows and columns of tiles."""
         return -(-camera.height // self.config.tile_height), -(-camera.width // self.config.tile_width)
 
     def _band_rows(self, drawing: Drawing, band: int) -> tuple[int, int]:
@@ -256,19 +230,16 @@ class Rasterizer:
         return self.pool.constant(f"frame {band}", content)
 
     def _subgroup_mismatch(self, name: str, drawing: Drawing) -> bool:
-        """Whether the driver has split the workgroups of a pass into several subgroups, checked after its first tile.
+        """Whether the driver has split the workgroups of a pass into several subgroups, checked after its first run.
 
-        If so, the pass no longer uses subgroups, and has to be run again. Waits for the device until a pass
-        has drawn a tile.
+        If so, the pass no longer uses subgroups, and has to be run again.
         """
         key = (name, drawing.depth, drawing.plan.rounds > 1)
         if not self.config.shuffles(name) or key in self._trusted:
             return False
-        lists = drawing.lists
-        if isinstance(lists.workgroups, DeviceArray) and not lists.workgroups.read()[0]:  # no tile was drawn
-            return False
         self._trusted.add(key)
-        flags = lists.ranges.rows(lists.ranges.shape[0] - 1, 1).read()[0]
+        ranges = drawing.lists.ranges
+        flags = ranges.rows(ranges.shape[0] - 1, 1).read()[0]
         if not flags[3 if name == "rasterize_bwd" else 2]:
             return False
         self.config = self.config.without_subgroups(name)
@@ -300,7 +271,7 @@ class Rasterizer:
                 self._backward_band(commands, drawing, band, d_image, d_splats)
             if self._subgroup_mismatch("rasterize_bwd", drawing):
                 if self.config.round_splats:  # there may be more rounds now
-                    self._draw_again(drawing)
+                    drawing = self._drawn_again(drawing)
                 return self.backward(drawing, d_image, camera=camera, profile=profile)
         d_sh, d_camera = None, self._camera_sums(n) if camera else None
         arrays = gaussians.arrays() | {"frame": self._frame(drawing, 0), "d_splats": d_splats}
@@ -319,13 +290,12 @@ class Rasterizer:
                 commands.run(Kernel.get(self.device, "camera_bwd", FORCE=True), _groups(n), shifted)
         return GaussianGradients(d_splats, d_means, d_quats, d_scales, d_sh, d_camera)
 
-    def _draw_again(self, drawing: Drawing) -> None:
-        """Make a drawing one of the present config."""
+    def _drawn_again(self, drawing: Drawing) -> Drawing:
+        """The same image, drawn with the present config."""
         while True:
             again = self.draw(drawing.gaussians, drawing.camera, drawing.background, depth=drawing.depth, gradient=True)
             if not self.grow_on_overflow(again):
-                vars(drawing).update(vars(again))
-                return
+                return again
 
     def _camera_sums(self, n: int) -> DeviceArray:
         """A row for each workgroup of camera_bwd, twice; each half begins at a multiple of 256 bytes."""
@@ -351,7 +321,7 @@ class Rasterizer:
             if plan.rounds > 1:
                 uniform = kernel.uniform("Piece", number=number, state=tails)
                 arrays["piece"] = self.pool.constant(f"piece {number}", uniform)
-            commands.run(kernel, lists.workgroups, arrays)
+            commands.run(kernel, self._band_tiles(drawing, band), arrays)
         commands.run(gather, _groups(len(drawing.gaussians)), arrays)
 
     def _color_bwd(

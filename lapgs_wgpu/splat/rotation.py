@@ -7,7 +7,7 @@ from torch import Tensor
 
 
 def rotation_matrices(quats: Tensor) -> Tensor:
-    """(N, 3, 3) rotation matrices of (N, 4) quaternions wxyz of any non-zero length."""
+    """Return the rotation matrices (N, 3, 3) of quaternions (N, 4) wxyz of any non-zero length."""
     w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -17,8 +17,8 @@ def rotation_matrices(quats: Tensor) -> Tensor:
     return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
 
 
-def multiply(first: Tensor, second: Tensor) -> Tensor:
-    """Products (N, 4) of quaternions wxyz (N, 4): the rotation `second`, followed by the rotation `first`."""
+def quat_multiply(first: Tensor, second: Tensor) -> Tensor:
+    """Return products (N, 4) of quaternions wxyz (N, 4): the rotation `second`, followed by the rotation `first`."""
     w, axis = first[:, :1], first[:, 1:]
     v, other = second[:, :1], second[:, 1:]
     real = w * v - (axis * other).sum(dim=1, keepdim=True)

@@ -20,7 +20,6 @@ BACKGROUND_LEVELS = {"black": 0.0, "white": 1.0, "random": 0.0}  # under views t
 Split = Literal["plain", "adaptive"]
 HeldOut = Literal["test", "val"]
 Units = Literal["world", "capture"]
-Precision = Literal["float32", "bfloat16"]
 DecoderPlace = Literal["auto", "torch", "device"]
 RefineCameras = Literal["auto", "on", "off"]
 
@@ -447,14 +446,9 @@ class Config(Options):
         "viewers that draw without it show the scene a little thicker",
         False,
     )
-    precision: Precision = option(
-        "data type of the field's features and of its decoder's matrix products and their gradients; bfloat16: "
-        "only fields grid4d and laplacian, faster on processors with bfloat16 instructions; all else is float32",
-        "float32",
-    )
     decoder: DecoderPlace = option(
         "where the decoder of the fields grid4d and laplacian runs during training; torch: on the CPU; "
-        "device: as kernels on the device, which changes the last bits and needs precision float32, field.depth 0 and, "
+        "device: as kernels on the device, which changes the last bits and needs field.depth 0 and, "
         "for the field laplacian, field.motion laplacian; auto: torch on CPU devices, device on others where it can; "
         "config.toml records which",
         "torch",
@@ -467,10 +461,4 @@ class Config(Options):
                 "decoder device is for the fields grid4d and laplacian with field.depth 0, and for laplacian only with "
                 f"field.motion laplacian, not for {self.field.kind} with depth {self.field.depth} and motion "
                 f"{self.field.motion}"
-            )
-        if self.decoder == "device" and self.precision != "float32":
-            raise ValueError(f"decoder device works in float32: precision {self.precision} needs decoder torch")
-        if self.precision != "float32" and self.field.kind not in ("grid4d", "laplacian"):
-            raise ValueError(
-                f"precision {self.precision} is for the fields grid4d and laplacian, not for {self.field.kind}"
             )

@@ -11,7 +11,8 @@ from torch import nn
 from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.motion.scene import Scene4D, check_own
+from lapgs_wgpu.motion.fields.make_field import check_own
+from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.camera_refinement import Corrections
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.discovery.discover import discover

@@ -138,7 +138,6 @@ _YOUNGER: tuple[tuple[str, Any, str], ...] = (
     ("data.undistort", True, ""),
     ("smoothness.start", 0, ""),
     ("acceleration", 0, "acceleration.weight"),
-    ("precision", "float32", ""),
 )
 
 

@@ -31,7 +31,7 @@ def _raster() -> Choices:
     gpu = [{"TILE_W": 16, "TILE_H": 8, "LANES": n, "ROWS": 128 // n} for n in (16, 32)]
     lanes = [
         shape | ({"LANES_16": 1} if shape["LANES"] > 8 else {}) | ({"LANES_32": 1} if shape["LANES"] > 16 else {})
-        for shape in _all(cpu, [rounds], *_flags("LISTED")) + gpu
+        for shape in _all(cpu, [rounds]) + gpu
     ]
     return _all(lanes, *_flags("SUBGROUPS", "DEPTH"))
 
@@ -58,9 +58,9 @@ SHAPES: dict[str, Choices] = {
     "gate": _all(*_flags("MOTION")),
     "gate_bwd": _all(*_flags("MOTION")),
     "gather_gradients": _all(*_flags("DEPTH")),
-    "hashgrid": _all(_CORNERS, *_flags("ROWS", "BFLOAT16", "LONG_LANES")),
-    "hashgrid_bwd": _all(_CORNERS, *_flags("LANE_LEVELS", "BFLOAT16")),
-    "hashgrid_largest": _all(*_flags("BFLOAT16")),
+    "hashgrid": _all(_CORNERS, *_flags("LONG_LANES")),
+    "hashgrid_bwd": _all(_CORNERS, *_flags("LANE_LEVELS")),
+    "hashgrid_largest": [{}],
     "hashgrid_slice": _all(*_flags("LONG_LANES")),
     "hashgrid_slice_bwd": _all(*_flags("LONG_LANES")),
     "hashgrid_unfix": [{}],
@@ -90,17 +90,15 @@ SHAPES: dict[str, Choices] = {
     "smoothness_bwd": [{}],
     "sort_count": _all(*_flags("LANE_RUNS")),
     "sort_scatter": _all([{}, {"LANE_RUNS": 1}, {"LANE_RUNS": 1, "UNSUMMED": 1}], *_flags("IOTA")),
-    "tile_ranges": _all(*_flags("LISTED")),
+    "tile_ranges": [{}],
 }
 
 
 def all_shapes() -> Iterator[tuple[str, Defines]]:
-    """(shader, defines), with tables in buffers, unless tiles are listed, and, except where triangles are drawn, in
-    textures."""
+    """(shader, defines), with tables in buffers and, except where triangles are drawn, in textures."""
     for name, choices in SHAPES.items():
         for defines in choices:
-            if "LISTED" not in defines:
-                yield name, defines
+            yield name, defines
             if name != "present":
                 yield name, defines | {"TEXTURES": 1}
 

@@ -44,12 +44,8 @@ export class Playback {
         this.tables = grids.map((_, i) => pool.upload(`table ${i}`, parameters[`temporal_grids.${i}.table`]));
         const stream = this.stream(features);
         this.streamAt = this.headsAt(0).length / 4;
-        this.rowsAt = this.streamAt + stream.length / 4;
-        this.weights = pool.array("weights", 16 * (this.rowsAt + Math.ceil(count / 4)));
+        this.weights = pool.array("weights", 16 * this.streamAt + 4 * stream.length);
         gpu.device.queue.writeBuffer(this.weights.buffer, 16 * this.streamAt, stream);
-        const rows = new Float32Array(4 * Math.ceil(count / 4));
-        for (let i = 0; i < count; i++) rows[i] = i % size;
-        gpu.device.queue.writeBuffer(this.weights.buffer, 16 * this.rowsAt, rows);
     }
 
     block(active, first, count) {
@@ -74,7 +70,7 @@ export class Playback {
             copy(still, at + CANONICAL, gaussians.static_features, i, field.staticFeatures);
             if (field.dynamics) copy(moving, movingRow * n, gaussians.dynamics, i, field.dynamics);
         }
-        const arrays = { points, still, moving, rows: Uint32Array.from({ length: count }, (_, n) => n) };
+        const arrays = { points, still, moving };
         const block = { first, count };
         for (const [name, values] of Object.entries(arrays)) block[name] = this.pool.upload(`${name} from ${first}`, values);
         return block;
@@ -185,11 +181,11 @@ export class Playback {
         gpu.device.queue.writeBuffer(this.weights.buffer, 0, this.headsAt(t));
         const time = 0.5 * ((2 * t - 1) * field.timeScale + 1);
         const coefficients = (shDegree + 1) ** 2;
-        this.blocks.forEach(({ first, count, points, still, moving, rows }, number) => {
+        this.blocks.forEach(({ first, count, points, still, moving }, number) => {
             const commands = new Commands(gpu, log); // a submission each: all together may take longer than watchdogs allow
-            this.encoder.record(commands, number, { points, rows, encoding: moving, tables: this.tables, n: count, time });
+            this.encoder.record(commands, number, { points, encoding: moving, tables: this.tables, n: count, time });
             const deform = pool.uniform(`deform ${number}`, gpu.kernel(this.deform), "deform", {
-                gaussians: count, first, rows: this.rowsAt, rounds: this.rounds, still_quads: this.stillQuads,
+                gaussians: count, rounds: this.rounds, still_quads: this.stillQuads,
                 moving_quads: this.movingQuads, stream: this.streamAt, sh_stored: coefficients,
             });
             const range = (array, row) => part(array, row * first, row * count);

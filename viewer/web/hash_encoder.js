@@ -1,4 +1,4 @@
-// The temporal features of Gaussians at a time (motion/passes/hash_encoder_passes.py, of listed rows).
+// The temporal features of Gaussians at a time (motion/passes/hash_encoder_passes.py).
 import { Pool } from "./gpu.js";
 import { isSliced } from "./hash_grid.js";
 
@@ -41,8 +41,8 @@ export class HashEncoder {
         return { name, grid, cells, count: records.length, array: this.pool.upload(`levels ${name}`, words) };
     }
 
-    // Encode the n points that `rows` names. number: of the block, among those that are submitted together.
-    record(commands, number, { points, rows, encoding, tables, n, time }) {
+    // Encode n points. number: of the block, among those that are submitted together.
+    record(commands, number, { points, encoding, tables, n, time }) {
         const grid = this.pool.uniform(`grid ${number} from 0`, this.gpu.kernel("hashgrid_slice"), "grid", {
             points: n, all_points: n, all_levels: this.row / 2, time, bound: this.bound,
         });
@@ -53,10 +53,10 @@ export class HashEncoder {
             });
         }
         for (const levels of this.lookups) {
-            const key = levels.grid === null ? "hashgrid SLICED ROWS" : "hashgrid ROWS";
+            const key = levels.grid === null ? "hashgrid SLICED" : "hashgrid";
             const features = levels.grid === null ? slices : tables[levels.grid];
             commands.dispatch(key, Math.ceil(n / 512) * levels.count, {
-                grid, levels: levels.array, features, points, encoding, rows,
+                grid, levels: levels.array, features, points, encoding,
             });
         }
     }

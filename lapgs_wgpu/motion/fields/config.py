@@ -146,7 +146,7 @@ class FieldConfig(Options):
 
     @property
     def head_factors(self) -> list[float]:
-        """Of the outputs of the grid fields' heads, geometry and appearance: lengths are learnt in `unit`."""
+        """Factors of the outputs of the grid fields' heads, geometry and appearance: lengths are learnt in `unit`."""
         turn, shift, quaternion, scale = GEOMETRY
         lengths = [*[1.0] * turn, *[self.unit] * shift, *[1.0] * quaternion, *[self.unit] * scale]
         return [*lengths, *[APPEARANCE_SCALE] * self.appearance_size]
@@ -173,7 +173,7 @@ def temporal_grids(config: FieldConfig) -> list[GridShape]:
 
 
 def plane_shapes(config: PlaneConfig) -> list[tuple[int, int, int, int]]:
-    """(1, features, second axis, first axis) of each plane of the field hexplane, six for each resolution."""
+    """Return the shape (1, features, second axis, first axis) of each plane of hexplane, six per resolution."""
     shapes = []
     for level in range(config.levels):
         sizes = [config.space << level] * 3 + [config.time]

@@ -24,12 +24,12 @@ from lapgs_wgpu.splat.rasterize import upload
 class Decoded(NamedTuple):
     """Results of a decoder.
 
-    outputs: (N, outputs) of the heads, without their biases. apart: for each group of grids, the sum of the squared
+    outputs: (N, outputs) of the heads, without their biases. sq_distances: for each group of grids, the sum of squared
     differences between the features of the compared places; empty without them.
     """
 
     outputs: Tensor
-    apart: Tensor
+    sq_distances: Tensor
 
 
 class Decoder:
@@ -97,7 +97,7 @@ class Decoder:
         return results
 
     def record_bwd(
-        self, commands: Commands, written: _Written, d_outputs: DeviceArray, d_apart: Sequence[float]
+        self, commands: Commands, written: _Written, d_outputs: DeviceArray, d_sq_distances: Sequence[float]
     ) -> list[DeviceArray]:
         """Record the backward pass. Returns the gradients of `beside`, of the weights and of the tables.
 
@@ -108,7 +108,7 @@ class Decoder:
             commands.dispatch(
                 Kernel.get(self._device, "smoothness_bwd"),
                 -(-pairs * self.encoder.features[group] // 64),
-                smoothness=self._smoothness(group, pairs, 2 * d_apart[group]),
+                smoothness=self._smoothness(group, pairs, 2 * d_sq_distances[group]),
                 here=here,
                 there=there,
             )
@@ -148,12 +148,12 @@ class _Decode(torch.autograd.Function):
         with Commands(decoder._device) as commands:
             results = decoder.record(commands, ctx.written)
         outputs, *sums = read_all(results)
-        apart = np.array([each.sum(dtype=np.float64) for each in sums], np.float32)
-        return torch.from_numpy(outputs).to(beside.device), torch.from_numpy(apart).to(beside.device)
+        sq_distances = np.array([each.sum(dtype=np.float64) for each in sums], np.float32)
+        return torch.from_numpy(outputs).to(beside.device), torch.from_numpy(sq_distances).to(beside.device)
 
     @staticmethod
     def backward(ctx: Any, *d_results: Tensor) -> tuple[Tensor | None, ...]:
-        d_outputs, d_apart = d_results
+        d_outputs, d_sq_distances = d_results
         decoder: Decoder = ctx.decoder
         sets = len(ctx.times)
         places = list(zip(ctx.saved_tensors[:sets], ctx.times, strict=True))
@@ -165,6 +165,6 @@ class _Decode(torch.autograd.Function):
         with Commands(decoder._device) as commands:
             if lost:
                 decoder.record(commands, ctx.written)
-            gradients = decoder.record_bwd(commands, ctx.written, upstream, d_apart.tolist())
+            gradients = decoder.record_bwd(commands, ctx.written, upstream, d_sq_distances.tolist())
         d_beside, *d_tensors = (torch.from_numpy(array).to(beside.device) for array in read_all(gradients))
         return (None, None, d_beside, None, *d_tensors)

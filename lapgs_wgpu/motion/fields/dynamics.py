@@ -17,7 +17,7 @@ LEAST_DEVIATION = 1e-8
 
 
 def outliers(d: Tensor) -> Tensor:
-    """(N,) bool: rows whose distance exceeds the mean distance by a standard deviation (eqs. 10, 11).
+    """Return a mask (N,) of the rows whose distance exceeds the mean distance by a standard deviation (eqs. 10, 11).
 
     The standard deviation of the N distances is divided by N, not by N - 1. If all rows are equal, none is an outlier.
     """
@@ -47,7 +47,7 @@ def dynamics_loss(d: Tensor, mode: DynamicsMode) -> Tensor:
 
 
 def _offsets(d: Tensor) -> Tensor:
-    """(N, D) each row less the mean row."""
+    """Return each row less the mean row, (N, D)."""
     return d - d.detach().mean(dim=0)
 
 

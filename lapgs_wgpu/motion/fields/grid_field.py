@@ -12,10 +12,9 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.config import GEOMETRY, TEMPORAL_AXES, FieldConfig
 from lapgs_wgpu.motion.fields.deformation import Deformation, Moments, Nearby
 from lapgs_wgpu.motion.fields.device_decoder import Decoder
-from lapgs_wgpu.motion.fields.gate import gated
 from lapgs_wgpu.motion.fields.hash_encoder import HashEncoder, HashGrid
 from lapgs_wgpu.motion.fields.laplacian import LaplacianMotion, TimeMotion
-from lapgs_wgpu.motion.fields.layers import linear, product, zero_head
+from lapgs_wgpu.motion.fields.layers import linear, zero_head
 from lapgs_wgpu.motion.fields.parameter_shapes import parameter_shapes
 from lapgs_wgpu.motion.fields.torch_decoder import KEPT, DecoderWeights, decode
 from lapgs_wgpu.motion.passes.decoder_passes import decoder_shape
@@ -32,8 +31,6 @@ class GridField(nn.Module):
 
     on_device: compute the decoder by kernels if gradients are needed; the configuration must be one that
     `decodes_on_device`. Otherwise, and without gradients, torch computes it.
-    precision: torch.float32 or torch.bfloat16; data type of features and of the decoder's products in torch if
-    gradients are needed. Parameters, outputs of the heads, and everything without gradients are float32.
     """
 
     def __init__(self, config: FieldConfig, device: Device, seed: int) -> None:
@@ -42,7 +39,6 @@ class GridField(nn.Module):
         ours = config.kind == "laplacian"
         width = config.width
         self.config = config
-        self.precision = torch.float32
         self.static_grid = HashGrid(config.static, (0, 1, 2), generator)
         axes = TEMPORAL_AXES if config.temporal_hash else ()
         self.temporal_grids = nn.ModuleList(HashGrid(config.temporal, three, generator) for three in axes)
@@ -80,9 +76,9 @@ class GridField(nn.Module):
         self, means: Tensor, t: float, dynamics: Tensor | None = None, nearby: Nearby | None = None
     ) -> Deformation:
         """See motion/fields/deformation.py."""
-        return self.at_moments(means, t, dynamics, nearby)[0]
+        return self.at_times(means, t, dynamics, nearby)[0]
 
-    def at_moments(
+    def at_times(
         self,
         means: Tensor,
         t: float,
@@ -95,8 +91,8 @@ class GridField(nn.Module):
         All are encoded together, which takes much less time than one after another.
         """
         evaluate = self._on_device if self.on_device and torch.is_grad_enabled() else self._in_torch
-        now, *others, apart = evaluate(means, t, dynamics, nearby, moments)
-        smoothness = _smoothness(apart, nearby) if nearby is not None else None
+        now, *others, sq_distances = evaluate(means, t, dynamics, nearby, moments)
+        smoothness = _smoothness(sq_distances, nearby) if nearby is not None else None
         return [self._deformation(now)._replace(smoothness=smoothness), *map(self._deformation, others)]
 
     def _deformation(self, outputs: Tensor) -> Deformation:
@@ -126,20 +122,36 @@ class GridField(nn.Module):
             their_means, their_dynamics = moments.chosen(means, dynamics)
             places += [(their_means, self.config.grid_time(time)) for time in moments.times]
             decoded += [(time, their_dynamics) for time in moments.times]
-        precision = self.precision if torch.is_grad_enabled() else torch.float32
-        here, *others = self._encoder.encode_all(places, precision)
-        apart = []
+        here, *others = self._encoder.encode_all(places)
+        sq_distances = []
         if nearby is not None:
             near, *others = others
-            apart = [(b - a[nearby.rows]).float().square().sum() for a, b in zip(here, near, strict=True)]
+            sq_distances = [(b - a[nearby.rows]).square().sum() for a, b in zip(here, near, strict=True)]
         outputs = [self._decode(*given, *each) for given, each in zip(decoded, [here, *others], strict=True)]
-        return [*outputs, torch.stack(apart) if apart else means.new_zeros(0)]
+        return [*outputs, torch.stack(sq_distances) if sq_distances else means.new_zeros(0)]
 
     def _decode(self, t: float, dynamics: Tensor | None, static: Tensor, temporal: Tensor | None = None) -> Tensor:
         """Outputs of the geometry heads (N, 14) and, in further columns, of the appearance head."""
-        if len(self.hidden):
-            return self._decode_blocks(t, dynamics, static, *([] if temporal is None else [temporal]))
-        return decode(static, temporal, dynamics if self.config.dynamics_size else None, self._weights(t))
+        inputs = static, temporal, dynamics if self.config.dynamics_size else None
+        if not len(self.hidden):
+            return decode(*inputs, self._weights(t))
+        # In blocks, which avoids large allocations. For many Gaussians the backward pass computes them again: the
+        # activations, 4 KB per Gaussian at a width of 256, would be most of a training's memory.
+        decode_block = self._decode_hidden
+        if len(static) > KEPT:
+            decode_block = partial(checkpoint, decode_block, use_reentrant=False, preserve_rng_state=False)
+        count = -(-len(static) // _BLOCK) or 1
+        blocks = zip(*([None] * count if part is None else part.split(_BLOCK) for part in inputs), strict=True)
+        return torch.cat([decode_block(t, *block) for block in blocks])
+
+    def _decode_hidden(self, t: float, static: Tensor, temporal: Tensor | None, dynamics: Tensor | None) -> Tensor:
+        """The same through the hidden layers: `decode` gives what these read, and the gated channels, which the
+        appearance head reads."""
+        fused, *gated = decode(static, temporal, dynamics, self._weights(t)).split(self.config.width, dim=1)
+        outputs = [self.heads(self.hidden(fused))]
+        if self.appearance is not None:
+            outputs.append(self.appearance(*gated))
+        return torch.cat(outputs, dim=1) * self._head_factors()
 
     def _on_device(
         self, means: Tensor, t: float, dynamics: Tensor | None, nearby: Nearby | None, moments: Moments | None
@@ -174,22 +186,29 @@ class GridField(nn.Module):
             "temporal": self.temporal.weight[:, size:],
             "heads": heads,
         }
-        outputs, apart = self._decoder((means, time), beside, weights, compared)
-        return [outputs + w.heads_bias, *others, apart]
+        outputs, sq_distances = self._decoder((means, time), beside, weights, compared)
+        return [outputs + w.heads_bias, *others, sq_distances]
 
     def _weights(self, t: float) -> DecoderWeights:
-        """The decoder's weights at a time. The second layer of the motion, which only linear heads follow, is folded
-        into these, and all heads are one matrix, so that the features' gradient (N, width) is written once."""
+        """The decoder's weights at a time. The second layer of the motion, which only linear layers follow, is folded
+        into the heads, and all heads are one matrix, so that the features' gradient (N, width) is written once. Before
+        hidden layers the heads are the identity."""
         size = self.config.dynamics_size
-        layers = [self.heads] if self.appearance is None else [self.heads, self.appearance]
-        factors = self._head_factors()
-        heads = torch.cat([head.weight for head in layers]) * factors[:, None]
-        bias = torch.cat([head.bias for head in layers]) * factors
+        if len(self.hidden):
+            identity, moved = torch.eye(self.config.width), self.config.width
+            heads = torch.cat([identity] if self.appearance is None else [identity, identity])
+            bias = heads.new_zeros(len(heads))
+        else:
+            layers = [self.heads] if self.appearance is None else [self.heads, self.appearance]
+            factors = self._head_factors()
+            heads = torch.cat([head.weight for head in layers]) * factors[:, None]
+            bias = torch.cat([head.bias for head in layers]) * factors
+            moved = sum(GEOMETRY)  # heads that the motion reaches
         inner = inner_bias = motion_heads = None
         if self.motion is not None:
             (inner, inner_bias), second = self.motion.layers(t)
-            rest = len(heads) - sum(GEOMETRY)
-            folded, shift = (heads[: sum(GEOMETRY)] @ factor for factor in second)
+            folded, shift = (heads[:moved] @ factor for factor in second)
+            rest = len(heads) - moved
             motion_heads = nn.functional.pad(folded, (0, 0, 0, rest))
             bias = bias + nn.functional.pad(shift, (0, rest))
         return DecoderWeights(
@@ -205,50 +224,19 @@ class GridField(nn.Module):
             heads_bias=bias,
         )
 
-    def _decode_blocks(self, t: float, dynamics: Tensor | None, *features: Tensor) -> Tensor:
-        """`_decode_hidden` in blocks, which avoids large allocations. For many Gaussians the backward pass recomputes
-        it: the activations, 4 KB per Gaussian at a width of 256, would be most of a training's memory."""
-        decode_block = self._decode_hidden
-        if len(features[0]) > KEPT:
-            decode_block = partial(checkpoint, decode_block, use_reentrant=False, preserve_rng_state=False)
-        blocks = [part.split(_BLOCK) for part in features]
-        of_dynamics = [None] * len(blocks[0]) if dynamics is None else dynamics.split(_BLOCK)
-        return torch.cat([decode_block(t, *block) for block in zip(of_dynamics, *blocks, strict=True)])
-
-    def _decode_hidden(
-        self, t: float, dynamics: Tensor | None, static: Tensor, temporal: Tensor | None = None
-    ) -> Tensor:
-        """Outputs of the geometry heads (N, 14) and, in further columns, of the appearance head, by hidden layers."""
-        half = product(static, 0.5 * self.spatial.weight, 0.5 * self.spatial.bias)
-        size, bias, weight = self.config.dynamics_size, self.temporal.bias, self.temporal.weight
-        moving = bias.to(static.dtype).expand(len(static), -1)
-        if size and dynamics is not None:
-            moving = product(dynamics.to(static.dtype), weight[:, :size], bias)
-        if temporal is not None:
-            moving = torch.addmm(moving, temporal, weight[:, size:].to(temporal.dtype).T)
-        features = gated(moving, half)
-        fused = features
-        if self.motion is not None:
-            first, second = self.motion.layers(t)
-            fused = fused + product(torch.relu(product(static, *first)), *second)
-        outputs = self.heads(self.hidden(fused.float()))
-        if self.appearance is not None:
-            outputs = torch.cat([outputs, self.appearance(features.float())], dim=1)
-        return outputs * self._head_factors()
-
     def _head_factors(self) -> Tensor:
         return self.heads.bias.new_tensor(self.config.head_factors)
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """See motion/fields/deformation.py. The spectrum's frequencies, in no group, have their own optimizer."""
         tables = [grid.table for grid in self.grids]
-        apart = {id(table) for table in tables}
+        excluded = {id(table) for table in tables}
         if isinstance(self.motion, LaplacianMotion):
-            apart.add(id(self.motion.frequencies))
-        return {"hash": tables, "mlp": [p for p in self.parameters() if id(p) not in apart]}
+            excluded.add(id(self.motion.frequencies))
+        return {"hash": tables, "mlp": [p for p in self.parameters() if id(p) not in excluded]}
 
 
-def _smoothness(apart: Tensor, nearby: Nearby) -> Tensor:
+def _smoothness(sq_distances: Tensor, nearby: Nearby) -> Tensor:
     """Grid4D's smoothness loss: the mean squared distance between the features of near places, static and temporal."""
-    weights = apart.new_tensor([nearby.static_weight, nearby.temporal_weight][: len(apart)])
-    return (weights * apart).sum() / max(1, len(nearby.rows))
+    weights = sq_distances.new_tensor([nearby.static_weight, nearby.temporal_weight][: len(sq_distances)])
+    return (weights * sq_distances).sum() / max(1, len(nearby.rows))

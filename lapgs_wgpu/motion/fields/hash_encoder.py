@@ -7,6 +7,7 @@ import itertools
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
@@ -19,7 +20,6 @@ from lapgs_wgpu.motion.fields.hash_grid_config import GridShape, HashConfig
 from lapgs_wgpu.motion.passes.hash_encoder_passes import HashEncoderPasses, PointSet
 
 Place = tuple[Tensor, float]  # points (N, 3), world units, and a time in [0, 1]
-_NUMPY = {torch.float32: "float32", torch.bfloat16: "int16"}  # the dtype of arrays, which have no bfloat16
 
 
 class Encoded(NamedTuple):
@@ -74,31 +74,28 @@ class HashEncoder:
         """Length of a point's encoding, for each group."""
         return [sum(grid.features for grid in group) for group in self.groups]
 
-    def __call__(self, points: Tensor, time: float = 0.0, dtype: torch.dtype = torch.float32) -> list[Tensor]:
-        """Encode points (N, 3), world units, at a time in [0, 1]: an (N, features) tensor for each group.
+    def __call__(self, points: Tensor, time: float = 0.0) -> list[Tensor]:
+        """Encode points (N, 3), world units, at a time in [0, 1]: an (N, features) float32 tensor for each group.
 
-        Differentiable in the tables, not in the points. Outside the box [-bound, bound]^3 the features are zero. dtype:
-        of the encodings and their gradients, float32 or bfloat16; sums, tables and their gradients are float32.
+        Differentiable in the tables, not in the points. Outside the box [-bound, bound]^3 the features are zero.
         """
-        return self.encode_all([(points, time)], dtype)[0]
+        return self.encode_all([(points, time)])[0]
 
-    def encode_all(self, places: Sequence[Place], dtype: torch.dtype = torch.float32) -> list[list[Tensor]]:
+    def encode_all(self, places: Sequence[Place]) -> list[list[Tensor]]:
         """Encode several sets of points, each at its own time; the tables are uploaded once."""
         detached = [(points.detach(), time) for points, time in places]
-        outputs = _Encode.apply(self, detached, dtype, *[grid.table for grid in self.grids])
+        outputs = _Encode.apply(self, detached, *[grid.table for grid in self.grids])
         count = len(self.groups)
         return [list(outputs[i : i + count]) for i in range(0, len(outputs), count)]
 
-    def encode(
-        self, places: Sequence[Place], dtype: torch.dtype, tables: Sequence[Tensor]
-    ) -> tuple[Encoded, list[Tensor]]:
+    def encode(self, places: Sequence[Place], tables: Sequence[Tensor]) -> tuple[Encoded, list[Tensor]]:
         """The forward pass without autograd. Returns the encodings by place, then by group."""
-        encoded = self.write(places, tables, dtype)
+        encoded = self.write(places, tables)
         with Commands(self._device) as commands:
             self.record(commands, encoded)
         device = places[0][0].device
         arrays = read_all(list(itertools.chain(*encoded.encodings)))
-        return encoded, [torch.from_numpy(array).view(dtype).to(device) for array in arrays]
+        return encoded, [torch.from_numpy(array).to(device) for array in arrays]
 
     def backward(
         self, places: Sequence[Place], d_encodings: Sequence[Tensor], encoded: Encoded | None = None
@@ -108,7 +105,7 @@ class HashEncoder:
         encoded: result of `encode`, whose points are reused if the encoder still holds them.
         """
         if encoded is None or not self.holds(encoded):
-            encoded = self.write(places, (), d_encodings[0].dtype)
+            encoded = self.write(places)
         for array, d_encoding in zip(itertools.chain(*encoded.encodings), d_encodings, strict=True):
             array.write(_host(d_encoding))
         with Commands(self._device) as commands:
@@ -118,10 +115,8 @@ class HashEncoder:
     # The parts of `encode` and `backward`, which do not wait for the device. All writes precede the first submission: a
     # buffer can only be mapped while the device does not use it.
 
-    def write(
-        self, places: Sequence[Place], tables: Sequence[Tensor] = (), dtype: torch.dtype = torch.float32
-    ) -> Encoded:
-        """Upload points and, if given, tables. dtype: of the encodings."""
+    def write(self, places: Sequence[Place], tables: Sequence[Tensor] = ()) -> Encoded:
+        """Upload points and, if given, tables."""
         for number, table in enumerate(tables):
             self._pool.upload(f"table {number}", _host(table))
         numbers = itertools.count()
@@ -137,7 +132,7 @@ class HashEncoder:
             ],
             [
                 [
-                    self._pool.array(f"encoding {number} {group}", (len(points), size), _NUMPY[dtype])
+                    self._pool.array(f"encoding {number} {group}", (len(points), size))
                     for group, size in enumerate(self.features)
                 ]
                 for number, (points, _) in enumerate(places)
@@ -171,22 +166,19 @@ class HashEncoder:
                     yield points, passes, tables, encoding
 
 
-def _host(tensor: Tensor) -> NDArray[Any]:
-    words = tensor.detach().to("cpu").contiguous()
-    return words.view(torch.int16).numpy() if words.dtype == torch.bfloat16 else words.float().numpy()
+def _host(tensor: Tensor) -> NDArray[np.float32]:
+    return tensor.detach().to("cpu", torch.float32).contiguous().numpy()
 
 
 class _Encode(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx: Any, encoder: HashEncoder, places: Sequence[Place], dtype: torch.dtype, *tables: Tensor
-    ) -> tuple[Tensor, ...]:
+    def forward(ctx: Any, encoder: HashEncoder, places: Sequence[Place], *tables: Tensor) -> tuple[Tensor, ...]:
         ctx.encoder, ctx.times = encoder, [time for _, time in places]
         ctx.save_for_backward(*[points for points, _ in places])
-        ctx.encoded, encodings = encoder.encode(places, dtype, tables)
+        ctx.encoded, encodings = encoder.encode(places, tables)
         return tuple(encodings)
 
     @staticmethod
     def backward(ctx: Any, *d_encodings: Tensor) -> tuple[Tensor | None, ...]:
         places = list(zip(ctx.saved_tensors, ctx.times, strict=True))
-        return (None, None, None, *ctx.encoder.backward(places, d_encodings, ctx.encoded))
+        return (None, None, *ctx.encoder.backward(places, d_encodings, ctx.encoded))

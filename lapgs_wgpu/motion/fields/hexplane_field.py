@@ -58,7 +58,7 @@ class HexPlaneField(nn.Module):
         return Deformation(None, self.unit * shift, d_quats, self.unit * d_scales, smoothness=smoothness)
 
     def _features(self, unit: Tensor, first: int) -> Tensor:
-        """(N, F) features at points and time (N, 4) in [-1, 1], from six planes starting with number `first`."""
+        """Return features (N, F) at points and times (N, 4) in [-1, 1], of the six planes from number `first` on."""
         product: Tensor | None = None
         for plane, pair in zip(list(self.planes)[first : first + len(PLANES)], PLANES, strict=True):
             at = unit[None, None, :, list(pair)]
@@ -81,5 +81,5 @@ class HexPlaneField(nn.Module):
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """See motion/fields/deformation.py."""
         planes = list(self.planes)
-        apart = {id(plane) for plane in planes}
-        return {"hash": planes, "mlp": [p for p in self.parameters() if id(p) not in apart]}
+        excluded = {id(plane) for plane in planes}
+        return {"hash": planes, "mlp": [p for p in self.parameters() if id(p) not in excluded]}

@@ -60,12 +60,12 @@ class LaplacianMotion(nn.Module):
         return (self.first.weight, self.first.bias), (series[:, None] * self.second.weight, series * self.second.bias)
 
     def amplitudes(self) -> Tensor:
-        """(K,) |c_k|: root mean over the channels of alpha^2 + beta^2; without gradient."""
+        """Return |c_k|, (K,): root mean over the channels of alpha^2 + beta^2; without gradient."""
         with torch.no_grad():
             return (self.alpha.square() + self.beta.square()).mean(dim=1).sqrt()
 
     def variances(self) -> Tensor:
-        """(K,) sigma_k^2 of eq. 5: the variance of each component over time; without gradient.
+        """Return sigma_k^2 of eq. 5, (K,): the variance of each component over time; without gradient.
 
         It is limited to a factor around the geometric mean, so that the frequencies of small components stay stable.
         """
@@ -74,8 +74,8 @@ class LaplacianMotion(nn.Module):
         return variance.clamp(middle / VARIANCE_SPREAD, middle * VARIANCE_SPREAD)
 
     def frequency_gradient(self) -> Tensor:
-        """(K,) gradient of eq. 5: the loss's derivative by f_k, divided by 2 pi sigma_k^2. (The equation omits the
-        factor 2 pi of the derivative of cos(2 pi f t).) Requires a previous backward pass."""
+        """Return the gradient of eq. 5, (K,): the loss's derivative by f_k, divided by 2 pi sigma_k^2. (The equation
+        omits the factor 2 pi of the derivative of cos(2 pi f t).) Requires a previous backward pass."""
         gradient = self.frequencies.grad
         if gradient is None:
             raise ValueError("frequency_gradient needs the gradient of the frequencies: call backward() first")
@@ -92,6 +92,6 @@ class TimeMotion(nn.Module):
         self.second = linear(shapes["second.weight"], generator)
 
     def layers(self, t: float) -> tuple[Layer, Layer]:
-        """As LaplacianMotion.layers; the time, the last input, is a part of the bias."""
+        """Return layers as LaplacianMotion.layers does; the time, the last input, is part of the bias."""
         weight, bias = self.first.weight, self.first.bias
         return (weight[:, :-1], bias + t * weight[:, -1]), (self.second.weight, self.second.bias)

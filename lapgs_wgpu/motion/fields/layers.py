@@ -1,9 +1,9 @@
-"""Linear layers: initialization from a generator, and products in the precision of the inputs."""
+"""Linear layers, initialized from a generator."""
 
 from __future__ import annotations
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 
 def linear(shape: tuple[int, ...], generator: torch.Generator) -> nn.Linear:
@@ -24,8 +24,3 @@ def zero_head(shape: tuple[int, ...]) -> nn.Linear:
     nn.init.zeros_(layer.weight)
     nn.init.zeros_(layer.bias)
     return layer
-
-
-def product(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    """x (N, inputs) @ weight.T + bias in the precision of x, to which the float32 weights are rounded."""
-    return nn.functional.linear(x, weight.to(x.dtype), bias.to(x.dtype))

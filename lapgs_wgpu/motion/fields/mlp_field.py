@@ -45,6 +45,6 @@ class MlpField(nn.Module):
 
 
 def octaves(values: Tensor, count: int) -> Tensor:
-    """(N, D (1 + 2 count)): values (N, D), and their sines and cosines at pi, 2 pi, 4 pi, ... radians per unit."""
+    """Return values (N, D) with their sines and cosines at pi, 2 pi, 4 pi, ... per unit: (N, D (1 + 2 count))."""
     angles = [values * (math.pi * 2.0**k) for k in range(count)]
     return torch.cat([values, *(f(angle) for angle in angles for f in (torch.sin, torch.cos))], dim=1)

@@ -98,7 +98,7 @@ class OwnField(nn.Module):
         return {name: group for name, group in groups.items() if group}
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
-        """As of nn.Module. Raises InputError where names or shapes are not those of the module."""
+        """Load as nn.Module does. Raises InputError where names or shapes are not those of the module."""
         mine, given = (
             {name.removeprefix("module."): tuple(value.shape) for name, value in each.items()}
             for each in (self.state_dict(), state_dict)

@@ -133,44 +133,23 @@ class HashEncoderPasses:
         counts = ((first, min(size, n - first)) for first in range(0, n, size))
         return ((first, count, self._uniform(points, first, count, size)) for first, count in counts)
 
-    def encode(
-        self,
-        commands: Commands,
-        points: PointSet,
-        tables: list[DeviceArray],
-        encoding: DeviceArray,
-        *,
-        rows: DeviceArray | None = None,
-    ) -> None:
+    def encode(self, commands: Commands, points: PointSet, tables: list[DeviceArray], encoding: DeviceArray) -> None:
         """Encode points; outside the box [-bound, bound]^3 features are zero.
 
-        tables: (entries, 2) of each grid. encoding: (N, row), float32, or int16, which stands for bfloat16. rows:
-        uint32, the first `points.count` select the points; the encoding, which must then fit into a binding, keeps its
-        other rows.
+        tables: (entries, 2) of each grid. encoding: (N, row) float32, N = points.count.
         """
-        options = _precision(encoding) | self._long_lanes
-        if rows is None:
-            blocks = [
-                (
-                    count,
-                    {"grid": grid, "points": points.array.rows(first, count), "encoding": encoding.rows(first, count)},
-                )
-                for first, count, grid in self._blocks(points, encoding)
-            ]
-        else:
-            options["ROWS"] = 1
-            grid = self._uniform(points, 0, points.count, 0)
-            blocks = [(points.count, {"grid": grid, "points": points.array, "encoding": encoding, "rows": rows})]
+        blocks = list(self._blocks(points, encoding))
         slices = self.pool.array("slices", (self._slice_entries, 2))
         for number, cut in self._cuts.items():
             kernel = Kernel.get(self.device, "hashgrid_slice", **self._long_lanes)
-            arrays = {"levels": cut.array, "features": tables[number], "slices": slices, "grid": blocks[0][1]["grid"]}
+            arrays = {"levels": cut.array, "features": tables[number], "slices": slices, "grid": blocks[0][2]}
             commands.dispatch_grid(kernel, (-(-cut.cells // self._group_cells), cut.count), **arrays)
-        for count, of_block in blocks:
+        for first, count, grid in blocks:
+            arrays = {"points": points.array.rows(first, count), "encoding": encoding.rows(first, count), "grid": grid}
             for levels, features in self._lookups(slices, tables):
-                kernel = Kernel.get(self.device, "hashgrid", **levels.defines, **options)
+                kernel = Kernel.get(self.device, "hashgrid", **levels.defines, **self._long_lanes)
                 groups = -(-count // self._group_points) * levels.count
-                commands.dispatch(kernel, groups, levels=levels.array, features=features, **of_block)
+                commands.dispatch(kernel, groups, levels=levels.array, features=features, **arrays)
 
     def add_gradient(
         self, commands: Commands, points: PointSet, d_encoding: DeviceArray, d_tables: list[DeviceArray]
@@ -187,13 +166,12 @@ class HashEncoderPasses:
             for _, fixed in sums:
                 commands.clear(fixed)
 
-        options = _precision(d_encoding) | ({"LANE_LEVELS": 1} if self.lane_levels else {})
-        largest = {} if self.lane_levels else {"largest": self._largest(commands, points, d_encoding, options)}
+        largest = {} if self.lane_levels else {"largest": self._largest(commands, points, d_encoding)}
         for first, count, grid in self._blocks(points, d_encoding, self._most_points):
             arrays = {"points": points.array.rows(first, count), "d_encoding": d_encoding.rows(first, count)}
             arrays |= {"grid": grid, **largest}
             for levels, target in sums:
-                kernel = Kernel.get(self.device, "hashgrid_bwd", **levels.defines, **options)
+                kernel = Kernel.get(self.device, "hashgrid_bwd", **levels.defines, LANE_LEVELS=self.lane_levels)
                 groups = _shared(levels.count) if self.lane_levels else -(-count // 64) * levels.count
                 commands.run(kernel, groups, arrays | {"levels": levels.array, "d_features": target, "d_fixed": target})
                 commands.flush()  # all lookups together may take longer than a watchdog allows
@@ -208,13 +186,11 @@ class HashEncoderPasses:
             arrays = {"levels": cut.array, "d_slices": d_slices, "d_features": d_tables[number], "grid": grid}
             commands.dispatch_grid(kernel, (-(-cut.cells // self._group_cells), cut.count), **arrays)
 
-    def _largest(
-        self, commands: Commands, points: PointSet, d_encoding: DeviceArray, options: dict[str, int]
-    ) -> DeviceArray:
+    def _largest(self, commands: Commands, points: PointSet, d_encoding: DeviceArray) -> DeviceArray:
         """The largest absolute value of a gradient, which scales fixed-point sums."""
         largest = self.pool.array(f"largest {points.number}", (1,), "uint32")
         commands.clear(largest)
-        kernel = Kernel.get(self.device, "hashgrid_largest", **options)
+        kernel = Kernel.get(self.device, "hashgrid_largest")
         for first, count, grid in self._blocks(points, d_encoding):
             gradient = d_encoding.rows(first, count)
             commands.dispatch(kernel, -(-count * self._row // 4096), grid=grid, d_encoding=gradient, largest=largest)
@@ -225,10 +201,6 @@ def _shared(levels: int) -> int:
     """The number of workgroups whose lanes own levels: as many for each core, and at most eight levels in each."""
     cores = os.cpu_count() or 1
     return min(levels, -(-levels // (8 * cores)) * cores)
-
-
-def _precision(encoding: DeviceArray) -> dict[str, int]:
-    return {"BFLOAT16": 1} if encoding.dtype == "int16" else {}
 
 
 def _level_words(grid: GridShape, first_number: int, first_sliced: int) -> NDArray[np.uint32]:

@@ -58,7 +58,6 @@ class _Block:
     points: DeviceArray  # (count, 4)
     still: DeviceArray  # (count, 16 + still features)
     moving: DeviceArray  # (count, dynamics and temporal features)
-    rows: DeviceArray  # (count,) uint32; the first ones select the Gaussians of a dispatch
 
 
 class GridFieldPlayback:
@@ -91,8 +90,8 @@ class GridFieldPlayback:
         self._channels = 4 * self._defines["QUADS"]  # a round
         self._rounds = -(-config.width // self._channels)
         row = max(_CANONICAL + 4 * sizes.still_quads, 4 * sizes.moving_quads)
-        self._size = size = block or _BLOCK_BYTES // (4 * row) // _LANES * _LANES
-        self._count = count = len(gaussians["means"])
+        size = block or _BLOCK_BYTES // (4 * row) // _LANES * _LANES
+        count = len(gaussians["means"])
         self._blocks = [self._block(gaussians, first, min(size, count - first)) for first in range(0, count, size)]
         self._temporal = HashEncoderPasses(
             device, temporal_grids(config), config.bound, row=4 * sizes.moving_quads, column=sizes.first_temporal
@@ -103,11 +102,9 @@ class GridFieldPlayback:
         ]
         if "static_features" not in gaussians:
             self._encode_static(parameters["static_grid.table"])
-        heads, stream = self._heads(0.0), self._stream()
-        self._stream_at, self._rows_at = len(heads), len(heads) + len(stream)
-        # Vectors of four floats: heads, stream, and the indices of the moved rows.
-        self._weights = self._pool.array("weights", (self._rows_at + -(-count // 4), 4))
-        self._weights.rows(0, self._rows_at).write(np.concatenate([heads, stream]))
+        heads = self._heads(0.0)
+        self._stream_at = len(heads)
+        self._weights = self._pool.upload("weights", np.concatenate([heads, self._stream()]))
 
     def _block(self, gaussians: Mapping[str, Floats], first: int, count: int) -> _Block:
         g = {name: array[first : first + count] for name, array in gaussians.items()}
@@ -122,7 +119,7 @@ class GridFieldPlayback:
         moving = np.zeros((count, max(4, 4 * self._sizes.moving_quads)), np.float32)
         if self._sizes.dynamics:
             moving[:, : self._sizes.dynamics] = g["dynamics"]
-        named = {"points": points, "still": still, "moving": moving, "rows": np.zeros(count, np.uint32)}
+        named = {"points": points, "still": still, "moving": moving}
         return _Block(first, count, **{name: self._pool.upload(f"{name} from {first}", a) for name, a in named.items()})
 
     def _encode_static(self, entries: Floats) -> None:
@@ -137,7 +134,7 @@ class GridFieldPlayback:
                 encoder.encode(commands, PointSet(number, block.points, block.count, 0.0), [table], block.still)
 
     def static_features(self) -> Floats:
-        """(N, F) H_s: the static grid's features at the canonical means."""
+        """Return the spatial features H_s, (N, F): the static grid's at the canonical means."""
         parts = [block.still.read()[:, _CANONICAL : _CANONICAL + self._sizes.static] for block in self._blocks]
         return np.concatenate(parts)
 
@@ -150,7 +147,7 @@ class GridFieldPlayback:
         return padded.reshape(self._rounds, self._channels // 4, 4, quads, 4).transpose(0, 3, 1, 4, 2)
 
     def _stream(self) -> Floats:
-        """(vectors, 4) biases and layers of the decoder, in the order in which the pass reads them."""
+        """Return the vectors (V, 4) of biases and layers of the decoder, in the order in which the pass reads them."""
         p, sizes, rounds = self._parameters, self._sizes, self._rounds
         p = p | {name: np.float32(0.5) * p[name] for name in ("spatial.weight", "spatial.bias")}  # see common/gate.wgsl
         moving = np.zeros((sizes.width, sizes.first_temporal + sizes.temporal), np.float32)
@@ -165,7 +162,7 @@ class GridFieldPlayback:
         return np.concatenate([part.reshape(rounds, -1, 4) for part in parts], axis=1).reshape(-1, 4)
 
     def _heads(self, t: float) -> Floats:
-        """(vectors, 4) biases and, by channel, weights of the heads, with the Laplacian motion at a time folded in."""
+        """Return the vectors (V, 4) of the heads: biases, and weights by channel; the Laplacian motion is folded in."""
         p, width = self._parameters, self._sizes.width
         factors = np.array(self._config.head_factors, np.float32)
         of_geometry, of_look = np.split(factors, [sum(GEOMETRY)])
@@ -190,36 +187,25 @@ class GridFieldPlayback:
 
     # A time ----------------------------------------------------------------------------------------------------------
 
-    def move(self, t: float, out: Gaussians[DeviceArray], rows: NDArray[np.integer] | None = None) -> None:
+    def move(self, t: float, out: Gaussians[DeviceArray]) -> None:
         """Submit the passes that write the Gaussians at a time in [0, 1] to `out`.
 
         Of the colors only the constant part is written, if the field changes colors.
-        rows: (M,) ascending, the Gaussians to be moved; None for all. The others keep their values in `out`.
         """
         kernel = Kernel.get(self._device, "deform", **self._defines)
-        rows = np.arange(self._count) if rows is None else rows
-        of_block = rows % self._size
         heads = self._heads(t)
         self._weights.rows(0, len(heads)).write(heads)
-        listed = np.zeros((-(-len(rows) // 4), 4), np.float32)
-        listed.reshape(-1)[: len(rows)] = of_block
-        self._weights.rows(self._rows_at, len(listed)).write(listed)
-        lanes = _LANES * self._defines["POINTS"]  # Gaussians of a workgroup
+        names = {"means": "means", "quats": "quats", "scales": "scales", "opacities": "opacities"}
+        names |= {"colors": "sh"} if "COLOR" in self._defines else {}
         with Commands(self._device) as commands:
             for number, block in enumerate(self._blocks):
-                start, end = np.searchsorted(rows, (block.first, block.first + block.count)).tolist()
-                if start == end:
-                    continue
-                block.rows.rows(0, end - start).write(of_block[start:end].astype(np.uint32))
-                points = PointSet(number, block.points, end - start, self._config.grid_time(t))
-                self._temporal.encode(commands, points, self._tables, block.moving, rows=block.rows)
+                points = PointSet(number, block.points, block.count, self._config.grid_time(t))
+                self._temporal.encode(commands, points, self._tables, block.moving)
                 uniform = self._pool.constant(
                     f"deform {number}",
                     kernel.uniform(
                         "Deform",
-                        gaussians=end - start,
-                        first=start,
-                        rows=self._rows_at,
+                        gaussians=block.count,
                         rounds=self._rounds,
                         still_quads=self._sizes.still_quads,
                         moving_quads=self._sizes.moving_quads,
@@ -227,17 +213,14 @@ class GridFieldPlayback:
                         sh_stored=out.sh.shape[1],
                     ),
                 )
-                names = {"means": "means", "quats": "quats", "scales": "scales", "opacities": "opacities"}
-                names |= {"colors": "sh"} if "COLOR" in self._defines else {}
-                outputs = {name: getattr(out, of).rows(block.first, block.count) for name, of in names.items()}
                 commands.dispatch(
                     kernel,
-                    -(-(end - start) // lanes),
+                    -(-block.count // (_LANES * self._defines["POINTS"])),
                     deform=uniform,
                     still=block.still,
                     moving=block.moving,
                     weights=self._weights,
-                    **outputs,
+                    **{name: getattr(out, of).rows(block.first, block.count) for name, of in names.items()},
                 )
                 commands.flush()  # all blocks together may take longer than a watchdog allows
 

@@ -16,11 +16,8 @@ from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.io.ply import GaussianSnapshot
 from lapgs_wgpu.motion.fields.config import MIN_SCALE, FieldConfig
 from lapgs_wgpu.motion.playback.grid_field_playback import GridFieldPlayback, runs_on_device
-from lapgs_wgpu.motion.playback.motion_bounds import MotionBounds
-from lapgs_wgpu.motion.playback.seen_moments import SeenMoments
 from lapgs_wgpu.motion.scene_file import SceneFile
 from lapgs_wgpu.motion.timing import Timing
-from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.gaussians import Gaussians
 
 Floats = NDArray[np.float32]
@@ -44,25 +41,18 @@ class Playback(Protocol):
     def moves(self) -> bool: ...
     @property
     def timing(self) -> Timing: ...
-    @property
-    def exact(self) -> bool:
-        """Whether all Gaussians of the last call of `at` are of the requested time."""
 
-    def at(self, t: float, seen_by: Camera | None = None) -> Gaussians[DeviceArray]:
-        """The activated Gaussians at a time, on the device. Does not wait for it. Valid until the next call.
-
-        seen_by: the only camera that renders them, for images of a moving view or time: Gaussians that hardly move or
-        are outside its image may then be of other times.
-        """
+    def at(self, t: float) -> Gaussians[DeviceArray]:
+        """The activated Gaussians at a time, on the device. Does not wait for it. Valid until the next call."""
 
     def means(self, t: float) -> Floats:
-        """(count, 3) means at a time, world units."""
+        """Return the means (count, 3) at a time, world units."""
 
     def dynamics(self) -> Floats | None:
-        """(count, D) dynamics attributes; None for fields without them."""
+        """Return the dynamics attributes (count, D); None for fields without them."""
 
-    def still(self, t: float) -> GaussianSnapshot:
-        """All Gaussians at a time, as 3DGS viewers read them. `Scene4D.save` writes those at time 0."""
+    def snapshot(self, t: float) -> GaussianSnapshot:
+        """Return all Gaussians at a time, as 3DGS viewers read them. `Scene4D.save` writes those at time 0."""
 
 
 def playback_of(file: SceneFile, device: Device) -> Playback:
@@ -96,74 +86,20 @@ class DevicePlayback:
         names = {"means": "means", "quats": "quats", "scales": "scales", "opacities": "opacities", "sh": "colors"}
         arrays = {name: pool.upload(name, activated[of]) for name, of in names.items()}
         self._now = Gaussians(**arrays, antialiased=file.antialiased)
-        self.exact = True
         self._field: GridFieldPlayback | None = None
+        self._time: float | None = None  # of the Gaussians in the buffers, where a field moves them
         if self.moves:
-            self._times = np.full(self.count, np.nan)  # of each Gaussian in the buffers
-            # Parts of half an entry of the temporal grids' time axis, within which features hardly change.
-            parts = 2 * self.field_config.temporal.finest[2]
-            self._bounds = MotionBounds(self.count, parts)
-            self._moments = SeenMoments(self.count, 2 / parts)
-            # The time near which all Gaussians are, on the way between two moments, and how far they are off at most.
-            self._near: tuple[float, Floats] | None = None
-            self._colors = activated["colors"]  # of which the field may change the constant part
-            self._bounded = True  # whether the bounds include the values in the buffers
             self._field = GridFieldPlayback(device, file.field_config, file.field, activated, block=block)
 
-    def at(self, t: float, seen_by: Camera | None = None) -> Gaussians[DeviceArray]:
-        if self._field is None:
-            return self._now
+    def at(self, t: float) -> Gaussians[DeviceArray]:
         t = self.timing(t)
-        if self._near is not None and self._near[0] != t:
-            self._near = None
-        old = self._times != t
-        moved = old
-        # The choice reads the values back each time, which is fast only where buffers are mapped.
-        if seen_by is not None and self.device.mappable and old.any():
-            self._bound()
-            between = self._moments.between(t) if self._near is None else None
-            if between is not None:
-                self._take(between[0])
-                self._near = t, between[1]
-                old = self._times != t
-            moved = old & self._bounds.needed(t, seen_by, self._near[1] if self._near else None)
-        self.exact = bool((moved == old).all())
-        if moved.any():
-            self._field.move(t, self._now, np.flatnonzero(moved))
-            self._times[moved] = t
-            self._bounded = False
+        if self._field is not None and self._time != t:
+            self._field.move(t, self._now)
+            self._time = t
         return self._now
 
-    def _take(self, values: Floats) -> None:
-        """Write values (14, count), which are of no time exactly."""
-        now = self._now
-        now.means.write(np.ascontiguousarray(values[:3].T))
-        quats = values[3:7] / np.linalg.norm(values[3:7], axis=0)
-        now.quats.write(np.ascontiguousarray(quats.T))
-        now.scales.write(np.ascontiguousarray(values[7:10].T))
-        now.opacities.write(values[10])
-        if self.field_config.appearance_size:
-            self._colors[:, 0] = values[11:].T
-            now.sh.write(self._colors)
-        self._times[:] = np.nan
-        self._bounded = False
-
-    def _bound(self) -> None:
-        """Extend the bounds by the values in the buffers, of whatever times. Called before each choice."""
-        if self._bounded:
-            return
-        now = self._now
-        means, quats, scales, opacities, sh = read_all([now.means, now.quats, now.scales, now.opacities, now.sh])
-        values = [means, quats, scales, opacities[:, None], sh[:, 0]]
-        whole = bool((self._times == self._times[0]).all())
-        together = np.concatenate(values, axis=1)
-        self._bounds.add(together, float(self._times[0]) if whole else None)
-        if whole:
-            self._moments.add(together, float(self._times[0]))
-        self._bounded = True
-
     def static_features(self) -> Floats | None:
-        """(count, F) what a compact scene holds in place of the static table; None where nothing moves."""
+        """Return the features (count, F) of a compact scene, which replace the static table; None in static scenes."""
         return self._field.static_features() if self._field else None
 
     def means(self, t: float) -> Floats:
@@ -172,7 +108,7 @@ class DevicePlayback:
     def dynamics(self) -> Floats | None:
         return self._stored.get("dynamics")
 
-    def still(self, t: float) -> GaussianSnapshot:
+    def snapshot(self, t: float) -> GaussianSnapshot:
         now = self.at(t)
         means, quats, scales, opacities, colors = read_all([now.means, now.quats, now.scales, now.opacities, now.sh])
         logits = self._stored["opacity_logits"]

@@ -15,7 +15,6 @@ from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.io.ply import GaussianSnapshot
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.motion.timing import Timing
-from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterize import upload_gaussians
 
@@ -51,7 +50,6 @@ class TorchPlayback:
     def __init__(self, scene: Scene4D) -> None:
         self.scene = scene
         self.device, self.field_config, self.metadata = scene.device, scene.field_config, scene.metadata
-        self.exact = True
         self._pool = BufferPool(scene.device)  # a training uses its own
         self._shown: _Shown | None = None
 
@@ -71,7 +69,7 @@ class TorchPlayback:
     def moves(self) -> bool:
         return self.scene.field is not None
 
-    def at(self, t: float, seen_by: Camera | None = None) -> Gaussians[DeviceArray]:
+    def at(self, t: float) -> Gaussians[DeviceArray]:
         scene = self.scene
         if self._shown is None or not self._shown.is_of(scene, t):
             self._shown = None  # after a failure the buffers would be inconsistent
@@ -89,5 +87,5 @@ class TorchPlayback:
         d = self.scene.parameters.get("dynamics")
         return None if d is None else np.array(d.numpy(force=True))
 
-    def still(self, t: float) -> GaussianSnapshot:
-        return self.scene.still(t)
+    def snapshot(self, t: float) -> GaussianSnapshot:
+        return self.scene.snapshot(t)

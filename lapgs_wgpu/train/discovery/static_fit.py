@@ -124,6 +124,5 @@ def static_config(config: Config) -> Config:
         loss=dataclasses.replace(config.loss, pyramid=0.0, ncc=0.0, dynamics_mode="off"),
         smoothness=dataclasses.replace(config.smoothness, share=0.0),
         acceleration=dataclasses.replace(config.acceleration, weight=0.0),
-        precision="float32",
         decoder="torch",
     )

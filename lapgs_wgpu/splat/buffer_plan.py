@@ -1,4 +1,4 @@
-"""How much room an image is drawn with, by the images before it."""
+"""Buffer capacities of an image, predicted from earlier images."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ _KINDS = 32  # of images, whose plans are kept
 
 
 @dataclass(frozen=True)
-class Plan:
-    """How an image is drawn. Bands change the last bits of gradients; else the plan does not change the result.
+class BufferPlan:
+    """Buffer capacities of an image. Only the number of bands changes the result, in the last bits of gradients.
 
     capacity: maximum number of intersections (tile, splat). bands: number of bands of tile rows, which are drawn one
     after another. rounds: number of dispatches that draw the tiles' lists.
@@ -23,7 +23,7 @@ class Plan:
 
 
 def roomy(intersections: int) -> int:
-    """A capacity with room for a quarter more."""
+    """Return a capacity with room for a quarter more intersections."""
     return (5 * intersections // 4 + 4095) // 4096 * 4096
 
 
@@ -31,45 +31,46 @@ def roomy(intersections: int) -> int:
 Kind = tuple[int, int, bool]
 
 
-class Plans:
-    """The plan of each kind of images. Passes cost as much as there is room, so small images need one of their own. And
-    the number of bands decides in which order gradients are added, so images that are only looked at must not raise it.
+class BufferPlans:
+    """The plan of each kind of images. The cost of a pass grows with the capacity, so small images have plans of their
+    own. The number of bands decides the order in which gradients are added, so images without gradients must not
+    raise it.
 
     now: the plan of the kind that is drawn. capacity: of the first one.
     """
 
     def __init__(self, capacity: int) -> None:
-        self.now = Plan(capacity)
+        self.now = BufferPlan(capacity)
         self._first_capacity = capacity
         self._kind: Kind | None = None
-        self._others: dict[Kind, Plan] = {}  # the latest last
+        self._others: dict[Kind, BufferPlan] = {}  # the latest last
         self._watched, self._most = 0, 0  # drawings by this plan, and the most intersections of a band
 
     def turn_to(self, kind: Kind) -> None:
-        """Images of this kind come next."""
+        """Make the plan of this kind of images the current one."""
         if self._kind is not None and self._kind != kind:
             self._others[self._kind] = self.now
             # Small splats lie on one tile at any size, large ones on as many more as there are pixels.
             share = math.sqrt(math.prod(kind[:2]) / math.prod(self._kind[:2]))
             guess = min(self.now.capacity, max(self._first_capacity, round(share * self.now.capacity)))
-            self.now = self._others.pop(kind, Plan(guess))
+            self.now = self._others.pop(kind, BufferPlan(guess))
             if len(self._others) > _KINDS:
                 self._others.pop(next(iter(self._others)))
             self._watched = self._most = 0
         self._kind = kind
 
     def bands(self, kind: Kind) -> int:
-        """Of images of this kind."""
-        return self.now.bands if kind == self._kind else self._others.get(kind, Plan(0)).bands
+        """Return the number of bands of images of this kind."""
+        return self.now.bands if kind == self._kind else self._others.get(kind, BufferPlan(0)).bands
 
     def set_bands(self, kind: Kind, bands: int) -> None:
-        """Draw images of this kind, which come next, in so many bands."""
+        """Make the plan of this kind of images the current one, with this number of bands."""
         self.turn_to(kind)
         self.now = replace(self.now, bands=bands)
 
     def fitted(self, most: int) -> None:
-        """An image fitted, with at most so many intersections in a band. From time to time this shrinks a plan that was
-        too large for all.
+        """Record that an image fitted, with at most `most` intersections in a band. After _WATCHED images this shrinks
+        a plan that was too large for all of them.
 
         Bands stay, and a training's state holds their number, on which its bits depend.
         """
