@@ -31,10 +31,10 @@ from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.wgpu_errors import TranslatedErrors
 from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.motion.scene import Scene4D
+from lapgs_wgpu.run import resume, train
 from lapgs_wgpu.splat.rasterize import rasterizer_of
 from lapgs_wgpu.train.dataloader import ImageLoader
 from lapgs_wgpu.train.log import Log
-from lapgs_wgpu.train.run import resume, train
 from lapgs_wgpu.train.run_folder import STATE, load_state
 from lapgs_wgpu.train.step_result import StepResult
 
