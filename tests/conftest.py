@@ -17,14 +17,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers.training import configure
 
 from lapgs_wgpu.data import Dataset, load_dataset
 from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.gpu.device import Device, _adapters, _matches
 from lapgs_wgpu.splat import rasterize as rasterize_module
 from lapgs_wgpu.splat.rasterizer import Rasterizer
-from lapgs_wgpu.train.run import train
 
 # What the adapter is taken for, and how it is opened.
 CONFIGURATIONS: dict[str, tuple[str | None, dict[str, bool]]] = {
@@ -86,6 +84,10 @@ def dataset(data: Path) -> Dataset:
 def trained_run(data: Path, dataset: Dataset, device: Device, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a finished run of 36 steps with motion, on `dataset` (helpers/training.configure). No test changes
     it; a test that does copies it first."""
+    from helpers.training import configure
+
+    from lapgs_wgpu.run import train
+
     out = tmp_path_factory.mktemp("runs") / "trained"
     train(configure(data__path=str(data)), dataset, out, device=device)
     return out

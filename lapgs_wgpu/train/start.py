@@ -12,7 +12,7 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.camera_refinement import Corrections
 from lapgs_wgpu.train.config import Config
-from lapgs_wgpu.train.initial_points import initial_points
+from lapgs_wgpu.train.initial_points import INITIAL_OPACITY, initial_points
 
 # Learning rates at which a field keeps what discovery fitted; at higher ones Adam's noise undoes the fit.
 MAX_HASH_RATE, MAX_MLP_RATE = 5e-3, 1e-3
@@ -57,7 +57,7 @@ def start_from_points(config: Config, dataset: Dataset, device: Device, own_fiel
     scene = Scene4D.from_points(
         *initial_points(config.points, dataset, config.seed),
         config.field,
-        opacity=config.points.opacity,
+        opacity=INITIAL_OPACITY,
         antialiased=config.antialiased,
         device=device,
         seed=config.seed,

@@ -48,7 +48,7 @@ def static_config(config: Config) -> Config:
             rate=dataclasses.replace(config.cameras.rate, steps=steps),
             start=min(config.cameras.start, max(1, round(REFINE * steps))),
         ),
-        loss=dataclasses.replace(config.loss, pyramid=0.0, ncc=0.0, dynamics_mode="off"),
+        loss=dataclasses.replace(config.loss, pyramid=0.0, ncc=0.0, dynamics=0.0),
         smoothness=dataclasses.replace(config.smoothness, share=0.0),
         acceleration=dataclasses.replace(config.acceleration, weight=0.0),
         precision="float32",
