@@ -20,7 +20,7 @@ from lapgs_wgpu.train.acceleration import WOBBLE, acceleration_loss, draw_moment
 from lapgs_wgpu.train.config import AccelerationConfig
 from lapgs_wgpu.train.trainer import Trainer
 
-CONFIG = AccelerationConfig(weight=1.0, share=0.5, frames=2.0)
+CONFIG = AccelerationConfig(weight=1.0, share=0.5)
 COUNT = 9
 
 

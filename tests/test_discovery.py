@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from motion_scenes import MotionScene
+from motion_writer import write_motion
 from torch import nn
 
 from lapgs_wgpu.data import Dataset, View, load_dataset
-from lapgs_wgpu.data.motion_scenes import MotionScene
-from lapgs_wgpu.data.motion_writer import write_motion
 from lapgs_wgpu.data.small_views import small_views
 from lapgs_wgpu.data.synthetic import camera_at, cameras
 from lapgs_wgpu.discovery import discover as discover_module

@@ -90,7 +90,7 @@ def test_a_run_is_whole(trained_run: Path, data: Path, dataset: Dataset) -> None
         assert Image.open(trained_run / "eval" / f"{view.name}.png").size == (3 * 32, 32)
 
 
-@pytest.mark.parametrize("validated", [True, False])
+@pytest.mark.parametrize("validated", [True, pytest.param(False, marks=pytest.mark.nightly)])
 def test_an_evaluation_while_training_changes_nothing(
     trained_run: Path, dataset: Dataset, device: Device, tmp_path: Path, *, validated: bool
 ) -> None:
@@ -156,6 +156,7 @@ def test_the_training_never_sees_the_test_views(
     assert (tmp_path / "run" / "checkpoint.ply").read_bytes() == (trained_run / "checkpoint.ply").read_bytes()
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("key", "value"),
     [
@@ -193,6 +194,7 @@ def test_bfloat16_trains_as_well_and_repeats(
     assert psnrs[0] == pytest.approx(psnrs[1], abs=0.5)
 
 
+@pytest.mark.nightly
 def test_the_decoder_on_the_device_trains_as_well_and_repeats(
     trained_run: Path, dataset: Dataset, device: Device, tmp_path: Path
 ) -> None:
