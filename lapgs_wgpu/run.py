@@ -11,8 +11,6 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-import torch
-
 from lapgs_wgpu.data.initial_gaussians import first_points
 from lapgs_wgpu.data.validation import check_in_view, check_times
 from lapgs_wgpu.data.views import Dataset
@@ -87,7 +85,7 @@ def train(
     found += check_in_view(dataset, first_points(dataset, PROBES, config.points.box, config.seed)[0])
     if ranks.first:
         check_run_folder(out, overwrite=overwrite)
-        for warning in (*dataset.warnings, *found, *_precision_warnings(config)):
+        for warning in (*dataset.warnings, *found):
             print(f"warning: {warning}", file=sys.stderr, flush=True)
         if dataset.normalization is not None:
             say(f"normalization: {dataset.normalization}")
@@ -143,14 +141,6 @@ def resume(
                 reason = f"{type(error).__name__}: {error}".splitlines()[0]
                 raise InputError(f"{out}: its state and its config.toml do not belong together ({reason}).") from error
         return _run(training, out, watch, lpips) if ranks.first else _assist(training)
-
-
-def _precision_warnings(config: Config) -> list[str]:
-    """A sentence where the precision costs time instead of saving it."""
-    features: dict[str, object] = getattr(torch.cpu, "get_capabilities", dict)()  # not in every torch
-    if config.precision == "float32" or not features or any(features[name] for name in features if "bf16" in name):
-        return []
-    return ["this processor has no instructions for bfloat16: the training will be faster with --precision float32."]
 
 
 def _outside(scene: Scene4D) -> str:

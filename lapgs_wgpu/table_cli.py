@@ -40,8 +40,8 @@ def options() -> Parser:
 def _table(arguments: list[str]) -> int:
     given = options().parse_args(arguments)
     from lapgs_wgpu.gpu.device import open_device
+    from lapgs_wgpu.table import make_table, markdown, read_result, read_spec
     from lapgs_wgpu.train.lpips import Lpips
-    from lapgs_wgpu.train.table import make_table, markdown, read_result, read_spec
 
     runs, out = read_spec(Path(given.spec)), Path(given.out)
     if out.exists() and not out.is_dir():

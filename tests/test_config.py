@@ -152,7 +152,6 @@ def test_presets_are_complete_without_defaults_in_the_code() -> None:
         "acceleration",
         "antialiased",
         "exposure",
-        "precision",
         "decoder",
         "discovery",
         "cameras",
@@ -214,19 +213,10 @@ def test_unknown_preset(preset: str, message: str) -> None:
             'base = "dnerf"\n[density]\nsplit_quantile = 1.1',
             "split_quantile must be at least 0 and at most 1, got 1.1.",
         ),
-        ('base = "dnerf"\nprecision = "float16"', "precision must be float32 or bfloat16, got 'float16'"),
         (
             'base = "dnerf"\ndecoder = "device"\n[field]\ndepth = 1',
             "decoder device is for the fields grid4d and laplacian with field.depth 0, and for laplacian only with "
             "field.motion laplacian, not for laplacian with depth 1 and motion laplacian",
-        ),
-        (
-            'base = "dnerf"\ndecoder = "device"\nprecision = "bfloat16"',
-            "decoder device works in float32: precision bfloat16 needs decoder torch",
-        ),
-        (
-            'base = "dnerf"\nprecision = "bfloat16"\n[field]\nkind = "mlp"',
-            "for the fields grid4d and laplacian, not for mlp",
         ),
         ("[data]\nsize = 1", 'start the file with base = "dnerf"'),
         ("base = 3", "base must be the name of a preset, got 3"),

@@ -20,8 +20,8 @@ import pytest
 
 from lapgs_wgpu import cli, doctor_cli, prepare_cli, table_cli, train_options
 from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.table import read_spec
 from lapgs_wgpu.train.presets import config_keys, load_config
-from lapgs_wgpu.train.table import read_spec
 from lapgs_wgpu.viewer import cli as view_cli
 from lapgs_wgpu.viewer import options as view_options
 

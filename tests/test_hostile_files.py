@@ -49,11 +49,11 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.motion.playback.playback import DevicePlayback
 from lapgs_wgpu.motion.scene_file import compact_bytes, read_scene
+from lapgs_wgpu.table import read_spec
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.run_folder import STATE, check_state, load_state, save_state
-from lapgs_wgpu.train.table import read_spec
 from lapgs_wgpu.train.trainer import Trainer
 from lapgs_wgpu.viewer.path_file import read_path
 

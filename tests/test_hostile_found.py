@@ -38,11 +38,11 @@ from lapgs_wgpu.io.safe_json_toml import MAX_TOML_BYTES, read_json, read_toml
 from lapgs_wgpu.motion.scene_file import read_scene
 from lapgs_wgpu.run import evaluate_run, resume
 from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.table import read_spec
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.run_folder import STATE, load_state, locked_folder, save_state, start_run_folder
 from lapgs_wgpu.train.step_result import StepResult
-from lapgs_wgpu.train.table import read_spec
 from lapgs_wgpu.train.trainer import Trainer
 from lapgs_wgpu.viewer.ground_truth import open_ground_truth
 from lapgs_wgpu.viewer.path_file import read_path

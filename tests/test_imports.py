@@ -58,7 +58,8 @@ ALLOWED = {
         "train_options",
         "viewer",
     },
-    "table_cli": {"errors", "command", "train"},
+    "table": {"errors", "command", "stop_signals", "data", "io", "train"},
+    "table_cli": {"errors", "command", "gpu", "table", "train"},
 }
 FOLDERS = {"": PACKAGE, "viewer": Path(lapgs_wgpu.viewer.__file__).parent}  # where the parts lie on the disk
 FILES = sorted({Path(part) / file.relative_to(at) for part, at in FOLDERS.items() for file in at.rglob("*.py")})

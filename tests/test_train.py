@@ -183,17 +183,6 @@ def test_a_training_repeats_to_the_last_byte(
     assert first == second
 
 
-def test_bfloat16_trains_as_well_and_repeats(
-    trained_run: Path, dataset: Dataset, device: Device, tmp_path: Path
-) -> None:
-    for name in ("first", "again"):
-        train(configure(precision="bfloat16"), dataset, tmp_path / name, device=device)
-    assert (tmp_path / "first/checkpoint.ply").read_bytes() == (tmp_path / "again/checkpoint.ply").read_bytes()
-    assert (tmp_path / "first/checkpoint.ply").read_bytes() != (trained_run / "checkpoint.ply").read_bytes()
-    psnrs = [json.loads((folder / "metrics.json").read_text())["psnr"] for folder in (tmp_path / "first", trained_run)]
-    assert psnrs[0] == pytest.approx(psnrs[1], abs=0.5)
-
-
 @pytest.mark.nightly
 def test_the_decoder_on_the_device_trains_as_well_and_repeats(
     trained_run: Path, dataset: Dataset, device: Device, tmp_path: Path
@@ -242,20 +231,6 @@ def test_the_place_of_the_decoder_is_told_and_recorded(
     train(configure(schedule__steps="1"), dataset, tmp_path / "gpu", device=device)
     assert "decoder: on the device\n" in capsys.readouterr().out
     assert load_config(str(tmp_path / "gpu/config.toml")).decoder == "device"
-
-
-def test_a_processor_without_bfloat16_is_told(
-    dataset: Dataset,
-    device: Device,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    for name, found, said in (("new", True, False), ("old", False, True)):
-        features = {"avx2": True, "avx512_bf16": found, "amx_bf16": False}
-        monkeypatch.setattr(torch.cpu, "get_capabilities", lambda features=features: features, raising=False)
-        train(configure(precision="bfloat16", schedule__steps="1"), dataset, tmp_path / name, device=device)
-        assert ("no instructions for bfloat16" in capsys.readouterr().err) == said
 
 
 def test_another_seed_gives_another_model(dataset: Dataset, device: Device, tmp_path: Path) -> None:

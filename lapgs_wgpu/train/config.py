@@ -18,7 +18,6 @@ Background = Literal["black", "white", "random"]
 BACKGROUND_LEVELS = {"black": 0.0, "white": 1.0, "random": 0.0}  # under views that are measured
 Split = Literal["plain", "adaptive"]
 Units = Literal["world", "capture"]
-Precision = Literal["float32", "bfloat16"]
 DecoderPlace = Literal["auto", "torch", "device"]
 RefineCameras = Literal["auto", "on", "off"]
 
@@ -276,11 +275,6 @@ class Config(Options):
         "lower the opacity of thin Gaussians by the factor by which the low-pass filter enlarges them (as in gsplat)",
         False,
     )
-    precision: Precision = option(
-        "data type of the field's features and of its decoder's matrix products and their gradients; bfloat16: "
-        "only fields grid4d and laplacian, faster on processors with bfloat16 instructions; all else is float32",
-        "float32",
-    )
     decoder: DecoderPlace = option(
         "where the decoder of the fields grid4d and laplacian runs; auto: in torch for CPU devices, else on the device",
         "torch",
@@ -293,10 +287,4 @@ class Config(Options):
                 "decoder device is for the fields grid4d and laplacian with field.depth 0, and for laplacian only with "
                 f"field.motion laplacian, not for {self.field.kind} with depth {self.field.depth} and motion "
                 f"{self.field.motion}"
-            )
-        if self.decoder == "device" and self.precision != "float32":
-            raise ValueError(f"decoder device works in float32: precision {self.precision} needs decoder torch")
-        if self.precision != "float32" and self.field.kind not in ("grid4d", "laplacian"):
-            raise ValueError(
-                f"precision {self.precision} is for the fields grid4d and laplacian, not for {self.field.kind}"
             )

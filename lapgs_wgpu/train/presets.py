@@ -6,6 +6,7 @@ A file names every key, or starts from another preset (`base = "dnerf"`) and nam
 from __future__ import annotations
 
 import dataclasses
+import functools
 import importlib.resources
 import json
 import os
@@ -53,9 +54,7 @@ _SCENES = "published-scenes"  # the file with presets of single scenes
 
 def preset_names() -> list[str]:
     """The presets that come with the package."""
-    files = importlib.resources.files("lapgs_wgpu.configs").iterdir()
-    names = {Path(file.name).stem for file in files if file.name.endswith(".toml")} - {_SCENES}
-    return sorted(names | {name for name in read_toml(_packaged(_SCENES)) if not name.startswith("_")})
+    return sorted(name for name in _packaged() if not name.startswith("_"))
 
 
 def load_config(
@@ -163,18 +162,20 @@ def _read_file(path: str) -> Table:
 
 def _read_packaged(name: str) -> Table:
     """The table of a preset that comes with the package."""
-    scenes = read_toml(_packaged(_SCENES))
-    if name in scenes:
-        return dict(scenes[name])
-    names = preset_names()
-    if name not in names:
+    presets = _packaged()
+    if name not in presets:
+        names = preset_names()
         hint = did_you_mean(name, names, f"; there are {', '.join(names)}, or give a .toml file.")
         raise InputError(f"there is no preset {name!r}{hint}")
-    return read_toml(_packaged(name))
+    return dict(presets[name])
 
 
-def _packaged(name: str) -> Path:
-    return Path(str(importlib.resources.files("lapgs_wgpu.configs") / f"{name}.toml"))
+@functools.cache
+def _packaged() -> dict[str, Table]:
+    """The tables of configs/ by name. No caller changes them."""
+    folder = Path(str(importlib.resources.files("lapgs_wgpu.configs")))
+    presets = {file.stem: read_toml(file) for file in folder.glob("*.toml")}
+    return presets | presets.pop(_SCENES)
 
 
 def _remove(table: Any, key: str) -> bool:

@@ -53,5 +53,5 @@ def resolve_decoder(config: Config, device: Device) -> Config:
     """
     if config.decoder != "auto":
         return config
-    able = config.field.decodes_on_device and config.precision == "float32"
+    able = config.field.decodes_on_device
     return dataclasses.replace(config, decoder="device" if able and not device.is_cpu else "torch")

@@ -128,7 +128,6 @@ class Trainer:
         """Make what the steps work with."""
         config, scene, dataset = self.config, self.scene, self.dataset
         if isinstance(scene.field, GridField):
-            scene.field.precision = getattr(torch, config.precision)
             scene.field.on_device = config.decoder == "device"
         groups = scene.field.parameter_groups() if scene.field else {}
         rates = self.parts.rates_of(config.rates.schedules(), scene.parameters, groups)

@@ -74,6 +74,7 @@ def read_spec(path: Path) -> list[Run]:
     for name in (*spec.scenes, *spec.rows):
         if not _NAME.fullmatch(name):
             raise InputError(f"{path}: {name!r} must be a name of letters, digits, spaces and . + = _ - only.")
+    common = _copied(spec.common or {}, f"{path}: common")
     runs = []
     for scene, of_scene in spec.scenes.items():
         of_scene = _copied({"folder": of_scene} if isinstance(of_scene, str) else of_scene, f"{path}: scenes.{scene}")
@@ -89,7 +90,7 @@ def read_spec(path: Path) -> list[Run]:
             short = shorthands(of_row.pop("method", None), ablate, (f"{where}.method", f"{where}.ablate"))
             if scene not in scenes:
                 continue
-            values = merge(merge(spec.common or {}, of_scene), of_row)
+            values = merge(merge(common, of_scene), of_row)
             for seed in seeds:
                 config = build_config(spec.preset, merge(values, {"seed": seed}), f"{path}: {scene}, {row}", short)
                 runs.append(Run(scene, row, seed, folder, config))
