@@ -205,7 +205,6 @@ def test_the_decoder_on_the_device_trains_as_well_and_repeats(
         ({"method": "static"}, False, "torch"),
         ({"method": "hexplane"}, False, "torch"),
         ({"field__depth": "1"}, False, "torch"),
-        ({"precision": "bfloat16"}, False, "torch"),
         ({"decoder": "torch"}, False, "torch"),
         ({"decoder": "device"}, True, "device"),
     ],
