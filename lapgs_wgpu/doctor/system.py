@@ -12,7 +12,7 @@ from pathlib import Path
 # Packages that a training, the viewer or lapgs-prepare use; optional ones are reported as missing.
 PACKAGES = (
     "torch", "wgpu", "numpy", "scipy", "imageio", "pillow", "imgui-bundle", "glfw", "uvicorn", "av",
-    "pycolmap", "matplotlib",
+    "pycolmap",
 )  # fmt: skip
 # Environment variables that choose drivers or threads.
 _VARIABLES = (
