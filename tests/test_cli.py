@@ -174,6 +174,7 @@ MISTAKES = {
     "missing preset file": (["mine.toml", "--data", "SCENE", "--out", "OUT"], "mine.toml does not exist"),
     "unknown option": (["tiny", "--data", "SCENE", "--out", "OUT", "--stesp", "5"], "did you mean --steps?"),
     "unknown key": (["tiny", "--density.gradeint=5"], "did you mean --density.gradient?"),
+    "removed option": (["tiny", "--data.split=val"], "--data.split any more"),
     "strange option": (["tiny", "--zzzzzz"], "lapgs-train --help lists the options"),
     "one word too many": (["tiny", "SCENE", "--out", "OUT"], "is one word too many"),
     "no value": (["tiny", "--data"], "expected one argument"),
