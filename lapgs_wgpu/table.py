@@ -12,6 +12,7 @@ import re
 import subprocess
 import sys
 import tempfile
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -208,7 +209,8 @@ def _holds(folder: Path, config: Config) -> bool:
     """Whether a folder holds a run of this configuration, wherever its data are and its decoder ran."""
 
     def comparable(config: Config) -> Config:
-        return dataclasses.replace(config, decoder="auto", data=dataclasses.replace(config.data, path=""))
+        data = dataclasses.replace(config.data, path="", masks="")
+        return dataclasses.replace(config, decoder="auto", data=data)
 
     try:
         return comparable(load_config(str(folder / "config.toml"))) == comparable(config)
@@ -217,7 +219,7 @@ def _holds(folder: Path, config: Config) -> bool:
 
 
 def _train(run: Run, options: list[str], folder: Path) -> int:
-    """Run lapgs-train, or resume it; what it tells goes to stderr. Returns its exit code."""
+    """Run lapgs-train, or resume it; it tells on stderr. Returns its exit code; INTERRUPTED after a signal."""
     with tempfile.TemporaryDirectory() as work:
         preset = Path(work) / "config.toml"
         preset.write_text(write_toml(dataclasses.asdict(run.config)), encoding="utf-8")
@@ -225,8 +227,15 @@ def _train(run: Run, options: list[str], folder: Path) -> int:
         if has_state(folder) and _holds(folder, run.config):
             how = [f"--resume={folder.resolve()}"]
         command = [sys.executable, "-m", "lapgs_wgpu.cli", *how, *options]
+        stopped = threading.Event()
         with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
-            # The training saves its state and ends. On Windows it has got Ctrl-C itself, and `terminate` would kill it.
-            stop = process.terminate if sys.platform != "win32" else lambda: None
-            with on_stop_signals(lambda number, frame: stop()):
-                return process.wait()
+
+            def stop(number: int, frame: object) -> None:
+                """The training saves its state and ends. On Windows Ctrl-C has reached it, and `terminate` would kill it."""
+                stopped.set()
+                if sys.platform != "win32":
+                    process.terminate()
+
+            with on_stop_signals(stop):
+                code = process.wait()
+        return INTERRUPTED if stopped.is_set() else code

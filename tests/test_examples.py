@@ -19,7 +19,7 @@ ARGUMENTS = {
     "train": ["--steps", "30"],
     "growing_images": ["--steps", "60", "--until", "40", "--small", "16"],
     "own_field": ["--steps", "30"],
-    "own_loss": ["--steps", "12"],
+    "own_loss": ["--steps", "60"],
     "own_density": ["--steps", "230", "--budget", "4000"],
     "render_path": ["--frames", "4", "--size", "48"],
     "fit_image": ["--steps", "60", "--gaussians", "400", "--size", "48"],

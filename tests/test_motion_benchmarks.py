@@ -127,7 +127,7 @@ def test_a_run_is_measured(tmp_path: Path, device: Device) -> None:
 
 
 def test_pixels_that_move_before_a_still_camera(tmp_path: Path) -> None:
-    folder = write_motion(tmp_path / "scene", MotionScene(camera="still"), size=48, train_times=2, test_views=8)
+    folder = write_motion(tmp_path / "scene", MotionScene(camera="still"), size=48, train_times=9, test_views=8)
     views = load_dataset(folder).test
     backgrounds = still_backgrounds(views, lambda view: composite(view.load(), np.zeros(3)))
     for view, background, objects in zip(views, backgrounds, object_truths(folder, "test", views), strict=True):
