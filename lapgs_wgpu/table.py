@@ -231,7 +231,7 @@ def _train(run: Run, options: list[str], folder: Path) -> int:
         with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
 
             def stop(number: int, frame: object) -> None:
-                """The training saves its state and ends. On Windows Ctrl-C has reached it, and `terminate` would kill it."""
+                """The training saves its state. On Windows Ctrl-C has reached it, and `terminate` would kill it."""
                 stopped.set()
                 if sys.platform != "win32":
                     process.terminate()
