@@ -104,7 +104,7 @@ def plan_training(
             continue
         limit = minutes or (math.inf if last else PATIENCE)
         whole = config.schedule.steps
-        steps = int(min(max(whole, STEPS_PER_TIME * dataset.moments), 60 * limit / (WHOLE * step)))
+        steps = round(min(max(whole, STEPS_PER_TIME * dataset.moments), 60 * limit / (WHOLE * step)))
         if last or steps >= LEAST_SHARE * whole:
             break
     if steps < LEAST_STEPS:
