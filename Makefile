@@ -6,7 +6,6 @@
 #   make docs   the site of docs/ in build/site     make pictures   the pictures of README and docs/, from a trained demo
 #   make bench  times the kernels, beside what the device can do; options go into ARGS, for example:
 #               make bench ARGS="--scenes 50k@400x400 --parts raster --json new.json"
-#               make bench ARGS="--compare old.json new.json"
 
 BIN := .venv/bin
 READY := .venv/.ready

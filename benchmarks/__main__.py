@@ -22,13 +22,12 @@ from typing import Any
 
 import torch
 from ceilings import describe
-from compare import compare
 from crossings import BUSES, Crossing, bench_crossings
 from decoder import DecoderReport, bench_decoder
 from encoder import EncoderReport, bench_encoder
 from losses import LossReport, bench_losses
 from measure import Timing, Traffic
-from passes import Meter, PassTimes, by_processor_time, by_timestamps
+from passes import Meter, PassTimes
 from raster import RasterReport, bench_raster
 from scene import FIXED_SET, SceneSize, TrainedScene, parse_scene, save_scene
 from shares import bench_shares
@@ -63,18 +62,8 @@ def options() -> argparse.ArgumentParser:
     )
     parser.add_argument("--repeat", type=int, default=15, metavar="R", help="timed runs of each [15]")
     parser.add_argument("--device", metavar="NAME", help="adapter: a part of its name, or its kind")
-    parser.add_argument(
-        "--clock",
-        choices=("device", "processor"),
-        default="device",
-        help="what times single passes: the device's timestamps, or, of a CPU device, processor time, which other work "
-        "on the machine hardly changes [device]",
-    )
     parser.add_argument("--no-textures", action="store_true", help="tables in storage buffers on CPU devices, too")
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write the results to FILE")
-    parser.add_argument(
-        "--compare", type=Path, nargs=2, metavar=("OLD", "NEW"), help="set two such files against each other, and stop"
-    )
     parser.add_argument(
         "--save-scene", type=Path, metavar="FILE", help="write the first scene as .npz for other rasterizers, and stop"
     )
@@ -84,9 +73,7 @@ def options() -> argparse.ArgumentParser:
 def main() -> None:
     parser = options()
     given = parser.parse_args()
-    if given.compare:
-        print(compare(*given.compare))
-    elif given.save_scene:
+    if given.save_scene:
         save_scene(given.save_scene, *given.scenes[0].make())
     else:
         run(given, parser)
@@ -96,13 +83,11 @@ def run(options: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
     """Time the chosen parts, print what was found as it comes, and write it as JSON."""
     device = open_device(options.device)
     device.textures &= not options.no_textures
-    machine = describe_machine(device) | {"clock": options.clock}
+    machine = describe_machine(device)
     print(*(f"{name}: {value}" for name, value in machine.items()), sep="\n")
-    if options.clock == "processor" and not device.is_cpu:
-        parser.error(f"--clock processor is for CPU devices, and {device.info.name} is {device.info.kind}")
     meter = None
     if "timestamp-query" in device.features:
-        meter = Meter(device, by_processor_time if options.clock == "processor" else by_timestamps)
+        meter = Meter(device)
     first, repeat = options.scenes[0], options.repeat
     results: dict[str, Any] = {"machine": machine}
     if "raster" in options.parts:

@@ -10,14 +10,14 @@
 # passes    the passes of rasteriser, encoder, decoder (in torch and on the device), losses and a whole step: OUT/passes.json
 # gsplat    the same splats drawn by gsplat's kernels, where CUDA and gsplat are installed: OUT/gsplat.json
 # train     the three scenes at 800x800 by the whole schedule of dnerf, grid4d and laplacian: OUT/table. HOURS=H stops it
-#           in time; the same call goes on
+#           in time, with saved state; the same call goes on
 set -uo pipefail
 out=$(realpath -m "$1") data=$(realpath "$2")
 shift 2
 cd "$(dirname "$0")/.."
 python=${PYTHON:-.venv/bin/python}
 mkdir -p "$out"
-hours=${HOURS:+--hours $HOURS}
+limit=${HOURS:+timeout ${HOURS}h}
 if [ -n "${SMALL:-}" ]; then
   scenes=(2k@96x96) repeat=2 parts=(raster encoder losses) tests=(tests/test_scan.py tests/test_radix_sort.py)
   table=$out/small.toml
@@ -44,8 +44,8 @@ gsplat() {
 }
 
 # shellcheck disable=SC2086 # two words, or none
-train() { $python -c 'import sys; from lapgs_wgpu.table_cli import table_command; sys.exit(table_command())' \
-  "$table" --data "$data" --out "$out/table" $hours; }
+train() { $limit $python -c 'import sys; from lapgs_wgpu.table_cli import table_command; sys.exit(table_command())' \
+  "$table" --data "$data" --out "$out/table"; }
 
 failed=0
 for stage in "${@:-kernels passes gsplat train}"; do

@@ -4,27 +4,24 @@ from __future__ import annotations
 
 import sys
 import typing
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from lapgs_wgpu.command import guarded, print_devices
-from lapgs_wgpu.errors import InputError, pip_install
+from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.progress import say
+from lapgs_wgpu.train.presets import config_keys, load_config
 from lapgs_wgpu.train_options import parse_options
 
 if typing.TYPE_CHECKING:
     from lapgs_wgpu.data import Dataset
-    from lapgs_wgpu.gpu.device import Device
-    from lapgs_wgpu.motion.scene import Scene4D
+    from lapgs_wgpu.run import Watch
     from lapgs_wgpu.train.config import Config
     from lapgs_wgpu.train.distributed import Ranks
     from lapgs_wgpu.train.lpips import Lpips
-    from lapgs_wgpu.train.run import Watch
 
-# Of the keys, what goes with --eval: where the pictures lie now, and how they are read. The size must be the run's own.
-EVAL_KEYS = ("data.path", "data.size", "data.split", "data.background", "data.cache_gb")
-# And with --resume: where they and their masks lie now, on another machine.
-RESUME_KEYS = ("data.path", "data.masks", "data.cache_gb")
+EVAL_KEYS = ("data.path", "data.background", "data.cache_gb")  # keys that can be given with --eval
+RESUME_KEYS = ("data.path", "data.masks", "data.cache_gb")  # and with --resume: where the capture is now
 
 
 def train_command(arguments: Sequence[str] | None = None) -> int:
@@ -36,68 +33,61 @@ def _train(arguments: list[str]) -> None:
     if "--list-devices" in arguments:
         print_devices()
         return
-    from lapgs_wgpu.train.presets import config_keys, load_config
-
-    given = parse_options(arguments)
+    options = parse_options(arguments)
     from lapgs_wgpu.gpu.device import open_device  # what follows needs torch, which takes seconds to import
+    from lapgs_wgpu.run import train
     from lapgs_wgpu.train.distributed import join_ranks
-    from lapgs_wgpu.train.run import train
     from lapgs_wgpu.train.run_folder import check_run_folder, result_text
 
-    overrides = {key.name: given[key.name] for key in config_keys() if key.name in given}
-    if given["eval"]:
-        _evaluate(Path(given["eval"]), given, overrides)
+    overrides = {key: options[key] for key in config_keys() if key in options}
+    if options["eval"]:
+        _evaluate(Path(options["eval"]), options, overrides)
         return
-    if given["motion_from"]:
-        raise InputError("--motion-from goes with --eval RUN, after the training.")
-    lpips = _lpips(given)
+    lpips = _lpips(options)
     ranks = join_ranks()
     watch = None
-    if given["view"]:
+    if options["view"]:
         from lapgs_wgpu.viewer import live
 
         if ranks.first:
             live.check_window()  # before anything is written or replaced
         watch = live.watch
-    if given["resume"]:
-        _resume(Path(given["resume"]), given, overrides, watch, ranks, lpips)
+    if options["resume"]:
+        _resume(Path(options["resume"]), options, overrides, watch, ranks, lpips)
         return
-    if given["preset"] is None:
+    if options["preset"] is None:
         raise InputError("name a preset, such as tiny, and the data to train on; lapgs-train --help says more.")
-    ablate = [part.strip() for part in (given["ablate"] or "").split(",") if part.strip()]
-    config = load_config(given["preset"], overrides, method=given["field"], ablate=ablate)
-    default = f"runs/{_scene_name(config)}-{Path(given['preset']).stem}"
-    out = Path(default if given["out"] is None else given["out"])
+    ablate = [part.strip() for part in (options["ablate"] or "").split(",") if part.strip()]
+    config = load_config(options["preset"], overrides, method=options["field"], ablate=ablate)
+    scene = Path(config.data.path).resolve().name or "scene"
+    out = Path(options["out"] or f"runs/{scene}-{Path(options['preset']).stem}")
+    overwrite = options["overwrite"]
     if ranks.first:
-        check_run_folder(out, overwrite=given["overwrite"])
-    device = open_device(given["device"], number=ranks.local_rank)
+        check_run_folder(out, overwrite=overwrite)
+    device = open_device(options["device"], number=ranks.local_rank)
     config, dataset = _open_data(config, out.parent, ranks)
-    train(config, dataset, out, device=device, overwrite=given["overwrite"], watch=watch, ranks=ranks, lpips=lpips)
+    train(config, dataset, out, device=device, overwrite=overwrite, watch=watch, ranks=ranks, lpips=lpips)
     if ranks.first:
         say(result_text(out))
 
 
 def _resume(
     run: Path,
-    given: dict[str, typing.Any],
+    options: dict[str, typing.Any],
     overrides: dict[str, typing.Any],
     watch: Watch | None,
     ranks: Ranks,
     lpips: Lpips | None,
 ) -> None:
     from lapgs_wgpu.gpu.device import open_device
-    from lapgs_wgpu.train.presets import load_config
-    from lapgs_wgpu.train.run import resume
+    from lapgs_wgpu.run import resume
     from lapgs_wgpu.train.run_folder import changes_since, check_same_data, result_text
 
-    names = ("preset", "field", "ablate", "out", "overwrite")
-    others = _others(given, names, [key for key in overrides if key not in RESUME_KEYS])
-    if others:
-        raise InputError(f"--resume goes on as the run began, so {others[0]} cannot be given.")
+    _check_alone("resume", options, [key for key in overrides if key not in RESUME_KEYS], allowed=("view",))
     _check_files("--resume", "a run", run / "config.toml")
     config = load_config(str(run / "config.toml"), overrides)
     _check_capture(run, config)
-    device = open_device(given["device"], number=ranks.local_rank)
+    device = open_device(options["device"], number=ranks.local_rank)
     config, dataset = _open_data(config, run.parent, ranks)
     if "data.path" in overrides:
         check_same_data(run, config.data.path, dataset)
@@ -108,40 +98,23 @@ def _resume(
         say(result_text(run))
 
 
-def _others(given: dict[str, typing.Any], names: Sequence[str], keys: Iterable[str]) -> list[str]:
-    """Those of the options `names` that were given, and the keys, as they stand on the command line."""
-    words = [given[name] if name == "preset" else f"--{name}" for name in names if given[name]]
-    return words + [f"--{key}" for key in keys]
-
-
-def _evaluate(run: Path, given: dict[str, typing.Any], overrides: dict[str, str | list[str]]) -> None:
+def _evaluate(run: Path, options: dict[str, typing.Any], overrides: dict[str, typing.Any]) -> None:
     from lapgs_wgpu.gpu.device import open_device
     from lapgs_wgpu.io.safe_json_toml import read_json
     from lapgs_wgpu.motion.scene import load
-    from lapgs_wgpu.train import plots
+    from lapgs_wgpu.run import evaluate_run
     from lapgs_wgpu.train.distributed import SINGLE_PROCESS
-    from lapgs_wgpu.train.presets import load_config
-    from lapgs_wgpu.train.run import evaluate_run
     from lapgs_wgpu.train.run_folder import check_same_data, result_text
 
-    names = ("preset", "field", "ablate", "out", "resume", "overwrite", "view")
-    others = _others(given, names, [key for key in overrides if key not in EVAL_KEYS])
-    if others:
-        raise InputError(f"--eval measures a run as it is, so {others[0]} cannot be given.")
-    lpips = _lpips(given)
+    _check_alone("eval", options, [key for key in overrides if key not in EVAL_KEYS])
+    lpips = _lpips(options)
     _check_files("--eval", "a finished run", run / "config.toml", run / "checkpoint.ply")
-    size = load_config(str(run / "config.toml")).data.size
-    config = load_config(str(run / "config.toml"), {**overrides, "data.masks": ""})  # which concern the training alone
-    if config.data.size != size:
-        raise InputError(
-            f"--eval measures a run at its own size, so --data.size {config.data.size} cannot be given; "
-            f"{run / 'config.toml'} says {size}."
-        )
+    config = load_config(str(run / "config.toml"), {**overrides, "data.masks": ""})  # masks are for the training alone
     _check_capture(run, config)
-    device = open_device(given["device"])
+    device = open_device(options["device"])
     scene = load(run / "checkpoint.ply", device)
     config, dataset = _open_data(config, run.parent, SINGLE_PROCESS, normalize="placement" in scene.metadata)
-    if "data.path" in overrides and "data.split" not in overrides:
+    if "data.path" in overrides:
         check_same_data(run, config.data.path, dataset)
     try:
         training = read_json(run / "metrics.json")["training"]
@@ -152,33 +125,25 @@ def _evaluate(run: Path, given: dict[str, typing.Any], overrides: dict[str, str 
     done = training.get("steps") if isinstance(training, dict) else None
     if isinstance(done, int) and done < steps:
         print(f"note: {run} was interrupted; its checkpoint is of step {done} of {steps}.", file=sys.stderr)
-    static = _static_fit(Path(given["motion_from"]), device) if given["motion_from"] else None
-    evaluate_run(run, scene, dataset, config.data, training, lpips, static)
-    if plots.available():
-        plots.plot_run(run, scene)
-    else:
-        print(f"no plots: {pip_install('plots')} adds them to {run / 'eval'}.", file=sys.stderr)
+    evaluate_run(run, scene, dataset, config.data, training, lpips)
     say(result_text(run))
 
 
-def _lpips(given: dict[str, typing.Any]) -> Lpips | None:
+def _check_alone(option: str, options: dict[str, typing.Any], keys: Sequence[str], allowed: Sequence[str] = ()) -> None:
+    """Raises InputError where --resume or --eval was given with another option that starts a training, or with keys of
+    the configuration."""
+    starting = ("preset", "field", "ablate", "out", "resume", "overwrite", "view")
+    words = [f"--{name}" for name in starting if options[name] and name not in (option, *allowed)]
+    for word in [*words, *(f"--{key}" for key in keys)]:
+        word = repr(options["preset"]) if word == "--preset" else word
+        raise InputError(f"--{option} takes the configuration of the run as it is, so {word} cannot be given.")
+
+
+def _lpips(options: dict[str, typing.Any]) -> Lpips | None:
     """LPIPS with the weights that were given. Raises InputError."""
     from lapgs_wgpu.train.lpips import Lpips
 
-    return Lpips(Path(given["lpips_weights"])) if given["lpips_weights"] else None
-
-
-def _static_fit(run: Path, device: Device) -> Scene4D:
-    """The scene of a run that was trained without motion."""
-    from lapgs_wgpu.motion.scene import load
-
-    _check_files("--motion-from", "a finished run", run / "checkpoint.ply")
-    scene = load(run / "checkpoint.ply", device)
-    if scene.field_config.kind != "static":
-        raise InputError(
-            f"{run} has the field {scene.field_config.kind}; --motion-from needs a run trained with --field static."
-        )
-    return scene
+    return Lpips(Path(options["lpips_weights"])) if options["lpips_weights"] else None
 
 
 def _check_files(option: str, what: str, *files: Path) -> None:
@@ -189,26 +154,16 @@ def _check_files(option: str, what: str, *files: Path) -> None:
 
 def _check_capture(run: Path, config: Config) -> None:
     """Raises InputError where the capture of a run is gone."""
-    from lapgs_wgpu.data.builtin import is_builtin
-
-    if not is_builtin(config.data.path) and not Path(config.data.path).exists():
+    if config.data.path != "synthetic" and not Path(config.data.path).exists():
         raise InputError(
             f"{config.data.path}, the capture of {run / 'config.toml'}, does not exist; give --data the folder where "
             "it is now."
         )
 
 
-def _scene_name(config: Config) -> str:
-    from lapgs_wgpu.data.builtin import builtin_folder, is_builtin
-
-    if is_builtin(config.data.path):
-        return builtin_folder(config.data.path)
-    return Path(config.data.path).resolve().name or "scene"
-
-
 def _open_data(config: Config, parent: Path, ranks: Ranks, *, normalize: bool = True) -> tuple[Config, Dataset]:
-    """The dataset, and the configuration with its folder. parent: folder for built-in scenes, which the first of
-    several processes writes. normalize: of `load_dataset`."""
+    """The dataset, and the configuration with its folder. parent: folder for the built-in scene, which the
+    first of several processes writes. normalize: of `load_dataset`."""
     from lapgs_wgpu.train.open_dataset import open_dataset, resolve_data
 
     if not ranks.first:

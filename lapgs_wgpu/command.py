@@ -1,7 +1,6 @@
 """What all commands share. Users' mistakes end in one sentence on stderr and exit code 2.
 
-3 means no adapter, 4 that device or memory gave out, 5 values that are not finite in a training, 6 that a table's
-time was over before all its runs were done.
+3 means no adapter, 4 that device or memory gave out, 5 values that are not finite in a training.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ DEVICE_HELP = (
     "otherwise the first in the list of lapgs-train --list-devices]"
 )
 LIST_DEVICES_HELP = "list the graphics adapters and exit; the first one is the default unless LAPGS_DEVICE is set"
-OUT_OF_DEVICE, NOT_FINITE, TIME_OVER = 4, 5, 6
+OUT_OF_DEVICE, NOT_FINITE = 4, 5
 INTERRUPTED = 130  # the shell's code for a process that Ctrl-C ended
 
 

@@ -80,6 +80,19 @@ def dataset(data: Path) -> Dataset:
     return load_dataset(data)
 
 
+@pytest.fixture(scope="session")
+def trained_run(data: Path, dataset: Dataset, device: Device, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a finished run of 36 steps with motion, on `dataset` (helpers/training.configure). No test changes
+    it; a test that does copies it first."""
+    from helpers.training import configure
+
+    from lapgs_wgpu.run import train
+
+    out = tmp_path_factory.mktemp("runs") / "trained"
+    train(configure(data__path=str(data)), dataset, out, device=device)
+    return out
+
+
 @pytest.fixture
 def use(monkeypatch: pytest.MonkeyPatch) -> Callable[[Rasterizer], Rasterizer]:
     """Makes `rasterize` draw with the given Rasterizer until the test ends."""

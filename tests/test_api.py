@@ -18,7 +18,19 @@ from helpers.training import STEPS, configure
 from torch import Tensor, nn
 
 import lapgs_wgpu
-from lapgs_wgpu import Change, Deformation, Parts, Regularizer, Scene4D, StepResult, TorchLoss, Trainer, WgslLoss, load
+from lapgs_wgpu import (
+    Change,
+    Deformation,
+    Parts,
+    Regularizer,
+    Scene4D,
+    StepResult,
+    TorchLoss,
+    Trainer,
+    WgslLoss,
+    load,
+    start_training,
+)
 from lapgs_wgpu.data import Dataset
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.array import DeviceArray
@@ -27,14 +39,13 @@ from lapgs_wgpu.gpu.kernel import Commands
 from lapgs_wgpu.io.checkpoint import read_checkpoint
 from lapgs_wgpu.motion.fields.own_field import OwnField
 from lapgs_wgpu.motion.timing import Timing
+from lapgs_wgpu.run import resume, train
 from lapgs_wgpu.splat.rotation import rotate, rotation_matrices
 from lapgs_wgpu.train.config import LossWeights
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
 from lapgs_wgpu.train.learning_rate import Rate
 from lapgs_wgpu.train.loss_terms import LossTerm, torch_loss
-from lapgs_wgpu.train.monitor import monitored_views
 from lapgs_wgpu.train.presets import load_config
-from lapgs_wgpu.train.run import resume, train
 from lapgs_wgpu.train.run_folder import load_state, save_state
 from lapgs_wgpu.train.tensorboard import scalars
 from lapgs_wgpu.train.truth_cache import LEFT_OUT, upload_rgba
@@ -69,8 +80,7 @@ def equal(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> bool:
 # The trainer
 
 
-def test_steps_by_hand_are_those_of_a_run(dataset: Dataset, device: Device, tmp_path: Path) -> None:
-    train(configure(), dataset, tmp_path / "run", device=device)
+def test_steps_by_hand_are_those_of_a_run(trained_run: Path, dataset: Dataset, device: Device, tmp_path: Path) -> None:
     called: list[int] = []
 
     def note(trainer: Trainer, result: StepResult) -> None:
@@ -83,10 +93,10 @@ def test_steps_by_hand_are_those_of_a_run(dataset: Dataset, device: Device, tmp_
         found = saved(trainer, tmp_path / "scene.ply")
         metrics = trainer.evaluate()
     assert [first.step, *(result.step for result in rest)] == called == list(range(1, STEPS + 1))
-    assert equal(found, dict(read_checkpoint(tmp_path / "run" / "checkpoint.ply").tensors))
-    written, mine = (read_checkpoint(p).metadata for p in (tmp_path / "run" / "checkpoint.ply", tmp_path / "scene.ply"))
+    assert equal(found, dict(read_checkpoint(trained_run / "checkpoint.ply").tensors))
+    written, mine = (read_checkpoint(p).metadata for p in (trained_run / "checkpoint.ply", tmp_path / "scene.ply"))
     assert written == mine
-    assert metrics["psnr"] == json.loads((tmp_path / "run" / "metrics.json").read_text())["psnr"]
+    assert metrics["psnr"] == json.loads((trained_run / "metrics.json").read_text())["psnr"]
 
 
 def test_a_trainer_opens_what_its_configuration_names(data: Path, device: Device) -> None:
@@ -151,6 +161,7 @@ def test_a_step_that_breaks_off_did_not_begin(
         assert equal(trainer.state(), before)
 
 
+@pytest.mark.nightly
 def test_a_state_holds_in_how_many_bands_images_are_drawn(dataset: Dataset, device: Device) -> None:
     """They say in which order gradients are added. No other training and no picture changes them."""
 
@@ -180,7 +191,7 @@ def test_a_state_holds_in_how_many_bands_images_are_drawn(dataset: Dataset, devi
 
 def test_a_state_stays_as_it_is(dataset: Dataset, device: Device) -> None:
     """While the trainer that gave it, and one that took it, go on."""
-    with Trainer(configure(), dataset, device) as one, Trainer(configure(), dataset, device, resumed=True) as two:
+    with Trainer(configure(), dataset, device) as one, Trainer(configure(), dataset, device) as two:
         for _ in range(12):
             one.step()
         state = one.state()
@@ -232,7 +243,7 @@ def test_a_field_of_ones_own_learns_repeats_and_resumes(dataset: Dataset, device
     assert equal(*states)
     assert states[0]["field.module.velocity"].any()
     resumed = Drift()
-    with Trainer(config, dataset, device, parts=Parts(field=resumed), resumed=True) as trainer:
+    with Trainer(config, dataset, device, parts=Parts(field=resumed)) as trainer:
         trainer.restore(middle)
         list(trainer)
         assert equal(states[0], saved(trainer, tmp_path / "resumed.ply"))
@@ -265,6 +276,7 @@ def test_a_checkpoint_of_ones_own_field_needs_its_module(dataset: Dataset, devic
         load(path, device, field=Drift())
 
 
+@pytest.mark.nightly
 def test_a_whole_run_with_ones_own_field(dataset: Dataset, device: Device, tmp_path: Path) -> None:
     def stop(trainer: Trainer, result: StepResult) -> None:
         if result.step == 15:
@@ -370,11 +382,13 @@ def test_a_field_can_move_the_scene_rigidly(dataset: Dataset, device: Device) ->
     torch.testing.assert_close(both.quats, nn.functional.normalize(half_turn + d_quats, dim=1))
 
 
+@pytest.mark.nightly
 def test_a_training_says_why_it_leaves_out_discovery(
     dataset: Dataset, device: Device, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def told(parts: Parts | None = None, method: str = "laplacian", **overrides: str) -> str:
-        with Trainer(configure(method, timing__refine="false", **overrides), dataset, device, parts=parts) as trainer:
+        config = configure(method, timing__refine="false", **overrides)
+        with start_training(config, dataset, device, parts=parts) as trainer:
             assert trainer.discovery is None
             assert len(list(trainer)) == STEPS
         return capsys.readouterr().err
@@ -396,7 +410,7 @@ def test_a_training_says_that_its_warm_up_lasts_to_its_end(
         ("static", STEPS, False),
     ):
         config = configure(method, discovery__enabled="false", schedule__warm_up=str(warm_up), timing__refine="false")
-        Trainer(config, dataset, device).close()
+        start_training(config, dataset, device).close()
         note = f"(schedule.warm_up: {warm_up} steps) is not shorter than schedule.steps ({STEPS}).\n"
         assert capsys.readouterr().err == (
             f"note: nothing moves in this training, since its warm-up {note}" if told else ""
@@ -504,7 +518,7 @@ def test_a_field_without_a_module_is_told_before_discovery(
 ) -> None:
     config = configure(field__kind="own", schedule__steps="900")
     with pytest.raises(InputError, match="the field own needs a module, which only Python can give"):
-        Trainer(config, dataset, device)
+        start_training(config, dataset, device)
     assert capsys.readouterr().err == ""
 
 
@@ -606,6 +620,7 @@ def test_a_torch_term_of_a_window_asks_nothing_of_what_is_left_out(device: Devic
     assert (gradient[:3, 1, 1] != 0).all()
 
 
+@pytest.mark.nightly
 def test_a_wgsl_term_and_one_in_torch_train_alike(dataset: Dataset, device: Device) -> None:
     results = []
     for term in (WgslLoss("mine", CHARBONNIER, 0.5), TorchLoss("mine", charbonnier, 0.5)):
@@ -662,6 +677,7 @@ def test_losses_that_cannot_be_are_refused(dataset: Dataset, device: Device, tmp
         trainer.step()
 
 
+@pytest.mark.nightly
 def test_an_edited_shader_is_compiled_again(dataset: Dataset, device: Device, tmp_path: Path) -> None:
     file, values = tmp_path / "own.wgsl", []
     for factor in ("1.0", "2.0"):
@@ -748,43 +764,6 @@ def test_the_wgsl_of_the_page_is_the_mean_squared_error(device: Device, tmp_path
 def test_the_page_names_all_that_is_public() -> None:
     training = set(lapgs_wgpu.__all__) - {"Camera", "Gaussians", "Rendering", "rasterize"}
     assert all(f"`{name}" in PAGE for name in training), training
-
-
-def test_snapshots_and_monitored_views(dataset: Dataset, device: Device, tmp_path: Path) -> None:
-    config = configure(eval__snapshots="5, 20", eval__interval="18", eval__views="train_001,train_00003")
-    names = [view.name for view in dataset.train]
-    with pytest.raises(InputError, match=r"eval\.views names 'train_00003', which is no .* did you mean train_"):
-        train(config, dataset, tmp_path / "run", device=device)
-    config = configure(eval__interval="18", eval__views=dataset.test[0].name)
-    with pytest.raises(InputError, match=r"names '.*', a test view; those are measured after the training only\."):
-        train(config, dataset, tmp_path / "run", device=device)
-    assert not (tmp_path / "run").exists()
-    config = configure(eval__snapshots="5, 20", eval__interval="18", eval__views=f"{names[1]},{names[3]}")
-    train(config, dataset, tmp_path / "run", device=device)
-    assert sorted(p.name for p in (tmp_path / "run/snapshots").iterdir()) == ["step_000005.ply", "step_000020.ply"]
-    for step in (5, 20):
-        scene = open_playback(tmp_path / f"run/snapshots/step_{step:06d}.ply", device)
-        assert scene.metadata["step"] == str(step)
-        assert scene.moves
-    lines = [json.loads(line) for line in (tmp_path / "run/log.jsonl").read_text().splitlines()]
-    assert [(x["step"], x["val_views"]) for x in lines if "val_psnr" in x] == [
-        (step, f"{names[1]},{names[3]}") for step in (18, 36)
-    ]
-    assert [view.name for view in monitored_views(dataset, f"{names[1]}, {names[1]}")[1]] == [names[1]]
-    blind = dataclasses.replace(dataset, val=())
-    with pytest.raises(InputError, match="no views for validation"):
-        train(configure(eval__interval="1", eval__views="val"), blind, tmp_path / "other", device=device)
-    with pytest.raises(InputError, match="snapshots must be whole numbers, separated by commas, got '5;7'"):
-        configure(eval__snapshots="5;7")
-
-
-def test_options_of_the_evaluation_without_effect_are_told(
-    dataset: Dataset, device: Device, tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
-    train(configure(eval__snapshots="5, 500", eval__views="train"), dataset, tmp_path / "run", device=device)
-    told = capsys.readouterr().err
-    assert f"warning: eval.snapshots names step 500, which is none of the {STEPS} steps of schedule.steps.\n" in told
-    assert "warning: eval.views has no effect, since eval.interval is 0.\n" in told
 
 
 def test_tensorboard_gets_the_figures_of_the_log(dataset: Dataset, device: Device, tmp_path: Path) -> None:

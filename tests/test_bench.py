@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import subprocess
 import sys
@@ -16,6 +15,7 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.splat.camera import Camera
 
+pytestmark = pytest.mark.nightly
 BENCH = Path(__file__).parents[1] / "benchmarks"
 SCENE = "300@40x40"
 
@@ -111,16 +111,6 @@ def test_the_bytes_of_a_step_add_up_and_each_has_its_purpose(results: dict, deco
     assert crossings["all else"]["up"] + crossings["all else"]["down"] < 1024
 
 
-def test_the_scene_can_be_saved_for_other_rasterizers(tmp_path: Path) -> None:
-    bench("--save-scene", tmp_path / "scene.npz")
-    scene = np.load(tmp_path / "scene.npz")
-    assert scene["means"].shape == (300, 3)
-    assert scene["means"].dtype == np.float32
-    assert np.linalg.norm(scene["means"], axis=1).max() <= 1.3
-    assert (int(scene["width"]), int(scene["height"])) == (40, 40)
-    np.testing.assert_allclose(scene["T_cam_world"] @ [0, 0, -4, 1], [0, 0, 0, 1], atol=1e-6)
-
-
 # Ceilings, and what is counted
 
 
@@ -160,16 +150,6 @@ def test_every_counted_pass_stands_beside_its_ceiling(results: dict) -> None:
             assert one["share"] == pytest.approx(one["ceiling"] / one["milliseconds"]["median"])
 
 
-def test_processor_time_is_another_clock_for_the_same_passes(results: dict, tmp_path: Path) -> None:
-    if results["machine"]["kind"] != "cpu":
-        pytest.skip("the device is no processor")
-    bench("--parts", "raster", "--clock", "processor", "--json", tmp_path / "bench.json")
-    passes = raster(json.loads((tmp_path / "bench.json").read_text()))["passes"]["passes"]
-    assert passes.pop("copies to textures")["dispatches"] > 0
-    counts = {shader: one["dispatches"] for shader, one in passes.items()}
-    assert counts == {shader: one["dispatches"] for shader, one in raster(results)["passes"]["passes"].items()}
-
-
 @pytest.mark.parametrize("name", ["ceiling_copy", "ceiling_fma", "ceiling_exp"])
 def test_a_ceiling_is_really_computed(name: str) -> None:
     """What the kernels leave behind is what their loops say."""
@@ -197,43 +177,6 @@ else:
 np.testing.assert_allclose(got, expected, rtol=1e-4)
 """
     subprocess.run([sys.executable, "-c", program], check=True, timeout=300)
-
-
-# Comparing
-
-
-def test_results_compare_with_themselves(results: dict, file: Path) -> None:
-    table = bench("--compare", file, file)
-    assert f"raster / {SCENE} / rasterize_bwd" in table
-    assert "losses / kernels" in table
-    assert "*" not in table.split("\n", 1)[1]
-
-
-def test_a_comparison_tells_what_is_worse(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(BENCH)
-    compare = importlib.import_module("compare").compare
-
-    def write(name: str, adapter: str, **medians: tuple[float, float, float]) -> Path:
-        times = {key: dict(zip(("low", "median", "high"), values, strict=True)) for key, values in medians.items()}
-        passes = {shader: {"milliseconds": time} for shader, time in times.items()}
-        content = {"machine": {"adapter": adapter, "torch": "2"}, "raster": {"a": {"passes": {"passes": passes}}}}
-        (tmp_path / name).write_text(json.dumps(content))
-        return tmp_path / name
-
-    old = write(
-        "old.json", "one", sort=(1, 2, 3), duplicate_with_keys=(1.9, 2, 2.1), tile_ranges=(1, 1, 1), gone=(1, 1, 1)
-    )
-    new = write("new.json", "two", sort=(2, 3, 4), duplicate_with_keys=(3.8, 4, 4.2), tile_ranges=(0.4, 0.5, 0.6))
-    lines = compare(old, new).splitlines()
-    assert lines[0] == "adapter: one -> two"
-    assert [line.split()[:3] for line in lines[2:5]] == [["raster", "/", "a"]] * 3
-    assert [line.split()[4:] for line in lines[2:5]] == [
-        ["duplicate_with_keys", "2.00", "4.00", "2.00", "*"],
-        ["sort", "2.00", "3.00", "1.50"],
-        ["tile_ranges", "1.00", "0.50", "0.50", "*"],
-    ]
-    assert lines[5] == f"only in {old}: raster / a / gone"
-    assert len(lines) == 6
 
 
 def test_scenes_have_names() -> None:

@@ -18,7 +18,8 @@ from lapgs_wgpu.train.config import (
     TimingConfig,
 )
 from lapgs_wgpu.train.learning_rate import Rate
-from lapgs_wgpu.train.presets import ABLATIONS, config_keys, load_config, preset_names, write_toml
+from lapgs_wgpu.train.presets import ABLATIONS, REMOVED, config_keys, load_config, preset_names, write_toml
+from lapgs_wgpu.train_options import keys_help
 
 
 def write(path: Path, text: str) -> str:
@@ -40,7 +41,7 @@ def test_dnerf_is_the_papers_schedule() -> None:
     assert (density.min_opacity, density.max_screen_radius, density.max_world_size) == (0.005, 0, 0.1)
     assert (density.reset_interval, density.reset_opacity) == (3000, 0.01)
     assert (density.neighbours, density.divergence_weight, density.split_quantile) == (10, 0.5, 0.4)
-    assert (config.points.count, config.points.box, config.points.opacity) == (100_000, 1.3, 0.1)
+    assert (config.points.count, config.points.box) == (100_000, 1.3)
     assert (config.data.background, config.seed, config.loss.ssim) == ("black", 0, 0.2)
     assert (config.loss.pyramid, config.loss.ncc) == (0.2, 0.05)
     assert config.field == FieldConfig(negative_scales="mirror")
@@ -56,9 +57,11 @@ def test_configuration_survives_toml(name: str, tmp_path: Path) -> None:
 
 
 def test_every_key_can_be_overridden_and_has_a_help_text() -> None:
+    help_text = keys_help("dnerf")
     for key in config_keys():
-        assert key.help, key.name
-    keys = {key.name for key in config_keys()}
+        section = key.rpartition(".")[0]
+        assert f"--{key} " in help_text or f"--{section}.KEY " in help_text, key
+    keys = set(config_keys())
     assert {"seed", "data.path", "field.temporal.finest", "rates.means.start", "density.gradient"} <= keys
 
 
@@ -78,7 +81,7 @@ def test_a_method_in_short_leaves_out_what_is_the_papers(field: str) -> None:
 
 def test_the_papers_method_is_whole() -> None:
     assert (FULL.loss.pyramid, FULL.loss.ncc, FULL.density.split) == (0.2, 0.05, "adaptive")
-    assert (FULL.loss.dynamics, FULL.loss.dynamics_mode, FULL.field.dynamics_size) == (1e-3, "literal", 16)
+    assert (FULL.loss.dynamics, FULL.field.dynamics_size) == (1e-3, 16)
     assert FULL.rates.frequencies == Rate(1e-3, 1e-5, 45_000)
 
 
@@ -90,7 +93,7 @@ def test_the_papers_method_is_whole() -> None:
         ("split", "density.split", "plain"),
         ("lap", "loss.pyramid", 0),
         ("ncc", "loss.ncc", 0),
-        ("dy", "loss.dynamics_mode", "off"),
+        ("dy", "loss.dynamics", 0),
         ("hash", "field.temporal_hash", False),
         ("appearance", "field.appearance", "none"),
     ],
@@ -131,7 +134,7 @@ def test_overrides() -> None:
 
 
 def test_each_learning_rate_can_be_0_and_goes_from_or_to_0_in_a_line() -> None:
-    zero = {key.name: 0.0 for key in config_keys() if key.name.startswith("rates.") and not key.name.endswith(".steps")}
+    zero = {key: 0.0 for key in config_keys() if key.startswith("rates.") and not key.endswith(".steps")}
     assert all(rate.at(1) == rate.at(10**6) == 0 for rate in load_config("dnerf", zero).rates.schedules().values())
     assert Rate(0, 1e-3, 10).at(5) == Rate(1e-3, 0, 10).at(5) == 5e-4
 
@@ -203,7 +206,6 @@ def test_unknown_preset(preset: str, message: str) -> None:
         ('base = "dnerf"\n[field.static]\nbase = [1, 2]', "field.static.base must be 3 numbers, got [1, 2]"),
         ('base = "dnerf"\n[data]\nbackground = "blak"', "must be black or white or random, got 'blak'"),
         ('base = "dnerf"\n[rates.means]\nstart = -1', "rates.means.start must lie between 0 and 2147483647, got -1"),
-        ('base = "dnerf"\n[points]\nopacity = 1.0', "points.opacity must be above 0 and below 1, got 1."),
         ('base = "dnerf"\n[density]\ninterval = 0', "density.interval must be at least 1, got 0."),
         ('base = "dnerf"\n[density]\nsplit = "adaptiv"', "must be plain or adaptive, got 'adaptiv'; did you mean"),
         ('base = "dnerf"\n[density]\nneighbours = 0', "neighbours must be at least 1"),
@@ -227,6 +229,18 @@ def test_mistakes_in_a_file(text: str, message: str, tmp_path: Path) -> None:
     assert message in str(caught.value)
 
 
+def test_keys_of_earlier_versions_are_ignored_with_a_note(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    removed = "".join(f"{key} = 1\n" for key in REMOVED)
+    file = write(tmp_path / "config.toml", f'base = "tiny"\nloss.ncc = 0.5\n{removed}')
+    config = load_config(file)
+    assert config == load_config("tiny", {"loss.ncc": 0.5})
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    assert all(key in told for key in REMOVED)
+    with pytest.raises(InputError, match=r"data\.split"):
+        load_config("tiny", {"data.split": "val"})
+
+
 def test_a_base_that_leads_back(tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
     write(path, f'base = "{path}"')
@@ -240,14 +254,14 @@ def test_a_base_that_leads_back(tmp_path: Path) -> None:
         ("schedule.stepz", "5", "no key 'schedule.stepz'; did you mean schedule.steps?"),
         ("steps", "5", "no key 'steps'; did you mean schedule.steps?"),
         ("sh_dc", "5", "no key 'sh_dc'; did you mean rates.sh_dc?"),
-        ("schedule.steps", "many", "--schedule.steps must be a whole number, got 'many'"),
-        ("rates.means.start", "fast", "--rates.means.start must be a number, got 'fast'"),
+        ("schedule.steps", "many", "schedule.steps must be a whole number, got 'many'"),
+        ("rates.means.start", "fast", "rates.means.start must be a number, got 'fast'"),
         ("field.kind", "grid5d", "did you mean grid4d?"),
-        ("field.static.base", ["1", "2", "x"], "--field.static.base must be a whole number, got 'x'"),
-        ("seed", "1\nfoo = 2", "--seed must be a whole number"),
-        ("seed", ["5"], "--seed must be a whole number, got ['5']"),
-        ("field.static.base", ["16", "16"], "--field.static.base must be 3 numbers, got ['16', '16']"),
-        ("data.background", ["black"], "--data.background must be black or white or random, got ['black']"),
+        ("field.static.base", ["1", "2", "x"], "field.static.base must be a whole number, got 'x'"),
+        ("seed", "1\nfoo = 2", "seed must be a whole number"),
+        ("seed", ["5"], "seed must be a whole number, got ['5']"),
+        ("field.static.base", ["16", "16"], "field.static.base must be 3 numbers, got ['16', '16']"),
+        ("data.background", ["black"], "data.background must be black or white or random, got ['black']"),
     ],
 )
 def test_mistakes_in_an_override(key: str, text: str | list[str], message: str) -> None:

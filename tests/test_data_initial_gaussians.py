@@ -15,7 +15,7 @@ from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.rasterize import Rendering, rasterize
-from lapgs_wgpu.train.initial_points import initial_points
+from lapgs_wgpu.train.initial_points import INITIAL_OPACITY, initial_points
 from lapgs_wgpu.train.presets import load_config
 
 # A room that eight cameras film from one side.
@@ -78,7 +78,7 @@ def first_picture(dataset: Dataset, device: Device) -> tuple[Rendering, torch.Te
     """What the first camera sees of a training's first Gaussians, and the gradient of its brightness by opacities."""
     config = load_config("neu3d-tiny").points
     points, colors, scales = (torch.from_numpy(array) for array in initial_points(config, dataset, 0))
-    opacities = torch.full((len(points),), config.opacity, requires_grad=True)
+    opacities = torch.full((len(points),), INITIAL_OPACITY, requires_grad=True)
     quats = torch.tensor([1.0, 0, 0, 0]).expand(len(points), 4)
     drawn = rasterize(points, quats, scales[:, None].expand(-1, 3), opacities, colors, CAMERAS[0], device=device)
     drawn.image.sum().backward()

@@ -12,18 +12,18 @@ import numpy as np
 import pytest
 import torch
 from helpers.training import configure
+from motion_scenes import MotionScene
+from motion_writer import write_motion
 
 from lapgs_wgpu.data import Dataset, load_dataset
-from lapgs_wgpu.data.motion_scenes import MotionScene
-from lapgs_wgpu.data.motion_writer import write_motion
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.scene import load
+from lapgs_wgpu.run import train
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.distributed import Ranks
 from lapgs_wgpu.train.objective import Sample
 from lapgs_wgpu.train.presets import write_toml
-from lapgs_wgpu.train.run import train
 from lapgs_wgpu.train.trainer import Trainer
 
 

@@ -20,8 +20,8 @@ import pytest
 
 from lapgs_wgpu import cli, doctor_cli, prepare_cli, table_cli, train_options
 from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.table import read_spec
 from lapgs_wgpu.train.presets import config_keys, load_config
-from lapgs_wgpu.train.table_spec import read_spec
 from lapgs_wgpu.viewer import cli as view_cli
 from lapgs_wgpu.viewer import options as view_options
 
@@ -153,21 +153,20 @@ def test_configurations_and_descriptions_of_tables_can_be_read(tmp_path: Path) -
         if block.startswith("base ="):
             load_config(tmp_path / "a.toml")
         else:
-            assert read_spec(tmp_path / "a.toml").runs
+            assert read_spec(tmp_path / "a.toml")
 
 
 def train(words: list[str]) -> None:
     given = train_options.parse_options(words)
     assert given["preset"] or given["eval"] or given["resume"] or given["list_devices"], "names no preset"
-    overrides = {key.name: given[key.name] for key in config_keys() if key.name in given}
+    overrides = {key: given[key] for key in config_keys() if key in given}
     ablate = (given["ablate"] or "").split(",") if given["ablate"] else []
     load_config(given["preset"] or "tiny", overrides, method=given["field"], ablate=ablate)
 
 
 def table(words: list[str]) -> None:
     given = table_cli.options().parse_args(words)
-    if given.spec:
-        read_spec(ROOT / given.spec)
+    read_spec(ROOT / given.spec)
 
 
 def prepare(words: list[str]) -> None:

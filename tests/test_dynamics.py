@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import math
-
 import pytest
 import torch
 from torch import Tensor
 
-from lapgs_wgpu.motion.fields.dynamics import DynamicsMode, dynamics_loss, outliers
+from lapgs_wgpu.motion.fields.dynamics import dynamics_loss, outliers
 
 
 def column(values: list[float]) -> Tensor:
@@ -67,7 +65,7 @@ def test_nobody_stands_out_where_all_are_equally_far() -> None:
 
 def test_literal_is_the_papers_equation() -> None:
     d = spread(4.0).requires_grad_()
-    loss = dynamics_loss(d, "literal")
+    loss = dynamics_loss(d)
     loss.backward()
     assert loss.item() == pytest.approx(2 * 4.0**2 / 7)
     expected = torch.zeros(7, 16)
@@ -75,43 +73,18 @@ def test_literal_is_the_papers_equation() -> None:
     assert torch.allclose(d.grad, expected, rtol=1e-6)
 
 
-def test_promote_pushes_the_same_rows_away() -> None:
-    d = spread(4.0).requires_grad_()
-    loss = dynamics_loss(d, "promote")
-    loss.backward()
-    variance = 52 / 7 - (16 / 7) ** 2
-    assert loss.item() == pytest.approx(-2 * math.log(1 + 16 / variance) / 7)
-    slope = -2 * 4.0 / (variance + 16) / 7  # the deviation is a constant
-    expected = torch.zeros(7, 16)
-    expected[5:, 7] = torch.tensor([slope, -slope])
-    assert torch.allclose(d.grad, expected, rtol=1e-5)
-
-
 def test_the_mean_row_is_constant() -> None:
     # Its own gradient would spread over all rows where the outliers do not balance each other.
     d = column([0.0, 0.0, 0.0, 0.0, 8.0]).requires_grad_()
-    dynamics_loss(d, "literal").backward()
+    dynamics_loss(d).backward()
     assert d.grad[:4].count_nonzero() == 0
     assert d.grad[4, 3].item() == pytest.approx(2 * (8 - 8 / 5) / 5)
 
 
-def test_off() -> None:
-    d = spread(4.0).requires_grad_()
-    (dynamics_loss(d, "off") + 0 * d.sum()).backward()
-    assert dynamics_loss(d, "off").item() == 0
-    assert d.grad.count_nonzero() == 0
-
-
-def test_an_unknown_mode() -> None:
-    with pytest.raises(ValueError, match="literal, promote or off, got 'pull'"):
-        dynamics_loss(spread(4.0), "pull")  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("mode", ["literal", "promote"])
 @pytest.mark.parametrize("scale", [0.0, 1e-30, 1e-12, 1.0, 1e6])
-def test_finite_at_every_scale(mode: DynamicsMode, scale: float) -> None:
+def test_finite_at_every_scale(scale: float) -> None:
     d = (scale * torch.randn(200, 16, generator=torch.Generator().manual_seed(1))).requires_grad_()
-    loss = dynamics_loss(d, mode)
+    loss = dynamics_loss(d)
     loss.backward()
     assert loss.isfinite()
     assert d.grad.square().isfinite().all()  # as Adam's second moment
@@ -120,11 +93,10 @@ def test_finite_at_every_scale(mode: DynamicsMode, scale: float) -> None:
         assert d.grad.count_nonzero() == 0
 
 
-@pytest.mark.parametrize("mode", ["literal", "promote"])
 @pytest.mark.parametrize("count", [0, 1])
-def test_no_gaussians_and_a_single_one(mode: DynamicsMode, count: int) -> None:
+def test_no_gaussians_and_a_single_one(count: int) -> None:
     d = torch.ones(count, 16, requires_grad=True)
-    loss = dynamics_loss(d, mode)
+    loss = dynamics_loss(d)
     loss.backward()
     assert loss.item() == 0
     assert d.grad.count_nonzero() == 0

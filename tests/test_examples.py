@@ -16,9 +16,9 @@ from lapgs_wgpu.motion.fields.config import FieldConfig
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 ARGUMENTS = {
-    "train": ["--steps", "60"],
+    "train": ["--steps", "30"],
     "growing_images": ["--steps", "60", "--until", "40", "--small", "16"],
-    "own_field": ["--steps", "60"],
+    "own_field": ["--steps", "30"],
     "own_loss": ["--steps", "60"],
     "own_density": ["--steps", "230", "--budget", "4000"],
     "render_path": ["--frames", "4", "--size", "48"],
@@ -44,6 +44,7 @@ def test_train(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     assert (tmp_path / "scene.ply").stat().st_size > 1e5
 
 
+@pytest.mark.nightly
 def test_growing_images(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
@@ -63,6 +64,7 @@ def test_own_loss(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     assert all(terms[name] > 0 for name in ("edges", "charbonnier", "needles"))
 
 
+@pytest.mark.nightly
 def test_own_density(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert run("own_density", data, tmp_path, monkeypatch) <= 4000
 
@@ -81,6 +83,7 @@ def test_render_path(checkpoint: Path, tmp_path: Path, monkeypatch: pytest.Monke
     assert (tmp_path / "path.webp").read_bytes()[:4] == b"RIFF"
 
 
+@pytest.mark.nightly
 def test_fit_image(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     image = next((data / "train").glob("*.png"))
     assert run("fit_image", image, tmp_path, monkeypatch, option="--image") > 20

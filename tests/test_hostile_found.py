@@ -16,8 +16,6 @@ import numpy as np
 import pytest
 from helpers.damaged_files import (
     FOREIGN,
-    RESULTS,
-    SPEC,
     changes_since_without_device,
     short_config,
     small_scene,
@@ -38,14 +36,13 @@ from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.io.ply_points import read_points
 from lapgs_wgpu.io.safe_json_toml import MAX_TOML_BYTES, read_json, read_toml
 from lapgs_wgpu.motion.scene_file import read_scene
+from lapgs_wgpu.run import evaluate_run, resume
 from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.table import read_spec
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.presets import load_config
-from lapgs_wgpu.train.run import evaluate_run, resume
 from lapgs_wgpu.train.run_folder import STATE, load_state, locked_folder, save_state, start_run_folder
 from lapgs_wgpu.train.step_result import StepResult
-from lapgs_wgpu.train.table_results import read_results, write_results
-from lapgs_wgpu.train.table_spec import read_spec
 from lapgs_wgpu.train.trainer import Trainer
 from lapgs_wgpu.viewer.ground_truth import open_ground_truth
 from lapgs_wgpu.viewer.path_file import read_path
@@ -69,31 +66,6 @@ def test_found_in_toml(name: str, tmp_path: Path) -> None:
         load_config(str(tmp_path / "a.toml"))
     assert str(error.value).isprintable()
     assert len(str(error.value)) < 2100
-
-
-def test_found_in_specs(tmp_path: Path) -> None:
-    file = tmp_path / "spec.toml"
-    file.write_text(SPEC.replace('["ncc"]', "[[1]]"))
-    with pytest.raises(InputError, match=r"ablate must be a list of parts, got \[\[1\]\]"):
-        read_spec(file)
-    file.write_text(SPEC.replace("[0, 1]", str(list(range(6000)))))
-    with pytest.raises(InputError, match="more than 10000 runs"):
-        read_spec(file)
-
-
-def test_found_in_results(tmp_path: Path) -> None:
-    write_results(tmp_path, RESULTS)
-    good = json.loads((tmp_path / "results.json").read_text())
-    for name, value in (("psnr", float("inf")), ("seconds", 10**400), ("gaussians", True), ("size", [1, "2"]),
-                        ("environment", {"torch": 2}), ("scene", "a\nb")):  # fmt: skip
-        damaged = json.loads(json.dumps(good))
-        damaged["runs"][1][name] = value
-        (tmp_path / "results.json").write_text(json.dumps(damaged))
-        with pytest.raises(InputError, match=f"run 2: {name}.* (must|holds) "):
-            read_results(tmp_path / "results.json")
-    (tmp_path / "results.json").write_text("[" * 100_000)
-    with pytest.raises(InputError, match="nested too deeply"):
-        read_results(tmp_path / "results.json")
 
 
 def test_found_in_clouds(tmp_path: Path) -> None:

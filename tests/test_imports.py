@@ -35,10 +35,12 @@ ALLOWED = {
     },
     "io": {"errors", "splat.camera"},
     "train": {"errors", "progress", "stop_signals", "gpu", "splat", "motion", "data", "io"},
+    "discovery": {"errors", "progress", "gpu", "splat", "motion", "data", "train"},
+    "run": {"errors", "progress", "stop_signals", "gpu", "motion", "data", "io", "train", "discovery"},
     "command": {"errors", "gpu"},
     "viewer": {"errors", "command", "progress", "gpu", "splat", "motion", "data", "io"},
     "prepare": {"errors", "progress", "data", "splat.camera", "io.atomic", "io.listing"},
-    "prepare_cli": {"errors", "command", "gpu", "prepare", "train", "io.listing"},
+    "prepare_cli": {"errors", "command", "gpu", "prepare", "train", "run", "io.listing"},
     "doctor": {"errors", "command", "gpu", "splat"},
     "doctor_cli": {"errors", "command", "gpu", "doctor"},
     "train_options": {"errors", "command", "io", "train"},
@@ -52,10 +54,12 @@ ALLOWED = {
         "data",
         "io",
         "train",
+        "run",
         "train_options",
         "viewer",
     },
-    "table_cli": {"errors", "command", "train"},
+    "table": {"errors", "command", "stop_signals", "data", "io", "train"},
+    "table_cli": {"errors", "command", "gpu", "table", "train"},
 }
 FOLDERS = {"": PACKAGE, "viewer": Path(lapgs_wgpu.viewer.__file__).parent}  # where the parts lie on the disk
 FILES = sorted({Path(part) / file.relative_to(at) for part, at in FOLDERS.items() for file in at.rglob("*.py")})

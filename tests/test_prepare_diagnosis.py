@@ -21,7 +21,6 @@ from lapgs_wgpu.prepare_cli import prepare_command
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train import plan
 from lapgs_wgpu.train.presets import load_config
-from lapgs_wgpu.train.step_costs import Costs
 
 COUNT, SIZE = 12, (160, 120)
 GL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -234,18 +233,18 @@ def test_train_goes_on_to_a_scene(
     write_masks(write_capture(tmp_path / "walk", cameras, dark), masks)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(plan, "LEAST_STEPS", 10)
-    monkeypatch.setitem(plan.plan_training.__kwdefaults__, "measure", lambda *_: Costs(0.1, 0.1, 0.01, 0, 0.1))
+    monkeypatch.setitem(plan.plan_training.__kwdefaults__, "measure", lambda *_: 0.1)
     assert prepare_command(["--check", "walk", "--train", "--minutes", "0.04"]) == 0
     said = capsys.readouterr().out.splitlines()
     (chosen,) = [line for line in said if line.startswith("training: ")]
-    assert "hypernerf-tiny (one camera that moves" in chosen
+    assert "hypernerf-tiny (one moving camera" in chosen
     assert "colors of each image corrected" in chosen
-    assert "what the time allows" in chosen
+    assert " 16 steps (its schedule has 2500)" in chosen
     assert said[-2].startswith(f"{Path('runs', 'walk')}: ")
     assert said[-1] == f"{beside('lapgs-view')} {Path('runs', 'walk', 'checkpoint.ply')}"
     assert Path(said[-1].split()[1]).is_file()
     config = load_config("runs/walk/config.toml")
-    assert 10 <= config.schedule.steps <= 24
+    assert config.schedule.steps == 16
     assert config.exposure.enabled
     assert prepare_command(["--check", "walk", "--train"]) == 2  # before anything is measured
     assert "walk is there already, and the training would be written to it" in capsys.readouterr().err

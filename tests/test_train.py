@@ -17,14 +17,15 @@ import torch
 from helpers.training import STEPS, configure
 from PIL import Image
 
+from lapgs_wgpu import run as run_module
 from lapgs_wgpu.data import Dataset
 from lapgs_wgpu.data.normalize import Normalization
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.checkpoint import read_checkpoint
 from lapgs_wgpu.motion.scene import Scene4D, load
+from lapgs_wgpu.run import train
 from lapgs_wgpu.train import objective, trainer
-from lapgs_wgpu.train import run as run_module
 from lapgs_wgpu.train.config import LossWeights
 from lapgs_wgpu.train.dataloader import ImageLoader
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
@@ -33,16 +34,7 @@ from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.optimizer import Optimizer
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.resolve_config import resolve_decoder, resolve_for_dataset
-from lapgs_wgpu.train.run import train
 from lapgs_wgpu.train.step_result import StepResult
-
-
-@pytest.fixture(scope="module")
-def run(dataset: Dataset, device: Device, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a finished run with motion."""
-    out = tmp_path_factory.mktemp("runs") / "first"
-    train(configure(), dataset, out, device=device)
-    return out
 
 
 def lines(run: Path) -> list[dict]:
@@ -67,15 +59,17 @@ def test_pictures_improve(kind: str, dataset: Dataset, device: Device, tmp_path:
     assert np.mean(psnrs[-6:]) > np.mean(psnrs[:6]) + 2
 
 
-def test_a_run_is_whole(run: Path, dataset: Dataset) -> None:
-    assert {file.name for file in run.iterdir()} == {
+def test_a_run_is_whole(trained_run: Path, data: Path, dataset: Dataset) -> None:
+    assert {file.name for file in trained_run.iterdir()} == {
         "config.toml", "log.jsonl", "metrics.json", "metrics.csv", "checkpoint.ply", "eval",
     }  # fmt: skip
     assert resolve_for_dataset(configure(), dataset).field.components == 4  # of 8 times
-    assert load_config(str(run / "config.toml")) == dataclasses.replace(configure(), decoder="torch")
-    record = (run / "config.toml").read_text().split("[record]")[1]
+    assert load_config(str(trained_run / "config.toml")) == dataclasses.replace(
+        configure(data__path=str(data)), decoder="torch"
+    )
+    record = (trained_run / "config.toml").read_text().split("[record]")[1]
     assert all(f"\n{key} = " in record for key in ("lapgs_wgpu", "torch", "adapter", "driver"))
-    (last,) = lines(run)
+    (last,) = lines(trained_run)
     assert set(last) == {
         "step", "loss", "psnr", "terms", "gaussians", "pruned", "dead_scales", "frequencies", "amplitudes", "memory",
         "timing",
@@ -88,17 +82,17 @@ def test_a_run_is_whole(run: Path, dataset: Dataset) -> None:
     assert last["frequencies"] != list(range(4))  # they are learnt
     assert max(last["frequencies"]) <= 3.5  # the Nyquist frequency of 8 pictures
     assert last["step"] == STEPS
-    metrics = json.loads((run / "metrics.json").read_text())
+    metrics = json.loads((trained_run / "metrics.json").read_text())
     assert metrics["training"]["steps"] == STEPS
     assert [row["view"] for row in metrics["views"]] == [view.name for view in dataset.test]
     assert metrics["gaussians"] == last["gaussians"]
     for view in dataset.test:
-        assert Image.open(run / "eval" / f"{view.name}.png").size == (3 * 32, 32)
+        assert Image.open(trained_run / "eval" / f"{view.name}.png").size == (3 * 32, 32)
 
 
-@pytest.mark.parametrize("validated", [True, False])
+@pytest.mark.parametrize("validated", [True, pytest.param(False, marks=pytest.mark.nightly)])
 def test_an_evaluation_while_training_changes_nothing(
-    run: Path, dataset: Dataset, device: Device, tmp_path: Path, *, validated: bool
+    trained_run: Path, dataset: Dataset, device: Device, tmp_path: Path, *, validated: bool
 ) -> None:
     val = tuple(dataclasses.replace(view, name=f"val_{view.name}") for view in dataset.test) if validated else ()
     watched = dataclasses.replace(dataset, val=val)
@@ -109,7 +103,7 @@ def test_an_evaluation_while_training_changes_nothing(
     assert all(0 < line["val_psnr"] < 60 for line in (first, second))
     assert second["timing"]["seconds"] > first["timing"]["seconds"] > 0
     assert load(tmp_path / "run" / "checkpoint.ply", device).metadata["step"] == str(STEPS)
-    written, known = (read_checkpoint(folder / "checkpoint.ply").tensors for folder in (tmp_path / "run", run))
+    written, known = (read_checkpoint(folder / "checkpoint.ply").tensors for folder in (tmp_path / "run", trained_run))
     assert written.keys() == known.keys()
     assert all(np.array_equal(written[name], known[name]) for name in known)
     if validated and STEPS % 2 == 0:
@@ -117,10 +111,10 @@ def test_an_evaluation_while_training_changes_nothing(
         assert second["val_psnr"] == pytest.approx(psnr, abs=1e-3)
 
 
-def test_the_checkpoint_is_the_last_model(run: Path, dataset: Dataset, device: Device) -> None:
-    scene = load(run / "checkpoint.ply", device)
+def test_the_checkpoint_is_the_last_model(trained_run: Path, dataset: Dataset, device: Device) -> None:
+    scene = load(trained_run / "checkpoint.ply", device)
     metrics = run_module.evaluate(scene, dataset.test, "black")
-    stored = json.loads((run / "metrics.json").read_text())
+    stored = json.loads((trained_run / "metrics.json").read_text())
     assert metrics["views"] == stored["views"]
     assert scene.sh_degree == 3
     assert scene.metadata["background"] == "black"
@@ -142,7 +136,7 @@ def test_the_format_names_what_a_checkpoint_says_of_itself(dataset: Dataset, dev
 
 
 def test_the_training_never_sees_the_test_views(
-    run: Path, dataset: Dataset, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    trained_run: Path, dataset: Dataset, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Not one is opened before the model is saved, and without them it is the same to the last byte."""
 
@@ -159,9 +153,10 @@ def test_the_training_never_sees_the_test_views(
     monkeypatch.setattr(run_module, "evaluate_run", stop)
     with pytest.raises(SavedError):
         train(configure(), dataclasses.replace(dataset, test=blind), tmp_path / "run", device=device)
-    assert (tmp_path / "run" / "checkpoint.ply").read_bytes() == (run / "checkpoint.ply").read_bytes()
+    assert (tmp_path / "run" / "checkpoint.ply").read_bytes() == (trained_run / "checkpoint.ply").read_bytes()
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("key", "value"),
     [
@@ -170,31 +165,34 @@ def test_the_training_never_sees_the_test_views(
     ],
 )  # fmt: skip
 def test_each_part_of_the_method_reaches_the_model(
-    key: str, value: str, run: Path, dataset: Dataset, device: Device, tmp_path: Path
+    key: str, value: str, trained_run: Path, dataset: Dataset, device: Device, tmp_path: Path
 ) -> None:
     """None of these changes how many random numbers are drawn before the first step that differs."""
     train(configure(**{key: value}), dataset, tmp_path / "run", device=device)
-    assert (tmp_path / "run" / "checkpoint.ply").read_bytes() != (run / "checkpoint.ply").read_bytes()
+    assert (tmp_path / "run" / "checkpoint.ply").read_bytes() != (trained_run / "checkpoint.ply").read_bytes()
 
 
-def test_a_training_repeats_to_the_last_byte(run: Path, dataset: Dataset, device: Device, tmp_path: Path) -> None:
+def test_a_training_repeats_to_the_last_byte(
+    trained_run: Path, dataset: Dataset, device: Device, tmp_path: Path
+) -> None:
     train(configure(), dataset, tmp_path / "second", device=device)
-    assert (tmp_path / "second" / "checkpoint.ply").read_bytes() == (run / "checkpoint.ply").read_bytes()
-    first, second = lines(run), lines(tmp_path / "second")
+    assert (tmp_path / "second" / "checkpoint.ply").read_bytes() == (trained_run / "checkpoint.ply").read_bytes()
+    first, second = lines(trained_run), lines(tmp_path / "second")
     for line in first + second:
         del line["timing"], line["memory"]
     assert first == second
 
 
+@pytest.mark.nightly
 def test_the_decoder_on_the_device_trains_as_well_and_repeats(
-    run: Path, dataset: Dataset, device: Device, tmp_path: Path
+    trained_run: Path, dataset: Dataset, device: Device, tmp_path: Path
 ) -> None:
     config = configure(decoder="device")
     for name in ("first", "again"):
         train(config, dataset, tmp_path / name, device=device)
     assert load_config(str(tmp_path / "first/config.toml")) == config
     assert (tmp_path / "first/checkpoint.ply").read_bytes() == (tmp_path / "again/checkpoint.ply").read_bytes()
-    psnrs = [json.loads((folder / "metrics.json").read_text())["psnr"] for folder in (tmp_path / "first", run)]
+    psnrs = [json.loads((folder / "metrics.json").read_text())["psnr"] for folder in (tmp_path / "first", trained_run)]
     assert psnrs[0] == pytest.approx(psnrs[1], abs=0.5)
 
 
@@ -234,7 +232,7 @@ def test_the_place_of_the_decoder_is_told_and_recorded(
     assert load_config(str(tmp_path / "gpu/config.toml")).decoder == "device"
 
 
-def test_another_seed_gives_another_model(run: Path, dataset: Dataset, device: Device, tmp_path: Path) -> None:
+def test_another_seed_gives_another_model(dataset: Dataset, device: Device, tmp_path: Path) -> None:
     train(configure(seed="1", schedule__steps="3"), dataset, tmp_path / "a", device=device)
     train(configure(seed="2", schedule__steps="3"), dataset, tmp_path / "b", device=device)
     assert (tmp_path / "a" / "checkpoint.ply").read_bytes() != (tmp_path / "b" / "checkpoint.ply").read_bytes()

@@ -29,10 +29,10 @@ from lapgs_wgpu.gpu.buffer import Buffer
 from lapgs_wgpu.gpu.device import _DEFAULT_LIMITS, _RAISED_LIMITS, Device, DeviceInfo
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.wgpu_errors import TranslatedErrors
+from lapgs_wgpu.run import resume, train
 from lapgs_wgpu.splat.rasterize import rasterizer_of
 from lapgs_wgpu.train.dataloader import ImageLoader
 from lapgs_wgpu.train.log import Log
-from lapgs_wgpu.train.run import resume, train
 from lapgs_wgpu.train.run_folder import STATE, load_state
 from lapgs_wgpu.train.step_result import StepResult
 

@@ -12,7 +12,8 @@ from typing import Any
 from mkdocs.structure.files import File, Files
 
 import lapgs_wgpu
-from lapgs_wgpu.train.presets import config_keys, load_config, preset_names
+from lapgs_wgpu.train.presets import preset_names
+from lapgs_wgpu.train_options import keys_help
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
@@ -59,30 +60,13 @@ _ABOUT_PRESETS = (
 
 
 def presets_page() -> str:
-    """Every preset, and every key with its help text and its value in each preset."""
-    names = preset_names()
-    presets = {name: load_config(name) for name in names}
+    """Every preset, and every key with its help text and its value in the preset dnerf."""
     lines = ["# Presets and keys", "", _ABOUT_PRESETS, "", "## Presets", ""]
-    for name in names:
-        text = (ROOT / "configs" / f"{name}.toml").read_text(encoding="utf-8")
-        about = " ".join(line.lstrip("# ") for line in _head(text))
-        lines.append(f"- `{name}`: {about}")
-    section = ""
-    for key in config_keys():
-        part = key.name.split(".")[0] if "." in key.name else "general"
-        if part != section:
-            section = part
-            lines += [
-                "",
-                f"## {part}",
-                "",
-                "| key | | " + " | ".join(names) + " |",
-                "|---|---" + "|---" * len(names) + "|",
-            ]
-        values = [_value(preset, key.name) for preset in presets.values()]
-        about = key.help.replace("|", "\\|").replace("<", "&lt;")
-        lines.append(f"| `{key.name}` | {about} | " + " | ".join(values) + " |")
-    return "\n".join(lines) + "\n"
+    for file in sorted((ROOT / "configs").glob("*.toml")):
+        about = " ".join(line.lstrip("# ") for line in _head(file.read_text(encoding="utf-8")))
+        lines.append(f"- `{file.stem}`: {about}")
+    lines += ["", f"In all: {', '.join(f'`{name}`' for name in preset_names())}.", "", "## Keys", ""]
+    return "\n".join([*lines, "```text", keys_help("dnerf"), "```"]) + "\n"
 
 
 def _head(text: str) -> list[str]:
@@ -93,16 +77,6 @@ def _head(text: str) -> list[str]:
             break
         lines.append(line)
     return lines
-
-
-def _value(config: Any, name: str) -> str:
-    for part in name.split("."):
-        config = getattr(config, part)
-    if isinstance(config, tuple):
-        return ", ".join(map(str, config))
-    return (
-        f"{config:g}" if isinstance(config, float) else str(config).lower() if isinstance(config, bool) else str(config)
-    )
 
 
 def reference_page() -> str:

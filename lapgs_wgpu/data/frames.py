@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from lapgs_wgpu.data.cloud import Cloud
 from lapgs_wgpu.data.images import ImageFile
 from lapgs_wgpu.data.normalize import Normalization
-from lapgs_wgpu.data.objects import ObjectRecord
 from lapgs_wgpu.data.timestamps import ImageName
 from lapgs_wgpu.data.undistort import Lens
 from lapgs_wgpu.data.video_frames import VideoFrame
@@ -40,7 +39,6 @@ class Frame:
     depths: nearest and furthest depth, the capture's units.
     mask: image of the pixels that the masked metrics measure, of any size; white is measured.
     black: image of the pixels that the training leaves out, of any size; black is left out.
-    objects: moving objects of a generated scene.
     """
 
     image: ImageSource
@@ -54,7 +52,6 @@ class Frame:
     depths: tuple[float, float] | None = None
     mask: Path | None = None
     black: Path | None = None
-    objects: Sequence[ObjectRecord] = ()
 
 
 @dataclass(frozen=True, eq=False)

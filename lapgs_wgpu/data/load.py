@@ -133,7 +133,6 @@ def _dataset(folder: Path, capture: Capture, image_size: int | None, normalize: 
                 mask=None
                 if (path := frames[i].mask) is None
                 else partial(read_mask, path, undistortions[i], stored, size),
-                objects=tuple(record.seen_by(cameras[i]) for record in frames[i].objects),
                 ignored=None
                 if split != "train" or (path := ignored.get(frames[i].name.file)) is None
                 else partial(read_ignored, path, undistortions[i], stored, size, black=masks is None),

@@ -17,7 +17,6 @@ from numpy.typing import ArrayLike, NDArray
 from lapgs_wgpu.data.cloud import Cloud
 from lapgs_wgpu.data.focus import focus_of, spread
 from lapgs_wgpu.data.normalize import BOX, Normalization
-from lapgs_wgpu.data.objects import ObjectTruth
 from lapgs_wgpu.data.timestamps import time_step
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
@@ -37,7 +36,6 @@ class View:
         premultiplied) RGBA, uint8. Raises InputError.
     mask: decodes the mask of the masked metrics of a test view, such as DyCheck's covisibility masks: (height, width)
         bool. Raises InputError.
-    objects: ground truth of moving objects in a test view of a generated scene (data/objects.py).
     ignored: decodes the pixels of a training view that the loss leaves out: (height, width) bool. Raises InputError.
     """
 
@@ -47,7 +45,6 @@ class View:
     source: str
     pixels: Callable[[], NDArray[np.uint8]]
     mask: Callable[[], NDArray[np.bool_]] | None = None
-    objects: tuple[ObjectTruth, ...] = ()
     ignored: Callable[[], NDArray[np.bool_]] | None = None
 
     def load(self) -> NDArray[np.uint8]:

@@ -15,6 +15,8 @@ from lapgs_wgpu.train.config import AccelerationConfig
 
 WOBBLE = 1e-2  # world units: distances far below it count as they are, those far above it all as much as it
 EPSILON = 1e-12  # world units squared: keeps the gradient of a distance of 0 finite
+# Largest distance in time of the two moments, in distances of two images; drawn between half of it and all.
+LARGEST_DISTANCE = 2.0
 
 
 def draw_moments(
@@ -27,7 +29,7 @@ def draw_moments(
     if chosen == 0 or config.weight == 0 or clip_moments < 3:
         return None
     rows = torch.randint(count, (chosen,), generator=generator)
-    reach = config.frames / (clip_moments - 1) * (1 + float(torch.rand((), generator=generator))) / 2
+    reach = LARGEST_DISTANCE / (clip_moments - 1) * (1 + float(torch.rand((), generator=generator))) / 2
     return Moments(rows, (max(t - reach, 0.0), min(t + reach, 1.0)))
 
 

@@ -10,7 +10,6 @@ import io
 import json
 import time
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,13 +30,10 @@ from lapgs_wgpu.train.config import BACKGROUND_LEVELS
 from lapgs_wgpu.train.image_metrics import MS_SSIM_SMALLEST, SSIM_WINDOW, masked_ssim, ms_ssim, psnr, ssim
 from lapgs_wgpu.train.log import environment
 from lapgs_wgpu.train.lpips import SMALLEST, Lpips
-from lapgs_wgpu.train.motion_masks import differs_from_median, differs_from_static, still_backgrounds
-from lapgs_wgpu.train.object_metrics import measure_objects, psnr_within, summarise
 from lapgs_wgpu.train.view_alignment import aligned_view
 
 ERROR_GAIN = 4  # of the error pictures
 MEASURES = ("psnr", "ssim", "ms_ssim", "lpips", "lpips_unscaled", "masked_psnr", "masked_ssim")
-MOTION_MEASURES = ("psnr_moving", "psnr_still")  # of views of which motion masks are known
 NOT_AVAILABLE = "not available"
 ALIGNED = "test-time alignment: the camera of each test view was fitted to its image, the scene fixed"
 
@@ -49,7 +45,6 @@ def evaluate(
     folder: Path | None = None,
     *,
     lpips: Lpips | None = None,
-    static: Scene4D | None = None,
     camera_unit: float | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
@@ -57,14 +52,11 @@ def evaluate(
 
     background: black, white, or random, which is black here. folder: where a picture of each view is written, the
     ground truth beside the rendering and their error, 4 times enlarged; an existing folder. lpips: None where there
-    are no weights for it. static: a static fit of the capture, whose residual says what moves (`motion_masks`).
+    are no weights for it.
     Each measure is one of an image, then the mean over the images (of PSNR of the dB): psnr over all channels; ssim,
     that of the loss; ms_ssim; lpips on inputs in [-1, 1], and lpips_unscaled on inputs in [0, 1], as 3DGS's code
     reports it; masked_psnr and masked_ssim, of the pixels of the view's mask. "not available" stands for what cannot be
     measured: pictures too small, no weights, no masks.
-    psnr_moving is that of moving pixels. They belong to the objects of a generated scene, with found and track_error
-    (`object_metrics`); otherwise they differ from the static fit or, without one, from the median of a test camera that
-    stands still, and psnr_still is that of the other pixels. Absent where no moving pixel is known.
     camera_unit: extent of the cameras, world units, where training cameras were refined. `aligned` then holds the
     measures once more, after test-time alignment (`view_alignment`), labelled as such; the others stay without it.
     progress: takes a step for each view.
@@ -73,19 +65,12 @@ def evaluate(
     _check_any(views)
     start = time.perf_counter()
     color = torch.full((3,), BACKGROUND_LEVELS[background])
-    rows, frames, aligned = [], [], []
-    listed = any(view.objects for view in views)
-    medians = still_backgrounds(views, partial(_on, color)) if not listed and static is None else [None] * len(views)
-    for view, median in zip(views, medians, strict=True):
+    rows, aligned = [], []
+    for view in views:
         truth, image = _on(color, view), _render(scene, view, color)
         row: dict[str, Any] = {"view": view.name, "time": view.time}
         row |= _measures(_unit(image), _unit(truth), view.load_mask(), lpips)
-        if not listed and static is not None:
-            row |= _moving(image, truth, differs_from_static(truth, _render(static, view, color)))
-        elif median is not None:
-            row |= _moving(image, truth, differs_from_median(truth, median))
         rows.append(row)
-        frames.append(measure_objects(image, truth, view.objects, color.numpy()))
         if camera_unit is not None:
             aligned.append(_aligned_row(scene, view, truth, color, camera_unit, lpips))
         if folder is not None:
@@ -93,14 +78,8 @@ def evaluate(
                 file.write(encode_png(side_by_side(truth, image)))
         if progress is not None:
             progress.step()
-    motion = summarise(frames, [view.name for view in views])
-    for name in MOTION_MEASURES:
-        values = [row[name] for row in rows if name in row]
-        if values:
-            motion |= {name: _mean(values), "motion": "static fit" if static is not None else "median of the clip"}
     return {
         **{name: _mean([row[name] for row in rows]) for name in MEASURES},
-        **motion,
         **({"aligned": _aligned(aligned)} if aligned else {}),
         "gaussians": len(scene),
         "field": scene.field_config.kind,
@@ -158,12 +137,6 @@ def _render(scene: Scene4D, view: View, color: Tensor) -> NDArray[np.uint8]:
     return to_8_bit(scene.render(view.camera, view.time, color, depth=False).image)
 
 
-def _moving(image: NDArray[np.uint8], truth: NDArray[np.uint8], pixels: NDArray[np.bool_]) -> dict[str, float]:
-    """psnr_moving and psnr_still of a view, each only where it has such pixels."""
-    parts = {"psnr_moving": pixels, "psnr_still": ~pixels}
-    return {name: psnr_within(image, truth, part) for name, part in parts.items() if part.any()}
-
-
 def _measures(
     image: Tensor, truth: Tensor, pixels: NDArray[np.bool_] | None, lpips: Lpips | None
 ) -> dict[str, float | str]:
@@ -190,7 +163,6 @@ def _mean(values: list[Any]) -> float | str:
 def write_metrics(folder: Path, metrics: dict[str, Any]) -> None:
     """Write metrics.json, and metrics.csv with a line a view. Atomic; InputError where they cannot be written."""
     columns = ["view", "time", *MEASURES]
-    columns += [name for name in MOTION_MEASURES if any(name in row for row in metrics["views"])]
     text = io.StringIO()
     table = csv.DictWriter(text, columns, lineterminator="\n")
     table.writeheader()

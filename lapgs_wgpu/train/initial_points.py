@@ -12,6 +12,8 @@ from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.splat.morton import morton_order
 from lapgs_wgpu.train.config import PointsConfig
 
+INITIAL_OPACITY = 0.1
+
 
 def initial_points(
     config: PointsConfig, dataset: Dataset, seed: int
@@ -29,6 +31,6 @@ def initial_points(
     scales = initial_scales(points)
     # Published figures of D-NeRF start from a fog, which the empty background there soon lifts.
     if dataset.cloud is not None or dataset.depths is not None:
-        scales = limit_optical_depth(points, scales, config.opacity, dataset.cameras)
+        scales = limit_optical_depth(points, scales, INITIAL_OPACITY, dataset.cameras)
     order = morton_order(torch.from_numpy(points)).numpy()
     return points[order], colors[order], scales[order]

@@ -14,13 +14,9 @@ class Rate(Options):
     """A learning rate that goes from start to end exponentially, or in a straight line where one of them is 0, and then
     stays there."""
 
-    start: float = option(
-        "initial value; it changes to .end exponentially, or linearly if one of the two is 0; both 0: frozen",
-        at_least=0,
-        below=math.inf,
-    )
-    end: float = option("final value, reached at .steps and kept", at_least=0, below=math.inf)
-    steps: int = option("training step at which .end is reached; steps of discovery do not count", at_least=1)
+    start: float = option("initial value", at_least=0, below=math.inf)
+    end: float = option("final value", at_least=0, below=math.inf)
+    steps: int = option("step at which the final value is reached", at_least=1)
 
     def at(self, step: int) -> float:
         """The rate of a step, which are counted from 1."""
@@ -34,23 +30,19 @@ class Rate(Options):
 class RatesConfig(Options):
     """Adam's learning rates, for each parameter of the Gaussians and for the field's hash tables and its MLP."""
 
-    means: Rate = option(
-        "learning rate of the means, world units per step (unlike in 3DGS, not multiplied by the cameras' extent)"
-    )
-    log_scales: float = option("learning rate of the log-scales, constant; 0: frozen", at_least=0)
-    quats: float = option("learning rate of the rotations (quaternions), constant; 0: frozen", at_least=0)
-    opacity_logits: float = option("learning rate of the opacities (logits), constant; 0: frozen", at_least=0)
-    sh_dc: float = option(
-        "learning rate of the base colors (spherical harmonics of degree 0), constant; 0: frozen", at_least=0
-    )
+    means: Rate = option("means, world units per step")
+    log_scales: float = option("log-scales", at_least=0)
+    quats: float = option("rotations (quaternions)", at_least=0)
+    opacity_logits: float = option("opacities (logits)", at_least=0)
+    sh_dc: float = option("base colors (spherical harmonics of degree 0)", at_least=0)
     sh_rest: float = option(
-        "learning rate of the view-dependent colors (spherical harmonics of degree 1 to 3), constant; 0: frozen",
+        "view-dependent colors (spherical harmonics of degree 1 to 3)",
         at_least=0,
     )
-    dynamics: float = option("learning rate of the per-Gaussian dynamics attributes, constant; 0: frozen", at_least=0)
-    hash: Rate = option("learning rate of the field's hash tables or feature planes")
-    mlp: Rate = option("learning rate of the field's MLP weights and of the motion spectrum's coefficients")
-    frequencies: Rate = option("learning rate of the motion spectrum's frequencies, cycles per clip per step")
+    dynamics: float = option("per-Gaussian dynamics attributes", at_least=0)
+    hash: Rate = option("the field's hash tables or feature planes")
+    mlp: Rate = option("the field's MLP weights, and the motion spectrum's coefficients")
+    frequencies: Rate = option("the motion spectrum's frequencies, cycles per clip per step")
 
     def schedules(self) -> dict[str, Rate]:
         """Parameter name, or group of the field -> schedule."""

@@ -42,11 +42,19 @@ class Watched(Protocol):
 class Log:
     """Progress of a training, step by step. A context manager.
 
-    path: log.jsonl, written anew, or continued after the step `done`. before: seconds that the training took before
-    the first step. docs/metrics.md describes its lines. What
-    stands under "timing" and "memory" differs from run to run, all else repeats, but for the first line after a
-    resumption, which averages what came since. The time of an evaluation does not count as time of the training.
-    listeners: called with each line.
+    docs/metrics.md describes the lines of log.jsonl. Their entries "timing" and "memory" differ from run to run; all
+    others repeat, except in the first line after a resumption, which averages the steps since then. Evaluations do not
+    count as time of the training.
+
+    Args:
+        path: of log.jsonl, which is written anew, or continued after the step `done`.
+        steps: of the whole training.
+        done: number of steps that are done.
+        before: seconds that the training took before its first step.
+        terminal: stderr where None.
+
+    Attributes:
+        listeners: called with each line.
     """
 
     def __init__(
@@ -85,61 +93,60 @@ class Log:
         self.step(result, len(trainer.scene), lambda: _now(trainer))
 
     def step(self, result: StepResult, gaussians: int, now: Callable[[], dict[str, Any]] = dict) -> None:
-        """Take in a step that is done. now: what a line says of the moment, asked only where a line is written."""
-        time_now, step = time.perf_counter(), result.step
+        """Take in a step that is done. now: further entries of a line, asked only where a line is written."""
+        step, last = result.step, result.step == self._steps
         if math.isfinite(result.loss) and math.isfinite(result.psnr):
             self._recent.append(result)
-        self._times.append(time_now)
+        self._times.append(time.perf_counter())
         self._pruned += result.pruned
         if not self._recent:
             return
-        # The first step, which compiles kernels and decodes images, tells nothing about the others.
-        known = len(self._times) > 1
-        steps, since = (len(self._times) - 1, self._times[0]) if known else (1, self._began)
-        rate = steps / max(time_now - since, 1e-9)
-        if step % INTERVAL == 0 or step == self._steps:
-            count = len(self._recent)
-            terms = Counter[str]()
-            for each in self._recent:
-                terms.update({name: value / count for name, value in each.terms.items()})
-            timing = {"seconds": round(time_now - self._start, 3), "steps_per_second": round(rate, 3)}
-            self._write(
-                {
-                    "step": step,
-                    "loss": round(sum(each.loss for each in self._recent) / count, 7),
-                    "psnr": round(sum(each.psnr for each in self._recent) / count, 4),
-                    "terms": {name: round(value, 9) for name, value in terms.items()},
-                    "gaussians": gaussians,
-                    "pruned": self._pruned - self._pruned_before,
-                    **now(),
-                    "timing": timing,
-                }
-            )
-            self._pruned_before = self._pruned
-
-        def text() -> str:
-            smooth = sum(each.psnr for each in self._recent) / len(self._recent)
-            left = duration((self._steps - step) / rate) if known or step == self._steps else "?"
-            return (
-                f"step {step}/{self._steps}  {smooth:5.2f} dB  {gaussians} Gaussians  {rate:.1f} steps/s  {left} left"
-            )
-
-        if step == self._steps and self._pruned:
+        if step % INTERVAL == 0 or last:
+            timing = {"seconds": round(self.seconds, 3), "steps_per_second": round(self._steps_per_second(), 3)}
+            self._write({"step": step, **self._means(gaussians), **now(), "timing": timing})
+        if last and self._pruned:
             self.tell(f"pruned {self._pruned} Gaussians that hardly showed in any image (density.min_contribution)")
-        self._progress.at(step, text)
+        self._progress.at(step, lambda: self._progress_line(step, gaussians))
+
+    def _steps_per_second(self) -> float:
+        """Of the last steps. The first one, which compiles kernels, counts only while it is alone."""
+        steps, since = (len(self._times) - 1, self._times[0]) if len(self._times) > 1 else (1, self._began)
+        return steps / max(self._times[-1] - since, 1e-9)
+
+    def _means(self, gaussians: int) -> dict[str, Any]:
+        """Loss, PSNR and loss terms in the mean over the last steps, and the numbers of Gaussians."""
+        count = len(self._recent)
+        terms = Counter[str]()
+        for each in self._recent:
+            terms.update({name: value / count for name, value in each.terms.items()})
+        pruned, self._pruned_before = self._pruned - self._pruned_before, self._pruned
+        return {
+            "loss": round(sum(each.loss for each in self._recent) / count, 7),
+            "psnr": round(sum(each.psnr for each in self._recent) / count, 4),
+            "terms": {name: round(value, 9) for name, value in terms.items()},
+            "gaussians": gaussians,
+            "pruned": pruned,
+        }
+
+    def _progress_line(self, step: int, gaussians: int) -> str:
+        psnr = sum(each.psnr for each in self._recent) / len(self._recent)
+        rate = self._steps_per_second()
+        known = len(self._times) > 1 or step == self._steps
+        left = duration((self._steps - step) / rate) if known else "?"
+        return f"step {step}/{self._steps}  {psnr:5.2f} dB  {gaussians} Gaussians  {rate:.1f} steps/s  {left} left"
 
     def discovered(self, summary: str) -> None:
         """Take in what motion discovery found, before the first step."""
         self._write({"step": 0, "discovery": summary, "timing": {"seconds": round(self.seconds, 3)}})
 
     def evaluated(self, step: int, psnr: float, views: str, seconds: float) -> None:
-        """Take in the mean PSNR (dB) of views after a step, and how long it took to measure."""
+        """Take in the mean PSNR (dB) of views ("val" or "train") after a step, and how long it took to measure."""
         self._start += seconds
         self._times = deque((at + seconds for at in self._times), maxlen=self._times.maxlen)
         timing = {"seconds": round(self.seconds, 3)}
         self._write({"step": step, "val_psnr": round(psnr, 4), "val_views": views, "timing": timing})
-        shown = {"val": "the validation views", "train": "the training views"}.get(views, views)
-        self.tell(f"step {step}: {psnr:.2f} dB on {shown}")
+        shown = {"val": "validation", "train": "training"}[views]
+        self.tell(f"step {step}: {psnr:.2f} dB on the {shown} views")
 
     def _write(self, line: dict[str, Any]) -> None:
         for listener in self.listeners:

@@ -117,9 +117,8 @@ class Objective:
         if sample.moments is not None:
             weight = config.acceleration.weight * config.acceleration.interval
             beside["acceleration"] = weight * acceleration_loss(now, scene.timing(time), sample.moments)
-        if sample.moving and "dynamics" in scene.parameters:
-            spread = dynamics_loss(scene.parameters["dynamics"], config.loss.dynamics_mode)
-            beside["dynamics"] = config.loss.dynamics * spread
+        if sample.moving and config.loss.dynamics and "dynamics" in scene.parameters:
+            beside["dynamics"] = config.loss.dynamics * dynamics_loss(scene.parameters["dynamics"])
         for term, weight in weighted:
             if isinstance(term, Regularizer):
                 beside[term.name] = weight * term.function(scene, gaussians, time)

@@ -6,20 +6,22 @@ import dataclasses
 from pathlib import Path
 
 from lapgs_wgpu.data import Dataset, load_dataset
-from lapgs_wgpu.data.builtin import SYNTHETIC, is_builtin, write_builtin
+from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.train.config import Config
 
+SYNTHETIC = "synthetic"  # in place of a folder: the built-in scene
+
 
 def resolve_data(config: Config, scenes: Path) -> Config:
-    """The configuration with the absolute paths of its data. scenes: folder into which built-in scenes are written,
-    unless they are there. Raises InputError."""
+    """The configuration with the absolute paths of its data. scenes: folder into which the built-in scene is written,
+    unless it is there. Raises InputError."""
     path = config.data.path
     if not path:
         raise InputError(
             f"the configuration names no data; give --data DIR (in Python data.path), or take {SYNTHETIC}."
         )
-    folder = write_builtin(path, scenes) if is_builtin(path) else Path(path)
+    folder = write_synthetic(scenes / SYNTHETIC) if path == SYNTHETIC else Path(path)
     masks = str(Path(config.data.masks).resolve()) if config.data.masks else ""
     return dataclasses.replace(config, data=dataclasses.replace(config.data, path=str(folder.resolve()), masks=masks))
 
@@ -27,15 +29,10 @@ def resolve_data(config: Config, scenes: Path) -> Config:
 def open_dataset(config: Config, *, normalize: bool = True) -> Dataset:
     """The dataset of a configuration whose path is a folder's. normalize: of `load_dataset`. Raises InputError."""
     data = config.data
-    dataset = load_dataset(
+    return load_dataset(
         data.path,
         image_size=data.size or None,
         normalize=normalize,
         undistort=data.undistort,
         masks=data.masks or None,
     )
-    if data.split == "val":
-        if not dataset.val:
-            raise InputError(f"{data.path} has no validation views (transforms_val.json); leave out data.split.")
-        dataset = dataclasses.replace(dataset, test=dataset.val)
-    return dataset

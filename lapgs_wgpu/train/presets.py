@@ -6,12 +6,14 @@ A file names every key, or starts from another preset (`base = "dnerf"`) and nam
 from __future__ import annotations
 
 import dataclasses
+import functools
 import importlib.resources
 import json
 import os
+import sys
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from lapgs_wgpu.errors import InputError, shown
 from lapgs_wgpu.io.dataclass_table import build_dataclass, checked, did_you_mean, field_types, from_text
@@ -31,16 +33,28 @@ ABLATIONS: dict[str, tuple[str, str, Any]] = {
     "split": ("adaptive split", "density.split", "plain"),
     "lap": ("Laplacian pyramid loss", "loss.pyramid", 0.0),
     "ncc": ("cross-correlation loss", "loss.ncc", 0.0),
-    "dy": ("dynamics regularization", "loss.dynamics_mode", "off"),
+    "dy": ("dynamics regularization", "loss.dynamics", 0.0),
     "hash": ("space-time hash grids", "field.temporal_hash", False),
     "appearance": ("color changes over time", "field.appearance", "none"),
 }
 
+# Keys of earlier versions, and what holds now. In a .toml file they are ignored, with a note.
+REMOVED = {
+    "acceleration.frames": "it is 2",
+    "data.split": "a run is measured on its test views",
+    "eval.snapshots": "only the last model is saved",
+    "eval.views": "the validation views are measured, or 8 training views if there are none",
+    "loss.dynamics_mode": "the regularization is that of the paper's equation; loss.dynamics 0 turns it off",
+    "points.opacity": "it is 0.1",
+    "precision": "it is float32",
+}
+
+_SCENES = "published-scenes"  # the file with presets of single scenes
+
 
 def preset_names() -> list[str]:
     """The presets that come with the package."""
-    files = importlib.resources.files("lapgs_wgpu.configs").iterdir()
-    return sorted(Path(file.name).stem for file in files if file.name.endswith(".toml"))
+    return sorted(name for name in _packaged() if not name.startswith("_"))
 
 
 def load_config(
@@ -65,13 +79,14 @@ def load_config(
         InputError: the preset, a key or a value is not valid.
     """
     preset = os.fspath(preset)
-    known = {key.name: key.kind for key in config_keys()}
+    known = config_keys()
     table: Table = {}
     for key, value in (overrides or {}).items():
         if key not in known:
-            raise InputError(f"there is no key {key!r}{did_you_mean(key, known)}")
+            hint = f" any more: {REMOVED[key]}." if key in REMOVED else did_you_mean(key, known)
+            raise InputError(f"there is no key {key!r}{hint}")
         texts = isinstance(value, str) or (isinstance(value, list) and all(isinstance(each, str) for each in value))
-        _set(table, key, checked(known[key], from_text(value, known[key]) if texts else value, f"--{key}"))
+        _set(table, key, from_text(value, known[key]) if texts else value)
     return build_config(preset, table, preset, shorthands(method, ablate, ("--field", "--ablate")))
 
 
@@ -106,23 +121,13 @@ def shorthands(method: str | None, ablate: Iterable[str], names: tuple[str, str]
     return values
 
 
-class ConfigKey(NamedTuple):
-    """A key of the configuration: its dotted name, its type, and what it means."""
-
-    name: str
-    kind: Any
-    help: str
-
-
-def config_keys(cls: type = Config, prefix: str = "", about: str = "") -> Iterator[ConfigKey]:
-    """Every key of the configuration."""
-    types = field_types(cls)
-    for field in dataclasses.fields(cls):
-        text = ": ".join(filter(None, (about, field.metadata.get("help", ""))))
-        if dataclasses.is_dataclass(types[field.name]):
-            yield from config_keys(types[field.name], f"{prefix}{field.name}.", text)
-        else:
-            yield ConfigKey(prefix + field.name, types[field.name], text)
+def config_keys(cls: type = Config, prefix: str = "") -> dict[str, Any]:
+    """Dotted name of every key of the configuration -> its type."""
+    keys: dict[str, Any] = {}
+    for name, kind in field_types(cls).items():
+        inner = dataclasses.is_dataclass(kind)
+        keys |= config_keys(kind, f"{prefix}{name}.") if inner else {f"{prefix}{name}": kind}
+    return keys
 
 
 def write_toml(table: Mapping[str, Any]) -> str:
@@ -134,24 +139,54 @@ def _read(preset: str, seen: tuple[str, ...] = ()) -> Table:
     """The table of a preset, laid over its base's."""
     if preset in seen:
         raise InputError(f"{preset}: its base leads back to itself ({' -> '.join((*seen, preset))}).")
-    if preset.endswith(".toml"):
-        file = Path(preset)
-        if not file.is_file():
-            raise InputError(f"{preset} does not exist; give a preset ({', '.join(preset_names())}) or a .toml file.")
-    elif preset in preset_names():
-        file = Path(str(importlib.resources.files("lapgs_wgpu.configs") / f"{preset}.toml"))
-    else:
-        names = preset_names()
-        hint = did_you_mean(preset, names, f"; there are {', '.join(names)}, or give a .toml file.")
-        raise InputError(f"there is no preset {preset!r}{hint}")
-    table = read_toml(file)
-    table.pop("record", None)  # what a run noted about itself
+    table = _read_file(preset) if preset.endswith(".toml") else _read_packaged(preset)
     base = table.pop("base", None)
     if base is None:
         return table
     if not isinstance(base, str):
-        raise InputError(f"{file}: base must be the name of a preset, got {shown(base)}.")
+        raise InputError(f"{preset}: base must be the name of a preset, got {shown(base)}.")
     return merge(_read(base, (*seen, preset)), table)
+
+
+def _read_file(path: str) -> Table:
+    """The table of a file, such as a run's config.toml, without keys of earlier versions."""
+    if not Path(path).is_file():
+        raise InputError(f"{path} does not exist; give a preset ({', '.join(preset_names())}) or a .toml file.")
+    table = read_toml(Path(path))
+    table.pop("record", None)  # what a run noted about itself
+    removed = [key for key in REMOVED if _remove(table, key)]
+    if removed:
+        print(f"note: {path}: ignores {', '.join(removed)}, which this version has no more.", file=sys.stderr)
+    return table
+
+
+def _read_packaged(name: str) -> Table:
+    """The table of a preset that comes with the package."""
+    presets = _packaged()
+    if name not in presets:
+        names = preset_names()
+        hint = did_you_mean(name, names, f"; there are {', '.join(names)}, or give a .toml file.")
+        raise InputError(f"there is no preset {name!r}{hint}")
+    return dict(presets[name])
+
+
+@functools.cache
+def _packaged() -> dict[str, Table]:
+    """The tables of configs/ by name. No caller changes them."""
+    folder = Path(str(importlib.resources.files("lapgs_wgpu.configs")))
+    presets = {file.stem: read_toml(file) for file in folder.glob("*.toml")}
+    return presets | presets.pop(_SCENES)
+
+
+def _remove(table: Any, key: str) -> bool:
+    """Remove a dotted key from a nested table, if it is there; whether it was."""
+    section, _, rest = key.partition(".")
+    if not isinstance(table, dict) or section not in table:
+        return False
+    if rest:
+        return _remove(table[section], rest)
+    del table[section]
+    return True
 
 
 def merge(below: Table, above: Table) -> Table:

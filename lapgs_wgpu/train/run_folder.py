@@ -29,11 +29,9 @@ from lapgs_wgpu.train.presets import write_toml
 
 STATE, STATE_BEFORE, LOCK = "state.safetensors", "state.before.safetensors", ".lock"
 RUN_FILES = (
-    "config.toml", "log.jsonl", "metrics.json", "metrics.csv", "checkpoint.ply", "eval", "snapshots", "tensorboard",
+    "config.toml", "log.jsonl", "metrics.json", "metrics.csv", "checkpoint.ply", "eval", "tensorboard",
     STATE, STATE_BEFORE,
 )  # fmt: skip
-
-SPLITS = {"test": "test", "val": "validation"}  # how the views of a data.split are called
 
 State = Mapping[str, NDArray[Any]]
 
@@ -56,9 +54,9 @@ def check_run_folder(out: Path, *, overwrite: bool) -> None:
 
 
 @contextmanager
-def locked_folder(out: Path, writer: str = "lapgs-train") -> Iterator[None]:
-    """Create the folder if needed and lock it for one writer, a command; a folder that stays empty is removed again.
-    Raises InputError if another process holds the lock."""
+def locked_folder(out: Path) -> Iterator[None]:
+    """Create the folder if needed and lock it for one writer; a folder that stays empty is removed again. Raises
+    InputError if another process holds the lock."""
     from filelock import FileLock, Timeout
 
     new = not out.exists()
@@ -71,7 +69,7 @@ def locked_folder(out: Path, writer: str = "lapgs-train") -> Iterator[None]:
         with suppress(OSError):
             who = path.read_text(encoding="ascii", errors="replace")[:20].strip()
         raise InputError(
-            f"{out} is being written by another {writer} (process {who if who.isdecimal() else 'unknown'}); wait "
+            f"{out} is being written by another lapgs-train (process {who if who.isdecimal() else 'unknown'}); wait "
             "for it, or name another folder."
         ) from None
     try:
@@ -145,16 +143,12 @@ def _recorded(out: Path) -> dict[str, str]:
 def result_text(run: Path) -> str:
     """What metrics.json of a finished run says, in a line."""
     metrics = json.loads((run / "metrics.json").read_text())
-    views, size = f"{len(metrics['views'])} {SPLITS[metrics.get('split', 'test')]}", metrics["size"]
+    width, height = metrics["size"]
+    aligned = f" ({metrics['aligned']['psnr']:.2f} dB after test-time alignment)" if "aligned" in metrics else ""
     return (
-        f"{run}: {metrics['psnr']:.2f} dB PSNR, {metrics['ssim']:.4f} SSIM on {views} views of "
-        f"{size[0]}x{size[1]}{_aligned(metrics)}, {metrics['gaussians']} Gaussians"
+        f"{run}: {metrics['psnr']:.2f} dB PSNR, {metrics['ssim']:.4f} SSIM on {len(metrics['views'])} test views of "
+        f"{width}x{height}{aligned}, {metrics['gaussians']} Gaussians"
     )
-
-
-def _aligned(metrics: dict[str, Any]) -> str:
-    """The PSNR after test-time alignment, where it was measured."""
-    return f" ({metrics['aligned']['psnr']:.2f} dB after test-time alignment)" if "aligned" in metrics else ""
 
 
 def _record(config: Config, device: Device, dataset: Dataset) -> dict[str, str]:

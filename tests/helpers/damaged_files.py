@@ -18,7 +18,6 @@ from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.run_folder import changes_since
-from lapgs_wgpu.train.table_results import Result, Results
 
 GRID = HashConfig(1, (2, 2, 2), (2, 2, 2), 4)
 PLANES = PlaneConfig(features=1, space=2, time=2, levels=1)
@@ -58,16 +57,6 @@ def short_config() -> Config:
     few |= {"schedule.warm_up": "0", "schedule.steps": "5"}
     grids = {f"field.{name}.{end}": ["4", "4", "4"] for name in ("static", "temporal") for end in ("base", "finest")}
     return load_config("tiny", {**few, **grids})
-
-
-RESULTS = Results(
-    "a table",
-    "tiny",
-    tuple(
-        Result("a", row, 0, "f", 20.0, 0.5, 9, 3, 1.0, (24, 24), 2, {"field": {"kind": "static"}}, {"torch": "2"})
-        for row in "xy"
-    ),
-)
 
 
 def changes_since_without_device(folder: Path) -> Any:

@@ -4,13 +4,12 @@ transforms_train.json and transforms_test.json hold `camera_angle_x` (horizontal
 (`transforms`; those of a frame override those of the file, and both override the angle), and `frames`:
 `file_path` of an image (.png is appended if it has no suffix), `transform_matrix` (camera to world, OpenGL axes) and
 `time` in [0, 1], in all frames of a file or in none; frames without times are evenly spaced. transforms_val.json is
-optional, and left out with a warning if it is not usable. objects.json (`objects`) is optional, and so is a cloud:
+optional, and left out with a warning if it is not usable. A cloud is optional:
 fused.ply, points3d.ply or points3D.ply.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,6 @@ from lapgs_wgpu.data.cloud import find_cloud, is_random, read_cloud
 from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
 from lapgs_wgpu.data.images import Size, check_image
 from lapgs_wgpu.data.json_fields import image_path, number, read_json, required
-from lapgs_wgpu.data.objects import read_objects
 from lapgs_wgpu.data.poses import opengl_pose
 from lapgs_wgpu.data.readers.transforms import frame_entries, intrinsics
 from lapgs_wgpu.data.timestamps import ImageName
@@ -84,9 +82,6 @@ def _read_split(folder: Path, split: Split) -> list[Frame]:
         lens = lenses.setdefault(key, lens)
         name, label = ImageName(file_path), f"{index:03d}"
         frames.append(Frame(image, lens, T_cam_world, where, name, time=time, split=split, label=label))
-    if split != "train":
-        objects = read_objects(folder, split, [Path(str(frame.image)).stem for frame in frames])
-        frames = [dataclasses.replace(frame, objects=records) for frame, records in zip(frames, objects, strict=True)]
     return frames
 
 

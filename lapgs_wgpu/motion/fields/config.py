@@ -14,9 +14,6 @@ FieldKind = Literal[Method, "own"]
 Motion = Literal["laplacian", "mlp"]
 NegativeScales = Literal["floor", "mirror"]
 Appearance = Literal["none", "color", "color+opacity"]
-DynamicsMode = Literal[
-    "literal", "promote", "off"
-]  # of the regularization of the dynamics attributes (motion/fields/dynamics)
 MIN_SCALE = CONSTANTS["MIN_SCALE"]
 PLANES = ((0, 1), (0, 2), (1, 2), (0, TIME), (1, TIME), (2, TIME))  # of the field hexplane: pairs of x, y, z, t
 TEMPORAL_AXES = ((0, 1, TIME), (1, 2, TIME), (0, 2, TIME))  # of the temporal hash grids
@@ -34,11 +31,11 @@ APPEARANCE_SCALE = 0.1
 class PlaneConfig(Options):
     """The planes of the field hexplane."""
 
-    features: int = option("number of features per plane and level", 32, at_least=1, at_most=256)
+    features: int = option("features per plane and level", 32, at_least=1, at_most=256)
     space: int = option("resolution of the coarsest planes along each spatial axis", 64, at_least=2, at_most=4096)
     time: int = option("resolution along the time axis", 75, at_least=2, at_most=4096)
     levels: int = option(
-        "number of resolution levels; each doubles the spatial resolution of the level before", 2, at_least=1, at_most=6
+        "number of levels; each doubles the spatial resolution of the one before", 2, at_least=1, at_most=6
     )
 
 
@@ -47,92 +44,54 @@ class FieldConfig(Options):
     """The shape of a field."""
 
     kind: FieldKind = option(
-        "deformation field: static (no motion), mlp (deformable 3DGS), hexplane (4D-GS), grid4d (Grid4D), "
-        "laplacian (the paper's) or own (a module that Python gives, docs/api.md); changes the field only, whereas "
-        "--field also turns off the paper's other parts for the other methods",
+        "deformation field, as for --field, but nothing else changes with it; own: a module given in Python",
         "laplacian",
     )
-    bound: float = option(
-        "half side length of the field's cube, world units; outside it, features are zero (grid4d, laplacian) or those "
-        "of the border (hexplane); mlp divides positions by it",
-        1.6,
-        above=0,
-        below=1e6,
-    )
+    bound: float = option("half side length of the field's cube, world units", 1.6, above=0, below=1e6)
     unit: float = option(
-        "factor of the heads' outputs for translations and changes of the scales, world units; the "
-        "heads learn at a rate of their own, so this sets how fast things move while training; field own: not used",
+        "length unit of the decoder's translations and changes of scale, world units: how fast things learn to move",
         1.0,
         above=0,
         below=1e6,
     )
     static: HashConfig = option(
-        "fields grid4d and laplacian: spatial hash grid (x, y, z)", HashConfig(16, (16, 16, 16), (2048, 2048, 2048))
+        "spatial hash grid (grid4d, laplacian)", HashConfig(16, (16, 16, 16), (2048, 2048, 2048))
     )
     temporal: HashConfig = option(
-        "fields grid4d and laplacian: space-time hash grids (two axes and time)",
-        HashConfig(32, (8, 8, 8), (32, 32, 16)),
+        "space-time hash grids, two axes and time (grid4d, laplacian)", HashConfig(32, (8, 8, 8), (32, 32, 16))
     )
-    planes: PlaneConfig = option("planes of the field hexplane", PlaneConfig())
-    width: int = option(
-        "width of the layers of the field's decoder; field mlp: of all its layers", 256, at_least=1, at_most=4096
-    )
-    depth: int = option(
-        "number of further hidden layers of the decoder before its output heads (fields hexplane, grid4d, laplacian)",
-        0,
-        at_least=0,
-        at_most=16,
-    )
+    planes: PlaneConfig = option("feature planes (hexplane)", PlaneConfig())
+    width: int = option("width of the decoder's layers; of all layers of the field mlp", 256, at_least=1, at_most=4096)
+    depth: int = option("number of further hidden layers of the decoder (not mlp)", 0, at_least=0, at_most=16)
     time_scale: float = option(
-        "fraction of the space-time grids' time axis that the clip occupies, in its middle", 0.9, above=0, at_most=1
+        "fraction of the space-time grids' time axis that the clip takes, in its middle", 0.9, above=0, at_most=1
     )
-    temporal_hash: bool = option(
-        "fields grid4d and laplacian: use the three space-time hash grids; without them, laplacian depends on time "
-        "only through field.motion, and grid4d does not move",
-        True,
-    )
+    temporal_hash: bool = option("use the space-time hash grids (grid4d, laplacian)", True)
     motion: Motion = option(
-        "field laplacian: how motion is decoded; laplacian: as a sum of sinusoids (the motion spectrum); mlp: "
-        "by an MLP of features and time instead",
+        "how laplacian decodes motion; laplacian: as a sum of sinusoids, the motion spectrum; mlp: from features and "
+        "time",
         "laplacian",
     )
     components: int = option(
-        "field laplacian: number of frequencies in the motion spectrum; at most 1 + (T - 1) / (2 x frequency_step), "
-        "rounded down, are used, where T is the number of distinct training times",
+        "number of frequencies in the motion spectrum; fewer where the training times are too few to tell them apart",
         16,
         at_least=1,
         at_most=256,
     )
     frequency_step: float = option(
-        "field laplacian: initial spacing of the spectrum's frequencies, which start at 0; cycles per clip",
-        1.0,
-        above=0,
-        below=1e6,
+        "initial spacing of the spectrum's frequencies, which start at 0, cycles per clip", 1.0, above=0, below=1e6
     )
-    amplitude: float = option(
-        "field laplacian: initial standard deviation of the spectrum's sum, a feature without unit that the decoder "
-        "reads; useful values are 0.03 to 1",
-        0.3,
-        above=0,
-        below=1e6,
-    )
+    amplitude: float = option("initial standard deviation of the spectrum's sum", 0.3, above=0, below=1e6)
     dynamics: int = option(
-        "fields laplacian and own: number of values in each Gaussian's dynamics attribute, a learned motion code; "
-        "0: none",
+        "length of each Gaussian's dynamics attribute, a learned motion code (laplacian, own); 0: none",
         16,
         at_least=0,
         at_most=256,
     )
     negative_scales: NegativeScales = option(
-        "scales (standard deviations) that the field's additive change takes below zero; mirror: count as their "
-        "magnitude and keep their gradient, as in Grid4D; floor: become 1e-7 and lose it",
-        "floor",
+        "scales that the field takes below 0; mirror: count as their magnitude (Grid4D); floor: become 1e-7", "floor"
     )
-    appearance: Appearance = option(
-        "field laplacian: what the field changes over time besides geometry; color: base colors (spherical harmonics "
-        "of degree 0)",
-        "color",
-    )
+    appearance: Appearance = option("what laplacian changes over time besides geometry", "color")
 
     @property
     def dynamics_size(self) -> int:

@@ -1,4 +1,6 @@
-"""Writes a motion scene in the D-NeRF layout, with the ground truth of its objects.
+"""Writes motion scenes: python benchmarks/motion_writer.py DIR [path=4,cycles=2 ...] writes each to the folder of
+its name in DIR, in the D-NeRF layout; without names, all scenes of docs/tables/motion.toml. A name has the keys of
+`MotionScene`. Beside the images lies the ground truth of the moving objects:
 
 objects.json: parameters of the scene; size of each object, and its positions at the times of each split's images.
 masks/SPLIT/VIEW_OBJECT.png: pixels of a test image that show a moving object, 8-bit gray, antialiased.
@@ -8,20 +10,31 @@ clean/SPLIT/VIEW_OBJECT.png: the image without that object, RGBA.
 from __future__ import annotations
 
 import dataclasses
+import sys
+import tomllib
 from functools import partial
 from pathlib import Path
 
 import numpy as np
+from motion_scenes import STILL_CAMERAS, MotionScene, fov_x, moving_objects, scene_cameras, trace
 from numpy.typing import NDArray
 
 from lapgs_wgpu.data.dnerf_writer import split_times, write_image, write_scene
-from lapgs_wgpu.data.motion_scenes import STILL_CAMERAS, MotionScene, fov_x, moving_objects, scene_cameras, trace
-from lapgs_wgpu.data.objects import FORMAT, RECORD
 from lapgs_wgpu.data.raytrace import SAMPLES, Hits, combine, pixel_means, to_bytes, to_pixels
 from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.io.dataclass_table import build_dataclass, field_types, from_text
 from lapgs_wgpu.splat.camera import Camera
 
+FORMAT = "lapgs-objects 1"
 VERSION = 2  # of the rendered images: increase it with every change of them
+TABLE = Path(__file__).parents[1] / "docs" / "tables" / "motion.toml"
+
+
+def parse_motion(name: str) -> MotionScene:
+    """The scene that KEY=VALUE,... names. Raises InputError."""
+    types = field_types(MotionScene)
+    pairs = [part.partition("=") for part in name.split(",") if part]
+    return build_dataclass(MotionScene, {key: from_text(value, types.get(key)) for key, _, value in pairs}, name)
 
 
 def write_motion(
@@ -83,7 +96,9 @@ def write_motion(
         for one in moving_objects(scene)
     ]
     write_frame = partial(_write_frame, scene)
-    return write_scene(Path(folder), RECORD, parameters, splits, fov_x(scene), write_frame, {"objects": objects})
+    return write_scene(
+        Path(folder), "objects.json", parameters, splits, fov_x(scene), write_frame, {"objects": objects}
+    )
 
 
 def _write_frame(scene: MotionScene, folder: Path, split: str, name: str, camera: Camera, time: float) -> None:
@@ -104,3 +119,10 @@ def _write_frame(scene: MotionScene, folder: Path, split: str, name: str, camera
             file = f"{split}/{name}_{one.name}.png"
             write_image(folder / "masks" / file, to_bytes(pixel_means(owner == number, camera)))
             write_image(folder / "clean" / file, image([*surfaces[:number], *surfaces[number + 1 :]]))
+
+
+if __name__ == "__main__":
+    parent, *names = sys.argv[1:]
+    for name in names or tomllib.loads(TABLE.read_text())["scenes"].values():
+        name = name if isinstance(name, str) else name["folder"]
+        print(write_motion(Path(parent, name), parse_motion(name)))

@@ -14,6 +14,7 @@ from typing import Any
 from lapgs_wgpu.data.initial_gaussians import first_points
 from lapgs_wgpu.data.validation import check_in_view, check_times
 from lapgs_wgpu.data.views import Dataset
+from lapgs_wgpu.discovery.start import start_training
 from lapgs_wgpu.errors import DeviceError, InputError, NumericalError, quoted
 from lapgs_wgpu.gpu.device import Device, open_device
 from lapgs_wgpu.io.initial_view import InitialView
@@ -27,10 +28,9 @@ from lapgs_wgpu.train.evaluate import evaluate, write_metrics
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.lpips import Lpips
 from lapgs_wgpu.train.malloc import keep_freed_memory, return_freed_memory
-from lapgs_wgpu.train.monitor import Monitor, Snapshots, monitored_views, without_effect
+from lapgs_wgpu.train.monitor import Monitor
 from lapgs_wgpu.train.parts import Callback, Parts
 from lapgs_wgpu.train.run_folder import (
-    SPLITS,
     STATE,
     check_run_folder,
     check_state,
@@ -80,25 +80,23 @@ def train(
     if not dataset.test:
         raise InputError(f"{dataset.name} has no test view, by which a run is measured; add images to the capture.")
     found = check_times(dataset, moving=config.field.kind != "static")
-    if config.eval.interval:
-        monitored_views(dataset, config.eval.views)
     if config.eval.tensorboard:
         check_tensorboard()
     found += check_in_view(dataset, first_points(dataset, PROBES, config.points.box, config.seed)[0])
     if ranks.first:
         check_run_folder(out, overwrite=overwrite)
-        for warning in (*dataset.warnings, *found, *without_effect(config)):
+        for warning in (*dataset.warnings, *found):
             print(f"warning: {warning}", file=sys.stderr, flush=True)
         if dataset.normalization is not None:
             say(f"normalization: {dataset.normalization}")
     keep_freed_memory()
     device = device or open_device()
     if not ranks.first:
-        return _assist(Trainer(config, dataset, device, ranks, parts=parts))
+        return _assist(start_training(config, dataset, device, ranks, parts=parts))
     with locked_folder(out):
         check_run_folder(out, overwrite=overwrite)  # again: another training may have written it meanwhile
-        training = Trainer(config, dataset, device, ranks, parts=parts)
-        start_run_folder(out, training.given, training.scene.device, dataset)
+        training = start_training(config, dataset, device, ranks, parts=parts)
+        start_run_folder(out, training.user_config, training.scene.device, dataset)
         if training.discovery is not None:
             say(f"discovery: {training.discovery}; {training.discovery_seconds:.0f} s")
         if training.config.decoder == "device":
@@ -132,8 +130,10 @@ def resume(
             )
         if ranks.first:
             note_paths(out, config)
-        training = Trainer(config, dataset, device, ranks, parts=parts, resumed=state is not None)
-        if state is not None:
+        if state is None:
+            training = start_training(config, dataset, device, ranks, parts=parts)
+        else:
+            training = Trainer(config, dataset, device, ranks, parts=parts)
             try:
                 check_state(state, views=len(dataset.train), steps=config.schedule.steps)
                 training.restore(state)
@@ -233,9 +233,7 @@ def _monitors(training: Trainer, log: Log, out: Path) -> list[Callback]:
     if config.tensorboard:
         log.listeners.append(TensorBoard(out / "tensorboard", done=training.done))
     if config.interval:
-        found.append(Monitor(monitored_views(training.dataset, config.views), log))
-    if config.snapshots:
-        found.append(Snapshots(out / "snapshots"))
+        found.append(Monitor(training.dataset, log))
     return found
 
 
@@ -297,30 +295,27 @@ def evaluate_run(
     data: DataConfig,
     training: dict[str, Any],
     lpips: Lpips | None = None,
-    static: Scene4D | None = None,
 ) -> dict[str, object]:
     """Evaluate on the test views; write metrics.json, metrics.csv and eval/ of a run folder; returns the metrics.
 
-    data: says which views the dataset's test views are, and on which background. lpips, static: as `evaluate` takes
-    them.
+    data: says on which background. lpips: as for `evaluate`.
     """
-    for folder in (out / "eval", out / "eval" / "plots"):
-        if folder.is_symlink():
-            raise InputError(f"{folder} is a link, and pictures are written into the run's own folder only; remove it.")
-    (out / "eval").mkdir(exist_ok=True)
+    folder = out / "eval"
+    if folder.is_symlink():
+        raise InputError(f"{folder} is a link, and images are written into the run's own folder only; remove it.")
+    folder.mkdir(exist_ok=True)
     unit = dataset.extent if "cameras" in training else None  # they were refined
-    with Progress(len(dataset.test), f"{SPLITS[data.split]} views measured") as progress:
+    with Progress(len(dataset.test), "test views measured") as progress:
         metrics = evaluate(
             scene,
             dataset.test,
             data.background,
-            out / "eval",
+            folder,
             lpips=lpips,
-            static=static,
             camera_unit=unit,
             progress=progress,
         )
-    metrics |= {"split": data.split, "training": training}
+    metrics["training"] = training
     write_metrics(out, metrics)
     return metrics
 

@@ -1,9 +1,9 @@
-"""Built-in scenes for measuring motion: two objects travel along known paths.
+"""Scenes that measure motion: two objects travel along known paths.
 
 A ball moves along a circle and a box along a line. Both paths are `path` diameters wide and travelled `cycles` times
 over the clip. A small ball below them is static. z is up. All objects stay within [-1.3, 1.3]^3 and within the view of
-all cameras, unless `objects` says otherwise, so their size depends on the path. `write_motion` writes a scene in the
-D-NeRF layout with true trajectories, masks and clean plates (`objects.json`, docs/metrics.md).
+all cameras, unless `objects` says otherwise, so their size depends on the path. `motion_writer` writes
+a scene in the D-NeRF layout, with the true paths, masks and clean plates of the objects.
 """
 
 from __future__ import annotations

@@ -1,20 +1,30 @@
-"""Which pixels of a capture's test views move, where nothing but its images is known.
+"""PSNR of what moves: python benchmarks/moving_pixels.py RUN [STATIC_RUN] prints the PSNR of moving and of other pixels
+of the run's test views. Which pixels move follows from the images alone:
 
 - A test camera that stands still: pixels that differ from their median over the clip.
-- Any other: pixels that differ from the rendering of a static fit, averaged over small windows, since a fit is nowhere
-  exact at edges.
+- With STATIC_RUN, a run of the same capture with --field static: pixels that differ from its rendering, averaged over
+  small windows, since a fit is nowhere exact at edges.
 """
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from object_metrics import psnr_within
 from scipy.ndimage import uniform_filter
 
+from lapgs_wgpu import load, open_device
 from lapgs_wgpu.data.evenly import evenly
-from lapgs_wgpu.data.views import View
+from lapgs_wgpu.data.views import View, composite
+from lapgs_wgpu.motion.scene import Scene4D
+from lapgs_wgpu.train.config import BACKGROUND_LEVELS
+from lapgs_wgpu.train.evaluate import to_8_bit
+from lapgs_wgpu.train.open_dataset import open_dataset
+from lapgs_wgpu.train.presets import load_config
 
 THRESHOLD = 16  # levels of 255 in any channel: above the noise of a compressed video
 LEAST_TIMES = 5  # of a camera, for a median
@@ -68,3 +78,36 @@ def _median(images: Sequence[Image]) -> Image:
         for row in range(len(images[0]))
     ]
     return np.stack(rows)
+
+
+def measure_run(run: Path, static_run: Path | None) -> tuple[float, float]:
+    """PSNR (dB) of moving and of other pixels, means over the test views that have any; NaN where none has."""
+    config, device = load_config(run / "config.toml"), open_device()
+    views = open_dataset(config).test
+    color = np.full(3, BACKGROUND_LEVELS[config.data.background], np.float32)
+
+    def truth(view: View) -> Image:
+        return composite(view.load(), color)
+
+    def drawn(scene: Scene4D, view: View) -> Image:
+        return to_8_bit(scene.render(view.camera, view.time, color.tolist(), depth=False).image)
+
+    scene = load(run / "checkpoint.ply", device)
+    static = None if static_run is None else load(static_run / "checkpoint.ply", device)
+    moving, still = [], []
+    for view, background in zip(views, still_backgrounds(views, truth), strict=True):
+        if static is not None:
+            pixels = differs_from_static(truth(view), drawn(static, view))
+        elif background is not None:
+            pixels = differs_from_median(truth(view), background)
+        else:
+            continue
+        for part, values in ((pixels, moving), (~pixels, still)):
+            if part.any():
+                values.append(psnr_within(drawn(scene, view), truth(view), part))
+    return float(np.mean(moving)), float(np.mean(still))
+
+
+if __name__ == "__main__":
+    of_moving, of_still = measure_run(*map(Path, sys.argv[1:2]), Path(sys.argv[2]) if len(sys.argv) > 2 else None)
+    print(f"{of_moving:.2f} dB of moving pixels, {of_still:.2f} dB of the others")

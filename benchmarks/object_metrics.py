@@ -1,4 +1,6 @@
-"""How well a rendering shows a moving object, from images alone: PSNR, silhouette and displacement of each object.
+"""How well a run shows the moving objects of a motion scene: python benchmarks/object_metrics.py RUN... prints a
+Markdown table of PSNR, silhouette and displacement of the objects, means over the test views and the objects, from
+images alone. The capture of each RUN is a scene of motion_writer.
 
 A rendering's silhouette of an object is found by color, so the measure is the same for every representation. A pixel
 is claimed for the object where the rendering
@@ -14,8 +16,12 @@ object that have the clean plate's color.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+import sys
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 from statistics import mean, median
 
 import numpy as np
@@ -23,9 +29,14 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
-from lapgs_wgpu.data.objects import ObjectTruth
-from lapgs_wgpu.data.views import composite
+from lapgs_wgpu import load, open_device
+from lapgs_wgpu.data.images import check_image
+from lapgs_wgpu.data.views import View, composite
+from lapgs_wgpu.train.config import BACKGROUND_LEVELS
+from lapgs_wgpu.train.evaluate import to_8_bit
 from lapgs_wgpu.train.image_metrics import psnr_of
+from lapgs_wgpu.train.open_dataset import open_dataset
+from lapgs_wgpu.train.presets import load_config
 
 CONTRAST = 0.5
 REACH = 1.0  # diameters from the true mask within which a silhouette is looked for
@@ -34,10 +45,42 @@ LEAST_DIFFERENCE = 16.0  # levels of 255, over the channels: less between object
 VISIBLE_PIXELS, VISIBLE_SHARE = 20, 0.25  # least of an object that must be seen: pixels, share of its whole disc
 LEAST_CLAIM = 0.1  # a silhouette of fewer pixels than this share of the true one has no centroid
 FOUND_IOU = 0.5
-NOT_FOUND = "not found"  # the track error where most frames have no silhouette
 
 Image = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectTruth:
+    """One moving object in one test view.
+
+    diameter: of its projection, pixels. mask: decodes the coverage of each pixel by the object: (H, W) uint8. clean:
+    decodes the view without the object: (H, W, 3) RGB or (H, W, 4) straight RGBA, uint8.
+    """
+
+    name: str
+    diameter: float
+    mask: Callable[[], Image]
+    clean: Callable[[], Image]
+
+
+def object_truths(folder: Path, split: str, views: Sequence[View]) -> list[list[ObjectTruth]]:
+    """The moving objects of each view of a split of a motion scene, whose coordinates are the capture's."""
+    moving = [one for one in json.loads((folder / "objects.json").read_text())["objects"] if one["moves"]]
+
+    def truth(one: dict, index: int, view: View) -> ObjectTruth:
+        camera = view.camera
+        depth = float((camera.T_cam_world @ [*one["positions"][split][index], 1.0])[2])
+        mask, clean = (folder / part / split / f"r_{index:03d}_{one['name']}.png" for part in ("masks", "clean"))
+        size = (camera.width, camera.height)
+        return ObjectTruth(
+            one["name"],
+            camera.K[0, 0] * one["diameter"] / max(depth, 1e-6),
+            lambda: check_image(mask).read(size)[..., 0],
+            partial(check_image(clean).read, size),
+        )
+
+    return [[truth(one, index, view) for one in moving] for index, view in enumerate(views)]
 
 
 @dataclass(frozen=True)
@@ -132,41 +175,32 @@ def psnr_within(image: Image, truth: Image, pixels: Mask) -> float:
     return psnr_of(float(np.square(image[pixels].astype(np.float64) - truth[pixels]).mean()) / 255**2)
 
 
-def summarise(frames: Sequence[Sequence[ObjectFrame]], views: Sequence[str]) -> dict[str, object]:
-    """The entries of metrics.json, from the frames of each view: means over objects, each object, each of its views.
+def summarise(frames: Sequence[ObjectFrame]) -> tuple[float, float, float]:
+    """Moving PSNR (dB), share found and track error (diameters), means over the objects of the frames of all views.
 
-    An object's psnr_moving is the mean of dB over the views in which it is visible; found, the share of these with an
-    IoU of at least FOUND_IOU; track_error, the median of their distances, a missing silhouette counting as infinite.
+    Of each object: the mean of the dB; the share of the frames with an IoU of at least FOUND_IOU; the median of the
+    distances, infinite where most frames have no silhouette.
     """
-    objects: dict[str, list[tuple[str, ObjectFrame]]] = {}
-    for view, shown in zip(views, frames, strict=True):
-        for frame in shown:
-            objects.setdefault(frame.name, []).append((view, frame))
-    if not objects:
-        return {}
-    figures = {name: _figures([frame for _, frame in shown]) for name, shown in objects.items()}
-    entries = {
-        name: {
-            **_entries(figures[name]),
-            "views": [
-                {"view": view, "psnr": frame.psnr, "iou": frame.iou, "distance": frame.distance}
-                for view, frame in objects[name]
-            ],
-        }
-        for name in sorted(objects)
-    }
-    return {**_entries(np.mean(list(figures.values()), axis=0)), "objects": entries}
+    figures = []
+    for name in {frame.name for frame in frames}:
+        own = [frame for frame in frames if frame.name == name]
+        distances = [np.inf if frame.distance is None else frame.distance for frame in own]
+        found = mean(frame.iou >= FOUND_IOU for frame in own)
+        figures.append((mean(frame.psnr for frame in own), found, median(distances)))
+    psnr, found, track = np.mean(figures, axis=0)
+    return float(psnr), float(found), float(track)
 
 
-def _figures(frames: Sequence[ObjectFrame]) -> tuple[float, float, float]:
-    """psnr_moving, found and track_error of one object, the last infinite where it is not found."""
-    distances = [np.inf if frame.distance is None else frame.distance for frame in frames]
-    return mean(frame.psnr for frame in frames), mean(frame.iou >= FOUND_IOU for frame in frames), median(distances)
-
-
-def _entries(figures: Sequence[float] | NDArray[np.float64]) -> dict[str, float | str]:
-    psnr, found, track = map(float, figures)
-    return {"psnr_moving": psnr, "found": found, "track_error": track if np.isfinite(track) else NOT_FOUND}
+def measure_run(run: Path) -> tuple[float, float, float]:
+    """`summarise` of a finished run on its test views. Raises InputError."""
+    config = load_config(run / "config.toml")
+    dataset, scene = open_dataset(config), load(run / "checkpoint.ply", open_device())
+    color = np.full(3, BACKGROUND_LEVELS[config.data.background], np.float32)
+    frames: list[ObjectFrame] = []
+    for view, objects in zip(dataset.test, object_truths(Path(config.data.path), "test", dataset.test), strict=True):
+        image = to_8_bit(scene.render(view.camera, view.time, color.tolist(), depth=False).image)
+        frames += measure_objects(image, composite(view.load(), color), objects, color)
+    return summarise(frames)
 
 
 def _norm(a: Image, b: Image) -> NDArray[np.float64]:
@@ -191,3 +225,10 @@ def _distance_from(mask: Mask) -> NDArray[np.float64]:
 
 def _centroid(mask: Mask) -> NDArray[np.float64]:
     return np.stack(np.nonzero(mask)).mean(axis=1)
+
+
+if __name__ == "__main__":
+    print("| run | moving PSNR | found | track |\n|---|---:|---:|---:|")
+    for run in sys.argv[1:]:
+        psnr, found, track = measure_run(Path(run))
+        print(f"| {run} | {psnr:.2f} | {found:.0%} | {'-' if track == np.inf else f'{track:.2f}'} |")

@@ -1,0 +1,241 @@
+"""Tables of many runs: a preset on several scenes, by rows (methods, or changed keys) and seeds.
+
+Each run is a `lapgs-train` in a process of its own, so that a run that crashes ends no other, and device memory is free
+for the next one. A run whose folder holds its results is skipped, and an interrupted one is resumed.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import mean, stdev
+from typing import Any
+
+from lapgs_wgpu.command import INTERRUPTED
+from lapgs_wgpu.data.synthetic import write_synthetic
+from lapgs_wgpu.errors import InputError, shown
+from lapgs_wgpu.io.atomic import atomic_write
+from lapgs_wgpu.io.dataclass_table import Options, build_dataclass, checked, option
+from lapgs_wgpu.io.safe_json_toml import read_json, read_toml
+from lapgs_wgpu.stop_signals import on_stop_signals
+from lapgs_wgpu.train.config import Config
+from lapgs_wgpu.train.open_dataset import SYNTHETIC
+from lapgs_wgpu.train.presets import Table, build_config, load_config, merge, shorthands, write_toml
+from lapgs_wgpu.train.run_folder import has_state
+
+_NAME = re.compile(
+    r"\w[\w .+=-]*", re.ASCII
+)  # of a scene or a row: the name of a folder, and a cell of a Markdown table
+# Columns of the printed table: entry of a result, heading, format.
+_COLUMNS = (
+    ("psnr", "PSNR", ".2f"), ("ssim", "SSIM", ".4f"), ("lpips", "LPIPS", ".4f"), ("gaussians", "Gaussians", ",.0f"),
+    ("seconds", "seconds", ",.0f"),
+)  # fmt: skip
+
+Result = dict[str, Any]  # of a run: scene, row, seed, and the figures of its metrics.json
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run of a table. folder: of the scene, relative to --data, or "synthetic"."""
+
+    scene: str
+    row: str
+    seed: int
+    folder: str
+    config: Config
+
+    def __str__(self) -> str:
+        return f"{self.scene}, {self.row}, seed {self.seed}"
+
+
+@dataclass(frozen=True)
+class _SpecFile(Options):
+    """The file that defines a table (docs/tables/demo.toml describes the format)."""
+
+    preset: str = option("preset of all runs")
+    seeds: tuple[int, ...] = option("seeds of each row")
+    scenes: dict[str, Any] = option("name -> folder, or a table with the key folder and keys of the configuration")
+    rows: dict[str, Any] = option("name -> method, ablate, scenes, seeds and keys of the configuration")
+    common: dict[str, Any] | None = option("keys of the configuration, for all runs", None)
+
+
+def read_spec(path: Path) -> list[Run]:
+    """Read the file that defines a table. Returns its runs, scene by scene. Raises InputError before any training where
+    a name, a key or a value of any run is not valid."""
+    spec = build_dataclass(_SpecFile, read_toml(path), str(path))
+    for name in (*spec.scenes, *spec.rows):
+        if not _NAME.fullmatch(name):
+            raise InputError(f"{path}: {name!r} must be a name of letters, digits, spaces and . + = _ - only.")
+    common = _copied(spec.common or {}, f"{path}: common")
+    runs = []
+    for scene, of_scene in spec.scenes.items():
+        of_scene = _copied({"folder": of_scene} if isinstance(of_scene, str) else of_scene, f"{path}: scenes.{scene}")
+        folder = checked(str, of_scene.pop("folder", None), f"{path}: scenes.{scene}.folder")
+        for row, of_row in spec.rows.items():
+            where = f"{path}: rows.{row}"
+            of_row = _copied(of_row, where)
+            scenes = checked(tuple[str, ...], of_row.pop("scenes", list(spec.scenes)), f"{where}.scenes")
+            seeds = checked(tuple[int, ...], of_row.pop("seeds", list(spec.seeds)), f"{where}.seeds")
+            if unknown := [name for name in scenes if name not in spec.scenes]:
+                raise InputError(f"{where}.scenes: {shown(unknown[0])} is no scene of this table.")
+            ablate = checked(tuple[str, ...], of_row.pop("ablate", []), f"{where}.ablate")
+            short = shorthands(of_row.pop("method", None), ablate, (f"{where}.method", f"{where}.ablate"))
+            if scene not in scenes:
+                continue
+            values = merge(merge(common, of_scene), of_row)
+            for seed in seeds:
+                config = build_config(spec.preset, merge(values, {"seed": seed}), f"{path}: {scene}, {row}", short)
+                runs.append(Run(scene, row, seed, folder, config))
+    return runs
+
+
+def make_table(
+    runs: Sequence[Run], data: Path, out: Path, *, device: str | None = None, lpips: Path | None = None
+) -> list[Run]:
+    """Train the runs that are not finished, and write `out`/results.json anew after each.
+
+    Args:
+        runs: of `read_spec`.
+        data: the folder in which the scenes' folders are.
+        out: of the table; a run's own folder is `out`/SCENE/ROW/seedN.
+        device: adapter of the trainings, as for `lapgs-train --device`.
+        lpips: file of LPIPS's weights.
+
+    Returns:
+        The runs that failed, each of which has told why on stderr.
+
+    Raises:
+        InputError: a scene's folder does not exist.
+        KeyboardInterrupt: a signal ended it; the training under way has saved its state.
+    """
+    for run in runs:
+        if run.folder != SYNTHETIC and not (data / run.folder).exists():
+            raise InputError(f"{data / run.folder}, the scene {run.scene}, does not exist; --data names its folder.")
+    failed = []
+    for number, run in enumerate(runs, 1):
+        if read_result(out, run) is not None:
+            continue
+        print(f"run {number} of {len(runs)}: {run}", file=sys.stderr)
+        scene = write_synthetic(out / SYNTHETIC) if run.folder == SYNTHETIC else data / run.folder
+        more = [f"--device={device}"] if device else []
+        more += [f"--lpips-weights={lpips.resolve()}"] if lpips else []
+        code = _train(run, [f"--data={scene.resolve()}", *more], run_folder(out, run))
+        if code == INTERRUPTED:
+            raise KeyboardInterrupt(f"stopped in run {number} of {len(runs)}; the same command goes on.")
+        if code:
+            failed.append(run)
+        results = [result for each in runs if (result := read_result(out, each)) is not None]
+        out.mkdir(parents=True, exist_ok=True)
+        with atomic_write(out / "results.json") as file:
+            file.write((json.dumps(results, indent=1) + "\n").encode())
+    return failed
+
+
+def run_folder(out: Path, run: Run) -> Path:
+    """The folder of a run in the table's folder."""
+    return out / run.scene / run.row / f"seed{run.seed}"
+
+
+def read_result(out: Path, run: Run) -> Result | None:
+    """The results of a finished run; None where its folder holds no run, an unfinished one, or one of another
+    configuration."""
+    folder = run_folder(out, run)
+    try:
+        metrics = read_json(folder / "metrics.json")
+        if not _holds(folder, run.config) or metrics["training"]["steps"] != run.config.schedule.steps:
+            return None
+        figures = {name: metrics[name] for name in ("psnr", "ssim", "ms_ssim", "lpips", "gaussians", "size")}
+        seconds, environment = metrics["training"]["seconds"], metrics["environment"]
+    except (InputError, KeyError, TypeError):
+        return None
+    names = {"scene": run.scene, "row": run.row, "seed": run.seed}
+    return {**names, **figures, "seconds": seconds, "views": len(metrics["views"]), "environment": environment}
+
+
+def markdown(results: Sequence[Result]) -> str:
+    """The table of finished runs: a line for each scene and row, with means over the seeds and the sample standard
+    deviation of the PSNR; then means over the scenes, in which each scene weighs alike."""
+    columns = [column for column in _COLUMNS if any(_is_number(each[column[0]]) for each in results)]
+    heads = ["scene", "row", "seeds", "PSNR", "±", *(head for _, head, _ in columns[1:])]
+    lines = [f"| {' | '.join(heads)} |", f"|---|---|{'---:|' * (len(heads) - 2)}"]
+    scenes, rows = (list(dict.fromkeys(each[name] for each in results)) for name in ("scene", "row"))
+
+    def line(scene: str, row: str, parts: list[list[Result]]) -> str:
+        """Of the results of each scene."""
+        seeds = set.intersection(*({each["seed"] for each in part} for part in parts))
+        psnrs = [mean(each["psnr"] for part in parts for each in part if each["seed"] == seed) for seed in seeds]
+        texts = [scene, row, str(max(map(len, parts)))]
+        for name, _, form in columns:
+            known = all(_is_number(each[name]) for part in parts for each in part)
+            texts.append(format(mean(mean(each[name] for each in part) for part in parts), form) if known else "-")
+        texts.insert(4, f"{stdev(psnrs):.2f}" if len(psnrs) > 1 else "-")
+        return f"| {' | '.join(texts)} |"
+
+    of_rows = {
+        row: [[r for r in results if (r["scene"], r["row"]) == (scene, row)] for scene in scenes] for row in rows
+    }
+    for number, scene in enumerate(scenes):
+        lines += [line(scene, row, [parts[number]]) for row, parts in of_rows.items() if parts[number]]
+    if len(scenes) > 1:  # means over fewer scenes would not compare
+        lines += [line("mean", row, parts) for row, parts in of_rows.items() if all(parts)]
+    return "\n".join(lines)
+
+
+def _is_number(value: object) -> bool:
+    """Whether a measure is known; a text says why it is not."""
+    return isinstance(value, int | float)
+
+
+def _copied(value: Any, where: str) -> Table:
+    """A copy of a table of keys of the configuration. Raises InputError where a key is not the spec's to set."""
+    if not isinstance(value, dict):
+        raise InputError(f"{where} must be a table of keys of the configuration, got {shown(value)}.")
+    data = value.get("data")
+    if "seed" in value or (isinstance(data, dict) and "path" in data):
+        raise InputError(f"{where} must set neither seed nor data.path: the keys seeds and scenes do.")
+    return dict(value)
+
+
+def _holds(folder: Path, config: Config) -> bool:
+    """Whether a folder holds a run of this configuration, wherever its data are and its decoder ran."""
+
+    def comparable(config: Config) -> Config:
+        data = dataclasses.replace(config.data, path="", masks="")
+        return dataclasses.replace(config, decoder="auto", data=data)
+
+    try:
+        return comparable(load_config(str(folder / "config.toml"))) == comparable(config)
+    except InputError:  # it is not there, or damaged
+        return False
+
+
+def _train(run: Run, options: list[str], folder: Path) -> int:
+    """Run lapgs-train, or resume it; it tells on stderr. Returns its exit code; INTERRUPTED after a signal."""
+    with tempfile.TemporaryDirectory() as work:
+        preset = Path(work) / "config.toml"
+        preset.write_text(write_toml(dataclasses.asdict(run.config)), encoding="utf-8")
+        how = [str(preset), f"--out={folder.resolve()}", "--overwrite"]
+        if has_state(folder) and _holds(folder, run.config):
+            how = [f"--resume={folder.resolve()}"]
+        command = [sys.executable, "-m", "lapgs_wgpu.cli", *how, *options]
+        stopped = threading.Event()
+        with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
+
+            def stop(number: int, frame: object) -> None:
+                """The training saves its state. On Windows Ctrl-C has reached it, and `terminate` would kill it."""
+                stopped.set()
+                if sys.platform != "win32":
+                    process.terminate()
+
+            with on_stop_signals(stop):
+                code = process.wait()
+        return INTERRUPTED if stopped.is_set() else code

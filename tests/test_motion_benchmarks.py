@@ -1,0 +1,137 @@
+"""The scenes of benchmarks/motion_scenes, and the measures of what moves in them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import motion_writer
+import numpy as np
+import object_metrics
+import pytest
+from motion_scenes import MotionScene, moving_objects, scene_cameras
+from motion_writer import parse_motion, write_motion
+from moving_pixels import differs_from_median, still_backgrounds
+from object_metrics import ObjectFrame, measure_object, object_truths, summarise, visible
+from PIL import Image
+
+from lapgs_wgpu.data import load_dataset
+from lapgs_wgpu.data.views import composite
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.run import train
+from lapgs_wgpu.train.presets import load_config
+
+pytestmark = pytest.mark.nightly
+TIMES = np.linspace(0, 1, 201)
+
+
+@pytest.mark.parametrize("path", [0.5, 1, 2, 4, 8])
+@pytest.mark.parametrize("cycles", [0.5, 1, 5])
+def test_paths_are_as_wide_and_as_often_travelled_as_asked(path: float, cycles: float) -> None:
+    moving = [one for one in moving_objects(MotionScene(path=path, cycles=cycles)) if one.moves]
+    assert [one.name for one in moving] == ["ball", "box"]
+    for one in moving:
+        places = one.positions(TIMES)
+        apart = np.linalg.norm(places[:, None] - places[None], axis=2)
+        assert apart.max() == pytest.approx(path * one.diameter, rel=1e-3)
+        assert one.positions([0.0]) == pytest.approx(one.positions([1 / cycles]))
+
+
+@pytest.mark.parametrize("scene", [MotionScene(path=4), MotionScene(camera="walk", background="room")], ids=str)
+def test_objects_stay_in_the_box_and_in_view(scene: MotionScene) -> None:
+    for one in moving_objects(scene):
+        assert (np.abs(one.positions(TIMES)) + one.solid.half).max() < 1.3
+        for camera in scene_cameras(scene, "train", np.linspace(0, 1, 12), 0, size=100) if one.moves else ():
+            x, y, z = camera.T_cam_world[:3, :3] @ one.positions(TIMES).T + camera.T_cam_world[:3, 3:]
+            margin = 50 * one.diameter / (2 * z)
+            assert (np.abs(camera.K[0, 0] * x / z) < 50 - margin).all()
+            assert (np.abs(camera.K[1, 1] * y / z) < 50 - margin).all()
+
+
+def test_masks_and_clean_plates_match_the_images(tmp_path: Path) -> None:
+    """An image differs from an object's clean plate inside the mask alone."""
+    folder = write_motion(tmp_path / "scene", MotionScene(background="room"), size=64, train_times=2, test_views=4)
+    for index, view in enumerate(load_dataset(folder).test):
+        for name in ("ball", "box"):
+            mask, clean = (
+                np.asarray(Image.open(folder / f"{part}/test/r_{index:03d}_{name}.png")) for part in ("masks", "clean")
+            )
+            differs = (view.load() != clean).any(axis=2)
+            assert not differs[mask == 0].any()
+            assert differs[mask == 255].mean() > 0.9
+
+
+def test_names_of_scenes() -> None:
+    name = "path=4,cycles=0.5,camera=walk,background=room,objects=occluded"
+    assert parse_motion(name) == MotionScene(4, 0.5, "walk", "room", "occluded")
+    for wrong in ("pth=4", "path=long", "camera=jmp", "path=1,objects=occluded"):
+        with pytest.raises(InputError):
+            parse_motion(wrong)
+    assert motion_writer.TABLE.is_file()
+
+
+def frames_of(folder: Path, draw: Any) -> list[ObjectFrame]:
+    """Measure what `draw(clean, color, alpha, diameter)` makes of each visible object of the test views."""
+    views, found = load_dataset(folder).test, []
+    for view, objects in zip(views, object_truths(folder, "test", views), strict=True):
+        masks = {one.name: one.mask() for one in objects}
+        for one in objects:
+            if visible(masks[one.name], one.diameter):
+                clean, alpha = composite(one.clean(), np.zeros(3)).astype(float), masks[one.name][..., None] / 255
+                truth = composite(view.load(), np.zeros(3))
+                image = draw(clean, truth - clean * (1 - alpha), alpha, one.diameter).clip(0, 255).round()
+                others = np.any([mask > 0 for name, mask in masks.items() if name != one.name], axis=0)
+                args = (truth, clean.astype(np.uint8), masks[one.name], others, one.diameter)
+                found.append(measure_object(one.name, image.astype(np.uint8), *args))
+    return found
+
+
+def test_the_measures_know_the_answer(tmp_path: Path) -> None:
+    folder = write_motion(tmp_path / "scene", MotionScene(), size=100, train_times=4, test_views=4)
+    exact = frames_of(folder, lambda clean, color, alpha, d: color + clean * (1 - alpha))
+    assert len(exact) >= 5
+    assert min(frame.iou for frame in exact) > 0.88
+    assert max(frame.distance or 0 for frame in exact) < 0.05
+    missing = frames_of(folder, lambda clean, color, alpha, d: clean)
+    assert {(frame.iou, frame.distance) for frame in missing} == {(0.0, None)}
+    ghost = frames_of(folder, lambda clean, color, alpha, d: 0.4 * color + clean * (1 - 0.4 * alpha))
+    assert max(frame.iou for frame in ghost) < 0.1
+    shifted = frames_of(
+        folder,
+        lambda clean, color, alpha, d: np.roll(color, round(d / 2), 0) + clean * (1 - np.roll(alpha, round(d / 2), 0)),
+    )
+    assert max(frame.iou for frame in shifted) < 0.5
+    assert np.median([frame.distance for frame in shifted if frame.distance]) == pytest.approx(0.5, abs=0.1)
+
+
+def test_summary_over_frames_and_objects() -> None:
+    frames = [
+        ObjectFrame("a", 20.0, 0.9, 0.1), ObjectFrame("b", 10.0, 0.0, None), ObjectFrame("a", 30.0, 0.5, 0.3),
+        ObjectFrame("a", 28.0, 0.4, None),
+    ]  # fmt: skip
+    assert summarise(frames) == (18, pytest.approx(1 / 3), np.inf)
+    assert summarise([frame for frame in frames if frame.name == "a"]) == (26, pytest.approx(2 / 3), 0.3)
+
+
+def test_a_run_is_measured(tmp_path: Path, device: Device) -> None:
+    folder = write_motion(tmp_path / "scene", MotionScene(path=4), size=32, train_times=4, test_views=2)
+    given = {"data.path": str(folder), "schedule.steps": 2, "points.count": 50, "field.width": 8}
+    train(load_config("tiny", given), load_dataset(folder), tmp_path / "run", device=device)
+    record = json.loads((folder / "objects.json").read_text())
+    assert [one["moves"] for one in record["objects"]] == [True, True, False]
+    psnr, found, _ = object_metrics.measure_run(tmp_path / "run")
+    assert psnr > 0
+    assert found == 0
+
+
+def test_pixels_that_move_before_a_still_camera(tmp_path: Path) -> None:
+    folder = write_motion(tmp_path / "scene", MotionScene(camera="still"), size=48, train_times=9, test_views=8)
+    views = load_dataset(folder).test
+    backgrounds = still_backgrounds(views, lambda view: composite(view.load(), np.zeros(3)))
+    for view, background, objects in zip(views, backgrounds, object_truths(folder, "test", views), strict=True):
+        assert background is not None
+        moving = differs_from_median(composite(view.load(), np.zeros(3)), background)
+        shown = np.any([one.mask() == 255 for one in objects], axis=0)
+        assert moving[shown].mean() > 0.7
