@@ -21,11 +21,11 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands
 from lapgs_wgpu.gpu.profile import Profile
 from lapgs_wgpu.motion.fields import hash_encoder
+from lapgs_wgpu.run import train
 from lapgs_wgpu.train import fused_loss
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.optimizer import FrequencyOptimizer, Optimizer
 from lapgs_wgpu.train.presets import load_config
-from lapgs_wgpu.train.run import train
 
 VIEWS = 8
 WARM_UP = 10  # steps that are not counted: kernels are compiled, and each image is decoded

@@ -14,9 +14,9 @@ from measure import Timing, Traffic, count, recording, summary
 from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.run import train
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.presets import load_config
-from lapgs_wgpu.train.run import train
 
 WARM_UP = 5  # steps that are not counted: kernels are compiled, buffers grow
 

@@ -5,7 +5,7 @@ python examples/growing_images.py --data DIR --preset dnerf-400 --small 400 --un
 
 import argparse
 
-from lapgs_wgpu import StepResult, Trainer, load_config
+from lapgs_wgpu import StepResult, Trainer, load_config, start_training
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("--data", default="synthetic", help="folder of a capture, or a built-in scene")
@@ -29,12 +29,12 @@ def main() -> float:
     known = {"data.path": given.data, "schedule.steps": given.steps, "schedule.warm_up": given.steps // 20}
     for name in ("means", "hash", "mlp", "frequencies"):
         known[f"rates.{name}.steps"] = given.steps
-    with Trainer(load_config(given.preset, {**known, "data.size": given.small})) as small:
+    with start_training(load_config(given.preset, {**known, "data.size": given.small})) as small:
         small.callbacks.append(report)
         while small.done < given.until:
             small.step()
         state = small.state()
-    with Trainer(load_config(given.preset, {**known, "data.size": given.large}), resumed=True) as large:
+    with Trainer(load_config(given.preset, {**known, "data.size": given.large})) as large:
         large.restore(state)
         large.callbacks.append(report)
         for _ in large:

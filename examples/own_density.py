@@ -7,7 +7,7 @@ import argparse
 
 import torch
 
-from lapgs_wgpu import Change, DensityState, Parts, Trainer, load_config, published_rule
+from lapgs_wgpu import Change, DensityState, Parts, load_config, published_rule, start_training
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--data", default="synthetic", help="folder of a capture, or a built-in scene")
@@ -31,7 +31,7 @@ def main() -> int:
     given = parser.parse_args()
     overrides = {"data.path": given.data, "schedule.steps": given.steps, "schedule.warm_up": 50, "density.start": 100}
     parts = Parts(density=lambda state: within(given.budget, state))
-    with Trainer(load_config("demo", overrides), parts=parts) as trainer:
+    with start_training(load_config("demo", overrides), parts=parts) as trainer:
         for result in trainer:
             if result.step % 100 == 0:
                 print(f"step {result.step}: {result.psnr:.2f} dB, {len(trainer.scene)} Gaussians")

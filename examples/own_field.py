@@ -9,7 +9,7 @@ import argparse
 import torch
 from torch import Tensor, nn
 
-from lapgs_wgpu import Deformation, Parts, Trainer, load, load_config
+from lapgs_wgpu import Deformation, Parts, load, load_config, start_training
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--data", default="synthetic", help="folder of a capture, or a built-in scene")
@@ -46,7 +46,7 @@ def main() -> float:
     config = load_config("demo", overrides)
     torch.manual_seed(config.seed)
     parts = Parts(field=Polynomial(config.field.dynamics), rates={"coefficients": 1e-3})
-    with Trainer(config, parts=parts) as trainer:
+    with start_training(config, parts=parts) as trainer:
         for result in trainer:
             if result.step % 100 == 0:
                 print(f"step {result.step}: {result.psnr:.2f} dB, {len(trainer.scene)} Gaussians")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from torch import Tensor
 
-from lapgs_wgpu import Gaussians, Parts, Regularizer, Scene4D, TorchLoss, Trainer, WgslLoss, load_config
+from lapgs_wgpu import Gaussians, Parts, Regularizer, Scene4D, TorchLoss, WgslLoss, load_config, start_training
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--data", default="synthetic", help="folder of a capture, or a built-in scene")
@@ -34,7 +34,7 @@ def main() -> dict[str, float]:
         WgslLoss("charbonnier", Path(__file__).with_name("own_loss.wgsl"), weight=0.2),
         Regularizer("needles", needles, weight=lambda step: 0.01 if step > 50 else 0.0),  # from step 51 on
     ]
-    with Trainer(config, parts=Parts(losses=losses)) as trainer:
+    with start_training(config, parts=Parts(losses=losses)) as trainer:
         for result in trainer:
             if result.step % 50 == 0:
                 print(f"step {result.step}: {result.psnr:.2f} dB,", {n: round(v, 5) for n, v in result.terms.items()})

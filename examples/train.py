@@ -6,7 +6,7 @@ lapgs-view scene.ply
 
 import argparse
 
-from lapgs_wgpu import StepResult, Trainer, load_config
+from lapgs_wgpu import StepResult, Trainer, load_config, start_training
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--data", default="synthetic", help="folder of a capture, or a built-in scene")
@@ -24,7 +24,7 @@ def report(trainer: Trainer, result: StepResult) -> None:
 def main() -> dict[str, object]:
     given = parser.parse_args()
     config = load_config("demo", {"data.path": given.data, "schedule.steps": given.steps, "schedule.warm_up": 50})
-    with Trainer(config) as trainer:
+    with start_training(config) as trainer:
         trainer.callbacks.append(report)
         first = trainer.step()  # one step by hand ...
         for _ in trainer:  # ... and those that are left

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from lapgs_wgpu.data.load import load_dataset
+    from lapgs_wgpu.discovery.start import start_training
     from lapgs_wgpu.gpu.device import list_devices, open_device
     from lapgs_wgpu.motion.fields.deformation import Deformation
     from lapgs_wgpu.motion.scene import Scene4D, load
@@ -37,6 +38,7 @@ _HOMES = {
     "open_device": "gpu.device",
     "load_config": "train.presets",
     "load_dataset": "data.load",
+    "start_training": "discovery.start",
     "Trainer": "train.trainer",
     "StepResult": "train.step_result",
     "Parts": "train.parts",
@@ -51,7 +53,7 @@ _HOMES = {
 __all__ = [
     "Camera", "Change", "Deformation", "DensityState", "Gaussians", "Parts", "Regularizer", "Rendering", "Scene4D",
     "StepResult", "TorchLoss", "Trainer", "WgslLoss", "list_devices", "load", "load_config", "load_dataset",
-    "open_device", "published_rule", "rasterize",
+    "open_device", "published_rule", "rasterize", "start_training",
 ]  # fmt: skip
 
 

@@ -16,10 +16,10 @@ if typing.TYPE_CHECKING:
     from lapgs_wgpu.data import Dataset
     from lapgs_wgpu.gpu.device import Device
     from lapgs_wgpu.motion.scene import Scene4D
+    from lapgs_wgpu.run import Watch
     from lapgs_wgpu.train.config import Config
     from lapgs_wgpu.train.distributed import Ranks
     from lapgs_wgpu.train.lpips import Lpips
-    from lapgs_wgpu.train.run import Watch
 
 # Of the keys, what goes with --eval: where the pictures lie now, and how they are read. The size must be the run's own.
 EVAL_KEYS = ("data.path", "data.size", "data.split", "data.background", "data.cache_gb")
@@ -40,8 +40,8 @@ def _train(arguments: list[str]) -> None:
 
     given = parse_options(arguments)
     from lapgs_wgpu.gpu.device import open_device  # what follows needs torch, which takes seconds to import
+    from lapgs_wgpu.run import train
     from lapgs_wgpu.train.distributed import join_ranks
-    from lapgs_wgpu.train.run import train
     from lapgs_wgpu.train.run_folder import check_run_folder, result_text
 
     overrides = {key.name: given[key.name] for key in config_keys() if key.name in given}
@@ -86,8 +86,8 @@ def _resume(
     lpips: Lpips | None,
 ) -> None:
     from lapgs_wgpu.gpu.device import open_device
+    from lapgs_wgpu.run import resume
     from lapgs_wgpu.train.presets import load_config
-    from lapgs_wgpu.train.run import resume
     from lapgs_wgpu.train.run_folder import changes_since, check_same_data, result_text
 
     names = ("preset", "field", "ablate", "out", "overwrite")
@@ -118,10 +118,10 @@ def _evaluate(run: Path, given: dict[str, typing.Any], overrides: dict[str, str 
     from lapgs_wgpu.gpu.device import open_device
     from lapgs_wgpu.io.safe_json_toml import read_json
     from lapgs_wgpu.motion.scene import load
+    from lapgs_wgpu.run import evaluate_run
     from lapgs_wgpu.train import plots
     from lapgs_wgpu.train.distributed import SINGLE_PROCESS
     from lapgs_wgpu.train.presets import load_config
-    from lapgs_wgpu.train.run import evaluate_run
     from lapgs_wgpu.train.run_folder import check_same_data, result_text
 
     names = ("preset", "field", "ablate", "out", "resume", "overwrite", "view")

@@ -129,8 +129,8 @@ def _check(folder: Path) -> Diagnosis:
 
 def _train(capture: Path, run: Path, minutes: float | None, diagnosis: Diagnosis) -> None:
     from lapgs_wgpu.gpu.device import open_device
+    from lapgs_wgpu.run import train
     from lapgs_wgpu.train.plan import plan_training
-    from lapgs_wgpu.train.run import train
     from lapgs_wgpu.train.run_folder import result_text
 
     device = open_device()

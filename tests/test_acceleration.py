@@ -15,9 +15,9 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.fields.deformation import Deformation, Moments
 from lapgs_wgpu.motion.scene import Scene4D
+from lapgs_wgpu.run import train
 from lapgs_wgpu.train.acceleration import WOBBLE, acceleration_loss, draw_moments, robust_length
 from lapgs_wgpu.train.config import AccelerationConfig
-from lapgs_wgpu.train.run import train
 from lapgs_wgpu.train.trainer import Trainer
 
 CONFIG = AccelerationConfig(weight=1.0, share=0.5, frames=2.0)

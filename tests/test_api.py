@@ -18,7 +18,19 @@ from helpers.training import STEPS, configure
 from torch import Tensor, nn
 
 import lapgs_wgpu
-from lapgs_wgpu import Change, Deformation, Parts, Regularizer, Scene4D, StepResult, TorchLoss, Trainer, WgslLoss, load
+from lapgs_wgpu import (
+    Change,
+    Deformation,
+    Parts,
+    Regularizer,
+    Scene4D,
+    StepResult,
+    TorchLoss,
+    Trainer,
+    WgslLoss,
+    load,
+    start_training,
+)
 from lapgs_wgpu.data import Dataset
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.array import DeviceArray
@@ -27,6 +39,7 @@ from lapgs_wgpu.gpu.kernel import Commands
 from lapgs_wgpu.io.checkpoint import read_checkpoint
 from lapgs_wgpu.motion.fields.own_field import OwnField
 from lapgs_wgpu.motion.timing import Timing
+from lapgs_wgpu.run import resume, train
 from lapgs_wgpu.splat.rotation import rotate, rotation_matrices
 from lapgs_wgpu.train.config import LossWeights
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
@@ -34,7 +47,6 @@ from lapgs_wgpu.train.learning_rate import Rate
 from lapgs_wgpu.train.loss_terms import LossTerm, torch_loss
 from lapgs_wgpu.train.monitor import monitored_views
 from lapgs_wgpu.train.presets import load_config
-from lapgs_wgpu.train.run import resume, train
 from lapgs_wgpu.train.run_folder import load_state, save_state
 from lapgs_wgpu.train.tensorboard import scalars
 from lapgs_wgpu.train.truth_cache import LEFT_OUT, upload_rgba
@@ -180,7 +192,7 @@ def test_a_state_holds_in_how_many_bands_images_are_drawn(dataset: Dataset, devi
 
 def test_a_state_stays_as_it_is(dataset: Dataset, device: Device) -> None:
     """While the trainer that gave it, and one that took it, go on."""
-    with Trainer(configure(), dataset, device) as one, Trainer(configure(), dataset, device, resumed=True) as two:
+    with Trainer(configure(), dataset, device) as one, Trainer(configure(), dataset, device) as two:
         for _ in range(12):
             one.step()
         state = one.state()
@@ -232,7 +244,7 @@ def test_a_field_of_ones_own_learns_repeats_and_resumes(dataset: Dataset, device
     assert equal(*states)
     assert states[0]["field.module.velocity"].any()
     resumed = Drift()
-    with Trainer(config, dataset, device, parts=Parts(field=resumed), resumed=True) as trainer:
+    with Trainer(config, dataset, device, parts=Parts(field=resumed)) as trainer:
         trainer.restore(middle)
         list(trainer)
         assert equal(states[0], saved(trainer, tmp_path / "resumed.ply"))
@@ -374,7 +386,8 @@ def test_a_training_says_why_it_leaves_out_discovery(
     dataset: Dataset, device: Device, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def told(parts: Parts | None = None, method: str = "laplacian", **overrides: str) -> str:
-        with Trainer(configure(method, timing__refine="false", **overrides), dataset, device, parts=parts) as trainer:
+        config = configure(method, timing__refine="false", **overrides)
+        with start_training(config, dataset, device, parts=parts) as trainer:
             assert trainer.discovery is None
             assert len(list(trainer)) == STEPS
         return capsys.readouterr().err
@@ -396,7 +409,7 @@ def test_a_training_says_that_its_warm_up_lasts_to_its_end(
         ("static", STEPS, False),
     ):
         config = configure(method, discovery__enabled="false", schedule__warm_up=str(warm_up), timing__refine="false")
-        Trainer(config, dataset, device).close()
+        start_training(config, dataset, device).close()
         note = f"(schedule.warm_up: {warm_up} steps) is not shorter than schedule.steps ({STEPS}).\n"
         assert capsys.readouterr().err == (
             f"note: nothing moves in this training, since its warm-up {note}" if told else ""
@@ -504,7 +517,7 @@ def test_a_field_without_a_module_is_told_before_discovery(
 ) -> None:
     config = configure(field__kind="own", schedule__steps="900")
     with pytest.raises(InputError, match="the field own needs a module, which only Python can give"):
-        Trainer(config, dataset, device)
+        start_training(config, dataset, device)
     assert capsys.readouterr().err == ""
 
 

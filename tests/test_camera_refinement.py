@@ -18,8 +18,10 @@ from helpers.training import configure
 from scipy.spatial.transform import Rotation
 
 from lapgs_wgpu.data import Dataset
+from lapgs_wgpu.discovery.start import start_training
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.run import resume, train
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.drawing import camera_gradient
 from lapgs_wgpu.splat.rasterize import upload_gaussians
@@ -27,12 +29,11 @@ from lapgs_wgpu.splat.rasterizer import Rasterizer
 from lapgs_wgpu.train.camera_descent import ScenePoints, image_motion, whitening
 from lapgs_wgpu.train.camera_refinement import CameraRefinement, changed_camera, rotation_of, rotation_vector
 from lapgs_wgpu.train.config import CamerasConfig
-from lapgs_wgpu.train.discovery.static_fit import static_config
 from lapgs_wgpu.train.evaluate import evaluate, mean_psnr
 from lapgs_wgpu.train.fused_loss import render_loss
 from lapgs_wgpu.train.learning_rate import Rate
 from lapgs_wgpu.train.presets import load_config
-from lapgs_wgpu.train.run import resume, train
+from lapgs_wgpu.train.static_config import static_config
 from lapgs_wgpu.train.trainer import Trainer
 from lapgs_wgpu.train.truth_cache import upload_rgba
 from lapgs_wgpu.train.view_alignment import aligned_view
@@ -316,7 +317,7 @@ def test_own_footage_is_refined(device: Device, dataset: Dataset, refine: str, o
 
 def test_what_discovery_corrected_stays_corrected(device: Device, dataset: Dataset) -> None:
     config = configure(cameras__refine="on", discovery__enabled="true", discovery__steps="20", discovery__size="32")
-    with Trainer(config, dataset, device) as training:
+    with start_training(config, dataset, device) as training:
         assert training.cameras is not None
         start = [training.cameras.refined(camera).camera for camera in dataset.cameras]
         moved = [np.abs(a.T_cam_world - b.T_cam_world).max() for a, b in zip(start, dataset.cameras, strict=True)]

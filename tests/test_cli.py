@@ -271,7 +271,7 @@ def test_without_any_adapter_the_exit_code_is_3(
 def test_ctrl_c_ends_with_130(
     scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from lapgs_wgpu.train import run as run_module
+    from lapgs_wgpu import run as run_module
 
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt("stopped after step 1 of 2.")

@@ -40,9 +40,9 @@ from lapgs_wgpu.data.validation import check_film, check_in_view, check_times, c
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.run import train
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train.presets import load_config
-from lapgs_wgpu.train.run import train
 
 CLOUD = Cloud(Blobs.random(200).means.numpy(), Blobs.random(200).colors.numpy())
 WHERE = Path("points3D.bin")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
@@ -16,28 +17,30 @@ from lapgs_wgpu.data.motion_scenes import MotionScene
 from lapgs_wgpu.data.motion_writer import write_motion
 from lapgs_wgpu.data.small_views import small_views
 from lapgs_wgpu.data.synthetic import camera_at, cameras
+from lapgs_wgpu.discovery import discover as discover_module
+from lapgs_wgpu.discovery import static_fit as static_fit_module
+from lapgs_wgpu.discovery.acceptance import explained_share, rows_with, tracks_in_images
+from lapgs_wgpu.discovery.discover import RAMP_STEPS, discover
+from lapgs_wgpu.discovery.field_fit import fit_field
+from lapgs_wgpu.discovery.residual import Residual, moving_pixels
+from lapgs_wgpu.discovery.start import start_training
+from lapgs_wgpu.discovery.static_fit import static_fit
+from lapgs_wgpu.discovery.surface_points import PointClouds, Points, surface_points
+from lapgs_wgpu.discovery.tracks import Tracks, find_tracks
+from lapgs_wgpu.discovery.trajectories import find_trajectories
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.fields.deformation import Deformation
 from lapgs_wgpu.motion.scene import Scene4D
+from lapgs_wgpu.run import train
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train.config import Config
-from lapgs_wgpu.train.discovery import discover as discover_module
-from lapgs_wgpu.train.discovery import static_fit as static_fit_module
-from lapgs_wgpu.train.discovery.acceptance import explained_share, rows_with, tracks_in_images
-from lapgs_wgpu.train.discovery.discover import discover
-from lapgs_wgpu.train.discovery.field_fit import fit_field, max_rates_after_fit
-from lapgs_wgpu.train.discovery.residual import Residual, moving_pixels
-from lapgs_wgpu.train.discovery.static_fit import static_config, static_fit
-from lapgs_wgpu.train.discovery.surface_points import PointClouds, Points, surface_points
-from lapgs_wgpu.train.discovery.tracks import Tracks, find_tracks
-from lapgs_wgpu.train.discovery.trajectories import find_trajectories
 from lapgs_wgpu.train.optimizer import Optimizer
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.resolve_config import resolve_for_dataset
-from lapgs_wgpu.train.run import train
-from lapgs_wgpu.train.start import RISE
+from lapgs_wgpu.train.start import max_field_rates
+from lapgs_wgpu.train.static_config import static_config
 from lapgs_wgpu.train.trainer import Trainer
 
 RADIUS, BOX = 0.2, 1.3
@@ -298,7 +301,7 @@ def test_a_slow_ball_is_followed_though_its_points_jitter(monkeypatch: pytest.Mo
     tracks = find_tracks(clouds, BOX)
     assert tracks is not None
     assert errors(tracks, center).max() < 0.5
-    monkeypatch.setattr("lapgs_wgpu.train.discovery.tracks.EVEN", 0.0)
+    monkeypatch.setattr("lapgs_wgpu.discovery.tracks.EVEN", 0.0)
     assert find_tracks(clouds, BOX) is None
 
 
@@ -388,11 +391,16 @@ class FittedAlready:
     def exposure_of(self, view: View) -> torch.Tensor | None:
         return None if self.gains is None else self.gains[view.name] * torch.eye(3, 4)
 
-    def step(self) -> None: ...
-    def close(self) -> None: ...
+    def __iter__(self) -> Iterator[None]:
+        return iter(())
+
+    def __enter__(self) -> FittedAlready:
+        return self
+
+    def __exit__(self, *error: object) -> None: ...
 
 
-def test_what_is_exposed_otherwise_does_not_move(device: Device) -> None:
+def test_what_is_exposed_otherwise_does_not_move(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     static, camera, still = still_view(device, 48, 32)
     gains = {"train_000": 1.3, "train_001": 0.7}
 
@@ -403,7 +411,8 @@ def test_what_is_exposed_otherwise_does_not_move(device: Device) -> None:
     data = Dataset("made up", tuple(exposed(name) for name in gains), ())
     for known, moving in ((gains, False), (None, True)):
         training = FittedAlready(static, known)
-        found = static_fit(configure(), data, device, lambda *_, of=training: of, lambda step: None)
+        monkeypatch.setattr(static_fit_module, "Trainer", lambda *_, of=training: of)
+        found = static_fit(configure(), data, device, lambda step: None)
         assert any(image.mask.any() for image in found.images) == moving
         error = np.abs(found.images[0].still - found.images[0].image).mean()
         assert (error < 1e-3) == (not moving)
@@ -437,7 +446,7 @@ def test_a_long_clip_of_several_cameras_is_still_one(
     monkeypatch.setattr(static_fit_module, "MOST_VIEWS", len(dataset.train))
     for views in (dataset.train, dataset.train + again):
         config = configure(discovery__steps="4", discovery__field_steps="2")
-        discover(config, dataclasses.replace(dataset, train=views), device, Trainer)
+        discover(config, dataclasses.replace(dataset, train=views), device)
     assert told == [False, True]
 
 
@@ -455,7 +464,7 @@ class Fading(nn.Module):
 def test_a_field_that_moves_nothing_starts_from_the_static_fit(dataset: Dataset, device: Device) -> None:
     config = configure()
     config = dataclasses.replace(config, field=dataclasses.replace(config.field, kind="own"))
-    found = discover(config, dataset, device, Trainer, own_field=Fading())
+    found = discover(config, dataset, device, Fading())
     assert "the field moves nothing: nothing is added" in found.summary
     assert f"a static fit of {len(found.scene)} Gaussians" in found.summary
     assert not found.field_fitted
@@ -463,7 +472,7 @@ def test_a_field_that_moves_nothing_starts_from_the_static_fit(dataset: Dataset,
 
 def test_discovery_starts_a_training_which_goes_on_to_the_same_bits(dataset: Dataset, device: Device) -> None:
     config = resolve_for_dataset(configure(), dataset)
-    found = discover(config, dataset, device, Trainer)
+    found = discover(config, dataset, device)
     assert "moving parts" in found.summary
     with closing(Trainer(config, dataset, device, scene=found.scene)) as whole:
         before = found.scene.parameters["means"].detach().clone()
@@ -478,7 +487,7 @@ def test_discovery_starts_a_training_which_goes_on_to_the_same_bits(dataset: Dat
         for _ in range(5):
             whole.step()
         expected = whole.state()
-    with closing(Trainer(config, dataset, device, resumed=True)) as resumed:
+    with closing(Trainer(config, dataset, device)) as resumed:
         resumed.restore(state)
         assert int(resumed.state()["training.warm_up"]) == 0
         for _ in range(5):
@@ -496,7 +505,7 @@ def test_a_training_draws_a_scene_that_it_starts_from_as_it_is_drawn(dataset: Da
         Trainer(config, dataset, device, scene=scene)
 
 
-@pytest.mark.parametrize(("warm_up", "first"), [(10, 0.1), (0, 1 / RISE)])
+@pytest.mark.parametrize(("warm_up", "first"), [(10, 0.1), (0, 1 / RAMP_STEPS)])
 def test_rates_rise_after_discovery(
     dataset: Dataset, device: Device, monkeypatch: pytest.MonkeyPatch, warm_up: int, first: float
 ) -> None:
@@ -510,12 +519,12 @@ def test_rates_rise_after_discovery(
 
     monkeypatch.setattr(Optimizer, "step", noted)
     config = configure(schedule__warm_up=str(warm_up))
-    with closing(Trainer(config, dataset, device)) as training:
+    with closing(start_training(config, dataset, device)) as training:
         shares.clear()  # those of discovery
         for _ in range(2):
             training.step()
         state = training.state()
-    with closing(Trainer(config, dataset, device, resumed=True)) as resumed:
+    with closing(Trainer(config, dataset, device)) as resumed:
         resumed.restore(state)
         for _ in range(10):
             resumed.step()
@@ -524,15 +533,15 @@ def test_rates_rise_after_discovery(
 
 def test_a_field_that_knows_the_tracks_learns_slowly_also_when_resumed(dataset: Dataset, device: Device) -> None:
     config = configure()
-    assert config.rates.mlp.start > max_rates_after_fit(["mlp"])["mlp"]
-    with closing(Trainer(config, dataset, device)) as training:
-        assert training._optimizer.highest == max_rates_after_fit(["hash", "mlp"])
+    assert config.rates.mlp.start > max_field_rates(["mlp"])["mlp"]
+    with closing(start_training(config, dataset, device)) as training:
+        assert training._optimizer.highest == max_field_rates(["hash", "mlp"])
         state = training.state()
-    with closing(Trainer(config, dataset, device, resumed=True)) as resumed:
+    with closing(Trainer(config, dataset, device)) as resumed:
         assert resumed._optimizer.highest == {}
         resumed.restore(state)
-        assert resumed._optimizer.highest == max_rates_after_fit(["hash", "mlp"])
-    with closing(Trainer(configure(discovery__least="1"), dataset, device)) as training:
+        assert resumed._optimizer.highest == max_field_rates(["hash", "mlp"])
+    with closing(start_training(configure(discovery__least="1"), dataset, device)) as training:
         assert training._optimizer.highest == {}  # nothing was added
 
 
@@ -540,16 +549,16 @@ def test_a_field_that_knows_the_tracks_learns_slowly_also_when_resumed(dataset: 
 def test_a_field_that_knows_nearly_all_that_moves_keeps_it(
     dataset: Dataset, device: Device, monkeypatch: pytest.MonkeyPatch, nearly_all: float
 ) -> None:
-    monkeypatch.setattr("lapgs_wgpu.train.discovery.discover.NEARLY_ALL", nearly_all)
-    found = discover(configure(discovery__field_steps="20"), dataset, device, Trainer)
+    monkeypatch.setattr("lapgs_wgpu.discovery.discover.NEARLY_ALL", nearly_all)
+    found = discover(configure(discovery__field_steps="20"), dataset, device)
     assert "moving parts" in found.summary
     assert found.field_fitted == (nearly_all == 0)
 
 
 def test_without_parts_to_follow_the_static_fit_starts_a_training(dataset: Dataset, device: Device) -> None:
     config = configure(discovery__least="1")
-    static, _, _ = static_fit(config, dataset, device, Trainer, lambda step: None)
-    found = discover(config, dataset, device, Trainer)
+    static, _, _ = static_fit(config, dataset, device, lambda step: None)
+    found = discover(config, dataset, device)
     assert "nothing is added" in found.summary
     assert found.scene.parameters["dynamics"].abs().sum() == 0
     ours, theirs = found.scene.parameters["means"], static.parameters["means"]
@@ -569,7 +578,7 @@ def test_images_that_show_nothing_are_refused(dataset: Dataset, device: Device) 
 
     views = tuple(dataclasses.replace(view, pixels=empty) for view in dataset.train)
     with pytest.raises(InputError, match="show nothing but the black background"):
-        discover(configure(), dataclasses.replace(dataset, train=views), device, Trainer)
+        discover(configure(), dataclasses.replace(dataset, train=views), device)
 
 
 def test_short_trainings_go_without(

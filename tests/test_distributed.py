@@ -19,11 +19,11 @@ from lapgs_wgpu.data.motion_writer import write_motion
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.scene import load
+from lapgs_wgpu.run import train
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.distributed import Ranks
 from lapgs_wgpu.train.objective import Sample
 from lapgs_wgpu.train.presets import write_toml
-from lapgs_wgpu.train.run import train
 from lapgs_wgpu.train.trainer import Trainer
 
 

@@ -25,12 +25,12 @@ from lapgs_wgpu.data.views import View, composite
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands
+from lapgs_wgpu.run import resume, train
 from lapgs_wgpu.splat.rasterize import rasterize
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 from lapgs_wgpu.train.exposure import ExposurePasses, Exposures, without_exposure
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
 from lapgs_wgpu.train.learning_rate import Rate
-from lapgs_wgpu.train.run import resume, train
 from lapgs_wgpu.train.trainer import Trainer
 from lapgs_wgpu.train.truth_cache import upload_rgba
 

@@ -38,10 +38,10 @@ from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.io.ply_points import read_points
 from lapgs_wgpu.io.safe_json_toml import MAX_TOML_BYTES, read_json, read_toml
 from lapgs_wgpu.motion.scene_file import read_scene
+from lapgs_wgpu.run import evaluate_run, resume
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.presets import load_config
-from lapgs_wgpu.train.run import evaluate_run, resume
 from lapgs_wgpu.train.run_folder import STATE, load_state, locked_folder, save_state, start_run_folder
 from lapgs_wgpu.train.step_result import StepResult
 from lapgs_wgpu.train.table_results import read_results, write_results

@@ -20,9 +20,9 @@ from lapgs_wgpu.data import Dataset, load_dataset
 from lapgs_wgpu.data.small_views import small_views
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.run import train
 from lapgs_wgpu.splat.rasterize import rasterize
 from lapgs_wgpu.train.fused_loss import render_loss
-from lapgs_wgpu.train.run import train
 from lapgs_wgpu.train.run_folder import start_run_folder
 from lapgs_wgpu.train.truth_cache import LEFT_OUT, upload_rgba, without
 

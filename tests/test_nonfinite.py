@@ -18,12 +18,12 @@ from lapgs_wgpu.command import NOT_FINITE, guarded
 from lapgs_wgpu.data import Dataset
 from lapgs_wgpu.errors import NumericalError
 from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.run import resume, train
 from lapgs_wgpu.train import objective
 from lapgs_wgpu.train.adaptive_split import adaptive_split
 from lapgs_wgpu.train.densify import Statistics, densify
 from lapgs_wgpu.train.fused_loss import RenderLoss
 from lapgs_wgpu.train.nonfinite import IN_A_ROW, SHARE, SkipCounter, Skipped, describe, finite
-from lapgs_wgpu.train.run import resume, train
 from lapgs_wgpu.train.run_folder import STATE, load_state
 from lapgs_wgpu.train.trainer import Trainer
 

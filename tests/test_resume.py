@@ -22,18 +22,18 @@ from helpers.interrupts import handled, interrupt_at
 from helpers.training import STEPS, configure
 
 from lapgs_wgpu import cli, load
+from lapgs_wgpu import run as run_module
 from lapgs_wgpu.data import Dataset
 from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io import atomic
 from lapgs_wgpu.io.safe_json_toml import read_toml
-from lapgs_wgpu.train import run as run_module
+from lapgs_wgpu.run import evaluate_run, resume, train
 from lapgs_wgpu.train import run_folder
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.host_threads import step_threads
 from lapgs_wgpu.train.presets import write_toml
-from lapgs_wgpu.train.run import evaluate_run, resume, train
 from lapgs_wgpu.train.run_folder import STATE, STATE_BEFORE, load_state, locked_folder, save_state
 from lapgs_wgpu.train.trainer import Trainer
 
@@ -89,7 +89,7 @@ def test_states_are_saved_at_intervals_and_the_last_two_are_kept(
         original(out, state)
         saved.append(int(state["training.done"]))
 
-    monkeypatch.setattr("lapgs_wgpu.train.run.save_state", note)
+    monkeypatch.setattr("lapgs_wgpu.run.save_state", note)
     interrupt_at(28, monkeypatch)
     out = tmp_path / "run"
     with pytest.raises(KeyboardInterrupt):

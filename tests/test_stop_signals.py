@@ -8,8 +8,8 @@ import threading
 import pytest
 from helpers.interrupts import handled
 
+from lapgs_wgpu.run import _interruptible
 from lapgs_wgpu.stop_signals import on_stop_signals
-from lapgs_wgpu.train.run import _interruptible
 
 SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 

@@ -18,15 +18,16 @@ from torch import Tensor, nn
 from lapgs_wgpu.data import Dataset
 from lapgs_wgpu.data.timestamps import time_step
 from lapgs_wgpu.data.views import View
+from lapgs_wgpu.discovery.start import start_training
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.fields.deformation import Deformation
 from lapgs_wgpu.motion.scene import Scene4D, load
 from lapgs_wgpu.motion.timing import EVEN, Timing
+from lapgs_wgpu.run import resume, train
 from lapgs_wgpu.train import resolve_config, trainer
 from lapgs_wgpu.train.distributed import SINGLE_PROCESS, Ranks
-from lapgs_wgpu.train.run import resume, train
 from lapgs_wgpu.train.timing_refinement import FARTHEST, TimingRefinement, image_to_fit, running_median
 from lapgs_wgpu.train.trainer import Trainer
 
@@ -302,7 +303,7 @@ def test_a_training_too_short_for_corrections_says_so(
     dataset: Dataset, device: Device, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for start, told in ((STEPS - 1, False), (STEPS, True)):
-        Trainer(configure(**GIVEN | {"timing__start": str(start)}), dataset, device).close()
+        start_training(configure(**GIVEN | {"timing__start": str(start)}), dataset, device).close()
         note = f"no times are corrected in this training, since timing.start ({start}) is not below"
         assert (note in capsys.readouterr().err) == told
 

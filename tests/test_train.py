@@ -17,14 +17,15 @@ import torch
 from helpers.training import STEPS, configure
 from PIL import Image
 
+from lapgs_wgpu import run as run_module
 from lapgs_wgpu.data import Dataset
 from lapgs_wgpu.data.normalize import Normalization
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.checkpoint import read_checkpoint
 from lapgs_wgpu.motion.scene import Scene4D, load
+from lapgs_wgpu.run import train
 from lapgs_wgpu.train import objective, trainer
-from lapgs_wgpu.train import run as run_module
 from lapgs_wgpu.train.config import LossWeights
 from lapgs_wgpu.train.dataloader import ImageLoader
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
@@ -33,7 +34,6 @@ from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.optimizer import Optimizer
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.resolve_config import resolve_decoder, resolve_for_dataset
-from lapgs_wgpu.train.run import train
 from lapgs_wgpu.train.step_result import StepResult
 
 

@@ -32,7 +32,6 @@ from lapgs_wgpu.gpu.wgpu_errors import TranslatedErrors
 from lapgs_wgpu.splat.rasterize import rasterizer_of
 from lapgs_wgpu.train.dataloader import ImageLoader
 from lapgs_wgpu.train.log import Log
-from lapgs_wgpu.train.run import resume, train
 from lapgs_wgpu.train.run_folder import STATE, load_state
 from lapgs_wgpu.train.step_result import StepResult
 

@@ -13,17 +13,17 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from lapgs_wgpu import Camera, Gaussians, Scene4D, Trainer, load_config
+from lapgs_wgpu import Camera, Gaussians, Scene4D, load_config
+from lapgs_wgpu.discovery.acceptance import tracks_in_images
+from lapgs_wgpu.discovery.static_fit import static_fit
+from lapgs_wgpu.discovery.surface_points import surface_points
+from lapgs_wgpu.discovery.tracks import find_tracks
 from lapgs_wgpu.gpu.array import read_all
 from lapgs_wgpu.gpu.device import open_device
 from lapgs_wgpu.progress import Progress
 from lapgs_wgpu.splat.drawing import Drawing
 from lapgs_wgpu.splat.rasterize import rasterizer_of, upload_gaussians
 from lapgs_wgpu.splat.splat_layout import COLOR, MEAN, OPACITY, RADIUS
-from lapgs_wgpu.train.discovery.acceptance import tracks_in_images
-from lapgs_wgpu.train.discovery.static_fit import static_fit
-from lapgs_wgpu.train.discovery.surface_points import surface_points
-from lapgs_wgpu.train.discovery.tracks import find_tracks
 from lapgs_wgpu.train.open_dataset import open_dataset, resolve_data
 from lapgs_wgpu.train.resolve_config import resolve_for_dataset
 
@@ -201,7 +201,7 @@ def discovery(scenes: Path) -> Picture:
     dataset = open_dataset(given)
     config, device = resolve_for_dataset(given, dataset), open_device()
     meter = Progress(config.discovery.steps, "steps of the static fit", None)
-    fit = static_fit(config, dataset, device, Trainer, meter.at)
+    fit = static_fit(config, dataset, device, meter.at)
     static, images = fit.scene, fit.images
     meter.clear()
     clouds = surface_points(images, config.points.box)

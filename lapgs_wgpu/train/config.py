@@ -296,7 +296,7 @@ class AccelerationConfig(Options):
 
 @dataclass(frozen=True)
 class DiscoveryConfig(Options):
-    """Motion discovery before the training (train/discovery). Has defaults, since older config.toml files lack it."""
+    """Motion discovery before the training (docs/method.md). Has defaults, since older config.toml files lack it."""
 
     enabled: bool = option(
         "before training, fit a static fit, search for objects that move farther than their own size, and start from "

@@ -13,9 +13,9 @@ from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.config import Config
-from lapgs_wgpu.train.discovery.static_fit import static_config
 from lapgs_wgpu.train.evaluate import evaluate
 from lapgs_wgpu.train.initial_points import initial_points
+from lapgs_wgpu.train.static_config import static_config
 from lapgs_wgpu.train.trainer import Trainer
 
 # Gaussians of the two scenes that are timed, relative to `points.count`: as many as trainings often have that begin

@@ -31,7 +31,6 @@ from lapgs_wgpu.train.config import BACKGROUND_LEVELS, Config
 from lapgs_wgpu.train.dataloader import ImageLoader
 from lapgs_wgpu.train.densify import Statistics
 from lapgs_wgpu.train.density_control import DensityControl
-from lapgs_wgpu.train.discovery.field_fit import max_rates_after_fit
 from lapgs_wgpu.train.distributed import SINGLE_PROCESS, Ranks
 from lapgs_wgpu.train.evaluate import evaluate, mean_psnr
 from lapgs_wgpu.train.exposure import Exposures
@@ -44,7 +43,7 @@ from lapgs_wgpu.train.open_dataset import open_dataset, resolve_data
 from lapgs_wgpu.train.optimizer import FrequencyOptimizer, Optimizer
 from lapgs_wgpu.train.parts import Parts
 from lapgs_wgpu.train.resolve_config import nyquist_frequency, resolve_decoder, resolve_for_dataset
-from lapgs_wgpu.train.start import Start, start, warn_unused_settings
+from lapgs_wgpu.train.start import Start, max_field_rates, start_from_points
 from lapgs_wgpu.train.step_result import StepResult
 from lapgs_wgpu.train.timing_refinement import TimingRefinement, image_to_fit
 
@@ -52,25 +51,25 @@ MAX_SH_DEGREE = 3
 
 
 class Trainer:
-    """A training, step by step: what lapgs-train runs.
+    """A training, step by step.
 
     A context manager, and an iterator of the steps that are left.
 
     Attributes:
         scene: as the last step left it.
         config: the configuration, resolved for the data and the device.
-        given: the same before it was resolved for the data, but for the decoder's place; config.toml holds it.
+        user_config: the same before it was resolved for the data, but for the decoder's place; config.toml holds it.
         dataset: its test views are not touched by any step.
         parts: own field, losses, density control, learning rates and callbacks.
         done: number of the steps so far.
+        warm_up_steps: number of the first steps without motion.
         callbacks: a list of functions of the trainer and the StepResult, called after each step.
         discovery: what motion discovery found, a sentence; None where it was left out.
         discovery_seconds: that it took; 0 where it was left out.
         cameras: the corrections of the training cameras; None where they are kept.
         timing: the corrections of the training images' times; None where they are kept.
         ranks: this process among those that train together.
-        whole: whether `state` is that of a whole step, which it also is where `step` raised an error before anything
-            that lasts had changed.
+        whole: False while a step is partly applied, and after an error in that part of it.
     """
 
     def __init__(
@@ -81,52 +80,51 @@ class Trainer:
         ranks: Ranks = SINGLE_PROCESS,
         *,
         scene: Scene4D | None = None,
+        start: Start | None = None,
         parts: Parts | None = None,
-        resumed: bool = False,
     ) -> None:
-        """Open the data, do motion discovery as the configuration says, and make the first Gaussians.
+        """Open the data and prepare the first step. No motion discovery is done here (`start_training` does it first).
+
+        Without a scene and a start, the training starts from initial points, or from what `restore` is given.
 
         Args:
             config: as `load_config` gives it.
             dataset: None for the one that config.data names; a built-in scene is then written into the folder runs.
             device: None for the default adapter.
-            ranks: this process among those that train together.
-            scene: to start from, and to move from the first step on, in place of discovery and initial points. Its
-                field keeps its shape, whatever config.field says.
+            ranks: this process among those that train together. The first one's start replaces those of the others.
+            scene: to start from, and to move from the first step on. Its field keeps its shape, whatever config.field
+                says.
+            start: what motion discovery found.
             parts: own field, losses, density control, learning rates and callbacks.
-            resumed: leave out discovery, since `restore` follows.
 
         Raises:
-            InputError: the configuration, the data and the parts do not fit each other.
+            InputError: the configuration, the data, the scene and the parts do not fit each other.
         """
         parts = parts or Parts()
-        _check_given(config, dataset, scene, parts, ranks)
+        check_arguments(config, dataset, parts, ranks)
         if dataset is None:
             config = resolve_data(config, Path("runs"))
             dataset = open_dataset(config)
         device = device or open_device()
-        self.given = resolve_decoder(_with_field(config, scene, parts), device)
-        config = resolve_for_dataset(self.given, dataset)
-        if scene is not None:  # whose field does not change its shape any more
-            config = dataclasses.replace(config, field=scene.field_config)
-        self.config = config
+        if scene is not None:
+            _check_scene(scene, config, parts)
+            start = Start(scene, ramp_steps=config.schedule.warm_up)
+        self.user_config, self.config = resolved_configs(config, dataset, device, parts, scene)
+        if start is None:
+            start = start_from_points(self.config, dataset, device, parts.field)
         self.dataset, self.parts, self.callbacks = dataset, parts, list(parts.callbacks)
         self.ranks = ranks
         self.done = 0
-        self._threads = step_threads(config.field, device)
-        known = resumed or not ranks.first  # the first rank's start replaces those of the others
-        first = start(config, dataset, device, Trainer, ranks, scene=scene, own_field=parts.field, resumed=known)
-        self.scene, self.discovery, self.discovery_seconds = first.scene, first.discovery, first.seconds
-        self._warm_up, self._rising = first.warm_up, first.rising
-        if not resumed:
-            warn_unused_settings(config, first, ranks)
+        self._threads = step_threads(self.config.field, device)
+        self.scene, self.discovery, self.discovery_seconds = start.scene, start.summary, start.seconds
+        self.warm_up_steps, self._ramp_steps = start.warm_up_steps, start.ramp_steps
         self._generator = torch.Generator().manual_seed(config.seed)
-        self._prepare(first)
-        if ranks.count > 1 and not resumed:
+        self._prepare(start)
+        if ranks.count > 1:
             self.restore(ranks.of_first(self.state()))
         self.whole = True
 
-    def _prepare(self, first: Start) -> None:
+    def _prepare(self, start: Start) -> None:
         """Make what the steps work with."""
         config, scene, dataset = self.config, self.scene, self.dataset
         if isinstance(scene.field, GridField):
@@ -141,7 +139,7 @@ class Trainer:
         self._exposures = Exposures(len(dataset.train), config.exposure.rate) if config.exposure.enabled else None
         extent = dataset.extent
         self._objective = Objective(config, scene, self.parts.losses, dataset.moments, extent)
-        self._limit_field_rates(field_fitted=first.field_fitted)
+        self._limit_field_rates(field_fitted=start.field_fitted)
         self.cameras = None
         if config.cameras.refines(own_footage=dataset.own_footage):
             self.cameras = CameraRefinement(
@@ -149,7 +147,7 @@ class Trainer:
                 extent,
                 config.cameras,
                 lambda: scene_points(scene.parameters["means"], scene.parameters["opacity_logits"].sigmoid()),
-                first.corrections,
+                start.corrections,
             )
         self._color = torch.full((3,), BACKGROUND_LEVELS[config.data.background])  # of the evaluation
         self.timing = None
@@ -181,7 +179,7 @@ class Trainer:
         """Hold the field's learning rates low where discovery has fitted it to nearly all that moves."""
         self._objective.field_fitted = field_fitted
         field = self.scene.field
-        self._optimizer.highest = max_rates_after_fit(field.parameter_groups()) if field_fitted and field else {}
+        self._optimizer.highest = max_field_rates(field.parameter_groups()) if field_fitted and field else {}
 
     def close(self) -> None:
         """End what goes on beside the steps."""
@@ -253,7 +251,7 @@ class Trainer:
     def _step(self) -> StepResult:
         config, scene, ranks = self.config, self.scene, self.ranks
         step = self.done + 1
-        moving = step > self._warm_up
+        moving = step > self.warm_up_steps
         # Every rank draws the numbers of all views, so that their random streams stay the same.
         chosen = [self._images.choose() for _ in range(config.schedule.batch)]
         drawn = self._generator.get_state()
@@ -280,7 +278,7 @@ class Trainer:
             moments = self.timing.fitted(corrections.index(step))
         self.whole = False
         if skipped is None:
-            self._optimizer.step(step, min(1.0, step / self._rising) if self._rising else 1.0)
+            self._optimizer.step(step, min(1.0, step / self._ramp_steps) if self._ramp_steps else 1.0)
             for beside in self._beside:
                 beside.step(step)
             # After the optimizer's step, so that no gradient is lost with the rows that change.
@@ -382,8 +380,8 @@ class Trainer:
             "statistics": vars(self._density.statistics),
             "training": {
                 "done": torch.tensor(self.done),
-                "warm_up": torch.tensor(self._warm_up),
-                "rising": torch.tensor(self._rising),
+                "warm_up": torch.tensor(self.warm_up_steps),
+                "rising": torch.tensor(self._ramp_steps),
                 "field_fitted": torch.tensor(int(self._objective.field_fitted)),
                 "sh_degree": torch.tensor(scene.sh_degree),
                 "random": self._generator.get_state(),
@@ -428,9 +426,9 @@ class Trainer:
         self._density.statistics = Statistics(**parts["statistics"])
         own = parts["training"]
         self.done, scene.sh_degree = int(own["done"]), int(own["sh_degree"])
-        self._warm_up = int(own.get("warm_up", self._warm_up))  # older states lack it, and the next one
-        self._rising = int(own.get("rising", self.config.schedule.warm_up - self._warm_up))
-        if self._rising < 0:
+        self.warm_up_steps = int(own.get("warm_up", self.warm_up_steps))  # older states lack it, and the next one
+        self._ramp_steps = int(own.get("rising", self.config.schedule.warm_up - self.warm_up_steps))
+        if self._ramp_steps < 0:
             raise ValueError("its rates rise over a negative number of steps")
         self._limit_field_rates(field_fitted=bool(own.get("field_fitted", False)))
         self._generator.set_state(own["random"])
@@ -443,13 +441,11 @@ def _timing_state(timing: Timing) -> dict[str, Tensor]:
     return {name: torch.from_numpy(values) for name, values in vars(timing).items() if len(values)}
 
 
-def _check_given(config: Config, dataset: Dataset | None, scene: Scene4D | None, parts: Parts, ranks: Ranks) -> None:
-    """Raises InputError for arguments of another kind, or that exclude each other."""
+def check_arguments(config: Config, dataset: Dataset | None, parts: Parts, ranks: Ranks) -> None:
+    """Raises InputError for arguments of a Trainer that are of another kind, or that exclude each other."""
     for name, kind, given in (("config", Config, config), ("dataset", Dataset | None, dataset)):
         if not isinstance(given, kind):
             raise InputError(f"Trainer takes as {name} what load_{name} gives, got a {type(given).__name__}.")
-    if scene is not None and parts.field is not None:
-        raise InputError("the scene to start from keeps its own field; leave out Parts(field=...).")
     check_terms(tuple(parts.losses), TERMS)
     if config.schedule.batch % ranks.count:
         raise InputError(
@@ -458,13 +454,33 @@ def _check_given(config: Config, dataset: Dataset | None, scene: Scene4D | None,
         )
 
 
-def _with_field(config: Config, scene: Scene4D | None, parts: Parts) -> Config:
-    """The configuration with the field that the scene or the parts bring. Raises InputError."""
+def _check_scene(scene: Scene4D, config: Config, parts: Parts) -> None:
+    """Raises InputError for a scene from which a training cannot start."""
+    if parts.field is not None:
+        raise InputError("the scene to start from keeps its own field; leave out Parts(field=...).")
+    if scene.antialiased != config.antialiased:
+        raise InputError(
+            f"the scene to start from is drawn with antialiased = {scene.antialiased}, and the configuration says "
+            f"{config.antialiased}; give the configuration the scene's."
+        )
+
+
+def resolved_configs(
+    config: Config, dataset: Dataset, device: Device, parts: Parts, scene: Scene4D | None = None
+) -> tuple[Config, Config]:
+    """The configuration with its field and decoder decided, as config.toml holds it; and resolved for the data, too.
+
+    The field is that of the scene or of the parts, where they bring one. Raises InputError.
+    """
     if scene is not None:
-        return dataclasses.replace(config, field=scene.field_config)
-    if parts.field is None:
-        return config
-    try:
-        return dataclasses.replace(config, field=dataclasses.replace(config.field, kind="own"))
-    except ValueError as error:
-        raise InputError(f"{error}.") from None
+        config = dataclasses.replace(config, field=scene.field_config)
+    elif parts.field is not None:
+        try:
+            config = dataclasses.replace(config, field=dataclasses.replace(config.field, kind="own"))
+        except ValueError as error:
+            raise InputError(f"{error}.") from None
+    user_config = resolve_decoder(config, device)
+    resolved = resolve_for_dataset(user_config, dataset)
+    if scene is not None:  # whose field does not change its shape any more
+        resolved = dataclasses.replace(resolved, field=scene.field_config)
+    return user_config, resolved

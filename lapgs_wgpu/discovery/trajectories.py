@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.data.timestamps import time_step
-from lapgs_wgpu.train.discovery.residual import Floats
-from lapgs_wgpu.train.discovery.surface_points import PointClouds, parts_of
+from lapgs_wgpu.discovery.residual import Floats
+from lapgs_wgpu.discovery.surface_points import PointClouds, parts_of
 
 LEAST_GROUP = 6  # points
 FULL_GROUP = 20  # points, from which on a group counts in full

@@ -3,64 +3,54 @@
 from __future__ import annotations
 
 import time
-from typing import NamedTuple, TextIO
 
 import numpy as np
 import torch
 from torch import nn
 
 from lapgs_wgpu.data.views import Dataset
+from lapgs_wgpu.discovery.acceptance import explained_share, rows_with, tracks_in_images
+from lapgs_wgpu.discovery.field_fit import fit_field
+from lapgs_wgpu.discovery.static_fit import static_fit
+from lapgs_wgpu.discovery.surface_points import surface_points
+from lapgs_wgpu.discovery.tracks import Tracks, find_tracks
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.progress import Progress
 from lapgs_wgpu.splat.morton import morton_order
-from lapgs_wgpu.train.camera_refinement import Corrections
 from lapgs_wgpu.train.config import BACKGROUND_LEVELS, Config
-from lapgs_wgpu.train.discovery.acceptance import explained_share, rows_with, tracks_in_images
-from lapgs_wgpu.train.discovery.field_fit import fit_field
-from lapgs_wgpu.train.discovery.static_fit import MakeTrainer, static_fit
-from lapgs_wgpu.train.discovery.surface_points import surface_points
-from lapgs_wgpu.train.discovery.tracks import Tracks, find_tracks
+from lapgs_wgpu.train.start import Start
 
 DYNAMICS = 0.5  # standard deviation of the dynamics attribute of a discovered Gaussian, which it shares with its part
 NEARLY_ALL = 0.8  # share of the surface points that tracks explain, above which the field has little left to learn
+RAMP_STEPS = 200  # over which learning rates rise after discovery, where schedule.warm_up is 0
 SHOWN = 2.0 / 255  # least difference from the background of an image that shows something
 
 
-class Discovery(NamedTuple):
-    """What discovery leaves.
-
-    scene: to start from. field_fitted: whether its field knows nearly all that moves. summary: what was found, a line.
-    corrections: of the dataset's cameras; None where they are kept. seconds: that it took.
-    """
-
-    scene: Scene4D
-    field_fitted: bool
-    summary: str
-    corrections: Corrections | None
-    seconds: float
-
-
-def discover(
-    config: Config,
-    dataset: Dataset,
-    device: Device,
-    trainer: MakeTrainer,
-    terminal: TextIO | None = None,
-    own_field: nn.Module | None = None,
-) -> Discovery:
+def discover(config: Config, dataset: Dataset, device: Device, own_field: nn.Module | None = None) -> Start:
     """Find what moves, and build the scene that a training starts from.
 
     It holds the Gaussians of the static fit and those of the tracks, if there are any, and a field that moves the
-    latter. trainer: makes the training of the static fit. own_field: of Scene4D.
+    latter. It moves from the first step on. The rates rise first: Adam's first steps, all of the size of the rate,
+    would shake off what the field knows.
 
-    The same configuration and capture give the same scene. Raises InputError where the images show nothing at all.
+    Args:
+        config: resolved for the dataset.
+        dataset: the capture.
+        device: that trains.
+        own_field: of Scene4D.
+
+    Returns:
+        The start of the training. The same configuration and capture give the same one.
+
+    Raises:
+        InputError: the images show nothing at all.
     """
     started = time.perf_counter()
     steps, fit_steps = config.discovery.steps, config.discovery.field_steps
-    meter = Progress(steps, "steps of motion discovery, part 1 of 2: what stands still", terminal)
-    static, images, corrections = static_fit(config, dataset, device, trainer, meter.at)
+    meter = Progress(steps, "steps of motion discovery, part 1 of 2: what stands still")
+    static, images, corrections = static_fit(config, dataset, device, meter.at)
     meter.at(steps, lambda: "motion discovery: following what moves from one time to the next")
     background = BACKGROUND_LEVELS[config.data.background]
     if all(float(np.abs(image.image - background).max()) < SHOWN for image in images):
@@ -81,7 +71,7 @@ def discover(
     scene = scene_with(static, tracks, config, device, generator, own_field)
     found = f"{share:.1%} of what it lacks can be followed: nothing is added"
     if tracks is not None:
-        meter = Progress(fit_steps, "steps of motion discovery, part 2 of 2: what moves", terminal)
+        meter = Progress(fit_steps, "steps of motion discovery, part 2 of 2: what moves")
         error = fit_field(scene, tracks, clouds.times, len(static), fit_steps, generator, meter.at)
         if error is None:
             tracks, scene = None, scene_with(static, None, config, device, generator, own_field)
@@ -97,7 +87,14 @@ def discover(
     meter.clear()
     summary = f"a static fit of {len(static)} Gaussians; {found}"
     field_fitted = tracks is not None and share >= NEARLY_ALL
-    return Discovery(scene, field_fitted, summary, corrections, time.perf_counter() - started)
+    return Start(
+        scene,
+        ramp_steps=config.schedule.warm_up or RAMP_STEPS,
+        field_fitted=field_fitted,
+        corrections=corrections,
+        summary=summary,
+        seconds=time.perf_counter() - started,
+    )
 
 
 def scene_with(

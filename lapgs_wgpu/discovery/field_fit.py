@@ -9,13 +9,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from lapgs_wgpu.discovery.tracks import Tracks
 from lapgs_wgpu.motion.scene import Scene4D
-from lapgs_wgpu.train.discovery.tracks import Tracks
 from lapgs_wgpu.train.optimizer import ADAM_EPS
 
 STILL = 300  # Gaussians of the static fit that a step asks to stay where they are
-HASH_RATE, MLP_RATE = 1e-2, 2e-3  # learning rates, half of those of the preset tiny
-KEEPING = 0.5  # of these rates, at most, at which a training goes on; at higher ones Adam's noise undoes the fit
+HASH_RATE, MLP_RATE = 1e-2, 2e-3  # learning rates: half of those of the preset tiny, twice train.start.MAX_*_RATE
 LAST = 0.05  # of the learning rates, in the end; they fall over the second half
 SHAPE_WEIGHT = 0.1  # of changes of scales and quaternions, which the tracks do not know
 SOFTENING = 1e-2  # world units; distances below count as squares
@@ -74,11 +73,6 @@ def fit_field(
     optimizer.zero_grad()
     last = errors[-max(1, len(errors) // 10) :]
     return float(np.mean(last)) if last else 0.0
-
-
-def max_rates_after_fit(groups: Iterable[str]) -> dict[str, float]:
-    """The highest learning rate of each group of a field's parameters at which it keeps what it learned here."""
-    return {name: KEEPING * rate for name, rate in _rates(groups).items()}
 
 
 def _rates(groups: Iterable[str]) -> dict[str, float]:

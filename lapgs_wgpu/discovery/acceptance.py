@@ -16,10 +16,10 @@ from torch import Tensor
 
 from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.data.initial_gaussians import initial_scales
+from lapgs_wgpu.discovery.residual import Residual
+from lapgs_wgpu.discovery.surface_points import PointClouds
+from lapgs_wgpu.discovery.tracks import Tracks
 from lapgs_wgpu.motion.scene import Scene4D, isotropic_rows
-from lapgs_wgpu.train.discovery.residual import Residual
-from lapgs_wgpu.train.discovery.surface_points import PointClouds
-from lapgs_wgpu.train.discovery.tracks import Tracks
 
 OPACITY = 0.3  # of the Gaussian of a track
 SCALE = 0.4  # of it, in mean distances to its nearest neighbours; more of them lie behind one another

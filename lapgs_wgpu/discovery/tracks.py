@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from lapgs_wgpu.data.timestamps import time_step
-from lapgs_wgpu.train.discovery.follower import LEAST_PART, LINK, Follower
-from lapgs_wgpu.train.discovery.residual import Floats
-from lapgs_wgpu.train.discovery.surface_points import PointClouds, Points, parts_of
-from lapgs_wgpu.train.discovery.trajectories import Trajectory, find_trajectories
+from lapgs_wgpu.discovery.follower import LEAST_PART, LINK, Follower
+from lapgs_wgpu.discovery.residual import Floats
+from lapgs_wgpu.discovery.surface_points import PointClouds, Points, parts_of
+from lapgs_wgpu.discovery.trajectories import Trajectory, find_trajectories
 
 KEY_TIMES = 4  # from which is tracked, at most
 LEAST_REST = 0.05  # share of the points without a track that is worth another key time

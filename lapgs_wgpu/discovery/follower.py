@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.data.evenly import evenly_indices
-from lapgs_wgpu.train.discovery.residual import Floats
-from lapgs_wgpu.train.discovery.surface_points import Points, parts_of
-from lapgs_wgpu.train.discovery.trajectories import Trajectory
+from lapgs_wgpu.discovery.residual import Floats
+from lapgs_wgpu.discovery.surface_points import Points, parts_of
+from lapgs_wgpu.discovery.trajectories import Trajectory
 
 LEAST_PART = 12  # points
 DATA = 160  # points of a time that a part is compared with, at most

@@ -19,7 +19,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from lapgs_wgpu.data.evenly import evenly_indices
-from lapgs_wgpu.train.discovery.residual import Floats, Residual
+from lapgs_wgpu.discovery.residual import Floats, Residual
 
 RAYS = 300  # of an image, at most
 DEPTHS = 64  # that are tried along a ray

@@ -14,6 +14,7 @@ from typing import Any
 from lapgs_wgpu.data.initial_gaussians import first_points
 from lapgs_wgpu.data.validation import check_in_view, check_times
 from lapgs_wgpu.data.views import Dataset
+from lapgs_wgpu.discovery.start import start_training
 from lapgs_wgpu.errors import DeviceError, InputError, NumericalError, quoted
 from lapgs_wgpu.gpu.device import Device, open_device
 from lapgs_wgpu.io.initial_view import InitialView
@@ -94,11 +95,11 @@ def train(
     keep_freed_memory()
     device = device or open_device()
     if not ranks.first:
-        return _assist(Trainer(config, dataset, device, ranks, parts=parts))
+        return _assist(start_training(config, dataset, device, ranks, parts=parts))
     with locked_folder(out):
         check_run_folder(out, overwrite=overwrite)  # again: another training may have written it meanwhile
-        training = Trainer(config, dataset, device, ranks, parts=parts)
-        start_run_folder(out, training.given, training.scene.device, dataset)
+        training = start_training(config, dataset, device, ranks, parts=parts)
+        start_run_folder(out, training.user_config, training.scene.device, dataset)
         if training.discovery is not None:
             say(f"discovery: {training.discovery}; {training.discovery_seconds:.0f} s")
         if training.config.decoder == "device":
@@ -132,8 +133,10 @@ def resume(
             )
         if ranks.first:
             note_paths(out, config)
-        training = Trainer(config, dataset, device, ranks, parts=parts, resumed=state is not None)
-        if state is not None:
+        if state is None:
+            training = start_training(config, dataset, device, ranks, parts=parts)
+        else:
+            training = Trainer(config, dataset, device, ranks, parts=parts)
             try:
                 check_state(state, views=len(dataset.train), steps=config.schedule.steps)
                 training.restore(state)
