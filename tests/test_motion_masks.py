@@ -106,6 +106,7 @@ def test_the_evaluation_of_a_still_camera_reports_its_moving_pixels(scene: Scene
     )
 
 
+@pytest.mark.nightly
 def test_a_motion_scene_from_training_to_metrics(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     data = write_motion(tmp_path / "scene", MotionScene(camera="still"), size=48, train_times=5, test_views=5)
 

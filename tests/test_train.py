@@ -162,6 +162,7 @@ def test_the_training_never_sees_the_test_views(
     assert (tmp_path / "run" / "checkpoint.ply").read_bytes() == (run / "checkpoint.ply").read_bytes()
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("key", "value"),
     [
@@ -186,6 +187,7 @@ def test_a_training_repeats_to_the_last_byte(run: Path, dataset: Dataset, device
     assert first == second
 
 
+@pytest.mark.nightly
 def test_the_decoder_on_the_device_trains_as_well_and_repeats(
     run: Path, dataset: Dataset, device: Device, tmp_path: Path
 ) -> None:
@@ -232,12 +234,6 @@ def test_the_place_of_the_decoder_is_told_and_recorded(
     train(configure(schedule__steps="1"), dataset, tmp_path / "gpu", device=device)
     assert "decoder: on the device\n" in capsys.readouterr().out
     assert load_config(str(tmp_path / "gpu/config.toml")).decoder == "device"
-
-
-def test_another_seed_gives_another_model(run: Path, dataset: Dataset, device: Device, tmp_path: Path) -> None:
-    train(configure(seed="1", schedule__steps="3"), dataset, tmp_path / "a", device=device)
-    train(configure(seed="2", schedule__steps="3"), dataset, tmp_path / "b", device=device)
-    assert (tmp_path / "a" / "checkpoint.ply").read_bytes() != (tmp_path / "b" / "checkpoint.ply").read_bytes()
 
 
 def test_nothing_moves_during_the_warm_up(dataset: Dataset, device: Device, tmp_path: Path) -> None:
