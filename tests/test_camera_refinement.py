@@ -26,8 +26,15 @@ from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.drawing import camera_gradient
 from lapgs_wgpu.splat.rasterize import upload_gaussians
 from lapgs_wgpu.splat.rasterizer import Rasterizer
-from lapgs_wgpu.train.camera_descent import ScenePoints, image_motion, whitening
-from lapgs_wgpu.train.camera_refinement import CameraRefinement, changed_camera, rotation_of, rotation_vector
+from lapgs_wgpu.train.camera_refinement import (
+    CameraRefinement,
+    ScenePoints,
+    changed_camera,
+    image_motion,
+    rotation_of,
+    rotation_vector,
+    whitening,
+)
 from lapgs_wgpu.train.config import CamerasConfig
 from lapgs_wgpu.train.evaluate import evaluate, mean_psnr
 from lapgs_wgpu.train.fused_loss import render_loss
