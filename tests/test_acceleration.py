@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -15,8 +13,7 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.fields.deformation import Deformation, Moments
 from lapgs_wgpu.motion.scene import Scene4D
-from lapgs_wgpu.run import train
-from lapgs_wgpu.train.acceleration import WOBBLE, acceleration_loss, draw_moments, robust_length
+from lapgs_wgpu.train.acceleration import WOBBLE, acceleration_loss, draw_moments
 from lapgs_wgpu.train.config import AccelerationConfig
 from lapgs_wgpu.train.trainer import Trainer
 
@@ -63,15 +60,6 @@ def test_value_is_the_robust_distance_from_the_chord(device: Device) -> None:
     torch.testing.assert_close(curve.speed.grad, torch.zeros(3), rtol=0, atol=1e-6)
 
 
-def test_what_turns_quickly_is_not_held_back() -> None:
-    small, large = (torch.tensor([[length, 0.0, 0.0]], requires_grad=True) for length in (0.1 * WOBBLE, 50 * WOBBLE))
-    for vectors in (small, large):
-        robust_length(vectors).backward()
-    assert small.grad is not None
-    assert large.grad is not None
-    assert float(large.grad.norm()) < 1e-3 * float(small.grad.norm())
-
-
 @pytest.mark.parametrize("on_device", [False, True])
 def test_chosen_rows_move_as_all_do(device: Device, on_device: bool) -> None:
     scene = scene_of(device, configure().field)
@@ -109,19 +97,7 @@ def test_nowhere_to_look(config: AccelerationConfig, count: int, times: int) -> 
     assert draw_moments(config, count, 0.5, times, generator) is None
 
 
-@pytest.mark.parametrize("t", [0.0, 1.0])
-def test_ends_of_the_clip_add_nothing(device: Device, t: float) -> None:
-    curve = Curve()
-    scene = scene_of(device, FieldConfig(kind="own"), curve)
-    moments = draw_moments(CONFIG, COUNT, t, 101, torch.Generator().manual_seed(0))
-    assert moments is not None
-    loss = acceleration_loss(scene.deformed(t, moments=moments), t, moments)
-    loss.backward()
-    assert loss.item() < 1e-5
-    assert curve.bend.grad is not None
-    assert not curve.bend.grad.any()
-
-
+@pytest.mark.nightly
 def test_a_training_moves_more_evenly_with_it(dataset: Dataset, device: Device) -> None:
     bends = []
     for weight in ("0", "30"):
@@ -140,20 +116,6 @@ def test_it_rests_where_discovery_explains_what_moves(dataset: Dataset, device: 
         assert training.step().terms["acceleration"] > 0
         training._objective.field_fitted = True
         assert "acceleration" not in training.step().terms
-
-
-def test_it_repeats_to_the_last_bit(dataset: Dataset, device: Device, tmp_path: Path) -> None:
-    config = configure(acceleration__weight="1", schedule__steps="14")
-    for name in ("a", "b"):
-        train(config, dataset, tmp_path / name, device=device)
-    assert (tmp_path / "a" / "checkpoint.ply").read_bytes() == (tmp_path / "b" / "checkpoint.ply").read_bytes()
-
-
-def test_static_scenes_have_nothing_to_compare(dataset: Dataset, device: Device) -> None:
-    with Trainer(
-        configure("static", acceleration__weight="1", acceleration__interval="1"), dataset, device
-    ) as training:
-        assert all("acceleration" not in result.terms for result in training)
 
 
 def test_it_rests_between_and_counts_the_more(dataset: Dataset, device: Device) -> None:

@@ -61,14 +61,6 @@ def change(rows: Mapping[str, Tensor], gradients: Tensor) -> Change:
 # Neighbours
 
 
-def test_nearest_as_by_all_distances() -> None:
-    means = torch.randn(300, 3, generator=torch.Generator().manual_seed(3))
-    of = torch.tensor([7, 0, 299, 120])
-    distances = (means[of][:, None].double() - means[None].double()).norm(dim=2)
-    distances[torch.arange(4), of] = math.inf
-    assert torch.equal(nearest(means, of, 10), distances.argsort(dim=1)[:, :10])
-
-
 def test_nearest_breaks_ties_by_number_and_leaves_itself_out() -> None:
     means = torch.zeros(40, 3)
     means[20:] = 5.0
@@ -111,25 +103,6 @@ def test_shape_difference_by_hand() -> None:
     assert shape_difference(own[None], two).tolist() == pytest.approx([(4 / 8 + 0) / 2])
 
 
-def test_shape_difference_is_a_share() -> None:
-    needle, speck = torch.diag(torch.tensor([1.0, 0.0, 0.0])), 1e-12 * torch.eye(3)
-    lying = torch.diag(torch.tensor([0.0, 1.0, 0.0]))
-    assert shape_difference(needle[None], speck[None, None]).item() == pytest.approx(1.0)
-    assert shape_difference(needle[None], lying[None, None]).item() == pytest.approx(math.sqrt(2) / 2)
-    assert shape_difference(speck[None], speck[None, None]).item() == 0
-    assert shape_difference(0 * speck[None], 0 * speck[None, None]).item() == 0
-    rows = make_rows(200)
-    scores = split_scores(rows, torch.arange(200), 10, 0.0)
-    assert ((scores > 0) & (scores < 1)).all()
-
-
-def test_shape_difference_has_no_unit() -> None:
-    rows = make_rows(50)
-    tiny = rows | {"means": 1e-6 * rows["means"], "log_scales": rows["log_scales"] + math.log(1e-6)}
-    of = torch.arange(50)
-    assert torch.allclose(split_scores(tiny, of, 10, 0.0), split_scores(rows, of, 10, 0.0), atol=1e-5)
-
-
 def test_rotating_the_world_changes_no_score() -> None:
     rows, of = make_rows(60), torch.arange(60)
     turn = torch.tensor([0.3, -0.8, 0.5, 0.1])
@@ -162,14 +135,6 @@ def test_divergence_is_zero_for_uniform_and_one_for_one_hot() -> None:
     assert divergence(torch.tensor([[0.75, 0.25]])).item() == pytest.approx(expected)
 
 
-def test_probabilities_by_hand() -> None:
-    # The mean weight is 1, and each is raised by a hundredth of it.
-    assert probabilities(torch.tensor([[3.0, 0.0, 1.0, 0.0]])).tolist()[0] == pytest.approx(
-        [3.01 / 4.04, 0.01 / 4.04, 1.01 / 4.04, 0.01 / 4.04], rel=1e-5
-    )
-    assert probabilities(torch.zeros(1, 4)).tolist() == [[0.25] * 4]
-
-
 def test_dynamics_count_where_shapes_are_equal() -> None:
     rows = equals(12)
     of = torch.tensor([0, 11])
@@ -180,13 +145,6 @@ def test_dynamics_count_where_shapes_are_equal() -> None:
     assert expected > 0.8
     assert high == pytest.approx(0.5 * expected, rel=1e-5)
     assert low == pytest.approx(0, abs=1e-12)
-
-
-def test_scores_add_shapes_and_dynamics() -> None:
-    rows, of = make_rows(80), torch.arange(80)
-    shapes, both, double = (split_scores(rows, of, 10, weight) for weight in (0.0, 0.5, 1.0))
-    assert (both > shapes).all()
-    assert torch.allclose(both - shapes, double - both)
 
 
 def test_without_dynamics_the_distances_between_means_count() -> None:
@@ -213,20 +171,6 @@ def test_scores_from_the_quantile_on_are_split(monkeypatch: pytest.MonkeyPatch, 
     assert split.nonzero()[:, 0].tolist() == sorted(highest_first[:count])
 
 
-def test_the_configuration_reaches_the_scores(monkeypatch: pytest.MonkeyPatch) -> None:
-    seen = []
-
-    def scores(rows: Mapping[str, Tensor], of: Tensor, *numbers: float) -> Tensor:
-        seen.append(numbers)
-        return torch.zeros(len(of))
-
-    monkeypatch.setattr(module, "split_scores", scores)
-    rows = equals(4)
-    # Where all scores are equal, all reach the quantile.
-    assert adaptive_split(rows, everyone(rows), dataclasses.replace(CONFIG, neighbours=7, divergence_weight=0.1)).all()
-    assert seen == [(7, 0.1)]
-
-
 def test_outliers_are_split_whatever_their_score() -> None:
     rows = make_rows(100)
     rows["dynamics"] *= 0
@@ -242,35 +186,7 @@ def test_outliers_are_split_whatever_their_score() -> None:
     assert not without[lowest]
 
 
-def test_no_candidates() -> None:
-    rows = make_rows(5)
-    assert not adaptive_split(rows, ~everyone(rows), CONFIG).any()
-    empty = {name: row[:0] for name, row in rows.items()}
-    assert adaptive_split(empty, everyone(empty), CONFIG).shape == (0,)
-
-
-def test_the_same_rows_the_same_bits() -> None:
-    rows, of = make_rows(500), torch.arange(500)
-    assert torch.equal(split_scores(rows, of, 10, 0.5), split_scores(dict(rows), of.clone(), 10, 0.5))
-
-
 # In density control
-
-
-def test_candidates_that_are_passed_over_stay() -> None:
-    rows = make_rows(100)
-    rows["log_scales"][:10] = -9.0  # small ones, which are cloned
-    gradients = torch.where(torch.arange(100) % 4 == 3, 0.0, 1.0)
-    result = change(rows, gradients)
-    candidates = (gradients > 0) & (torch.arange(100) >= 10)
-    split = adaptive_split(rows, candidates, CONFIG)
-    assert 0 < int(split.sum()) < int(candidates.sum())
-    assert torch.equal(result.keep, ~split)
-    clones = int((gradients[:10] > 0).sum())
-    assert len(result.added["means"]) == clones + 2 * int(split.sum())
-    children = {name: row[clones:] for name, row in result.added.items()}
-    assert torch.equal(children["dynamics"], rows["dynamics"][split].repeat(2, 1))
-    assert torch.allclose(children["log_scales"], rows["log_scales"][split].repeat(2, 1) - math.log(1.6))
 
 
 def test_quantile_zero_is_the_plain_split() -> None:

@@ -26,8 +26,15 @@ from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.drawing import camera_gradient
 from lapgs_wgpu.splat.rasterize import upload_gaussians
 from lapgs_wgpu.splat.rasterizer import Rasterizer
-from lapgs_wgpu.train.camera_descent import ScenePoints, image_motion, whitening
-from lapgs_wgpu.train.camera_refinement import CameraRefinement, changed_camera, rotation_of, rotation_vector
+from lapgs_wgpu.train.camera_refinement import (
+    CameraRefinement,
+    ScenePoints,
+    changed_camera,
+    image_motion,
+    rotation_of,
+    rotation_vector,
+    whitening,
+)
 from lapgs_wgpu.train.config import CamerasConfig
 from lapgs_wgpu.train.evaluate import evaluate, mean_psnr
 from lapgs_wgpu.train.fused_loss import render_loss
@@ -57,15 +64,6 @@ def test_rotations() -> None:
         R = rotation_of(vector)
         np.testing.assert_allclose(R, Rotation.from_rotvec(vector).as_matrix(), atol=1e-14)
         np.testing.assert_allclose(rotation_vector(R), vector, atol=1e-14)
-
-
-def test_cameras_without_corrections_are_the_files() -> None:
-    given = cameras()
-    refinement = refinement_of(given)
-    for camera in given:
-        refined = refinement.refined(camera).camera
-        np.testing.assert_allclose(refined.T_cam_world, camera.T_cam_world, atol=1e-14)
-        assert np.array_equal(refined.K, camera.K)
 
 
 def test_the_image_motion_is_the_derivative_of_the_projection() -> None:
@@ -196,14 +194,6 @@ def test_the_zoom_goes_down_its_gradient(sign: float, focal: bool, rows: int) ->
     assert not refinement._learnt.any()
 
 
-def test_cameras_stay_before_the_first_step() -> None:
-    refinement = refinement_of(cameras(), dataclasses.replace(CONFIG, start=10))
-    for number, moved in ((9, False), (10, True)):
-        refinement.values.grad = torch.randn(5, 7, generator=torch.Generator().manual_seed(0))
-        refinement.step(number)
-        assert bool(refinement._learnt.any()) == moved
-
-
 @pytest.mark.kernels
 def test_a_step_has_the_gradient_of_its_camera(device: Device) -> None:
     """That of the rasterizer for the gradient of the reference's loss; and it changes no other gradient."""
@@ -247,6 +237,7 @@ def refined_walk(device: Device) -> tuple[Trainer, list[Camera]]:
     return training, true
 
 
+@pytest.mark.nightly
 def test_disturbed_poses_are_found_again(refined_walk: tuple[Trainer, list[Camera]]) -> None:
     training, true = refined_walk
     given = training.dataset.cameras
@@ -256,6 +247,7 @@ def test_disturbed_poses_are_found_again(refined_walk: tuple[Trainer, list[Camer
     assert np.median(after[1]) < 0.5 * np.median(before[1])  # 0.41 here, 0.2 after 1,500 steps (docs/data.md)
 
 
+@pytest.mark.nightly
 def test_test_views_are_aligned_beside_the_unaligned_measures(
     refined_walk: tuple[Trainer, list[Camera]], tmp_path: Path
 ) -> None:
@@ -283,27 +275,22 @@ def test_test_views_are_aligned_beside_the_unaligned_measures(
     assert np.array_equal(again.T_cam_world, near[0].T_cam_world)
 
 
-def test_byte_equal_repeat_and_resume(
+def test_an_interrupted_run_goes_on_to_the_same_bytes(
     device: Device, dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = configure(cameras__refine="on", cameras__start="5", schedule__save_interval="12")
     train(config, dataset, tmp_path / "one", device=device)
-    train(config, dataset, tmp_path / "two", device=device)
     with monkeypatch.context() as patched:
         interrupt_at(20, patched)
         with pytest.raises(KeyboardInterrupt):
             train(config, dataset, tmp_path / "three", device=device)
     resume(config, dataset, tmp_path / "three", device=device)
-    bytes_of = [(tmp_path / name / "checkpoint.ply").read_bytes() for name in ("one", "two", "three")]
-    assert bytes_of[0] == bytes_of[1] == bytes_of[2]
+    bytes_of = [(tmp_path / name / "checkpoint.ply").read_bytes() for name in ("one", "three")]
+    assert bytes_of[0] == bytes_of[1]
     cameras = json.loads((tmp_path / "one/metrics.json").read_text())["training"]["cameras"]
     assert 0 < cameras["rotation_degrees"]["median"] < 5
     assert len(cameras["cameras"]) == len(dataset.cameras)
     assert len(json.loads((tmp_path / "one/metrics.json").read_text())["aligned"]["views"]) == len(dataset.test)
-    kept = configure(cameras__refine="off", schedule__save_interval="12")
-    train(kept, dataset, tmp_path / "kept", device=device)
-    assert (tmp_path / "kept/checkpoint.ply").read_bytes() != bytes_of[0]
-    assert "cameras" not in json.loads((tmp_path / "kept/metrics.json").read_text())["training"]
 
 
 @pytest.mark.parametrize(("refine", "own", "refined"), [("auto", True, True), ("auto", False, False),
@@ -327,6 +314,7 @@ def test_what_discovery_corrected_stays_corrected(device: Device, dataset: Datas
         assert any(np.abs(a.T_cam_world - b.T_cam_world).max() > 1e-7 for a, b in zip(start, later, strict=True))
 
 
+@pytest.mark.nightly
 def test_training_views_are_measured_by_their_corrected_cameras(
     refined_walk: tuple[Trainer, list[Camera]],
 ) -> None:

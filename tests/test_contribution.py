@@ -17,8 +17,8 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train import density_control, trainer
 from lapgs_wgpu.train.config import Config
-from lapgs_wgpu.train.contribution import contributions
 from lapgs_wgpu.train.densify import published_rule
+from lapgs_wgpu.train.density_control import contributions
 from lapgs_wgpu.train.distributed import Ranks
 from lapgs_wgpu.train.optimizer import Optimizer
 from lapgs_wgpu.train.presets import load_config

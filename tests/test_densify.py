@@ -13,7 +13,7 @@ from torch import Tensor
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.rasterize import Rendering
 from lapgs_wgpu.train.config import DensityConfig
-from lapgs_wgpu.train.densify import Change, Statistics, densify, prunable, reset_opacities, split_rows
+from lapgs_wgpu.train.densify import Change, Statistics, densify, reset_opacities, split_rows
 from lapgs_wgpu.train.presets import load_config
 
 CONFIG = dataclasses.replace(load_config("dnerf").density, max_screen_radius=20)
@@ -65,13 +65,6 @@ def test_statistics_are_means_over_visible_views_in_normalised_device_coordinate
     assert statistics.radii.tolist() == [4, 7, 0]
 
 
-def test_statistics_need_a_backward_pass() -> None:
-    drawn = rendering([1], [[0.0, 0.0]])
-    drawn.means2d.grad = None
-    with pytest.raises(ValueError, match="backward"):
-        Statistics.zeros(1, torch.device("cpu")).add(drawn, Camera(np.eye(3), np.eye(4), 8, 8))
-
-
 def test_small_ones_are_cloned_and_large_ones_split() -> None:
     rows = make_rows([SMALL, SMALL, LARGE, LARGE])
     result = change(rows, make_statistics([1e-3, 1e-5, 1e-3, 1e-5]))
@@ -85,11 +78,6 @@ def test_small_ones_are_cloned_and_large_ones_split() -> None:
     for name in ("quats", "opacity_logits", "dynamics"):
         assert torch.equal(children[name], rows[name][[2, 2]])
     assert not torch.equal(children["means"][0], children["means"][1])
-
-
-def test_threshold_of_the_gradient() -> None:
-    result = change(make_rows([SMALL] * 2), make_statistics([CONFIG.gradient * 1.01, CONFIG.gradient * 0.99]))
-    assert len(result.added["means"]) == 1
 
 
 def test_children_are_distributed_like_their_parent() -> None:
@@ -144,11 +132,6 @@ def test_children_are_not_judged_by_their_parents_radius() -> None:
     assert len(result.added["means"]) == 1
 
 
-def test_no_bound_on_opacity() -> None:
-    config = dataclasses.replace(CONFIG, min_opacity=0.0)
-    assert not prunable(make_rows([SMALL], [1e-6]), torch.zeros(1), config, EXTENT, bound_sizes=False).any()
-
-
 def test_reset_lowers_only() -> None:
     logits = torch.tensor([0.9, 0.009, 0.01]).logit()
     assert reset_opacities(logits, 0.01).sigmoid().tolist() == pytest.approx([0.01, 0.009, 0.01], rel=1e-5)
@@ -159,11 +142,6 @@ def test_nothing_is_left_to_change() -> None:
     result = change(rows, Statistics.zeros(0, torch.device("cpu")))
     assert len(result.keep) == 0
     assert all(len(row) == 0 for row in result.added.values())
-
-
-def test_same_seed_same_children() -> None:
-    first, second = (change(make_rows([LARGE] * 50), make_statistics([1.0] * 50)) for _ in range(2))
-    assert all(torch.equal(first.added[name], second.added[name]) for name in first.added)
 
 
 def test_schedule() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
-from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -38,7 +37,6 @@ from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.optimizer import Optimizer
 from lapgs_wgpu.train.presets import load_config
-from lapgs_wgpu.train.resolve_config import resolve_for_dataset
 from lapgs_wgpu.train.start import max_field_rates
 from lapgs_wgpu.train.static_config import static_config
 from lapgs_wgpu.train.trainer import Trainer
@@ -128,6 +126,7 @@ def test_surface_points_lie_on_the_ball_at_every_time(residuals: list[Residual])
     assert np.allclose(np.concatenate([c.colors for c in clouds.clouds]), (0.9, 0.5, 0.2), atol=1e-5)
 
 
+@pytest.mark.nightly
 def test_a_camera_that_walks_slowly_sees_what_moves_in_the_middle_of_the_scene() -> None:
     """Its images of neighbouring times agree on depths that the ball's own motion feigns."""
     times = np.linspace(0, 1, 60)
@@ -234,18 +233,6 @@ def test_a_trajectory_does_not_change_over_to_another_color_at_a_crossing() -> N
         assert min(np.linalg.norm(each.centers - center, axis=1)[[0, 10, 50, 59]].max() for each in found) < RADIUS
 
 
-def test_points_without_a_group_have_no_trajectory() -> None:
-    empty = Points(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), np.zeros(0, np.float32))
-    assert find_trajectories(PointClouds(np.linspace(0, 1, 9), (empty,) * 9), LINK, BOX) == []
-
-
-def test_what_is_fast_is_followed_over_the_whole_clip() -> None:
-    center = fast_path(np.linspace(0, 1, 100))
-    tracks = find_tracks(balls(center), BOX)
-    assert tracks is not None
-    assert (errors(tracks, center) < 0.8).mean() > 0.9
-
-
 def test_two_balls_are_followed_over_the_whole_clip() -> None:
     t = np.linspace(0, 1, 80)
     one = path(t)
@@ -259,6 +246,7 @@ def test_two_balls_are_followed_over_the_whole_clip() -> None:
         assert (errors(tracks, center) < 0.8).mean() > 0.95
 
 
+@pytest.mark.nightly
 def test_a_track_is_not_drawn_to_the_side_that_is_seen() -> None:
     """Each time shows one side, whose points are half a radius from the center on average."""
     center = path(np.linspace(0, 1, 80))
@@ -269,6 +257,7 @@ def test_a_track_is_not_drawn_to_the_side_that_is_seen() -> None:
     assert np.median(wander) < 0.2 * RADIUS
 
 
+@pytest.mark.nightly
 def test_a_ball_that_is_hidden_for_a_while_is_found_again() -> None:
     center = path(np.linspace(0, 1, 80))
     tracks = find_tracks(balls(center, gone=range(50, 54)), BOX)
@@ -277,6 +266,7 @@ def test_a_ball_that_is_hidden_for_a_while_is_found_again() -> None:
     assert not tracks.supported[51].any()
 
 
+@pytest.mark.nightly
 def test_a_ball_that_enters_late_has_a_key_time_of_its_own() -> None:
     first, late = path(np.linspace(0, 1, 60)), np.tile([0.0, 0.0, -0.9], (60, 1))
     early, both = balls(first), balls(first, late)
@@ -294,6 +284,7 @@ def test_patches_that_come_and_go_are_not_followed() -> None:
     assert find_tracks(balls(leaping), BOX) is None
 
 
+@pytest.mark.nightly
 def test_a_slow_ball_is_followed_though_its_points_jitter(monkeypatch: pytest.MonkeyPatch) -> None:
     """It jitters by more than it moves from time to time, as what leaps does, but always explains as many points."""
     center = np.linspace([-0.5, 0, 0], [0.5, 0, 0], 120)
@@ -303,14 +294,6 @@ def test_a_slow_ball_is_followed_though_its_points_jitter(monkeypatch: pytest.Mo
     assert errors(tracks, center).max() < 0.5
     monkeypatch.setattr("lapgs_wgpu.discovery.tracks.EVEN", 0.0)
     assert find_tracks(clouds, BOX) is None
-
-
-def test_the_same_points_give_the_same_tracks() -> None:
-    clouds = balls(path(np.linspace(0, 1, 30)))
-    one, other = find_tracks(clouds, BOX), find_tracks(clouds, BOX)
-    assert one is not None
-    assert other is not None
-    assert all(np.array_equal(a, b) for a, b in zip(one, other, strict=True))
 
 
 # The static fit and what it loses ------------------------------------------------------------------------------------
@@ -421,7 +404,9 @@ def test_what_is_exposed_otherwise_does_not_move(device: Device, monkeypatch: py
 # The field, and all together -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", ["laplacian", "grid4d", "hexplane", "mlp"])
+@pytest.mark.parametrize(
+    "kind", ["laplacian", *(pytest.param(kind, marks=pytest.mark.nightly) for kind in ("grid4d", "hexplane", "mlp"))]
+)
 def test_every_field_learns_tracks(device: Device, kind: str) -> None:
     center = path(np.linspace(0, 1, 20)) * 0.5
     config = load_config("tiny", {k: v for k, v in QUICK.items() if k.startswith("field.")}, method=kind).field
@@ -461,6 +446,7 @@ class Fading(nn.Module):
         return Deformation(d_dc=(t * self.rate).expand(len(means), -1))
 
 
+@pytest.mark.nightly
 def test_a_field_that_moves_nothing_starts_from_the_static_fit(dataset: Dataset, device: Device) -> None:
     config = configure()
     config = dataclasses.replace(config, field=dataclasses.replace(config.field, kind="own"))
@@ -470,26 +456,34 @@ def test_a_field_that_moves_nothing_starts_from_the_static_fit(dataset: Dataset,
     assert not found.field_fitted
 
 
-def test_discovery_starts_a_training_which_goes_on_to_the_same_bits(dataset: Dataset, device: Device) -> None:
-    config = resolve_for_dataset(configure(), dataset)
-    found = discover(config, dataset, device)
-    assert "moving parts" in found.summary
-    with closing(Trainer(config, dataset, device, scene=found.scene)) as whole:
-        before = found.scene.parameters["means"].detach().clone()
+@pytest.fixture(scope="module")
+def started(dataset: Dataset, device: Device) -> tuple[str, dict[str, np.ndarray]]:
+    """What discovery found, and the state of the training that starts from it."""
+    with start_training(configure(), dataset, device) as training:
+        assert training.discovery is not None
+        return training.discovery, training.state()
+
+
+def test_discovery_starts_a_training_which_goes_on_to_the_same_bits(
+    started: tuple[str, dict[str, np.ndarray]], dataset: Dataset, device: Device
+) -> None:
+    summary, state = started
+    assert "moving parts" in summary
+    assert state["training.warm_up"] == 0
+    states = []
+    with Trainer(configure(), dataset, device) as whole:
+        whole.restore(state)
         whole.step()
         field = whole.scene.field
         assert field is not None
         assert any(p.grad is not None and p.grad.abs().sum() > 0 for p in field.parameters())  # from the first step on
-        assert not torch.equal(before, whole.scene.parameters["means"])
-        for _ in range(4):
-            whole.step()
-        state = {name: value.copy() for name, value in whole.state().items()}
-        for _ in range(5):
+        assert not np.array_equal(state["gaussians.means"], whole.scene.parameters["means"].numpy(force=True))
+        for _ in range(8):
+            states.append(whole.state())
             whole.step()
         expected = whole.state()
-    with closing(Trainer(config, dataset, device)) as resumed:
-        resumed.restore(state)
-        assert int(resumed.state()["training.warm_up"]) == 0
+    with Trainer(configure(), dataset, device) as resumed:
+        resumed.restore(states[3])
         for _ in range(5):
             resumed.step()
         ours = resumed.state()
@@ -505,12 +499,11 @@ def test_a_training_draws_a_scene_that_it_starts_from_as_it_is_drawn(dataset: Da
         Trainer(config, dataset, device, scene=scene)
 
 
-@pytest.mark.parametrize(("warm_up", "first"), [(10, 0.1), (0, 1 / RAMP_STEPS)])
 def test_rates_rise_after_discovery(
-    dataset: Dataset, device: Device, monkeypatch: pytest.MonkeyPatch, warm_up: int, first: float
+    started: tuple[str, dict[str, np.ndarray]], dataset: Dataset, device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Also in presets without a warm-up, and on from where they were in a training that is resumed."""
-    shares = []
+    """And on from where they were in a training that is resumed."""
+    shares: list[float] = []
     step = Optimizer.step
 
     def noted(self: Optimizer, number: int, share: float = 1.0) -> None:
@@ -518,33 +511,28 @@ def test_rates_rise_after_discovery(
         step(self, number, share)
 
     monkeypatch.setattr(Optimizer, "step", noted)
-    config = configure(schedule__warm_up=str(warm_up))
-    with closing(start_training(config, dataset, device)) as training:
-        shares.clear()  # those of discovery
-        for _ in range(2):
+    ramp = configure().schedule.warm_up or RAMP_STEPS
+    state = started[1]
+    for _ in range(2):
+        with Trainer(configure(), dataset, device) as training:
+            training.restore(state)
             training.step()
-        state = training.state()
-    with closing(Trainer(config, dataset, device)) as resumed:
-        resumed.restore(state)
-        for _ in range(10):
-            resumed.step()
-    assert shares == pytest.approx([min(1, first * (1 + i)) for i in range(12)])
+            state = training.state()
+    assert shares == pytest.approx([1 / ramp, 2 / ramp])
 
 
-def test_a_field_that_knows_the_tracks_learns_slowly_also_when_resumed(dataset: Dataset, device: Device) -> None:
+def test_a_field_that_knows_the_tracks_learns_slowly_also_when_resumed(
+    started: tuple[str, dict[str, np.ndarray]], dataset: Dataset, device: Device
+) -> None:
     config = configure()
     assert config.rates.mlp.start > max_field_rates(["mlp"])["mlp"]
-    with closing(start_training(config, dataset, device)) as training:
-        assert training._optimizer.highest == max_field_rates(["hash", "mlp"])
-        state = training.state()
-    with closing(Trainer(config, dataset, device)) as resumed:
+    with Trainer(config, dataset, device) as resumed:
         assert resumed._optimizer.highest == {}
-        resumed.restore(state)
+        resumed.restore(started[1])
         assert resumed._optimizer.highest == max_field_rates(["hash", "mlp"])
-    with closing(start_training(configure(discovery__least="1"), dataset, device)) as training:
-        assert training._optimizer.highest == {}  # nothing was added
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("nearly_all", [0.0, 1.01])
 def test_a_field_that_knows_nearly_all_that_moves_keeps_it(
     dataset: Dataset, device: Device, monkeypatch: pytest.MonkeyPatch, nearly_all: float
@@ -555,6 +543,7 @@ def test_a_field_that_knows_nearly_all_that_moves_keeps_it(
     assert found.field_fitted == (nearly_all == 0)
 
 
+@pytest.mark.nightly
 def test_without_parts_to_follow_the_static_fit_starts_a_training(dataset: Dataset, device: Device) -> None:
     config = configure(discovery__least="1")
     static, _, _ = static_fit(config, dataset, device, lambda step: None)
@@ -565,6 +554,7 @@ def test_without_parts_to_follow_the_static_fit_starts_a_training(dataset: Datas
     assert np.array_equal(np.sort(ours.numpy(force=True), axis=0), np.sort(theirs.numpy(force=True), axis=0))
 
 
+@pytest.mark.nightly
 def test_a_whole_run_repeats_to_the_last_byte(dataset: Dataset, device: Device, tmp_path: Path) -> None:
     for name in ("one", "other"):
         train(configure(), dataset, tmp_path / name, device=device)
@@ -578,7 +568,7 @@ def test_images_that_show_nothing_are_refused(dataset: Dataset, device: Device) 
 
     views = tuple(dataclasses.replace(view, pixels=empty) for view in dataset.train)
     with pytest.raises(InputError, match="show nothing but the black background"):
-        discover(configure(), dataclasses.replace(dataset, train=views), device)
+        discover(configure(discovery__steps="4"), dataclasses.replace(dataset, train=views), device)
 
 
 def test_short_trainings_go_without(

@@ -48,6 +48,7 @@ def test_gradients_of_a_step_are_the_mean_over_its_views(
     torch.testing.assert_close(seen_both, seen_first + seen_second, rtol=1e-4, atol=1e-9)
 
 
+@pytest.mark.nightly
 def test_a_batch_repeats_to_the_last_bit(dataset: Dataset, device: Device, tmp_path: Path) -> None:
     for name in ("a", "b"):
         train(configure(schedule__batch="3", schedule__steps="14"), dataset, tmp_path / name, device=device)
@@ -112,6 +113,7 @@ torch.optim.Adam([weight])
 """
 
 
+@pytest.mark.nightly
 @pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="lists threads by Linux's /proc")
 def test_threads_of_the_group_end_before_python_does() -> None:
     """Else they abort the process, once in some tens of runs."""
@@ -154,15 +156,12 @@ def check_two_processes(config: Config, dataset: Dataset, device: Device, folder
 
 
 def test_two_processes_are_one_with_two_views(dataset: Dataset, data: Path, device: Device, tmp_path: Path) -> None:
-    """And they give the same bits on each repetition."""
-    given = {"schedule__batch": "2", "schedule__steps": "24", "acceleration__weight": "1"}
+    given = {"schedule__batch": "2", "schedule__steps": "12", "acceleration__weight": "1"}
     config = configure(data__path=str(data), **given)
     check_two_processes(config, dataset, device, tmp_path)
-    torchrun(tmp_path / "small.toml", tmp_path / "again")
-    two, again = ((tmp_path / name / "checkpoint.ply").read_bytes() for name in ("two", "again"))
-    assert two == again
 
 
+@pytest.mark.nightly
 def test_two_processes_discover_the_same(device: Device, tmp_path: Path) -> None:
     data = write_motion(tmp_path / "scene", MotionScene(path=4, cycles=1), size=32, train_times=24, test_views=2)
     steps = {"schedule__steps": "46", "discovery__steps": "40", "discovery__field_steps": "20"}

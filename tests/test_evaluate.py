@@ -21,10 +21,8 @@ from lapgs_wgpu.io.safetensors_file import pack_tensors
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.scene import Scene4D, load
 from lapgs_wgpu.splat.camera import Camera
-from lapgs_wgpu.splat.drawing import Drawing
-from lapgs_wgpu.splat.rasterizer import Rasterizer
 from lapgs_wgpu.train.evaluate import evaluate, mean_psnr, side_by_side, to_8_bit, write_metrics
-from lapgs_wgpu.train.image_metrics import MS_SSIM_SMALLEST, masked_ssim, ms_ssim, psnr
+from lapgs_wgpu.train.image_metrics import MS_SSIM_SMALLEST, masked_ssim, ms_ssim
 from lapgs_wgpu.train.lpips import BLOCKS, Lpips
 
 CAMERA = Camera.looking_at([0, -4, 0], [0, 0, 0], up=[0, 0, 1], fov_x=0.7, width=24, height=16)
@@ -81,20 +79,6 @@ def test_no_views_are_told(scene: Scene4D) -> None:
     for measure in (evaluate, mean_psnr):
         with pytest.raises(InputError, match="no views to measure"):
             measure(scene, (), "black")
-
-
-def test_no_depth_is_drawn(scene: Scene4D, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It takes a tenth of the time, and another plane to read back."""
-    asked = []
-    draw = Rasterizer.draw
-
-    def spy(self: Rasterizer, *arguments: Any, depth: bool = False, **options: Any) -> Drawing:
-        asked.append(depth)
-        return draw(self, *arguments, depth=depth, **options)
-
-    monkeypatch.setattr(Rasterizer, "draw", spy)
-    evaluate(scene, [view("a", np.zeros((16, 24, 3), np.uint8))], "black")
-    assert set(asked) == {False}
 
 
 @pytest.mark.parametrize(("background", "value"), [("black", 0), ("white", 255), ("random", 0)])
@@ -203,18 +187,6 @@ def test_masked_ssim_written_out(name: str) -> None:
     assert (np.array(values)[:, -1, -1] == 1).all() == (name in ("blob", "one pixel"))
 
 
-def test_masked_ssim_of_all_pixels_is_that_of_the_windows_inside() -> None:
-    a, b = pictures(31, 28)
-    x = np.exp(-(np.arange(-5, 6) ** 2) / 4.5)
-    window = np.outer(x, x) / x.sum() ** 2
-    values = []
-    for p, q in zip(a.permute(2, 0, 1).numpy(), b.permute(2, 0, 1).numpy(), strict=True):
-        mp, mq, pp, qq, pq = (convolve2d(plane, window, "valid") for plane in (p, q, p * p, q * q, p * q))
-        similar = (2 * (pq - mp * mq) + 0.03**2) / (pp - mp**2 + qq - mq**2 + 0.03**2)
-        values.append(similar * (2 * mp * mq + 0.01**2) / (mp**2 + mq**2 + 0.01**2))
-    assert float(masked_ssim(a, b, torch.ones(31, 28, dtype=torch.bool))) == pytest.approx(np.mean(values), abs=1e-9)
-
-
 def test_masked_measures_see_the_pixels_of_the_mask_alone(scene: Scene4D, tmp_path: Path) -> None:
     drawn = to_8_bit(scene.render(CAMERA, 0.5).image)
     mask = np.zeros((16, 24), bool)
@@ -232,15 +204,6 @@ def test_masked_measures_see_the_pixels_of_the_mask_alone(scene: Scene4D, tmp_pa
     write_metrics(tmp_path, metrics)
     with (tmp_path / "metrics.csv").open(newline="") as file:
         assert [float(row["masked_psnr"]) for row in csv.DictReader(file)] == [first["masked_psnr"]] * 2
-
-
-def test_a_mask_of_all_pixels_changes_no_psnr(scene: Scene4D) -> None:
-    noise = np.random.default_rng(0).integers(0, 256, (16, 24, 3), np.uint8)
-    metrics = evaluate(scene, [view("a", noise, np.ones((16, 24), bool))], "black")
-    assert metrics["masked_psnr"] == metrics["psnr"]
-    a, b = (image.float() for image in pictures(203, 301))
-    every = torch.ones(203, 301, dtype=torch.bool)
-    assert psnr(a[every], b[every]) == psnr(a, b)
 
 
 def test_what_no_mask_measures_is_not_available(scene: Scene4D) -> None:
@@ -323,6 +286,7 @@ def test_lpips_is_measured_where_there_are_weights(
     assert 0 < metrics["lpips"] != metrics["lpips_unscaled"] > 0
 
 
+@pytest.mark.nightly
 def test_a_training_with_weights_measures_lpips_of_its_test_views(
     data: Path, dataset: Dataset, device: Device, tmp_path: Path, network: tuple[Path, torch.nn.Sequential, Any]
 ) -> None:

@@ -12,7 +12,7 @@ import torch
 from lapgs_wgpu import Parts, Regularizer, Trainer, load_config, load_dataset
 from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.train.host_threads import step_threads, torch_threads
+from lapgs_wgpu.train.host_threads import step_threads
 
 
 @pytest.fixture
@@ -33,15 +33,6 @@ def test_one_on_a_processor_where_torch_has_little_to_share(device: Device, monk
         assert step_threads(field, device) is None
     monkeypatch.setenv("OMP_NUM_THREADS", "3")
     assert step_threads(small, device) is None, "what the user chose stands"
-
-
-@pytest.mark.usefixtures("two_threads")
-def test_the_number_comes_back() -> None:
-    with torch_threads(1):
-        assert torch.get_num_threads() == 1
-    assert torch.get_num_threads() == 2
-    with torch_threads(None):
-        assert torch.get_num_threads() == 2
 
 
 @pytest.mark.usefixtures("two_threads")

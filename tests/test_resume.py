@@ -49,7 +49,9 @@ def whole(dataset: Dataset, device: Device, tmp_path_factory: pytest.TempPathFac
 
 
 # In the warm-up, after it, at a change of density, at a reset, with an epoch just over, at the last step but one.
-@pytest.mark.parametrize("at", [4, 11, 20, 25, 16, STEPS - 1])
+@pytest.mark.parametrize(
+    "at", [4, 20, *(pytest.param(at, marks=pytest.mark.nightly) for at in (11, 25, 16, STEPS - 1))]
+)
 def test_an_interrupted_run_goes_on_to_the_same_bytes(
     at: int, whole: Path, dataset: Dataset, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -66,6 +68,7 @@ def test_an_interrupted_run_goes_on_to_the_same_bytes(
     assert {file.name for file in (tmp_path / "run").iterdir()} == {file.name for file in whole.iterdir()}
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("method", ["static", "mlp", "hexplane", "grid4d"])
 def test_every_field_goes_on_to_the_same_bytes(
     method: str, dataset: Dataset, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -311,6 +314,7 @@ def moments(seed: int, longest: float) -> Iterator[float]:
         yield draw.uniform(0.0, longest)
 
 
+@pytest.mark.nightly
 def test_killed_at_random_moments_and_resumed(command: list[str], tmp_path: Path) -> None:
     """With SIGKILL, anywhere: at the start, between and during the writing of states, while it evaluates."""
     start = time.monotonic()

@@ -12,21 +12,20 @@ import pytest
 import torch
 from helpers.interrupts import interrupt_at
 from helpers.scenes import front_camera
-from helpers.training import STEPS, configure
+from helpers.training import configure
 from torch import Tensor, nn
 
 from lapgs_wgpu.data import Dataset
 from lapgs_wgpu.data.timestamps import time_step
 from lapgs_wgpu.data.views import View
-from lapgs_wgpu.discovery.start import start_training
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.fields.deformation import Deformation
 from lapgs_wgpu.motion.scene import Scene4D, load
-from lapgs_wgpu.motion.timing import EVEN, Timing
+from lapgs_wgpu.motion.timing import EVEN
 from lapgs_wgpu.run import resume, train
-from lapgs_wgpu.train import resolve_config, trainer
+from lapgs_wgpu.train import trainer
 from lapgs_wgpu.train.distributed import SINGLE_PROCESS, Ranks
 from lapgs_wgpu.train.timing_refinement import FARTHEST, TimingRefinement, image_to_fit, running_median
 from lapgs_wgpu.train.trainer import Trainer
@@ -83,15 +82,6 @@ def film(scene: Scene4D, moments: np.ndarray = MOMENTS) -> Callable[[View], Tens
     return lambda view: images[view.time]
 
 
-def test_more_times_than_a_checkpoint_holds_are_refused_at_once(
-    dataset: Dataset, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(resolve_config, "MOST_TIMES", len(dataset.times) - 1)
-    config = configure(timing__refine="true")
-    with pytest.raises(InputError, match=rf"has {len(dataset.times)} times, .* give --timing.refine false"):
-        resolve_config.resolve_for_dataset(config, dataset)
-
-
 def test_it_finds_which_moments_a_film_shows(device: Device) -> None:
     scene = moving(device)
     found = refinement(scene, film(scene))
@@ -100,23 +90,6 @@ def test_it_finds_which_moments_a_film_shows(device: Device) -> None:
     np.testing.assert_allclose(scene.timing.moments, MOMENTS, atol=1e-3)
     np.testing.assert_array_equal(scene.timing.times, TIMES)
     assert found.report()["frames_most"] == pytest.approx(0.4, abs=0.01)
-
-
-def test_one_step_is_that_of_least_squares(device: Device) -> None:
-    """Of images whose brightness grows evenly with the moment, the minimum itself; by half a gap at most."""
-    scene = moving(device)
-    shown = dict(zip(TIMES.tolist(), TIMES.tolist(), strict=True)) | {TIMES[3]: 0.33, TIMES[6]: 0.5, TIMES[7]: 0.71}
-
-    def picture(view: View) -> Tensor:
-        return torch.full((2, 2, 3), scene.timing(view.time))
-
-    found = TimingRefinement(
-        scene, views_at(TIMES), lambda view: torch.full((2, 2, 3), shown[view.time]), picture, 0.1, SINGLE_PROCESS
-    )
-    found.set(found.fitted(0))
-    expected = TIMES.copy()
-    expected[[3, 6, 7]] = 0.33, 0.55, 0.71
-    np.testing.assert_allclose(scene.timing.moments, expected, atol=1e-5)
 
 
 def test_what_all_images_have_in_common_is_left_to_the_field(device: Device) -> None:
@@ -150,30 +123,6 @@ def test_what_does_not_count_is_not_looked_at(device: Device) -> None:
     assert found[1] < 1e-3
 
 
-def test_what_stands_still_tells_no_times(device: Device) -> None:
-    scene = moving(device, speed=0.0)
-    other = moving(device)
-    found = refinement(scene, film(other))
-    found.set(found.fitted(0))
-    assert scene.timing is EVEN
-    assert found.report() == {"frames": 0.0, "frames_most": 0.0}
-
-
-def test_an_error_that_a_shift_hardly_mends_moves_nothing(device: Device) -> None:
-    scene = moving(device)
-    noise = np.random.default_rng(1).random((32, 48, 3)).astype(np.float32)
-    refine(scene, lambda view: torch.from_numpy(noise))
-    assert scene.timing is EVEN
-
-
-def test_a_picture_that_is_not_finite_moves_nothing(device: Device) -> None:
-    scene = moving(device)
-    with torch.no_grad():
-        scene.parameters["sh_dc"].fill_(torch.nan)
-    refine(scene, lambda view: torch.zeros(32, 48, 3))
-    assert scene.timing is EVEN
-
-
 def test_moments_rise_and_stay_near_their_times(device: Device) -> None:
     scene = moving(device)
     backwards = film(scene, MOMENTS[::-1])
@@ -182,41 +131,6 @@ def test_moments_rise_and_stay_near_their_times(device: Device) -> None:
         found.set(found.fitted(number))
     assert (np.diff(scene.timing.moments) >= 0).all()
     assert np.abs(scene.timing.moments - TIMES).max() <= FARTHEST * 0.1 + 1e-12
-
-
-def test_moments_beside_a_pause_stay_near_their_times(device: Device) -> None:
-    """By the usual gap, not by that of the pause."""
-    scene = moving(device)
-    times = [0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.8, 0.85, 0.9, 0.95, 1.0]
-    late = scene.render(CAMERA, 0.9).image
-    found = refinement(scene, lambda view: late if view.time == 0.8 else scene.render(CAMERA, view.time).image, times)
-    for number in range(6):
-        found.set(found.fitted(number))
-    assert np.abs(scene.timing.moments - times).max() <= FARTHEST * 0.05 + 1e-12
-    assert found.report()["frames_most"] == pytest.approx(FARTHEST)
-
-
-def test_it_goes_on_from_the_timing_of_the_scene(device: Device) -> None:
-    scene = moving(device)
-    shown = film(scene)
-    scene.timing = Timing(TIMES, MOMENTS)
-    found = refinement(scene, shown)
-    assert found.report()["frames_most"] == pytest.approx(0.4)
-    np.testing.assert_allclose(found.fitted(0), MOMENTS, atol=1e-3)
-
-
-def test_of_a_rig_it_takes_one_camera_after_the_other(device: Device) -> None:
-    scene = moving(device)
-    asked: list[str] = []
-
-    def truth(view: View) -> Tensor:
-        asked.append(view.name)
-        return scene.render(CAMERA, view.time).image
-
-    found = refinement(scene, truth, [0.0, 1.0, 0.0, 1.0, 1.0])
-    for number in range(3):
-        found.set(found.fitted(number))
-    assert asked == ["train_000", "train_001", "train_002", "train_003", "train_000", "train_004"]
 
 
 class Alone(Ranks):
@@ -263,7 +177,7 @@ def test_an_interrupted_training_goes_on_to_the_same_bytes(
     assert (tmp_path / "run" / "checkpoint.ply").read_bytes() == (tmp_path / "whole" / "checkpoint.ply").read_bytes()
 
 
-@pytest.mark.parametrize("moments", [[0.1, 0.2], [1.5] * 8, list(np.linspace(1, 0, 8))])
+@pytest.mark.parametrize("moments", [[0.1, 0.2], list(np.linspace(1, 0, 8))])
 def test_a_state_of_other_times_is_refused(dataset: Dataset, device: Device, moments: list[float]) -> None:
     with Trainer(configure(**GIVEN), dataset, device) as training:
         state = training.state() | {"timing.moments": np.array(moments)}
@@ -299,20 +213,6 @@ def test_a_correction_that_fails_changes_nothing(
             np.testing.assert_array_equal(value, before[name])
 
 
-def test_a_training_too_short_for_corrections_says_so(
-    dataset: Dataset, device: Device, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for start, told in ((STEPS - 1, False), (STEPS, True)):
-        start_training(configure(**GIVEN | {"timing__start": str(start)}), dataset, device).close()
-        note = f"no times are corrected in this training, since timing.start ({start}) is not below"
-        assert (note in capsys.readouterr().err) == told
-
-
-def test_static_scenes_have_no_timing(dataset: Dataset, device: Device) -> None:
-    with Trainer(configure("static", **GIVEN), dataset, device) as training:
-        assert training.timing is None
-
-
 def test_it_sees_what_the_losses_see(dataset: Dataset, device: Device) -> None:
     """Colors and cameras with their corrections; pixels that are ignored do not count."""
     ignored = np.zeros((32, 32), bool)
@@ -328,12 +228,3 @@ def test_it_sees_what_the_losses_see(dataset: Dataset, device: Device) -> None:
         truth = image_to_fit(first, torch.zeros(3))
         assert bool(truth[:5].isnan().all())
         assert not truth[5:].isnan().any()
-
-
-def test_measured_views_have_the_timing_of_the_training(dataset: Dataset, device: Device) -> None:
-    with Trainer(configure(**GIVEN), dataset, device) as training:
-        list(training)
-        training.scene.timing = EVEN
-        own = training.evaluate()["psnr"]
-        training.scene.timing = Timing(np.array([0.0, 1.0]), np.array([0.5, 0.5]))
-        assert training.evaluate()["psnr"] != own

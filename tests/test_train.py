@@ -232,12 +232,6 @@ def test_the_place_of_the_decoder_is_told_and_recorded(
     assert load_config(str(tmp_path / "gpu/config.toml")).decoder == "device"
 
 
-def test_another_seed_gives_another_model(dataset: Dataset, device: Device, tmp_path: Path) -> None:
-    train(configure(seed="1", schedule__steps="3"), dataset, tmp_path / "a", device=device)
-    train(configure(seed="2", schedule__steps="3"), dataset, tmp_path / "b", device=device)
-    assert (tmp_path / "a" / "checkpoint.ply").read_bytes() != (tmp_path / "b" / "checkpoint.ply").read_bytes()
-
-
 def test_nothing_moves_during_the_warm_up(dataset: Dataset, device: Device, tmp_path: Path) -> None:
     config = configure(schedule__steps="4")
     scene = train(config, dataset, tmp_path / "run", device=device)

@@ -56,7 +56,7 @@ def static_fit(config: Config, dataset: Dataset, device: Device, progress: Calla
         images.append(Residual(camera, view.time, image, still))
     corrections = None
     if refinement is not None:
-        known = {id(before.camera): after.camera for before, after in zip(picked, small, strict=True)}
-        numbers = {n: known[id(camera)] for n, camera in enumerate(dataset.cameras) if id(camera) in known}
+        known = {before.camera: after.camera for before, after in zip(picked, small, strict=True)}
+        numbers = {n: known[camera] for n, camera in enumerate(dataset.cameras) if camera in known}
         corrections = refinement.corrections_of(numbers)
     return StaticFit(training.scene, images, corrections)

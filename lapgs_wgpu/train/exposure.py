@@ -19,7 +19,7 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.train.learning_rate import Rate
-from lapgs_wgpu.train.row_adam import RowAdam, restore_rows
+from lapgs_wgpu.train.optimizer import RowAdam, restore_rows
 
 SQUARE_DECAY = 0.999  # Adam's
 

@@ -40,6 +40,20 @@ class RenderLoss(NamedTuple):
         return psnr_of(self.terms["mse"])
 
 
+class _Step(NamedTuple):
+    """What `_FusedLoss` takes besides tensors; see `render_loss`. wanted: whether any tensor wants a gradient."""
+
+    camera: Camera
+    camera_unit: float
+    antialiased: bool
+    truth: DeviceArray
+    background: tuple[float, float, float]
+    weights: LossWeights
+    device: Device
+    own: Sequence[tuple[TorchLoss | WgslLoss, float]]
+    wanted: bool
+
+
 # The passes of a device, whose buffers serve all calls of `render_loss`.
 image_loss_of, exposure_of = functools.cache(ImageLoss), functools.cache(ExposurePasses)
 
@@ -79,19 +93,8 @@ def render_loss(
     wanted = torch.is_grad_enabled() and any(tensor is not None and tensor.requires_grad for tensor in tensors)
     probe = gaussians.means.new_empty((len(gaussians), 2)).requires_grad_(wanted)
     red, green, blue = background.tolist()
-    loss, computed, radii, centres = _FusedLoss.apply(
-        *tensors,
-        probe,
-        camera,
-        camera_unit,
-        gaussians.antialiased,
-        truth,
-        (red, green, blue),
-        weights,
-        device,
-        wanted,
-        own,
-    )
+    step = _Step(camera, camera_unit, gaussians.antialiased, truth, (red, green, blue), weights, device, own, wanted)
+    loss, computed, radii, centres = _FusedLoss.apply(step, *tensors, probe)
     probe.data = centres
     names = ("l1", "mse", "ssim", "pyramid", "ncc", *(term.name for term, _ in own))
     used = (True, True, weights.ssim, weights.pyramid, weights.ncc, *[True] * len(own))
@@ -104,11 +107,22 @@ class _FusedLoss(torch.autograd.Function):
     host needs. backward: multiplies the gradients that are then already there."""
 
     @staticmethod
-    def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
-        *tensors, correction, change, probe, camera, unit, antialiased = arguments[:-6]
-        truth, background, weights, device, wanted, own = arguments[-6:]
+    def forward(
+        ctx: Any,
+        step: _Step,
+        means: Tensor,
+        quats: Tensor,
+        scales: Tensor,
+        opacities: Tensor,
+        sh: Tensor,
+        correction: Tensor | None,
+        change: Tensor | None,
+        probe: Tensor,
+    ) -> tuple[Tensor, ...]:
+        camera, unit, antialiased, truth, background, weights, device, own, wanted = step
         rasterizer, losses, exposing = rasterizer_of(device), image_loss_of(device), exposure_of(device)
-        gaussians = upload_gaussians(rasterizer.pool, Gaussians(*tensors, antialiased=antialiased))
+        leaves = Gaussians(means, quats, scales, opacities, sh=sh, antialiased=antialiased)
+        gaussians = upload_gaussians(rasterizer.pool, leaves)
         while True:
             drawing = rasterizer.draw(gaussians, camera, background, gradient=wanted)
             d_rows, d_gaussians = [], []
@@ -133,7 +147,7 @@ class _FusedLoss(torch.autograd.Function):
                 break
         ctx.gradients = None
         if gradients:
-            by_gaussians, d_means2d = gradient_tensors(gradients, tensors[3])
+            by_gaussians, d_means2d = gradient_tensors(gradients, opacities)
             by_correction = None if correction is None else correction.new_tensor(rows[0].sum(axis=0, dtype=np.float64))
             by_camera = None
             if change is not None:
@@ -149,7 +163,7 @@ class _FusedLoss(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *d_outputs: Any) -> tuple[Tensor | None, ...]:
         scaled = (None if gradient is None else d_outputs[0] * gradient for gradient in ctx.gradients)
-        return (*scaled, *[None] * 9)
+        return (None, *scaled)
 
 
 def _own_terms(

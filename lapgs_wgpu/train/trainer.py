@@ -25,8 +25,7 @@ from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.motion.timing import Timing, checked_timing
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.rasterize import rasterizer_of
-from lapgs_wgpu.train.camera_descent import scene_points
-from lapgs_wgpu.train.camera_refinement import CameraRefinement, RefinedCamera
+from lapgs_wgpu.train.camera_refinement import CameraRefinement, RefinedCamera, scene_points
 from lapgs_wgpu.train.config import BACKGROUND_LEVELS, Config
 from lapgs_wgpu.train.dataloader import ImageLoader
 from lapgs_wgpu.train.densify import Statistics
@@ -154,8 +153,8 @@ class Trainer:
         if config.timing.refine and scene.field is not None and len(dataset.times) > 2:
             truth = partial(image_to_fit, color=self._color)
             self.timing = TimingRefinement(scene, dataset.train, truth, self._picture, dataset.time_gap, self.ranks)
-        beside = (self._frequencies, self._exposures, self.cameras)
-        self._beside = [each for each in beside if each is not None]
+        refiners = (self._frequencies, self._exposures, self.cameras)
+        self._refiners = [each for each in refiners if each is not None]
         self._density = DensityControl(
             config,
             scene,
@@ -279,8 +278,8 @@ class Trainer:
         self.whole = False
         if skipped is None:
             self._optimizer.step(step, min(1.0, step / self._ramp_steps) if self._ramp_steps else 1.0)
-            for beside in self._beside:
-                beside.step(step)
+            for refiner in self._refiners:
+                refiner.step(step)
             # After the optimizer's step, so that no gradient is lost with the rows that change.
             if step < config.density.stop:
                 self._density.statistics.merge(self._seen_by_all(seen))
@@ -310,9 +309,9 @@ class Trainer:
 
     def _as_seen(self, views: Sequence[View]) -> list[View]:
         """The views, those by cameras of the training with the corrections of these."""
-        trained = {id(camera) for camera in self.dataset.cameras}
+        trained = set(self.dataset.cameras)
         return [
-            dataclasses.replace(view, camera=self._camera_of(view)) if id(view.camera) in trained else view
+            dataclasses.replace(view, camera=self._camera_of(view)) if view.camera in trained else view
             for view in views
         ]
 
@@ -330,11 +329,11 @@ class Trainer:
     def _gradients(self) -> dict[str, list[Tensor]]:
         """By group, of all parameters that have one."""
         gradients = self._optimizer.gradients()
-        return gradients | {each.name: [each.values.grad] for each in self._beside if each.values.grad is not None}
+        return gradients | {each.name: [each.values.grad] for each in self._refiners if each.values.grad is not None}
 
     def _zero_grad(self) -> None:
         self._optimizer.zero_grad()
-        for each in self._beside:
+        for each in self._refiners:
             each.values.grad = None
 
     def _all_reduce_gradients(self) -> None:
@@ -350,7 +349,7 @@ class Trainer:
         """Whether the step of these gradients is to be skipped, and why. Raises NumericalError for a parameter, whose
         values a step cannot mend."""
         parameters, gradients = self._optimizer.parameters(), self._gradients()
-        parameters |= {each.name: [each.values] for each in self._beside}
+        parameters |= {each.name: [each.values] for each in self._refiners}
         places = [each.means2d.grad for each in renderings if each.means2d.grad is not None]
         gradients |= {"the places in the image": places} if places else {}
         if not self.ranks.any_rank(not (math.isfinite(loss) and finite(parameters, gradients))):

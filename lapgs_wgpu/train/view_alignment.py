@@ -14,8 +14,7 @@ from torch import Tensor
 
 from lapgs_wgpu.data.views import View
 from lapgs_wgpu.motion.scene import Scene4D
-from lapgs_wgpu.train.camera_descent import CameraDescent, image_motion, scene_points, whitening
-from lapgs_wgpu.train.camera_refinement import changed_camera
+from lapgs_wgpu.train.camera_refinement import CameraDescent, changed_camera, image_motion, scene_points, whitening
 from lapgs_wgpu.train.config import LossWeights
 from lapgs_wgpu.train.fused_loss import render_loss
 from lapgs_wgpu.train.learning_rate import Rate
