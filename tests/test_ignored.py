@@ -17,7 +17,7 @@ from PIL import Image
 
 from lapgs_wgpu import cli
 from lapgs_wgpu.data import Dataset, load_dataset
-from lapgs_wgpu.data.small_views import small_views
+from lapgs_wgpu.data.views import small_views
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.splat.rasterize import rasterize

@@ -75,7 +75,7 @@ def read_objects(folder: Path, split: str, images: Sequence[str]) -> list[list[O
     path = folder / RECORD
     if not path.is_file():
         return [[] for _ in images]
-    listed = required(read_json(path, "format and objects"), "objects", path, _HINT)
+    listed = required(read_json(path).values, "objects", path, _HINT)
     if not isinstance(listed, list):
         raise InputError(f"{path}: objects must be a list, got {kind(listed)}.")
     result: list[list[ObjectRecord]] = [[] for _ in images]
