@@ -81,7 +81,9 @@ def load_dataset(
 
     def views(split: Split) -> tuple[View, ...]:
         chosen = [i for i in order if splits[i] == split]
-        return tuple(_view(split, n, shots[i], placed[shots[i].camera], times[i], ignored) for n, i in enumerate(chosen))
+        return tuple(
+            _view(split, n, shots[i], placed[shots[i].camera], times[i], ignored) for n, i in enumerate(chosen)
+        )
 
     return Dataset(
         folder.resolve().name,

@@ -48,8 +48,8 @@ def find_masks(folder: Path, names: Iterable[str], what: str) -> dict[str, Path]
             masks[name] = path
     if missing:
         raise InputError(
-            f"{folder} lacks {len(missing)} of {len(missing) + len(masks)} masks, such as that of {missing[0]}; there must be a "
-            f"PNG for {what}."
+            f"{folder} lacks {len(missing)} of {len(missing) + len(masks)} masks, such as that of {missing[0]}; there must "
+            f"be a PNG for {what}."
         )
     return masks
 
@@ -92,7 +92,7 @@ def check_ignored(masks: Mapping[str, Path], size: Size, *, black: bool) -> list
 
 
 def read_ignored(path: Path, undistortion: Undistortion | None, stored: Size, size: Size, *, black: bool) -> Mask:
-    """Decode the training mask of an image of (width, height) `stored` that is undistorted and shrunk to `size`: (H, W).
+    """Decode a training mask (H, W) of an image of (width, height) `stored` that is undistorted and shrunk to `size`.
 
     An output pixel is ignored if any of the mask's pixels that it covers is. black: whether black pixels are ignored,
     or white ones. Raises InputError.

@@ -17,9 +17,9 @@ from lapgs_wgpu.data.cloud import Cloud, in_view, views_of
 from lapgs_wgpu.data.focus import spread
 from lapgs_wgpu.data.frames import Frame
 from lapgs_wgpu.data.images import check_image, gray_thumbnail, size_text
-from lapgs_wgpu.data.thumbnails import BLURRED, EQUAL, THUMBNAIL, blurred, repeats, sharpness, sharpness_around
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.masks import check_measured
+from lapgs_wgpu.data.thumbnails import BLURRED, EQUAL, THUMBNAIL, blurred, repeats, sharpness, sharpness_around
 from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera

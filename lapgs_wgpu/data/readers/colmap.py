@@ -17,6 +17,7 @@ from lapgs_wgpu.data.cloud import Cloud
 from lapgs_wgpu.data.frames import Capture, Frame, Reader
 from lapgs_wgpu.data.images import SUFFIXES, check_image
 from lapgs_wgpu.data.json_fields import LARGEST_ENTRY, absent_image
+from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.poses import check_rotation
 from lapgs_wgpu.data.readers.colmap_model import (
     ColmapCamera,
@@ -27,7 +28,6 @@ from lapgs_wgpu.data.readers.colmap_model import (
     read_model,
 )
 from lapgs_wgpu.data.timestamps import ImageName, natural_key
-from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.listing import is_desktop_file
 from lapgs_wgpu.splat.camera import rotation_matrix

@@ -72,9 +72,7 @@ def _read_split(folder: Path, split: Split) -> list[Frame]:
             raise InputError(f"{entry.where}: time must lie in [0, 1], got {time:g}; divide by the clip's duration.")
         image = check_image(file)
         lens, name = read_lens(entry, data, image.size), ImageName(file_path)
-        frames.append(
-            Frame(image, lens, T_cam_world, entry.where, name, time=time, split=split, label=f"{index:03d}")
-        )
+        frames.append(Frame(image, lens, T_cam_world, entry.where, name, time=time, split=split, label=f"{index:03d}"))
     if split != "train":
         objects = read_objects(folder, split, [Path(str(frame.image)).stem for frame in frames])
         frames = [dataclasses.replace(frame, objects=records) for frame, records in zip(frames, objects, strict=True)]

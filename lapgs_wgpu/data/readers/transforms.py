@@ -50,8 +50,8 @@ def read_lens(frame: Fields, shared: Fields, image: Size) -> Lens:
     if model not in MODELS or source("is_fisheye").values.get("is_fisheye"):
         named = kind(model) if model not in MODELS else "is_fisheye"
         raise InputError(
-            f"{frame.where}: camera_model {named} is not among those that are read ({', '.join(MODELS)}); undistort the "
-            "images first."
+            f"{frame.where}: camera_model {named} is not among those that are read ({', '.join(MODELS)}); undistort "
+            "the images first."
         )
     values = {
         name: source(name).number(name, least, most)
