@@ -39,7 +39,7 @@ class Lens:
     tangential: tuple[float, float] = (0.0, 0.0)
 
     @property
-    def K(self) -> Array:
+    def K(self) -> Array:  # noqa: N802
         """(3, 3) intrinsics, the skew in row 0, column 1."""
         return np.array([[self.fx, self.skew, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
@@ -57,7 +57,8 @@ class Lens:
         """The same lens for images of another size."""
         x, y = width / self.width, height / self.height
         return Lens(
-            width, height, self.fx * x, self.fy * y, self.cx * x, self.cy * y, self.skew * x, self.radial, self.tangential
+            width, height, self.fx * x, self.fy * y, self.cx * x, self.cy * y, self.skew * x,
+            self.radial, self.tangential,
         )  # fmt: skip
 
     def project(self, rays: Array) -> Array:

@@ -48,8 +48,8 @@ def find_masks(folder: Path, names: Iterable[str], what: str) -> dict[str, Path]
             masks[name] = path
     if missing:
         raise InputError(
-            f"{folder} lacks {len(missing)} of {len(missing) + len(masks)} masks, such as that of {missing[0]}; there must "
-            f"be a PNG for {what}."
+            f"{folder} lacks {len(missing)} of {len(missing) + len(masks)} masks, such as that of {missing[0]}; add a "
+            f"PNG for {what}."
         )
     return masks
 

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from lapgs_wgpu.data.images import check_image
-from lapgs_wgpu.data.readers.colmap import IMAGES, SPARSE
 from lapgs_wgpu.data.masks import check_mask_folder
+from lapgs_wgpu.data.readers.colmap import IMAGES, SPARSE
 from lapgs_wgpu.data.timestamps import write_times
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.prepare.capture_folder import appearing

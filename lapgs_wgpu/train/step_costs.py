@@ -8,8 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lapgs_wgpu.data.views import small_views
-from lapgs_wgpu.data.views import Dataset
+from lapgs_wgpu.data.views import Dataset, small_views
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.config import Config

@@ -10,8 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lapgs_wgpu.data.views import small_views
-from lapgs_wgpu.data.views import Dataset, View, composite, spread_views
+from lapgs_wgpu.data.views import Dataset, View, composite, small_views, spread_views
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.camera_refinement import CameraRefinement, Corrections
