@@ -14,8 +14,8 @@ from torch import nn
 from lapgs_wgpu.data import Dataset, View, load_dataset
 from lapgs_wgpu.data.motion_scenes import MotionScene
 from lapgs_wgpu.data.motion_writer import write_motion
-from lapgs_wgpu.data.views import small_views
 from lapgs_wgpu.data.synthetic import camera_at, cameras
+from lapgs_wgpu.data.views import small_views
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.config import FieldConfig
