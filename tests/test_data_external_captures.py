@@ -256,7 +256,7 @@ REFUSED: dict[str, tuple[Callable[[Path, Device], Path], Callable[[Path], Any], 
     "a depth map that is none": (
         write_endonerf,
         lambda folder: (folder / "depth/000000.png").write_text("hello"),
-        ["not a readable depth map"],
+        ["000000.png"],
     ),
 }  # fmt: skip
 

@@ -303,7 +303,7 @@ BAD: dict[str, tuple[Change, list[str]]] = {
     "scale NaN": (json_file("scene", scale=math.nan), ["scene.json", "scale", "nan"]),
     "center of 2": (json_file("scene", center=[0, 0]), ["scene.json", "center"]),
     "near beyond far": (json_file("scene", near=9, far=2), ["scene.json", "near", "far"]),
-    "entry missing": (json_file("metadata", **{ID: None}), ["metadata.json", f"no field {ID}", "dataset.json"]),
+    "entry missing": (json_file("metadata", **{ID: None}), ["metadata.json", ID]),
     "no warp_id": (entry(warp_id=None), ["metadata.json", ID, "warp_id"]),
     "one time_id": (entry(time_id=4), ["metadata.json", "time_id"]),
     "warp_id of text": (entry(warp_id="4"), ["metadata.json", ID, "warp_id", '"4"']),
