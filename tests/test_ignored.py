@@ -170,6 +170,7 @@ def test_bad_masks_are_refused(masked: tuple[Path, Path], tmp_path: Path) -> Non
         load_dataset(capture, masks=tmp_path / "none")
 
 
+@pytest.mark.nightly
 def test_a_run_whose_masks_have_moved_is_resumed_and_evaluated(
     dataset: Dataset, data: Path, device: Device, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

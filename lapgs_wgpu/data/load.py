@@ -202,9 +202,7 @@ def _check_cloud(capture: Capture, shots: Sequence[_Shot], training: Sequence[Ca
         return []
     warnings = []
     if capture.own_footage:
-        first = {shot.camera: shot.frame.name.file for shot in reversed(shots)}  # a camera goes by its first image
-        cameras = list(dict.fromkeys(shot.camera for shot in shots))
-        names = [first[camera] for camera in cameras]
+        cameras, names = [shot.camera for shot in shots], [shot.frame.name.file for shot in shots]
         warnings = check_views(capture.cloud, cameras, names, capture.source, capture.axes_hint)
     check_cloud(capture.cloud, training, capture.source)
     return warnings

@@ -188,9 +188,12 @@ def check_in_view(dataset: Dataset, points: NDArray[np.floating]) -> list[str]:
 def check_views(cloud: Cloud, cameras: Sequence[Camera], names: Sequence[str], where: Path, axes: str) -> list[str]:
     """Warn about cameras that see no point of the cloud or hardly move, and about a sparse cloud.
 
-    cameras: distinct ones, in the coordinates of the cloud. names: the first image of each. axes: advice for cameras
-    that look the wrong way. Raises InputError if more than half of the cameras see no point.
+    cameras, names: of each image, in the coordinates of the cloud; a camera counts once, by its first image's name.
+    axes: advice for cameras that look the wrong way. Raises InputError if more than half of the cameras see no point.
     """
+    first_name = dict(zip(reversed(cameras), reversed(names), strict=True))
+    cameras = list(dict.fromkeys(cameras))
+    names = [first_name[camera] for camera in cameras]
     points = cloud.points.astype(np.float64)
     seen = np.array([views_of(points, [camera]).sum() for camera in cameras])
     blind = np.flatnonzero(seen == 0).tolist()
