@@ -9,7 +9,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -113,7 +113,8 @@ class StackedGaussians:
         K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
         camera = Camera(K, np.eye(4), WIDTH, HEIGHT)
         background = torch.tensor(BACKGROUND, dtype=torch.float32)
-        return tensors, rasterize(**tensors, camera=camera, background=background, device=device)
+        gaussians: dict[str, Any] = dict(tensors)  # arguments of rasterize by name
+        return tensors, rasterize(**gaussians, camera=camera, background=background, device=device)
 
 
 def image(device: Device) -> float:

@@ -283,6 +283,7 @@ def test_truncated_at_any_byte(tmp_path: Path) -> None:
             read_checkpoint(path)
 
 
+@pytest.mark.nightly
 @given(st.data())
 @settings(max_examples=400, deadline=None, derandomize=True)
 def test_mutated_checkpoints_are_refused_or_valid(

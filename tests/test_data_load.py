@@ -11,17 +11,23 @@ from helpers.captures import HEIGHT, WIDTH, cameras
 from lapgs_wgpu.data import Dataset, load, load_dataset
 from lapgs_wgpu.data.frames import Capture, Frame, Reader
 from lapgs_wgpu.data.images import ImageFile, check_image, decode, encode_png
+from lapgs_wgpu.data.lens import Lens, Undistortion
 from lapgs_wgpu.data.timestamps import ImageName, frame_numbers
-from lapgs_wgpu.data.undistort import Lens
 from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.splat.camera import Camera
 
 COUNT = 6
+
+
+def lens_of(camera: Camera, k1: float) -> Lens:
+    K = camera.K
+    return Lens(WIDTH, HEIGHT, K[0, 0], K[1, 1], K[0, 2], K[1, 2], radial=(k1, 0.0, 0.0))
 
 
 def read(folder: Path, image_size: int | None) -> Capture:
     """A format of images alone: poses on an arc, one lens with distortion, times by the file names."""
     frames = []
-    lens = Lens(cameras(1)[0].K, WIDTH, HEIGHT, (0.1, 0.0, 0.0))
+    lens = lens_of(cameras(1)[0], 0.1)
     for file, camera in zip(sorted(folder.glob("*.png")), cameras(COUNT), strict=True):
         frames.append(Frame(check_image(file), lens, camera.T_cam_world, str(file), ImageName(file.name)))
     return Capture(frames, None, folder)
@@ -57,15 +63,16 @@ def test_a_new_reader_gets_everything_else(folder: Path) -> None:
 
 def test_undistorting_leaves_the_color_of_transparent_pixels_behind() -> None:
     """A white disk on black that is transparent: all that is left of it is white."""
-    lens = Lens(cameras(1)[0].K, WIDTH, HEIGHT, (-0.2, 0.0, 0.0))
+    lens = lens_of(cameras(1)[0], -0.2)
+    undistortion = Undistortion(lens, lens.pinhole("here"))
     y, x = np.mgrid[:HEIGHT, :WIDTH]
     disk = np.hypot(x - WIDTH / 2, y - HEIGHT / 2) < HEIGHT / 3
     image = np.where(disk[..., None], 255, 0).astype(np.uint8).repeat(4, axis=2)
-    straight = lens.undistort(image, lens.pinhole("here"))
+    straight = undistortion.apply(image)
     alpha = straight[..., 3]
     assert ((alpha > 0) & (alpha < 255)).sum() > 50
     assert (straight[alpha > 0] >= 254)[:, :3].all()
-    np.testing.assert_array_equal(alpha, lens.undistort(image[..., :3], lens.pinhole("here"))[..., 0])
+    np.testing.assert_array_equal(alpha, undistortion.apply(image[..., :3])[..., 0])
 
 
 def test_a_name_without_a_frame_number_is_told_beside_one_with() -> None:

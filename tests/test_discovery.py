@@ -14,8 +14,8 @@ from motion_writer import write_motion
 from torch import nn
 
 from lapgs_wgpu.data import Dataset, View, load_dataset
-from lapgs_wgpu.data.small_views import small_views
 from lapgs_wgpu.data.synthetic import camera_at, cameras
+from lapgs_wgpu.data.views import small_views
 from lapgs_wgpu.discovery import discover as discover_module
 from lapgs_wgpu.discovery import static_fit as static_fit_module
 from lapgs_wgpu.discovery.acceptance import explained_share, rows_with, tracks_in_images

@@ -37,6 +37,8 @@ from lapgs_wgpu.viewer.cli import view_command
 from lapgs_wgpu.viewer.path import CameraPath
 from lapgs_wgpu.viewer.path_file import PathFile, read_path, write_path
 
+pytestmark = pytest.mark.nightly
+
 EVERY = bool(os.environ.get("LAPGS_FUZZ"))
 ERRORS = list(FAILING)
 

@@ -30,6 +30,8 @@ from hypothesis import strategies as st
 from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.gpu.device import Device
 
+pytestmark = pytest.mark.nightly
+
 MODEL = ("cameras", "images", "points3D")
 WORDS = [
     *(b"PINHOLE", b"OPENCV_FISHEYE", b" nan", b" inf", b" 1e308", b" 99999999999", b"#", b"\t", b" ../../x.png"),

@@ -57,6 +57,8 @@ from lapgs_wgpu.train.run_folder import STATE, check_state, load_state, save_sta
 from lapgs_wgpu.train.trainer import Trainer
 from lapgs_wgpu.viewer.path_file import read_path
 
+pytestmark = pytest.mark.nightly
+
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:

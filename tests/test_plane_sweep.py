@@ -71,6 +71,7 @@ def test_no_depth_is_beyond_the_stated_ones() -> None:
         assert found.min() >= planes[0]
 
 
+@pytest.mark.nightly
 def test_what_looks_the_same_everywhere_has_no_depth() -> None:
     data = rig(moments=2)
     blank = [dataclasses.replace(view, pixels=lambda: np.full((60, 80, 3), 90, np.uint8)) for view in data.train]
@@ -90,6 +91,7 @@ def test_other_captures_have_none(lacking: str) -> None:
     assert still_surface(data) is None
 
 
+@pytest.mark.nightly
 def test_a_training_starts_from_it() -> None:
     """As large a share of the points as of the pixels lies on the surface."""
     data, config = rig(), load_config("neu3d-tiny").points

@@ -213,6 +213,7 @@ def test_file_that_shrinks_while_it_is_read(tmp_path: Path, monkeypatch: pytest.
         read_ply(path)
 
 
+@pytest.mark.nightly
 @given(st.data())
 @settings(max_examples=400, deadline=None, derandomize=True)
 def test_mutated_files_are_refused_or_valid(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:

@@ -26,7 +26,7 @@ Size = tuple[int, int]  # (width, height) in pixels
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
 _FORMATS = ("PNG", "JPEG")  # no other decoder of Pillow gets a file
-ERRORS = (  # what Pillow raises; the last five for damage that it takes for valid data
+_ERRORS = (  # what Pillow raises; the last five for damage that it takes for valid data
     OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError,
     IndexError, KeyError, TypeError, struct.error, zlib.error,
 )  # fmt: skip
@@ -65,7 +65,7 @@ def check_image(path: Path, *, whole: bool = True) -> ImageFile:
             size, mode = file.size, file.mode
             if whole:
                 file.verify()
-    except ERRORS as error:
+    except _ERRORS as error:
         reason = "neither PNG nor JPEG" if isinstance(error, Image.UnidentifiedImageError) else error
         raise InputError(f"{path} is not a readable image ({reason}); copy or render it again.") from None
     if mode not in _EIGHT_BIT_MODES:
@@ -82,6 +82,14 @@ def decode(path: Path) -> Pixels:
         return iio.imread(file, plugin="pillow", index=0, mode="RGBA" if transparent else "RGB")
 
 
+def decode_gray(path: Path) -> NDArray[Any]:
+    """Decode a gray PNG of 8 or 16 bits: (H, W) levels. Raises InputError."""
+    with _decoding(path), Image.open(path, formats=("PNG",)) as file:
+        if file.mode not in ("L", "I", "I;16", "I;16B"):
+            raise ValueError(f"its pixels have the mode {file.mode}; it must be gray, of 8 or 16 bits")
+        return np.asarray(file)
+
+
 def gray_thumbnail(path: Path, side: int) -> NDArray[np.float32]:
     """Gray levels 0 to 255 of a small version of an image, its longer side at most `side`. Raises InputError."""
     with _decoding(path), Image.open(path, formats=_FORMATS) as file:
@@ -95,7 +103,7 @@ def gray_thumbnail(path: Path, side: int) -> NDArray[np.float32]:
 def _decoding(path: Path) -> Iterator[None]:
     try:
         yield
-    except ERRORS as error:
+    except _ERRORS as error:
         raise InputError(f"{path} cannot be decoded as an image ({error}); copy or render it again.") from None
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
@@ -15,13 +16,64 @@ from lapgs_wgpu.data.images import SUFFIXES
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io import safe_json_toml
 
+LARGEST_ENTRY = 1e9  # of a pose: matrix products of larger entries lose all digits
+LARGEST_SIDE = 1e5  # of an image, pixels
+LARGEST_INTRINSIC = 1e6  # pixels
 
-def read_json(path: Path, needs: str) -> dict[str, Any]:
-    """Read a file that holds a JSON object. needs: its expected content, for errors. Raises InputError."""
-    data = safe_json_toml.read_json(path)
-    if not isinstance(data, dict):
-        raise InputError(f"{path} must hold a JSON object with {needs}, got {kind(data)}.")
-    return data
+
+@dataclass(frozen=True)
+class Fields:
+    """The fields of a JSON object. where: file and entry, which begin each error."""
+
+    values: dict[str, Any]
+    where: str
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.values
+
+    def required(self, name: str) -> Any:
+        """Return a field of any type. Raises InputError where it is missing."""
+        return required(self.values, name, self.where, "which this format needs")
+
+    def number(self, name: str, least: float = -LARGEST_ENTRY, most: float = LARGEST_ENTRY) -> float:
+        """Return a finite number within bounds. Raises InputError."""
+        value = finite(self.required(name), name, self.where)
+        if not least <= value <= most:
+            raise InputError(f"{self.where}: {name} is {value:g}, and must be {least:g} to {most:g}.")
+        return value
+
+    def side(self, name: str) -> int:
+        """Return a side of an image in pixels. Raises InputError."""
+        return round(self.number(name, 1, LARGEST_SIDE))
+
+    def vector(self, name: str, length: int, default: list[float] | None = None) -> NDArray[np.float64]:
+        """Return (length,) finite numbers, `default` where the field is missing. Raises InputError."""
+        return vector(self.required(name) if default is None else self.values.get(name, default), length, name,
+                      self.where)  # fmt: skip
+
+    def entries(self, name: str, count: int | None = None) -> list[Any]:
+        """Return a list of at least one entry, or of `count`. Raises InputError."""
+        value = self.required(name)
+        if not isinstance(value, list) or not value or (count is not None and len(value) != count):
+            needed = "at least one entry" if count is None else f"{count} entries"
+            raise InputError(f"{self.where}: {name} must be a list of {needed}, got {kind(value)}.")
+        return value
+
+    def objects(self, name: str, what: str) -> list[Fields]:
+        """Return a list of objects. what: an entry, for errors. Raises InputError."""
+        return [as_fields(value, f"{self.where}, {what} {i}") for i, value in enumerate(self.entries(name))]
+
+
+def as_fields(value: Any, where: str) -> Fields:
+    """Check that a JSON value is an object. Raises InputError."""
+    if not isinstance(value, dict):
+        raise InputError(f"{where} must be a JSON object, got {kind(value)}.")
+    return Fields(value, where)
+
+
+def read_json(path: Path) -> Fields:
+    """Read a file that holds a JSON object. Raises InputError."""
+    return as_fields(safe_json_toml.read_json(path), str(path))
 
 
 def required(data: dict[str, Any], name: str, where: str | Path, hint: str) -> Any:
@@ -43,10 +95,10 @@ def number(value: Any, name: str, where: str | Path) -> float:
 
 def finite(value: Any, name: str, where: str | Path) -> float:
     """Convert a finite JSON number to a float. Raises InputError."""
-    got = number(value, name, where)
-    if not math.isfinite(got):
-        raise InputError(f"{where}: {name} must be a finite number, got {got:g}.")
-    return got
+    converted = number(value, name, where)
+    if not math.isfinite(converted):
+        raise InputError(f"{where}: {name} must be a finite number, got {converted:g}.")
+    return converted
 
 
 def vector(value: Any, length: int, name: str, where: str | Path) -> NDArray[np.float64]:
@@ -69,27 +121,27 @@ def check_inside(name: str, field: str, where: str | Path) -> None:
             )
 
 
-def image_path(entry: dict[str, Any], folder: Path, where: str, hint: str, *, suffix: str = "") -> tuple[str, Path]:
-    """The file_path of a frame, and the existing file that it names.
+def image_path(entry: Fields, folder: Path) -> tuple[str, Path]:
+    """Return the file_path of a frame, and the existing file that it names; .png is appended to a name without suffix.
 
-    suffix: appended to a name without an image's suffix. where, hint: for errors, as in `required`.
+    Raises InputError.
     """
-    name = required(entry, "file_path", where, hint)
+    name, named = entry.required("file_path"), f"{entry.where} names it as file_path"
     if not isinstance(name, str) or not name:
-        raise InputError(f"{where}: file_path must be the path of an image, got {kind(name)}.")
-    check_inside(name, "file_path", where)
+        raise InputError(f"{entry.where}: file_path must be the path of an image, got {kind(name)}.")
+    check_inside(name, "file_path", entry.where)
     for written in dict.fromkeys((name, name.replace("\\", "/"))):  # as it stands, or as Windows writes it
-        file = folder / (written if written.lower().endswith(SUFFIXES) else written + suffix)
+        file = folder / (written if written.lower().endswith(SUFFIXES) else written + ".png")
         if os.path.isfile(file):  # Path.is_file raises for names that are too long
             return written, file
-    raise InputError(absent(folder / name if os.path.isfile(folder / name) else file, f"{where} names it as file_path"))
+    raise absent_image(folder / name if os.path.isfile(folder / name) else file, named)
 
 
-def absent(file: Path, named: str) -> str:
-    """Why there is no image of this name, for an error. named: what names it."""
+def absent_image(file: Path, named: str) -> InputError:
+    """The error for a file that is missing or no image. named: what names it."""
     if os.path.isfile(file):
-        return f"{file} is neither PNG nor JPEG, but {named}; convert it."
-    return f"{file} does not exist, but {named}."
+        return InputError(f"{file} is neither PNG nor JPEG, but {named}; convert it.")
+    return InputError(f"{file} does not exist, but {named}.")
 
 
 def kind(value: Any) -> str:

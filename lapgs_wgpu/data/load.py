@@ -1,4 +1,4 @@
-"""Load a capture: reader -> frames and cloud -> undistort -> normalize -> split -> validate -> Dataset.
+"""Load a capture: reader -> times -> splits -> undistort -> normalize -> masks -> views.
 
 A reader knows its file format and nothing else; whatever holds for all formats stands here, once. A new format needs a
 file in `readers` and a line in READERS.
@@ -7,23 +7,19 @@ file in `readers` and a line in READERS.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
-import numpy as np
-
-from lapgs_wgpu.data.cloud import Cloud, points_in_view
-from lapgs_wgpu.data.covisible import read_mask
-from lapgs_wgpu.data.focus import are_parallel, focus_of
-from lapgs_wgpu.data.frames import Capture, Frame, ImageSource, Reader, Split
-from lapgs_wgpu.data.ignored import check_ignored, find_ignored, read_ignored
+from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
 from lapgs_wgpu.data.images import Pixels, Size, shrink, shrunk_size
-from lapgs_wgpu.data.normalize import BOX, Cube, cube_in_view, cube_of_points
+from lapgs_wgpu.data.lens import Lens, Undistortion
+from lapgs_wgpu.data.masks import Mask, check_ignored, find_masks, read_ignored, read_measured
+from lapgs_wgpu.data.placement import place
 from lapgs_wgpu.data.readers import colmap, dnerf, endonerf, hypernerf, nerfstudio, neu3d, polycam, record3d
 from lapgs_wgpu.data.split import held_out
 from lapgs_wgpu.data.timestamps import disorder, in_step, natural_key, read_times, to_unit_range
-from lapgs_wgpu.data.undistort import Undistortion
 from lapgs_wgpu.data.validation import check_cloud, check_film, check_frames, check_views
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.errors import InputError
@@ -32,10 +28,6 @@ from lapgs_wgpu.splat.camera import Camera
 READERS: tuple[Reader, ...] = tuple(
     module.READER for module in (dnerf, hypernerf, neu3d, nerfstudio, colmap, record3d, polycam, endonerf)
 )
-
-PROBES = 4096  # points that determine the normalization of a capture without a cloud
-DENSE = 4096  # points; a smaller cloud is filled up: Gaussians multiply too slowly to fill what it leaves empty
-NEAREST, FURTHEST = 0.25, 2.0  # depths relative to the distance of the focus, for own footage without a cloud
 
 
 def load_dataset(
@@ -65,14 +57,57 @@ def load_dataset(
     folder = Path(folder)
     if image_size is not None and image_size < 1:
         raise InputError(f"image_size must be at least 1 pixel, got {image_size}.")
+    capture = _reader(folder).read(folder, image_size)
+    if not undistort:
+        pinholes = [dataclasses.replace(frame, lens=frame.lens.idealized) for frame in capture.frames]
+        capture = dataclasses.replace(capture, frames=pinholes)
+    frames, warnings = capture.frames, list(capture.warnings)
+
+    times, time_source = _times(folder, capture, warnings)
+    splits = _splits(folder, frames, times)
+    check_frames(frames)
+    shots = _undistort(frames, shrunk_size(frames[0].image.size, image_size))
+    training = [shot for shot, split in zip(shots, splits, strict=True) if split == "train"]
+    training_cameras = list(dict.fromkeys(shot.camera for shot in training))
+    warnings += _check_cloud(capture, shots, training_cameras)
+    placement = place(capture, [shot.frame for shot in training], training_cameras, normalize=normalize)
+    warnings += placement.warnings
+    order = _film_order(frames, times, warnings) if capture.own_footage else range(len(frames))
+    ignored = _ignored(None if masks is None else Path(masks), frames, splits, warnings)
+
+    fit = placement.normalization
+    cameras = dict.fromkeys(shot.camera for shot in shots)
+    placed = {camera: camera if fit is None else fit.camera(camera) for camera in cameras}
+
+    def views(split: Split) -> tuple[View, ...]:
+        chosen = [i for i in order if splits[i] == split]
+        return tuple(
+            _view(split, n, shots[i], placed[shots[i].camera], times[i], ignored) for n, i in enumerate(chosen)
+        )
+
+    return Dataset(
+        folder.resolve().name,
+        views("train"),
+        views("test"),
+        val=views("val"),
+        cloud=placement.cloud,
+        depths=placement.depths,
+        normalization=fit if fit is None or capture.moved is None else capture.moved.then(fit),
+        scale=1.0 if fit is None else fit.scale,
+        warnings=tuple(warnings),
+        time_source=time_source,
+        own_footage=capture.own_footage,
+    )
+
+
+def _reader(folder: Path) -> Reader:
+    """Return the one reader whose files a folder holds. Raises InputError."""
     if not folder.is_dir():
         problem = "is not a folder" if folder.exists() else "does not exist"
         raise InputError(f"{folder} {problem}; give the folder of a scene.")
     matching = [reader for reader in READERS if reader.matches(folder)]
     if len(matching) == 1:
-        capture = matching[0].read(folder, image_size)
-        masks = None if masks is None else Path(masks)
-        return _dataset(folder, capture if undistort else _idealized(capture), image_size, normalize, masks)
+        return matching[0]
     if matching:
         both = " and of ".join(f"{reader.name} ({reader.files})" for reader in matching)
         raise InputError(f"{folder} holds the files of {both}; keep one format's in it.")
@@ -85,97 +120,20 @@ def load_dataset(
     raise InputError(f"{folder} is no scene in a known format: expected {expected}{inside}.")
 
 
-def _dataset(folder: Path, capture: Capture, image_size: int | None, normalize: bool, masks: Path | None) -> Dataset:
-    """Turn what a reader returned into a dataset."""
-    frames, cloud, warnings = capture.frames, capture.cloud, list(capture.warnings)
-    times, time_source = _times(folder, capture, warnings)
-    splits = _splits(folder, frames, times)
-    check_frames(frames)
-    stored = frames[0].image.size
-    size = shrunk_size(stored, image_size)
-    cameras, undistortions = _undistort(frames, stored, size)
-    trained = [camera for camera, split in zip(cameras, splits, strict=True) if split == "train"]
-    training = list({id(camera): camera for camera in trained}.values())  # distinct ones
-
-    if cloud is not None:
-        if capture.own_footage:
-            names = [frame.name.file for frame in frames]
-            warnings += check_views(cloud, cameras, names, capture.source, capture.axes_hint)
-        check_cloud(cloud, training, capture.source)
-    depths = _depths(capture, splits, training, warnings)
-    cube = _cube(capture, training, depths)
-    if cube is None:
-        warnings.append(
-            f"{capture.source}: half or more of {len(training)} cameras look away from the point nearest to all "
-            "optical axes, so the size of the scene is unknown and it keeps its coordinates: if that is not "
-            f"[-{BOX:g}, {BOX:g}]^3, raise points.box and field.bound, or add a cloud (fused.ply)."
-        )
-    kept = cube is None or (capture.keeps_coordinates and (cube.fits or not normalize))
-    fit = None if cube is None or kept else cube.normalization
-    if cloud is not None and capture.own_footage:
-        cloud = _filled(cloud, training)
-    order = _film_order(frames, times, warnings) if capture.own_footage else range(len(frames))
-    ignored = {frame.name.file: frame.black for frame in frames if frame.black is not None}
-    if masks is not None:
-        ignored = find_ignored(masks, [frame.name.file for frame in frames], splits)
-    warnings += check_ignored(ignored, stored, black=masks is None)
-    placed = {id(camera): camera if fit is None else fit.camera(camera) for camera in cameras}
-
-    def views(split: Split) -> tuple[View, ...]:
-        chosen = [i for i in order if splits[i] == split]
-        return tuple(
-            View(
-                name=f"{split}_{frames[i].label or f'{index:05d}'}",
-                camera=placed[id(cameras[i])],
-                time=times[i],
-                source=str(frames[i].image),
-                pixels=partial(_read_pixels, frames[i].image, undistortions[i], size),
-                mask=None
-                if (path := frames[i].mask) is None
-                else partial(read_mask, path, undistortions[i], stored, size),
-                ignored=None
-                if split != "train" or (path := ignored.get(frames[i].name.file)) is None
-                else partial(read_ignored, path, undistortions[i], stored, size, black=masks is None),
-            )
-            for index, i in enumerate(chosen)
-        )
-
-    return Dataset(
-        folder.resolve().name,
-        views("train"),
-        views("test"),
-        val=views("val"),
-        cloud=cloud if cloud is None or fit is None else fit.cloud(cloud),
-        depths=depths if depths is None or fit is None else (depths[0] * fit.scale, depths[1] * fit.scale),
-        normalization=fit if fit is None or capture.moved is None else capture.moved.then(fit),
-        scale=1.0 if fit is None else fit.scale,
-        warnings=tuple(warnings),
-        time_source=time_source,
-        own_footage=capture.own_footage,
-    )
-
-
-def _idealized(capture: Capture) -> Capture:
-    """The capture as if its lenses had neither distortion nor skew, and looked at the center of the image."""
-    lenses = {id(frame.lens): frame.lens.idealized for frame in capture.frames}
-    frames = [dataclasses.replace(frame, lens=lenses[id(frame.lens)]) for frame in capture.frames]
-    return dataclasses.replace(capture, frames=frames)
-
-
 def _times(folder: Path, capture: Capture, warnings: list[str]) -> tuple[list[float], str]:
-    """The times of all frames in [0, 1], and their source. Appends warnings about own footage."""
+    """Return the times of all frames in [0, 1], and their source. Appends warnings about own footage."""
     names = [frame.name for frame in capture.frames]
-    values, source = [frame.time for frame in capture.frames if frame.time is not None], capture.time_source
-    if not values:
-        values, source = read_times(names, folder)
+    times, source = [frame.time for frame in capture.frames if frame.time is not None], capture.time_source
+    if not times:
+        times, source = read_times(names, folder)
     if capture.own_footage:
-        warnings += disorder(names, values)
-        values = in_step(names, values)
-    return to_unit_range(values, *(capture.time_range or (min(values), max(values)))), source
+        warnings += disorder(names, times)
+        times = in_step(names, times)
+    return to_unit_range(times, *(capture.time_range or (min(times), max(times)))), source
 
 
 def _splits(folder: Path, frames: Sequence[Frame], times: Sequence[float]) -> list[Split]:
-    """The split of each frame, as the files state it, or by the rule for own footage."""
+    """Return the split of each frame, as the files state it, or by the rule for own footage. Raises InputError."""
     splits: list[Split] = [frame.split for frame in frames if frame.split is not None]
     if not splits:
         tested = held_out([frame.name for frame in frames], times)
@@ -185,97 +143,111 @@ def _splits(folder: Path, frames: Sequence[Frame], times: Sequence[float]) -> li
     return splits
 
 
-def _undistort(frames: Sequence[Frame], stored: Size, size: Size) -> tuple[list[Camera], list[Undistortion | None]]:
-    """The pinhole camera of each frame at `size`, and what undistorts its image of size `stored`; None for a pinhole.
+class _Shot(NamedTuple):
+    """A frame, its pinhole camera, and what makes the camera's image of the file's.
 
-    Frames that share lens and pose share the camera.
+    undistortion: at the file's size; None for a pinhole.
     """
-    undistortions: dict[int, Undistortion | None] = {}
-    cameras: dict[tuple[int, int], Camera] = {}
+
+    frame: Frame
+    camera: Camera
+    undistortion: Undistortion | None
+
+    @property
+    def size(self) -> Size:
+        return self.camera.width, self.camera.height
+
+    def pixels(self) -> Pixels:
+        """Decode, undistort and shrink the image. Raises InputError."""
+        image = self.frame.image
+        if self.undistortion is None:
+            return image.read(self.size)
+        return shrink(self.undistortion.apply(image.read(image.size)), self.size)
+
+    def measured(self, mask: Path) -> Mask:
+        """Decode, undistort and shrink a test mask. Raises InputError."""
+        return read_measured(mask, self.undistortion, self.frame.image.size, self.size)
+
+    def ignored(self, mask: Path, *, black: bool) -> Mask:
+        """Decode, undistort and shrink a training mask. Raises InputError."""
+        return read_ignored(mask, self.undistortion, self.frame.image.size, self.size, black=black)
+
+
+def _undistort(frames: Sequence[Frame], size: Size) -> list[_Shot]:
+    """Give each frame its pinhole camera for images of `size`, (width, height). Raises InputError.
+
+    Frames of equal lens and pose share the camera.
+    """
+    stored = frames[0].image.size
+    undistortions: dict[Lens, Undistortion | None] = {}
+    cameras: dict[tuple[Lens, bytes], Camera] = {}
+    shots = []
     for frame in frames:
-        lens, key = frame.lens, (id(frame.lens), id(frame.T_cam_world))
-        if id(lens) not in undistortions:
+        lens = frame.lens
+        if lens not in undistortions:
             resized = lens.resized(*stored)
-            undistortions[id(lens)] = None if lens.is_pinhole else Undistortion(resized, resized.pinhole(frame.where))
+            undistortions[lens] = None if lens.is_pinhole else Undistortion(resized, resized.pinhole(frame.where))
+        undistortion = undistortions[lens]
+        key = lens, frame.T_cam_world.tobytes()
         if key not in cameras:
-            undistortion = undistortions[id(lens)]
             K, taken = (lens.K, (lens.width, lens.height)) if undistortion is None else (undistortion.K, stored)
             cameras[key] = Camera(K, frame.T_cam_world, *taken).resized(*size)
-    return (
-        [cameras[id(frame.lens), id(frame.T_cam_world)] for frame in frames],
-        [undistortions[id(frame.lens)] for frame in frames],
-    )
+        shots.append(_Shot(frame, cameras[key], undistortion))
+    return shots
 
 
-def _read_pixels(image: ImageSource, undistortion: Undistortion | None, size: Size) -> Pixels:
-    return image.read(size) if undistortion is None else shrink(undistortion.apply(image.read(image.size)), size)
-
-
-def _depths(
-    capture: Capture, splits: Sequence[Split], cameras: Sequence[Camera], warnings: list[str]
-) -> tuple[float, float] | None:
-    """Nearest and furthest depth of the training cameras, if the files state it or there is no cloud to replace it.
-    Appends a warning where it is a guess."""
-    trained = [frame for frame, split in zip(capture.frames, splits, strict=True) if split == "train"]
-    stated = [frame.depths for frame in trained if frame.depths is not None]
-    if stated:
-        return min(near for near, _ in stated), float(np.median([far for _, far in stated]))
-    if capture.cloud is not None or capture.keeps_coordinates:
-        return None
-    focus = focus_of(cameras, origin=False)
-    depth = np.array([(camera.T_cam_world @ [*focus, 1.0])[2] for camera in cameras])
-    behind = int((depth <= 0).sum())
-    if 2 * behind > len(cameras):
-        raise InputError(
-            f"{capture.source}: there is no cloud, and {behind} of {len(cameras)} cameras look away from the point "
-            f"nearest to all optical axes: {capture.axes_hint}, or give a cloud."
-        )
-    near, far = NEAREST * float(depth[depth > 0].min()), FURTHEST * float(depth.max())
-    if are_parallel(cameras):
-        warnings.append(
-            f"{capture.source}: there is no cloud, and all cameras look in one direction, so nothing tells how far "
-            f"away the scene is, and {near:.3g} to {far:.3g} in the capture's units is a guess: walk around what "
-            "moves, or give a cloud."
-        )
-    return near, far
-
-
-def _cube(capture: Capture, cameras: Sequence[Camera], depths: tuple[float, float] | None) -> Cube | None:
-    """The cube that the capture fills, in its own coordinates; None if neither files nor cameras determine it."""
-    if capture.cloud is not None:
-        return cube_of_points(capture.cloud.points.astype(np.float64))
-    if depths is not None:
-        return cube_of_points(points_in_view(cameras, *depths, PROBES, 0))
-    return cube_in_view(cameras)
-
-
-def _filled(cloud: Cloud, cameras: Sequence[Camera]) -> Cloud:
-    """Fill up a cloud to DENSE points.
-
-    The new points are random where views overlap, between the depths of the cloud. Each has the color of the nearest
-    old one.
-    """
-    from scipy.spatial import cKDTree  # slow to import
-
-    missing = DENSE - len(cloud.points)
-    if missing <= 0:
-        return cloud
-    points = cloud.points.astype(np.float64)
-    depths = np.concatenate([points @ c.T_cam_world[2, :3] + c.T_cam_world[2, 3] for c in cameras])
-    near, far = np.percentile(depths[depths > 0], [1, 99])
-    added = points_in_view(cameras, float(near), float(far) * 1.01, missing, 0)
-    _, nearest = cKDTree(points).query(added)
-    return Cloud(
-        np.concatenate([cloud.points, added.astype(np.float32)]),
-        np.concatenate([cloud.colors, cloud.colors[nearest]]),
-    )
+def _check_cloud(capture: Capture, shots: Sequence[_Shot], training: Sequence[Camera]) -> list[str]:
+    """Check a cloud against the cameras: return warnings, or raise InputError."""
+    if capture.cloud is None:
+        return []
+    warnings = []
+    if capture.own_footage:
+        cameras, names = [shot.camera for shot in shots], [shot.frame.name.file for shot in shots]
+        warnings = check_views(capture.cloud, cameras, names, capture.source, capture.axes_hint)
+    check_cloud(capture.cloud, training, capture.source)
+    return warnings
 
 
 def _film_order(frames: Sequence[Frame], times: Sequence[float], warnings: list[str]) -> list[int]:
-    """The frames by camera, then time. Appends warnings about blurred and repeated images of each camera."""
+    """Return the frames by camera, then time. Appends warnings about blurred and repeated images of each camera."""
     films: dict[str, list[int]] = {}
     for i in sorted(range(len(frames)), key=lambda i: (times[i], natural_key(frames[i].name.file))):
         films.setdefault(frames[i].name.camera, []).append(i)
     for film in films.values():
         warnings += check_film([Path(str(frames[i].image)) for i in film])
     return [i for camera in sorted(films, key=natural_key) for i in films[camera]]
+
+
+class _IgnoredMasks(NamedTuple):
+    """Masks of training images by the images' names. black: whether black pixels are ignored, or white ones."""
+
+    paths: Mapping[str, Path]
+    black: bool
+
+
+def _ignored(
+    folder: Path | None, frames: Sequence[Frame], splits: Sequence[Split], warnings: list[str]
+) -> _IgnoredMasks:
+    """Find and check the masks in the user's folder, or else those that the capture names. Appends warnings."""
+    if folder is None:
+        paths = {frame.name.file: frame.black for frame in frames if frame.black is not None}
+    else:
+        names = [frame.name.file for frame, split in zip(frames, splits, strict=True) if split == "train"]
+        paths = find_masks(folder, names, "each training image, named as the image")
+    warnings += check_ignored(paths, frames[0].image.size, black=folder is None)
+    return _IgnoredMasks(paths, folder is None)
+
+
+def _view(split: Split, number: int, shot: _Shot, camera: Camera, time: float, ignored: _IgnoredMasks) -> View:
+    """Make the view of a frame. number: within its split, for its name. camera: in the world's coordinates."""
+    frame = shot.frame
+    path = ignored.paths.get(frame.name.file) if split == "train" else None
+    return View(
+        name=f"{split}_{frame.label or f'{number:05d}'}",
+        camera=camera,
+        time=time,
+        source=str(frame.image),
+        pixels=shot.pixels,
+        mask=None if frame.mask is None else partial(shot.measured, frame.mask),
+        ignored=None if path is None else partial(shot.ignored, path, black=ignored.black),
+    )

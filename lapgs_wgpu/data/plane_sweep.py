@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from lapgs_wgpu.data.evenly import evenly
-from lapgs_wgpu.data.small_views import small_views
-from lapgs_wgpu.data.views import Dataset
+from lapgs_wgpu.data.views import Dataset, small_views
 from lapgs_wgpu.splat.camera import Camera
 
 Array = NDArray[np.float64]

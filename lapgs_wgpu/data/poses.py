@@ -7,14 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.data.json_fields import kind, number
+from lapgs_wgpu.data.json_fields import LARGEST_ENTRY, kind, number
 from lapgs_wgpu.errors import InputError
 
 Array = NDArray[np.float64]
 
 # Largest deviation of R^T R from the identity: files store about seven digits; scale or shear exceeds this by far.
 ROTATION_TOLERANCE = 1e-3
-LARGEST_ENTRY = 1e9  # of a pose: matrix products of larger entries lose all digits
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0])  # y up, z backward -> y down, z forward
 
 

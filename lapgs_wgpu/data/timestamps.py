@@ -69,7 +69,7 @@ def in_step(names: Sequence[ImageName], values: Sequence[float]) -> list[float]:
 
 
 def _listed(names: Sequence[ImageName], path: Path) -> list[float]:
-    times = read_json(path, "a time for each image")
+    times = read_json(path).values
     listed = [file if (file := name.file) in times else file.removeprefix("images/") for name in names]
     missing = [file for file in listed if file not in times]
     if missing:

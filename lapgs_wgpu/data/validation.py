@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.data.cloud import Cloud, in_view, views_of
-from lapgs_wgpu.data.covisible import check_mask
 from lapgs_wgpu.data.focus import spread
 from lapgs_wgpu.data.frames import Frame
 from lapgs_wgpu.data.images import check_image, gray_thumbnail, size_text
+from lapgs_wgpu.data.lens import Lens
+from lapgs_wgpu.data.masks import check_measured
 from lapgs_wgpu.data.thumbnails import BLURRED, EQUAL, THUMBNAIL, blurred, repeats, sharpness, sharpness_around
-from lapgs_wgpu.data.undistort import Lens
 from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
@@ -37,7 +37,7 @@ GAP, GAP_FACTOR = 0.1, 4.0  # a gap is longer than this share of the clip, and t
 
 def check_frames(frames: Sequence[Frame]) -> None:
     """Check that all images have one size, which fits their cameras, and the same of masks. Raises InputError."""
-    checked: set[tuple[int, Path | None]] = set()
+    checked: set[tuple[Lens, Path | None]] = set()
     first = frames[0].image
     for frame in frames:
         if frame.image.size != first.size:
@@ -45,7 +45,7 @@ def check_frames(frames: Sequence[Frame]) -> None:
                 f"{frame.image} is {size_text(frame.image.size)} pixels and {first} is {size_text(first.size)}; all "
                 "images must have one size."
             )
-        key = id(frame.lens), frame.mask
+        key = frame.lens, frame.mask
         if key in checked:
             continue
         checked.add(key)
@@ -53,13 +53,13 @@ def check_frames(frames: Sequence[Frame]) -> None:
         check_proportions(first.size, frame.lens, str(frame.image), frame.where)
         if frame.mask is not None:
             check_proportions(check_image(frame.mask).size, frame.lens, str(frame.mask), frame.where)
-            check_mask(frame.mask)
+            check_measured(frame.mask)
 
 
 def check_focal(lens: Lens, where: str) -> None:
     """Check that both focal lengths are plausible. Raises InputError, whose message begins with `where`."""
     longer = max(lens.width, lens.height)
-    for focal in (lens.K[0, 0], lens.K[1, 1]):
+    for focal in (lens.fx, lens.fy):
         if not MIN_FOCAL * longer <= focal <= MAX_FOCAL * longer:
             raise InputError(
                 f"{where}: a focal length of {focal:.4g} pixels does not fit images of {lens.width}x{lens.height}; it "
@@ -161,13 +161,10 @@ def check_in_view(dataset: Dataset, points: NDArray[np.floating]) -> list[str]:
 
     points: (N, 3) means of the initial Gaussians, world units. Raises InputError if no view shows any.
     """
-    seen: dict[int, bool] = {}
+    seen = {camera: bool(in_view(points, camera)[1].any()) for camera in dataset.cameras}
     blind: dict[float, bool] = {}  # time -> whether no view of that time shows the scene
     for view in dataset.train:
-        key = id(view.camera)
-        if key not in seen:
-            seen[key] = bool(in_view(points, view.camera)[1].any())
-        blind[view.time] = blind.get(view.time, True) and not seen[key]
+        blind[view.time] = blind.get(view.time, True) and not seen[view.camera]
     if not any(seen.values()):
         low, high = points.min(axis=0), points.max(axis=0)
         box = ", ".join(f"{a:.3g} to {b:.3g}" for a, b in zip(low, high, strict=True))
@@ -191,13 +188,13 @@ def check_in_view(dataset: Dataset, points: NDArray[np.floating]) -> list[str]:
 def check_views(cloud: Cloud, cameras: Sequence[Camera], names: Sequence[str], where: Path, axes: str) -> list[str]:
     """Warn about cameras that see no point of the cloud or hardly move, and about a sparse cloud.
 
-    Cloud and cameras are in the same coordinates. cameras, names: of each image; a camera counts once, by the name of
-    its first image. axes: advice for cameras that look the
-    wrong way. Raises InputError if more than half of the cameras see no point.
+    cameras, names: of each image, in the coordinates of the cloud; a camera counts once, by its first image's name.
+    axes: advice for cameras that look the wrong way. Raises InputError if more than half of the cameras see no point.
     """
+    first_name = dict(zip(reversed(cameras), reversed(names), strict=True))
+    cameras = list(dict.fromkeys(cameras))
+    names = [first_name[camera] for camera in cameras]
     points = cloud.points.astype(np.float64)
-    first = sorted({id(camera): i for i, camera in reversed(list(enumerate(cameras)))}.values())
-    cameras, names = [cameras[i] for i in first], [names[i] for i in first]
     seen = np.array([views_of(points, [camera]).sum() for camera in cameras])
     blind = np.flatnonzero(seen == 0).tolist()
     if 2 * len(blind) > len(cameras):

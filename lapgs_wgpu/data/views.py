@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property, partial
 from pathlib import Path
 from threading import Lock
 
@@ -16,6 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from lapgs_wgpu.data.cloud import Cloud
 from lapgs_wgpu.data.focus import focus_of, spread
+from lapgs_wgpu.data.images import Size, shrink
+from lapgs_wgpu.data.masks import as_pixels
 from lapgs_wgpu.data.normalize import BOX, Normalization
 from lapgs_wgpu.data.timestamps import time_step
 from lapgs_wgpu.errors import InputError
@@ -104,7 +107,7 @@ class Dataset:
     @cached_property
     def cameras(self) -> tuple[Camera, ...]:
         """The distinct training cameras."""
-        return tuple({id(view.camera): view.camera for view in self.train}.values())
+        return tuple(dict.fromkeys(view.camera for view in self.train))
 
     @cached_property
     def extent(self) -> float:
@@ -144,7 +147,7 @@ class Dataset:
     def moments(self) -> int:
         """The number of moments of the clip: that of its times. Of a few still cameras, which may not be in step, it is
         the largest number of images of one camera."""
-        most = max(Counter(id(view.camera) for view in self.train).values())
+        most = max(Counter(view.camera for view in self.train).values())
         return most if len(self.cameras) <= most else len(self.times)
 
     @property
@@ -167,6 +170,36 @@ def spread_views(views: Sequence[View], most: int) -> list[View]:
     ordered = sorted(views, key=lambda view: (view.time, view.name))
     count = min(len(ordered), most)
     return [ordered[int((i + i * GOLDEN_SECTION % 1) * len(ordered) / count)] for i in range(count)]
+
+
+def small_views(views: Sequence[View], size: int) -> list[View]:
+    """Return the views with their longer side shrunk to `size` pixels, smaller ones as they are.
+
+    Views that share a camera still share one, and each image is read once.
+    """
+    cameras: dict[Camera, Camera] = {}
+    shrunk_views = []
+    for view in views:
+        width, height = view.camera.width, view.camera.height
+        scale = size / max(width, height)
+        if scale >= 1:
+            shrunk_views.append(view)
+            continue
+        small = max(1, round(scale * width)), max(1, round(scale * height))
+        camera = cameras.setdefault(view.camera, view.camera.resized(*small))
+        ignored = None if view.ignored is None else partial(_shrunk_mask, view.ignored, small)
+        pixels = cache(partial(_shrunk, view, small))
+        shrunk_views.append(dataclasses.replace(view, camera=camera, pixels=pixels, ignored=ignored))
+    return shrunk_views
+
+
+def _shrunk(view: View, size: Size) -> NDArray[np.uint8]:
+    return shrink(view.load(), size)
+
+
+def _shrunk_mask(mask: Callable[[], NDArray[np.bool_]], size: Size) -> NDArray[np.bool_]:
+    """Shrink a mask (H, W): a pixel is set where any of the pixels mixed into it is."""
+    return shrink(as_pixels(mask()), size)[..., 0] > 0
 
 
 def composite(image: NDArray[np.uint8], background: ArrayLike) -> NDArray[np.uint8]:

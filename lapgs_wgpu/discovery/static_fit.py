@@ -9,8 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from lapgs_wgpu.data.small_views import small_views
-from lapgs_wgpu.data.views import Dataset, composite, spread_views
+from lapgs_wgpu.data.views import Dataset, composite, small_views, spread_views
 from lapgs_wgpu.discovery.residual import Residual
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.scene import Scene4D

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from lapgs_wgpu.data.images import check_image
+from lapgs_wgpu.data.masks import check_mask_folder
 from lapgs_wgpu.data.readers.colmap import IMAGES, SPARSE
 from lapgs_wgpu.data.timestamps import write_times
 from lapgs_wgpu.errors import InputError
@@ -27,7 +28,7 @@ from lapgs_wgpu.prepare.extract import (
     shortened,
 )
 from lapgs_wgpu.prepare.film import Film
-from lapgs_wgpu.prepare.masks import MASKS, check_folder, read_masks, write_masks
+from lapgs_wgpu.prepare.masks import MASKS, read_masks, write_masks
 from lapgs_wgpu.prepare.moving import World, area, remove_matches, rim, solve_world
 from lapgs_wgpu.prepare.reconstruct import Reconstruction, all_pairs, import_pycolmap, merged, neighbouring_pairs
 from lapgs_wgpu.prepare.report import REPORT, write_report
@@ -73,7 +74,7 @@ def prepare(
     if masks is not None and len(videos) > 1:
         raise InputError("--masks goes with one moving camera; cameras that stand still need no masks.")
     if masks is not None:
-        check_folder(masks)
+        check_mask_folder(masks, "each image")
     import_pycolmap()
     films = [Film(video) for video in videos]
     with appearing(out) as folder:

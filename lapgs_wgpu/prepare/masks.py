@@ -6,13 +6,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lapgs_wgpu.data.images import Size, decode, encode_png
-from lapgs_wgpu.data.mask_files import WHITE, check_mask_size, find_mask
-from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.data.masks import WHITE, Mask, check_mask_size, find_masks
 
-Mask = NDArray[np.bool_]
 MASKS = "masks"  # folder of a capture
 
 
@@ -24,29 +21,14 @@ def write_masks(folder: Path, masks: Mapping[str, Mask]) -> None:
         path.write_bytes(encode_png(mask.astype(np.uint8) * 255))
 
 
-def check_folder(folder: Path) -> None:
-    """Raises InputError where a folder of masks is none."""
-    if not folder.is_dir():
-        raise InputError(f"{folder} is not a folder; --masks needs one with a PNG for each image.")
-
-
 def read_masks(folder: Path, names: Sequence[str], size: Size) -> dict[str, Mask]:
     """Read the masks of images of (width, height), white where something moves, by the images' names.
 
     Every image needs one: NAME.png or NAME.jpg.png (COLMAP's way) below the folder. Raises InputError.
     """
-    check_folder(folder)
-    found = {name: find_mask(folder, name) for name in names}
-    missing = [name for name, path in found.items() if path is None]
-    if missing:
-        example = PurePosixPath(missing[0]).with_suffix(".png").name
-        raise InputError(
-            f"{folder} lacks {len(missing)} of {len(names)} masks, such as {example}; name each mask as its image in "
-            "images/ of a first run without --masks, with the same --fps."
-        )
-    masks = {}
-    for name, path in found.items():
-        assert path is not None
+    paths = find_masks(
+        folder, names, "each image in images/ of a first run without --masks, with the same --fps, named as the image"
+    )
+    for path in paths.values():
         check_mask_size(path, size)
-        masks[name] = decode(path)[..., 0] >= WHITE
-    return masks
+    return {name: decode(path)[..., 0] >= WHITE for name, path in paths.items()}

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lapgs_wgpu.data.json_fields import LARGEST_ENTRY, LARGEST_INTRINSIC, LARGEST_SIDE
 from lapgs_wgpu.errors import InputError, shown
 
 Array = NDArray[np.float64]
@@ -33,11 +33,6 @@ OTHER_MODELS = {
 }  # fmt: skip
 PARAMETERS = dict(MODELS.values())
 LONGEST_NAME = 4096  # bytes of an image's name
-
-UNSUPPORTED = (
-    "is not among those that are read ({known}); run COLMAP again with --ImageReader.camera_model OPENCV, or "
-    "undistort the images with colmap image_undistorter"
-)
 
 
 class ColmapCamera(NamedTuple):
@@ -98,28 +93,42 @@ def count_images(folder: Path) -> int:
     """Count the images of a model, without reading all of a binary one."""
     path = folder / "images.bin"
     if path.is_file():
-        with _binary(path) as reader:
-            return reader.count(BINARY_IMAGE_BYTES, "images")
+        return _Bytes(path).count(BINARY_IMAGE_BYTES, "images")
     path = folder / "images.txt"
     return len(_text_images(path)) if path.is_file() else 0
 
 
 def _camera(where: str, model: str, width: float, height: float, values: list[float]) -> ColmapCamera:
+    """Check the values of a camera. Raises InputError."""
     if model not in PARAMETERS:
-        raise InputError(f"{where}: its model {model[:40]} {UNSUPPORTED.format(known=', '.join(PARAMETERS))}.")
+        raise InputError(
+            f"{where}: its model {model[:40]} is not among those that are read ({', '.join(PARAMETERS)}); run COLMAP "
+            "again with --ImageReader.camera_model OPENCV, or undistort the images with colmap image_undistorter."
+        )
     names = PARAMETERS[model]
     if len(values) != len(names):
         raise InputError(
             f"{where}: a {model} has {len(names)} parameters ({', '.join(names)}), but there are {len(values)}."
         )
-    if not (1 <= width <= 1e5 and 1 <= height <= 1e5):
-        raise InputError(f"{where}: width and height must be 1 to 100000 pixels, got {shown(width)}x{shown(height)}.")
-    parameters = dict(zip(names, values, strict=True))
-    for name, value in parameters.items():
-        if not abs(value) <= 1e6 or (name[0] == "f" and value <= 0):  # true for NaN, too
-            bounds = "above 0 and at most" if name[0] == "f" else "at most"
-            raise InputError(f"{where}: {name} must be {bounds} 1e+06, got {value:g}.")
-    return ColmapCamera(int(width), int(height), parameters)
+    if not (1 <= width <= LARGEST_SIDE and 1 <= height <= LARGEST_SIDE):
+        raise InputError(
+            f"{where}: width and height must be 1 to {LARGEST_SIDE:g} pixels, got {shown(width)}x{shown(height)}."
+        )
+    for name, value in zip(names, values, strict=True):
+        if not abs(value) <= LARGEST_INTRINSIC or (name[0] == "f" and value <= 0):  # true for NaN, too
+            raise InputError(f"{where}: {name} is {value:g}, which no camera has.")
+    return ColmapCamera(int(width), int(height), dict(zip(names, values, strict=True)))
+
+
+def _image(name: str, camera: int, pose: Array, where: str) -> ColmapImage:
+    """Check the values of an image. pose: (7,) quaternion and translation. Raises InputError."""
+    bad = ~(np.abs(pose) <= LARGEST_ENTRY)  # true for NaN, too
+    if bad.any():
+        raise InputError(f"{where}: its pose holds {pose[bad][0]:g}; at most {LARGEST_ENTRY:g} is allowed.")
+    length = float(np.linalg.norm(pose[:4]))
+    if abs(length - 1) > 1e-3:
+        raise InputError(f"{where}: its quaternion has length {length:g}, must be 1; export the model again.")
+    return ColmapImage(name, camera, pose[:4] / length, pose[4:], where)
 
 
 # Text
@@ -182,16 +191,6 @@ def _text_points(path: Path) -> tuple[Array, NDArray[np.uint8]]:
     return values[:, :3], np.clip(np.nan_to_num(values[:, 3:]), 0, 255).astype(np.uint8)
 
 
-def _image(name: str, camera: int, pose: Array, where: str) -> ColmapImage:
-    """pose: (7,) quaternion and translation."""
-    if not (np.abs(pose) <= 1e9).all():
-        raise InputError(f"{where}: its pose holds {pose[~(np.abs(pose) <= 1e9)][0]:g}; at most 1e+09 is allowed.")
-    length = float(np.linalg.norm(pose[:4]))
-    if abs(length - 1) > 1e-3:
-        raise InputError(f"{where}: its quaternion has length {length:g}, must be 1; export the model again.")
-    return ColmapImage(name, camera, pose[:4] / length, pose[4:], where)
-
-
 # Binary: little-endian, each file begins with a count of 8 bytes
 
 BINARY_CAMERA_BYTES = 24 + 3 * 8  # at least: id, model, width, height, parameters
@@ -199,96 +198,81 @@ BINARY_IMAGE_BYTES = 4 + 7 * 8 + 4 + 1 + 8  # at least: id, pose, camera, the na
 BINARY_POINT_BYTES = 8 + 3 * 8 + 3 + 8 + 8  # at least: id, position, color, error, length of the track
 
 
-class _Reader:
+class _Bytes:
     """A binary file in memory, and the position up to which it was read."""
 
-    def __init__(self, path: Path, data: bytes) -> None:
-        self.path, self.data, self.at = path, data, 0
+    def __init__(self, path: Path) -> None:
+        self.path, self.at = path, 0
+        try:
+            self.data = path.read_bytes()
+        except OSError as error:
+            raise InputError(f"{path} cannot be read ({error.strerror}).") from None
+
+    def damaged(self, problem: str) -> InputError:
+        return InputError(f"{self.path} {problem}; it is damaged, so copy it again.")
 
     def take(self, form: str) -> tuple[Any, ...]:
-        """The next values, by struct's names for their kinds."""
+        """Return the next values, by struct's names for their types."""
         size = struct.calcsize("<" + form)
         self.skip(size)
         return struct.unpack_from("<" + form, self.data, self.at - size)
 
     def skip(self, size: int) -> None:
         if size > len(self.data) - self.at:
-            raise InputError(
-                f"{self.path} ends too early: {size} bytes are needed at byte {self.at}, but it has {len(self.data)} "
-                "in all; copy it again."
-            )
+            raise self.damaged(f"ends too early: {size} bytes are needed at byte {self.at} of {len(self.data)}")
         self.at += size
 
     def count(self, least: int, what: str) -> int:
-        """Read a count of items that take at least so many bytes each."""
+        """Return a count of items that take at least so many bytes each."""
         (count,) = self.take("Q")
-        room = len(self.data) - self.at
-        if count * least > room:
-            raise InputError(
-                f"{self.path} declares {count} {what}, which need at least {count * least} bytes, but {room} bytes "
-                "follow; it is damaged, so copy it again."
-            )
+        rest = len(self.data) - self.at
+        if count * least > rest:
+            raise self.damaged(f"declares {count} {what}, which need {count * least} bytes or more, but {rest} follow")
         return int(count)
-
-    def end(self) -> None:
-        """Check that all bytes were read."""
-        if self.at < len(self.data):
-            raise InputError(
-                f"{self.path} declares {self.at} bytes, but has {len(self.data)}; it is damaged, so copy it again."
-            )
 
     def name(self) -> str:
         end = self.data.find(b"\0", self.at, self.at + LONGEST_NAME)
         if end < 0:
-            raise InputError(
-                f"{self.path}: the name at byte {self.at} has no end within {LONGEST_NAME} bytes; it is damaged, so "
-                "copy it again."
-            )
+            raise self.damaged(f"has a name at byte {self.at} that does not end within {LONGEST_NAME} bytes")
         text = self.data[self.at : end].decode("utf-8", "replace")
         self.at = end + 1
         return text
 
-
-@contextmanager
-def _binary(path: Path) -> Iterator[_Reader]:
-    try:
-        yield _Reader(path, path.read_bytes())
-    except OSError as error:
-        raise InputError(f"{path} cannot be read ({error.strerror}).") from None
+    def end(self) -> None:
+        """Check that all bytes were read."""
+        if self.at < len(self.data):
+            raise self.damaged(f"declares {self.at} bytes, but has {len(self.data)}")
 
 
 def _binary_cameras(path: Path) -> dict[int, ColmapCamera]:
-    cameras = {}
-    with _binary(path) as reader:
-        for index in range(reader.count(BINARY_CAMERA_BYTES, "cameras")):
-            identity, model, width, height = reader.take("iiQQ")
-            where = f"{path}, camera {index}"
-            name, names = MODELS.get(model, (OTHER_MODELS.get(model, f"number {model}"), ()))
-            cameras[identity] = _camera(where, name, width, height, list(reader.take(f"{len(names)}d")))
-        reader.end()
+    cameras, file = {}, _Bytes(path)
+    for index in range(file.count(BINARY_CAMERA_BYTES, "cameras")):
+        identity, model, width, height = file.take("iiQQ")
+        name, names = MODELS.get(model, (OTHER_MODELS.get(model, f"number {model}"), ()))
+        values = list(file.take(f"{len(names)}d"))
+        cameras[identity] = _camera(f"{path}, camera {index}", name, width, height, values)
+    file.end()
     return cameras
 
 
 def _binary_images(path: Path) -> list[ColmapImage]:
-    images = []
-    with _binary(path) as reader:
-        for index in range(reader.count(BINARY_IMAGE_BYTES, "images")):
-            _, *pose, camera = reader.take("i7di")
-            name = reader.name()
-            where = f"{path}, image {index} ({name[:80]})"
-            reader.skip(24 * reader.count(24, f"points of {name[:80]}"))
-            images.append(_image(name, camera, np.array(pose), where))
-        reader.end()
+    images, file = [], _Bytes(path)
+    for index in range(file.count(BINARY_IMAGE_BYTES, "images")):
+        _, *pose, camera = file.take("i7di")
+        name = file.name()
+        file.skip(24 * file.count(24, f"points of {name[:80]}"))
+        images.append(_image(name, camera, np.array(pose), f"{path}, image {index} ({name[:80]})"))
+    file.end()
     return images
 
 
 def _binary_points(path: Path) -> tuple[Array, NDArray[np.uint8]]:
-    with _binary(path) as reader:
-        count = reader.count(BINARY_POINT_BYTES, "points")
-        points, colors = np.empty((count, 3)), np.empty((count, 3), np.uint8)
-        for index in range(count):
-            _, *values, _ = reader.take("Q3d3Bd")
-            points[index], colors[index] = values[:3], values[3:]
-            reader.skip(8 * reader.count(8, f"images that see point {index}"))
-        reader.end()
+    file = _Bytes(path)
+    count = file.count(BINARY_POINT_BYTES, "points")
+    points, colors = np.empty((count, 3)), np.empty((count, 3), np.uint8)
+    for index in range(count):
+        _, *values, _ = file.take("Q3d3Bd")
+        points[index], colors[index] = values[:3], values[3:]
+        file.skip(8 * file.count(8, f"images that see point {index}"))
+    file.end()
     return points, colors

@@ -10,25 +10,18 @@ fused.ply, points3d.ply or points3D.ply.
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from lapgs_wgpu.data.cloud import find_cloud, is_random, read_cloud
 from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
-from lapgs_wgpu.data.images import Size, check_image
-from lapgs_wgpu.data.json_fields import image_path, number, read_json, required
+from lapgs_wgpu.data.images import check_image
+from lapgs_wgpu.data.json_fields import image_path, read_json
 from lapgs_wgpu.data.poses import opengl_pose
-from lapgs_wgpu.data.readers.transforms import frame_entries, intrinsics
+from lapgs_wgpu.data.readers.transforms import read_lens, timed_frames
 from lapgs_wgpu.data.timestamps import ImageName
-from lapgs_wgpu.data.undistort import Lens
 from lapgs_wgpu.data.validation import check_frames
 from lapgs_wgpu.errors import InputError
-from lapgs_wgpu.splat.camera import intrinsics_of_fov
 
-NEEDED = "which a D-NeRF scene needs"
 CLOUDS = ("fused.ply", "points3d.ply", "points3D.ply")
 
 
@@ -40,9 +33,9 @@ def _read(folder: Path, image_size: int | None) -> Capture:
     frames, warnings = [*_read_split(folder, "train"), *_read_split(folder, "test")], []
     if (folder / "transforms_val.json").is_file():
         try:
-            found = _read_split(folder, "val")
-            check_frames([frames[0], *found])
-            frames += found
+            validation = _read_split(folder, "val")
+            check_frames([frames[0], *validation])
+            frames += validation
         except InputError as error:
             warnings.append(f"the validation views are left out: {error}")
     path = find_cloud(folder, CLOUDS)
@@ -62,46 +55,23 @@ def _read(folder: Path, image_size: int | None) -> Capture:
 
 
 def _read_split(folder: Path, split: Split) -> list[Frame]:
-    """The frames of one transforms file."""
+    """Read the frames of one transforms file."""
     path = folder / f"transforms_{split}.json"
     if not path.is_file():
         raise InputError(f"{path} does not exist; a D-NeRF scene needs transforms_train.json and transforms_test.json.")
-    data = read_json(path, "camera_angle_x and frames")
-    entries = list(frame_entries(data, path, NEEDED))
+    data = read_json(path)
+    entries = timed_frames(data)
     frames: list[Frame] = []
-    lenses: dict[tuple[float, ...], Lens] = {}
-    for index, (entry, where, stated) in enumerate(entries):
-        file_path, file = image_path(entry, folder, where, NEEDED, suffix=".png")
-        T_cam_world = opengl_pose(required(entry, "transform_matrix", where, NEEDED), where)
+    for index, (entry, stated) in enumerate(entries):
+        file_path, file = image_path(entry, folder)
+        T_cam_world = opengl_pose(entry.required("transform_matrix"), entry.where)
         time = index / max(len(entries) - 1, 1) if stated is None else stated
         if not 0 <= time <= 1:
-            raise InputError(f"{where}: time must lie in [0, 1], got {time:g}; divide by the clip's duration.")
+            raise InputError(f"{entry.where}: time must lie in [0, 1], got {time:g}; divide by the clip's duration.")
         image = check_image(file)
-        lens = _lens(entry, data, image.size, where, path)
-        key = (*lens.K.ravel(), lens.width, lens.height, *lens.radial, *lens.tangential)
-        lens = lenses.setdefault(key, lens)
-        name, label = ImageName(file_path), f"{index:03d}"
-        frames.append(Frame(image, lens, T_cam_world, where, name, time=time, split=split, label=label))
+        lens, name = read_lens(entry, data, image.size), ImageName(file_path)
+        frames.append(Frame(image, lens, T_cam_world, entry.where, name, time=time, split=split, label=f"{index:03d}"))
     return frames
-
-
-def _lens(entry: dict[str, Any], shared: dict[str, Any], size: Size, where: str, path: Path) -> Lens:
-    """The lens of a frame, at the size that it states, else that of its image, (width, height) `size`."""
-    values = intrinsics(entry, shared, where, path)
-    width, height = int(values.get("w", size[0])), int(values.get("h", size[1]))
-    if "fl_x" in values:
-        K = np.array([[values["fl_x"], 0.0, width / 2], [0.0, values["fl_x"], height / 2], [0.0, 0.0, 1.0]])
-    else:
-        source, at = (entry, where) if "camera_angle_x" in entry else (shared, str(path))
-        fov_x = number(required(source, "camera_angle_x", at, NEEDED), "camera_angle_x", at)
-        if not 1e-6 < fov_x < math.pi:
-            raise InputError(f"{at}: camera_angle_x must be an angle in radians between 0 and pi, got {fov_x:g}.")
-        K = intrinsics_of_fov(fov_x, width, height)
-    for name, row, column in (("fl_y", 1, 1), ("cx", 0, 2), ("cy", 1, 2)):
-        if name in values:
-            K[row, column] = values[name]
-    k1, k2, k3, p1, p2 = (values.get(name, 0.0) for name in ("k1", "k2", "k3", "p1", "p2"))
-    return Lens(K, width, height, (k1, k2, k3), (p1, p2))
 
 
 READER = Reader("D-NeRF", "transforms_train.json and transforms_test.json", _matches, _read)

@@ -10,24 +10,34 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from lapgs_wgpu.data.cloud import find_cloud, read_cloud
-from lapgs_wgpu.data.covisible import factor_folders, find_covisible
 from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
 from lapgs_wgpu.data.images import check_image
-from lapgs_wgpu.data.json_fields import finite, kind, read_json, required, vector
+from lapgs_wgpu.data.json_fields import (
+    LARGEST_ENTRY,
+    LARGEST_SIDE,
+    Fields,
+    absent_image,
+    as_fields,
+    kind,
+    read_json,
+    vector,
+)
+from lapgs_wgpu.data.lens import Lens
+from lapgs_wgpu.data.masks import find_covisible
 from lapgs_wgpu.data.normalize import Normalization
-from lapgs_wgpu.data.poses import LARGEST_ENTRY, check_rotation, world_to_camera
+from lapgs_wgpu.data.poses import check_rotation, world_to_camera
 from lapgs_wgpu.data.timestamps import ImageName
-from lapgs_wgpu.data.undistort import Lens
 from lapgs_wgpu.errors import InputError
 
-NEEDED = "which a capture in nerfies' layout needs"
 CLOUDS = ("points.npy", "points3D_downsample*.ply", "points3D.ply")  # all in the coordinates of the camera files
 STRIDE = 4  # without val_ids: every fourth id from the first on is for training, from the third on for testing
+
+
+SPLITS = ("val", "val_intl")  # folders of masks: of DyCheck's captures; of rigs that alternate the training camera
 
 
 def _matches(folder: Path) -> bool:
@@ -36,18 +46,18 @@ def _matches(folder: Path) -> bool:
 
 def _read(folder: Path, image_size: int | None) -> Capture:
     """Images come from the folder rgb/Nx with the smallest that are at least of the wanted size, else the largest."""
-    ids, train_ids, test_ids = _splits(folder / "dataset.json")
-    scene_json = folder / "scene.json"
-    scene = _object(scene_json, "scale and center")
-    scale = _positive(scene, "scale", scene_json)
-    moved = Normalization(vector(required(scene, "center", scene_json, NEEDED), 3, "center", scene_json), scale)
-    depths = _positive(scene, "near", scene_json), _positive(scene, "far", scene_json)
+    ids, train_ids, test_ids = _splits(_object(folder / "dataset.json"))
+    scene = _object(folder / "scene.json")
+    moved = Normalization(scene.vector("center", 3), _positive(scene, "scale"))
+    depths = _positive(scene, "near"), _positive(scene, "far")
     if depths[0] >= depths[1]:
-        raise InputError(f"{scene_json}: near must be below far, got {depths[0]:g} and {depths[1]:g}.")
-    times = _times(folder / "metadata.json", ids)
-    cameras = {name: _read_camera(folder / "camera" / f"{name}.json") for name in train_ids + test_ids}
+        raise InputError(f"{scene.where}: near must be below far, got {depths[0]:g} and {depths[1]:g}.")
+    times = _times(_object(folder / "metadata.json"), ids)
+    cameras = {name: _read_camera(_object(folder / "camera" / f"{name}.json")) for name in train_ids + test_ids}
     rgb = _image_folder(folder / "rgb", train_ids + test_ids, image_size)
-    masks = find_covisible(folder / "covisible", test_ids, rgb.name)
+    covisible = folder / "covisible"
+    factors = [covisible / rgb.name, *_factor_folders(covisible)]  # that of the images first, then the smallest
+    masks = find_covisible([factor / split for factor in factors for split in SPLITS], test_ids)
     splits: list[tuple[Split, list[str]]] = [("train", train_ids), ("test", test_ids)]
     frames = [
         Frame(
@@ -69,133 +79,123 @@ def _read(folder: Path, image_size: int | None) -> Capture:
     return Capture(
         frames,
         None if cloud is None else moved.cloud(read_cloud(cloud)),
-        source=cloud or scene_json,
+        source=cloud or folder / "scene.json",
         time_source=f"time_id (else warp_id) in {folder / 'metadata.json'}",
         time_range=(min(times.values()), max(times.values())),
         moved=moved,
     )
 
 
-def _splits(path: Path) -> tuple[list[str], list[str], list[str]]:
-    """All ids, and those to train on and to test on."""
-    data = _object(path, "ids")
-    ids = _names(required(data, "ids", path, NEEDED), "ids", path)
-    test = _names(data.get("val_ids") or [], "val_ids", path)
+def _splits(data: Fields) -> tuple[list[str], list[str], list[str]]:
+    """Return all ids, and those to train on and to test on."""
+    ids, test = _names(data, "ids"), _names(data, "val_ids") if data.values.get("val_ids") else []
     if test:
-        train = _names(required(data, "train_ids", path, NEEDED), "train_ids", path)
+        train = _names(data, "train_ids")
         both = [name for name in train if name in set(test)]
         if both:
             raise InputError(
-                f"{path}: {len(both)} of {len(test)} val_ids are train_ids, too, such as {both[0]}; no test image "
-                "may be trained on."
+                f"{data.where}: {len(both)} of {len(test)} val_ids are train_ids, too, such as {both[0]}; no test "
+                "image may be trained on."
             )
     else:  # "interp": the frames between
         train, test = ids[::STRIDE], ids[STRIDE // 2 :: STRIDE]
     if not train or not test:
-        raise InputError(f"{path}: {len(train)} train_ids and {len(test)} test ids; at least one of each is needed.")
-    known = set(ids)
+        raise InputError(f"{data.where}: {len(train)} train_ids and {len(test)} test ids; at least one of each.")
     for field, names in (("train_ids", train), ("val_ids", test)):
-        for name in names:
-            if name not in known:
-                raise InputError(f"{path}: {field} names {name}, which is not among its {len(ids)} ids.")
+        for name in set(names) - set(ids):
+            raise InputError(f"{data.where}: {field} names {name}, which is not among its {len(ids)} ids.")
     return ids, train, test
 
 
-def _times(path: Path, ids: Sequence[str]) -> dict[str, int]:
-    """The time_id or warp_id of each id."""
-    metadata = _object(path, "an entry for each id")
-    entries = {}
-    for name in ids:
-        entries[name] = entry = required(metadata, name, path, "though dataset.json names it")
-        if not isinstance(entry, dict):
-            raise InputError(f"{path}: {name} must be a JSON object, got {kind(entry)}.")
+def _times(metadata: Fields, ids: Sequence[str]) -> dict[str, int]:
+    """Return the time_id or warp_id of each id."""
+    entries = {name: as_fields(metadata.required(name), f"{metadata.where}: {name}") for name in ids}
     field = "time_id" if any("time_id" in entry for entry in entries.values()) else "warp_id"
-    values = {}
-    with_it = sum(field in entry for entry in entries.values())
+    times = {}
     for name, entry in entries.items():
-        hint = f"though {with_it} of {len(entries)} entries have it" if with_it else NEEDED
-        value = required(entry, field, f"{path}: {name}", hint)
+        value = entry.required(field)
         if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= LARGEST_ENTRY:
-            raise InputError(f"{path}: {field} of {name} must be a whole number from 0 up, got {kind(value)}.")
-        values[name] = value
-    return values
+            raise InputError(f"{entry.where}: {field} must be a whole number from 0 up, got {kind(value)}.")
+        times[name] = value
+    return times
 
 
-def _read_camera(path: Path) -> tuple[Lens, np.ndarray]:
-    """A camera file: the lens at image_size and the pose, in the file's coordinates."""
-    data = _object(path, "orientation, position and focal_length")
-
-    def field(name: str) -> Any:
-        return required(data, name, path, NEEDED)
-
-    rows = field("orientation")
-    if not isinstance(rows, list) or len(rows) != 3:
-        raise InputError(f"{path}: orientation must be 3 rows of 3 numbers, got {kind(rows)}.")
-    R_cam_world = np.stack([vector(row, 3, "orientation", path) for row in rows])
-    check_rotation(R_cam_world.T, f"{path}: orientation")
-    position = vector(field("position"), 3, "position", path)
+def _read_camera(data: Fields) -> tuple[Lens, np.ndarray]:
+    """Return the lens and the pose of a camera file, in the file's coordinates."""
+    rows = data.entries("orientation", 3)
+    R_cam_world = np.stack([vector(row, 3, "orientation", data.where) for row in rows])
+    check_rotation(R_cam_world.T, f"{data.where}: orientation")
+    position = data.vector("position", 3)
     if np.abs(position).max() > LARGEST_ENTRY:
-        raise InputError(f"{path}: position holds {np.abs(position).max():g}; at most {LARGEST_ENTRY:g} is allowed.")
-    width, height = (int(side) for side in vector(field("image_size"), 2, "image_size", path))
-    if not (1 <= width <= 1e5 and 1 <= height <= 1e5):
-        raise InputError(f"{path}: image_size must be 1 to 100000 pixels a side, got {width}x{height}.")
-    focal = _positive(data, "focal_length", path)
-    aspect = _positive(data, "pixel_aspect_ratio", path, default=1.0)
-    cx, cy = vector(field("principal_point"), 2, "principal_point", path)
-    skew = finite(data.get("skew", 0.0), "skew", path)
-    K = np.array([[focal, skew, cx], [0, focal * aspect, cy], [0, 0, 1]])
-    radial = vector(data.get("radial_distortion", [0.0] * 3), 3, "radial_distortion", path)
+        raise InputError(
+            f"{data.where}: position holds {np.abs(position).max():g}; at most {LARGEST_ENTRY:g} is allowed."
+        )
+    width, height = (int(side) for side in data.vector("image_size", 2))
+    if not (1 <= width <= LARGEST_SIDE and 1 <= height <= LARGEST_SIDE):
+        raise InputError(f"{data.where}: image_size must be 1 to {LARGEST_SIDE:g} pixels a side, got {width}x{height}.")
+    focal = _positive(data, "focal_length")
+    aspect = _positive(data, "pixel_aspect_ratio") if "pixel_aspect_ratio" in data else 1.0
+    cx, cy = data.vector("principal_point", 2).tolist()
+    skew = data.number("skew") if "skew" in data else 0.0
+    k1, k2, k3 = data.vector("radial_distortion", 3, [0.0] * 3).tolist()
     # nerfies has written the second name, and its first releases the first one.
-    tangential_name = "tangential" if "tangential" in data else "tangential_distortion"
-    tangential = vector(data.get(tangential_name, [0.0] * 2), 2, tangential_name, path)
-    lens = Lens(K, width, height, tuple(radial.tolist()), tuple(tangential.tolist()))
+    tangential = "tangential" if "tangential" in data else "tangential_distortion"
+    p1, p2 = data.vector(tangential, 2, [0.0] * 2).tolist()
+    lens = Lens(width, height, focal, focal * aspect, cx, cy, skew, (k1, k2, k3), (p1, p2))
     return lens, world_to_camera(R_cam_world.T, position)
 
 
+def _factor_folders(folder: Path) -> list[Path]:
+    """Return the folders 1x, 2x, ... in a folder, by number: the same images at 1 / N of their size."""
+    children = [child for child in folder.glob("*x") if re.fullmatch(r"[1-9]\d{0,3}x", child.name)]
+    return sorted(children, key=lambda child: int(child.name[:-1]))
+
+
 def _image_folder(rgb: Path, names: Sequence[str], image_size: int | None) -> Path:
-    """The folder rgb/Nx that suits the wanted size best, which holds the images of all names."""
-    folders = factor_folders(rgb)
-    if not folders:
-        raise InputError(f"{rgb} holds no folder 1x, 2x, ... of images, {NEEDED}.")
+    """Return the folder rgb/Nx that suits the wanted size best, which holds the images of all names."""
     best: Path | None = None
-    for folder in folders:  # from the largest images on
+    for folder in _factor_folders(rgb):  # from the largest images on
         first = folder / f"{names[0]}.png"
         if first.is_file():
             longer = max(check_image(first, whole=False).size)
             if best is None or (image_size is not None and longer >= image_size):
                 best = folder
     if best is None:
-        raise InputError(f"{folders[0] / names[0]}.png does not exist, but dataset.json names {names[0]}.")
+        raise InputError(f"{rgb} holds no folder 1x, 2x, ... with {names[0]}.png, which dataset.json names.")
     for name in names:
         if not (best / f"{name}.png").is_file():
-            raise InputError(f"{best / name}.png does not exist, but dataset.json names {name}.")
+            raise absent_image(best / f"{name}.png", f"dataset.json names {name}")
     return best
 
 
-def _object(path: Path, needs: str) -> dict[str, Any]:
+def _object(path: Path) -> Fields:
     if not path.is_file():
         raise InputError(f"{path} does not exist; a capture in nerfies' layout needs it.")
-    return read_json(path, needs)
+    return read_json(path)
 
 
-def _names(value: Any, field: str, path: Path) -> list[str]:
-    """A list of ids, each of which is safe as a file name."""
-    if not isinstance(value, list):
-        raise InputError(f"{path}: {field} must be a list of ids, got {kind(value)}.")
-    for name in value:
+def _names(data: Fields, field: str) -> list[str]:
+    """Return a list of ids, each of which is safe as a file name."""
+    names = data.required(field)
+    if not isinstance(names, list):
+        raise InputError(f"{data.where}: {field} must be a list of ids, got {kind(names)}.")
+    for name in names:
         if not isinstance(name, str) or not re.fullmatch(r"\w[\w.-]{0,99}", name):
-            raise InputError(f"{path}: {field} holds {kind(name)}, which is no id (letters, digits and . _ - only).")
-    if len(set(value)) < len(value):
-        raise InputError(f"{path}: {field} holds {len(value)} ids of which {len(set(value))} differ; name each once.")
+            raise InputError(
+                f"{data.where}: {field} holds {kind(name)}, which is no id (letters, digits and . _ - only)."
+            )
+    if len(set(names)) < len(names):
+        raise InputError(
+            f"{data.where}: {field} holds {len(names)} ids of which {len(set(names))} differ; name each once."
+        )
+    return names
+
+
+def _positive(data: Fields, name: str) -> float:
+    value = data.number(name)
+    if value <= 0:
+        raise InputError(f"{data.where}: {name} must be above 0, got {value:g}.")
     return value
-
-
-def _positive(data: dict[str, Any], name: str, path: Path, default: float | None = None) -> float:
-    value = required(data, name, path, NEEDED) if default is None else data.get(name, default)
-    got = finite(value, name, path)
-    if not 0 < got <= LARGEST_ENTRY:
-        raise InputError(f"{path}: {name} must be above 0 and at most {LARGEST_ENTRY:g}, got {got:g}.")
-    return got
 
 
 READER = Reader("HyperNeRF", "dataset.json beside camera/ and rgb/", _matches, _read)

@@ -10,71 +10,62 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
 from lapgs_wgpu.data.frames import Capture, Frame, Reader
 from lapgs_wgpu.data.images import SUFFIXES, check_image
-from lapgs_wgpu.data.json_fields import finite, read_json, required
+from lapgs_wgpu.data.json_fields import LARGEST_INTRINSIC, absent_image, read_json
+from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.poses import opengl_pose
 from lapgs_wgpu.data.timestamps import ImageName, natural_key
-from lapgs_wgpu.data.undistort import Lens
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.listing import listed
 
-NEEDED = "which raw data of Polycam need"
 AXES = "t_00 ... t_23 must be camera to world in ARKit's axes (y up, z backward)"
-INTRINSICS = ("width", "height", "fx", "fy", "cx", "cy")
-LARGEST = 1e6  # of the intrinsics, pixels
-LARGEST_SIDE = 1e5
 
 
-def _first(folder: Path, names: tuple[str, str]) -> Path | None:
-    return next((folder / "keyframes" / name for name in names if (folder / "keyframes" / name).is_dir()), None)
-
-
-def _cameras(folder: Path) -> Path | None:
-    return _first(folder, ("corrected_cameras", "cameras"))
+def _subfolder(folder: Path, name: str) -> Path:
+    """Return keyframes/corrected_NAME where it exists, else keyframes/NAME."""
+    corrected = folder / "keyframes" / f"corrected_{name}"
+    return corrected if corrected.is_dir() else folder / "keyframes" / name
 
 
 def _matches(folder: Path) -> bool:
-    return _cameras(folder) is not None
+    return _subfolder(folder, "cameras").is_dir()
 
 
 def _read(folder: Path, image_size: int | None) -> Capture:
-    cameras, images = _cameras(folder), _first(folder, ("corrected_images", "images"))
-    assert cameras is not None
-    if images is None:
-        raise InputError(f"{folder / 'keyframes'} has no images/; export raw data from Polycam again.")
+    cameras, images = _subfolder(folder, "cameras"), _subfolder(folder, "images")
+    if not images.is_dir():
+        raise InputError(f"{images} does not exist; export raw data from Polycam again.")
     files = {file.stem: file for file in listed(images) if file.suffix.lower() in SUFFIXES}
-    found = (file for file in listed(cameras) if file.suffix == ".json")
-    described = sorted(found, key=lambda file: natural_key(file.stem))
+    described = sorted((file for file in listed(cameras) if file.suffix == ".json"), key=lambda f: natural_key(f.stem))
     if not described:
         raise InputError(f"{cameras} holds no camera (.json); export raw data from Polycam again.")
-    lenses: dict[tuple[float, ...], Lens] = {}
-    frames: list[Frame] = []
-    times: list[float] = []
+    frames = []
     for path in described:
         if path.stem not in files:
-            raise InputError(f"{images / path.stem}.jpg does not exist, but {path} describes its camera.")
-        data = read_json(path, "t_00, ... and fx")
-        rows = [[required(data, f"t_{i}{j}", path, NEEDED) for j in range(4)] for i in range(3)]
-        values = tuple(finite(required(data, name, path, NEEDED), name, path) for name in INTRINSICS)
-        width, height, fx, fy, cx, cy = values
-        if not (1 <= width <= LARGEST_SIDE and 1 <= height <= LARGEST_SIDE) or max(map(abs, values)) > LARGEST:
-            raise InputError(f"{path}: {', '.join(INTRINSICS)} must be in pixels, got {', '.join(map(str, values))}.")
-        K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-        lens = lenses.setdefault(values, Lens(K, round(width), round(height)))
-        pose = opengl_pose([*rows, [0.0, 0.0, 0.0, 1.0]], str(path))
-        times.append(finite(required(data, "timestamp", path, NEEDED), "timestamp", path))
-        file = files[path.stem]
-        frames.append(Frame(check_image(file), lens, pose, str(path), ImageName(file.name), times[-1]))
-    left = len(files) - len(frames)
+            raise absent_image(images / f"{path.stem}.jpg", f"{path} describes its camera")
+        data = read_json(path)
+        fx, fy, cx, cy = (data.number(k, -LARGEST_INTRINSIC, LARGEST_INTRINSIC) for k in ("fx", "fy", "cx", "cy"))
+        rows = [[data.required(f"t_{i}{j}") for j in range(4)] for i in range(3)]
+        frames.append(
+            Frame(
+                check_image(files[path.stem]),
+                Lens(data.side("width"), data.side("height"), fx, fy, cx, cy),
+                opengl_pose([*rows, [0.0, 0.0, 0.0, 1.0]], str(path)),
+                str(path),
+                ImageName(files[path.stem].name),
+                data.number("timestamp", -1e18, 1e18),
+            )
+        )
+    left_out = len(files) - len(frames)
     return Capture(
         frames,
         None,
         source=cameras,
         time_source=f"timestamp in {cameras}",
-        warnings=[f"{left} of {len(files)} images in {images} have no camera and are left out."] if left else [],
+        warnings=[f"{left_out} of {len(files)} images in {images} have no camera and are left out."]
+        if left_out
+        else [],
         own_footage=True,
         axes_hint=AXES,
     )

@@ -1,4 +1,4 @@
-"""Rows of poses_bounds.npy, which the formats Neu3D and EndoNeRF share.
+"""Rows of LLFF's poses_bounds.npy, which the formats Neu3D and EndoNeRF share.
 
 A row of 17 numbers holds a 3x5 matrix [R, position, (height, width, focal length)], then nearest and furthest depth.
 The pose is camera to world; which axes the columns of R are is each format's own matter.
@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.data.cloud import read_npy
-from lapgs_wgpu.data.poses import LARGEST_ENTRY, check_rotation
-from lapgs_wgpu.data.undistort import Lens
+from lapgs_wgpu.data.json_fields import LARGEST_ENTRY, LARGEST_SIDE
+from lapgs_wgpu.data.lens import Lens
+from lapgs_wgpu.data.poses import check_rotation
 from lapgs_wgpu.errors import InputError
 
 POSES = "poses_bounds.npy"
-LARGEST_SIDE = 1e5  # pixels
 Array = NDArray[np.float64]
 
 
@@ -35,15 +35,9 @@ class PoseRow(NamedTuple):
 
 
 def read_rows(path: Path, names: Sequence[str], what: str) -> list[PoseRow]:
-    """Read a row for each of the names, in their order.
+    """Read a row for each of the names, in their order. names: at least one, of `what`, such as "images".
 
-    Args:
-        path: of the file.
-        names: of what the rows belong to; one at least.
-        what: what these are, for errors, such as "images".
-
-    Raises:
-        InputError: the file is not readable, has another number of rows, or one of them is no camera.
+    Raises InputError: the file is not readable, has another number of rows, or one of them is no camera.
     """
     rows = read_npy(path).astype(np.float64)
     if rows.ndim != 2 or rows.shape[1] != 17:
@@ -53,19 +47,17 @@ def read_rows(path: Path, names: Sequence[str], what: str) -> list[PoseRow]:
             f"{path} holds {len(rows)} poses, but there are {len(names)} {what}, {names[0]} to {names[-1]}; each of "
             "them needs a row, in this order."
         )
-    return [
-        _row(row, f"{path}, row {index} ({name})") for index, (row, name) in enumerate(zip(rows, names, strict=True))
-    ]
+    return [_row(row, f"{path}, row {i} ({name})") for i, (row, name) in enumerate(zip(rows, names, strict=True))]
 
 
 def _row(row: Array, where: str) -> PoseRow:
-    """A row (17,) that was checked. Raises InputError."""
+    """Check a row (17,). Raises InputError."""
     bad = ~(np.abs(row) <= LARGEST_ENTRY)  # true for NaN, too
     if bad.any():
         column = int(np.argmax(bad))
         raise InputError(f"{where} holds {row[column]:g} in column {column}; it must be at most {LARGEST_ENTRY:g}.")
     pose, (near, far) = row[:15].reshape(3, 5), row[15:]
-    height, width, focal = pose[:, 4]
+    height, width, focal = pose[:, 4].tolist()
     if not (1 <= width <= LARGEST_SIDE and 1 <= height <= LARGEST_SIDE and focal > 0):
         raise InputError(
             f"{where}: height, width and focal length must be positive pixels, got {height:g}, {width:g} and {focal:g}."
@@ -73,5 +65,5 @@ def _row(row: Array, where: str) -> PoseRow:
     if not 0 < near < far:
         raise InputError(f"{where}: the depth bounds must be 0 < near < far, got {near:g} and {far:g}.")
     check_rotation(pose[:, :3], f"{where}: the pose")
-    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-    return PoseRow(Lens(K, round(width), round(height)), pose[:, :3], pose[:, 3], (float(near), float(far)), where)
+    lens = Lens(round(width), round(height), focal, focal, width / 2, height / 2)
+    return PoseRow(lens, pose[:, :3], pose[:, 3], (float(near), float(far)), where)

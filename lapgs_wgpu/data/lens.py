@@ -1,4 +1,4 @@
-"""Undistort: resample the images of a lens with distortion to those of a pinhole camera, which is what we render.
+"""Lenses with distortion, and the resampling of their images to those of pinhole cameras, which is what we render.
 
 The lens model is that of nerfies and of Brown (1966): three radial and two tangential coefficients, and a skew.
 """
@@ -19,39 +19,50 @@ Array = NDArray[np.float64]
 MAX_ZOOM = 4.0  # a lens that needs more has wrong coefficients
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Lens:
-    """Intrinsics and distortion of a camera.
+    """Intrinsics and distortion of a camera; lenses of equal values are equal.
 
-    K: (3, 3) float64 intrinsics in pixels, the skew in row 0, column 1; pixel centers at + 0.5.
-    width, height: size in pixels of the images for which K holds.
-    radial: (3,) coefficients of r^2, r^4 and r^6. tangential: (2,).
+    width, height: size in pixels of the images for which the values hold.
+    fx, fy, cx, cy, skew: intrinsics in pixels; pixel centers at + 0.5.
+    radial: coefficients of r^2, r^4 and r^6. tangential: p1 and p2.
     """
 
-    K: Array
     width: int
     height: int
-    radial: tuple[float, ...] = (0.0, 0.0, 0.0)
-    tangential: tuple[float, ...] = (0.0, 0.0)
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    skew: float = 0.0
+    radial: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    tangential: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def K(self) -> Array:  # noqa: N802
+        """(3, 3) intrinsics, the skew in row 0, column 1."""
+        return np.array([[self.fx, self.skew, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     @property
     def is_pinhole(self) -> bool:
         """Whether the lens has neither distortion nor skew."""
-        return not (any(self.radial) or any(self.tangential) or self.K[0, 1])
+        return not (any(self.radial) or any(self.tangential) or self.skew)
 
     @property
     def idealized(self) -> Lens:
         """A pinhole of the same focal lengths that looks at the image's center, as much published code takes it."""
-        K = np.array([[self.K[0, 0], 0, self.width / 2], [0, self.K[1, 1], self.height / 2], [0, 0, 1]])
-        return Lens(K, self.width, self.height)
+        return Lens(self.width, self.height, self.fx, self.fy, self.width / 2, self.height / 2)
 
     def resized(self, width: int, height: int) -> Lens:
         """The same lens for images of another size."""
-        scale = np.diag([width / self.width, height / self.height, 1.0])
-        return Lens(scale @ self.K, width, height, self.radial, self.tangential)
+        x, y = width / self.width, height / self.height
+        return Lens(
+            width, height, self.fx * x, self.fy * y, self.cx * x, self.cy * y, self.skew * x,
+            self.radial, self.tangential,
+        )  # fmt: skip
 
     def project(self, rays: Array) -> Array:
-        """Project rays (..., 2), x / z and y / z: (..., 2) pixel coordinates."""
+        """Project rays (..., 2), x / z and y / z, to pixel coordinates (..., 2)."""
         x, y = rays[..., 0], rays[..., 1]
         r2 = x * x + y * y
         k1, k2, k3 = self.radial
@@ -59,8 +70,8 @@ class Lens:
         bend = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
         bent_x = x * bend + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
         bent_y = y * bend + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)
-        u = self.K[0, 0] * bent_x + self.K[0, 1] * bent_y + self.K[0, 2]
-        return np.stack([u, self.K[1, 1] * bent_y + self.K[1, 2]], axis=-1)
+        u = self.fx * bent_x + self.skew * bent_y + self.cx
+        return np.stack([u, self.fy * bent_y + self.cy], axis=-1)
 
     def pinhole(self, where: str) -> Array:
         """(3, 3) K of the pinhole camera of the same image size and the smallest zoom at which the image has no gaps.
@@ -93,8 +104,24 @@ class Lens:
             low, high = (low, middle) if covered(middle) else (middle, high)
         return self._zoomed(high)
 
-    def undistort(self, image: Pixels, K: Array) -> Pixels:
-        """Resample an image (H, W, C) bilinearly to that of a pinhole camera with intrinsics K (3, 3), same size.
+    def _unfolds(self, rays: Array) -> bool:
+        """Whether the radial distortion is monotonic up to these rays (N, 2)."""
+        r2 = np.linspace(0, 1, 64) * np.square(rays).sum(axis=-1).max()
+        k1, k2, k3 = self.radial
+        return bool((1 + r2 * (3 * k1 + r2 * (5 * k2 + r2 * 7 * k3)) > 0).all())
+
+    def _zoomed(self, zoom: float) -> Array:
+        return np.array([[zoom * self.fx, 0, self.cx], [0, zoom * self.fy, self.cy], [0, 0, 1]])
+
+
+class Undistortion(NamedTuple):
+    """Resamples images of `lens` (at their size) to those of a pinhole camera with intrinsics K (3, 3)."""
+
+    lens: Lens
+    K: Array
+
+    def apply(self, image: Pixels) -> Pixels:
+        """Resample an image (H, W, C) bilinearly to the pinhole's, of the same size.
 
         Colors weigh by their alpha, so that those of transparent pixels do not bleed into edges.
         """
@@ -102,11 +129,11 @@ class Lens:
 
         height, width = image.shape[:2]
         columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-        source = self.project(_rays(K, np.stack([columns, rows], axis=-1))) - 0.5
-        where = [source[..., 1], source[..., 0]]
+        source = self.lens.project(_rays(self.K, np.stack([columns, rows], axis=-1))) - 0.5
+        places = [source[..., 1], source[..., 0]]
 
         def resampled(channel: NDArray[Any]) -> NDArray[np.float32]:
-            return map_coordinates(channel, where, np.float32, order=1, mode="nearest")
+            return map_coordinates(channel, places, np.float32, order=1, mode="nearest")
 
         channels = np.moveaxis(image, -1, 0)
         if len(channels) == 3:
@@ -117,27 +144,6 @@ class Lens:
             covered = np.where(alpha > 0, alpha, 1)
             values = np.stack([*(resampled(channel * weight) / covered for channel in channels[:3]), alpha])
         return np.floor(np.moveaxis(values, 0, -1) + 0.5).astype(np.uint8)
-
-    def _unfolds(self, rays: Array) -> bool:
-        """Whether the radial distortion is monotonic up to these rays (N, 2)."""
-        r2 = np.linspace(0, 1, 64) * np.square(rays).sum(axis=-1).max()
-        k1, k2, k3 = self.radial
-        return bool((1 + r2 * (3 * k1 + r2 * (5 * k2 + r2 * 7 * k3)) > 0).all())
-
-    def _zoomed(self, zoom: float) -> Array:
-        fx, fy = zoom * self.K[0, 0], zoom * self.K[1, 1]
-        return np.array([[fx, 0, self.K[0, 2]], [0, fy, self.K[1, 2]], [0, 0, 1]])
-
-
-class Undistortion(NamedTuple):
-    """Undistorts images of `lens` (at their size) for a pinhole camera with intrinsics K (3, 3)."""
-
-    lens: Lens
-    K: Array
-
-    def apply(self, image: Pixels) -> Pixels:
-        """The undistorted image, (H, W, C) like the given one."""
-        return self.lens.undistort(image, self.K)
 
 
 def _rays(K: Array, pixels: Array) -> Array:

@@ -1,0 +1,120 @@
+"""Where the scene of a capture lies: its depths before the cameras, its cube, and a cloud that is filled up."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from lapgs_wgpu.data.cloud import Cloud, points_in_view
+from lapgs_wgpu.data.focus import are_parallel, focus_of
+from lapgs_wgpu.data.frames import Capture, Frame
+from lapgs_wgpu.data.normalize import BOX, Cube, Normalization, cube_in_view, cube_of_points
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.splat.camera import Camera
+
+CUBE_POINTS = 4096  # random points that determine the cube of a capture without a cloud
+DENSE = 4096  # points; a smaller cloud is filled up: Gaussians multiply too slowly to fill what it leaves empty
+NEAREST, FURTHEST = 0.25, 2.0  # depths relative to the distance of the focus, for own footage without a cloud
+
+
+class Placement(NamedTuple):
+    """normalization: from the capture's coordinates to the world's; None keeps them. cloud, depths: in the world's."""
+
+    normalization: Normalization | None
+    cloud: Cloud | None
+    depths: tuple[float, float] | None
+    warnings: list[str]
+
+
+def place(capture: Capture, training: Sequence[Frame], cameras: Sequence[Camera], *, normalize: bool) -> Placement:
+    """Determine the cube that a capture fills, and bring cloud and depths into the world's coordinates.
+
+    Args:
+        capture: with or without a cloud.
+        training: its training frames.
+        cameras: the distinct cameras of these, in the capture's coordinates.
+        normalize: False keeps the coordinates of captures that may keep theirs, whatever their size.
+
+    Raises:
+        InputError: nothing tells where the scene is.
+    """
+    depths, warnings = _depths(capture, training, cameras)
+    cube = _cube(capture, cameras, depths)
+    if cube is None:
+        warnings.append(
+            f"{capture.source}: half or more of {len(cameras)} cameras look away from the point nearest to all "
+            "optical axes, so the size of the scene is unknown and it keeps its coordinates: if that is not "
+            f"[-{BOX:g}, {BOX:g}]^3, raise points.box and field.bound, or add a cloud (fused.ply)."
+        )
+    cloud = capture.cloud
+    if cloud is not None and capture.own_footage:
+        cloud = _filled(cloud, cameras)
+    if cube is None or (capture.keeps_coordinates and (cube.fits or not normalize)):
+        return Placement(None, cloud, depths, warnings)
+    fit = cube.normalization
+    return Placement(
+        fit,
+        None if cloud is None else fit.cloud(cloud),
+        None if depths is None else (depths[0] * fit.scale, depths[1] * fit.scale),
+        warnings,
+    )
+
+
+def _depths(
+    capture: Capture, training: Sequence[Frame], cameras: Sequence[Camera]
+) -> tuple[tuple[float, float] | None, list[str]]:
+    """Return nearest and furthest depth, if files state them or no cloud replaces them, and warnings of a guess."""
+    stated = [frame.depths for frame in training if frame.depths is not None]
+    if stated:
+        return (min(near for near, _ in stated), float(np.median([far for _, far in stated]))), []
+    if capture.cloud is not None or capture.keeps_coordinates:
+        return None, []
+    focus = focus_of(cameras, origin=False)
+    depth = np.array([(camera.T_cam_world @ [*focus, 1.0])[2] for camera in cameras])
+    behind = int((depth <= 0).sum())
+    if 2 * behind > len(cameras):
+        raise InputError(
+            f"{capture.source}: there is no cloud, and {behind} of {len(cameras)} cameras look away from the point "
+            f"nearest to all optical axes: {capture.axes_hint}, or give a cloud."
+        )
+    near, far = NEAREST * float(depth[depth > 0].min()), FURTHEST * float(depth.max())
+    if not are_parallel(cameras):
+        return (near, far), []
+    return (near, far), [
+        f"{capture.source}: there is no cloud, and all cameras look in one direction, so nothing tells how far "
+        f"away the scene is, and {near:.3g} to {far:.3g} in the capture's units is a guess: walk around what "
+        "moves, or give a cloud."
+    ]
+
+
+def _cube(capture: Capture, cameras: Sequence[Camera], depths: tuple[float, float] | None) -> Cube | None:
+    """Return the cube that the capture fills, in its own coordinates; None if neither files nor cameras tell."""
+    if capture.cloud is not None:
+        return cube_of_points(capture.cloud.points.astype(np.float64))
+    if depths is not None:
+        return cube_of_points(points_in_view(cameras, *depths, CUBE_POINTS, 0))
+    return cube_in_view(cameras)
+
+
+def _filled(cloud: Cloud, cameras: Sequence[Camera]) -> Cloud:
+    """Fill up a cloud to DENSE points.
+
+    The new points are random where views overlap, between the depths of the cloud. Each has the color of the nearest
+    old one.
+    """
+    from scipy.spatial import cKDTree  # slow to import
+
+    missing = DENSE - len(cloud.points)
+    if missing <= 0:
+        return cloud
+    points = cloud.points.astype(np.float64)
+    depths = np.concatenate([points @ c.T_cam_world[2, :3] + c.T_cam_world[2, 3] for c in cameras])
+    near, far = np.percentile(depths[depths > 0], [1, 99])
+    added = points_in_view(cameras, float(near), float(far) * 1.01, missing, 0)
+    _, nearest = cKDTree(points).query(added)
+    return Cloud(
+        np.concatenate([cloud.points, added.astype(np.float32)]),
+        np.concatenate([cloud.colors, cloud.colors[nearest]]),
+    )
