@@ -42,9 +42,8 @@ _TAKES = {
     "screenshot": _PICTURE,
     "video": _PICTURE | {"path", "fps", "seconds"},
     "export": _COMMON | {"time", "frames", "max_error", "overwrite"},
-    "window": _PICTURE | {"time_slider", "play", "fps", "speed", "loop", "backend", "host", "port", "token"},
+    "window": _PICTURE | {"time_slider", "play", "fps", "speed", "loop", "backend", "host", "port"},
 }
-NEW_TOKEN = ""  # value of --token without a text
 
 
 def parse_options(arguments: Sequence[str]) -> tuple[Any, str]:
@@ -60,12 +59,9 @@ def _job(given: Any) -> str:
         raise InputError(f"{_option(jobs[0])} and {_option(jobs[1])} do not go together: one at a time.")
     job = jobs[0] if jobs else "window"
     for name, value in vars(given).items():
-        if value is None or name in ("file", job) or name in _TAKES[job]:
-            continue
-        needs = [_option(other) for other, takes in _TAKES.items() if name in takes and other != "window"]
-        if job != "window":
-            raise InputError(f"{_option(name)} has no use with {_option(job)}.")
-        raise InputError(f"{_option(name)} has no use without {' or '.join(needs)}.")
+        if value is not None and name not in ("file", job) and name not in _TAKES[job]:
+            place = f"with {_option(job)}" if job != "window" else "in a window"
+            raise InputError(f"{_option(name)} has no use {place}.")
     return job
 
 
@@ -99,8 +95,7 @@ def _parse(arguments: Sequence[str]) -> Any:
         "whole scene]")
 
     add = parser.add_argument_group("window").add_argument
-    add("--time-slider", action=argparse.BooleanOptionalAction, help="show or hide the time slider [shown if the "
-        "scene moves]")
+    add("--time-slider", action="store_const", const=True, help="show the time slider [shown if the scene moves]")
     add("--play", action="store_const", const=True, help="start playing at once [paused]")
     add("--fps", type=_number(0.1, 1000.0), metavar="F", help="frames of the clip per second at speed 1, and of "
         "--video; the clip has a fixed number of frames, so more make it shorter, except in a video whose length "
@@ -108,16 +103,12 @@ def _parse(arguments: Sequence[str]) -> Any:
     add("--speed", type=_number(0.01, 100.0), metavar="X", help="playback speed in the window, a factor [1]")
     add("--loop", choices=list(LOOPS), help="at the end of the clip; loop: start again; bounce: play backwards; "
         "once: stop [loop]")
-    add("--backend", choices=("auto", "glfw", "qt", "http"), help="how to display; glfw or qt: desktop window of "
-        "that library; auto: glfw if it works, otherwise qt; http: web server for a browser (pip install "
-        "'lapgs-wgpu[remote]') [auto]")
+    add("--backend", choices=("glfw", "http"), help="how to display; glfw: desktop window; http: web server for a "
+        "browser (pip install 'lapgs-wgpu[remote]') [glfw]")
 
     add = parser.add_argument_group("web server (with --backend http)").add_argument
-    add("--host", metavar="ADDRESS", help="network address to listen on; an address that other machines can reach "
-        "requires --token [127.0.0.1: this machine only]")
+    add("--host", metavar="ADDRESS", help="network address to listen on [127.0.0.1: this machine only]")
     add("--port", type=_port, metavar="N", help="TCP port to listen on; 0: any free port [8080]")
-    add("--token", nargs="?", const=NEW_TOKEN, metavar="TEXT", help="require this token from browsers, 16 or more "
-        "letters, digits, - or _; without TEXT a random token is generated and printed [no token]")
 
     add = parser.add_argument_group("screenshot and video (no window)").add_argument
     add("--screenshot", metavar="FILE.png", help="render one image to a PNG file; replaces an existing file")

@@ -38,7 +38,6 @@ class Viewport:
         self._presenter = Presenter(self.device, self.format)
         self.frame: Frame | None = None
         self.scale = self._moving_scale = 1.0
-        self._trained: Any = None  # the training's last step before the frame was drawn
         self._drawn: tuple[Any, ...] = ()  # all that the frame depends on, with the renderer at the end
         self.stale = False
         self.moved_at = time.perf_counter()
@@ -47,25 +46,24 @@ class Viewport:
     @property
     def fps(self) -> float:
         """Frames of the scene drawn in the last second."""
-        recent = [moment for moment in self._times if moment > time.perf_counter() - 1.0]
+        recent = [drawn for drawn in self._times if drawn > time.perf_counter() - 1.0]
         return len(recent) - 1.0 if len(recent) > 1 else 0.0
 
     @property
     def at_rest(self) -> bool:
-        """Whether the frame on show is final, at full resolution."""
+        """Whether the frame on show is final: of the full resolution."""
         return self.scale == 1 and self.frame is not None
 
     def refresh(self) -> None:
         """The scene itself has changed: draw it again."""
         self.stale = True
-        self.state.renderer.forget()
         self.canvas.request_draw()
 
     def draw(self, now: float) -> None:
-        """Draw the scene where something changed: at a lower resolution while it changes, in full
-        once nothing has changed for SETTLED seconds. now: seconds of `time.perf_counter`."""
+        """Draw the scene where something changed: at a lower resolution while it changes, in full once
+        nothing has changed for SETTLED seconds. now: seconds of `time.perf_counter`."""
         state, full = self.state, self._full_camera()
-        key = (*_camera_key(full), state.clock.time, state.mode, state.background, state.profiling, state.renderer)
+        key = (*_camera_key(full), state.clock.time, state.mode, state.background, state.renderer)
         changed = key != self._drawn
         if changed:
             moving = bool(self._drawn) and self._drawn[-1] is state.renderer  # not the first frame of a scene
@@ -74,15 +72,13 @@ class Viewport:
             return
         else:
             moving = False
-        if state.training is not None and state.training.last is not self._trained:
-            self._trained = state.training.last
+        if state.training is not None:
             state.renderer.forget()
         self.scale = self._moving_scale if moving else 1.0
         camera = full
         if self.scale < 1:
             camera = full.resized(max(1, round(self.scale * full.width)), max(1, round(self.scale * full.height)))
-        request = FrameRequest(camera, state.clock.time, state.mode, state.background)
-        self.frame = state.renderer.draw(request, profile=state.profiling)
+        self.frame = state.renderer.draw(FrameRequest(camera, state.clock.time, state.mode, state.background))
         self._drawn, self.stale = key, False
         self._times.append(time.perf_counter())
         if moving:
