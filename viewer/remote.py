@@ -42,13 +42,17 @@ _PAGE = """<!DOCTYPE html>
 <link rel="stylesheet" href="renderview.css">
 <style>
 html, body { margin: 0; height: 100%; overflow: hidden; background: #1c1c1f; color: #eee; font: 13px system-ui; }
-div.renderview-wrapper { position: absolute; inset: 0; border: none; }
+div.renderview-wrapper { position: absolute; border: none; }
 #status { position: absolute; top: 0; left: 50%; transform: translateX(-50%); opacity: 0.7; }
 </style>
+<script>
+// Browsers keep pages that one has left, and their connections: another browser is to take over.
+addEventListener("pagehide", () => window.websocket?.close())
+</script>
 <script type="module" src="renderview.js"></script>
 <script type="module" src="renderview-client.js"></script>
 </head>
-<body><div id="canvas" class="renderview-wrapper"></div><div id="status"></div></body>
+<body><div id="canvas" style="width: 100%; height: 100%"></div><div id="status"></div></body>
 </html>
 """
 
