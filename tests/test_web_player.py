@@ -190,6 +190,17 @@ def test_a_still_scene(window: Browser, folder: Path, device: Device) -> None:
 
 
 @pytest.mark.nightly
+def test_an_antialiased_scene(window: Browser, folder: Path, device: Device) -> None:
+    scene = trained(device, OURS, 300)
+    without = Desktop(export_scene(scene, folder, device, "aliased"), device)
+    scene.antialiased = True
+    made = export_scene(scene, folder, device, "antialiased")
+    open_page(window, made.as_uri())
+    assert same(window, Desktop(made, device), 0.0)
+    assert not same(window, without, 0.0)
+
+
+@pytest.mark.nightly
 def test_a_scene_of_uneven_timing(window: Browser, folder: Path, device: Device) -> None:
     scene = trained(device, OURS, 300)
     without = Desktop(export_scene(scene, folder, device, "even"), device)
