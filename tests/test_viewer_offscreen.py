@@ -310,7 +310,6 @@ def test_exports_for_other_viewers_say_that_these_draw_it_thicker(
     for told, words in (
         (True, ["still.ply"]),
         (True, ["frames", "--frames", "2"]),
-        (True, ["a.4dgs", "--max-error", "50"]),
         (False, ["a.lapgs"]),
     ):
         view(tmp_path / "a.ply", "--export", tmp_path / words[0], *words[1:])

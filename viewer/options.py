@@ -91,7 +91,7 @@ def _parse(arguments: Sequence[str]) -> Any:
     add = parser.add_argument_group("window").add_argument
     add("--time-slider", action="store_const", const=True, help="show the time slider [shown if the scene moves]")
     add("--play", action="store_const", const=True, help="start playing at once [paused]")
-    add("--fps", type=_number(0.1, 1000.0), metavar="F", help="frames of the clip per second at speed 1, also of --video "
+    add("--fps", type=_number(0.1, 1000.0), metavar="F", help="frames a second at speed 1 and of --video "
         "[30, or that of the camera path]")
     add("--speed", type=_number(0.01, 100.0), metavar="X", help="playback speed, a factor [1]")
     add("--loop", choices=list(LOOPS), help="at the end of the clip: start again, play backwards, or stop [loop]")
@@ -110,10 +110,10 @@ def _parse(arguments: Sequence[str]) -> Any:
         "camera path; 6 for view]")
 
     add = parser.add_argument_group("export (no window)").add_argument
-    add("--export", metavar="FILE.ply|.lapgs|.html|.4dgs|DIR", help=".ply: static 3DGS file of the Gaussians at --time; "
+    add("--export", metavar="FILE.ply|.lapgs|.html|.4dgs|DIR", help=".ply: static 3DGS file at --time; "
         ".lapgs: compact scene with its motion; .html: web page that plays it; .4dgs: motion as straight lines (pip "
         "install 'lapgs-wgpu[export]'); DIR: a static file for each of --frames")
-    add("--max-error", type=_number(0.01, 100.0), metavar="PX", help="of a .4dgs: how far lines may be from the learned "
+    add("--max-error", type=_number(0.01, 100.0), metavar="PX", help="of a .4dgs: how far lines may be off the learned "
         "motion, pixels of the captured images at the focus [0.5]")
     add("--frames", type=_count, metavar="N", help="number of files in DIR, at times evenly from 0 to 1")
     add("--overwrite", action="store_const", const=True, help="replace an existing file, or the frame_*.ply in DIR")
