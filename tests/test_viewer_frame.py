@@ -32,7 +32,7 @@ pytestmark = pytest.mark.kernels
 
 
 def planes(frame: Frame) -> np.ndarray:
-    return frame.placed.planes.read().view(np.uint32)[:4]
+    return frame.layout.planes.read().view(np.uint32)[:4]
 
 
 @pytest.mark.parametrize("mode", ["motion", "scale"])

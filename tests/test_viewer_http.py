@@ -216,7 +216,7 @@ def expected(scene: Path, device: Device, size: tuple[int, int], time: float) ->
     """What the desktop draws where the viewer begins."""
     opened = load_scene(scene, lambda: device)
     request = FrameRequest(opened.camera().camera(*size), time, "rgb", opened.background)
-    return Offscreen(device)(size, [FrameRenderer(opened.playback).draw(request).placed], MARGIN).astype(np.int16)
+    return Offscreen(device)(size, [FrameRenderer(opened.playback).draw(request).layout], MARGIN).astype(np.int16)
 
 
 def apart(a: NDArray[np.int16], b: NDArray[np.int16]) -> float:

@@ -10,14 +10,15 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
+from helpers.scene_files import moving_scene
 from PIL import Image
+from plyfile import PlyData
 
 from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.gpu import device as device_module
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.config import FieldConfig
-from lapgs_wgpu.motion.fields.hash_grid_config import HashConfig
 from lapgs_wgpu.motion.scene import Scene4D, load
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.rasterize import rasterize
@@ -35,25 +36,6 @@ from lapgs_wgpu.viewer.viewport import Viewport
 
 pytestmark = pytest.mark.triangles
 kernels = pytest.mark.kernels
-COUNT = 60
-
-
-def moving_scene(device: Device) -> Scene4D:
-    """Gaussians that a random field moves by about their own size."""
-    rng = np.random.default_rng(0)
-    grid = HashConfig(2, (4, 4, 4), (8, 8, 8), 10)
-    config = FieldConfig(static=grid, temporal=grid, width=8)
-    points, colors = rng.uniform(-0.8, 0.8, (COUNT, 3)), rng.uniform(0, 1, (COUNT, 3))
-    scene = Scene4D.from_points(points, colors, rng.uniform(0.05, 0.2, COUNT), config, opacity=0.7, device=device)
-    torch.manual_seed(0)
-    with torch.no_grad():
-        scene.parameters["sh_rest"].copy_(0.2 * torch.randn(COUNT, 15, 3))
-        scene.parameters["quats"].copy_(torch.randn(COUNT, 4))
-        scene.parameters["log_scales"].add_(0.5 * torch.randn(COUNT, 3))
-        for value in scene.field.parameters():  # type: ignore[union-attr]
-            value.add_(0.2 * torch.randn_like(value))
-    scene.sh_degree = 3
-    return scene
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +44,7 @@ def run(device: Device, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("run")
     data = write_synthetic(folder / "toys", size=24, train_views=3, test_views=2)
     (folder / "config.toml").write_text(f'[data]\npath = "{data}"\nsize = 0\n')
-    scene = moving_scene(device)
+    scene = moving_scene(device, sh_degree=3)
     scene.save(folder / "checkpoint.ply", {"background": "white"})
     still = Scene4D.from_points(np.eye(3), np.eye(3), np.full(3, 0.2), FieldConfig(kind="static"), device=device)
     still.save(folder / "still.ply")
@@ -248,15 +230,8 @@ def test_without_pyav_one_sentence_says_what_to_install(
 
 
 def columns(file: Path) -> dict[str, np.ndarray]:
-    """A reader of its own: the float properties of the first element, by name."""
-    header, _, body = file.read_bytes().partition(b"end_header\n")
-    lines = header.decode("ascii").splitlines()
-    assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
-    assert lines[2].startswith("element vertex ")
-    assert all(line.startswith("property float ") for line in lines[3:])
-    names = [line.split()[-1] for line in lines[3:]]
-    rows = np.frombuffer(body, "<f4").reshape(int(lines[2].split()[-1]), len(names))
-    return dict(zip(names, rows.T, strict=True))
+    data = PlyData.read(file)["vertex"].data
+    return {name: data[name] for name in data.dtype.names}
 
 
 def assert_still(file: Path, scene: Scene4D, time: float) -> None:
@@ -304,7 +279,7 @@ def test_an_exported_still(run: Path, scene: Scene4D, tmp_path: Path, capsys: py
 def test_exports_for_other_viewers_say_that_these_draw_it_thicker(
     antialiased: bool, device: Device, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    scene = moving_scene(device)
+    scene = moving_scene(device, sh_degree=3)
     scene.antialiased = antialiased
     scene.save(tmp_path / "a.ply")
     for told, words in (

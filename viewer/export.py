@@ -1,4 +1,4 @@
-"""Files for other viewers: stills as plain .ply in Inria's layout, one or one a moment; a compact scene; a web page."""
+"""Files for other viewers: stills as plain .ply in Inria's layout, one or a sequence; a compact scene; a web page."""
 
 from __future__ import annotations
 

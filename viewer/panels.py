@@ -103,8 +103,8 @@ class Panels:
         state.mode = choice("mode", state.mode, state.renderer.modes())
         tip(MODES[state.mode])
         frame = self.viewport.frame
-        if frame is not None and frame.placed.shows in ("depth", "value"):
-            _legend(frame.placed.low, frame.placed.high)
+        if frame is not None and frame.layout.shows in ("depth", "value"):
+            _legend(frame.layout.low, frame.layout.high)
         state.background = choice("ground", state.background, list(BACKGROUNDS.values()), list(BACKGROUNDS))
         tip("background")
         if button("Reset"):

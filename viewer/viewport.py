@@ -10,7 +10,7 @@ from typing import Any
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.viewer.frame import Frame, FrameRequest
-from lapgs_wgpu.viewer.present import Placed, Presenter
+from lapgs_wgpu.viewer.present import ImageLayout, Presenter
 from lapgs_wgpu.viewer.view_state import ViewState
 
 SETTLED = 0.2  # seconds without a change after which the full resolution is drawn
@@ -89,7 +89,7 @@ class Viewport:
     def present(self) -> None:
         """Copy the frame, with the ground truth where the two are compared, to the canvas's texture."""
         target = self._context.get_current_texture()
-        self._presenter(target.create_view(), self._placed(*target.size[:2]), MARGIN)
+        self._presenter(target.create_view(), self._layouts(*target.size[:2]), MARGIN)
 
     def _full_camera(self) -> Camera:
         """The camera at full resolution: the canvas's, or that of the image that is subtracted."""
@@ -99,23 +99,23 @@ class Viewport:
         width, height = self.canvas.get_physical_size()
         return camera.camera(max(1, width // 2 if comparing == "side" else width), max(1, height))
 
-    def _placed(self, width: int, height: int) -> list[Placed]:
+    def _layouts(self, width: int, height: int) -> list[ImageLayout]:
         """The layout on a canvas of this size, pixels."""
         assert self.frame is not None
-        placed = self.frame.placed._replace(**self._truth())
+        layout = self.frame.layout._replace(**self._truth())
         compare = self.state.comparing()
         columns = width // 2 if compare == "side" else width
         if compare == "side":
-            right = _fit(placed._replace(truth_until=0.0), columns, height, columns)
-            return [_fit(placed._replace(truth_until=1.0), columns, height, 0), right]
+            right = _fit(layout._replace(truth_until=0.0), columns, height, columns)
+            return [_fit(layout._replace(truth_until=1.0), columns, height, 0), right]
         if compare == "split":
-            placed = placed._replace(truth_until=self.state.split)
+            layout = layout._replace(truth_until=self.state.split)
         elif compare == "error":
-            placed = placed._replace(error_gain=_ERROR_GAIN)
-        return [_fit(placed, columns, height, 0)]
+            layout = layout._replace(error_gain=_ERROR_GAIN)
+        return [_fit(layout, columns, height, 0)]
 
     def _truth(self) -> dict[str, Any]:
-        """What `Placed` has to know of the image that is compared with, if any. One that cannot be read ends the
+        """What `ImageLayout` has to know of the image that is compared with, if any. One that cannot be read ends the
         comparison, with a message."""
         state = self.state
         if state.comparing() == "off" or state.ground_truth is None or state.view is None:
@@ -132,10 +132,10 @@ class Viewport:
         two images the right one counts."""
         if self.frame is None:
             return None
-        placed = self._placed(*self.canvas.get_physical_size())[-1]
+        layout = self._layouts(*self.canvas.get_physical_size())[-1]
         ratio = self.canvas.get_pixel_ratio()
         across, down = (
-            (at * ratio - start) / length for at, start, length in zip((x, y), placed.origin, placed.size, strict=True)
+            (at * ratio - start) / length for at, start, length in zip((x, y), layout.origin, layout.size, strict=True)
         )
         return (across, down) if 0 <= across < 1 and 0 <= down < 1 else None
 
@@ -158,13 +158,13 @@ def _camera_key(camera: Camera) -> tuple[bytes, bytes, int, int]:
     return camera.K.tobytes(), camera.T_cam_world.tobytes(), camera.width, camera.height
 
 
-def _fit(placed: Placed, width: int, height: int, left: int) -> Placed:
+def _fit(layout: ImageLayout, width: int, height: int, left: int) -> ImageLayout:
     """The image as large as fits between columns left and left + width, centred."""
-    columns, rows = placed.picture
+    columns, rows = layout.picture
     scale = min(width / columns, height / rows)
     # An image drawn for this canvas at a lower resolution fills it again, whatever rounding did to its size.
     across, down = (
         most if abs(scale * n - most) <= max(1.0, scale) else max(1, round(scale * n))
         for n, most in ((columns, width), (rows, height))
     )
-    return placed._replace(origin=(left + (width - across) // 2, (height - down) // 2), size=(across, down))
+    return layout._replace(origin=(left + (width - across) // 2, (height - down) // 2), size=(across, down))
