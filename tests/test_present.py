@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.viewer.present import HEAT, Offscreen, Placed
+from lapgs_wgpu.viewer.present import HEAT, ImageLayout, Offscreen
 
 pytestmark = [pytest.mark.kernels, pytest.mark.triangles]
 Floats = NDArray[np.float64]
@@ -25,12 +25,12 @@ class Bench:
     """A random picture: planes (5, H, W) of red, green, blue, transmittance and depth, some beyond [0, 1]."""
 
     planes: Floats
-    placed: Placed
+    layout: ImageLayout
     truth: NDArray[np.uint8]
     offscreen: Offscreen
-    with_truth: Placed
+    with_truth: ImageLayout
 
-    def show(self, *pictures: Placed, size: tuple[int, int] = (WIDTH, HEIGHT)) -> Floats:
+    def show(self, *pictures: ImageLayout, size: tuple[int, int] = (WIDTH, HEIGHT)) -> Floats:
         """(H, W, 3) as presented, in [0, 1]."""
         return self.offscreen(size, list(pictures), MARGIN) / 255.0
 
@@ -46,9 +46,9 @@ def bench(device: Device) -> Bench:
     truth = rng.integers(0, 256, (HEIGHT, WIDTH, 4)).astype(np.uint8)
     arrays = [DeviceArray.upload(device, "planes", planes), DeviceArray.upload(device, "truth", truth.view(np.uint32))]
     size = (WIDTH, HEIGHT)
-    placed = Placed(arrays[0], size, (0, 0), size, BACKGROUND)
-    with_truth = placed._replace(truth=arrays[1], truth_size=size)
-    return Bench(planes.astype(np.float64), placed, truth[..., :3], Offscreen(device), with_truth)
+    layout = ImageLayout(arrays[0], size, (0, 0), size, BACKGROUND)
+    with_truth = layout._replace(truth=arrays[1], truth_size=size)
+    return Bench(planes.astype(np.float64), layout, truth[..., :3], Offscreen(device), with_truth)
 
 
 def near(got: Floats, expected: Floats) -> None:
@@ -69,22 +69,22 @@ def scaled(total: Floats, alpha: Floats, low: float, high: float) -> Floats:
 
 
 def test_colors(bench: Bench) -> None:
-    near(bench.show(bench.placed), colors(bench.planes))
+    near(bench.show(bench.layout), colors(bench.planes))
 
 
 def test_coverage(bench: Bench) -> None:
     expected = np.repeat(1 - bench.planes[3][..., None], 3, axis=2)
-    near(bench.show(bench.placed._replace(shows="alpha")), expected)
+    near(bench.show(bench.layout._replace(shows="alpha")), expected)
 
 
 @pytest.mark.parametrize(("shows", "plane"), [("depth", 4), ("value", 0)])
 def test_values_by_a_scale_of_colors(bench: Bench, shows: str, plane: int) -> None:
-    got = bench.show(bench.placed._replace(shows=shows, low=0.5, high=3.0))
+    got = bench.show(bench.layout._replace(shows=shows, low=0.5, high=3.0))
     near(got, scaled(bench.planes[plane], 1 - bench.planes[3], 0.5, 3.0))
 
 
 def test_a_scale_without_length_is_no_accident(bench: Bench) -> None:
-    got = bench.show(bench.placed._replace(shows="depth", low=1.0, high=1.0))
+    got = bench.show(bench.layout._replace(shows="depth", low=1.0, high=1.0))
     assert np.isfinite(got).all()
     near(got[0, :3], np.broadcast_to(BACKGROUND, (3, 3)))
 
@@ -107,17 +107,17 @@ def enlarged(picture: Floats, width: int, height: int) -> Floats:
 
 
 def test_enlargement_is_bilinear(bench: Bench) -> None:
-    got = bench.show(bench.placed._replace(size=(40, 30)), size=(40, 30))
+    got = bench.show(bench.layout._replace(size=(40, 30)), size=(40, 30))
     near(got, enlarged(colors(bench.planes), 40, 30))
 
 
 def test_values_are_enlarged_as_colors(bench: Bench) -> None:
-    got = bench.show(bench.placed._replace(size=(26, 14), shows="depth", high=3.0), size=(26, 14))
+    got = bench.show(bench.layout._replace(size=(26, 14), shows="depth", high=3.0), size=(26, 14))
     near(got, enlarged(scaled(bench.planes[4], 1 - bench.planes[3], 0.0, 3.0), 26, 14))
 
 
 def test_margins_surround_the_picture(bench: Bench) -> None:
-    got = bench.show(bench.placed._replace(origin=(5, 3)), size=(30, 20))
+    got = bench.show(bench.layout._replace(origin=(5, 3)), size=(30, 20))
     expected = np.broadcast_to(MARGIN, (20, 30, 3)).copy()
     expected[3 : 3 + HEIGHT, 5 : 5 + WIDTH] = colors(bench.planes)
     near(got, expected)
@@ -154,6 +154,6 @@ def test_truth_of_another_size_is_not_smoothed(bench: Bench) -> None:
 
 def test_a_target_of_another_size_follows(bench: Bench) -> None:
     for size in ((70, 3), (WIDTH, HEIGHT)):  # rows of 280 bytes are no multiple of the copy's 256
-        got = bench.show(bench.placed, size=size) if size[1] >= HEIGHT else bench.show(size=size)
+        got = bench.show(bench.layout, size=size) if size[1] >= HEIGHT else bench.show(size=size)
         assert got.shape == (size[1], size[0], 3)
     near(got, colors(bench.planes))

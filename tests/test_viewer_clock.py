@@ -51,12 +51,6 @@ def test_speed_and_rate() -> None:
     assert clock.time == pytest.approx(0.6)
 
 
-def test_nothing_passes_while_it_stands() -> None:
-    clock = Clock(11, time=0.3)
-    clock.advance(5.0)
-    assert clock.time == 0.3
-
-
 def test_steps_pause_and_stop_at_the_ends() -> None:
     clock = playing(time=0.52)
     clock.step(1)
@@ -82,11 +76,3 @@ def test_seeking_stays_in_the_clip(asked: float, got: float) -> None:
     clock = Clock(11)
     clock.seek(asked)
     assert clock.time == got
-
-
-def test_a_clip_of_one_frame() -> None:
-    clock = Clock(1, playing=True)
-    assert clock.frame == 0
-    clock.step(1)
-    assert clock.time == 1.0
-    assert clock.seconds > 0

@@ -1,4 +1,4 @@
-"""Frames: exact at rest, whatever was drawn while something moved."""
+"""Frames: in full at rest, whatever was drawn while something moved; files and devices that fail."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.playback import open_playback
-from helpers.still_scenes import CAMERA, KINDS, saved_scene
+from helpers.still_scenes import CAMERA, KINDS
 from helpers.trained_scenes import GRID4D, OURS, trained
 
 from lapgs_wgpu.errors import DeviceLostError, NumericalError
@@ -32,7 +32,7 @@ pytestmark = pytest.mark.kernels
 
 
 def planes(frame: Frame) -> np.ndarray:
-    return frame.placed.planes.read().view(np.uint32)[:4]
+    return frame.layout.planes.read().view(np.uint32)[:4]
 
 
 @pytest.mark.parametrize("mode", ["motion", "scale"])
@@ -60,19 +60,23 @@ def app_by_the_clock(file: Path, device: Device, monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.mark.triangles
-def test_the_window_rests_on_the_full_frame(device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    saved_scene(device, tmp_path)
+def test_the_window_rests_in_full(device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    trained(device, GRID4D, 100).save(tmp_path / "scene.ply")
     canvas, app, now = app_by_the_clock(tmp_path / "scene.ply", device, monkeypatch)
-    alone = FrameRenderer(open_playback(tmp_path / "scene.ply", device))
-    for t in (0.1, 0.3, 0.31):
-        now[0] += 0.1
-        app.state.clock.seek(t)
-        canvas.draw()
-    now[0] += 0.3
+    exact = FrameRenderer(open_playback(tmp_path / "scene.ply", device))
+    canvas.draw()
+    monkeypatch.setattr(app.viewport, "_moving_scale", 0.5)
+    app.state.clock.seek(0.3)
+    now[0] += 0.1
+    canvas.draw()
+    assert app.viewport.scale == 0.5
+    now[0] += 0.1
+    canvas.draw()
+    assert not app.viewport.at_rest  # it may move on
+    now[0] += 0.2
     canvas.draw()
     assert app.viewport.at_rest
-    assert app.viewport.scale == 1
-    np.testing.assert_array_equal(planes(app.viewport.frame), planes(alone.draw(app.viewport.frame.request)))
+    np.testing.assert_array_equal(planes(app.viewport.frame), planes(exact.draw(app.viewport.frame.request)))
     rests = app.viewport.frame
     now[0] += 5
     canvas.draw()
@@ -80,9 +84,9 @@ def test_the_window_rests_on_the_full_frame(device: Device, tmp_path: Path, monk
 
 
 TROUBLE = {
-    "no file": "scene.txt: cannot be read",
-    "a buffer": "buffer 'input means' needs 12000 bytes, but a buffer of this device holds 8192",
-    "a binding": "of the pass project needs [0-9]+ bytes in one binding, but .* allows 8192",
+    "no file": "scene.txt",
+    "a buffer": "12000 bytes, .* 8192",
+    "a binding": "one binding, .* 8192",
     "memory": "out of memory",
 }
 
@@ -123,16 +127,14 @@ def test_a_file_that_cannot_be_shown_leaves_the_scene_as_it_is(
     np.testing.assert_array_equal(planes(app.viewport.frame), shown)
     app.open(tmp_path / "large.ply")
     assert (app.state.scene.playback.count, app.state.clock.time, app.state.message) == (1000, 0.0, None)
-    opened = app.viewport.frame
-    assert opened is not before["frame"]
     canvas.draw()
-    assert app.viewport.frame is opened  # drawn once
+    assert app.viewport.frame is not before["frame"]
 
 
 @pytest.mark.triangles
 def test_a_device_that_fails_ends_the_viewer(device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """rendercanvas logs exceptions and goes on. And the clip does not leap where the window could not be drawn."""
-    saved_scene(device, tmp_path)
+    trained(device, GRID4D, 100).save(tmp_path / "scene.ply")
     canvas, app, now = app_by_the_clock(tmp_path / "scene.ply", device, monkeypatch)
     app.state.clock.playing = True
     canvas.draw()
@@ -199,8 +201,7 @@ def test_an_error_of_a_watched_step_reaches_the_caller(device: Device, monkeypat
 
     canvas = offscreen.RenderCanvas(size=(64, 48), pixel_ratio=1)
     loop = SimpleNamespace(add_task=tasks.append, run=run, call_later=lambda seconds, callback: None)
-    monkeypatch.setattr(live, "choose_backend", lambda wanted: "glfw")
-    monkeypatch.setattr(live, "make_canvas", lambda *_: (canvas, loop))
+    monkeypatch.setattr(live.window, "make_canvas", lambda *_: (canvas, loop))
     interrupt = signal.getsignal(signal.SIGINT)
     try:
         with pytest.raises(NumericalError, match="the loss is nan"):

@@ -62,15 +62,8 @@ def desktop() -> Iterator[Desktop]:
         yield made
 
 
-@pytest.fixture(params=["glfw", "qt"])
-def backend(request: pytest.FixtureRequest) -> str:
-    if request.param == "qt":
-        pytest.importorskip("PySide6")
-    return str(request.param)
-
-
-def view(desktop: Desktop, file: Path, size: str, backend: str) -> None:
-    command = [sys.executable, "-m", "lapgs_wgpu.viewer.cli", str(file), "--backend", backend]
+def view(desktop: Desktop, file: Path, size: str) -> None:
+    command = [sys.executable, "-m", "lapgs_wgpu.viewer.cli", str(file)]
     desktop.start(*command, "--time-slider", "--size", size)
 
 
@@ -79,8 +72,12 @@ def scene_part(screen: Picture) -> Picture:
     return screen[120:480, 260:620]
 
 
-def test_scrub_play_orbit_and_modes(desktop: Desktop, run: Path, backend: str) -> None:
-    view(desktop, run / "checkpoint.ply", "800x600", backend)
+def changed(screen: Picture, before: Picture) -> bool:
+    return np.abs(scene_part(screen) - scene_part(before)).mean() > 1
+
+
+def test_scrub_and_turn(desktop: Desktop, run: Path) -> None:
+    view(desktop, run / "checkpoint.ply", "800x600")
     desktop.wait_for(lambda s: scene_part(s).max() > 60 and s[535:590, 20:780].max() > 200, "scene and slider")
     desktop.events("mousemove", 640, 300)  # away from the scene's part, since Qt shows the pointer
     first = desktop.wait_for(lambda s: True, "the pointer elsewhere")
@@ -88,20 +85,25 @@ def test_scrub_play_orbit_and_modes(desktop: Desktop, run: Path, backend: str) -
     def grab(screen: Picture) -> float:
         return float(np.argwhere(screen[543, :800, 0] - screen[543, :800, 2] > 100).mean())
 
-    def changed(screen: Picture, before: Picture) -> bool:
-        return np.abs(scene_part(screen) - scene_part(before)).mean() > 1
-
     desktop.drag((25, 548), (400, 548))  # faster than frames are drawn: the last place counts
-    scrubbed = desktop.wait_for(lambda s: changed(s, first) and abs(grab(s) - 400) < 3, "another time")
+    desktop.wait_for(lambda s: changed(s, first) and abs(grab(s) - 400) < 3, "another time")
     desktop.events("mousemove", 640, 300, "key", "Home")
     desktop.wait_for(lambda s: np.abs(scene_part(s) - scene_part(first)).max() <= 1, "the start again")
 
     desktop.drag((400, 300), (470, 320))
-    turned = desktop.wait_for(lambda s: changed(s, first), "the scene from elsewhere")
+    desktop.wait_for(lambda s: changed(s, first), "the scene from elsewhere")
     desktop.events("key", "r")
     desktop.wait_for(lambda s: not changed(s, first), "the first camera again")
 
-    seen = [first, scrubbed, turned]
+
+@pytest.mark.nightly
+def test_modes_help_key_frames_and_play(desktop: Desktop, run: Path) -> None:
+    view(desktop, run / "checkpoint.ply", "800x600")
+    desktop.wait_for(lambda s: scene_part(s).max() > 60 and s[535:590, 20:780].max() > 200, "scene and slider")
+    desktop.events("mousemove", 640, 300)
+    first = desktop.wait_for(lambda s: True, "the pointer elsewhere")
+
+    seen = [first]
     for mode in ("depth", "alpha", "motion", "dynamics", "scale"):
         desktop.events("key", "m")
         seen.append(desktop.wait_for(lambda s: all(changed(s, other) for other in seen), f"the mode {mode}"))
@@ -130,11 +132,12 @@ def test_scrub_play_orbit_and_modes(desktop: Desktop, run: Path, backend: str) -
     assert sum(not np.array_equal(a, b) for a, b in itertools.pairwise(pictures)) >= 3, "it does not play"
 
 
-def test_the_picture_is_the_evaluators(desktop: Desktop, run: Path, device: Device, backend: str) -> None:
+@pytest.mark.nightly
+def test_the_picture_is_the_evaluators(desktop: Desktop, run: Path, device: Device) -> None:
     """At a camera and time of the capture, to 1/255 in every pixel; and beside it the capture's own picture."""
-    view(desktop, run / "checkpoint.ply", f"{SIZE}x{SIZE}", backend)
+    view(desktop, run / "checkpoint.ply", f"{SIZE}x{SIZE}")
     desktop.wait_for(lambda s: s[:SIZE, :SIZE].max() > 60, "the scene")
-    desktop.events("mousemove", 160, 160, "click", 1, "key", "h", "n", "n")  # a click, since Qt has no focus before
+    desktop.events("mousemove", 160, 160, "click", 1, "key", "h", "n", "n")  # the keys
     shot = load_dataset(run / "data").test[1]
     expected = to_8_bit(load(run / "checkpoint.ply", device).render(shot.camera, shot.time).image).astype(np.int32)
     screen = desktop.wait_for(lambda s: np.abs(s[:SIZE, :SIZE] - expected).mean() < 1, "the second test view")
@@ -148,6 +151,7 @@ def test_the_picture_is_the_evaluators(desktop: Desktop, run: Path, device: Devi
     desktop.wait_for(lambda s: np.abs(s[:SIZE, :SIZE][left] - truth[left]).max() <= 2, "the ground truth at the left")
 
 
+@pytest.mark.nightly
 def test_a_training_is_watched_paused_and_stepped(desktop: Desktop, run: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     training = desktop.start(

@@ -1,4 +1,7 @@
-"""The web page in headless Chromium, on SwiftShader, against the desktop's viewer; driven by real events."""
+"""The web page in headless Chromium, on SwiftShader, against the desktop's viewer; driven by real events.
+
+On every push the two must agree; the rest runs every night.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,6 @@ import struct
 import threading
 from collections.abc import Iterator
 from pathlib import Path
-from time import sleep
 from typing import Any
 
 import numpy as np
@@ -123,6 +125,7 @@ def test_three_times_and_two_cameras(browser: Browser, desktop: Desktop) -> None
     assert psnr(desktop.picture(0.0), desktop.picture(1.0)) < 40  # the scene moves
 
 
+@pytest.mark.nightly
 def test_a_trained_scene(window: Browser, folder: Path, device: Device) -> None:
     """The preset demo: its first steps alone, unless LAPGS_SOAK is set. Where two Gaussians lie at one depth, the last
     bit decides which is drawn first: that may be seen in a picture, not in many (docs/notes/web.md)."""
@@ -154,15 +157,6 @@ def test_a_trained_scene(window: Browser, folder: Path, device: Device) -> None:
     assert min(found) >= 60, found
 
 
-def test_the_canvas_shows_it(browser: Browser, desktop: Desktop) -> None:
-    """What is on the screen, but for the bar and rounding to 8 bits."""
-    call(browser, "setTime", 0.37)
-    page_picture(browser)
-    screen = browser.picture()[: SIZE[1] - BAR]
-    expected = 255 * desktop.picture(0.37).clip(0, 1)[: SIZE[1] - BAR]
-    assert np.abs(screen - expected).max() < 2.5
-
-
 # What makes the page's code differ from that of OURS. Several at once, as opening a page costs more than the picture.
 FIELDS = {
     "grid4d, odd levels": dataclasses.replace(CONFIGS["odd levels"], kind="grid4d", appearance="none"),
@@ -175,6 +169,7 @@ FIELDS = {
 }
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", FIELDS)
 def test_every_field(window: Browser, folder: Path, device: Device, name: str) -> None:
     made = export_scene(trained(device, FIELDS[name], 300), folder, device, name.replace(" ", "-").replace(",", ""))
@@ -183,6 +178,7 @@ def test_every_field(window: Browser, folder: Path, device: Device, name: str) -
     assert same(window, Desktop(made, device), 0.7)
 
 
+@pytest.mark.nightly
 def test_a_still_scene(window: Browser, folder: Path, device: Device) -> None:
     """No time slider, and nothing that plays."""
     made = export_scene(moving_scene(device, FieldConfig(kind="static"), sh_degree=3), folder, device, "still")
@@ -193,6 +189,7 @@ def test_a_still_scene(window: Browser, folder: Path, device: Device) -> None:
     assert not window.value("lapgs.playing")
 
 
+@pytest.mark.nightly
 def test_an_antialiased_scene(window: Browser, folder: Path, device: Device) -> None:
     scene = trained(device, OURS, 300)
     without = Desktop(export_scene(scene, folder, device, "aliased"), device)
@@ -203,6 +200,7 @@ def test_an_antialiased_scene(window: Browser, folder: Path, device: Device) -> 
     assert not same(window, without, 0.0)
 
 
+@pytest.mark.nightly
 def test_a_scene_of_uneven_timing(window: Browser, folder: Path, device: Device) -> None:
     scene = trained(device, OURS, 300)
     without = Desktop(export_scene(scene, folder, device, "even"), device)
@@ -215,6 +213,7 @@ def test_a_scene_of_uneven_timing(window: Browser, folder: Path, device: Device)
         assert not same(window, without, time)
 
 
+@pytest.mark.nightly
 def test_the_desktop_runs_the_same_dispatches(browser: Browser, page: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Kernels, workgroups and bindings of a frame, in the shape for GPUs: all that the page's own code decides."""
     info, adapter = _adapters()[0]
@@ -239,6 +238,7 @@ def test_the_desktop_runs_the_same_dispatches(browser: Browser, page: Path, monk
     assert len(found) > 50
 
 
+@pytest.mark.nightly
 def test_default_limits(window: Browser, page: Path, desktop: Desktop) -> None:
     """A device without any feature or limit beyond WebGPU's own."""
     script = "GPUAdapter.prototype.requestDevice = function () { return own.call(this, {}); };"
@@ -247,84 +247,7 @@ def test_default_limits(window: Browser, page: Path, desktop: Desktop) -> None:
     assert same(window, desktop, 0.37)
 
 
-def test_a_window_larger_than_a_binding(window: Browser, page: Path) -> None:
-    """As 4K with bindings of 128 MiB, in small: the canvas has fewer pixels, and depth still fits."""
-    limit = 20 * 30_000
-    script = "GPUAdapter.prototype.requestDevice = async function (...given) {"
-    script += " const device = await own.apply(this, given); const limits = {};"
-    script += " for (const name in GPUSupportedLimits.prototype) limits[name] = device.limits[name];"
-    script += (
-        f" Object.defineProperty(device, 'limits', {{ value: {{ ...limits, maxStorageBufferBindingSize: {limit} }} }});"
-    )
-    script += " return device; };"
-    open_page(window, page.as_uri() + "?binding", first=OWN_DEVICE + script)
-    width, height = window.value("[document.getElementById('canvas').width, document.getElementById('canvas').height]")
-    assert 29_500 < width * height <= limit / 20
-    assert abs(width / height - SIZE[0] / SIZE[1]) < 0.01
-    assert page_picture(window).shape == (height, width, 3)
-    window.mouse("mouseMoved", 160, 120)
-    window.key("f")  # draws depth
-    sleep(1)
-    assert page_picture(window).shape == (height, width, 3)
-    assert window.note() == ""
-
-
-def test_a_browser_that_looks_only_where_something_is_submitted(window: Browser, page: Path) -> None:
-    """As Firefox does: a mapped buffer is seen with the next submission, otherwise late. No submission at rest."""
-    script = """
-        window.seen = [];
-        window.empty = 0;
-        const submit = GPUQueue.prototype.submit, map = GPUBuffer.prototype.mapAsync;
-        let look = () => {};
-        GPUQueue.prototype.submit = function (list) {
-            window.empty += list.length === 0;
-            look("submission");
-            return submit.call(this, list);
-        };
-        GPUBuffer.prototype.mapAsync = async function (...given) {
-            await map.apply(this, given);
-            seen.push(await new Promise(resolve => { look = resolve; setTimeout(resolve, 5000, "late"); }));
-        };"""
-    open_page(window, page.as_uri() + "?firefox", first=script)
-    call(window, "setTime", 0.37)
-    page_picture(window)
-    assert set(window.value("seen")) == {"submission"}
-    page_picture(window)
-    before = window.value("empty")
-    assert before > 0
-    sleep(0.3)
-    assert window.value("empty") == before
-
-
-def test_room_that_no_picture_needs_is_given_back(
-    window: Browser, folder: Path, device: Device, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Passes dispatch workgroups for all the room that there is. After 8 pictures here, not 256."""
-
-    def workgroups() -> int:
-        return next(columns * rows for name, columns, rows, _ in call(window, "passes", 0.5) if name == "tile_ranges")
-
-    script, watched = web_page.module_script, "const WATCHED = 256;"
-    assert watched in script("rasterizer")
-    monkeypatch.setattr(web_page, "module_script", lambda name: script(name).replace(watched, "const WATCHED = 8;"))
-    open_page(window, export_scene(trained(device, OURS, 300), folder, device, "room").as_uri())
-    rooms = [workgroups() for _ in range(10)]
-    assert rooms[0] == 256
-    assert rooms[-1] < 128
-
-
-def test_workgroups_that_are_no_subgroups(window: Browser, page: Path, desktop: Desktop) -> None:
-    """An adapter that promises subgroups of 32 lanes and has less: the pass says so, and the page does without them."""
-    script = "Object.defineProperty(GPUAdapterInfo.prototype, 'subgroupMinSize', { get: () => 32 });"
-    script += "GPUAdapter.prototype.requestDevice = async function (...given) {"
-    script += " const device = await own.apply(this, given); window.features = [...device.features]; return device; };"
-    open_page(window, page.as_uri() + "?subgroups", first=OWN_DEVICE + script)
-    assert "subgroups" in window.value("features")
-    call(window, "setTime", 0.37)
-    assert same(window, desktop, 0.37)
-    assert {name for name, *_ in call(window, "passes", 0.5) if name.startswith("rasterize")} == {"rasterize"}
-
-
+@pytest.mark.nightly
 @pytest.mark.skipif("LAPGS_SOAK" not in os.environ, reason="takes minutes: LAPGS_SOAK=1, or make soak")
 def test_200_000_gaussians(window: Browser, folder: Path, device: Device) -> None:
     """With grids as those of the preset dnerf: rows of features are more than a binding holds, hence two blocks."""
@@ -347,6 +270,7 @@ def test_200_000_gaussians(window: Browser, folder: Path, device: Device) -> Non
 # Input
 
 
+@pytest.mark.nightly
 def test_play_pause_and_scrub(browser: Browser, desktop: Desktop) -> None:
     browser.key(" ")
     wait_for(lambda: browser.value("lapgs.time") > 0.1, "time goes on")
@@ -365,6 +289,7 @@ def test_play_pause_and_scrub(browser: Browser, desktop: Desktop) -> None:
     assert same(browser, desktop, time)
 
 
+@pytest.mark.nightly
 def test_keys(browser: Browser, desktop: Desktop) -> None:
     for key, frame in ((".", 1), (".", 2), (",", 1), ("End", FRAMES - 1), ("Home", 0)):
         browser.key(key)
@@ -382,67 +307,7 @@ def test_keys(browser: Browser, desktop: Desktop) -> None:
     assert same(browser, desktop, 0.0, background="black")
 
 
-def test_a_key_that_is_held_counts_once(browser: Browser) -> None:
-    """But for those that go from frame to frame."""
-    for key, held in ((" ", 0), (".", 3)):
-        browser.value("lapgs.setTime(0)")
-        event = f"new KeyboardEvent('keydown', {{ key: '{key}', repeat: true, bubbles: true }})"
-        browser.value(f"for (let i = 0; i < 3; i++) document.getElementById('canvas').dispatchEvent({event})")
-        assert browser.value("lapgs.playing") is False
-        assert browser.value("lapgs.time") == pytest.approx(held / (FRAMES - 1))
-
-
-def test_space_on_a_button_presses_it(browser: Browser) -> None:
-    browser.value("document.getElementById('more').focus()")
-    browser.key(" ")
-    assert browser.value("lapgs.playing") is False
-    browser.value("document.getElementById('canvas').focus()")
-    browser.key(" ")
-    assert browser.value("lapgs.playing") is True
-    browser.key(" ")
-    assert browser.value("lapgs.playing") is False
-    if not browser.value("document.getElementById('help').hidden"):
-        browser.key("?")
-
-
-def test_the_reset_button(browser: Browser, desktop: Desktop) -> None:
-    browser.mouse("mousePressed", 100, 80, down=True)
-    browser.mouse("mouseMoved", 160, 100, down=True)
-    browser.mouse("mouseReleased", 160, 100)
-    assert not same(browser, desktop, 0.0)
-    browser.value("document.getElementById('home').click()")
-    assert same(browser, desktop, 0.0)
-
-
-def test_a_picture_is_kept_only_at_rest(browser: Browser) -> None:
-    """To compress one takes longer than to draw it."""
-    count = "const own = HTMLCanvasElement.prototype.toBlob; window.kept = 0;"
-    count += "HTMLCanvasElement.prototype.toBlob = function (take) { kept++; return own.call(this, take); };"
-    browser.value(f"(() => {{ {count} }})()")
-    for i in range(20):
-        browser.value(f"lapgs.setTime({i / 20})")
-        sleep(0.1)
-    assert browser.value("kept") <= 1  # of before
-    page_picture(browser)
-    wait_for(lambda: browser.value("kept") > 0, "the picture")
-    sleep(2)
-    assert browser.value("kept") <= 2
-
-
-def test_keys_fly_by_their_letter(browser: Browser, desktop: Desktop) -> None:
-    """Of a Dvorak keyboard, whose S lies where others have their semicolon."""
-    browser.key("v")
-    where = {"key": "s", "code": "Semicolon"}
-    browser.value("(window.seen = 0, lapgs.onframe = () => seen++)")
-    browser.call("Input.dispatchKeyEvent", type="keyDown", text="s", **where)
-    wait_for(lambda: browser.value("seen") > 2, "the flight")
-    browser.call("Input.dispatchKeyEvent", type="keyUp", **where)
-    assert not same(browser, desktop, 0.0)
-    browser.key("v")
-    browser.key("r")
-    assert same(browser, desktop, 0.0)
-
-
+@pytest.mark.nightly
 def test_orbit_zoom_and_reset(browser: Browser, desktop: Desktop) -> None:
     browser.mouse("mousePressed", 100, 80, down=True)
     browser.mouse("mouseMoved", 160, 100, down=True)
@@ -460,6 +325,7 @@ def test_orbit_zoom_and_reset(browser: Browser, desktop: Desktop) -> None:
     assert same(browser, desktop, 0.0)
 
 
+@pytest.mark.nightly
 def test_focus(browser: Browser, page: Path, device: Device) -> None:
     """A double click, and F where the pointer is, turn about what lies there, as on the desktop."""
     desktop = Desktop(page, device)
@@ -483,65 +349,7 @@ def test_focus(browser: Browser, page: Path, device: Device) -> None:
         assert psnr(desktop.picture(0.0), desktop.picture(0.0, focus)) < 40
 
 
-def test_focus_while_it_plays(browser: Browser) -> None:
-    """It does not wait for the end of the clip."""
-    browser.key("r")
-    browser.value("location.hash = '#t=0.1&speed=0.01&play'")  # a hundred seconds
-    wait_for(lambda: browser.value("lapgs.time") > 0.1, "time goes on")
-    count = "const own = GPUComputePassEncoder.prototype.setPipeline; window.depths = 0;"
-    count += "GPUComputePassEncoder.prototype.setPipeline = function (pipeline)"
-    count += " { depths += pipeline.label === 'rasterize DEPTH'; return own.call(this, pipeline); };"
-    browser.value(f"(() => {{ {count} }})()")
-    browser.mouse("mouseMoved", 190, 130)
-    browser.key("f")
-    wait_for(lambda: browser.value("depths") > 0, "the depth at the pointer")
-    page_picture(browser)
-    assert browser.value("lapgs.playing") is True
-    browser.value("lapgs.pause()")
-    browser.key("r")
-
-
-def test_pictures_while_it_plays(browser: Browser, desktop: Desktop) -> None:
-    """Each is the frame on show, and says of which time; in between, frames go on."""
-    browser.value("(window.seen = [], lapgs.onframe = time => seen.push(time))")
-    browser.value("location.hash = '#t=0.1&speed=0.02&play'")
-    wait_for(lambda: 0.1 < (browser.value("seen.at(-1)") or 0) < 1, "time goes on")  # 1: a frame asked for before
-    times = []
-    for _ in range(3):
-        width, height, time, values = browser.value(
-            "Promise.all([lapgs.picture(), lapgs.picture()])"
-            ".then(([{width, height, time, values}]) => [width, height, time, Array.from(values)])"
-        )
-        found = np.array(values, np.float32).reshape(4, height, width)[:3].transpose(1, 2, 0)
-        assert psnr(found, desktop.picture(time, size=(width, height))) >= SAME
-        times.append(time)
-        frames = len(browser.value("seen"))
-        wait_for(lambda frames=frames: len(browser.value("seen")) > frames + 1, "frames")  # type: ignore[misc]
-    assert browser.value("lapgs.playing")
-    assert 0.1 < times[0] < times[1] < times[2]
-    assert set(times) <= set(browser.value("seen"))
-    assert psnr(desktop.picture(times[0]), desktop.picture(times[2])) < SAME
-
-
-def test_panels(browser: Browser) -> None:
-    """The overlay, the button for the help, and all of them hidden."""
-    hidden = "document.getElementById('{}').checkVisibility()"
-    browser.key("o")
-    call(browser, "setTime", 0.3)
-    page_picture(browser)
-    said = browser.value("document.getElementById('overlay').innerText")
-    assert f"300 Gaussians\n{SIZE[0]}x{SIZE[1]}" in said
-    browser.value("document.getElementById('more').click()")
-    assert "turn about what lies there" in browser.value("document.getElementById('help').innerText")
-    browser.key("h")
-    assert not any(browser.value(hidden.format(name)) for name in ("overlay", "help", "bar"))
-    for key in ("h", "?", "o", "t"):
-        browser.key(key)
-    assert not any(browser.value(hidden.format(name)) for name in ("overlay", "help", "bar"))
-    browser.key("t")
-    assert browser.value(hidden.format("bar"))
-
-
+@pytest.mark.nightly
 def test_fingers(browser: Browser, desktop: Desktop) -> None:
     """One turns the scene; two, moved apart, come nearer."""
 
@@ -566,6 +374,7 @@ def test_fingers(browser: Browser, desktop: Desktop) -> None:
     assert same(browser, desktop, 0.0, spread)
 
 
+@pytest.mark.nightly
 def test_resize_and_density(browser: Browser, desktop: Desktop) -> None:
     browser.resize((250, 311))
     wait_for(lambda: browser.value("document.getElementById('canvas').width") == 250, "the canvas")
@@ -577,6 +386,7 @@ def test_resize_and_density(browser: Browser, desktop: Desktop) -> None:
     assert same(browser, desktop, 0.0, size=(400, 300))
 
 
+@pytest.mark.nightly
 def test_address_and_script(window: Browser, page: Path, desktop: Desktop) -> None:
     open_page(window, page.as_uri() + "#t=0.3&speed=2&loop=once&background=white")
     assert same(window, desktop, 0.3, background="white")
@@ -614,13 +424,7 @@ def server(folder: Path) -> Iterator[str]:
         running.shutdown()
 
 
-def test_from_a_static_server(window: Browser, page: Path, server: str, device: Device, folder: Path) -> None:
-    """Also another scene, by ?src, whose MIME type no server knows."""
-    made = export_scene(trained(device, CONFIGS["color"], 200), folder, device, "other")
-    open_page(window, f"{server}/{page.name}?src=other.lapgs")
-    assert same(window, Desktop(made, device), 0.0)
-
-
+@pytest.mark.nightly
 def test_a_dropped_file(browser: Browser, device: Device, folder: Path, desktop: Desktop) -> None:
     """A scene takes the place of the one on show; what is no scene does not, and is refused in a sentence."""
 
@@ -653,14 +457,7 @@ def test_a_dropped_file(browser: Browser, device: Device, folder: Path, desktop:
     browser.open("about:blank")  # the next test begins anew
 
 
-def test_an_adapter_that_is_too_small(window: Browser, page: Path) -> None:
-    script = "Object.defineProperty(GPUSupportedLimits.prototype, 'maxBufferSize', { get: () => 2000 });"
-    made = window.call("Page.addScriptToEvaluateOnNewDocument", source=script)
-    window.open(page.as_uri() + "?small")
-    wait_for(lambda: "but a buffer of this adapter holds 2000" in window.note(), "the sentence")
-    window.call("Page.removeScriptToEvaluateOnNewDocument", identifier=made["identifier"])
-
-
+@pytest.mark.nightly
 def test_what_cannot_be_fetched(window: Browser, page: Path, server: str) -> None:
     for address, reason in (
         (f"{server}/{page.name}?src=missing.lapgs", "the server says 404"),
@@ -671,80 +468,7 @@ def test_what_cannot_be_fetched(window: Browser, page: Path, server: str) -> Non
         wait_for(lambda reason=reason: reason in window.note(), reason)  # type: ignore[misc]
 
 
-def test_a_poor_server(window: Browser, page: Path, device: Device, folder: Path) -> None:
-    """One that knows no ranges, calls a scene a text, is slow and does not say how long it is."""
-    made = export_scene(trained(device, CONFIGS["color"], 200), folder, device, "slow")
-    files = {f"/{page.name}": page.read_bytes(), "/slow.lapgs": made.with_suffix(".lapgs").read_bytes()}
-    seen = threading.Event()
-
-    class Poor(http.server.BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            data = files[self.path.split("?")[0]]
-            self.send_response(200)
-            self.send_header("Content-Type", "text/html" if self.path.startswith(f"/{page.name}") else "text/plain")
-            self.end_headers()
-            half = len(data) // 2
-            self.wfile.write(data[:half])
-            self.wfile.flush()
-            if self.path.startswith("/slow"):
-                seen.wait(60)
-            self.wfile.write(data[half:])
-
-        def log_message(self, *_: object) -> None:
-            pass
-
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Poor) as running:
-        threading.Thread(target=running.serve_forever, daemon=True).start()
-        window.open(f"http://127.0.0.1:{running.server_port}/{page.name}?src=slow.lapgs")
-        wait_for(lambda: window.note().startswith("Loading 0."), "the progress")
-        assert window.value("document.getElementById('poster').checkVisibility()")
-        window.value("(window.files = new DataTransfer()).items.add(new File(['no scene'], 'a.txt')) && 1")
-        window.value("dispatchEvent(new DragEvent('drop', { dataTransfer: files, cancelable: true })) || 1")
-        wait_for(lambda: "do not begin as a scene does" in window.note(), "the refusal")  # which ends no other one
-        seen.set()
-        wait_for(lambda: window.note() == "", "the scene")
-        assert same(window, Desktop(made, device), 0.0)
-        running.shutdown()
-
-
-def test_servers_that_send_too_much_or_too_little(window: Browser, page: Path) -> None:
-    """What cannot be a scene is not read on: by the length that is announced, or by what has come."""
-    ended = threading.Event()
-
-    class Server(http.server.BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            announced = {"/large.lapgs": LARGE, "/broken.lapgs": 1000}.get(self.path)
-            self.send_response(200)
-            if announced:
-                self.send_header("Content-Length", str(announced))
-            self.end_headers()
-            if self.path.startswith(f"/{page.name}"):
-                self.wfile.write(page.read_bytes())
-                return
-            try:
-                self.wfile.write(header(1000))
-                while self.path != "/broken.lapgs":
-                    self.wfile.write(bytes(1000))
-            except OSError:  # the page has hung up
-                ended.set()
-
-        def log_message(self, *_: object) -> None:
-            pass
-
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Server) as running:
-        threading.Thread(target=running.serve_forever, daemon=True).start()
-        for name, reason in (
-            ("large", f"it has {LARGE} bytes, more than the 1000 that it declares"),
-            ("endless", "more than the 1000 that it declares"),
-            ("broken", "Reading the scene failed (network error): load the page again, or report this error."),
-        ):
-            ended.clear()
-            window.open(f"http://127.0.0.1:{running.server_port}/{page.name}?src={name}.lapgs")
-            wait_for(lambda reason=reason: reason in window.note(), reason)  # type: ignore[misc]
-            assert name == "broken" or ended.wait(30)
-        running.shutdown()
-
-
+@pytest.mark.nightly
 def test_in_a_frame(window: Browser, page: Path, server: str, folder: Path) -> None:
     """Of another page, whose scripts find it in the frame's window."""
     listen = "<script>window.told = []; addEventListener('message', ({ data }) => told.push(data))</script>"
@@ -764,60 +488,7 @@ def test_in_a_frame(window: Browser, page: Path, server: str, folder: Path) -> N
     assert window.value("told[1]") == {"lapgs": "failed", "reason": reason}
 
 
-def test_a_page_that_is_held_up(browser: Browser) -> None:
-    """Time goes on where it stopped, instead of leaping: a tab in the background, or a computer that slept."""
-    browser.value("location.hash = '#t=0&speed=0.1&play'")  # 10 seconds
-    wait_for(lambda: browser.value("lapgs.time") > 0, "time goes on")
-    before = browser.value("lapgs.time")
-    browser.call("Debugger.enable")
-    browser.call("Debugger.pause")  # every script stands still
-    sleep(6)
-    browser.call("Debugger.resume")
-    browser.call("Debugger.disable")
-    wait_for(lambda: browser.value("lapgs.time") > before, "time goes on again")
-    assert browser.value("lapgs.time") < before + 0.3
-    browser.value("lapgs.pause()")
-
-
-def test_a_device_that_is_refused(window: Browser, page: Path) -> None:
-    script = "GPUAdapter.prototype.requestDevice = async () => { throw new TypeError('too few\\nbindings'); };"
-    made = window.call("Page.addScriptToEvaluateOnNewDocument", source=script)
-    window.open(page.as_uri() + "?refused")
-    expected = "Opening the graphics adapter failed (too few): try another browser or a newer driver."
-    wait_for(lambda: window.note() == expected, "the sentence")
-    assert window.value("document.getElementById('poster').checkVisibility()")
-    window.call("Page.removeScriptToEvaluateOnNewDocument", identifier=made["identifier"])
-
-
-@pytest.mark.parametrize(
-    ("script", "doing", "advice"),
-    [
-        (
-            "GPUDevice.prototype.createComputePipelineAsync = async () => { throw new GPUPipelineError('no stack',"
-            " { reason: 'internal' }); };",
-            "Preparing the scene failed (no stack)",
-            "try another browser or a newer driver.",
-        ),
-        (
-            "Map.prototype.get = function () { throw new TypeError('no map'); };",
-            "Reading the scene failed (no map)",
-            "load the page again, or report this error.",
-        ),
-        (
-            "GPUQueue.prototype.submit = () => { throw new TypeError('no queue'); };",
-            "Drawing the scene failed (no queue)",
-            "load the page again, or report this error.",
-        ),
-    ],
-)
-def test_what_failed_is_told(window: Browser, page: Path, script: str, doing: str, advice: str) -> None:
-    """The adapter is to blame only for its own errors."""
-    made = window.call("Page.addScriptToEvaluateOnNewDocument", source=script)
-    window.open(page.as_uri() + "?failing")
-    wait_for(lambda: window.note() == f"{doing}: {advice}", doing)
-    window.call("Page.removeScriptToEvaluateOnNewDocument", identifier=made["identifier"])
-
-
+@pytest.mark.nightly
 def test_a_lost_device(window: Browser, page: Path) -> None:
     """A sentence, and the last picture stays on the screen."""
     script = "GPUAdapter.prototype.requestDevice = async function (...given)"
@@ -835,6 +506,7 @@ def test_a_lost_device(window: Browser, page: Path) -> None:
     assert window.value("lapgs.time") == 0
 
 
+@pytest.mark.nightly
 def test_a_device_that_is_lost_later_is_opened_again(
     window: Browser, device: Device, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -856,6 +528,7 @@ def test_a_device_that_is_lost_later_is_opened_again(
     assert same(window, Desktop(made, device), 0.4)
 
 
+@pytest.mark.nightly
 def test_without_webgpu(page: Path, tmp_path: Path) -> None:
     with Browser(tmp_path / "profile", SIZE) as browser:
         browser.open(page.as_uri())

@@ -9,6 +9,7 @@ from typing import Any
 
 from lapgs_wgpu.errors import DeviceError, InputError
 from lapgs_wgpu.viewer.controls import Controls
+from lapgs_wgpu.viewer.frame import FrameRenderer, FrameRequest
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene, load_scene
 from lapgs_wgpu.viewer.view_state import ViewState
 from lapgs_wgpu.viewer.viewport import SETTLED, Viewport
@@ -28,9 +29,9 @@ class App:
     drawing_seconds: spent on drawing so far, GUI included. failed: what ended it, if the device did. end: called then.
     """
 
-    def __init__(self, canvas: Any, loop: Any, scene: LoadedScene, *, transport: bool | None = None) -> None:
+    def __init__(self, canvas: Any, loop: Any, scene: LoadedScene) -> None:
         self.canvas, self.loop = canvas, loop
-        self.state = ViewState(scene, transport=transport)
+        self.state = ViewState(scene)
         self.viewport = Viewport(canvas, self.state)
         self._gui: Any = None  # created after the first frame, which does not wait for it
         self._gui_draws = _GUI_DRAWS
@@ -43,18 +44,19 @@ class App:
 
     def open(self, path: Path) -> None:
         """Show another file. If it cannot be read or is too large: keep the present scene, and show a message."""
-        before = [(part, vars(part).copy()) for part in (self.state, self.viewport)]
         try:
-            self.state.show(load_scene(path, lambda: self.viewport.device))
-            self.viewport.draw(time.perf_counter())  # some buffers are allocated only now
+            scene = load_scene(path, lambda: self.viewport.device)
+            renderer = FrameRenderer(scene.playback)
+            width, height = self.canvas.get_physical_size()
+            # Some buffers are allocated only when a frame is drawn.
+            renderer.draw(FrameRequest(scene.camera().camera(width, height), 0.0, "rgb", scene.background))
         except (InputError, DeviceError, MemoryError) as error:
-            for part, attributes in before:
-                vars(part).update(attributes)
             if not isinstance(error, InputError):
                 error = InputError(f"{path} cannot be shown: {str(error) or 'out of memory'}.")
             self.state.message = str(error)
             self.state.show_panels = True  # which tell of it
         else:
+            self.state.show(scene, renderer)
             self.canvas.set_title(window_title(path))
         self.canvas.request_draw()
 

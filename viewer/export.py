@@ -1,4 +1,4 @@
-"""Files for other viewers: stills as plain .ply in Inria's layout, one or one a moment; a compact scene; a web page."""
+"""Files for other viewers: stills as plain .ply in Inria's layout, one or a sequence; a compact scene; a web page."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.io.listing import listed
 from lapgs_wgpu.io.ply import write_ply
 from lapgs_wgpu.motion.playback.playback import DevicePlayback
-from lapgs_wgpu.motion.scene_file import compact_bytes, read_scene
+from lapgs_wgpu.motion.scene_file import compact_bytes
 from lapgs_wgpu.progress import Progress
-from lapgs_wgpu.viewer.loaded_scene import LoadedScene, stamp_of
+from lapgs_wgpu.viewer.loaded_scene import LoadedScene
 from lapgs_wgpu.viewer.offscreen import OffscreenRenderer
 from lapgs_wgpu.viewer.web_page import page_html
 
@@ -43,16 +43,14 @@ def export_compact(scene: LoadedScene, file: Path, *, overwrite: bool = False) -
     where only torch evaluates the field.
     """
     assert scene.path is not None
+    assert scene.file is not None
     if file.exists() and file.samefile(scene.path):
         raise InputError(f"{file}: is the opened file; take another name.")
     check_free(file, overwrite)
     with atomic_write(file) as target:  # before a minute of work
-        stored = read_scene(scene.path)
-        if scene.stamp != stamp_of(scene.path):
-            raise InputError(f"{scene.path}: was replaced while it was exported, as by a training; export it again.")
         features = scene.playback.static_features() if isinstance(scene.playback, DevicePlayback) else None
-        metadata = stored.metadata | {"view": scene.look.to_json()}
-        content = compact_bytes(dataclasses.replace(stored, metadata=metadata), features)
+        metadata = scene.file.metadata | {"view": scene.look.to_json()}
+        content = compact_bytes(dataclasses.replace(scene.file, metadata=metadata), features)
         if file.suffix.lower() == ".html":
             camera = scene.camera().camera(*_POSTER_SIZE)
             poster = OffscreenRenderer(scene)(camera, 0.0)

@@ -1,20 +1,19 @@
-"""A scene for players without our field: straight pieces of motion in a `.4dgs` file, and how far off they are."""
+"""Export to `.4dgs`: the motion as straight pieces, written by the format's own library, with its measured error."""
 
 from __future__ import annotations
 
+import io
 import math
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.errors import InputError, pip_install
 from lapgs_wgpu.io.atomic import atomic_write
-from lapgs_wgpu.io.fourdgs_file import Grid, LinearPieces, bytes_harmonics, harmonics_bytes, pack_4dgs, round_pieces
 from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.motion.playback.linear_pieces import Pieces, linear_pieces, piece_errors
-from lapgs_wgpu.motion.playback.playback import Playback
 from lapgs_wgpu.progress import Progress
 from lapgs_wgpu.splat.constants import CONSTANTS
 from lapgs_wgpu.splat.linear_light import directions, display_colors, linear_harmonics, sh_basis, to_display
@@ -23,113 +22,111 @@ from lapgs_wgpu.viewer.loaded_scene import LoadedScene
 
 MAX_ERROR = 0.5  # pixels, without --max-error
 _SHADE = 4 / 255  # largest change of opacity and color within a piece
-_OF_LINES = 0.85  # share of the error that straight lines may use up; the rest is for rounding
-_TICKS = 1 << 12  # of the clip: middles of pieces lie on them
+_OF_LINES = 0.85  # share of the error that straight lines may use up; the rest is for the format's rounding
+_TIME_STEP = 1e-3  # seconds: the library rounds the middles of pieces to it (profile "fine")
+_SH_RANGE = 4.0  # a coefficient is a byte from -this to +this (section 6.5 of the specification)
 _PROGRESS = 1000
 
 
 class Baked(NamedTuple):
-    """data: the file. gaussians, pieces: how many. error: largest displacement found, pixels."""
+    """gaussians, pieces: how many. error: largest displacement that was found in the written file, pixels."""
 
-    data: bytes
     gaussians: int
     pieces: int
     error: float
 
 
 def export_4dgs(scene: LoadedScene, file: Path, max_error: float, *, overwrite: bool = False) -> Baked:
-    """Write a `.4dgs`. Atomic. Raises InputError as `bake_4dgs`, and where it cannot be written or is there already."""
-    check_free(file, overwrite)
-    with atomic_write(file) as target:  # before minutes of work
-        baked = bake_4dgs(scene, max_error)
-        target.write(baked.data)
-    return baked
+    """Write a `.4dgs` of a scene that moves. Atomic.
 
+    Args:
+        max_error: how far a point of the ellipsoid of one standard deviation of a Gaussian may lie from where the field
+            has it, pixels of the captured images at the distance of the focus.
 
-def bake_4dgs(scene: LoadedScene, max_error: float) -> Baked:
-    """Bake a scene that moves.
-
-    max_error: how far a point of the ellipsoid of one standard deviation of a Gaussian may lie from where it should,
-    pixels of the captured pictures at the distance of the focus. Raises InputError where nothing moves or can be seen.
+    Raises InputError where the file cannot be written or is there already, nothing moves or can be seen, or the package
+    fourdgs is missing.
     """
-    playback, look = scene.playback, scene.look
+    try:
+        import fourdgs
+    except ImportError:
+        raise InputError(f"writing .4dgs needs fourdgs: {pip_install('export')}") from None
+    check_free(file, overwrite)
+    playback = scene.playback
     if not playback.moves:
         raise InputError(f"{scene.path}: holds no motion; --export FILE.ply writes it for other viewers.")
-    camera = scene.camera()
-    pixel = 2 * math.tan(0.5 * camera.fov_y) * camera.distance / look.camera.height  # world units
-    with Progress(_PROGRESS, "thousandths of the motion") as progress:
-        allowed = _OF_LINES * max_error * pixel
-        pieces = linear_pieces(playback, allowed, _SHADE, lambda share: progress.at(1 + int((_PROGRESS - 2) * share)))
-        progress.at(_PROGRESS)
-    if not len(pieces.source):
-        raise InputError(f"{scene.path}: holds no Gaussians that can be seen.")
-    seconds = scene.clock().seconds
-    largest = float(np.quantile(pieces.scales.max(axis=1), 0.999))
-    grid = _grid((1 - _OF_LINES) * max_error * pixel, largest, seconds)
-    rounded = round_pieces(_colored(pieces, _harmonics(playback), seconds), grid)
-    error = float(piece_errors(playback, _on_the_clip(rounded.pieces, seconds)).max()) / pixel
-    texts = {
-        "color_space": "linear-rec709-display",
-        "visibility_profile": "box",
-        "source": f"baked by lapgs-view: at most {error:.2f} pixels of {look.camera.height} beside the learned motion",
-    }
-    pose = (math.degrees(camera.fov_y), camera.position.tolist(), camera.focus.tolist())
-    data = pack_4dgs(rounded, grid, seconds, camera=pose, axes=_axes(look), texts=texts)
-    return Baked(data, len(np.unique(pieces.source)), len(pieces.source), error)
+    camera, seconds = scene.camera(), scene.clock().seconds
+    pixel = 2 * math.tan(0.5 * camera.fov_y) * camera.distance / scene.look.camera.height  # world units
+    with atomic_write(file) as target:  # before minutes of work
+        with Progress(_PROGRESS, "thousandths of the motion") as progress:
+            allowed = _OF_LINES * max_error * pixel
+            pieces = linear_pieces(playback, allowed, _SHADE, lambda share: progress.at(1 + int(998 * share)))
+            progress.at(_PROGRESS)
+        if not len(pieces.source):
+            raise InputError(f"{scene.path}: holds no Gaussians that can be seen.")
+        options = fourdgs.WriteOptions(
+            profile="fine",
+            library="lapgs_wgpu",
+            metadata={"color_space": "linear-rec709-display", "visibility_profile": "box"},
+            provenance=_frame(scene.look),
+            preserve_source_ids=True,
+        )
+        fov, position, focus = math.degrees(camera.fov_y), tuple(camera.position), tuple(camera.focus)
+        view = fourdgs.CameraTrajectory(fov, position, focus, interpolation="linear")
+        sh = playback.at(0.0).sh.read()  # (N, K, 3); those of degree 0 change with time
+        written = io.BytesIO()
+        fourdgs.write(written, _gaussian_set(pieces, sh, seconds), seconds, options=options, camera=view)
+        target.write(written.getvalue())
+    read = fourdgs.read(written.getvalue()).gaussians
+    error = float(piece_errors(playback, _pieces_of(read, seconds)).max()) / pixel
+    return Baked(len(np.unique(pieces.source)), len(pieces.source), error)
 
 
-def _on_the_clip(pieces: LinearPieces, seconds: float) -> Pieces:
-    """What a file says of its pieces, in times of the clip."""
-    begin, end = pieces.spans.T / seconds
-    return Pieces(
-        pieces.source, begin, end, pieces.means, pieces.velocities * seconds, pieces.scales, pieces.quats,
-        pieces.opacities, pieces.colors,
-    )  # fmt: skip
+def _gaussian_set(pieces: Pieces, sh: NDArray[np.float32], seconds: float) -> Any:
+    """The library's Gaussians, on the clock of the file, with colors as linear light."""
+    import fourdgs
 
-
-def _grid(rest: float, largest: float, seconds: float) -> Grid:
-    """Steps whose roundings together displace Gaussians of up to the largest scale by about `rest`, world units."""
-    angle = min(rest / (40 * largest), 2e-3)
-    return Grid(
-        mean=0.25 * rest,
-        log_scale=min(rest / (4 * largest), 0.04),
-        rotation=angle,
-        color=1 / 2047,
-        opacity=1 / 255,
-        velocity=2 * rest / max(1.0, seconds),  # displaces most at the ends of the longest span
-        time=seconds / _TICKS,
-    )
-
-
-def _harmonics(playback: Playback) -> NDArray[np.float32]:
-    """(N, K, 3) of the Gaussians; those of degree 0 change with time."""
-    sh: NDArray[np.float32] = playback.at(0.0).sh.read()
-    return sh
-
-
-def _colored(pieces: Pieces, sh: NDArray[np.float32], seconds: float) -> LinearPieces:
-    """The pieces on the clock of the file, their colors as linear light."""
     colors = sh[pieces.source].astype(np.float64)
     colors[:, 0] = pieces.dc
-    light = linear_harmonics(colors, best_degree(colors))
-    return LinearPieces(
-        source=pieces.source,
-        spans=np.stack([pieces.begin, pieces.end], axis=1) * seconds,
-        means=pieces.means,
-        velocities=pieces.slopes / seconds,
+    degree = best_degree(colors)
+    light = linear_harmonics(colors, degree)
+    base = (CONSTANTS["SH_C0"] * light[:, 0]).clip(0, 1)
+    middles = 0.5 * (pieces.begin + pieces.end)
+    at = _TIME_STEP * np.rint(middles * seconds / _TIME_STEP)
+    return fourdgs.GaussianSet(
+        positions=pieces.means + (at / seconds - middles)[:, None] * pieces.slopes,
         scales=pieces.scales,
-        quats=pieces.quats,
-        opacities=pieces.opacities,
-        colors=(CONSTANTS["SH_C0"] * light[:, 0]).clip(0, 1),
-        harmonics=light[:, 1:],
+        rotations=pieces.quats,
+        colors=np.column_stack([base, pieces.opacities]),
+        motions=pieces.slopes / seconds,
+        mu_t=at,
+        sigma_t=np.full(len(at), np.inf),  # a piece is there from its begin to its end, in full opacity
+        win_lo=pieces.begin * seconds,
+        win_hi=pieces.end * seconds,
+        sh=harmonics_bytes(light[:, 1:]).transpose(0, 2, 1).reshape(len(at), -1),  # all reds, greens, blues
+        sh_degree=degree,
+        source_group=np.zeros(len(at), np.int64),
+        source_index=pieces.source,
     )
+
+
+def _pieces_of(gaussians: Any, seconds: float) -> Pieces:
+    """The pieces that a file holds, with times and slopes of the clip."""
+    begin, end = gaussians.win_lo / seconds, gaussians.win_hi / seconds
+    slopes = gaussians.motions.astype(np.float64) * seconds
+    ahead = 0.5 * (begin + end) - gaussians.mu_t / seconds
+    means = gaussians.positions + ahead[:, None] * slopes
+    none = np.zeros((len(begin), 3))
+    return Pieces(
+        gaussians.source_index, begin, end, means, slopes, gaussians.scales, gaussians.rotations,
+        gaussians.colors[:, 3], none,
+    )  # fmt: skip
 
 
 def best_degree(sh: NDArray[np.floating]) -> int:
     """The degree whose harmonics, as bytes of linear light, come nearest to the displayed colors of sh (N, K, 3).
 
-    Bytes are coarse (fourdgs_file.harmonics_bytes), and most so in the dark: where colors hardly depend on the
-    direction, fewer harmonics are nearer to them than all.
+    Bytes are coarse (`harmonics_bytes`), and most so in the dark: where colors hardly depend on the direction, fewer
+    harmonics are nearer to them than all.
     """
     some = sh[:: max(1, len(sh) // 2000)]
     degree = int(sh.shape[1] ** 0.5) - 1
@@ -138,19 +135,30 @@ def best_degree(sh: NDArray[np.floating]) -> int:
     errors = []
     for fewer in range(degree + 1):
         light = linear_harmonics(some, fewer)
-        light[:, 1:] = bytes_harmonics(harmonics_bytes(light[:, 1:]))
+        light[:, 1:] = harmonics_bytes(light[:, 1:]) * (2 * _SH_RANGE / 255) - _SH_RANGE
         shown = to_display(np.einsum("dk,nkc->ndc", sh_basis(around, fewer), light).clip(0, 1))
         errors.append(float(((shown - true) ** 2).mean()))
     return int(np.argmin(errors))
 
 
-def _axes(look: InitialView) -> tuple[int, int] | None:
-    """Up and ahead as the nearest of +x +y +z -x -y -z; None where up is not near to one."""
+def harmonics_bytes(coefficients: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Coefficients as the format's bytes; those beyond its range as the ends of it."""
+    return np.rint((coefficients + _SH_RANGE) * (255 / (2 * _SH_RANGE))).clip(0, 255).astype(np.uint8)
+
+
+def _frame(look: InitialView) -> Any:
+    """Which axes of the file are up and ahead; None where up is not near to an axis."""
+    import fourdgs
+
     up = _axis(look.up)
-    ahead = look.camera.T_cam_world[2, :3] * (np.arange(3) != up % 3)
-    return (up, _axis(ahead)) if np.abs(look.up).max() > 0.9 else None
+    if np.abs(look.up).max() <= 0.9:
+        return None
+    ahead = _axis(look.camera.T_cam_world[2, :3] * (np.arange(3) != up % 3))
+    frame = fourdgs.CoordinateFrame(handedness=1, up_axis=up, forward_axis=ahead)  # right-handed, of no unit
+    return fourdgs.Provenance(frames=[frame])
 
 
 def _axis(direction: NDArray[np.floating]) -> int:
+    """The nearest of +x +y +z -x -y -z, by its place in this list."""
     largest = int(np.abs(direction).argmax())
     return largest + (3 if direction[largest] < 0 else 0)

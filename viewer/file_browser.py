@@ -8,7 +8,7 @@ from pathlib import Path
 
 from imgui_bundle import imgui
 
-from lapgs_wgpu.viewer.gui_library import printable
+from lapgs_wgpu.viewer.widgets import printable
 
 
 class FileBrowser:

@@ -12,15 +12,14 @@ from numpy.typing import NDArray
 from lapgs_wgpu.gpu.array import DeviceArray, read_all
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.pool import BufferPool
-from lapgs_wgpu.gpu.profile import Profile
 from lapgs_wgpu.motion.playback.playback import Playback
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterizer import Rasterizer
-from lapgs_wgpu.viewer.present import Placed
+from lapgs_wgpu.viewer.present import ImageLayout
 from lapgs_wgpu.viewer.render_modes import MODES, Mode
 
-_MOMENTS = 9  # times at which the Gaussians' places are compared
+_TIMES = 9  # of the clip, at which the Gaussians' places are compared
 
 
 class FrameRequest(NamedTuple):
@@ -34,14 +33,13 @@ class FrameRequest(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Frame:
-    """A drawn frame. placed: for the presenter, at the origin in its own size. seconds: it took, all passes waited for.
-    splats: how many touched the picture. passes: milliseconds of each pass, where they were asked for."""
+    """A drawn frame. layout: for the presenter, at the origin in its own size. seconds: it took, all passes waited for.
+    splats: how many touched the picture."""
 
     request: FrameRequest
-    placed: Placed
+    layout: ImageLayout
     seconds: float
     splats: int
-    passes: dict[str, float]
 
 
 def warm_up(device: Device) -> None:
@@ -60,7 +58,6 @@ class FrameRenderer:
         self.playback = playback
         self._rasterizer = Rasterizer(playback.device)
         self._pool = BufferPool(playback.device)
-        self._profile: Profile | None = None
         self._values: dict[tuple[Mode, float], tuple[DeviceArray, float, float]] = {}
 
     def forget(self) -> None:
@@ -74,8 +71,8 @@ class FrameRenderer:
             missing.add("dynamics")
         return [mode for mode in MODES if mode not in missing]
 
-    def draw(self, request: FrameRequest, *, profile: bool = False) -> Frame:
-        """Draw, and wait until it is done. profile: take the time of each pass, where the device can."""
+    def draw(self, request: FrameRequest) -> Frame:
+        """Draw, and wait until it is done."""
         start = time.perf_counter()
         camera, mode = request.camera, request.mode
         low, high, background = 0.0, 1.0, request.background
@@ -86,33 +83,24 @@ class FrameRenderer:
             colors, low, high = value
             gaussians = dataclasses.replace(gaussians, sh=colors)
             background = (0.0, 0.0, 0.0)
-        taken = self._profiler() if profile else None
         while True:
-            drawing = self._rasterizer.draw(gaussians, camera, background, depth=mode == "depth", profile=taken)
+            drawing = self._rasterizer.draw(gaussians, camera, background, depth=mode == "depth")
             visible, *needed = read_all([drawing.lists.visible, *drawing.needed])
-            passes: dict[str, float] = {}
-            for name, milliseconds in taken.read() if taken else []:
-                passes[name] = passes.get(name, 0.0) + milliseconds
             if not self._rasterizer.grow_on_overflow(drawing, needed):
                 break
         if mode == "depth":
             low, high = self._depth_range(drawing.image)
         shows = {"rgb": "color", "alpha": "alpha", "depth": "depth"}.get(mode, "value")
         size = (camera.width, camera.height)
-        placed = Placed(drawing.image, size, (0, 0), size, request.background, shows, low, high)
-        return Frame(request, placed, time.perf_counter() - start, int(visible[0]), passes)
+        layout = ImageLayout(drawing.image, size, (0, 0), size, request.background, shows, low, high)
+        return Frame(request, layout, time.perf_counter() - start, int(visible[0]))
 
     def depth_at(self, frame: Frame, column: int, row: int) -> float | None:
         """Depth along the camera's axis of what a pixel shows, world units; None where it shows next to nothing."""
         drawn = self.draw(frame.request._replace(mode="depth"))
-        planes = drawn.placed.planes.read()
+        planes = drawn.layout.planes.read()
         alpha = 1.0 - float(planes[3, row, column])
         return float(planes[4, row, column]) / alpha if alpha > 0.1 else None
-
-    def _profiler(self) -> Profile | None:
-        if self._profile is None and "timestamp-query" in self.playback.device.features:
-            self._profile = Profile(self.playback.device)
-        return self._profile
 
     def _depth_range(self, planes: DeviceArray) -> tuple[float, float]:
         rest, depth = planes.read()[3:]
@@ -143,5 +131,5 @@ class FrameRenderer:
         if mode == "scale":
             scales = self.playback.at(t).scales.read()
             return scales.max(axis=1, initial=0.0)
-        places = np.stack([self.playback.means(moment) for moment in np.linspace(0, 1, _MOMENTS)])
+        places = np.stack([self.playback.means(t) for t in np.linspace(0, 1, _TIMES)])
         return np.linalg.norm(places - places.mean(axis=0), axis=2).max(axis=0).astype(np.float32)

@@ -25,7 +25,7 @@ class GroundTruth:
         self._held: Any = None
 
     def truth(self, view: int, background: tuple[float, float, float], device: Device) -> dict[str, Any]:
-        """What `Placed` has to know of the picture of a view, laid on a background."""
+        """What `ImageLayout` has to know of the picture of a view, laid on a background."""
         key = (view, background)
         if self._held is None or self._held[0] != key:
             from lapgs_wgpu.data import composite

@@ -1,8 +1,7 @@
-"""Dear ImGui: whether it can be loaded, a package and libraries of the system that it does not bring, and its texts."""
+"""Dear ImGui: whether it can be loaded, a package and libraries of the system that it does not bring."""
 
 from __future__ import annotations
 
-import os
 import sys
 
 from lapgs_wgpu.errors import InputError, pip_install
@@ -21,8 +20,3 @@ def check_imgui() -> None:
             f"the viewer's package imgui-bundle cannot be loaded ({error}); install the system's library that it lacks"
             + (f", on Debian and Ubuntu: sudo apt-get install -y {PACKAGES}." if sys.platform == "linux" else ".")
         ) from None
-
-
-def printable(text: str) -> str:
-    """A text that may hold names of files, as UTF-8: others end Dear ImGui's frame with an error."""
-    return os.fsencode(text).decode("utf-8", "replace")

@@ -18,10 +18,10 @@ from rendercanvas.utils.asyncs import sleep
 from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.motion.playback.torch_playback import TorchPlayback
 from lapgs_wgpu.motion.scene import Scene4D
+from lapgs_wgpu.viewer import window
 from lapgs_wgpu.viewer.app import App
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene
 from lapgs_wgpu.viewer.training_control import TrainingControl, TrainingStep
-from lapgs_wgpu.viewer.window import choose_backend, make_canvas
 
 SHARE = 0.02  # of the time may go into pictures while nobody moves anything
 _OPENING = 4.0  # seconds after the first step, in which the window draws what it begins with: shaders are compiled
@@ -31,7 +31,7 @@ _PATIENCE = 0.02  # seconds between looks at mouse and keys while the training r
 
 def check_window() -> None:
     """Raises InputError where no window can be opened here."""
-    choose_backend("auto", otherwise="leave out --view")
+    window.check_window("leave out --view")
 
 
 def watch(scene: Scene4D, look: InitialView, steps: Iterator[TrainingStep]) -> None:
@@ -39,8 +39,8 @@ def watch(scene: Scene4D, look: InitialView, steps: Iterator[TrainingStep]) -> N
 
     An error of a step closes the window and goes on to the caller.
     """
-    canvas, loop = make_canvas(choose_backend("auto"), "training - lapgs-train", (1280, 720))
-    app = App(canvas, loop, LoadedScene(None, TorchPlayback(scene), look), transport=True)
+    canvas, loop = window.make_canvas("training - lapgs-train", (1280, 720))
+    app = App(canvas, loop, LoadedScene(None, TorchPlayback(scene), look))
     state, viewport = app.state, app.viewport
     state.training = training = TrainingControl()
     interrupt = signal.getsignal(signal.SIGINT)

@@ -12,13 +12,11 @@ import numpy as np
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.motion.playback.playback import Playback, playback_of
-from lapgs_wgpu.motion.scene_file import read_scene
+from lapgs_wgpu.motion.scene_file import SceneFile, read_scene
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.viewer.camera import ViewCamera
 from lapgs_wgpu.viewer.clock import Clock
 from lapgs_wgpu.viewer.render_modes import BACKGROUNDS
-
-Stamp = tuple[int, int, int]
 
 _ELEVATION = math.radians(35)  # of the guessed camera above the middle
 _FLAT = 0.5  # of the extents along x and y: what is lower lies on the ground
@@ -26,13 +24,13 @@ _FRAMES = 150  # of a clip whose file does not say how many it has
 
 
 class LoadedScene(NamedTuple):
-    """path: where it came from, None for a training under way. look: camera, focus, up and frames to begin with. stamp:
-    of the file, when it was read."""
+    """path: where it came from, None for a training under way. look: camera, focus, up and frames to begin with. file:
+    its content, None for a training."""
 
     path: Path | None
     playback: Playback
     look: InitialView
-    stamp: Stamp | None = None
+    file: SceneFile | None = None
 
     def camera(self) -> ViewCamera:
         """A camera where the viewer begins."""
@@ -53,19 +51,10 @@ def load_scene(path: Path, device: Callable[[], Device]) -> LoadedScene:
 
     device: is asked for when the file has been read.
     """
-    stamp = stamp_of(path)
-    playback = playback_of(read_scene(path), device())
+    file = read_scene(path)
+    playback = playback_of(file, device())
     look = InitialView.from_json(playback.metadata.get("view", ""))
-    return LoadedScene(path, playback, look or guess_look(playback), stamp)
-
-
-def stamp_of(path: Path) -> Stamp | None:
-    """What tells a file from another one that takes its place; None where there is none."""
-    try:
-        found = path.stat()
-    except OSError:
-        return None
-    return found.st_ino, found.st_size, found.st_mtime_ns
+    return LoadedScene(path, playback, look or guess_look(playback), file)
 
 
 def guess_look(playback: Playback) -> InitialView:

@@ -42,9 +42,8 @@ _TAKES = {
     "screenshot": _PICTURE,
     "video": _PICTURE | {"path", "fps", "seconds"},
     "export": _COMMON | {"time", "frames", "max_error", "overwrite"},
-    "window": _PICTURE | {"time_slider", "play", "fps", "speed", "loop", "backend", "host", "port", "token"},
+    "window": _PICTURE | {"time_slider", "play", "fps", "speed", "loop", "backend", "host", "port"},
 }
-NEW_TOKEN = ""  # value of --token without a text
 
 
 def parse_options(arguments: Sequence[str]) -> tuple[Any, str]:
@@ -60,12 +59,9 @@ def _job(given: Any) -> str:
         raise InputError(f"{_option(jobs[0])} and {_option(jobs[1])} do not go together: one at a time.")
     job = jobs[0] if jobs else "window"
     for name, value in vars(given).items():
-        if value is None or name in ("file", job) or name in _TAKES[job]:
-            continue
-        needs = [_option(other) for other, takes in _TAKES.items() if name in takes and other != "window"]
-        if job != "window":
-            raise InputError(f"{_option(name)} has no use with {_option(job)}.")
-        raise InputError(f"{_option(name)} has no use without {' or '.join(needs)}.")
+        if value is not None and name not in ("file", job) and name not in _TAKES[job]:
+            place = f"with {_option(job)}" if job != "window" else "in a window"
+            raise InputError(f"{_option(name)} has no use {place}.")
     return job
 
 
@@ -78,70 +74,49 @@ def _parse(arguments: Sequence[str]) -> Any:
     # fmt: off
     add = parser.add_argument
     # All defaults are None, which tells given options from others.
-    add("file", nargs="?", metavar="FILE.ply", help="checkpoint of lapgs-train, compact scene (.lapgs), or any "
-        "3DGS .ply file; required, but for --list-devices")
+    add("file", nargs="?", metavar="FILE.ply", help="checkpoint, compact scene (.lapgs), or any 3DGS .ply file")
     add("--device", metavar="NAME", help=DEVICE_HELP)
     add("--list-devices", action="store_const", const=True, help=LIST_DEVICES_HELP)
 
     add = parser.add_argument_group("content of the window, screenshot or video").add_argument
-    add("--time", type=_number(0.0, 1.0), metavar="T", help="time in the clip: 0 is its start, 1 its end; a window "
-        "opens at this time; also of --export FILE.ply; not for videos in which the clip plays [0, or the time of "
-        "--view]")
-    modes = "; ".join(f"{mode}: {about}" for mode, about in MODES.items())
-    add("--mode", choices=list(MODES), help=f"what to render; {modes}. Depth, motion, dynamics and scale are drawn in "
-        "a color scale whose range follows the content; the window shows the values at its ends, image files do not "
-        "[rgb]")
+    add("--time", type=_number(0.0, 1.0), metavar="T", help="time in the clip, from 0 to 1; also of --export FILE.ply; "
+        "not for videos in which the clip plays [0, or the time of --view]")
+    add("--mode", choices=list(MODES), help="; ".join(f"{mode}: {about}" for mode, about in MODES.items()) + " [rgb]")
     add("--background", choices=list(BACKGROUNDS), help="color behind the Gaussians [the training's, otherwise black]")
-    add("--size", type=_size, metavar="WxH", help="width and height of the window, screenshot or video, pixels; not "
-        "with --backend http [window: 1280x720; otherwise that of --view or of the camera path, or 1280x720]")
-    add("--view", metavar="N|NAME", help="camera of the capture (config.toml beside FILE.ply says where that is), by "
-        "name, or by number from 0; test views come first [a camera stored in the file, otherwise one that shows the "
-        "whole scene]")
+    add("--size", type=_size, metavar="WxH", help="pixels [1280x720, or of a picture that of --view or of the camera "
+        "path]")
+    add("--view", metavar="N|NAME", help="camera of the capture by name or number; test views come first [where the "
+        "file says, otherwise one that shows the whole scene]")
 
     add = parser.add_argument_group("window").add_argument
-    add("--time-slider", action=argparse.BooleanOptionalAction, help="show or hide the time slider [shown if the "
-        "scene moves]")
+    add("--time-slider", action="store_const", const=True, help="show the time slider [shown if the scene moves]")
     add("--play", action="store_const", const=True, help="start playing at once [paused]")
-    add("--fps", type=_number(0.1, 1000.0), metavar="F", help="frames of the clip per second at speed 1, and of "
-        "--video; the clip has a fixed number of frames, so more make it shorter, except in a video whose length "
-        "--seconds, --path view or CAMERAS.json gives [30, or that of the camera path]")
-    add("--speed", type=_number(0.01, 100.0), metavar="X", help="playback speed in the window, a factor [1]")
-    add("--loop", choices=list(LOOPS), help="at the end of the clip; loop: start again; bounce: play backwards; "
-        "once: stop [loop]")
-    add("--backend", choices=("auto", "glfw", "qt", "http"), help="how to display; glfw or qt: desktop window of "
-        "that library; auto: glfw if it works, otherwise qt; http: web server for a browser (pip install "
-        "'lapgs-wgpu[remote]') [auto]")
+    add("--fps", type=_number(0.1, 1000.0), metavar="F", help="frames a second at speed 1 and of --video "
+        "[30, or that of the camera path]")
+    add("--speed", type=_number(0.01, 100.0), metavar="X", help="playback speed, a factor [1]")
+    add("--loop", choices=list(LOOPS), help="at the end of the clip: start again, play backwards, or stop [loop]")
+    add("--backend", choices=("glfw", "http"), help="glfw: desktop window; http: web server for a browser (pip install "
+        "'lapgs-wgpu[remote]') [glfw]")
+    add("--host", metavar="ADDRESS", help="with --backend http: address to listen on [127.0.0.1: this machine only]")
+    add("--port", type=_port, metavar="N", help="with --backend http: TCP port; 0: any free port [8080]")
 
-    add = parser.add_argument_group("web server (with --backend http)").add_argument
-    add("--host", metavar="ADDRESS", help="network address to listen on; an address that other machines can reach "
-        "requires --token [127.0.0.1: this machine only]")
-    add("--port", type=_port, metavar="N", help="TCP port to listen on; 0: any free port [8080]")
-    add("--token", nargs="?", const=NEW_TOKEN, metavar="TEXT", help="require this token from browsers, 16 or more "
-        "letters, digits, - or _; without TEXT a random token is generated and printed [no token]")
-
-    add = parser.add_argument_group("screenshot and video (no window)").add_argument
-    add("--screenshot", metavar="FILE.png", help="render one image to a PNG file; replaces an existing file")
-    add("--video", metavar="FILE.mp4", help="render a video to an MP4 file (H.264); needs PyAV (pip install "
-        "'lapgs-wgpu[video]'); replaces an existing file")
-    add("--path", metavar="time|view|both|CAMERAS.json", help="camera motion of --video; time: static camera while "
-        "the clip plays; view: one orbit around the focus point at --time, to and fro where the capture has cameras "
-        "on one side only; both: the same while the clip plays; CAMERAS.json: camera path in nerfstudio's format, with "
-        "its times in the clip; without times, the clip plays once [time, or view if the scene does not move]")
-    add("--seconds", type=_number(0.001, 86400.0), metavar="S", help="length of --video, seconds; the clip, the "
-        "orbit or the camera path then takes this long [length of the clip or of the camera path; 6 for view]")
+    add = parser.add_argument_group("screenshot and video (no window); existing files are replaced").add_argument
+    add("--screenshot", metavar="FILE.png", help="render one image")
+    add("--video", metavar="FILE.mp4", help="render a video (H.264; pip install 'lapgs-wgpu[video]')")
+    add("--path", metavar="time|view|both|CAMERAS.json", help="of --video; time: static camera while the clip plays; "
+        "view: one orbit at --time, to and fro where the capture has cameras on one side only; both: the same while "
+        "the clip plays; CAMERAS.json: camera path in nerfstudio's format [time, or view if the scene does not move]")
+    add("--seconds", type=_number(0.001, 86400.0), metavar="S", help="length of --video [that of the clip or of the "
+        "camera path; 6 for view]")
 
     add = parser.add_argument_group("export (no window)").add_argument
-    add("--export", metavar="FILE.ply|.lapgs|.html|.4dgs|DIR", help="write a static 3DGS .ply file of the "
-        "Gaussians at --time; .lapgs: a compact scene with its motion; .html: a web page that plays it; .4dgs: the "
-        "motion as straight lines, for players without the deformation field; with --frames: a sequence of static "
-        "files in the folder DIR")
-    add("--max-error", type=_number(0.01, 100.0), metavar="PX", help="with --export FILE.4dgs: largest distance of a "
-        "Gaussian from its learned motion, pixels of the captured images at the distance of the focus point; less "
-        "makes the file larger [0.5]")
-    add("--frames", type=_count, metavar="N", help="number of files in --export DIR, at equally spaced times from "
-        "0 to 1; required for DIR, no default")
-    add("--overwrite", action="store_const", const=True, help="allow --export to replace an existing file; "
-        "with --frames: allow a DIR that is not empty, and delete its frame_*.ply first")
+    add("--export", metavar="FILE.ply|.lapgs|.html|.4dgs|DIR", help=".ply: static 3DGS file at --time; "
+        ".lapgs: compact scene with its motion; .html: web page that plays it; .4dgs: motion as straight lines (pip "
+        "install 'lapgs-wgpu[export]'); DIR: a static file for each of --frames")
+    add("--max-error", type=_number(0.01, 100.0), metavar="PX", help="of a .4dgs: how far lines may be off the learned "
+        "motion, pixels of the captured images at the focus [0.5]")
+    add("--frames", type=_count, metavar="N", help="number of files in DIR, at times evenly from 0 to 1")
+    add("--overwrite", action="store_const", const=True, help="replace an existing file, or the frame_*.ply in DIR")
     # fmt: on
     return parser.parse_args(arguments)
 

@@ -10,7 +10,6 @@ from imgui_bundle import imgui
 from wgpu.utils.imgui import ImguiRenderer
 
 from lapgs_wgpu.viewer.file_browser import FileBrowser
-from lapgs_wgpu.viewer.gui_library import printable
 from lapgs_wgpu.viewer.key_bindings import KEYS, MOUSE
 from lapgs_wgpu.viewer.path_panel import draw_path
 from lapgs_wgpu.viewer.present import HEAT
@@ -19,6 +18,7 @@ from lapgs_wgpu.viewer.time_slider import draw_time_slider
 from lapgs_wgpu.viewer.training_control import TrainingControl
 from lapgs_wgpu.viewer.view_state import ViewState
 from lapgs_wgpu.viewer.viewport import Viewport
+from lapgs_wgpu.viewer.widgets import button, choice, printable, tip
 
 _FIXED = imgui.WindowFlags_.no_move | imgui.WindowFlags_.no_resize | imgui.WindowFlags_.no_saved_settings
 _BAR = _FIXED | imgui.WindowFlags_.no_title_bar | imgui.WindowFlags_.no_scrollbar
@@ -100,36 +100,24 @@ class Panels:
         imgui.set_next_window_pos((_GAP, _GAP))
         imgui.set_next_window_size((_SIDE, 0))
         imgui.begin("View", None, _FIXED)
-        modes = state.renderer.modes()
-        imgui.set_next_item_width(-70)
-        changed, chosen = imgui.combo("mode", modes.index(state.mode), list(modes))
-        if changed:
-            state.mode = modes[chosen]
-        _tip(MODES[state.mode])
+        state.mode = choice("mode", state.mode, state.renderer.modes())
+        tip(MODES[state.mode])
         frame = self.viewport.frame
-        if frame is not None and frame.placed.shows in ("depth", "value"):
-            _legend(frame.placed.low, frame.placed.high)
-        names = list(BACKGROUNDS)
-        colors = list(BACKGROUNDS.values())
-        imgui.set_next_item_width(-70)
-        present = colors.index(state.background) if state.background in colors else 0
-        changed, chosen = imgui.combo("ground", present, names)
-        if changed:
-            state.background = colors[chosen]
-        _tip("background")
-        dropped = "; one can also be dropped on the window" if state.takes_drops else ""
-        for text, action, tip in (
-            ("Reset", state.reset_camera, "camera back to where it started (R)"),
-            ("Open", self._files.toggle, "another .ply or .lapgs file" + dropped),
-            ("Help", state.toggle_help, "keys and mouse (?)"),
-        ):
-            if text == "Open" and state.training is not None:  # there would be no way back to the training
-                continue
-            if imgui.button(text, (66, 0)):
-                action()
-            _tip(tip)
-            imgui.same_line()
-        imgui.new_line()
+        if frame is not None and frame.layout.shows in ("depth", "value"):
+            _legend(frame.layout.low, frame.layout.high)
+        state.background = choice("ground", state.background, list(BACKGROUNDS.values()), list(BACKGROUNDS))
+        tip("background")
+        if button("Reset"):
+            state.reset_camera()
+        tip("camera back to where it started (R)")
+        imgui.same_line()
+        if button("Open", enabled=state.training is None):  # there would be no way back to the training
+            self._files.toggle()
+        tip("another .ply or .lapgs file")
+        imgui.same_line()
+        if button("Help"):
+            state.toggle_help()
+        tip("keys and mouse (?)")
         if state.flying:
             imgui.text_colored(_ACCENT, "flying: W A S D Q E, V ends")
         if state.training is not None:
@@ -146,28 +134,25 @@ class Panels:
         if last is not None:
             imgui.progress_bar(last.step / last.steps, (-1, 0), f"step {last.step} of {last.steps}")
             imgui.text(f"{last.psnr:.2f} dB   {self.state.scene.playback.count:,} Gaussians")
-        if imgui.button("Go on" if training.paused else "Pause", (66, 0)):
+        if button("Go on" if training.paused else "Pause"):
             training.toggle_pause()
         imgui.same_line()
-        if imgui.button("Step", (66, 0)):
+        if button("Step"):
             training.step()
-        _tip("one step of the optimizer, then pause")
+        tip("one step of the optimizer, then pause")
 
     def _capture(self) -> None:
         state = self.state
         assert state.ground_truth is not None
         imgui.separator_text("Capture")
-        names = [view.name for view in state.ground_truth.views]
-        imgui.set_next_item_width(-70)
-        changed, chosen = imgui.combo("camera", -1 if state.view is None else state.view, names)
-        if changed:
+        views = state.ground_truth.views
+        chosen = choice("camera", state.view, range(len(views)), [view.name for view in views])
+        compare = choice("##compare", state.compare, COMPARES, _COMPARE_NAMES, width=-1)
+        if compare != state.compare and state.view is None:
+            chosen = 0
+        state.compare = compare
+        if chosen is not None and chosen != state.view:
             state.stand_at(chosen)
-        imgui.set_next_item_width(-1)
-        changed, chosen = imgui.combo("##compare", COMPARES.index(state.compare), list(_COMPARE_NAMES))
-        if changed:
-            state.compare = COMPARES[chosen]
-            if state.view is None:
-                state.stand_at(0)
         if state.compare != "off" and state.comparing() == "off":
             imgui.text_wrapped("The capture has no picture of this camera and time; N goes to the next that it has.")
 
@@ -180,7 +165,6 @@ class Panels:
         width, _ = viewport.canvas.get_logical_size()
         imgui.set_next_window_pos((width - _GAP, _GAP), imgui.Cond_.always, (1.0, 0.0))
         imgui.set_next_window_bg_alpha(0.6)
-        # Not without inputs: its one check box must be reached.
         imgui.begin("overlay", None, _BAR | imgui.WindowFlags_.always_auto_resize | imgui.WindowFlags_.no_nav)
         frame, camera = viewport.frame, viewport.frame.request.camera
         rate = f"{viewport.fps:.0f} fps" if viewport.fps else "at rest"
@@ -190,9 +174,6 @@ class Panels:
             f"{camera.width}x{camera.height}" + (f" ({100 * viewport.scale:.0f} %)" if viewport.scale < 1 else "")
         )
         imgui.text(viewport.device.info.name[:34])
-        _, state.profiling = imgui.checkbox("passes", state.profiling)
-        for name, milliseconds in sorted(frame.passes.items(), key=lambda entry: -entry[1]):
-            imgui.text(f"{milliseconds:7.2f} ms {name}")
         self._end()
 
     def _message(self, message: str) -> None:
@@ -220,11 +201,6 @@ class Panels:
             imgui.end_table()
         self._end()
         self.state.show_help = bool(stays)
-
-
-def _tip(text: str) -> None:
-    if imgui.is_item_hovered():
-        imgui.set_tooltip(text)
 
 
 def _legend(low: float, high: float) -> None:

@@ -1,4 +1,4 @@
-"""A camera's path through the scene and the clip: key-frames, and what lies between them."""
+"""A camera path through the scene and the clip: key-frames, and the smooth curve through them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from lapgs_wgpu.data.poses import world_to_camera
 from lapgs_wgpu.splat.camera import Camera
 
 Array = NDArray[np.float64]
-_LIMIT = 2.0  # of a speed at a key-frame, in speeds of its slower side: nothing swings far beyond a key-frame
+_LIMIT = 2.0  # of a velocity at a key-frame, in mean velocities of its slower side
 
 
 class Pose(NamedTuple):
@@ -43,30 +43,32 @@ class KeyFrame(NamedTuple):
 class CameraPath:
     """A path through its key-frames, at least one, in the order of their seconds; the first is at second 0.
 
-    Positions and rotations move smoothly (their velocities do not jump, not even at key-frames, and they rest between
-    two equal key-frames), fields of view too; times in the clip go linearly from key-frame to key-frame.
+    Positions, rotations (as quaternions, the shortest way) and fields of view follow cubic curves without jumps of
+    velocity, and rest between two equal key-frames. Times in the clip are linear from key-frame to key-frame.
+    Raises ValueError where two key-frames are at the same second.
     """
 
     def __init__(self, keys: Iterable[KeyFrame]) -> None:
-        from scipy.spatial.transform import Rotation  # not at the start of the viewer: it takes a fifth of a second
+        # Not at the start of the viewer: it takes a fifth of a second.
+        from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
+        from scipy.spatial.transform import Rotation
 
         ordered = sorted(keys, key=lambda key: key.second)
-        start = ordered[0].second
-        self.keys = tuple(key._replace(second=key.second - start) for key in ordered)
-        self._moments = np.array([key.second for key in self.keys])
-        if len(self.keys) > 1 and not (np.diff(self._moments) > 0).all():
+        self.keys = tuple(key._replace(second=key.second - ordered[0].second) for key in ordered)
+        self._curve = None
+        if len(self.keys) < 2:
+            return
+        seconds = np.array([key.second for key in self.keys])
+        if not (np.diff(seconds) > 0).all():
             raise ValueError("two key-frames of a camera path are at the same second")
-        gaps = np.diff(self._moments)[:, None]
-        self._positions = np.stack([key.pose.position for key in self.keys])
-        self._turns = Rotation.from_matrix(np.stack([key.pose.rotation for key in self.keys]))
-        self._fovs = np.array([[key.pose.fov_y] for key in self.keys])
-        self._velocities = _speeds(np.diff(self._positions, axis=0) / gaps, gaps)
-        # Rotation vectors from one key-frame to the next, the shortest way, in camera axes: the same from both ends.
-        turned = (self._turns[1:] * self._turns[:-1].inv()).as_rotvec() if len(self.keys) > 1 else np.zeros((0, 3))
-        self._spins = _speeds(turned / gaps, gaps)
-        slopes = np.diff(self._fovs, axis=0) / gaps
-        self._zooms = _speeds(slopes, gaps)
-        self._zooms[1:-1][slopes[1:] * slopes[:-1] <= 0] = 0.0  # never beyond the widest and the narrowest key-frame
+        positions, turns, fovs = zip(*(key.pose for key in self.keys), strict=True)
+        quats = Rotation.from_matrix(np.stack(turns)).as_quat()
+        for before, after in itertools.pairwise(quats):
+            after *= 1.0 if before @ after >= 0 else -1.0  # both signs are the same rotation
+        parts = [np.stack(positions), quats]
+        velocities = np.hstack([_velocities(values, seconds) for values in parts])
+        self._curve = CubicHermiteSpline(seconds, np.hstack(parts), velocities)
+        self._fov = PchipInterpolator(seconds, fovs)  # never beyond the widest and the narrowest key-frame
 
     @property
     def seconds(self) -> float:
@@ -75,51 +77,24 @@ class CameraPath:
 
     def at(self, second: float) -> tuple[Pose, float]:
         """The camera and the time in the clip at a second of the path; beyond its ends those of the end."""
-        if len(self.keys) == 1:
-            return self.keys[0].pose, self.keys[0].time
-        second = min(max(second, 0.0), self.seconds)
-        i = min(max(int(np.searchsorted(self._moments, second, "right")) - 1, 0), len(self.keys) - 2)
-        gap = float(self._moments[i + 1] - self._moments[i])
-        u = (second - float(self._moments[i])) / gap
-        position = _hermite(self._positions, self._velocities, i, gap, u)
-        fov = float(_hermite(self._fovs, self._zooms, i, gap, u)[0])
-        time = (1 - u) * self.keys[i].time + u * self.keys[i + 1].time
-        return Pose(position, self._rotation(i, gap, u), fov), time
-
-    def _rotation(self, i: int, gap: float, u: float) -> Array:
-        """De Casteljau's algorithm on rotations: a cubic curve with the angular velocities at its two ends."""
         from scipy.spatial.transform import Rotation
 
-        first, last = self._turns[i], self._turns[i + 1]
-        points = [
-            first,
-            Rotation.from_rotvec(self._spins[i] * gap / 3) * first,
-            Rotation.from_rotvec(-self._spins[i + 1] * gap / 3) * last,
-            last,
-        ]
-        while len(points) > 1:
-            points = [Rotation.from_rotvec(u * (b * a.inv()).as_rotvec()) * a for a, b in itertools.pairwise(points)]
-        matrix: Array = points[0].as_matrix()
-        return matrix
+        if self._curve is None:
+            return self.keys[0].pose, self.keys[0].time
+        second = min(max(second, 0.0), self.seconds)
+        position, quat = np.split(self._curve(second), [3])
+        pose = Pose(position, Rotation.from_quat(quat).as_matrix(), float(self._fov(second)))
+        time = np.interp(second, [key.second for key in self.keys], [key.time for key in self.keys])
+        return pose, float(time)
 
 
-def _speeds(chords: Array, gaps: Array) -> Array:
-    """(K, D) velocities at K key-frames from the mean velocities (K - 1, D) between them and their seconds (K - 1, 1):
-    in between the one of the parabola through three key-frames, cut to `_LIMIT` of the slower side."""
-    if len(chords) == 0:
-        return np.zeros((1, chords.shape[1]))
-    before, after = chords[:-1], chords[1:]
-    inner = (gaps[1:] * before + gaps[:-1] * after) / (gaps[1:] + gaps[:-1])
-    length = np.linalg.norm(inner, axis=1)
-    most = _LIMIT * np.minimum(np.linalg.norm(before, axis=1), np.linalg.norm(after, axis=1))
-    inner = inner * np.minimum(1.0, most / np.maximum(length, 1e-300))[:, None]
-    return np.concatenate([chords[:1], inner, chords[-1:]])
-
-
-def _hermite(values: Array, speeds: Array, i: int, gap: float, u: float) -> Array:
-    """The cubic from values[i] to values[i + 1] with these speeds at its ends, at u in [0, 1]."""
-    a, b = values[i], values[i + 1]
-    rest = 1 - u
-    middle = 3 * u * rest * (rest * (a + speeds[i] * gap / 3) + u * (b - speeds[i + 1] * gap / 3))
-    curve: Array = rest**3 * a + middle + u**3 * b
-    return curve
+def _velocities(values: Array, seconds: Array) -> Array:
+    """(K, D) velocities of values (K, D) at K >= 2 seconds: in between those of the parabola through three key-frames,
+    cut to _LIMIT of the slower side, so that the path rests between equal key-frames and never swings far beyond one.
+    """
+    velocities: Array = np.gradient(values, seconds, axis=0)
+    means = np.linalg.norm(np.diff(values, axis=0), axis=1) / np.diff(seconds)
+    inner = velocities[1:-1]
+    lengths = np.maximum(np.linalg.norm(inner, axis=1), 1e-300)
+    inner *= np.minimum(1.0, _LIMIT * np.minimum(means[:-1], means[1:]) / lengths)[:, None]
+    return velocities

@@ -8,15 +8,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lapgs_wgpu.data.json_fields import number, read_json, vector
 from lapgs_wgpu.data.poses import OPENGL_TO_OPENCV
 from lapgs_wgpu.errors import InputError, shown
 from lapgs_wgpu.io.atomic import atomic_write
-from lapgs_wgpu.io.safe_json_toml import read_json
 from lapgs_wgpu.viewer.path import CameraPath, KeyFrame, Pose
 
-_MOST_KEYS = 100_000
 _MOST_SECONDS = 24 * 3600.0
 
 
@@ -31,11 +29,9 @@ class PathFile(NamedTuple):
 def write_path(file: Path, held: PathFile) -> None:
     """Write a camera path. Atomic. Raises InputError where it cannot be written."""
     width, height = held.size
-    aspect = width / height
     keys = held.path.keys
     waits = [0.0, *np.diff([key.second for key in keys]).tolist()]
-    frames = max(1, int(held.fps * held.path.seconds))
-    moments = [held.path.at(number / held.fps) for number in range(frames)]
+    frames = [held.path.at(i / held.fps) for i in range(max(1, int(held.fps * held.path.seconds)))]
     values = {
         "camera_type": "perspective",
         "render_height": height,
@@ -50,9 +46,7 @@ def write_path(file: Path, held: PathFile) -> None:
         "keyframes": [
             {
                 "matrix": _matrix(key.pose),
-                "fov": math.degrees(key.pose.fov_y),
-                "aspect": aspect,
-                "render_time": key.time,
+                **_lens(key.pose, key.time, width / height),
                 "override_time_enabled": True,
                 "override_transition_enabled": True,
                 "override_transition_sec": wait,
@@ -60,142 +54,15 @@ def write_path(file: Path, held: PathFile) -> None:
             for key, wait in zip(keys, waits, strict=True)
         ],
         "camera_path": [
-            {
-                "camera_to_world": _matrix(pose),
-                "fov": math.degrees(pose.fov_y),
-                "aspect": aspect,
-                "render_time": time,
-            }
-            for pose, time in moments
+            {"camera_to_world": _matrix(pose), **_lens(pose, time, width / height)} for pose, time in frames
         ],
     }
     with atomic_write(file) as target:
         target.write((json.dumps(values, indent=1) + "\n").encode())
 
 
-def read_path(file: Path) -> PathFile:
-    """Read a camera path: its key-frames, or, in files without usable ones, its frames as key-frames.
-
-    Files without times play the clip once along the path. Raises InputError, which names the file and the field.
-    """
-    values = read_json(file)
-    if not isinstance(values, dict):
-        raise InputError(f"{file}: holds {type(values).__name__}, not the object of a camera path.")
-    return _Reader(file, values).read()
-
-
-class _Reader:
-    def __init__(self, file: Path, values: dict[str, Any]) -> None:
-        self.file, self.values = file, values
-
-    def read(self) -> PathFile:
-        values = self.values
-        kind = values.get("camera_type", "perspective")
-        if kind != "perspective":
-            raise self.wrong("camera_type", f"is {shown(kind)}; only perspective cameras can be drawn")
-        size = tuple(int(self.number(values, f"render_{side}", 1, 16384)) for side in ("width", "height"))
-        fps = self.number(values, "fps", 0.1, 1000.0, 30.0)
-        keys = values.get("keyframes", [])
-        if not isinstance(keys, list):
-            raise self.wrong("keyframes", "is not a list")
-        # Until 2023 key-frames were saved as a text of the viewer's own; the frames are then what there is.
-        if keys and all(isinstance(key, dict) and isinstance(key.get("matrix"), list) for key in keys):
-            found = self.key_frames(keys)
-        else:
-            found = self.frames(fps)
-        timed = all(time is not None for _, time, _ in found)
-        length = max(found[-1][0], 1e-9)
-        return PathFile(
-            CameraPath(
-                KeyFrame(second, time if timed and time is not None else min(second / length, 1.0), pose)
-                for second, time, pose in found
-            ),
-            (size[0], size[1]),
-            fps,
-        )
-
-    def key_frames(self, keys: list[Any]) -> list[tuple[float, float | None, Pose]]:
-        values = self.values
-        usual = self.number(values, "default_transition_sec", 1e-3, _MOST_SECONDS, 0.0)
-        told = "default_transition_sec" in values or any("override_transition_sec" in key for key in keys)
-        if not told:  # spread over the length that the file names
-            steps = max(1, len(keys) - 1 + (values.get("is_cycle") is True))
-            usual = self.number(values, "seconds", 1e-3, _MOST_SECONDS) / steps
-        found: list[tuple[float, float | None, Pose]] = []
-        second = 0.0
-        waits = []
-        for i, key in enumerate(self.counted(keys, "keyframes")):
-            name = f"keyframes[{i}]"
-            wait = usual
-            if key.get("override_transition_enabled") and key.get("override_transition_sec") is not None:
-                # The first one's is only used where the path is closed.
-                wait = self.number(key, "override_transition_sec", 1e-3 if i else 0.0, _MOST_SECONDS, where=name)
-            if i and wait <= 0:
-                raise self.wrong("default_transition_sec", "is missing, and key-frames need it")
-            waits.append(wait)
-            second += wait if i else 0.0
-            found.append((second, self.time(key, name), self.pose(key, "matrix", name)))
-        if values.get("is_cycle") is True and len(found) > 1 and waits[0] > 0:
-            found.append((second + waits[0], found[0][1], found[0][2]))
-        return found
-
-    def frames(self, fps: float) -> list[tuple[float, float | None, Pose]]:
-        frames = self.values.get("camera_path")
-        if not isinstance(frames, list) or not frames:
-            raise self.wrong("camera_path", "is missing or empty, and there are no keyframes")
-        found = []
-        for i, frame in enumerate(self.counted(frames, "camera_path")):
-            name = f"camera_path[{i}]"
-            found.append((i / fps, self.time(frame, name), self.pose(frame, "camera_to_world", name)))
-        return found
-
-    def counted(self, entries: list[Any], name: str) -> list[dict[str, Any]]:
-        if len(entries) > _MOST_KEYS:
-            raise self.wrong(name, f"has {len(entries)} entries, over {_MOST_KEYS}")
-        for i, entry in enumerate(entries):
-            if not isinstance(entry, dict):
-                raise self.wrong(f"{name}[{i}]", "is not an object")
-        return entries
-
-    def time(self, entry: dict[str, Any], name: str) -> float | None:
-        for key in ("render_time", "time"):
-            if entry.get(key) is not None:
-                return self.number(entry, key, 0.0, 1.0, where=name)
-        return None
-
-    def pose(self, entry: dict[str, Any], key: str, name: str) -> Pose:
-        field = f"{name}.{key}"
-        try:
-            matrix: NDArray[np.float64] = np.array(entry.get(key), np.float64).reshape(4, 4)
-        except (ValueError, TypeError, OverflowError) as error:
-            raise self.wrong(field, "is not a matrix of 4x4 numbers") from error
-        turn, scale = matrix[:3, :3], np.linalg.norm(matrix[:3, 0])
-        if not np.isfinite(matrix).all() or not 1e-6 < scale < 1e6 or np.abs(matrix).max() > 1e12:
-            raise self.wrong(field, "holds numbers that no camera has")
-        turn = turn / scale
-        if not np.allclose(turn @ turn.T, np.eye(3), atol=1e-3) or np.linalg.det(turn) < 0:
-            raise self.wrong(field, "is not a rotation and a position")
-        left, _, right = np.linalg.svd(turn)  # rounded in the file; exactly a rotation again
-        fov = math.radians(self.number(entry, "fov", 0.1, 179.0, where=name))
-        return Pose(matrix[:3, 3].copy(), OPENGL_TO_OPENCV @ (left @ right).T, fov)
-
-    def number(
-        self, entry: dict[str, Any], key: str, low: float, high: float, default: float | None = None, where: str = ""
-    ) -> float:
-        field = f"{where}.{key}" if where else key
-        value = entry.get(key)
-        if value is None and default is not None:
-            return default
-        if value is None:
-            raise self.wrong(field, "is missing")
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise self.wrong(field, f"is {shown(value)}, not a number")
-        if not low <= value <= high:
-            raise self.wrong(field, f"is {shown(value)}, outside {low:g} to {high:g}")
-        return float(value)
-
-    def wrong(self, field: str, what: str) -> InputError:
-        return InputError(f"{self.file}: {field} {what}.")
+def _lens(pose: Pose, time: float, aspect: float) -> dict[str, float]:
+    return {"fov": math.degrees(pose.fov_y), "aspect": aspect, "render_time": time}
 
 
 def _matrix(pose: Pose) -> list[float]:
@@ -204,3 +71,82 @@ def _matrix(pose: Pose) -> list[float]:
     matrix[:3, :3], matrix[:3, 3] = (OPENGL_TO_OPENCV @ pose.rotation).T, pose.position
     values: list[float] = matrix.ravel().tolist()
     return values
+
+
+def read_path(file: Path) -> PathFile:
+    """Read a camera path: its key-frames, or, in files without usable ones, its frames as key-frames.
+
+    Files without times play the clip once along the path. Raises InputError, which names the file and the field.
+    """
+    values = read_json(file, "a camera path")
+    kind = values.get("camera_type", "perspective")
+    if kind != "perspective":
+        raise InputError(f"{file}: camera_type is {shown(kind)}; only perspective cameras can be drawn.")
+    width, height = (int(_within(values, f"render_{side}", 1, 16384, str(file))) for side in ("width", "height"))
+    fps = _within(values, "fps", 0.1, 1000.0, str(file), default=30.0)
+    keys = values.get("keyframes")
+    # nerfstudio's first viewer saved its key-frames as texts; the frames are then what there is.
+    if isinstance(keys, list) and keys and all(isinstance(key, dict) and key.get("properties") is None for key in keys):
+        found = _key_frames(values, keys, file)
+    else:
+        frames = values.get("camera_path")
+        if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
+            raise InputError(f"{file}: holds neither keyframes nor a list of objects as its camera_path.")
+        found = [
+            _key_frame(i / fps, frame, "camera_to_world", f"{file}: camera_path[{i}]") for i, frame in enumerate(frames)
+        ]
+    if not all(math.isfinite(key.time) for key in found):
+        length = max(found[-1].second, 1e-9)
+        found = [key._replace(time=min(key.second / length, 1.0)) for key in found]
+    return PathFile(CameraPath(found), (width, height), fps)
+
+
+def _key_frames(values: dict[str, Any], keys: list[dict[str, Any]], file: Path) -> list[KeyFrame]:
+    closed = values.get("is_cycle") is True and len(keys) > 1
+    usual = 0.0
+    if values.get("default_transition_sec") is not None:
+        usual = _within(values, "default_transition_sec", 1e-3, _MOST_SECONDS, str(file))
+    elif len(keys) > 1:  # older files say how long the whole path takes
+        usual = _within(values, "seconds", 1e-3, _MOST_SECONDS, str(file)) / (len(keys) - 1 + closed)
+    found: list[KeyFrame] = []
+    second = 0.0
+    waits = []  # seconds before each key-frame; the first one's counts where the path is closed
+    for i, key in enumerate(keys):
+        where = f"{file}: keyframes[{i}]"
+        wait = usual
+        if key.get("override_transition_enabled") and key.get("override_transition_sec") is not None:
+            wait = _within(key, "override_transition_sec", 1e-3 if i else 0.0, _MOST_SECONDS, where)
+        waits.append(wait)
+        second += wait if i else 0.0
+        found.append(_key_frame(second, key, "matrix", where))
+    if closed and waits[0] > 0:
+        found.append(found[0]._replace(second=second + waits[0]))
+    return found
+
+
+def _key_frame(second: float, entry: dict[str, Any], matrix: str, where: str) -> KeyFrame:
+    """time: NaN where the entry has none."""
+    from scipy.spatial.transform import Rotation
+
+    key = "render_time" if entry.get("render_time") is not None else "time"
+    time = _within(entry, key, 0.0, 1.0, where, default=math.nan)
+    world = vector(entry.get(matrix), 16, matrix, where).reshape(4, 4)
+    turn = world[:3, :3] / max(float(np.linalg.norm(world[:3, 0])), 1e-12)
+    if np.abs(world).max() > 1e12 or not np.allclose(turn @ turn.T, np.eye(3), atol=1e-3) or np.linalg.det(turn) < 0:
+        raise InputError(f"{where}: {matrix} is not a rotation and a position.")
+    rotation = OPENGL_TO_OPENCV @ Rotation.from_matrix(turn).as_matrix().T  # exactly a rotation; files are rounded
+    fov = math.radians(_within(entry, "fov", 0.1, 179.0, where))
+    return KeyFrame(second, time, Pose(world[:3, 3].copy(), rotation, fov))
+
+
+def _within(
+    entry: dict[str, Any], name: str, low: float, high: float, where: str, default: float | None = None
+) -> float:
+    """A number of a table. Raises InputError where it is missing without a default, or outside its range."""
+    value = entry.get(name)
+    if value is None and default is not None:
+        return default
+    got = number(value, name, where)
+    if not low <= got <= high:
+        raise InputError(f"{where}: {name} must be from {low:g} to {high:g}, got {got:g}.")
+    return got

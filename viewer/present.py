@@ -26,7 +26,7 @@ VALUES = ("color", "alpha", "depth", "value")  # what a pixel shows; the order i
 OFFSCREEN_FORMAT = "rgba8unorm"
 
 
-class Placed(NamedTuple):
+class ImageLayout(NamedTuple):
     """A picture and where it stands on the target.
 
     planes: as the rasterizer draws them, (4 or 5, height, width). origin, size: in pixels of the target.
@@ -74,37 +74,37 @@ class Presenter:
             primitive={"topology": "triangle-list"},
         )
 
-    def __call__(self, target: Any, pictures: list[Placed], margin: tuple[float, float, float]) -> None:
+    def __call__(self, target: Any, pictures: list[ImageLayout], margin: tuple[float, float, float]) -> None:
         """Submit: `target`, a texture view, filled with the margin's color and then with the pictures."""
-        uniforms = [self._uniform(i, placed) for i, placed in enumerate(pictures)]
+        uniforms = [self._uniform(i, layout) for i, layout in enumerate(pictures)]
         native = self.device.wgpu_device
         encoder = native.create_command_encoder()
         attachment = {"view": target, "load_op": "clear", "store_op": "store", "clear_value": (*margin, 1)}
         render = encoder.begin_render_pass(color_attachments=[attachment])
         render.set_pipeline(self._pipeline)
-        for uniform, placed in zip(uniforms, pictures, strict=True):
-            bound = (uniform, placed.planes, placed.truth or self._no_truth)
+        for uniform, layout in zip(uniforms, pictures, strict=True):
+            bound = (uniform, layout.planes, layout.truth or self._no_truth)
             entries = [{"binding": i, "resource": array.resource} for i, array in enumerate(bound)]
             render.set_bind_group(0, native.create_bind_group(layout=self._layout, entries=entries))
-            render.set_viewport(*placed.origin, *placed.size, 0, 1)
-            render.set_scissor_rect(*placed.origin, *placed.size)
+            render.set_viewport(*layout.origin, *layout.size, 0, 1)
+            render.set_scissor_rect(*layout.origin, *layout.size)
             render.draw(3)
         render.end()
         self.device.queue.submit([encoder.finish()])
 
-    def _uniform(self, number: int, placed: Placed) -> DeviceArray:
+    def _uniform(self, number: int, layout: ImageLayout) -> DeviceArray:
         values: dict[str, object] = {f"heat{i}": (*color, 1.0) for i, color in enumerate(HEAT)}
         values |= {
-            "background": (*placed.background, 1.0),
-            "origin": placed.origin,
-            "size": placed.size,
-            "picture": placed.picture,
-            "truth": placed.truth_size,
-            "value": VALUES.index(placed.shows),
-            "low": placed.low,
-            "high": placed.high,
-            "truth_until": placed.truth_until,
-            "error_gain": placed.error_gain,
+            "background": (*layout.background, 1.0),
+            "origin": layout.origin,
+            "size": layout.size,
+            "picture": layout.picture,
+            "truth": layout.truth_size,
+            "value": VALUES.index(layout.shows),
+            "low": layout.low,
+            "high": layout.high,
+            "truth_until": layout.truth_until,
+            "error_gain": layout.error_gain,
         }
         return self._pool.constant(f"picture {number}", pack(self._source, "Present", values))
 
@@ -118,7 +118,7 @@ class Offscreen:
         self._device = device
 
     def __call__(
-        self, size: tuple[int, int], pictures: list[Placed], margin: tuple[float, float, float]
+        self, size: tuple[int, int], pictures: list[ImageLayout], margin: tuple[float, float, float]
     ) -> NDArray[np.uint8]:
         """(height, width, 3) uint8 of the pictures on a target of (width, height)."""
         native = self._device.wgpu_device

@@ -1,4 +1,8 @@
-"""The viewer in a browser: a web server on this machine that draws, and sends pictures."""
+"""The viewer in a browser: a web server on this machine that draws, and sends pictures.
+
+Any user of this machine, and any page in a browser on it, can reach the server. So all of its addresses begin with a
+token that is made anew each time: who does not know it gets no page and no websocket.
+"""
 
 from __future__ import annotations
 
@@ -6,58 +10,84 @@ import asyncio
 import errno
 import html
 import importlib.util
+import secrets
 import socket
 import sys
+from collections.abc import Awaitable, Callable, MutableMapping
 from functools import partial
-from importlib import resources
 from typing import Any, NamedTuple
 
 from lapgs_wgpu.errors import InputError, pip_install
-from lapgs_wgpu.viewer.auth import LOCAL, Application, AuthMiddleware, Receive, Scope, Send, answer, check_entry
 from lapgs_wgpu.viewer.gui_library import check_imgui
-from lapgs_wgpu.viewer.initial_state import InitialState
+from lapgs_wgpu.viewer.loaded_scene import LoadedScene
+from lapgs_wgpu.viewer.view_state import ViewState
+
+Message = MutableMapping[str, Any]
+Receive = Callable[[], Awaitable[Message]]
+Send = Callable[[Message], Awaitable[None]]
+Application = Callable[[Message, Receive, Send], Awaitable[None]]
 
 DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 8080
+_LOCAL = ("localhost", "127.0.0.1", "::1")
 _EVERYWHERE = ("0.0.0.0", "::")
-_TYPES = {"index.html": "text/html", "page.css": "text/css", "page.js": "text/javascript"}
+# Of rendercanvas's page, whose scripts it uses; the canvas fills the window.
+_PAGE = """<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="referrer" content="no-referrer">
+<title>TITLE</title>
+<link rel="icon" href="data:,">
+<link rel="stylesheet" href="renderview.css">
+<style>
+html, body { margin: 0; height: 100%; overflow: hidden; background: #1c1c1f; color: #eee; font: 13px system-ui; }
+div.renderview-wrapper { position: absolute; border: none; }
+#status { position: absolute; top: 0; left: 50%; transform: translateX(-50%); opacity: 0.7; }
+</style>
+<script>
+// Browsers keep pages that one has left, and their connections: another browser is to take over.
+addEventListener("pagehide", () => window.websocket?.close())
+</script>
+<script type="module" src="renderview.js"></script>
+<script type="module" src="renderview-client.js"></script>
+</head>
+<body><div id="canvas" style="width: 100%; height: 100%"></div><div id="status"></div></body>
+</html>
+"""
 
 
 class Entry(NamedTuple):
-    """Where the server listens. host: as given. token: what every request needs, or None."""
+    """Where the server listens. host: as given. token: with which all addresses begin."""
 
     listening: socket.socket
     host: str
-    token: str | None
+    token: str
 
     @property
     def port(self) -> int:
         return int(self.listening.getsockname()[1])
 
-    @property
-    def url(self) -> str:
-        """To open in a browser."""
-        name = "localhost" if self.host in LOCAL else socket.gethostname() if self.host in _EVERYWHERE else self.host
-        query = f"?token={self.token}" if self.token else ""
-        return f"http://{_bracketed(name)}:{self.port}/{query}"
+    def url(self, name: str) -> str:
+        """To open in a browser that reaches this machine under a name."""
+        return f"http://{_bracketed(name)}:{self.port}/{self.token}/"
 
-    def welcome(self, name: str) -> str:
+    def welcome(self, file: str) -> str:
         """What the user should know: where to look, and how from another machine."""
-        end = "localhost" if self.host in (*LOCAL, *_EVERYWHERE) else _bracketed(self.host)
-        here = self.url.replace(self.url.split("/")[2], f"localhost:{self.port}")
+        name = "localhost" if self.host in _LOCAL else socket.gethostname() if self.host in _EVERYWHERE else self.host
+        end = "localhost" if self.host in (*_LOCAL, *_EVERYWHERE) else _bracketed(self.host)
         lines = [
-            f"lapgs-view: {name} is shown at {self.url} until Ctrl-C.",
-            f"From another machine: ssh -L {self.port}:{end}:{self.port} USER@THIS_MACHINE, then open {here} there.",
+            f"lapgs-view: {file} is shown at {self.url(name)} until Ctrl-C.",
+            f"From another machine: ssh -L {self.port}:{end}:{self.port} USER@THIS_MACHINE, then open "
+            f"{self.url('localhost')} there.",
         ]
-        if self.host not in LOCAL:
+        if self.host not in _LOCAL:
             lines.append("Pictures and token go over the network as they are; through the tunnel they are encrypted.")
-        elif not self.token:
-            lines.append("Every user of this machine can open it; with --token only who knows the address.")
         return "\n".join(lines)
 
 
-def open_entry(host: str, port: int, token: str | None) -> Entry:
-    """Listen. Raises InputError where that is not allowed or not possible, or a package is missing."""
-    check_entry(host, token)
+def open_entry(host: str, port: int) -> Entry:
+    """Listen. Raises InputError where that is not possible, or a package is missing."""
     missing = [name for name in ("uvicorn", "websockets", "imgui_bundle") if importlib.util.find_spec(name) is None]
     if missing:
         raise InputError(f"--backend http needs {', '.join(missing)}: {pip_install('remote')}.")
@@ -65,21 +95,17 @@ def open_entry(host: str, port: int, token: str | None) -> Entry:
     address = "127.0.0.1" if host == "localhost" else host
     family = socket.AF_INET6 if ":" in address else socket.AF_INET
     try:
-        return Entry(socket.create_server((address, port), family=family), host, token)
-    except socket.gaierror:
-        raise InputError(f"--host {host} is no address of this machine.") from None
+        return Entry(socket.create_server((address, port), family=family), host, secrets.token_urlsafe(24))
     except OSError as error:
         if error.errno == errno.EADDRINUSE:
             raise InputError(f"port {port} is in use; name another with --port, 0 for any that is free.") from None
-        if error.errno == errno.EADDRNOTAVAIL:
-            raise InputError(f"--host {host} is no address of this machine.") from None
         raise InputError(f"--host {host} --port {port} cannot be listened on: {error.strerror}.") from None
 
 
-def run_remote(scene: Any, entry: Entry, *, transport: bool | None, start: InitialState) -> None:
-    """Show it to browsers until Ctrl-C, which raises KeyboardInterrupt. transport, start: as for run_window."""
+def run_remote(scene: LoadedScene, entry: Entry, start: Callable[[ViewState], None]) -> None:
+    """Show it to browsers until Ctrl-C, which raises KeyboardInterrupt. start: as for run_window."""
     import uvicorn
-    from rendercanvas.http import asgi, loop
+    from rendercanvas.http import asgi, loop, resources
 
     from lapgs_wgpu.viewer.app import App
     from lapgs_wgpu.viewer.remote_canvas import RemoteCanvas
@@ -87,14 +113,11 @@ def run_remote(scene: Any, entry: Entry, *, transport: bool | None, start: Initi
     # rendercanvas takes Ctrl-C from uvicorn when its loop starts, closes the canvas and leaves the server running.
     loop._BaseLoop__setup_interrupt_hooks = dict
     name = scene.path.name if scene.path else "lapgs-view"
-    canvas = RemoteCanvas(scene.playback.device, title=name, update_mode="ondemand", max_fps=60)
-    viewer = App(canvas, loop, scene, transport=transport)
-    start.apply(viewer.state)
-    everywhere = entry.host in _EVERYWHERE
-    names = [entry.host, entry.listening.getsockname()[0], *([socket.gethostname()] if everywhere else [])]
-    guard = AuthMiddleware(pages(name, asgi), names=names, any_address=everywhere, token=entry.token)
+    resources["index.html"] = "text/html", _PAGE.replace("TITLE", html.escape(name))
+    app = App(RemoteCanvas(title=name, update_mode="ondemand", max_fps=60), loop, scene)
+    start(app.state)
     config = uvicorn.Config(
-        guard,
+        guarded(asgi, entry.token),
         log_level="warning",
         access_log=False,  # it would show the token
         server_header=False,
@@ -108,31 +131,25 @@ def run_remote(scene: Any, entry: Entry, *, transport: bool | None, start: Initi
     )
     print(entry.welcome(str(scene.path or name)), file=sys.stderr, flush=True)
     server = uvicorn.Server(config)
-    viewer.end = partial(setattr, server, "should_exit", True)
+    app.end = partial(setattr, server, "should_exit", True)
     asyncio.run(server.serve(sockets=[entry.listening]))
-    if viewer.failed is not None:
-        raise viewer.failed
+    if app.failed is not None:
+        raise app.failed
     raise KeyboardInterrupt  # nothing else ends the server, but on a busy machine it may come to end without a word
 
 
-def pages(title: str, sockets: Application) -> Application:
-    """ASGI: the page and its parts, with everything that is no http left to `sockets`."""
-    folder = resources.files(__package__) / "page"
-    files = {name: (kind, (folder / name).read_bytes()) for name, kind in _TYPES.items()}
-    page = files.pop("index.html")
-    files[""] = (page[0], page[1].replace(b"TITLE", html.escape(title).encode()))
-    view = resources.files("rendercanvas.core") / "renderview.js"
-    files["renderview.js"] = ("text/javascript", view.read_bytes())
+def guarded(app: Application, token: str) -> Application:
+    """ASGI: an app behind its token. Addresses that do not begin with it are not found, websockets are closed."""
 
-    async def serve(scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http":
-            await sockets(scope, receive, send)
-        elif scope["method"] not in ("GET", "HEAD"):
-            await answer(scope, send, 405, "text/plain", b"Only GET.\n")
+    async def serve(scope: Message, receive: Receive, send: Send) -> None:
+        given = scope.get("path", "").removeprefix("/").partition("/")[0]
+        if scope["type"] == "lifespan" or secrets.compare_digest(given.encode(), token.encode()):
+            await app(scope, receive, send)
+        elif scope["type"] == "websocket":
+            await send({"type": "websocket.close", "code": 1008})  # http's 403
         else:
-            kind, body = files.get(scope["path"].removeprefix("/"), (None, b""))
-            status = 200 if kind else 404
-            await answer(scope, send, status, f"{kind or 'text/plain'}; charset=utf-8", body or b"Not here.\n")
+            await send({"type": "http.response.start", "status": 404, "headers": [(b"content-type", b"text/plain")]})
+            await send({"type": "http.response.body", "body": b"Open the address that lapgs-view printed.\n"})
 
     return serve
 

@@ -6,6 +6,7 @@ from imgui_bundle import imgui
 
 from lapgs_wgpu.viewer.clock import LOOPS, SPEEDS
 from lapgs_wgpu.viewer.view_state import ViewState
+from lapgs_wgpu.viewer.widgets import button, choice
 
 
 def draw_time_slider(state: ViewState) -> None:
@@ -23,15 +24,14 @@ def draw_time_slider(state: ViewState) -> None:
     if moved:
         clock.playing = False
         clock.seek(time)
-    for text, action in (("|<", state.first_frame), ("<", state.previous_frame)):
-        if imgui.button(text, (32, 0)):
-            action()
-        imgui.same_line()
-    if imgui.button("Pause" if clock.playing else "Play", (64, 0)):
-        state.toggle_playing()
-    imgui.same_line()
-    for text, action in ((">", state.next_frame), (">|", state.last_frame)):
-        if imgui.button(text, (32, 0)):
+    for text, width, action in (
+        ("|<", 32, state.first_frame),
+        ("<", 32, state.previous_frame),
+        ("Pause" if clock.playing else "Play", 64, state.toggle_playing),
+        (">", 32, state.next_frame),
+        (">|", 32, state.last_frame),
+    ):
+        if button(text, width):
             action()
         imgui.same_line()
     imgui.set_next_item_width(70)
@@ -39,16 +39,10 @@ def draw_time_slider(state: ViewState) -> None:
     if changed:
         clock.fps = min(max(fps, 0.1), 1000.0)
     imgui.same_line()
-    imgui.set_next_item_width(70)
     speeds = sorted({*SPEEDS, clock.speed})
-    changed, chosen = imgui.combo("speed", speeds.index(clock.speed), [f"{speed:g}x" for speed in speeds])
-    if changed:
-        clock.speed = speeds[chosen]
+    clock.speed = choice("speed", clock.speed, speeds, [f"{speed:g}x" for speed in speeds], width=70)
     imgui.same_line()
-    imgui.set_next_item_width(84)
-    changed, chosen = imgui.combo("##loop", LOOPS.index(clock.loop), list(LOOPS))
-    if changed:
-        clock.loop = LOOPS[chosen]
+    clock.loop = choice("##loop", clock.loop, LOOPS, width=84)
     imgui.end_disabled()
 
 

@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Iterator
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,55 +88,21 @@ def write_video(
     except ImportError as error:
         raise InputError(f"writing mp4 needs PyAV: {pip_install('video')}") from error
     rate = Fraction(fps).limit_denominator(65535)
-    with atomic_write(file) as target:
-        sink = _Sink(target)
-        with Progress(frames, "frames") as progress, av.open(sink, "w", format="mp4") as container:
-            stream = container.add_stream("libx264", rate, options={"crf": _QUALITY, "preset": "medium"})
-            stream.pix_fmt = "yuv420p"
-            # Without these, players guess the color space from the image size: BT.601's matrix and limited range, as
-            # swscale converts, and sRGB's primaries.
-            context = stream.codec_context
-            context.colorspace, context.color_primaries, context.color_trc, context.color_range = 6, 1, 13, 1
-            for camera, time in cameras:
-                image = render(camera, time)
-                if not context.is_open:  # the first encoded frame opens it
-                    stream.height, stream.width = image.shape[:2]
-                container.mux(stream.encode(av.VideoFrame.from_ndarray(image, "rgb24")))
-                sink.check()
-                progress.step()
-            container.mux(stream.encode(None))
-        sink.check()
-
-
-class _Sink:
-    """A file for PyAV that keeps errors of the disk to itself until `check`.
-
-    PyAV would otherwise continue to encode in a destructor, and print errors.
-    """
-
-    def __init__(self, file: BinaryIO) -> None:
-        self._file = file
-        self._error: OSError | None = None
-
-    def check(self) -> None:
-        """Raise the first error of writing, if any."""
-        if self._error is not None:
-            raise self._error
-
-    def write(self, data: bytes) -> int:
-        try:
-            if self._error is None:
-                self._file.write(data)
-        except OSError as error:
-            self._error = error
-        return len(data)
-
-    def seek(self, *place: int) -> int:
-        try:
-            return self._file.seek(*place)  # flushes, so it may fail, too
-        except OSError as error:
-            self._error = self._error or error
-            return 0
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._file, name)
+    with (
+        atomic_write(file) as target,
+        Progress(frames, "frames") as progress,
+        av.open(f"file:{target.name}", "w", format="mp4") as container,
+    ):
+        stream = container.add_stream("libx264", rate, options={"crf": _QUALITY, "preset": "medium"})
+        stream.pix_fmt = "yuv420p"
+        # Without these, players guess the color space from the image size: BT.601's matrix and limited range, as
+        # swscale converts, and sRGB's primaries.
+        context = stream.codec_context
+        context.colorspace, context.color_primaries, context.color_trc, context.color_range = 6, 1, 13, 1
+        for camera, time in cameras:
+            image = render(camera, time)
+            if not context.is_open:  # the first encoded frame opens it
+                stream.height, stream.width = image.shape[:2]
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, "rgb24")))
+            progress.step()
+        container.mux(stream.encode(None))

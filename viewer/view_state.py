@@ -17,33 +17,28 @@ from lapgs_wgpu.viewer.training_control import TrainingControl
 class ViewState:
     """Panels read and set the attributes; keys call the methods (viewer/key_bindings). Knows no window and no GUI.
 
-    transport: whether the time slider is shown; None: where the scene moves. split: divider of the comparison, share
-    of the width. view: number of the capture's camera that was chosen last, or None. message: one sentence for the
-    user, or None. training: the training under way; None where a file is shown.
+    split: divider of the comparison, share of the width. view: number of the capture's camera that was chosen last, or
+    None. message: one sentence for the user, or None. training: the training under way; None where a file is shown.
     """
 
-    def __init__(self, scene: LoadedScene, *, transport: bool | None = None) -> None:
+    def __init__(self, scene: LoadedScene) -> None:
         self.mode: Mode = "rgb"
         self.compare: Compare = "off"
         self.split = 0.5
         self.show_panels = self.show_overlay = True
         self.show_help = False
-        self.takes_drops = False  # of files, as windows do
         self.show_path = False  # opens the panel's section at the next draw
         self.flying = False
-        self.profiling = False
         self.training: TrainingControl | None = None
-        self._transport = transport
-        self.show(scene)
+        self.show(scene, FrameRenderer(scene.playback))
 
-    def show(self, scene: LoadedScene) -> None:
-        """Show another scene, from its initial camera and time."""
-        self.scene = scene
-        self.renderer = FrameRenderer(scene.playback)
+    def show(self, scene: LoadedScene, renderer: FrameRenderer) -> None:
+        """Show another scene, from its initial camera and time. renderer: of the scene."""
+        self.scene, self.renderer = scene, renderer
         self.camera, self.clock = scene.camera(), scene.clock()
         self.path = PathEditor()
         self.background = scene.background
-        self.show_transport = scene.playback.moves if self._transport is None else self._transport
+        self.show_transport = scene.playback.moves
         self._ground_truth: GroundTruth | None = None
         self._ground_truth_sought = False
         self.view: int | None = None
@@ -141,7 +136,7 @@ class ViewState:
             self.training.step()
 
     def add_key_frame(self) -> None:
-        self.path.add(self.camera, self.clock.time)
+        self.path.add(self.camera.pose, self.clock.time)
         self.show_path = True
 
     def toggle_overlay(self) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.viewer.frame import Frame, FrameRequest
-from lapgs_wgpu.viewer.present import Placed, Presenter
+from lapgs_wgpu.viewer.present import ImageLayout, Presenter
 from lapgs_wgpu.viewer.view_state import ViewState
 
 SETTLED = 0.2  # seconds without a change after which the full resolution is drawn
@@ -38,7 +38,6 @@ class Viewport:
         self._presenter = Presenter(self.device, self.format)
         self.frame: Frame | None = None
         self.scale = self._moving_scale = 1.0
-        self._trained: Any = None  # the training's last step before the frame was drawn
         self._drawn: tuple[Any, ...] = ()  # all that the frame depends on, with the renderer at the end
         self.stale = False
         self.moved_at = time.perf_counter()
@@ -47,25 +46,24 @@ class Viewport:
     @property
     def fps(self) -> float:
         """Frames of the scene drawn in the last second."""
-        recent = [moment for moment in self._times if moment > time.perf_counter() - 1.0]
+        recent = [drawn for drawn in self._times if drawn > time.perf_counter() - 1.0]
         return len(recent) - 1.0 if len(recent) > 1 else 0.0
 
     @property
     def at_rest(self) -> bool:
-        """Whether the frame on show is final, at full resolution."""
+        """Whether the frame on show is final: of the full resolution."""
         return self.scale == 1 and self.frame is not None
 
     def refresh(self) -> None:
         """The scene itself has changed: draw it again."""
         self.stale = True
-        self.state.renderer.forget()
         self.canvas.request_draw()
 
     def draw(self, now: float) -> None:
-        """Draw the scene where something changed: at a lower resolution while it changes, in full
-        once nothing has changed for SETTLED seconds. now: seconds of `time.perf_counter`."""
+        """Draw the scene where something changed: at a lower resolution while it changes, in full once
+        nothing has changed for SETTLED seconds. now: seconds of `time.perf_counter`."""
         state, full = self.state, self._full_camera()
-        key = (*_camera_key(full), state.clock.time, state.mode, state.background, state.profiling, state.renderer)
+        key = (*_camera_key(full), state.clock.time, state.mode, state.background, state.renderer)
         changed = key != self._drawn
         if changed:
             moving = bool(self._drawn) and self._drawn[-1] is state.renderer  # not the first frame of a scene
@@ -74,15 +72,13 @@ class Viewport:
             return
         else:
             moving = False
-        if state.training is not None and state.training.last is not self._trained:
-            self._trained = state.training.last
+        if state.training is not None:
             state.renderer.forget()
         self.scale = self._moving_scale if moving else 1.0
         camera = full
         if self.scale < 1:
             camera = full.resized(max(1, round(self.scale * full.width)), max(1, round(self.scale * full.height)))
-        request = FrameRequest(camera, state.clock.time, state.mode, state.background)
-        self.frame = state.renderer.draw(request, profile=state.profiling)
+        self.frame = state.renderer.draw(FrameRequest(camera, state.clock.time, state.mode, state.background))
         self._drawn, self.stale = key, False
         self._times.append(time.perf_counter())
         if moving:
@@ -93,7 +89,7 @@ class Viewport:
     def present(self) -> None:
         """Copy the frame, with the ground truth where the two are compared, to the canvas's texture."""
         target = self._context.get_current_texture()
-        self._presenter(target.create_view(), self._placed(*target.size[:2]), MARGIN)
+        self._presenter(target.create_view(), self._layouts(*target.size[:2]), MARGIN)
 
     def _full_camera(self) -> Camera:
         """The camera at full resolution: the canvas's, or that of the image that is subtracted."""
@@ -103,23 +99,23 @@ class Viewport:
         width, height = self.canvas.get_physical_size()
         return camera.camera(max(1, width // 2 if comparing == "side" else width), max(1, height))
 
-    def _placed(self, width: int, height: int) -> list[Placed]:
+    def _layouts(self, width: int, height: int) -> list[ImageLayout]:
         """The layout on a canvas of this size, pixels."""
         assert self.frame is not None
-        placed = self.frame.placed._replace(**self._truth())
+        layout = self.frame.layout._replace(**self._truth())
         compare = self.state.comparing()
         columns = width // 2 if compare == "side" else width
         if compare == "side":
-            right = _fit(placed._replace(truth_until=0.0), columns, height, columns)
-            return [_fit(placed._replace(truth_until=1.0), columns, height, 0), right]
+            right = _fit(layout._replace(truth_until=0.0), columns, height, columns)
+            return [_fit(layout._replace(truth_until=1.0), columns, height, 0), right]
         if compare == "split":
-            placed = placed._replace(truth_until=self.state.split)
+            layout = layout._replace(truth_until=self.state.split)
         elif compare == "error":
-            placed = placed._replace(error_gain=_ERROR_GAIN)
-        return [_fit(placed, columns, height, 0)]
+            layout = layout._replace(error_gain=_ERROR_GAIN)
+        return [_fit(layout, columns, height, 0)]
 
     def _truth(self) -> dict[str, Any]:
-        """What `Placed` has to know of the image that is compared with, if any. One that cannot be read ends the
+        """What `ImageLayout` has to know of the image that is compared with, if any. One that cannot be read ends the
         comparison, with a message."""
         state = self.state
         if state.comparing() == "off" or state.ground_truth is None or state.view is None:
@@ -136,10 +132,10 @@ class Viewport:
         two images the right one counts."""
         if self.frame is None:
             return None
-        placed = self._placed(*self.canvas.get_physical_size())[-1]
+        layout = self._layouts(*self.canvas.get_physical_size())[-1]
         ratio = self.canvas.get_pixel_ratio()
         across, down = (
-            (at * ratio - start) / length for at, start, length in zip((x, y), placed.origin, placed.size, strict=True)
+            (at * ratio - start) / length for at, start, length in zip((x, y), layout.origin, layout.size, strict=True)
         )
         return (across, down) if 0 <= across < 1 and 0 <= down < 1 else None
 
@@ -162,13 +158,13 @@ def _camera_key(camera: Camera) -> tuple[bytes, bytes, int, int]:
     return camera.K.tobytes(), camera.T_cam_world.tobytes(), camera.width, camera.height
 
 
-def _fit(placed: Placed, width: int, height: int, left: int) -> Placed:
+def _fit(layout: ImageLayout, width: int, height: int, left: int) -> ImageLayout:
     """The image as large as fits between columns left and left + width, centred."""
-    columns, rows = placed.picture
+    columns, rows = layout.picture
     scale = min(width / columns, height / rows)
     # An image drawn for this canvas at a lower resolution fills it again, whatever rounding did to its size.
     across, down = (
         most if abs(scale * n - most) <= max(1.0, scale) else max(1, round(scale * n))
         for n, most in ((columns, width), (rows, height))
     )
-    return placed._replace(origin=(left + (width - across) // 2, (height - down) // 2), size=(across, down))
+    return layout._replace(origin=(left + (width - across) // 2, (height - down) // 2), size=(across, down))

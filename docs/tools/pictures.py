@@ -75,7 +75,7 @@ def window(scene: LoadedScene) -> Picture:
     from rendercanvas.offscreen import OffscreenRenderCanvas, loop
 
     canvas = OffscreenRenderCanvas(size=WINDOW, pixel_ratio=1)
-    app = App(canvas, loop, scene, transport=True)
+    app = App(canvas, loop, scene)
     app.state.clock.seek(0.3)
     for _ in range(6):  # until the panels have found their sizes, and the image its full resolution
         drawn = canvas.draw()

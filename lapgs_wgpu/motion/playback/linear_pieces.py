@@ -24,8 +24,7 @@ SAMPLES = 128  # of the clip at least; a field's spectrum has up to 16 cycles
 _PIECE_SAMPLES = 8  # of a piece at least
 _SHORTEST = 2.0**-9  # of the clip: shorter pieces are not halved
 _BLOCK = 1 << 21  # samples at once: 0.1 GB
-_CHECKS = 97  # moments at which finished pieces are compared; none but a few is one of those they were made of
-_REPAIRS = 4  # times that what is still too far is baked again, twice as finely
+_CHECKS = 97  # times at which finished pieces are compared; few of them are samples
 _MEAN, _ROOT, _REST = slice(0, 3), slice(3, 9), slice(9, 13)  # columns of a state: mean, root; opacity and color
 _ROWS, _COLUMNS = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]  # entries of a root
 _WEIGHTS = np.array([1, 1, 1, 2, 2, 2]) ** 0.5  # so that the norm of the six is that of the matrix
@@ -55,35 +54,22 @@ def linear_pieces(
 ) -> Pieces:
     """Bake a playback.
 
-    farthest: largest distance of a point of an ellipsoid of one standard deviation from where it should be, world
-    units. shade: largest change of opacity and color, both in [0, 1]. Gaussians that no pass draws during a piece are
-    left out of it. done: called with the share that is done, now and then.
+    Args:
+        farthest: largest distance, at the samples, of a point of an ellipsoid of one standard deviation from where the
+            playback has it, world units.
+        shade: largest change of opacity and color within a piece, both in [0, 1].
+        done: called with the share that is done, now and then.
+
+    Gaussians that no pass draws during a piece are left out of it.
     """
-    pieces = _bake(playback, np.arange(playback.count), farthest, shade, done)
-    for repair in range(1, _REPAIRS + 1):
-        wrong = np.unique(pieces.source[piece_errors(playback, pieces) > farthest])
-        if not len(wrong):
-            break
-        right = ~np.isin(pieces.source, wrong)
-        again = _bake(playback, wrong, 0.5**repair * farthest, shade, lambda share: None)
-        joined = [np.concatenate([old[right], new]) for old, new in zip(pieces, again, strict=True)]
-        order = np.lexsort((joined[1], joined[0]))
-        pieces = Pieces(*(each[order] for each in joined))
-    return pieces
-
-
-def _bake(
-    playback: Playback, rows: NDArray[np.integer], farthest: float, shade: float, done: Callable[[float], object]
-) -> Pieces:
-    """The pieces of some Gaussians, near enough at the samples."""
     found: list[tuple[Floats, ...]] = []
     size = _BLOCK // SAMPLES
-    for first in range(0, len(rows), size):
-        block = rows[first : first + size]
+    for first in range(0, playback.count, size):
+        block = np.arange(first, min(first + size, playback.count))
         values = np.stack([state(playback, t, block) for t in np.linspace(0, 1, SAMPLES + 1).tolist()])
         for piece in _halve(playback, values, block, 0.0, 1.0, farthest, shade):
             found.append(piece)
-            done((first + len(block) * float(piece[1].max(initial=0))) / len(rows))
+            done((first + len(block) * float(piece[1].max(initial=0))) / playback.count)
     source, begin, end, middle, slopes = (np.concatenate(each) for each in zip(*found, strict=True))
     order = np.lexsort((begin, source))
     middle = middle[order].astype(np.float64)
