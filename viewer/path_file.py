@@ -78,7 +78,7 @@ def read_path(file: Path) -> PathFile:
 
     Files without times play the clip once along the path. Raises InputError, which names the file and the field.
     """
-    values = read_json(file, "a camera path")
+    values = read_json(file).values
     kind = values.get("camera_type", "perspective")
     if kind != "perspective":
         raise InputError(f"{file}: camera_type is {shown(kind)}; only perspective cameras can be drawn.")
