@@ -1,13 +1,11 @@
-"""Scenes of which a half stands still."""
+"""Fields of every kind, and a camera that sees the scenes of trained_scenes."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
-from helpers.trained_scenes import CONFIGS, GRID4D, OURS, trained
+from helpers.trained_scenes import CONFIGS, OURS
 
-from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.splat.camera import Camera
 
@@ -19,8 +17,3 @@ KINDS = {
     "hidden layers": replace(OURS, depth=1),
     "ablated motion": replace(OURS, motion="mlp"),
 } | CONFIGS
-
-
-def saved_scene(device: Device, folder: Path) -> None:
-    """Save a moving scene of 300 Gaussians as scene.ply."""
-    trained(device, GRID4D, 300).save(folder / "scene.ply")
