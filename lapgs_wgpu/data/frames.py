@@ -29,8 +29,8 @@ class Frame:
     """One image of a capture, as the files describe it.
 
     image: its header was checked.
-    lens: at the size that the files state; the image may have another size. Frames of one camera share the object.
-    T_cam_world: (4, 4) pose, OpenCV axes, the capture's coordinates. Frames of a camera that stands still share it.
+    lens: at the size that the files state; the image may have another size.
+    T_cam_world: (4, 4) pose, OpenCV axes, the capture's coordinates.
     where: the description of camera and lens: file and entry, for errors.
     name: file name and camera, for rules on own footage.
     time: in any unit; None if the files state none. Either all frames of a capture have a time, or none.
@@ -66,6 +66,7 @@ class Capture:
     warnings: what the reader left out, one sentence each.
     moved: the transform from the files' coordinates to those of frames and cloud, if the files ask for one.
     keeps_coordinates: the files may already use the presets' coordinates (D-NeRF); they are kept if the scene fits.
+    shares_cameras: frames of equal lens and pose are of one camera that stands still.
     own_footage: poses and cloud come from structure from motion. Then `load` orders the frames by camera and time,
         checks the images and the poses for what goes wrong with own footage, and fills up a sparse cloud.
     axes_hint: advice for own footage whose cameras look the wrong way.
@@ -79,6 +80,7 @@ class Capture:
     warnings: Sequence[str] = ()
     moved: Normalization | None = None
     keeps_coordinates: bool = False
+    shares_cameras: bool = False
     own_footage: bool = False
     axes_hint: str = ""
 

@@ -66,7 +66,7 @@ def load_dataset(
     times, time_source = _times(folder, capture, warnings)
     splits = _splits(folder, frames, times)
     check_frames(frames)
-    shots = _undistort(frames, shrunk_size(frames[0].image.size, image_size))
+    shots = _undistort(capture, shrunk_size(frames[0].image.size, image_size))
     training = [shot for shot, split in zip(shots, splits, strict=True) if split == "train"]
     training_cameras = list(dict.fromkeys(shot.camera for shot in training))
     warnings += _check_cloud(capture, shots, training_cameras)
@@ -173,22 +173,22 @@ class _Shot(NamedTuple):
         return read_ignored(mask, self.undistortion, self.frame.image.size, self.size, black=black)
 
 
-def _undistort(frames: Sequence[Frame], size: Size) -> list[_Shot]:
+def _undistort(capture: Capture, size: Size) -> list[_Shot]:
     """Give each frame its pinhole camera for images of `size`, (width, height). Raises InputError.
 
-    Frames of equal lens and pose share the camera.
+    Frames of equal lens and pose share the camera if the capture says so.
     """
-    stored = frames[0].image.size
+    stored = capture.frames[0].image.size
     undistortions: dict[Lens, Undistortion | None] = {}
-    cameras: dict[tuple[Lens, bytes], Camera] = {}
+    cameras: dict[tuple[Lens, bytes] | int, Camera] = {}
     shots = []
-    for frame in frames:
+    for index, frame in enumerate(capture.frames):
         lens = frame.lens
         if lens not in undistortions:
             resized = lens.resized(*stored)
             undistortions[lens] = None if lens.is_pinhole else Undistortion(resized, resized.pinhole(frame.where))
         undistortion = undistortions[lens]
-        key = lens, frame.T_cam_world.tobytes()
+        key = (lens, frame.T_cam_world.tobytes()) if capture.shares_cameras else index
         if key not in cameras:
             K, taken = (lens.K, (lens.width, lens.height)) if undistortion is None else (undistortion.K, stored)
             cameras[key] = Camera(K, frame.T_cam_world, *taken).resized(*size)

@@ -71,7 +71,15 @@ def _read(folder: Path, image_size: int | None) -> Capture:
             f"{model.points_file} holds 0 points, so Gaussians start at random depths before the cameras; a model with "
             "points trains better."
         )
-    return Capture(frames, cloud, model.points_file, warnings=warnings, own_footage=True, axes_hint=AXES)
+    return Capture(
+        frames,
+        cloud,
+        model.points_file,
+        warnings=warnings,
+        shares_cameras=True,
+        own_footage=True,
+        axes_hint=AXES,
+    )
 
 
 def _models(folder: Path) -> list[Path]:

@@ -69,6 +69,7 @@ def _read(folder: Path, image_size: int | None) -> Capture:
         source=path if cloud is None else folder / DEPTH,
         time_source=f"the order of the images in {folder / IMAGES}",
         warnings=[f"{folder}: {STILL.format(depth=depth) if poses == 1 else MOVING.format(count=poses)}."],
+        shares_cameras=True,
     )
 
 

@@ -67,6 +67,7 @@ def _read(folder: Path, image_size: int | None) -> Capture:
         source=cloud or path,
         warnings=warnings,
         time_source=f"{time_field} in {path}",
+        shares_cameras=True,
         own_footage=True,
         axes_hint=AXES,
     )

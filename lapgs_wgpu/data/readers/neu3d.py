@@ -76,6 +76,7 @@ def _read(folder: Path, image_size: int | None) -> Capture:
         warnings=warnings,
         time_source=f"the number of frames in {others[0]}",
         time_range=(0.0, float(count)),
+        shares_cameras=True,
     )
 
 
