@@ -9,7 +9,7 @@ import dataclasses
 import inspect
 import re
 import textwrap
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -37,30 +37,19 @@ def attributes(cls: type) -> set[str]:
     elif issubclass(cls, tuple):
         names = list(cls._fields)  # type: ignore[attr-defined]
     else:
-        tree = ast.parse(textwrap.dedent(inspect.getsource(cls)))
-        stored = [node for node in ast.walk(tree) if isinstance(node, ast.Attribute)]
-        names = [
-            node.attr
-            for node in stored
-            if isinstance(node.ctx, ast.Store) and isinstance(node.value, ast.Name) and node.value.id == "self"
-        ]
+        nodes = ast.walk(ast.parse(textwrap.dedent(inspect.getsource(cls))))
+        stored = [node for node in nodes if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store)]
+        names = [node.attr for node in stored if isinstance(node.value, ast.Name) and node.value.id == "self"]
     return {name for name in names if not name.startswith("_")}
 
 
-def methods(cls: type) -> Iterator[tuple[str, Callable[..., Any]]]:
-    for name, value in vars(cls).items():
-        function = getattr(value, "__func__", value)
-        if inspect.isfunction(function) and not name.startswith("_"):
-            yield name, function
+def methods(cls: type) -> dict[str, Callable[..., Any]]:
+    found = {name: getattr(value, "__func__", value) for name, value in vars(cls).items() if name[0] != "_"}
+    return {name: value for name, value in found.items() if inspect.isfunction(value)}
 
 
 def parameters(function: Callable[..., Any]) -> set[str]:
     return set(inspect.signature(function).parameters) - {"self"}
-
-
-@pytest.mark.parametrize("name", CLASSES)
-def test_docstrings_list_the_attributes(name: str) -> None:
-    assert set(section(CLASSES[name], "Attributes")) == attributes(CLASSES[name])
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
@@ -70,94 +59,56 @@ def test_docstrings_list_parameters_and_result(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", CLASSES)
-def test_docstrings_of_methods_name_their_parameters(name: str) -> None:
-    """In a section, all of them; or somewhere in a text of a few lines."""
+def test_docstrings_list_attributes_and_parameters_of_methods(name: str) -> None:
+    """Parameters in a section, all of them; or somewhere in a text of a few lines."""
     cls = CLASSES[name]
-    for method, function in methods(cls):
-        assert inspect.getdoc(function), method
-        listed = set(section(function, "Args"))
-        missing = {each for each in parameters(function) if not re.search(rf"\b{each}\b", inspect.getdoc(function))}
-        assert listed == parameters(function) if listed else not missing, (method, missing)
-    if not dataclasses.is_dataclass(cls) and not issubclass(cls, tuple):
-        assert set(section(cls.__init__, "Args")) == parameters(cls.__init__)
+    assert set(section(cls, "Attributes")) == attributes(cls)
+    for method, function in methods(cls).items():
+        listed, text = set(section(function, "Args")), inspect.getdoc(function)
+        assert text, method
+        named = {each for each in parameters(function) if re.search(rf"\b{each}\b", text)}
+        assert (listed or named) == parameters(function), method
 
 
-# docs/api.md ---------------------------------------------------------------------------------------------------------
+# docs/api.md
 
-# Signatures stand at the beginning of a line; calls within the text.
-CALLABLE = PUBLIC | dict(methods(lapgs_wgpu.Trainer))
+CALLABLE = PUBLIC | methods(lapgs_wgpu.Trainer)
 CALLS = [call for call in re.findall(r"`(\w+)\(([^`]*)\)`", PAGE) if call[0] in CALLABLE]
-LEADING = [line.lstrip("|* ") for line in PAGE.splitlines()]
-SIGNATURES = [
-    call
-    for line in LEADING
-    if line.startswith("`")
-    for call in re.findall(r"`(\w+)\(([^`]*)\)`", line.split(" |")[0].split(":")[0])
-    if call[0] in CALLABLE
-]
+SIGNATURES = re.findall(r"^[|* ]*`(\w+)\(([^`]*)\)`", PAGE, re.MULTILINE)  # those that begin a line
 
 
-def test_page_has_all_functions_and_parts() -> None:
-    shown = {name for name, _ in SIGNATURES}
-    assert {"load_config", "load_dataset", "Trainer", "Parts", "list_devices", "open_device"} <= shown
-    assert {"Regularizer", "TorchLoss", "WgslLoss", "Change", "step", "evaluate", "state"} <= shown
-
-
-@pytest.mark.parametrize(("name", "written"), SIGNATURES)
+@pytest.mark.parametrize(("name", "written"), [call for call in SIGNATURES if call[0] in CALLABLE])
 def test_page_states_signatures(name: str, written: str) -> None:
-    """Names, kinds and defaults of the parameters that the page shows."""
+    """Names and kinds of the parameters that the page shows, and their defaults as they are written in the code."""
     actual = inspect.signature(CALLABLE[name]).parameters
-    for parameter in eval_signature(written).values():
-        assert parameter.name in actual, parameter.name
-        real = actual[parameter.name]
-        assert parameter.kind == real.kind, parameter.name
-        if parameter.default is not parameter.empty:
-            assert parameter.default == shown_default(real), parameter.name
-
-
-def eval_signature(written: str) -> dict[str, inspect.Parameter]:
-    """The parameters as they are written, with the text of each default."""
     arguments = ast.parse(f"def f({written}): ...").body[0].args  # type: ignore[attr-defined]
-    defaults = [None] * (len(arguments.args) - len(arguments.defaults)) + arguments.defaults
-    kinds = inspect.Parameter
-    pairs = [
-        (each, default, kinds.POSITIONAL_OR_KEYWORD) for each, default in zip(arguments.args, defaults, strict=True)
-    ]
-    pairs += [
-        (each, default, kinds.KEYWORD_ONLY)
-        for each, default in zip(arguments.kwonlyargs, arguments.kw_defaults, strict=True)
-    ]
-    return {
-        each.arg: kinds(each.arg, kind, default=kinds.empty if default is None else ast.unparse(default))
-        for each, default, kind in pairs
-    }
-
-
-def shown_default(parameter: inspect.Parameter) -> str:
-    default = parameter.default
-    if callable(default) and hasattr(default, "__name__"):
-        return default.__name__
-    return "{}" if repr(default) == "<factory>" else repr(default)
+    for parameter in (*arguments.args, *arguments.kwonlyargs):
+        keyword_only = actual[parameter.arg].kind is inspect.Parameter.KEYWORD_ONLY
+        assert keyword_only == (parameter in arguments.kwonlyargs), parameter.arg
+    shown = dict(zip([each.arg for each in arguments.args[::-1]], arguments.defaults[::-1], strict=False))
+    shown |= {each.arg: default for each, default in zip(arguments.kwonlyargs, arguments.kw_defaults, strict=True)}
+    for parameter, default in shown.items():
+        real = actual[parameter].default
+        texts = {repr(real), getattr(real, "__name__", "{}" if repr(real) == "<factory>" else repr(real))}
+        assert default is None or ast.unparse(default) in texts, parameter
 
 
 def test_calls_on_the_page_name_parameters_that_exist() -> None:
+    assert {"load_config", "load_dataset", "Trainer", "Parts", "load"} <= {name for name, _ in CALLS}
     for name, written in CALLS:
-        for keyword in re.findall(r"(?<![\w.])(\w+)=", written):
-            assert keyword in parameters(CALLABLE[name]), f"{name}({written})"
+        assert set(re.findall(r"(?<![\w.])(\w+)=", written)) <= parameters(CALLABLE[name]), f"{name}({written})"
 
 
 def rows(heading: str) -> dict[str, str]:
     """Name -> text of the lines of a section's tables."""
-    part = re.search(rf"^## {heading}\n(.*?)(?=^## |\Z)", PAGE, re.MULTILINE | re.DOTALL)
-    assert part
+    part = PAGE.partition(f"\n## {heading}\n")[2].partition("\n## ")[0]
     found = {}
-    for first, text in re.findall(r"^\| ([^|]+) \| (.*) \|$", part[1], re.MULTILINE):
+    for first, text in re.findall(r"^\| ([^|]+) \| (.*) \|$", part, re.MULTILINE):
         found |= dict.fromkeys(re.findall(r"`(\w+)(?=[`(])", first), text)
     return found
 
 
 def shapes(text: str) -> list[str]:
-    """The shapes that a text names, and whatever else it puts in brackets that begin like one."""
     return sorted(re.findall(r"\([NMD],[^)]*\)", " ".join(text.split())))
 
 
@@ -168,18 +119,12 @@ def shapes(text: str) -> list[str]:
 def test_page_lists_fields_and_shapes(heading: str, cls: type) -> None:
     documented, listed = section(cls, "Attributes"), rows(heading)
     listed.pop(cls.__name__, None)  # a head of the table
-    assert set(listed) == set(documented)
-    for name, text in listed.items():
-        assert shapes(text) == shapes(documented[name]), name
+    assert {name: shapes(text) for name, text in listed.items()} == {
+        name: shapes(text) for name, text in documented.items()
+    }
 
 
 def test_page_lists_the_trainer() -> None:
     cls = lapgs_wgpu.Trainer
     properties = {name for name, value in vars(cls).items() if isinstance(value, property)}
-    assert set(rows("A trainer")) == attributes(cls) | properties | dict(methods(cls)).keys()
-
-
-def test_page_lists_what_a_step_and_a_change_tell() -> None:
-    for name, opening in (("StepResult", "A `StepResult` has "), ("Change", "`Change(keep, added)`: ")):
-        paragraph = PAGE[PAGE.index(opening) :].split("\n\n")[0]
-        assert set(section(PUBLIC[name], "Attributes")) <= set(re.findall(r"`(\w+)`", paragraph))
+    assert set(rows("A trainer")) == attributes(cls) | properties | set(methods(cls))
