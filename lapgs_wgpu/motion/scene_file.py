@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.checkpoint import read_checkpoint
 from lapgs_wgpu.io.dataclass_table import build_dataclass
+from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.io.lapgs_file import is_lapgs, pack_lapgs, read_lapgs
 from lapgs_wgpu.io.safe_json_toml import parse_json
 from lapgs_wgpu.motion.compact_scene import compress, expand
@@ -100,8 +101,9 @@ def compact_bytes(file: SceneFile, static_features: NDArray[np.float32] | None) 
         )
     gaussians = file.gaussians | ({} if static_features is None else {"static_features": static_features})
     header = scene_header(config, file.sh_degree, file.antialiased, file.timing)
+    look = InitialView.from_json(file.metadata.get("view", ""))
     try:
-        return pack_lapgs(compress(gaussians, file.field, config, file.sh_degree), file.metadata | header)
+        return pack_lapgs(compress(gaussians, file.field, config, file.sh_degree, look), file.metadata | header)
     except InputError as error:
         raise InputError(f"{file.path}: no compact scene can be made of it, because {error}") from error
 
