@@ -41,6 +41,7 @@ _MOST_LOGIT = 16.0  # beyond it an opacity is 0 or 1 to seven digits
 # Largest errors of a value by what they change in a picture.
 _SHIFT = 0.03  # of a mean, standard deviations of the Gaussian
 _SHIFT_PIXELS = 0.1  # of a mean
+_TURN = 0.2  # of where a turned Gaussian's longest axis ends, of its shortest one; or four pixels
 _WIDENING = 0.06  # of a variance, with the one of a pixel that drawing adds
 _OPACITY = 0.012  # of an opacity above _FAINT; below it of opacity / _FAINT
 _FAINT = 0.1
@@ -68,11 +69,14 @@ def compress(
     config: FieldConfig,
     sh_degree: int,
     look: InitialView | None = None,
+    *,
+    finer: float = 1.0,
 ) -> dict[str, NDArray[Any]]:
     """The tensors of a compact scene.
 
     gaussians: as SceneFile has them, and "static_features" (N, F) where the scene moves. field: as SceneFile has it.
     look: from where and how near it is seen; by default, so near that only the Gaussians' own sizes count.
+    finer: factor of the largest errors that are allowed.
     Gaussians that are too faint to be drawn at any time are left out.
     """
     stored = {name: gaussians[name] for name in _BITS if name in gaussians}
@@ -91,13 +95,15 @@ def compress(
     for name, columns in row_columns(config, sh_degree).items():
         bits, centered = _BITS[name]
         values = stored[name].reshape(-1, columns)
-        tensors |= _named(f"gaussians.{name}", quantize(values, bits, allowed.get(name, np.inf), centered=centered))
+        most = allowed[name] if name in allowed else _half_step(values, bits)
+        tensors |= _named(f"gaussians.{name}", quantize(values, bits, finer * most, centered=centered))
     starts = _table_starts(config)
     for name, values in field.items():
         if name == STATIC_TABLE:
             continue
         if name.endswith(".table"):
-            tensors |= _named(f"field.{name}", quantize(values, _TABLE_BITS, centered=True, starts=starts))
+            most = _half_step(values, _TABLE_BITS, starts)
+            tensors |= _named(f"field.{name}", quantize(values, _TABLE_BITS, finer * most, centered=True, starts=starts))
         else:
             with np.errstate(over="ignore"):  # refused when it is written
                 tensors[f"field.{name}"] = values if name in _EXACT else values.astype(np.float16)
@@ -151,11 +157,18 @@ def _allowed_errors(
     color = np.abs(0.5 + CONSTANTS["SH_C0"] * stored["sh_dc"].reshape(-1, 3).astype(np.float64))
     return {
         "means": shift,
+        "quats": np.maximum(_TURN * scales.min(axis=1, keepdims=True), 4 * pixel) / scales.max(axis=1, keepdims=True),
         "log_scales": 0.5 * np.log1p(_WIDENING * (1 + ratio)),
         "opacity_logits": np.minimum(logit, 4 * _OPACITY) if opacity_changes else logit,
         "sh_dc": _COLOR / CONSTANTS["SH_C0"] * np.maximum(color, 1),
         "sh_rest": np.array([[_HARMONIC]]),
     }
+
+
+def _half_step(values: Floats, bits: int, starts: Sequence[int] = (0,)) -> NDArray[np.floating]:
+    """Largest errors (N, columns) of features, of which only the field knows what they change: what the range allows."""
+    largest = np.maximum.reduceat(np.abs(values), starts)
+    return np.repeat(largest / ((1 << bits) - 2) * 1.01, np.diff([*starts, len(values)]), axis=0)
 
 
 def _pixels(means: NDArray[np.float64], look: InitialView | None) -> NDArray[np.float64]:

@@ -52,7 +52,7 @@ def quantize(
     for width in sorted({bits, max(bits, 8), 16}):
         found = _round(values, width, allowed, centered, starts)
         size = values.size * width / 8 + len(found.outliers) * _OUTLIER_BYTES
-        if size < fewest or not len(found.outliers):
+        if size < fewest:
             best, fewest = found, size
         if not len(found.outliers):
             break
