@@ -84,12 +84,8 @@ def compress(
     stored["quats"] = stored["quats"] / np.maximum(np.linalg.norm(stored["quats"], axis=1, keepdims=True), 1e-12)
     stored["opacity_logits"] = stored["opacity_logits"].clip(-_MOST_LOGIT, _MOST_LOGIT)
     stored["sh_rest"] = stored["sh_rest"][:, : (sh_degree + 1) ** 2 - 1]
-    seen = np.ones(len(stored["means"]), bool)
-    if config.appearance_size < 4:  # opacities do not change
-        least = CONSTANTS["ALPHA_MIN"]
-        seen = stored["opacity_logits"] >= math.log(least / (1 - least))
-        seen[:1] |= not seen.any()  # a file holds at least one
-    stored = {name: values[seen] for name, values in stored.items()}
+    held = held_rows(stored["opacity_logits"], config)
+    stored = {name: values[held] for name, values in stored.items()}
     allowed = _allowed_errors(stored, config.appearance_size == 4, look)
     tensors: dict[str, NDArray[Any]] = {}
     for name, columns in row_columns(config, sh_degree).items():
@@ -102,12 +98,21 @@ def compress(
         if name == STATIC_TABLE:
             continue
         if name.endswith(".table"):
-            most = _half_step(values, _TABLE_BITS, starts)
-            tensors |= _named(f"field.{name}", quantize(values, _TABLE_BITS, finer * most, centered=True, starts=starts))
+            most = finer * _half_step(values, _TABLE_BITS, starts)
+            tensors |= _named(f"field.{name}", quantize(values, _TABLE_BITS, most, centered=True, starts=starts))
         else:
             with np.errstate(over="ignore"):  # refused when it is written
                 tensors[f"field.{name}"] = values if name in _EXACT else values.astype(np.float16)
     return tensors
+
+
+def held_rows(opacity_logits: Floats, config: FieldConfig) -> NDArray[np.integer]:
+    """Which of the Gaussians a compact scene holds, at least one: those that are not too faint at all times."""
+    least = CONSTANTS["ALPHA_MIN"]
+    held = opacity_logits >= math.log(least / (1 - least))
+    if config.appearance_size == 4:  # opacities change
+        held[:] = True
+    return np.flatnonzero(held) if held.any() else np.zeros(1, int)
 
 
 def expand(
@@ -166,7 +171,7 @@ def _allowed_errors(
 
 
 def _half_step(values: Floats, bits: int, starts: Sequence[int] = (0,)) -> NDArray[np.floating]:
-    """Largest errors (N, columns) of features, of which only the field knows what they change: what the range allows."""
+    """Largest errors (N, columns) of features, whose effect only the field knows: half a step of their range."""
     largest = np.maximum.reduceat(np.abs(values), starts)
     return np.repeat(largest / ((1 << bits) - 2) * 1.01, np.diff([*starts, len(values)]), axis=0)
 

@@ -74,9 +74,7 @@ def dequantize(quantized: Quantized, starts: Sequence[int] = (0,)) -> Floats:
     return np.ascontiguousarray(values.T)
 
 
-def _round(
-    values: Floats, bits: int, allowed: NDArray[np.float64], centered: bool, starts: Sequence[int]
-) -> Quantized:
+def _round(values: Floats, bits: int, allowed: NDArray[np.float64], centered: bool, starts: Sequence[int]) -> Quantized:
     top = (1 << bits) - (2 if centered else 1)  # an even number of steps has a middle
     whole = np.empty(values.shape[::-1], np.uint16 if bits > 8 else np.uint8)
     ranges = np.zeros((len(starts), values.shape[1], 2), np.float32)
@@ -127,8 +125,8 @@ def _levels(exact: NDArray[np.float64], top: int, centered: bool) -> tuple[float
         high = max(abs(low), abs(high))
         low = -high
     step = np.array([(high - low) / top], np.float32)
-    if centered:
-        step = ((step.view(np.uint32) + 0x80) & 0xFFFFFF00).view(np.float32)  # so that its multiples up to 127 are exact
+    if centered:  # so that the step's multiples up to 127 are exact
+        step = ((step.view(np.uint32) + 0x80) & 0xFFFFFF00).view(np.float32)
     return float(np.float32(-step[0] * np.float32(top / 2)) if centered else np.float32(low)), float(step[0])
 
 
