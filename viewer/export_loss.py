@@ -124,7 +124,7 @@ def _reason(
     true = {name: array.read()[rows] for name, array in exact.arrays().items()}
     gains = {}
     for name, values in true.items():
-        mended = dataclasses.replace(shown, **{name: _upload(device, values)})
+        mended = Gaussians(**(shown.arrays() | {name: _upload(device, values)}), antialiased=shown.antialiased)
         gains[name] = _psnr(wanted, _draw(rasterizer, scene, mended, camera))
     mended = dataclasses.replace(shown, antialiased=exact.antialiased)
     if _psnr(wanted, _draw(rasterizer, scene, mended, camera)) > max(gains.values()):
@@ -144,7 +144,8 @@ def _reason(
 
 def _errors(name: str, true: dict[str, Floats], found: dict[str, Floats], camera: Camera) -> Floats:
     """(N,) by how much a property of each Gaussian differs, as _ERRORS counts it."""
-    a, b = true[name].astype(np.float64), found[name].astype(np.float64)
+    a: Floats = true[name].astype(np.float64)
+    b: Floats = found[name].astype(np.float64)
     if name == "means":
         return np.asarray(np.linalg.norm(a - b, axis=1) / np.median(true["scales"], axis=1))
     if name == "quats":

@@ -47,10 +47,10 @@ def quantize(
     centered: the levels lie evenly about zero, which is one of them, exactly so up to 8 bits.
     starts: first rows of the parts that have ranges of their own, ascending from 0.
     """
-    allowed = np.broadcast_to(np.asarray(allowed, np.float64), values.shape)
+    most = np.broadcast_to(np.asarray(allowed, np.float64), values.shape)
     best, fewest = None, 4.0 * values.size
     for width in sorted({bits, max(bits, 8), 16}):
-        found = _round(values, width, allowed, centered, starts)
+        found = _round(values, width, most, centered, starts)
         size = values.size * width / 8 + len(found.outliers) * _OUTLIER_BYTES
         if size < fewest:
             best, fewest = found, size
