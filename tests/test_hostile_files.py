@@ -40,6 +40,7 @@ from helpers.hostile import (
     tree_edits,
 )
 from helpers.playback import open_playback
+from helpers.scene_files import scene_of_outliers
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
@@ -134,7 +135,7 @@ def test_checkpoints_with_another_description(
 
 @pytest.fixture(scope="module")
 def compact_scenes(device: Device, tmp_path_factory: pytest.TempPathFactory) -> list[bytes]:
-    """One of each field that such a file can hold."""
+    """One of each field that such a file can hold, and one with outliers."""
     file = tmp_path_factory.mktemp("compact") / "a.ply"
     found = []
     for kind in ("static", "grid4d", "laplacian"):
@@ -142,11 +143,11 @@ def compact_scenes(device: Device, tmp_path_factory: pytest.TempPathFactory) -> 
         playback = open_playback(file, device)
         assert isinstance(playback, DevicePlayback)
         found.append(compact_bytes(read_scene(file), playback.static_features()))
-    return found
+    return [*found, compact_bytes(scene_of_outliers(20), None)]
 
 
 @fuzzed()
-@given(damaged_compact_scenes(3))
+@given(damaged_compact_scenes(4))
 def test_compact_scenes(compact_scenes: list[bytes], device: Device, folder: Path, damage: CompactDamage) -> None:
     (folder / "a.lapgs").write_bytes(damage_compact(compact_scenes, damage))
     refused_or(lambda: shown_at_all_times(folder / "a.lapgs", device))

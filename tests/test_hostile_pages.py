@@ -18,6 +18,7 @@ from helpers.damaged_files import small_scene
 from helpers.damaged_lapgs import CompactDamage, damage_compact, damaged_compact_scenes
 from helpers.hostile import fuzzed
 from helpers.playback import open_playback
+from helpers.scene_files import scene_of_outliers
 from helpers.trained_scenes import OURS, trained
 from hypothesis import given
 
@@ -68,13 +69,19 @@ def compact(scene: Scene4D, file: Path, device: Device) -> bytes:
     return compact_bytes(read_scene(file), playback.static_features())
 
 
-def test_the_page_reads_the_same_bits(page: Browser, device: Device, tmp_path: Path) -> None:
-    data = compact(trained(device, OURS, 50), tmp_path / "a.ply", device)
+@pytest.mark.parametrize("still", [False, True], ids=["moving", "with outliers"])
+def test_the_page_reads_the_same_bits(page: Browser, device: Device, tmp_path: Path, still: bool) -> None:
+    data = (
+        compact_bytes(scene_of_outliers(50), None)
+        if still
+        else compact(trained(device, OURS, 50), tmp_path / "a.ply", device)
+    )
     (tmp_path / "a.lapgs").write_bytes(data)
     expected = read_scene(tmp_path / "a.lapgs")
     assert read(page, data) == ""
     arrays = {f"gaussians.{name}": values for name, values in expected.gaussians.items() if name != "sh_rest"}
-    arrays["gaussians.sh_rest"] = expected.gaussians["sh_rest"][:, :8]  # of degree 2
+    if not still:
+        arrays["gaussians.sh_rest"] = expected.gaussians["sh_rest"][:, :8]  # of degree 2
     arrays |= {f"parameters['{name}']": values for name, values in expected.field.items()}
     for name, values in arrays.items():
         bits = page.value(f"Array.from(new Uint32Array(scene.{name}.buffer))")
@@ -83,13 +90,14 @@ def test_the_page_reads_the_same_bits(page: Browser, device: Device, tmp_path: P
 
 @pytest.fixture(scope="module")
 def files(device: Device, tmp_path_factory: pytest.TempPathFactory) -> list[bytes]:
-    """One of each field that such a file can hold."""
+    """One of each field that such a file can hold, and one with outliers."""
     file = tmp_path_factory.mktemp("compact") / "a.ply"
-    return [compact(small_scene(kind, device), file, device) for kind in ("static", "grid4d", "laplacian")]
+    moving = [compact(small_scene(kind, device), file, device) for kind in ("static", "grid4d", "laplacian")]
+    return [*moving, compact_bytes(scene_of_outliers(20), None)]
 
 
 @fuzzed()
-@given(damaged_compact_scenes(3))
+@given(damaged_compact_scenes(4))
 def test_damaged_files(page: Browser, files: list[bytes], damage: CompactDamage) -> None:
     said = read(page, damage_compact(files, damage))
     assert not said.startswith("no sentence"), said
@@ -98,9 +106,9 @@ def test_damaged_files(page: Browser, files: list[bytes], damage: CompactDamage)
 
 
 def test_a_later_version_and_a_foreign_file(page: Browser, files: list[bytes]) -> None:
-    later = files[0][:8] + (2).to_bytes(4, "little") + files[0][12:]
+    later = files[0][:8] + (3).to_bytes(4, "little") + files[0][12:]
     assert read(page, later) == (
-        "The scene has version 2 of its format, and this page reads version 1: "
+        "The scene has version 3 of its format, and this page reads versions 1 to 2: "
         "export the page again with a newer lapgs-view."
     )
     for data in (b"", b"ply\nformat", files[0][:100], files[0] + b"more"):

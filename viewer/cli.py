@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from lapgs_wgpu.viewer.view_state import ViewState
 
 _SIZE = (1280, 720)  # of a window or picture, where nothing else says it
+_AS_IT_IS = "a .html or .lapgs file shows the scene as it is"
 _WITHOUT_WINDOW = "take --backend http to look in a browser (also from another machine), or --screenshot FILE.png"
 
 
@@ -176,6 +177,7 @@ def _video(given: Any, scene: LoadedScene) -> None:
 
 def _export(given: Any, scene: LoadedScene) -> None:
     from lapgs_wgpu.viewer.export import export_compact, export_frames, export_still
+    from lapgs_wgpu.viewer.export_loss import report
 
     file, overwrite = Path(given.export), bool(given.overwrite)
     ending, count = file.suffix.lower(), scene.playback.count
@@ -184,25 +186,27 @@ def _export(given: Any, scene: LoadedScene) -> None:
         if getattr(given, name) is not None and name != takes:
             raise InputError(f"--{name.replace('_', '-')} has no use with --export {given.export}.")
     if ending == ".ply":
-        export_still(scene, file, given.time or 0.0, overwrite=overwrite)
-        print(f"{file}: {count} Gaussians at time {given.time or 0.0:g}")
+        loss = export_still(scene, file, given.time or 0.0, overwrite=overwrite)
+        report(f"{file}: {count} Gaussians at time {given.time or 0.0:g}", loss, scene.path, _AS_IT_IS)
     elif ending in (".lapgs", ".html"):
-        export_compact(scene, file, overwrite=overwrite)
-        print(f"{file}: {count} Gaussians, {file.stat().st_size / 1e6:.2f} MB")
+        loss = export_compact(scene, file, overwrite=overwrite)
+        line = f"{file}: {count} Gaussians, {file.stat().st_size / 1e6:.2f} MB"
+        report(line, loss, scene.path, "a still .ply, or the opened file itself, shows the scene as it is")
         return  # our own formats say whether the scene is antialiased
     elif ending == ".4dgs":
         from lapgs_wgpu.viewer.export_4dgs import MAX_ERROR, export_4dgs
 
         baked = export_4dgs(scene, file, given.max_error or MAX_ERROR, overwrite=overwrite)
-        print(
+        line = (
             f"{file}: {baked.gaussians} Gaussians as {baked.pieces} pieces, at most {baked.error:.2f} pixels of the "
             f"captured images from the learned motion, {file.stat().st_size / 1e6:.2f} MB"
         )
+        report(line, baked.loss, scene.path, f"a smaller --max-error is nearer, and {_AS_IT_IS}")
     elif given.frames is None:
         raise InputError(f"--export {file}: name a .ply, .lapgs, .html or .4dgs file, or a folder and its --frames.")
     else:
-        export_frames(scene, file, given.frames, overwrite=overwrite)
-        print(f"{file}: {given.frames} frames of {count} Gaussians")
+        loss = export_frames(scene, file, given.frames, overwrite=overwrite)
+        report(f"{file}: {given.frames} frames of {count} Gaussians", loss, scene.path, _AS_IT_IS)
     if scene.playback.at(0.0).antialiased:
         print(
             "note: the scene was trained antialiased, which a file for other viewers cannot say: where they offer "

@@ -18,6 +18,7 @@ from lapgs_wgpu.progress import Progress
 from lapgs_wgpu.splat.constants import CONSTANTS
 from lapgs_wgpu.splat.linear_light import directions, display_colors, linear_harmonics, sh_basis, to_display
 from lapgs_wgpu.viewer.export import check_free
+from lapgs_wgpu.viewer.export_loss import Loss, measure, of_pieces
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene
 
 MAX_ERROR = 0.5  # pixels, without --max-error
@@ -29,11 +30,13 @@ _PROGRESS = 1000
 
 
 class Baked(NamedTuple):
-    """gaussians, pieces: how many. error: largest displacement that was found in the written file, pixels."""
+    """gaussians, pieces: how many. error: largest displacement that was found in the written file, pixels. loss: of its
+    pictures."""
 
     gaussians: int
     pieces: int
     error: float
+    loss: Loss
 
 
 def export_4dgs(scene: LoadedScene, file: Path, max_error: float, *, overwrite: bool = False) -> Baked:
@@ -77,8 +80,10 @@ def export_4dgs(scene: LoadedScene, file: Path, max_error: float, *, overwrite: 
         fourdgs.write(written, _gaussian_set(pieces, sh, seconds), seconds, options=options, camera=view)
         target.write(written.getvalue())
     read = fourdgs.read(written.getvalue()).gaussians
-    error = float(piece_errors(playback, _pieces_of(read, seconds)).max()) / pixel
-    return Baked(len(np.unique(pieces.source)), len(pieces.source), error)
+    found = _pieces_of(read, seconds)
+    error = float(piece_errors(playback, found).max()) / pixel
+    loss = measure(scene, of_pieces(found, _light_of(read), playback.device))
+    return Baked(len(np.unique(pieces.source)), len(pieces.source), error, loss)
 
 
 def _gaussian_set(pieces: Pieces, sh: NDArray[np.float32], seconds: float) -> Any:
@@ -120,6 +125,15 @@ def _pieces_of(gaussians: Any, seconds: float) -> Pieces:
         gaussians.source_index, begin, end, means, slopes, gaussians.scales, gaussians.rotations,
         gaussians.colors[:, 3], none,
     )  # fmt: skip
+
+
+def _light_of(gaussians: Any) -> NDArray[np.float64]:
+    """(P, K, 3) harmonics of linear light that a file holds."""
+    base = gaussians.colors[:, None, :3] / CONSTANTS["SH_C0"]
+    if not gaussians.sh_degree:
+        return np.asarray(base, np.float64)
+    others = gaussians.sh.reshape(len(base), 3, -1).transpose(0, 2, 1) * (2 * _SH_RANGE / 255) - _SH_RANGE
+    return np.concatenate([base, others], axis=1)
 
 
 def best_degree(sh: NDArray[np.floating]) -> int:

@@ -21,7 +21,7 @@ from lapgs_wgpu.io.safetensors_file import pack_tensors, unpack_tensors
 PathLike = str | os.PathLike[str]
 
 MAGIC = b"lapgs4d\n"
-VERSION = 1
+VERSION = 2  # 1 has no outliers, and whole numbers alone
 MAX_BYTES = 1 << 30  # unpacked: 1.5 million Gaussians with the field of the preset dnerf
 _HEADER = struct.Struct("<8sIQ")  # magic, version, bytes once unpacked
 _MOST_RATIO = 64  # of unpacked bytes to packed ones: a small file cannot fill the memory of who opens it
@@ -46,11 +46,12 @@ def pack_lapgs(tensors: Mapping[str, NDArray[Any]], metadata: Mapping[str, str])
     content = b"".join(bytes(part) for part in pack_tensors(tensors, metadata))
     if len(content) > MAX_BYTES:
         raise InputError(f"a compact scene holds at most {MAX_BYTES} bytes, and this one needs {len(content)}")
+    version = 2 if any(name.endswith(".outliers") for name in tensors) else 1
     packed = zlib.compress(content, 9)
     if len(content) > _MOST_RATIO * len(packed):  # no repeats then, so that a byte takes a bit or more
         packer = zlib.compressobj(9, strategy=zlib.Z_HUFFMAN_ONLY)
         packed = packer.compress(content) + packer.flush()
-    return _HEADER.pack(MAGIC, VERSION, len(content)) + packed
+    return _HEADER.pack(MAGIC, version, len(content)) + packed
 
 
 def read_lapgs(path: PathLike) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
@@ -74,9 +75,9 @@ def unpack_lapgs(data: bytes, where: str) -> tuple[dict[str, NDArray[Any]], dict
         )
     _, version, size = _HEADER.unpack_from(data)
     packed = len(data) - _HEADER.size
-    if version != VERSION:
+    if not 1 <= version <= VERSION:
         raise InputError(
-            f"{where}: has version {version} of the compact scene, and this program reads version {VERSION}; "
+            f"{where}: has version {version} of the compact scene, and this program reads versions 1 to {VERSION}; "
             "export the scene again, or use the program that wrote it"
         )
     if size > MAX_BYTES:

@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.motion.fields.config import MIN_SCALE, FieldConfig, static_grid, temporal_grids
 from lapgs_wgpu.motion.fields.parameter_shapes import parameter_shapes
-from lapgs_wgpu.motion.quantize import dequantize, quantize
+from lapgs_wgpu.motion.quantize import Quantized, dequantize, quantize
 from lapgs_wgpu.splat.constants import CONSTANTS
 
 Floats = NDArray[np.float32]
@@ -36,7 +37,18 @@ _BITS = {
 }
 _TABLE_BITS = 8
 _EXACT = ("motion.frequencies",)  # a phase is up to 2 pi times this: 16 bits would move the end of the clip
-_MOST_LOGIT = 16.0  # beyond it an opacity is 0 or 1 to seven digits, and an outlier would widen the steps of all
+_MOST_LOGIT = 16.0  # beyond it an opacity is 0 or 1 to seven digits
+# Largest errors of a value by what they change in a picture.
+_SHIFT = 0.03  # of a mean, standard deviations of the Gaussian
+_SHIFT_PIXELS = 0.1  # of a mean
+_TURN = 0.2  # of where a turned Gaussian's longest axis ends, of its shortest one; or four pixels
+_WIDENING = 0.06  # of a variance, with the one of a pixel that drawing adds
+_OPACITY = 0.012  # of an opacity above _FAINT; below it of opacity / _FAINT
+_FAINT = 0.1
+_COLOR = 0.008  # of a color, where 1 is white; of colors above that a share
+_HARMONIC = 0.04  # of a higher harmonic's coefficient
+_PIXELS = 1000  # of the picture's height in which a pixel is meant
+_NEAREST = 0.25  # of the initial distance: what a viewer comes near to
 
 
 def row_columns(config: FieldConfig, sh_degree: int) -> dict[str, int]:
@@ -52,11 +64,19 @@ def row_columns(config: FieldConfig, sh_degree: int) -> dict[str, int]:
 
 
 def compress(
-    gaussians: Mapping[str, Floats], field: Mapping[str, Floats], config: FieldConfig, sh_degree: int
+    gaussians: Mapping[str, Floats],
+    field: Mapping[str, Floats],
+    config: FieldConfig,
+    sh_degree: int,
+    look: InitialView | None = None,
+    *,
+    finer: float = 1.0,
 ) -> dict[str, NDArray[Any]]:
     """The tensors of a compact scene.
 
     gaussians: as SceneFile has them, and "static_features" (N, F) where the scene moves. field: as SceneFile has it.
+    look: from where and how near it is seen; by default, so near that only the Gaussians' own sizes count.
+    finer: factor of the largest errors that are allowed.
     Gaussians that are too faint to be drawn at any time are left out.
     """
     stored = {name: gaussians[name] for name in _BITS if name in gaussians}
@@ -64,28 +84,35 @@ def compress(
     stored["quats"] = stored["quats"] / np.maximum(np.linalg.norm(stored["quats"], axis=1, keepdims=True), 1e-12)
     stored["opacity_logits"] = stored["opacity_logits"].clip(-_MOST_LOGIT, _MOST_LOGIT)
     stored["sh_rest"] = stored["sh_rest"][:, : (sh_degree + 1) ** 2 - 1]
-    seen = np.ones(len(stored["means"]), bool)
-    if config.appearance_size < 4:  # opacities do not change
-        least = CONSTANTS["ALPHA_MIN"]
-        seen = stored["opacity_logits"] >= math.log(least / (1 - least))
-        seen[:1] |= not seen.any()  # a file holds at least one
+    held = held_rows(stored["opacity_logits"], config)
+    stored = {name: values[held] for name, values in stored.items()}
+    allowed = _allowed_errors(stored, config.appearance_size == 4, look)
     tensors: dict[str, NDArray[Any]] = {}
     for name, columns in row_columns(config, sh_degree).items():
         bits, centered = _BITS[name]
-        values = stored[name].reshape(-1, columns)[seen]
-        whole, ranges = quantize(values, bits, centered=centered)
-        tensors |= {f"gaussians.{name}": whole, f"gaussians.{name}.range": ranges}
+        values = stored[name].reshape(-1, columns)
+        most = allowed[name] if name in allowed else _half_step(values, bits)
+        tensors |= _named(f"gaussians.{name}", quantize(values, bits, finer * most, centered=centered))
     starts = _table_starts(config)
     for name, values in field.items():
         if name == STATIC_TABLE:
             continue
         if name.endswith(".table"):
-            whole, ranges = quantize(values, _TABLE_BITS, centered=True, starts=starts)
-            tensors |= {f"field.{name}": whole, f"field.{name}.range": ranges}
+            most = finer * _half_step(values, _TABLE_BITS, starts)
+            tensors |= _named(f"field.{name}", quantize(values, _TABLE_BITS, most, centered=True, starts=starts))
         else:
             with np.errstate(over="ignore"):  # refused when it is written
                 tensors[f"field.{name}"] = values if name in _EXACT else values.astype(np.float16)
     return tensors
+
+
+def held_rows(opacity_logits: Floats, config: FieldConfig) -> NDArray[np.integer]:
+    """Which of the Gaussians a compact scene holds, at least one: those that are not too faint at all times."""
+    least = CONSTANTS["ALPHA_MIN"]
+    held = opacity_logits >= math.log(least / (1 - least))
+    if config.appearance_size == 4:  # opacities change
+        held[:] = True
+    return np.flatnonzero(held) if held.any() else np.zeros(1, int)
 
 
 def expand(
@@ -122,6 +149,50 @@ def expand(
     return gaussians, field
 
 
+def _allowed_errors(
+    stored: Mapping[str, Floats], opacity_changes: bool, look: InitialView | None
+) -> dict[str, NDArray[np.floating]]:
+    """Largest errors of a Gaussian's values that are hardly seen, (N, 1 or columns) by name."""
+    means, scales = stored["means"].astype(np.float64), np.exp(stored["log_scales"].astype(np.float64))
+    pixel = _pixels(means, look)[:, None]
+    shift = np.maximum(_SHIFT * np.sort(scales, axis=1)[:, 1:2], _SHIFT_PIXELS * pixel)
+    ratio = CONSTANTS["DILATION"] * (pixel / scales) ** 2
+    opacity = 0.5 + 0.5 * np.tanh(0.5 * stored["opacity_logits"].astype(np.float64)[:, None])
+    logit = _OPACITY / (np.maximum(opacity, _FAINT) * (1 - opacity + 1e-9))
+    color = np.abs(0.5 + CONSTANTS["SH_C0"] * stored["sh_dc"].reshape(-1, 3).astype(np.float64))
+    return {
+        "means": shift,
+        "quats": np.maximum(_TURN * scales.min(axis=1, keepdims=True), 4 * pixel) / scales.max(axis=1, keepdims=True),
+        "log_scales": 0.5 * np.log1p(_WIDENING * (1 + ratio)),
+        "opacity_logits": np.minimum(logit, 4 * _OPACITY) if opacity_changes else logit,
+        "sh_dc": _COLOR / CONSTANTS["SH_C0"] * np.maximum(color, 1),
+        "sh_rest": np.array([[_HARMONIC]]),
+    }
+
+
+def _half_step(values: Floats, bits: int, starts: Sequence[int] = (0,)) -> NDArray[np.floating]:
+    """Largest errors (N, columns) of features, whose effect only the field knows: half a step of their range."""
+    largest = np.maximum.reduceat(np.abs(values), starts)
+    return np.repeat(largest / ((1 << bits) - 2) * 1.01, np.diff([*starts, len(values)]), axis=0)
+
+
+def _pixels(means: NDArray[np.float64], look: InitialView | None) -> NDArray[np.float64]:
+    """(N,) width of a pixel at each Gaussian, world units, where a camera that turns about the focus is nearest."""
+    if look is None:
+        return np.zeros(len(means))
+    camera = look.camera
+    distance = float(np.linalg.norm(camera.position - look.focus))
+    nearest = np.maximum(np.linalg.norm(means - look.focus, axis=1) - distance, _NEAREST * distance)
+    return nearest * (camera.height / camera.K[1, 1] / _PIXELS)
+
+
+def _named(name: str, quantized: Quantized) -> dict[str, NDArray[Any]]:
+    tensors = {name: quantized.whole, f"{name}.range": quantized.ranges}
+    if len(quantized.outliers):
+        tensors |= {f"{name}.outliers": quantized.outliers, f"{name}.exact": quantized.exact}
+    return tensors
+
+
 def _table_starts(config: FieldConfig) -> list[int]:
     """Return the first entries of the levels of a temporal grid."""
     grids = temporal_grids(config)
@@ -145,12 +216,24 @@ class _Reader:
             )
         return array
 
+    def _outliers(self, name: str, size: int) -> tuple[NDArray[np.uint32], Floats]:
+        """Places and values of those that are stored exactly, none in most files."""
+        places = self._tensors.get(f"{name}.outliers", np.zeros(0, np.uint32))
+        places = self.tensor(f"{name}.outliers", (places.size,), "u4") if places.size else places
+        values = self.tensor(f"{name}.exact", places.shape, "f4") if places.size else np.zeros(0, np.float32)
+        if places.size and (places[-1] >= size or (places[1:] <= places[:-1]).any()):
+            raise InputError(
+                f"{self._where}: tensor '{name}.outliers' does not count places from 0 to {size - 1} in ascending "
+                "order; the file is damaged"
+            )
+        return places, values
+
     def columns(self, name: str, rows: int, columns: int, starts: Sequence[int] = (0,)) -> Floats:
         """Return a dequantized tensor (rows, columns)."""
-        whole = self.tensor(name, (columns, rows), "u1", "u2")
+        whole = self.tensor(name, (columns, rows), "u1", "u2", "f4")
         ranges = self.tensor(f"{name}.range", (len(starts), columns, 2), "f4")
-        with np.errstate(over="ignore"):
-            values = dequantize(whole, ranges, starts)
+        with np.errstate(over="ignore", invalid="ignore"):
+            values = dequantize(Quantized(whole, ranges, *self._outliers(name, whole.size)), starts)
         if not np.isfinite(values).all():
             raise InputError(f"{self._where}: tensor {name!r} has a range beyond float32; the file is damaged")
         return values

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.checkpoint import read_checkpoint
 from lapgs_wgpu.io.dataclass_table import build_dataclass
-from lapgs_wgpu.io.lapgs_file import is_lapgs, pack_lapgs, read_lapgs
+from lapgs_wgpu.io.initial_view import InitialView
+from lapgs_wgpu.io.lapgs_file import is_lapgs, pack_lapgs, read_lapgs, unpack_lapgs
 from lapgs_wgpu.io.safe_json_toml import parse_json
 from lapgs_wgpu.motion.compact_scene import compress, expand
 from lapgs_wgpu.motion.fields.config import FieldConfig
@@ -56,10 +57,7 @@ class SceneFile:
 def read_scene(path: str | os.PathLike[str]) -> SceneFile:
     """Read a checkpoint, a compact scene, or any 3DGS .ply file as a static scene. Raises InputError."""
     if is_lapgs(path):
-        tensors, metadata = read_lapgs(path)
-        config, degree, antialiased, timing = _read_header(metadata, path)
-        arrays = expand(tensors, config, degree, str(path))
-        return SceneFile(path, config, degree, *arrays, _texts(metadata), antialiased, timing)
+        return _expanded(*read_lapgs(path), path)
     still, tensors, metadata = read_checkpoint(path)
     if not tensors:
         sh = np.zeros((len(still.means), 16, 3), np.float32)
@@ -87,10 +85,23 @@ def read_scene(path: str | os.PathLike[str]) -> SceneFile:
     return SceneFile(path, config, degree, gaussians, field, _texts(metadata), antialiased, timing)
 
 
-def compact_bytes(file: SceneFile, static_features: NDArray[np.float32] | None) -> bytes:
+def read_compact(data: bytes, path: str | os.PathLike[str]) -> SceneFile:
+    """As `read_scene`, of the bytes of a compact scene. path: where they are from."""
+    return _expanded(*unpack_lapgs(data, str(path)), path)
+
+
+def _expanded(
+    tensors: Mapping[str, NDArray[Any]], metadata: Mapping[str, str], path: str | os.PathLike[str]
+) -> SceneFile:
+    config, degree, antialiased, timing = _read_header(metadata, path)
+    arrays = expand(tensors, config, degree, str(path))
+    return SceneFile(path, config, degree, *arrays, _texts(metadata), antialiased, timing)
+
+
+def compact_bytes(file: SceneFile, static_features: NDArray[np.float32] | None, *, finer: float = 1.0) -> bytes:
     """The bytes of a compact scene (docs/format.md). Raises InputError where only torch evaluates the field.
 
-    static_features: (N, F) of the Gaussians of a checkpoint that moves, else None.
+    static_features: (N, F) of the Gaussians of a checkpoint that moves, else None. finer: see `compress`.
     """
     config = file.field_config
     if config.kind != "static" and not config.decodes_on_device:
@@ -100,8 +111,10 @@ def compact_bytes(file: SceneFile, static_features: NDArray[np.float32] | None) 
         )
     gaussians = file.gaussians | ({} if static_features is None else {"static_features": static_features})
     header = scene_header(config, file.sh_degree, file.antialiased, file.timing)
+    look = InitialView.from_json(file.metadata.get("view", ""))
     try:
-        return pack_lapgs(compress(gaussians, file.field, config, file.sh_degree), file.metadata | header)
+        tensors = compress(gaussians, file.field, config, file.sh_degree, look, finer=finer)
+        return pack_lapgs(tensors, file.metadata | header)
     except InputError as error:
         raise InputError(f"{file.path}: no compact scene can be made of it, because {error}") from error
 

@@ -1,4 +1,4 @@
-"""A moving scene and its checkpoint."""
+"""A moving scene and its checkpoint; a still one with outliers."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -16,6 +17,7 @@ from lapgs_wgpu.io.checkpoint import read_checkpoint, write_checkpoint
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.fields.hash_grid_config import HashConfig
 from lapgs_wgpu.motion.scene import Scene4D
+from lapgs_wgpu.motion.scene_file import SceneFile
 
 CONFIG = FieldConfig(
     bound=1.5,
@@ -47,6 +49,37 @@ def moving_scene(device: Device, config: FieldConfig = CONFIG, sh_degree: int = 
             for parameter in scene.field.parameters():
                 parameter.copy_(0.3 * normal(*parameter.shape))
     return scene
+
+
+def scene_of_outliers(count: int, *, outliers: bool = True) -> SceneFile:
+    """A still cloud of `count` Gaussians, the first four overexposed, and six beside it, far away and huge: of these
+    two, else the first two of all, are too faint to be seen."""
+    rng = np.random.default_rng(0)
+    n = count + 6
+    gaussians = {
+        "means": rng.uniform(-1, 1, (n, 3)),
+        "log_scales": rng.uniform(-4.5, -3, (n, 3)),
+        "quats": rng.normal(size=(n, 4)),
+        "opacity_logits": rng.normal(size=n).clip(-3, 3),
+        "sh_dc": rng.uniform(-1.5, 1.5, (n, 1, 3)),
+        "sh_rest": np.zeros((n, 15, 3)),
+    }
+    if outliers:
+        gaussians["means"][count:] = [
+            [3e3, 2e2, 10],
+            [-1e6, 5, 0],
+            [0, -6e3, 0],
+            [0, 9, 5e3],
+            [7e3, 0, 0],
+            [0, 0, -8e3],
+        ]
+        gaussians["log_scales"][count:] = 6
+        gaussians["opacity_logits"][count:] = [80, 80, -80, 80, -80, 5]
+        gaussians["sh_dc"][:4] *= 50
+    else:
+        gaussians["opacity_logits"][[0, 1]] = -80
+    arrays = {name: values.astype(np.float32) for name, values in gaussians.items()}
+    return SceneFile("outliers.ply", FieldConfig(kind="static"), 0, arrays, {}, {})
 
 
 def rewrite(path: Path, change: Callable[[dict[str, Any], dict[str, str]], object]) -> None:

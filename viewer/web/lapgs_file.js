@@ -3,11 +3,11 @@ import { Refusal, quoted } from "./refusal.js";
 
 const MAGIC = "lapgs4d\n";
 const HEADER = 20; // magic, version, bytes once unpacked
-const VERSION = 1;
+const VERSION = 2;
 const MOST_BYTES = 2 ** 30; // once unpacked
 const MOST_RATIO = 64; // of unpacked bytes to packed ones
 const MOST_TABLE = 2 ** 20; // of the safetensors file's table
-const ARRAYS = { F32: Float32Array, F16: Uint16Array, U16: Uint16Array, U8: Uint8Array };
+const ARRAYS = { F32: Float32Array, F16: Uint16Array, U32: Uint32Array, U16: Uint16Array, U8: Uint8Array };
 
 const damaged = reason => new Refusal(`The scene cannot be read: ${reason}; the file is damaged, or not a scene.lapgs.`);
 
@@ -47,8 +47,8 @@ function unpackedSize(head, length) {
         throw damaged(`its ${length} bytes do not begin as a scene does`);
     }
     const version = view.getUint32(8, true);
-    if (version !== VERSION) {
-        throw new Refusal(`The scene has version ${version} of its format, and this page reads version ${VERSION}: `
+    if (version < 1 || version > VERSION) {
+        throw new Refusal(`The scene has version ${version} of its format, and this page reads versions 1 to ${VERSION}: `
             + "export the page again with a newer lapgs-view.");
     }
     const size = Number(view.getBigUint64(12, true));

@@ -140,9 +140,9 @@ function find(tensors, name, shape, types) {
     return tensor;
 }
 
-// Values row by row; starts: first rows of the parts that have ranges of their own.
+// Values row by row; starts: first rows of the parts that have ranges of their own. Outliers are counted column by column.
 function dequantize(tensors, name, rows, columns, starts) {
-    const { data } = find(tensors, name, [columns, rows], ["U8", "U16"]);
+    const { data } = find(tensors, name, [columns, rows], ["U8", "U16", "F32"]);
     const ranges = find(tensors, `${name}.range`, [starts.length, columns, 2], ["F32"]).data;
     const values = new Float32Array(rows * columns);
     for (let part = 0; part < starts.length; part++) {
@@ -154,6 +154,16 @@ function dequantize(tensors, name, rows, columns, starts) {
                 values[row * columns + column] = low + step * data[column * rows + row];
             }
         }
+    }
+    const places = tensors.get(`${name}.outliers`);
+    if (places) {
+        const count = places.data.length;
+        const { data: at } = find(tensors, `${name}.outliers`, [count], ["U32"]);
+        const { data: exact } = find(tensors, `${name}.exact`, [count], ["F32"]);
+        if (!at.every((place, i) => place < rows * columns && (i === 0 || place > at[i - 1]))) {
+            throw damaged(`its tensor ${quoted(`${name}.outliers`)} does not count places in ascending order`);
+        }
+        at.forEach((place, i) => (values[place % rows * columns + Math.floor(place / rows)] = exact[i]));
     }
     if (!values.every(Number.isFinite)) throw damaged(`its tensor ${quoted(name)} has a range beyond float32`);
     return values;
