@@ -54,7 +54,7 @@ def turned(camera: Camera) -> Camera:
 
 
 def views(taken: list[Camera], cloud: Cloud = CLOUD) -> list[str]:
-    return check_views(cloud, taken, [f"{i}.png" for i in range(len(taken))], WHERE, "turn them")
+    return check_views(cloud, taken, [f"{i}.png" for i in range(len(taken))], WHERE)
 
 
 def test_nothing_is_wrong_with_a_good_capture(device: Device, tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from lapgs_wgpu.data.cloud import Cloud, points_in_view
 from lapgs_wgpu.data.focus import are_parallel, focus_of
 from lapgs_wgpu.data.frames import Capture, Frame
 from lapgs_wgpu.data.normalize import BOX, Cube, Normalization, cube_in_view, cube_of_points
+from lapgs_wgpu.data.poses import AXES_HINT
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
 
@@ -77,7 +78,7 @@ def _depths(
     if 2 * behind > len(cameras):
         raise InputError(
             f"{capture.source}: there is no cloud, and {behind} of {len(cameras)} cameras look away from the point "
-            f"nearest to all optical axes: {capture.axes_hint}, or give a cloud."
+            f"nearest to all optical axes: {AXES_HINT}, or give a cloud."
         )
     near, far = NEAREST * float(depth[depth > 0].min()), FURTHEST * float(depth.max())
     if not are_parallel(cameras):

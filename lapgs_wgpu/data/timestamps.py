@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.data.json_fields import finite, read_json
+from lapgs_wgpu.data.json_fields import number, read_json
 from lapgs_wgpu.errors import InputError
 
 TIMES = "times.json"
@@ -78,7 +78,7 @@ def _listed(names: Sequence[ImageName], path: Path) -> list[float]:
             f"{path} has {len(times)} times{example}, but none for {len(missing)} of {len(names)} images, such "
             f"as {missing[0]}; name each image by its path below images/."
         )
-    return [finite(times[file], f"the time of {file}", path) for file in listed]
+    return [number(times[file], f"the time of {file}", path) for file in listed]
 
 
 def frame_numbers(names: Sequence[ImageName]) -> list[int]:

@@ -19,6 +19,7 @@ from lapgs_wgpu.data.frames import Frame
 from lapgs_wgpu.data.images import check_image, gray_thumbnail, size_text
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.masks import check_measured
+from lapgs_wgpu.data.poses import AXES_HINT
 from lapgs_wgpu.data.thumbnails import BLURRED, EQUAL, THUMBNAIL, blurred, repeats, sharpness, sharpness_around
 from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.errors import InputError
@@ -185,11 +186,11 @@ def check_in_view(dataset: Dataset, points: NDArray[np.floating]) -> list[str]:
     ]
 
 
-def check_views(cloud: Cloud, cameras: Sequence[Camera], names: Sequence[str], where: Path, axes: str) -> list[str]:
+def check_views(cloud: Cloud, cameras: Sequence[Camera], names: Sequence[str], where: Path) -> list[str]:
     """Warn about cameras that see no point of the cloud or hardly move, and about a sparse cloud.
 
     cameras, names: of each image, in the coordinates of the cloud; a camera counts once, by its first image's name.
-    axes: advice for cameras that look the wrong way. Raises InputError if more than half of the cameras see no point.
+    Raises InputError if more than half of the cameras see no point.
     """
     first_name = dict(zip(reversed(cameras), reversed(names), strict=True))
     cameras = list(dict.fromkeys(cameras))
@@ -200,7 +201,7 @@ def check_views(cloud: Cloud, cameras: Sequence[Camera], names: Sequence[str], w
     if 2 * len(blind) > len(cameras):
         back = [Camera(c.K, np.diag([1.0, -1, -1, 1]) @ c.T_cam_world, c.width, c.height) for c in cameras]
         turned = float(np.mean([views_of(points, [camera]).any() for camera in back]))
-        hint = f"; turned round, {100 * turned:.0f} % of them would see some: {axes}" if turned > 0.5 else ""
+        hint = f"; turned round, {100 * turned:.0f} % of them would see some: {AXES_HINT}" if turned > 0.5 else ""
         raise InputError(
             f"{where}: cameras look away from the cloud: {len(blind)} of {len(cameras)} see none of its {len(points)} "
             f"points{hint or '; cloud and cameras have different coordinates or scales'}."

@@ -86,7 +86,7 @@ class PlyFile(NamedTuple):
             rows = np.fromfile(self.file, layout, min(size, element.count - start))
             if start + len(rows) < min(start + size, element.count):
                 raise InputError(
-                    f"{self.path}: became shorter while it was read, at row {start + len(rows)} of {element.count}"
+                    f"{self.path}: became shorter while it was read, at row {start + len(rows)} of {element.count}."
                 )
             yield rows
 
@@ -96,7 +96,7 @@ class PlyFile(NamedTuple):
         if len(lines) < element.count:
             raise InputError(
                 f"{self.path}: declares {element.count} rows of {element.name}, but {len(lines)} lines follow; it is "
-                "truncated"
+                "truncated."
             )
         for number, line in enumerate(lines):
             try:
@@ -104,7 +104,7 @@ class PlyFile(NamedTuple):
             except ValueError:
                 raise InputError(
                     f"{self.path}: row {number} of {element.name}, {line[:80]!r}, does not hold "
-                    f"{len(element.properties)} numbers; the file is damaged"
+                    f"{len(element.properties)} numbers; the file is damaged."
                 ) from None
 
 
@@ -114,27 +114,27 @@ def open_ply(path: PathLike) -> Iterator[PlyFile]:
     try:
         mode = os.stat(path).st_mode  # before opening: a pipe would block, a device could be endless
         if stat.S_ISDIR(mode):
-            raise InputError(f"{path}: is a folder; give a .ply file, for example the checkpoint.ply in it")
+            raise InputError(f"{path}: is a folder; give a .ply file, for example the checkpoint.ply in it.")
         if not stat.S_ISREG(mode):
-            raise InputError(f"{path}: is not a regular file; give a .ply file")
+            raise InputError(f"{path}: is not a regular file; give a .ply file.")
         with open(path, "rb") as file:
             yield _read_header(file, path)
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the path.") from error
 
 
 def _read_header(file: BinaryIO, path: PathLike) -> PlyFile:
     head = file.read(MAX_HEADER_BYTES)
     if head[:64].lstrip().lower().startswith(b"<!doctype html"):
-        raise InputError(f"{path}: is a web page, and this is not a browser; give the checkpoint that it was made of")
+        raise InputError(f"{path}: is a web page, and this is not a browser; give the checkpoint that it was made of.")
     if re.match(rb"ply\r?\n", head) is None:
         what = f"begins with {head[:8]!r}" if head else "is empty (0 bytes)"
-        raise InputError(f"{path}: {what}, where a PLY file begins with the line 'ply'; give a 3DGS .ply file")
+        raise InputError(f"{path}: {what}, where a PLY file begins with the line 'ply'; give a 3DGS .ply file.")
     end = re.search(rb"^end_header\r?\n", head, re.MULTILINE)
     if end is None:
         raise InputError(
             f"{path}: has no line 'end_header' in its first {len(head)} bytes (at most {MAX_HEADER_BYTES} are read): "
-            "it is truncated or not a .ply file"
+            "it is truncated or not a .ply file."
         )
     lines = head[: end.start()].decode(errors="replace").split("\n")[1:-1]  # comments may be in any encoding
     encoding, elements = _parse_lines(lines, path)
@@ -155,26 +155,26 @@ def _parse_lines(lines: list[str], path: PathLike) -> tuple[str, dict[str, Eleme
                     last.comments.append(" ".join(words))
             case ["format", encoding, _]:
                 if encoding not in _BYTE_ORDERS:
-                    raise InputError(f"{where} has none of the encodings {', '.join(_BYTE_ORDERS)}")
+                    raise InputError(f"{where} has none of the encodings {', '.join(_BYTE_ORDERS)}.")
             case ["element", name, count]:
                 if name in elements:
-                    raise InputError(f"{where} declares an element a second time; the file is damaged")
+                    raise InputError(f"{where} declares an element a second time; the file is damaged.")
                 if not re.fullmatch("[0-9]{1,18}", count):
-                    raise InputError(f"{where} does not declare a count from 0 to 10^18 - 1; the file is damaged")
+                    raise InputError(f"{where} does not declare a count from 0 to 10^18 - 1; the file is damaged.")
                 last = elements[name] = Element(name, int(count))
             case ["property", "list", *_] if last is not None:
                 last.has_lists = True
             case ["property", kind, name]:
                 if last is None or kind not in _SCALARS:
                     what = "stands before any element" if last is None else f"has an unknown type {kind[:40]!r}"
-                    raise InputError(f"{where} {what}; the file is damaged")
+                    raise InputError(f"{where} {what}; the file is damaged.")
                 if name in last.properties:
-                    raise InputError(f"{where} declares a property a second time; the file is damaged")
+                    raise InputError(f"{where} declares a property a second time; the file is damaged.")
                 last.properties[name] = np.dtype(_BYTE_ORDERS.get(encoding, "<") + _SCALARS[kind])
             case _:
-                raise InputError(f"{where} is not a line of a PLY header; the file is damaged")
+                raise InputError(f"{where} is not a line of a PLY header; the file is damaged.")
     if not encoding:
-        raise InputError(f"{path}: its header has no line 'format binary_little_endian 1.0'; the file is damaged")
+        raise InputError(f"{path}: its header has no line 'format binary_little_endian 1.0'; the file is damaged.")
     return encoding, elements
 
 
@@ -195,11 +195,11 @@ def _place(elements: dict[str, Element], encoding: str, start: int, size: int, p
         if end > size + text:  # the last line needs no end
             raise InputError(
                 f"{path}: element {element.name[:40]!r} ({element.count} rows of {stride} bytes) would end at byte "
-                f"{end}, but the file has {size} bytes: it is truncated or its header is wrong"
+                f"{end}, but the file has {size} bytes: it is truncated or its header is wrong."
             )
     if end < size and not text:
         raise InputError(
             f"{path}: its header declares {end} bytes, but the file has {size}: a count is wrong or something was "
-            "appended"
+            "appended."
         )
     return placed

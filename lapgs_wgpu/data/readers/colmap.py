@@ -32,7 +32,6 @@ from lapgs_wgpu.io.listing import is_desktop_file
 from lapgs_wgpu.splat.camera import rotation_matrix
 
 IMAGES, SPARSE = "images", "sparse"
-AXES = "the model is damaged, since COLMAP keeps only points in front of its cameras"
 
 
 def _matches(folder: Path) -> bool:
@@ -70,7 +69,6 @@ def _read(folder: Path, image_size: int | None) -> Capture:
         warnings=warnings,
         shares_cameras=True,
         own_footage=True,
-        axes_hint=AXES,
     )
 
 
