@@ -143,16 +143,15 @@ def _gaps(dataset: Dataset, source: str) -> list[str]:
     edges = np.concatenate([[0.0], times, [1.0]])
     gaps = np.diff(edges)
     usual = float(np.median(np.diff(times)))
-    found = np.flatnonzero((gaps > GAP) & (gaps > GAP_FACTOR * usual))
-    if not len(found):
+    wide = np.flatnonzero((gaps > GAP) & (gaps > GAP_FACTOR * usual))
+    if not len(wide):
         return []
-    longest = found[np.argmax(gaps[found])]
+    longest = wide[np.argmax(gaps[wide])]
     low, high = edges[longest], edges[longest + 1]
     tested = sum(low < view.time < high for view in dataset.test)
-    others = f" ({len(found) - 1} more such gaps)" if len(found) > 1 else ""
     return [
         f"{source}: no training image has a time between {low:.4g} and {high:.4g}, though the usual step is "
-        f"{usual:.2g}{others}; the motion there, in {tested} test images too, is unconstrained: add images, or cut "
+        f"{usual:.2g}; the motion there, in {tested} test images too, is unconstrained: add images, or cut "
         "the clip there."
     ]
 
@@ -178,9 +177,8 @@ def check_in_view(dataset: Dataset, points: NDArray[np.floating]) -> list[str]:
         return []
     longest = max(spans, key=len)
     names = [view.name for view in dataset.train if longest[0] <= view.time <= longest[-1]]
-    others = f" ({len(spans) - 1} more such spans)" if len(spans) > 1 else ""
     return [
-        f"{dataset.name}: all cameras look away from time {longest[0]:.4g} to {longest[-1]:.4g}{others}: "
+        f"{dataset.name}: all cameras look away from time {longest[0]:.4g} to {longest[-1]:.4g}: "
         f"{_named(names)} show nothing of the scene, so its motion there is a guess; check these poses, or remove "
         "these images."
     ]
@@ -236,13 +234,13 @@ def check_film(images: Sequence[Path]) -> list[str]:
         thumbnails = list(pool.map(lambda path: gray_thumbnail(path, THUMBNAIL), images))
     values = np.array([sharpness(thumbnail) for thumbnail in thumbnails])
     warnings = []
-    found: list[int] = np.flatnonzero(blurred(values)).tolist()
-    if found:
+    blurry: list[int] = np.flatnonzero(blurred(values)).tolist()
+    if blurry:
         around = sharpness_around(values)
-        shares = {i: float(values[i] / around[i]) for i in found}
-        worst = min(found, key=shares.__getitem__)
+        shares = {i: float(values[i] / around[i]) for i in blurry}
+        worst = min(blurry, key=shares.__getitem__)
         warnings.append(
-            f"blurred images: {_named([images[i].name for i in found])} ({len(found)} of {len(images)}) have less "
+            f"blurred images: {_named([images[i].name for i in blurry])} ({len(blurry)} of {len(images)}) have less "
             f"than {BLURRED:g} of their neighbours' sharpness, {images[worst].name} {shares[worst]:.2g}; leave them "
             "out."
         )
