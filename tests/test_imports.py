@@ -31,7 +31,7 @@ ALLOWED = {
         "io.listing",
         "io.safe_json_toml",
         "io.dataclass_table",
-        "io.ply_points",
+        "io.ply_elements",
     },
     "io": {"errors", "splat.camera"},
     "train": {"errors", "progress", "stop_signals", "gpu", "splat", "motion", "data", "io"},
