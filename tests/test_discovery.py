@@ -11,12 +11,10 @@ import pytest
 import torch
 from motion_scenes import MotionScene
 from motion_writer import write_motion
-from torch import nn
 
 from lapgs_wgpu.data import Dataset, View, load_dataset
 from lapgs_wgpu.data.synthetic import camera_at, cameras
 from lapgs_wgpu.data.views import small_views
-from lapgs_wgpu.discovery import discover as discover_module
 from lapgs_wgpu.discovery import static_fit as static_fit_module
 from lapgs_wgpu.discovery.acceptance import explained_share, rows_with, tracks_in_images
 from lapgs_wgpu.discovery.discover import RAMP_STEPS, discover
@@ -30,7 +28,6 @@ from lapgs_wgpu.discovery.trajectories import find_trajectories
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.config import FieldConfig
-from lapgs_wgpu.motion.fields.deformation import Deformation
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.run import train
 from lapgs_wgpu.splat.camera import Camera
@@ -246,36 +243,6 @@ def test_two_balls_are_followed_over_the_whole_clip() -> None:
         assert (errors(tracks, center) < 0.8).mean() > 0.95
 
 
-@pytest.mark.nightly
-def test_a_track_is_not_drawn_to_the_side_that_is_seen() -> None:
-    """Each time shows one side, whose points are half a radius from the center on average."""
-    center = path(np.linspace(0, 1, 80))
-    tracks = find_tracks(balls(center), BOX)
-    assert tracks is not None
-    middle = tracks.paths.mean(axis=1) - center
-    wander = np.linalg.norm(middle - np.median(middle, axis=0), axis=1)
-    assert np.median(wander) < 0.2 * RADIUS
-
-
-@pytest.mark.nightly
-def test_a_ball_that_is_hidden_for_a_while_is_found_again() -> None:
-    center = path(np.linspace(0, 1, 80))
-    tracks = find_tracks(balls(center, gone=range(50, 54)), BOX)
-    assert tracks is not None
-    assert (errors(tracks, center) < 1.0).mean() > 0.9
-    assert not tracks.supported[51].any()
-
-
-@pytest.mark.nightly
-def test_a_ball_that_enters_late_has_a_key_time_of_its_own() -> None:
-    first, late = path(np.linspace(0, 1, 60)), np.tile([0.0, 0.0, -0.9], (60, 1))
-    early, both = balls(first), balls(first, late)
-    clouds = PointClouds(both.times, early.clouds[:40] + both.clouds[40:])
-    tracks = find_tracks(clouds, BOX)
-    assert tracks is not None
-    assert (errors(tracks, late)[42:] < 0.8).all()
-
-
 def test_patches_that_come_and_go_are_not_followed() -> None:
     """Six places, of which one at a time shows a ball: what a static fit only blurs looks like that."""
     rng = np.random.default_rng(3)
@@ -420,42 +387,6 @@ def test_every_field_learns_tracks(device: Device, kind: str) -> None:
     assert error < {"laplacian": 0.35, "grid4d": 0.35, "hexplane": 0.65, "mlp": 0.65}[kind] * at_rest
 
 
-def test_a_long_clip_of_several_cameras_is_still_one(
-    dataset: Dataset, device: Device, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Of its images discovery looks at some, no two of one time perhaps; the capture says how many cameras see each."""
-    told: list[bool] = []
-    monkeypatch.setattr(discover_module, "find_tracks", lambda clouds, half_side: object())
-    monkeypatch.setattr(discover_module, "tracks_in_images", lambda *_, together: told.append(together))
-    again = tuple(dataclasses.replace(view, name=f"{view.name} again") for view in dataset.train)
-    monkeypatch.setattr(static_fit_module, "MOST_VIEWS", len(dataset.train))
-    for views in (dataset.train, dataset.train + again):
-        config = configure(discovery__steps="4", discovery__field_steps="2")
-        discover(config, dataclasses.replace(dataset, train=views), device)
-    assert told == [False, True]
-
-
-class Fading(nn.Module):
-    """Changes colors alone."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.rate = nn.Parameter(torch.zeros(3))
-
-    def forward(self, means: torch.Tensor, t: float) -> Deformation:
-        return Deformation(d_dc=(t * self.rate).expand(len(means), -1))
-
-
-@pytest.mark.nightly
-def test_a_field_that_moves_nothing_starts_from_the_static_fit(dataset: Dataset, device: Device) -> None:
-    config = configure()
-    config = dataclasses.replace(config, field=dataclasses.replace(config.field, kind="own"))
-    found = discover(config, dataset, device, Fading())
-    assert "the field moves nothing: nothing is added" in found.summary
-    assert f"a static fit of {len(found.scene)} Gaussians" in found.summary
-    assert not found.field_fitted
-
-
 @pytest.fixture(scope="module")
 def started(dataset: Dataset, device: Device) -> tuple[str, dict[str, np.ndarray]]:
     """What discovery found, and the state of the training that starts from it."""
@@ -530,17 +461,6 @@ def test_a_field_that_knows_the_tracks_learns_slowly_also_when_resumed(
         assert resumed._optimizer.highest == {}
         resumed.restore(started[1])
         assert resumed._optimizer.highest == max_field_rates(["hash", "mlp"])
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize("nearly_all", [0.0, 1.01])
-def test_a_field_that_knows_nearly_all_that_moves_keeps_it(
-    dataset: Dataset, device: Device, monkeypatch: pytest.MonkeyPatch, nearly_all: float
-) -> None:
-    monkeypatch.setattr("lapgs_wgpu.discovery.discover.NEARLY_ALL", nearly_all)
-    found = discover(configure(discovery__field_steps="20"), dataset, device)
-    assert "moving parts" in found.summary
-    assert found.field_fitted == (nearly_all == 0)
 
 
 @pytest.mark.nightly

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -100,31 +99,6 @@ def test_all_start_as_the_first_one_does(dataset: Dataset, device: Device, monke
     assert training.done == 3
     assert found.keys() == first.keys()
     assert all(np.array_equal(found[name], first[name]) for name in first)
-
-
-GROUP_OF_ONE = """
-import atexit, os, pathlib, torch
-atexit.register(lambda: print([task.read_text() for task in pathlib.Path("/proc/self/task").glob("*/comm")]))
-from lapgs_wgpu.train.distributed import join_ranks
-ranks = join_ranks()
-ranks.barrier()
-weight = torch.ones(3, requires_grad=True)
-torch.optim.Adam([weight])
-"""
-
-
-@pytest.mark.nightly
-@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="lists threads by Linux's /proc")
-def test_threads_of_the_group_end_before_python_does() -> None:
-    """Else they abort the process, once in some tens of runs."""
-    place = {"TORCHELASTIC_RUN_ID": "one", "RANK": "0", "LOCAL_RANK": "0", "WORLD_SIZE": "1"}
-    where = {"MASTER_ADDR": "localhost", "MASTER_PORT": "0"}
-    done = subprocess.run(
-        [sys.executable, "-c", GROUP_OF_ONE], capture_output=True, text=True, env={**os.environ, **place, **where}
-    )
-    assert done.returncode == 0, done.stderr
-    assert "python" in done.stdout
-    assert "gloo" not in done.stdout
 
 
 def torchrun(config: Path, out: Path) -> str:

@@ -86,16 +86,6 @@ def test_invisible_gaussians_disturb_nobody(device: Device, antialiased: bool) -
     check_rest(bad, rows, good, device, antialiased=antialiased)
 
 
-@pytest.mark.parametrize("sh_degree", [None, 1])
-def test_bad_colors_of_invisible_gaussians_do_no_harm(device: Device, sh_degree: int | None) -> None:
-    good = in_front(40, 2, sh=sh_degree and 4)
-    rows = torch.arange(40) % 7 == 3
-    for value in (NAN, INF):
-        bad = {name: tensor.clone() for name, tensor in good.items()}
-        bad["opacities"][rows], bad["colors"][rows] = 0.0, value
-        check_rest(bad, rows, {name: tensor[~rows] for name, tensor in good.items()}, device, sh_degree=sh_degree)
-
-
 def test_only_invisible_gaussians(device: Device) -> None:
     scene = in_front(30, 3)
     scene["means"][:, 2] *= -1
@@ -250,19 +240,6 @@ def test_poisoned_buffers_do_not_change_a_bit(
         )  # so that the buffers are there, with room behind what is needed
         assert poison(rasterizer, PATTERNS[pattern]) > 20
         assert drawn(scene, device, sh_degree=sh_degree).bits == expected.bits
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize("pattern", ["all bits", "NaN"])
-def test_buffers_poisoned_between_the_bands(device: Device, use: Use, pattern: str) -> None:
-    scene = in_front(300, 8)
-    drawn(scene, device)
-    rasterizer = use(Rasterizer(device, capacity=256))
-    rasterizer.max_capacity = 640
-    expected = drawn(scene, device)
-    assert rasterizer.plan.bands > 1
-    poison(rasterizer, PATTERNS[pattern])
-    assert drawn(scene, device).bits == expected.bits
 
 
 def test_a_picture_without_gradients_leaves_none(device: Device) -> None:

@@ -84,17 +84,6 @@ def test_options_of_the_server_need_it(capsys: pytest.CaptureFixture[str]) -> No
         assert capsys.readouterr().err.count("\n") == 1
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere there is always a display")
-def test_without_a_display_it_says_what_works(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    pytest.importorskip("glfw")
-    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
-        monkeypatch.delenv(name, raising=False)
-    assert cli.view_command(["scene.ply"]) == 2
-    assert "--backend http" in capsys.readouterr().err
-
-
 def test_a_missing_library_of_the_system_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

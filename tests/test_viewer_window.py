@@ -24,7 +24,6 @@ from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.motion.scene import Scene4D, load
-from lapgs_wgpu.train.evaluate import to_8_bit
 from lapgs_wgpu.train.presets import load_config, write_toml
 
 SIZE = 320
@@ -130,25 +129,6 @@ def test_modes_help_key_frames_and_play(desktop: Desktop, run: Path) -> None:
         pictures.append(scene_part(desktop.picture()))
         time.sleep(0.3)
     assert sum(not np.array_equal(a, b) for a, b in itertools.pairwise(pictures)) >= 3, "it does not play"
-
-
-@pytest.mark.nightly
-def test_the_picture_is_the_evaluators(desktop: Desktop, run: Path, device: Device) -> None:
-    """At a camera and time of the capture, to 1/255 in every pixel; and beside it the capture's own picture."""
-    view(desktop, run / "checkpoint.ply", f"{SIZE}x{SIZE}")
-    desktop.wait_for(lambda s: s[:SIZE, :SIZE].max() > 60, "the scene")
-    desktop.events("mousemove", 160, 160, "click", 1, "key", "h", "n", "n")  # the keys
-    shot = load_dataset(run / "data").test[1]
-    expected = to_8_bit(load(run / "checkpoint.ply", device).render(shot.camera, shot.time).image).astype(np.int32)
-    screen = desktop.wait_for(lambda s: np.abs(s[:SIZE, :SIZE] - expected).mean() < 1, "the second test view")
-    # The pointer, which the server draws into its frame buffer, hides a few pixels.
-    away = np.ones((SIZE, SIZE), bool)
-    away[145:185, 145:185] = False
-    assert np.abs(screen[:SIZE, :SIZE] - expected)[away].max() <= 1
-    desktop.events("key", "c", "c")
-    truth = shot.load()[..., :3].astype(np.int32) * (shot.load()[..., 3:] / 255)
-    left = (slice(0, SIZE), slice(0, SIZE // 2 - 20))
-    desktop.wait_for(lambda s: np.abs(s[:SIZE, :SIZE][left] - truth[left]).max() <= 2, "the ground truth at the left")
 
 
 @pytest.mark.nightly
