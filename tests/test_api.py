@@ -160,30 +160,6 @@ def test_a_step_that_breaks_off_did_not_begin(
         assert equal(trainer.state(), before)
 
 
-@pytest.mark.nightly
-def test_a_state_holds_in_how_many_bands_images_are_drawn(dataset: Dataset, device: Device) -> None:
-    """They say in which order gradients are added. No other training and no picture changes them."""
-
-    def go_on(trainer: Trainer, steps: int) -> None:
-        for _ in range(steps):
-            trainer.psnr(dataset.test)
-            trainer.step()
-
-    with Trainer(configure(), dataset, device) as trainer:
-        go_on(trainer, 2)
-        trainer._plans.set_bands(trainer._drawn, 3)  # as if the intersections did not fit
-        go_on(trainer, 2)
-        state = trainer.state()
-        assert state["training.bands"] == 3
-        go_on(trainer, 3)
-        end = trainer.state()
-    with Trainer(configure(), dataset, device) as trainer:
-        assert trainer.state()["training.bands"] == 1
-        trainer.restore(state)
-        go_on(trainer, 3)
-        assert equal(trainer.state(), end)
-
-
 def test_a_state_stays_as_it_is(dataset: Dataset, device: Device) -> None:
     """While the trainer that gave it, and one that took it, go on."""
     with Trainer(configure(), dataset, device) as one, Trainer(configure(), dataset, device) as two:

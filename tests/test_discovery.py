@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +11,9 @@ import torch
 from motion_scenes import MotionScene
 from motion_writer import write_motion
 
-from lapgs_wgpu.data import Dataset, View, load_dataset
-from lapgs_wgpu.data.synthetic import camera_at, cameras
+from lapgs_wgpu.data import Dataset, load_dataset
+from lapgs_wgpu.data.synthetic import cameras
 from lapgs_wgpu.data.views import small_views
-from lapgs_wgpu.discovery import static_fit as static_fit_module
 from lapgs_wgpu.discovery.acceptance import explained_share, rows_with, tracks_in_images
 from lapgs_wgpu.discovery.discover import RAMP_STEPS, discover
 from lapgs_wgpu.discovery.field_fit import fit_field
@@ -121,27 +119,6 @@ def test_surface_points_lie_on_the_ball_at_every_time(residuals: list[Residual])
     assert np.median(distances) < 1.2 * RADIUS
     assert (distances < 1.6 * RADIUS).mean() > 0.95
     assert np.allclose(np.concatenate([c.colors for c in clouds.clouds]), (0.9, 0.5, 0.2), atol=1e-5)
-
-
-@pytest.mark.nightly
-def test_a_camera_that_walks_slowly_sees_what_moves_in_the_middle_of_the_scene() -> None:
-    """Its images of neighbouring times agree on depths that the ball's own motion feigns."""
-    times = np.linspace(0, 1, 60)
-    walk = [camera_at(1.5 * t, 0.4, size=64, fov_x=0.69) for t in times]
-    black = np.zeros((64, 64, 3), np.float32)
-    views = zip(walk, times, path(times), strict=True)
-    images = [Residual(camera, float(t), disc(camera, center, (0.9, 0.5, 0.2)), black) for camera, t, center in views]
-    clouds = surface_points(images, BOX)
-    for camera, center, points in zip(walk, path(times), clouds.clouds, strict=True):
-        rays = points.positions - camera.position
-        depths = -rays @ camera.position / np.linalg.norm(camera.position) ** 2
-        assert np.abs(depths - 1.0).max() < 0.2  # the middle, where the ball is not: it moves by 0.2 around it
-        towards = center - camera.position
-        apart = np.linalg.norm(np.cross(rays, towards), axis=1) / np.linalg.norm(rays, axis=1)
-        assert apart.max() < 1.3 * RADIUS
-    tracks = find_tracks(clouds, BOX)
-    assert tracks is not None
-    assert tracks.supported.mean() > 0.95
 
 
 def test_what_is_residual_at_all_times_is_no_motion() -> None:
@@ -251,18 +228,6 @@ def test_patches_that_come_and_go_are_not_followed() -> None:
     assert find_tracks(balls(leaping), BOX) is None
 
 
-@pytest.mark.nightly
-def test_a_slow_ball_is_followed_though_its_points_jitter(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It jitters by more than it moves from time to time, as what leaps does, but always explains as many points."""
-    center = np.linspace([-0.5, 0, 0], [0.5, 0, 0], 120)
-    clouds = balls(center + 0.03 * np.random.default_rng(4).normal(size=center.shape))
-    tracks = find_tracks(clouds, BOX)
-    assert tracks is not None
-    assert errors(tracks, center).max() < 0.5
-    monkeypatch.setattr("lapgs_wgpu.discovery.tracks.EVEN", 0.0)
-    assert find_tracks(clouds, BOX) is None
-
-
 # The static fit and what it loses ------------------------------------------------------------------------------------
 
 
@@ -330,42 +295,6 @@ def test_the_static_fit_has_no_motion_and_small_images(dataset: Dataset) -> None
     assert (view.camera.width, view.camera.height) == (32, 32)
     assert view.load().shape == (32, 32, 4)
     assert small_views(dataset.train[:1], 48) == [dataset.train[0]]
-
-
-class FittedAlready:
-    """The training of a static fit that is done, and has learnt by how much each image is too bright."""
-
-    def __init__(self, scene: Scene4D, gains: dict[str, float] | None) -> None:
-        self.scene, self.gains, self.cameras = scene, gains, None
-
-    def exposure_of(self, view: View) -> torch.Tensor | None:
-        return None if self.gains is None else self.gains[view.name] * torch.eye(3, 4)
-
-    def __iter__(self) -> Iterator[None]:
-        return iter(())
-
-    def __enter__(self) -> FittedAlready:
-        return self
-
-    def __exit__(self, *error: object) -> None: ...
-
-
-def test_what_is_exposed_otherwise_does_not_move(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    static, camera, still = still_view(device, 48, 32)
-    gains = {"train_000": 1.3, "train_001": 0.7}
-
-    def exposed(name: str) -> View:
-        image = np.round(255 * (gains[name] * still).clip(0, 1)).astype(np.uint8)
-        return View(name, camera, 0.5, "made up", lambda: image)
-
-    data = Dataset("made up", tuple(exposed(name) for name in gains), ())
-    for known, moving in ((gains, False), (None, True)):
-        training = FittedAlready(static, known)
-        monkeypatch.setattr(static_fit_module, "Trainer", lambda *_, of=training: of)
-        found = static_fit(configure(), data, device, lambda step: None)
-        assert any(image.mask.any() for image in found.images) == moving
-        error = np.abs(found.images[0].still - found.images[0].image).mean()
-        assert (error < 1e-3) == (not moving)
 
 
 # The field, and all together -----------------------------------------------------------------------------------------

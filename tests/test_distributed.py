@@ -21,7 +21,6 @@ from lapgs_wgpu.motion.scene import load
 from lapgs_wgpu.run import train
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.distributed import Ranks
-from lapgs_wgpu.train.objective import Sample
 from lapgs_wgpu.train.presets import write_toml
 from lapgs_wgpu.train.trainer import Trainer
 
@@ -57,33 +56,6 @@ def test_a_batch_repeats_to_the_last_bit(dataset: Dataset, device: Device, tmp_p
 def test_processes_share_views_evenly_or_not_at_all(dataset: Dataset, device: Device) -> None:
     with pytest.raises(InputError, match=r"2 processes cannot share 3 views a step evenly; give --batch 2"):
         Trainer(configure(schedule__batch="3"), dataset, device, Ranks(0, 2))
-
-
-def test_every_process_draws_the_same_numbers_and_other_views(
-    dataset: Dataset, device: Device, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    looked: list[str] = []
-    original = Trainer._loss
-
-    def note(self: Trainer, sample: Sample) -> object:
-        looked.append(sample.view.name)
-        return original(self, sample)
-
-    monkeypatch.setattr(Trainer, "_loss", note)
-    monkeypatch.setattr(Ranks, "all_gather", lambda self, tensors: [[tensor] * self.count for tensor in tensors])
-    monkeypatch.setattr(Ranks, "any_rank", lambda self, here: here)
-    monkeypatch.setattr(Ranks, "of_first", lambda self, value: value)
-    states, views = [], []
-    for rank in range(2):
-        training = Trainer(configure(schedule__batch="2", schedule__warm_up="0"), dataset, device, Ranks(rank, 2))
-        looked.clear()
-        training.step()
-        states.append(training._generator.get_state())
-        views.append(list(looked))
-        training.close()
-    assert torch.equal(states[0], states[1])
-    assert len(views[0]) == len(views[1]) == 1
-    assert views[0] != views[1]
 
 
 def test_all_start_as_the_first_one_does(dataset: Dataset, device: Device, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -143,6 +143,7 @@ def test_frequencies_stay_below_nyquist_and_steps_are_bounded() -> None:
     assert m.frequencies.tolist() == pytest.approx([0.02, 1.0, 2.0, 3.0, 3.98])
 
 
+@pytest.mark.nightly
 def test_frequencies_find_a_motion() -> None:
     """Two tones of 1.3 and 2.6 cycles from a start at 1 and 3: the factor does not keep them from converging."""
     generator = torch.Generator().manual_seed(2)

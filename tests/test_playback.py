@@ -23,7 +23,6 @@ from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.playback.playback import DevicePlayback, Playback
 from lapgs_wgpu.motion.playback.torch_playback import TorchPlayback
 from lapgs_wgpu.motion.scene import Scene4D, load
-from lapgs_wgpu.motion.scene_file import read_scene
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterize import rasterizer_of
@@ -174,16 +173,6 @@ def test_a_foreign_ply_stands_still(device: Device, tmp_path: Path, degree: int)
     np.testing.assert_array_equal(found.means, still.means)
     np.testing.assert_array_equal(found.sh[:, : still.sh.shape[1]], still.sh)
     np.testing.assert_array_equal(found.opacity_logits, still.opacity_logits)
-
-
-@pytest.mark.kernels
-def test_blocks_make_no_difference(device: Device, tmp_path: Path) -> None:
-    _, path = saved(device, tmp_path, OURS)
-    whole, parts = (DevicePlayback(read_scene(path), device, block=block) for block in (None, 128))
-    for t in TIMES:
-        a, b = (read_all([p.at(t).sh, p.at(t).quats]) for p in (whole, parts))
-        for x, y in zip(a, b, strict=True):
-            np.testing.assert_array_equal(x, y)
 
 
 def contents(now: Gaussians[DeviceArray]) -> list[np.ndarray]:

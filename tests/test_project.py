@@ -120,6 +120,7 @@ def test_who_is_seen(
     assert visible or not drawn.image.any()
 
 
+@pytest.mark.nightly
 def test_no_comparison_is_needed_against_nan(monkeypatch: pytest.MonkeyPatch, device: Device) -> None:
     """As a compiler may turn them round, which assumes that there is no NaN."""
     text = shader.shader_text

@@ -229,13 +229,6 @@ def test_workgroups_that_are_cut_into_subgroups_are_noticed(device: Device, use:
             assert torch.equal(other.gradients[name], gradient)
 
 
-@pytest.mark.parametrize("lanes", [8, 16])
-def test_a_processors_rounds_follow_its_shape(lanes: int) -> None:
-    """Without subgroups a round has fewer splats, or the driver would end its loops early."""
-    for name in ("rasterize", "rasterize_bwd"):
-        assert cpu_config(lanes).without_subgroups(name) == replace(cpu_config(0), lanes=lanes)
-
-
 # The door for torch
 
 

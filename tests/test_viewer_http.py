@@ -132,24 +132,6 @@ def test_the_lossless_picture_comes_also_after_a_slow_network(sent: Any) -> None
     assert log[2:] == [(1, "image/png", 3)]
 
 
-def test_another_browser_takes_over(sent: Any) -> None:
-    """In its own size, without the keys that the former one held; and closing a page closes no canvas."""
-    canvas, _ = sent
-    left: list[str] = []
-    canvas._events.flush()
-    canvas.add_event_handler(lambda event: left.append(event["event_type"]), "pointer_leave")
-    canvas._on_event({"type": "_clients_change", "ids": (1, 2)}, 0)
-    for browser, width in ((1, 300), (2, 200)):
-        canvas._on_event({"type": "resize", "pwidth": width, "pheight": 100, "ratio": 1}, browser)
-    assert canvas.get_physical_size() == (300, 100)
-    canvas._on_event({"type": "close"}, 1)
-    assert not canvas.get_closed()
-    canvas._on_event({"type": "_clients_change", "ids": (2,)}, 0)
-    canvas._events.flush()
-    assert canvas.get_physical_size() == (200, 100)
-    assert left == ["pointer_leave"]
-
-
 # In a browser
 
 

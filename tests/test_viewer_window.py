@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import json
 import signal
 import sys
@@ -93,42 +92,6 @@ def test_scrub_and_turn(desktop: Desktop, run: Path) -> None:
     desktop.wait_for(lambda s: changed(s, first), "the scene from elsewhere")
     desktop.events("key", "r")
     desktop.wait_for(lambda s: not changed(s, first), "the first camera again")
-
-
-@pytest.mark.nightly
-def test_modes_help_key_frames_and_play(desktop: Desktop, run: Path) -> None:
-    view(desktop, run / "checkpoint.ply", "800x600")
-    desktop.wait_for(lambda s: scene_part(s).max() > 60 and s[535:590, 20:780].max() > 200, "scene and slider")
-    desktop.events("mousemove", 640, 300)
-    first = desktop.wait_for(lambda s: True, "the pointer elsewhere")
-
-    seen = [first]
-    for mode in ("depth", "alpha", "motion", "dynamics", "scale"):
-        desktop.events("key", "m")
-        seen.append(desktop.wait_for(lambda s: all(changed(s, other) for other in seen), f"the mode {mode}"))
-    desktop.events("key", "m")
-    desktop.wait_for(lambda s: not changed(s, first), "colors again")
-
-    desktop.events("key", "question")
-    desktop.wait_for(lambda s: changed(s, first), "the help")
-    desktop.events("key", "question")
-    desktop.wait_for(lambda s: not changed(s, first), "no help")
-
-    def panel(screen: Picture) -> Picture:
-        return screen[140:460, 10:236]
-
-    desktop.events("key", "k")
-    one = desktop.wait_for(lambda s: np.abs(panel(s) - panel(first)).mean() > 2, "a key-frame in the panel")
-    desktop.drag((400, 300), (470, 320))
-    desktop.events("key", "k")
-    desktop.wait_for(lambda s: np.abs(panel(s) - panel(one)).mean() > 0.5, "another key-frame")
-
-    desktop.events("key", "space")
-    pictures = []
-    for _ in range(20):
-        pictures.append(scene_part(desktop.picture()))
-        time.sleep(0.3)
-    assert sum(not np.array_equal(a, b) for a, b in itertools.pairwise(pictures)) >= 3, "it does not play"
 
 
 @pytest.mark.nightly
