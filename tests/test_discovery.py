@@ -207,6 +207,7 @@ def test_a_trajectory_does_not_change_over_to_another_color_at_a_crossing() -> N
         assert min(np.linalg.norm(each.centers - center, axis=1)[[0, 10, 50, 59]].max() for each in found) < RADIUS
 
 
+@pytest.mark.nightly
 def test_two_balls_are_followed_over_the_whole_clip() -> None:
     t = np.linspace(0, 1, 80)
     one = path(t)

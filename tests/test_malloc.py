@@ -1,5 +1,5 @@
 """Blocks of memory that are freed and asked for again are not cleared by the system each time, and given back in the
-end; and a step of a training leaves none behind."""
+end."""
 
 from __future__ import annotations
 

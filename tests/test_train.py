@@ -122,7 +122,9 @@ def test_the_checkpoint_is_the_last_model(trained_run: Path, dataset: Dataset, d
 def test_the_format_names_what_a_checkpoint_says_of_itself(dataset: Dataset, device: Device, tmp_path: Path) -> None:
     moved = dataclasses.replace(dataset, normalization=Normalization(np.zeros(3), 1.0))
     # Whose times are corrected.
-    config = configure(schedule__warm_up="0", timing__refine="true", timing__start="20", timing__interval="1")
+    config = configure(
+        schedule__warm_up="0", schedule__steps="8", timing__refine="true", timing__start="6", timing__interval="1"
+    )
     train(config, moved, tmp_path / "run", device=device)
     written = read_checkpoint(tmp_path / "run" / "checkpoint.ply").metadata
     text = (Path(__file__).parents[1] / "docs" / "format.md").read_text(encoding="utf-8")
@@ -216,18 +218,11 @@ def test_where_the_decoder_works_follows_from_the_device(
     assert resolve_decoder(config, device) == dataclasses.replace(config, decoder=place)
 
 
-def test_the_place_of_the_decoder_is_told_and_recorded(
-    dataset: Dataset,
-    device: Device,
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+def test_the_place_of_the_decoder_is_recorded(
+    dataset: Dataset, device: Device, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    train(configure(schedule__steps="1"), dataset, tmp_path / "cpu", device=device)
-    assert "decoder:" not in capsys.readouterr().out
     monkeypatch.setattr(device, "is_cpu", False)
     train(configure(schedule__steps="1"), dataset, tmp_path / "gpu", device=device)
-    assert "decoder: on the device\n" in capsys.readouterr().out
     assert load_config(str(tmp_path / "gpu/config.toml")).decoder == "device"
 
 
