@@ -253,7 +253,7 @@ def test_test_views_are_aligned_beside_the_unaligned_measures(
 def test_an_interrupted_run_goes_on_to_the_same_bytes(
     device: Device, dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config = configure(cameras__refine="on", cameras__start="5", schedule__save_interval="12")
+    config = configure(cameras__refine="on", cameras__start="5", schedule__save_interval="12", schedule__steps="24")
     train(config, dataset, tmp_path / "one", device=device)
     with monkeypatch.context() as patched:
         interrupt_at(20, patched)

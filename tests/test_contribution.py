@@ -31,7 +31,7 @@ def views(count: int) -> list[View]:
     ]
 
 
-@pytest.mark.parametrize("moving", [False, True])
+@pytest.mark.parametrize("moving", [pytest.param(False, marks=pytest.mark.nightly), True])
 def test_contributions_are_the_largest_sums_of_blending_weights(device: Device, *, moving: bool) -> None:
     scene, shown = moving_scene(device), views(3)
     expected = torch.zeros(len(scene), dtype=torch.float64)

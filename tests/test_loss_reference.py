@@ -69,7 +69,7 @@ def test_ncc_of_an_image_without_a_window() -> None:
     assert not a.grad.any()
 
 
-@pytest.mark.parametrize("size", [(2, 4), (3, 4), (12, 13), (9, 16)])
+@pytest.mark.parametrize("size", [(2, 4), (3, 4), (12, 13)])
 @pytest.mark.parametrize("loss", [pyramid_loss, ncc_loss])
 def test_gradients_of_pyramid_and_ncc(loss: Callable[[Tensor, Tensor], Tensor], size: tuple[int, int]) -> None:
     a, b = noisy_pair(*size)

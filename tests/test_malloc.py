@@ -52,6 +52,7 @@ def page_faults(how: str) -> int:
     return int(subprocess.run(command, check=True, capture_output=True, text=True, timeout=120, env=start).stdout)
 
 
+@pytest.mark.nightly
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc can be told")
 def test_freed_memory_is_used_again() -> None:
     assert page_faults("keep") < 100

@@ -183,6 +183,7 @@ def test_an_interrupted_table_goes_on(
     assert f"--data={data / 'toys'}" in commands[1]
 
 
+@pytest.mark.nightly
 def test_runs_are_trained_in_processes_and_a_failed_one_stops_no_other(
     data: Path, spec: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -163,7 +163,7 @@ GIVEN = {"timing__refine": "true", "timing__start": "15", "timing__interval": "6
 def test_an_interrupted_training_goes_on_to_the_same_bytes(
     dataset: Dataset, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config = configure(**GIVEN)
+    config = configure(**GIVEN, schedule__steps="28")
     train(config, dataset, tmp_path / "whole", device=device)
     assert load(tmp_path / "whole" / "checkpoint.ply", device).timing is not EVEN
     with monkeypatch.context() as patched:

@@ -195,6 +195,7 @@ def apart(a: NDArray[np.int16], b: NDArray[np.int16]) -> float:
     return float(np.abs(a - b)[24:].max()) if a.shape == b.shape else np.inf
 
 
+@pytest.mark.nightly
 @pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
 def test_in_a_browser(server: Server, scene: Path, device: Device, tmp_path: Path) -> None:
     first, last = (expected(scene, device, SIZE, time) for time in (0.0, 1.0))
