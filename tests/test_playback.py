@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from contextlib import closing
 from pathlib import Path
 
@@ -178,3 +180,22 @@ def test_a_foreign_ply_stands_still(device: Device, tmp_path: Path, degree: int)
 def contents(now: Gaussians[DeviceArray]) -> list[np.ndarray]:
     """As words, so that equal means equal bits."""
     return [values.view(np.uint32) for values in read_all(list(now.arrays().values()))]
+
+
+SHOW = """
+import sys
+from lapgs_wgpu.gpu.device import open_device
+from lapgs_wgpu.motion.playback.playback import playback_of
+from lapgs_wgpu.motion.scene_file import read_scene
+
+playback = playback_of(read_scene(sys.argv[1]), open_device())
+playback.at(0.3), playback.means(0.5), playback.dynamics(), playback.snapshot(0.2)
+print("torch" in sys.modules)
+"""
+
+
+def test_fields_on_the_device_are_played_without_torch(device: Device, tmp_path: Path) -> None:
+    _, path = saved(device, tmp_path, OURS)
+    done = subprocess.run([sys.executable, "-c", SHOW, str(path)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "False\n"
