@@ -143,6 +143,3 @@ def test_a_number_of_intersections_beyond_32_bits_is_not_taken_for_a_small_one(d
     gaussians = upload_gaussians(rasterizer.pool, Gaussians(*filling, torch.ones(count, 3)))
     drawing = rasterizer.draw(gaussians, front_camera(2048, 2048, focal=2000.0))
     assert all(needed.read()[0] == 0xFFFFFFFF for needed in drawing.needed)
-
-
-# What takes long

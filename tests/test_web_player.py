@@ -269,7 +269,7 @@ def test_address_and_script(window: Browser, page: Path, desktop: Desktop) -> No
         assert "Error" in window.value(f"(() => {{ try {{ {act} }} catch (error) {{ return String(error) }} }})()")
 
 
-# Served, dropped, refused
+# Dropped, lost, refused
 
 
 def header(size: int) -> bytes:
