@@ -6,6 +6,7 @@ What is large runs with LAPGS_SOAK=1 alone (`make soak`).
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -143,3 +144,12 @@ def test_a_number_of_intersections_beyond_32_bits_is_not_taken_for_a_small_one(d
     gaussians = upload_gaussians(rasterizer.pool, Gaussians(*filling, torch.ones(count, 3)))
     drawing = rasterizer.draw(gaussians, front_camera(2048, 2048, focal=2000.0))
     assert all(needed.read()[0] == 0xFFFFFFFF for needed in drawing.needed)
+
+
+@pytest.mark.skipif(os.environ.get("LAPGS_SOAK") != "1", reason="large: LAPGS_SOAK=1 runs it")
+def test_two_million_gaussians_on_a_4k_picture(device: Device) -> None:
+    scene = random_scene(2_000_000, 5, size=0.002)
+    scene["means"][:, 2] += 5
+    found = drawn(scene, front_camera(3840, 2160, focal=3000.0), device, depth=False)
+    assert all(value.isfinite().all() for value in found.values())
+    assert float(found["alpha"].mean()) > 0.1
