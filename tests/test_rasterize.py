@@ -241,7 +241,7 @@ def test_all_shapes_draw_the_same(device: Device, use: Callable[[Rasterizer], An
 
 
 def test_workgroups_that_are_cut_into_subgroups_are_noticed(device: Device, use: Callable[[Rasterizer], Any]) -> None:
-    """And the pass does without shuffles then."""
+    """And no pass uses shuffles from then on."""
     if not 0 < subgroup_size(device) < 32:
         pytest.skip("this device has no subgroups, or none of fewer than 32 lanes")
     scene, camera = random_scene(500, 8, size=0.08), oblique_camera(101, 61)
@@ -251,7 +251,7 @@ def test_workgroups_that_are_cut_into_subgroups_are_noticed(device: Device, use:
     for shape in (whole, cut):
         rasterizer = use(Rasterizer(device, config=shape))
         drawn = [step(scene, camera, device, background=BACKGROUND, weights=weights) for _ in range(2)]
-        assert not any(map(rasterizer.config.shuffles, ("rasterize", "rasterize_bwd")))
+        assert not rasterizer.config.subgroups
         steps += drawn
     for other in steps[1:]:
         assert torch.equal(other.image, steps[0].image)
@@ -259,61 +259,14 @@ def test_workgroups_that_are_cut_into_subgroups_are_noticed(device: Device, use:
             assert torch.equal(other.gradients[name], gradient)
 
 
-def test_only_the_backward_pass_is_cut(
-    device: Device, use: Callable[[Rasterizer], Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    if not 0 < subgroup_size(device) < 32:
-        pytest.skip("this device has no subgroups, or none of fewer than 32 lanes")
-    scene, camera = random_scene(500, 8, size=0.08), oblique_camera(101, 61)
-    use(Rasterizer(device, config=gpu_config(0)))
-    expected = step(scene, camera, device)
-    defines = RasterConfig.raster_defines
-    rasterizer = use(Rasterizer(device, config=replace(gpu_config(32), subgroups=True)))
-    mismatch = rasterizer._subgroup_mismatch
-
-    def forward_without(self: RasterConfig, name: str = "rasterize", *, depth: bool) -> dict[str, int]:
-        found = defines(self, name, depth=depth)
-        if name == "rasterize":
-            found.pop("SUBGROUPS", None)
-        return found
-
-    monkeypatch.setattr(RasterConfig, "raster_defines", forward_without)
-    asked: list[tuple[str, bool]] = []
-    monkeypatch.setattr(
-        rasterizer,
-        "_subgroup_mismatch",
-        lambda name, drawn: asked.append((name, mismatch(name, drawn))) or asked[-1][1],
-    )
-    found = step(scene, camera, device)
-    assert asked == [("rasterize", False), ("rasterize_bwd", True), ("rasterize_bwd", False)]
-    assert rasterizer.config.shuffles("rasterize")
-    assert not rasterizer.config.shuffles("rasterize_bwd")
-    for name, gradient in expected.gradients.items():
-        assert torch.equal(found.gradients[name], gradient)
-
-
 @pytest.mark.parametrize("lanes", [8, 16])
 def test_a_processors_rounds_follow_its_shape(lanes: int) -> None:
     """Without subgroups a round has fewer splats, or the driver would end its loops early."""
-    for name in ("rasterize", "rasterize_bwd"):
-        assert cpu_config(lanes).without_subgroups(name) == replace(cpu_config(0), lanes=lanes)
+    assert cpu_config(lanes).without_subgroups() == replace(cpu_config(0), lanes=lanes)
 
 
-def test_a_gpus_other_pass_keeps_its_subgroups() -> None:
-    whole, plain = gpu_config(32), gpu_config(0)
-    passes = ("rasterize", "rasterize_bwd")
-    for name, other in (passes, passes[::-1]):
-        cut = whole.without_subgroups(name)
-        for depth in (False, True):
-            assert cut.raster_defines(name, depth=depth) == plain.raster_defines(name, depth=depth)
-            assert cut.raster_defines(other, depth=depth) == whole.raster_defines(other, depth=depth)
-        both = cut.without_subgroups(other)
-        assert not any(map(both.shuffles, passes))
-
-
-@pytest.mark.nightly
-def test_a_processors_backward_pass_is_cut(device: Device, use: Callable[[Rasterizer], Any]) -> None:
-    """It then has more rounds than the drawing."""
+def test_only_the_backward_pass_is_cut(device: Device, use: Callable[[Rasterizer], Any]) -> None:
+    """The image is drawn again, in more rounds."""
     if subgroup_size(device) < 8:
         pytest.skip("this device has no subgroups, or none of 8 lanes")
     scene, camera = random_scene(300, 8, size=0.3), oblique_camera(20, 12)
@@ -325,7 +278,7 @@ def test_a_processors_backward_pass_is_cut(device: Device, use: Callable[[Raster
     def mismatch(name: str, drawn: Drawing) -> bool:
         if name == "rasterize" or not next(mismatches, False):
             return False
-        rasterizer.config = rasterizer.config.without_subgroups(name)
+        rasterizer.config = rasterizer.config.without_subgroups()
         return True
 
     rasterizer._subgroup_mismatch = mismatch  # type: ignore[method-assign]

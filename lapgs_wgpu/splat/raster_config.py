@@ -22,7 +22,6 @@ class RasterConfig:
     """A workgroup of `lanes` draws a tile of tile_width x tile_height pixels, each lane `rows` pixels of a column.
 
     subgroups: the lanes form one subgroup and exchange values by shuffles instead of workgroup memory.
-    split_passes: whose workgroups the driver splits into several subgroups nevertheless; they use workgroup memory.
     lane_runs: use the radix sort for CPU devices, and a polynomial for exp2, which is slow there.
     round_splats: maximum number of splats of a list that one dispatch draws, on devices that limit loops; else None.
     """
@@ -33,7 +32,6 @@ class RasterConfig:
     subgroups: bool
     lane_runs: bool
     round_splats: int | None = None
-    split_passes: tuple[str, ...] = ()
 
     @property
     def rows(self) -> int:
@@ -43,25 +41,15 @@ class RasterConfig:
     def tile_defines(self) -> dict[str, int]:
         return {"TILE_W": self.tile_width, "TILE_H": self.tile_height}
 
-    def shuffles(self, name: str) -> bool:
-        """Whether a pass, rasterize or rasterize_bwd, uses subgroups."""
-        return self.subgroups and name not in self.split_passes
+    def without_subgroups(self) -> RasterConfig:
+        """The same for a driver that splits workgroups into several subgroups. Loops are longer then, and rounds
+        shorter."""
+        rounds = self.round_splats and self.round_splats * SUBGROUP_TURNS // PLAIN_TURNS
+        return replace(self, subgroups=False, round_splats=rounds)
 
-    def without_subgroups(self, name: str) -> RasterConfig:
-        """The same for a driver that splits the workgroups of a pass. Where lists are drawn in rounds, both passes do
-        without subgroups, as they share the rounds, which are then shorter, as loops are longer."""
-        if self.round_splats is None:
-            return replace(self, split_passes=(*self.split_passes, name))
-        return replace(self, subgroups=False, round_splats=self.round_splats * SUBGROUP_TURNS // PLAIN_TURNS)
-
-    def raster_defines(self, name: str = "rasterize", *, depth: bool) -> dict[str, int]:
-        """Defines of a pass, rasterize or rasterize_bwd. depth: whether to draw it, too."""
-        flags = {
-            "SUBGROUPS": self.shuffles(name),
-            "DEPTH": depth,
-            "LANES_16": self.lanes > 8,
-            "LANES_32": self.lanes > 16,
-        }
+    def raster_defines(self, *, depth: bool) -> dict[str, int]:
+        """Defines of the passes rasterize and rasterize_bwd. depth: whether to draw it, too."""
+        flags = {"SUBGROUPS": self.subgroups, "DEPTH": depth, "LANES_16": self.lanes > 8, "LANES_32": self.lanes > 16}
         values = {"LANES": self.lanes, "ROWS": self.rows, "POLYNOMIAL_EXP2": self.lane_runs}
         if self.round_splats:
             values["ROUND_SPLATS"] = self.round_splats

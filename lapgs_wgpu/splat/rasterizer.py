@@ -232,17 +232,17 @@ class Rasterizer:
     def _subgroup_mismatch(self, name: str, drawing: Drawing) -> bool:
         """Whether the driver has split the workgroups of a pass into several subgroups, checked after its first run.
 
-        If so, the pass no longer uses subgroups, and has to be run again.
+        If so, no pass uses subgroups from now on, and the image has to be drawn again.
         """
         key = (name, drawing.depth, drawing.plan.rounds > 1)
-        if not self.config.shuffles(name) or key in self._trusted:
+        if not self.config.subgroups or key in self._trusted:
             return False
         self._trusted.add(key)
         ranges = drawing.lists.ranges
         flags = ranges.rows(ranges.shape[0] - 1, 1).read()[0]
         if not flags[3 if name == "rasterize_bwd" else 2]:
             return False
-        self.config = self.config.without_subgroups(name)
+        self.config = self.config.without_subgroups()
         return True
 
     # Backward --------------------------------------------------------------------------------------------------------
@@ -270,9 +270,7 @@ class Rasterizer:
                     drawing.lists = self._draw_band(commands, drawing, band)
                 self._backward_band(commands, drawing, band, d_image, d_splats)
             if self._subgroup_mismatch("rasterize_bwd", drawing):
-                if self.config.round_splats:  # there may be more rounds now
-                    drawing = self._drawn_again(drawing)
-                return self.backward(drawing, d_image, camera=camera, profile=profile)
+                return self.backward(self._drawn_again(drawing), d_image, camera=camera, profile=profile)
         d_sh, d_camera = None, self._camera_sums(n) if camera else None
         arrays = gaussians.arrays() | {"frame": self._frame(drawing, 0), "d_splats": d_splats}
         arrays |= {"d_means": d_means, "d_quats": d_quats, "d_scales": d_scales}
@@ -309,7 +307,7 @@ class Rasterizer:
         tails = (3 if drawing.depth else 2) * plan.capacity
         states = 2 * drawing.camera.width * drawing.camera.height if plan.rounds > 1 else 0
         record_tails = self.pool.array("record tails", (tails + states,), "uint32")
-        defines = self.config.raster_defines("rasterize_bwd", depth=drawing.depth)
+        defines = self.config.raster_defines(depth=drawing.depth)
         kernel = Kernel.get(self.device, "rasterize_bwd", ROUNDS=plan.rounds > 1, **defines)
         gather = Kernel.get(self.device, "gather_gradients", DEPTH=drawing.depth)
         arrays = lists._asdict() | {"ids": lists.sorted_ids, "frame": self._frame(drawing, band)}

@@ -1,4 +1,4 @@
-"""Linear layers, initialized from a generator."""
+"""Linear layers, initialized from a generator or to zero."""
 
 from __future__ import annotations
 
@@ -8,9 +8,8 @@ from torch import nn
 
 def linear(shape: tuple[int, ...], generator: torch.Generator) -> nn.Linear:
     """A linear layer with a weight of this shape (outputs, inputs) and torch's own initial distribution."""
-    outputs, inputs = shape
-    layer = nn.Linear(inputs, outputs)
-    reach = inputs**-0.5
+    layer = zero_head(shape)
+    reach = shape[1] ** -0.5
     with torch.no_grad():
         layer.weight.uniform_(-reach, reach, generator=generator)
         layer.bias.uniform_(-reach, reach, generator=generator)
