@@ -42,13 +42,15 @@ class RasterConfig:
         return {"TILE_W": self.tile_width, "TILE_H": self.tile_height}
 
     def without_subgroups(self) -> RasterConfig:
-        """The same for a driver that splits workgroups into several subgroups. Loops are longer then, and rounds
-        shorter."""
+        """Return the same for a driver that splits workgroups into several subgroups.
+
+        Loops are longer then, and rounds shorter.
+        """
         rounds = self.round_splats and self.round_splats * SUBGROUP_TURNS // PLAIN_TURNS
         return replace(self, subgroups=False, round_splats=rounds)
 
     def raster_defines(self, *, depth: bool) -> dict[str, int]:
-        """Defines of the passes rasterize and rasterize_bwd. depth: whether to draw it, too."""
+        """Return the defines of the passes rasterize and rasterize_bwd. depth: whether to draw it, too."""
         flags = {"SUBGROUPS": self.subgroups, "DEPTH": depth, "LANES_16": self.lanes > 8, "LANES_32": self.lanes > 16}
         values = {"LANES": self.lanes, "ROWS": self.rows, "POLYNOMIAL_EXP2": self.lane_runs}
         if self.round_splats:
@@ -57,7 +59,7 @@ class RasterConfig:
 
 
 def cpu_config(subgroup_size: int, max_loop_turns: int = SOFTWARE_LOOP_TURNS) -> RasterConfig:
-    """A workgroup is one vector of the processor, so that no barrier waits."""
+    """Return the configuration for processors: a workgroup is one vector of the processor, so that no barrier waits."""
     lanes = 16 if subgroup_size == 16 else 8
     subgroups = subgroup_size >= lanes
     round_splats = (max_loop_turns + 1) // (SUBGROUP_TURNS if subgroups else PLAIN_TURNS)
@@ -65,12 +67,12 @@ def cpu_config(subgroup_size: int, max_loop_turns: int = SOFTWARE_LOOP_TURNS) ->
 
 
 def gpu_config(subgroup_size: int) -> RasterConfig:
-    """Wider tiles, hence fewer intersections to sort; a subgroup of 16 or 32 lanes per tile."""
+    """Return the configuration for GPUs: wider tiles, hence fewer intersections to sort; a subgroup per tile."""
     lanes = 16 if subgroup_size == 16 else 32
     return RasterConfig(16, 8, lanes, subgroups=subgroup_size >= lanes, lane_runs=False)
 
 
 def raster_config(device: Device) -> RasterConfig:
-    """The configuration for this adapter."""
+    """Return the configuration for this adapter."""
     size = subgroup_size(device)
     return gpu_config(size) if device.max_loop_turns is None else cpu_config(size, device.max_loop_turns)

@@ -41,7 +41,7 @@ class Rendering(NamedTuple):
 
 @functools.cache
 def rasterizer_of(device: Device) -> Rasterizer:
-    """The rasterizer that `rasterize` uses on this device. Its buffers are reused by all calls."""
+    """Return the rasterizer that `rasterize` uses on this device. Its buffers are reused by all calls."""
     return Rasterizer(device)
 
 
@@ -186,7 +186,7 @@ def radii_and_centres(splats: NDArray[np.float32], device: torch.device) -> tupl
 
 
 def gradient_tensors(arrays: list[NDArray[np.float32]], opacities: Tensor) -> tuple[tuple[Tensor, ...], Tensor]:
-    """Gradients of means, quats, scales, opacities and sh; and of means2d, on the device of the opacities (N,).
+    """Return gradients of means, quats, scales, opacities and sh, and of means2d, on the opacities' torch device.
 
     arrays: GaussianGradients, read back.
     """
@@ -198,5 +198,5 @@ def gradient_tensors(arrays: list[NDArray[np.float32]], opacities: Tensor) -> tu
 
 
 def upload(pool: BufferPool, name: str, tensor: Tensor) -> DeviceArray:
-    """A copy of a tensor, as float32, in the buffer `input NAME` of a pool."""
+    """Return a copy of a tensor, as float32, in the buffer `input NAME` of a pool."""
     return pool.upload(f"input {name}", np.ascontiguousarray(tensor.detach().to("cpu", torch.float32).numpy()))

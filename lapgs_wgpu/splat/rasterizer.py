@@ -188,7 +188,7 @@ class Rasterizer:
             commands.run(kernel, _groups(colors.shape[0]), arrays | {"part": part, "colors": colors})
 
     def _color_parts(self, kernel: Kernel, colors: DeviceArray) -> list[tuple[DeviceArray, DeviceArray]]:
-        """The kernel's uniform and the rows of colors for each range of Gaussians that fits into one binding."""
+        """Return the kernel's uniform and the rows of colors for each range of Gaussians that fits into one binding."""
         count = colors.shape[0]
         most = self.device.max_binding // (4 * math.prod(colors.shape[1:])) // 64 * 64  # parts begin at 256 bytes
         parts = []
@@ -230,7 +230,7 @@ class Rasterizer:
         return self.pool.constant(f"frame {band}", content)
 
     def _subgroup_mismatch(self, name: str, drawing: Drawing) -> bool:
-        """Whether the driver has split the workgroups of a pass into several subgroups, checked after its first run.
+        """Return whether the driver has split a pass's workgroups into several subgroups, checked after its first run.
 
         If so, no pass uses subgroups from now on, and the image has to be drawn again.
         """
@@ -289,14 +289,14 @@ class Rasterizer:
         return GaussianGradients(d_splats, d_means, d_quats, d_scales, d_sh, d_camera)
 
     def _drawn_again(self, drawing: Drawing) -> Drawing:
-        """The same image, drawn with the present config."""
+        """Return the same image, drawn with the present config."""
         while True:
             again = self.draw(drawing.gaussians, drawing.camera, drawing.background, depth=drawing.depth, gradient=True)
             if not self.grow_on_overflow(again):
                 return again
 
     def _camera_sums(self, n: int) -> DeviceArray:
-        """A row for each workgroup of camera_bwd, twice; each half begins at a multiple of 256 bytes."""
+        """Return a row for each workgroup of camera_bwd, twice; each half begins at a multiple of 256 bytes."""
         return self.pool.array("d_camera", (2, (_groups(n) + 15) // 16 * 16, 4))
 
     def _backward_band(

@@ -89,7 +89,7 @@ class HashEncoder:
         return [list(outputs[i : i + count]) for i in range(0, len(outputs), count)]
 
     def encode(self, places: Sequence[Place], tables: Sequence[Tensor]) -> list[Tensor]:
-        """The forward pass without autograd. Returns the encodings by place, then by group."""
+        """Return the encodings by place, then by group, without autograd."""
         encoded = self.write(places, tables)
         with Commands(self._device) as commands:
             self.record(commands, encoded)
@@ -97,7 +97,7 @@ class HashEncoder:
         return [torch.from_numpy(array).to(places[0][0].device) for array in arrays]
 
     def backward(self, places: Sequence[Place], d_encodings: Sequence[Tensor]) -> list[Tensor]:
-        """Gradients of the tables from those of the encodings, in the order of `encode`."""
+        """Return the gradients of the tables from those of the encodings, in the order of `encode`."""
         encoded = self.write(places)
         for array, d_encoding in zip(itertools.chain(*encoded.encodings), d_encodings, strict=True):
             array.write(_host(d_encoding))
@@ -125,7 +125,7 @@ class HashEncoder:
         return self._held
 
     def holds(self, encoded: Encoded) -> bool:
-        """Whether the device still holds these encodings: neither other points nor gradients have overwritten them."""
+        """Return whether the device still holds these encodings: no other points or gradients have overwritten them."""
         return encoded is self._held
 
     def record(self, commands: Commands, encoded: Encoded) -> None:

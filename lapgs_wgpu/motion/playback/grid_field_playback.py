@@ -28,7 +28,7 @@ _BLOCK_BYTES = 128 << 20  # of the features that a dispatch reads: WebGPU's defa
 
 
 def runs_on_device(config: FieldConfig, device: Device) -> bool:
-    """Whether `GridFieldPlayback` supports this field on the device."""
+    """Return whether `GridFieldPlayback` supports this field on the device."""
     if not config.decodes_on_device or device.max_loop_turns is None:
         return config.decodes_on_device
     sizes = _Sizes(config)
