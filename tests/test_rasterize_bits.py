@@ -50,7 +50,7 @@ def expected(scene: Scene, device: Device) -> Step:
 
 def needed(rasterizer: Rasterizer) -> int:
     """Intersections of the last draw."""
-    arrays = [rasterizer.pool.array(f"needed {band}", (3,), "uint32") for band in range(rasterizer.plan.bands)]
+    arrays = [rasterizer.pool.array(f"needed {band}", (3,), "uint32") for band in range(rasterizer.plans.now.bands)]
     return sum(int(array.read()[0]) for array in arrays)
 
 
@@ -129,8 +129,10 @@ def test_capacity_does_not_matter(device: Device, use: Use, scene: Scene, expect
     for capacity in (16, total - 1, total, 4 * total):
         rasterizer = use(Rasterizer(device, capacity=capacity))
         same(one_step(scene, device), expected)
-        assert rasterizer.plan.capacity == capacity if capacity >= total else rasterizer.plan.capacity >= total
-        assert rasterizer.plan.bands == 1
+        assert (
+            rasterizer.plans.now.capacity == capacity if capacity >= total else rasterizer.plans.now.capacity >= total
+        )
+        assert rasterizer.plans.now.bands == 1
 
 
 @pytest.mark.nightly
@@ -152,13 +154,13 @@ def test_a_small_image_does_not_pay_for_a_large_one(device: Device, use: Use, sc
     """Each size has its plan, and finds it again."""
     rasterizer = use(Rasterizer(device, capacity=64))
     same(one_step(scene, device), expected)
-    large = rasterizer.plan
+    large = rasterizer.plans.now
     small = CAMERA.resized(CAMERA.width // 4, CAMERA.height // 4)
     first = step(scene, small, device, sh_degree=DEGREE)
-    assert 64 < rasterizer.plan.capacity < large.capacity
+    assert 64 < rasterizer.plans.now.capacity < large.capacity
     drawings = rasterizer._drawings
     same(one_step(scene, device), expected)
-    assert rasterizer.plan == large
+    assert rasterizer.plans.now == large
     same(step(scene, small, device, sh_degree=DEGREE), first)
     assert rasterizer._drawings == drawings + 2  # none was drawn twice
 
@@ -170,16 +172,16 @@ def test_a_plan_shrinks_when_no_image_needs_it(
     monkeypatch.setattr(buffer_plan, "_WATCHED", 3)
     rasterizer = use(Rasterizer(device, capacity=100 * total))
     if rasterizer.config.round_splats:
-        rasterizer.plan = dataclasses.replace(rasterizer.plan, rounds=2)
+        rasterizer.plans.now = dataclasses.replace(rasterizer.plans.now, rounds=2)
     for count in (1, 2, 3, 4):
         same(one_step(scene, device), expected)
-        assert (rasterizer.plan.capacity < 2 * total + 4096) == (count >= 3)
-    assert rasterizer.plan.rounds == 1
+        assert (rasterizer.plans.now.capacity < 2 * total + 4096) == (count >= 3)
+    assert rasterizer.plans.now.rounds == 1
     assert rasterizer._drawings == 4
-    kept = rasterizer.plan
+    kept = rasterizer.plans.now
     for _ in range(4):
         same(one_step(scene, device), expected)
-    assert rasterizer.plan == kept
+    assert rasterizer.plans.now == kept
 
 
 @pytest.mark.nightly
@@ -207,8 +209,8 @@ def test_bands_draw_the_same_image(
 ) -> None:
     rasterizer = banded(device, use, total // share)
     found = one_step(scene, device)
-    assert rasterizer.plan.bands > share
-    assert rasterizer.plan.capacity <= total // share
+    assert rasterizer.plans.now.bands > share
+    assert rasterizer.plans.now.capacity <= total // share
     for name in ("image", "alpha", "depth", "radii", "means2d"):
         assert found.bits[name] == expected.bits[name], name
     for name, gradient in expected.gradients.items():  # a splat's records are added band by band: other rounding
@@ -216,7 +218,7 @@ def test_bands_draw_the_same_image(
     same(one_step(scene, device), found)
     again = banded(device, use, total // share)
     same(one_step(scene, device), found)
-    assert again.plan.bands == rasterizer.plan.bands
+    assert again.plans.now.bands == rasterizer.plans.now.bands
 
 
 @pytest.mark.nightly
@@ -227,13 +229,13 @@ def test_bands_are_no_larger_than_need_be(
     monkeypatch.setattr(rasterizer_module, "_BAND_CAPACITY", total // 3)
     rasterizer = use(Rasterizer(device, capacity=64))
     assert one_step(scene, device).bits["image"] == expected.bits["image"]
-    assert 3 < rasterizer.plan.bands < -(-CAMERA.height // rasterizer.config.tile_height)
-    assert rasterizer.plan.capacity <= total // 3
+    assert 3 < rasterizer.plans.now.bands < -(-CAMERA.height // rasterizer.config.tile_height)
+    assert rasterizer.plans.now.capacity <= total // 3
     monkeypatch.setattr(rasterizer_module, "_BAND_CAPACITY", 16)
     rasterizer = use(Rasterizer(device, capacity=16))
     assert one_step(scene, device).bits["image"] == expected.bits["image"]
-    assert rasterizer.plan.bands == -(-CAMERA.height // rasterizer.config.tile_height)
-    assert rasterizer.plan.capacity > 16
+    assert rasterizer.plans.now.bands == -(-CAMERA.height // rasterizer.config.tile_height)
+    assert rasterizer.plans.now.capacity > 16
 
 
 @pytest.mark.nightly
@@ -256,20 +258,20 @@ def test_pictures_that_are_looked_at_change_no_gradients(
     rasterizer.plans.set_bands((CAMERA.width, CAMERA.height, False), 3)
     with torch.no_grad():
         rasterize(**scene, camera=CAMERA, sh_degree=DEGREE, background=BACKGROUND, device=device)
-    assert rasterizer.plan.bands == 3
+    assert rasterizer.plans.now.bands == 3
     same(one_step(scene, device), expected)
-    assert rasterizer.plan.bands == 1
+    assert rasterizer.plans.now.bands == 1
 
 
 def test_bands_do_not_outlive_images_of_a_size(device: Device, use: Use, scene: Scene, total: int) -> None:
     rasterizer = banded(device, use, total // 3)
     expected = one_step(scene, device)
-    bands = rasterizer.plan.bands
+    bands = rasterizer.plans.now.bands
     assert bands > 1
     rasterize(**random_scene(30, 9), camera=oblique_camera(40, 90), device=device)
-    assert rasterizer.plan.bands == 1
+    assert rasterizer.plans.now.bands == 1
     same(one_step(scene, device), expected)
-    assert rasterizer.plan.bands == bands
+    assert rasterizer.plans.now.bands == bands
 
 
 def test_a_row_of_tiles_that_does_not_fit_is_refused(device: Device, use: Use) -> None:

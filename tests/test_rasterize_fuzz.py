@@ -260,7 +260,7 @@ def test_buffers_poisoned_between_the_bands(device: Device, use: Use, pattern: s
     rasterizer = use(Rasterizer(device, capacity=256))
     rasterizer.max_capacity = 640
     expected = drawn(scene, device)
-    assert rasterizer.plan.bands > 1
+    assert rasterizer.plans.now.bands > 1
     poison(rasterizer, PATTERNS[pattern])
     assert drawn(scene, device).bits == expected.bits
 

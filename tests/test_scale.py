@@ -96,7 +96,7 @@ def test_lists_beyond_a_round_are_drawn_in_more(device: Device, use: Use) -> Non
         pytest.skip("this device has no rounds")
     rasterizer = use(Rasterizer(device))
     check_pile(5000 if shape.round_splats < 5000 else 40_000, device)
-    assert rasterizer.plan.rounds > 1
+    assert rasterizer.plans.now.rounds > 1
 
 
 @pytest.mark.nightly
@@ -116,9 +116,9 @@ def test_rounds_change_no_bit(depth: bool, device: Device, use: Use, monkeypatch
     short = dataclasses.replace(raster_config(device), round_splats=16)
     for bands in (1, 2):
         rasterizer = use(Rasterizer(device, config=short))
-        rasterizer.plan = dataclasses.replace(rasterizer.plan, bands=bands)
+        rasterizer.plans.now = dataclasses.replace(rasterizer.plans.now, bands=bands)
         found = drawn(scene, camera, device, depth=depth, background=background)
-        assert rasterizer.plan.rounds >= 8
+        assert rasterizer.plans.now.rounds >= 8
         for name in ("image", "alpha"):
             assert torch.equal(found[name], expected[name]), name
         for name, value in expected.items():
@@ -138,7 +138,7 @@ def test_large_images_are_cut_so_that_a_splat_has_few_enough_tiles(
     monkeypatch.setattr("lapgs_wgpu.splat.rasterizer.MAX_BAND_TILES", 20)
     rasterizer = use(Rasterizer(device))
     found = drawn(scene, camera, device)
-    assert rasterizer.plan.bands == 4
+    assert rasterizer.plans.now.bands == 4
     drawing = rasterizer.draw(upload_gaussians(rasterizer.pool, Gaussians(*scene.values())), camera)
     assert max(rasterizer._band_tiles(drawing, band) for band in range(4)) <= 20
     assert torch.equal(found["image"], expected["image"])
@@ -197,7 +197,7 @@ def peak_gb() -> float:
 def test_a_hundred_thousand_splats_in_one_tile(device: Device, use: Use) -> None:
     rasterizer = use(Rasterizer(device))
     check_pile(100_000, device)
-    print(f"rounds {rasterizer.plan.rounds}")
+    print(f"rounds {rasterizer.plans.now.rounds}")
 
 
 @soak
@@ -214,9 +214,9 @@ def test_a_thousand_gaussians_over_the_whole_screen(device: Device, use: Use) ->
     }
     found = drawn(scene, front_camera(800, 800, focal=800.0), device, depth=False)
     transmittance = max((1 - 0.01) ** 1000, 0.0)
-    assert rasterizer.plan.bands > 1
+    assert rasterizer.plans.now.bands > 1
     assert (found["alpha"] - (1 - transmittance)).abs().max() < 1e-3
-    print(f"{time.perf_counter() - start:.1f} s, bands {rasterizer.plan.bands}, {peak_gb():.2f} GB")
+    print(f"{time.perf_counter() - start:.1f} s, bands {rasterizer.plans.now.bands}, {peak_gb():.2f} GB")
 
 
 @soak
@@ -229,4 +229,4 @@ def test_two_million_gaussians_on_a_4k_picture(size: tuple[int, int], device: De
     found = drawn(scene, front_camera(*size, focal=3000.0), device, depth=False)
     assert all(value.isfinite().all() for value in found.values())
     assert float(found["alpha"].mean()) > 0.1
-    print(f"{time.perf_counter() - start:.1f} s, bands {rasterizer.plan.bands}, {peak_gb():.2f} GB")
+    print(f"{time.perf_counter() - start:.1f} s, bands {rasterizer.plans.now.bands}, {peak_gb():.2f} GB")

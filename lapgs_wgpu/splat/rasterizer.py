@@ -19,7 +19,7 @@ from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.gpu.profile import Profile
 from lapgs_wgpu.gpu.radix_sort import RadixSort
 from lapgs_wgpu.gpu.scan import Scan
-from lapgs_wgpu.splat.buffer_plan import BufferPlan, BufferPlans, roomy
+from lapgs_wgpu.splat.buffer_plan import BufferPlans, roomy
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.drawing import Drawing, GaussianGradients, TileLists
 from lapgs_wgpu.splat.gaussians import Gaussians
@@ -55,15 +55,6 @@ class Rasterizer:
         self._drawings = 0
         self._trusted: set[tuple[str, bool, bool]] = set()  # passes whose subgroups were checked
 
-    @property
-    def plan(self) -> BufferPlan:
-        """The plan of the current kind of images."""
-        return self.plans.now
-
-    @plan.setter
-    def plan(self, plan: BufferPlan) -> None:
-        self.plans.now = plan
-
     # Forward ---------------------------------------------------------------------------------------------------------
 
     def draw(
@@ -83,21 +74,21 @@ class Rasterizer:
         self.plans.turn_to((camera.width, camera.height, gradient))
         if self.config.round_splats:
             rows, columns = self._tiles(camera)
-            bands = max(self.plan.bands, -(-rows // max(1, MAX_BAND_TILES // columns)))
-            self.plan = replace(self.plan, bands=bands)
+            bands = max(self.plans.now.bands, -(-rows // max(1, MAX_BAND_TILES // columns)))
+            self.plans.now = replace(self.plans.nows.now, bands=bands)
         self._drawings += 1
         drawing = Drawing(
             gaussians,
             camera,
             background,
             depth,
-            self.plan,
+            self.plans.now,
             self._drawings,
             image=self.pool.array("image", (5 if depth else 4, camera.height, camera.width)),
             splats=self.pool.array("splats", (len(gaussians), SPLAT_FLOATS)),
-            needed=[self.pool.array(f"needed {band}", (3,), "uint32") for band in range(self.plan.bands)],
+            needed=[self.pool.array(f"needed {band}", (3,), "uint32") for band in range(self.plans.now.bands)],
         )
-        for band in range(self.plan.bands):
+        for band in range(self.plans.now.bands):
             with Commands(self.device, profile) as commands:
                 drawing.lists = self._draw_band(commands, drawing, band)
             if self._subgroup_mismatch("rasterize", drawing):
@@ -120,10 +111,10 @@ class Rasterizer:
         most = max(totals)
         if most <= plan.capacity:
             if not self.config.round_splats or not any(count[2] for count in counts):
-                if plan == self.plan:
+                if plan == self.plans.now:
                     self.plans.fitted(most)
                 return False
-            self.plan = replace(plan, rounds=2 * plan.rounds)
+            self.plans.now = replace(plan, rounds=2 * plan.rounds)
             return True
         bands = plan.bands
         rows, _ = self._tiles(drawing.camera)
@@ -134,7 +125,7 @@ class Rasterizer:
                     f"one row of tiles holds {most} intersections, but the device's bindings hold {limit}"
                 )
             bands = min(rows, max(bands + 1, -(-5 * sum(totals) // (4 * limit))))
-        self.plan = replace(plan, capacity=min(limit, roomy(most)), bands=bands)
+        self.plans.now = replace(plan, capacity=min(limit, roomy(most)), bands=bands)
         return True
 
     def _draw_band(self, commands: Commands, drawing: Drawing, band: int) -> TileLists:
@@ -271,7 +262,9 @@ class Rasterizer:
                 self._backward_band(commands, drawing, band, d_image, d_splats)
             if self._subgroup_mismatch("rasterize_bwd", drawing):
                 return self.backward(self._drawn_again(drawing), d_image, camera=camera, profile=profile)
-        d_sh, d_camera = None, self._camera_sums(n) if camera else None
+        d_sh = d_camera = None
+        if camera:  # a row for each workgroup of camera_bwd, twice; each half begins at a multiple of 256 bytes
+            d_camera = self.pool.array("d_camera", (2, (_groups(n) + 15) // 16 * 16, 4))
         arrays = gaussians.arrays() | {"frame": self._frame(drawing, 0), "d_splats": d_splats}
         arrays |= {"d_means": d_means, "d_quats": d_quats, "d_scales": d_scales}
         with Commands(self.device, profile) as commands:
@@ -294,10 +287,6 @@ class Rasterizer:
             again = self.draw(drawing.gaussians, drawing.camera, drawing.background, depth=drawing.depth, gradient=True)
             if not self.grow_on_overflow(again):
                 return again
-
-    def _camera_sums(self, n: int) -> DeviceArray:
-        """Return a row for each workgroup of camera_bwd, twice; each half begins at a multiple of 256 bytes."""
-        return self.pool.array("d_camera", (2, (_groups(n) + 15) // 16 * 16, 4))
 
     def _backward_band(
         self, commands: Commands, drawing: Drawing, band: int, d_image: DeviceArray, d_splats: DeviceArray

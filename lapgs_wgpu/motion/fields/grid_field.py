@@ -168,12 +168,9 @@ class GridField(nn.Module):
         if nearby is not None:
             near = means[nearby.rows]
             compared = (near, time), (near + nearby.offsets, self.config.grid_time(nearby.time))
-        ones = means.new_ones(len(means), 1)
         size = self.config.dynamics_size
-        if size:
-            beside = torch.cat([means.new_zeros(len(means), size) if dynamics is None else dynamics, ones], dim=1)
-        else:
-            beside = ones
+        given = means.new_zeros(len(means), size) if dynamics is None or not size else dynamics
+        beside = torch.cat([given, means.new_ones(len(means), 1)], dim=1)
         w = self._weights(t)
         placed = [(w.spatial, w.spatial_bias)]
         heads = w.heads
