@@ -75,7 +75,7 @@ class Rasterizer:
         if self.config.round_splats:
             rows, columns = self._tiles(camera)
             bands = max(self.plans.now.bands, -(-rows // max(1, MAX_BAND_TILES // columns)))
-            self.plans.now = replace(self.plans.nows.now, bands=bands)
+            self.plans.now = replace(self.plans.now, bands=bands)
         self._drawings += 1
         drawing = Drawing(
             gaussians,
