@@ -89,7 +89,7 @@ def raster_work(scene: SceneCounts, rasterizer: Rasterizer) -> dict[str, Work]:
         _sort_counters(rasterizer, capacity, bits)
         for capacity, bits in (
             (scene.gaussians, 32),
-            (rasterizer.plan.capacity, (scene.tiles // scene.bands).bit_length()),
+            (rasterizer.plans.now.capacity, (scene.tiles // scene.bands).bit_length()),
         )
     )
     keys = depth.passes * v + tile.passes * i

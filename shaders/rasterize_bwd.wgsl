@@ -31,34 +31,7 @@ struct Piece { number: u32, state: u32 }   // the place of the state among the t
 #endif
 #import common/index
 #import common/raster
-
-#ifdef SUBGROUPS
-// One step of a transposed reduction: of two values each lane keeps one and gives the other to its partner.
-fn exchange(keep_second: bool, first: f32, second: f32, distance: u32) -> f32 {
-    let given = select(second, first, keep_second);
-    return select(first, second, keep_second) + subgroupShuffleXor(given, distance);
-}
-
-fn subgroup_sum(value: f32) -> f32 {   // always in the same order, which subgroupAdd does not promise
-    var sum = value + subgroupShuffleXor(value, 1u);
-    sum += subgroupShuffleXor(sum, 2u);
-    sum += subgroupShuffleXor(sum, 4u);
-#ifdef LANES_16
-    sum += subgroupShuffleXor(sum, 8u);
-#endif
-#ifdef LANES_32
-    sum += subgroupShuffleXor(sum, 16u);
-#endif
-    return sum;
-}
-#else
-#ifdef DEPTH
-const VALUES = 10u;
-#else
-const VALUES = 9u;
-#endif
-var<workgroup> partials: array<array<f32, LANES>, VALUES>;
-#endif
+#import common/lane_sums
 
 @compute @workgroup_size($LANES)
 fn main(
@@ -188,26 +161,10 @@ fn main(
 #end
             let mx = m0 * dx;
 #ifdef SUBGROUPS
-            // Eight values over eight lanes: afterwards lane k holds the sum of the k-th; then over the other lanes.
-            let bit0 = (lane & 1u) != 0u;
-            let bit1 = (lane & 2u) != 0u;
-            let bit2 = (lane & 4u) != 0u;
-            let v01 = exchange(bit0, m0, mx, 1u);
-            let v23 = exchange(bit0, m1, mx * dx, 1u);
-            let v45 = exchange(bit0, m1 * dx, m2, 1u);
-            let v67 = exchange(bit0, g_red, g_green, 1u);
-            var value = exchange(bit2, exchange(bit1, v01, v23, 2u), exchange(bit1, v45, v67, 2u), 4u);
-            let blue = subgroup_sum(g_blue);
-            my_blue = select(my_blue, blue, lane == j);
+            let value = eight_sums(lane, vec4(m0, mx, m1, mx * dx), vec4(m1 * dx, m2, g_red, g_green));
+            my_blue = select(my_blue, subgroup_sum(g_blue), lane == j);
 #ifdef DEPTH
-            let depth = subgroup_sum(g_depth);
-            my_depth = select(my_depth, depth, lane == j);
-#endif
-#ifdef LANES_16
-            value += subgroupShuffleXor(value, 8u);
-#endif
-#ifdef LANES_32
-            value += subgroupShuffleXor(value, 16u);
+            my_depth = select(my_depth, subgroup_sum(g_depth), lane == j);
 #endif
             if (lane < 8u) {
                 records[(first + j) * 8u + lane] = value;

@@ -117,7 +117,10 @@ def test_dispatches_a_step(device: Device, scene: Scene, truths: TruthCache, eve
     shape = rasterizer_of(device).config
     tiles = math.ceil(CAMERA.width / shape.tile_width) * math.ceil(CAMERA.height / shape.tile_height)
     widest = 8 if shape.lane_runs else 4
-    sorts = {COUNT: math.ceil(32 / widest), rasterizer_of(device).plan.capacity: math.ceil(tiles.bit_length() / widest)}
+    sorts = {
+        COUNT: math.ceil(32 / widest),
+        rasterizer_of(device).plans.now.capacity: math.ceil(tiles.bit_length() / widest),
+    }
     digits = sum(sorts.values())
     assert names.count("sort_count") == names.count("sort_scatter") == digits
     # Of few lane runs, the counters are added up without a scan.

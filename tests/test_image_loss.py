@@ -229,7 +229,7 @@ def test_overflow_and_bands_do_not_show(device: Device, monkeypatch: pytest.Monk
         scene = gaussians(400)
         done = step(device, scene)
         done.loss.backward()
-        results.append((rasterizer.plan.bands, done.loss.item(), gradients(scene, done)))
+        results.append((rasterizer.plans.now.bands, done.loss.item(), gradients(scene, done)))
     bands, values, found = zip(*results, strict=True)
     assert bands[:2] == (1, 1)
     assert bands[2] > 1

@@ -211,7 +211,7 @@ def test_all_shapes_draw_the_same(device: Device, use: Callable[[Rasterizer], An
 
 
 def test_workgroups_that_are_cut_into_subgroups_are_noticed(device: Device, use: Callable[[Rasterizer], Any]) -> None:
-    """And the pass does without shuffles then."""
+    """And no pass uses shuffles from then on."""
     if not 0 < subgroup_size(device) < 32:
         pytest.skip("this device has no subgroups, or none of fewer than 32 lanes")
     scene, camera = random_scene(500, 8, size=0.08), oblique_camera(101, 61)
@@ -221,12 +221,35 @@ def test_workgroups_that_are_cut_into_subgroups_are_noticed(device: Device, use:
     for shape in (whole, cut):
         rasterizer = use(Rasterizer(device, config=shape))
         drawn = [step(scene, camera, device, background=BACKGROUND, weights=weights) for _ in range(2)]
-        assert not any(map(rasterizer.config.shuffles, ("rasterize", "rasterize_bwd")))
+        assert not rasterizer.config.subgroups
         steps += drawn
     for other in steps[1:]:
         assert torch.equal(other.image, steps[0].image)
         for name, gradient in steps[0].gradients.items():
             assert torch.equal(other.gradients[name], gradient)
+
+
+def test_only_the_backward_pass_is_cut(device: Device, use: Callable[[Rasterizer], Any]) -> None:
+    """The image is drawn again, in more rounds."""
+    if subgroup_size(device) < 8:
+        pytest.skip("this device has no subgroups, or none of 8 lanes")
+    scene, camera = random_scene(300, 8, size=0.3), oblique_camera(20, 12)
+    use(Rasterizer(device, config=cpu_config(0, 255)))
+    expected = step(scene, camera, device)
+    rasterizer = use(Rasterizer(device, config=cpu_config(8, 255)))
+    mismatches = iter([True])
+
+    def mismatch(name: str, drawn: Drawing) -> bool:
+        if name == "rasterize" or not next(mismatches, False):
+            return False
+        rasterizer.config = rasterizer.config.without_subgroups()
+        return True
+
+    rasterizer._subgroup_mismatch = mismatch  # type: ignore[method-assign]
+    found = step(scene, camera, device)
+    assert rasterizer.plans.now.rounds > 1
+    for name, gradient in expected.gradients.items():
+        assert torch.equal(found.gradients[name], gradient), name
 
 
 # The door for torch

@@ -45,7 +45,7 @@ def expected(scene: Scene, device: Device) -> Step:
 
 def needed(rasterizer: Rasterizer) -> int:
     """Intersections of the last draw."""
-    arrays = [rasterizer.pool.array(f"needed {band}", (3,), "uint32") for band in range(rasterizer.plan.bands)]
+    arrays = [rasterizer.pool.array(f"needed {band}", (3,), "uint32") for band in range(rasterizer.plans.now.bands)]
     return sum(int(array.read()[0]) for array in arrays)
 
 
@@ -111,21 +111,23 @@ def test_capacity_does_not_matter(device: Device, use: Use, scene: Scene, expect
     for capacity in (16, total - 1, total, 4 * total):
         rasterizer = use(Rasterizer(device, capacity=capacity))
         same(one_step(scene, device), expected)
-        assert rasterizer.plan.capacity == capacity if capacity >= total else rasterizer.plan.capacity >= total
-        assert rasterizer.plan.bands == 1
+        assert (
+            rasterizer.plans.now.capacity == capacity if capacity >= total else rasterizer.plans.now.capacity >= total
+        )
+        assert rasterizer.plans.now.bands == 1
 
 
 def test_a_small_image_does_not_pay_for_a_large_one(device: Device, use: Use, scene: Scene, expected: Step) -> None:
     """Each size has its plan, and finds it again."""
     rasterizer = use(Rasterizer(device, capacity=64))
     same(one_step(scene, device), expected)
-    large = rasterizer.plan
+    large = rasterizer.plans.now
     small = CAMERA.resized(CAMERA.width // 4, CAMERA.height // 4)
     first = step(scene, small, device, sh_degree=DEGREE)
-    assert 64 < rasterizer.plan.capacity < large.capacity
+    assert 64 < rasterizer.plans.now.capacity < large.capacity
     drawings = rasterizer._drawings
     same(one_step(scene, device), expected)
-    assert rasterizer.plan == large
+    assert rasterizer.plans.now == large
     same(step(scene, small, device, sh_degree=DEGREE), first)
     assert rasterizer._drawings == drawings + 2  # none was drawn twice
 
@@ -155,8 +157,8 @@ def test_bands_draw_the_same_image(
 ) -> None:
     rasterizer = banded(device, use, total // share)
     found = one_step(scene, device)
-    assert rasterizer.plan.bands > share
-    assert rasterizer.plan.capacity <= total // share
+    assert rasterizer.plans.now.bands > share
+    assert rasterizer.plans.now.capacity <= total // share
     for name in ("image", "alpha", "depth", "radii", "means2d"):
         assert found.bits[name] == expected.bits[name], name
     for name, gradient in expected.gradients.items():  # a splat's records are added band by band: other rounding
@@ -164,7 +166,20 @@ def test_bands_draw_the_same_image(
     same(one_step(scene, device), found)
     again = banded(device, use, total // share)
     same(one_step(scene, device), found)
-    assert again.plan.bands == rasterizer.plan.bands
+    assert again.plans.now.bands == rasterizer.plans.now.bands
+
+
+@pytest.mark.nightly
+def test_bands_with_backward_after_another_image(device: Device, use: Use, scene: Scene, total: int) -> None:
+    banded(device, use, total // 3)
+    expected = one_step(scene, device)
+    leaves = {name: value.clone().requires_grad_() for name, value in scene.items()}
+    drawn = rasterize(**leaves, camera=CAMERA, sh_degree=DEGREE, background=BACKGROUND, device=device)
+    rasterize(**random_scene(300, 9), camera=oblique_camera(40, 90), device=device)
+    torch.autograd.backward([drawn.image, drawn.alpha, drawn.depth], list(Weights.random(CAMERA)))
+    for name, leaf in leaves.items():
+        assert leaf.grad is not None
+        assert torch.equal(leaf.grad, expected.gradients[name])
 
 
 def test_pictures_that_are_looked_at_change_no_gradients(
@@ -174,20 +189,20 @@ def test_pictures_that_are_looked_at_change_no_gradients(
     rasterizer.plans.set_bands((CAMERA.width, CAMERA.height, False), 3)
     with torch.no_grad():
         rasterize(**scene, camera=CAMERA, sh_degree=DEGREE, background=BACKGROUND, device=device)
-    assert rasterizer.plan.bands == 3
+    assert rasterizer.plans.now.bands == 3
     same(one_step(scene, device), expected)
-    assert rasterizer.plan.bands == 1
+    assert rasterizer.plans.now.bands == 1
 
 
 def test_bands_do_not_outlive_images_of_a_size(device: Device, use: Use, scene: Scene, total: int) -> None:
     rasterizer = banded(device, use, total // 3)
     expected = one_step(scene, device)
-    bands = rasterizer.plan.bands
+    bands = rasterizer.plans.now.bands
     assert bands > 1
     rasterize(**random_scene(30, 9), camera=oblique_camera(40, 90), device=device)
-    assert rasterizer.plan.bands == 1
+    assert rasterizer.plans.now.bands == 1
     same(one_step(scene, device), expected)
-    assert rasterizer.plan.bands == bands
+    assert rasterizer.plans.now.bands == bands
 
 
 def test_a_row_of_tiles_that_does_not_fit_is_refused(device: Device, use: Use) -> None:

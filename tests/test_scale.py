@@ -91,7 +91,35 @@ def test_lists_beyond_a_round_are_drawn_in_more(device: Device, use: Use) -> Non
         pytest.skip("this device has no rounds")
     rasterizer = use(Rasterizer(device))
     check_pile(5000 if shape.round_splats < 5000 else 40_000, device)
-    assert rasterizer.plan.rounds > 1
+    assert rasterizer.plans.now.rounds > 1
+
+
+@pytest.mark.nightly
+@pytest.mark.kernels
+@pytest.mark.subgroups
+@pytest.mark.parametrize("depth", [False, True])
+def test_rounds_change_no_bit(depth: bool, device: Device, use: Use, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Many short rounds, with other tiles that are done long before, in bands and at once."""
+    if not raster_config(device).round_splats:
+        pytest.skip("this device has no rounds")
+    scene, camera = random_scene(400, 3, size=0.3), front_camera(45, 37)
+    scene["means"][:, 2] += 4
+    scene["opacities"] *= 0.3
+    use(Rasterizer(device))
+    background = (0.2, 0.7, 0.4)
+    expected = drawn(scene, camera, device, depth=depth, background=background)
+    short = dataclasses.replace(raster_config(device), round_splats=16)
+    for bands in (1, 2):
+        rasterizer = use(Rasterizer(device, config=short))
+        rasterizer.plans.now = dataclasses.replace(rasterizer.plans.now, bands=bands)
+        found = drawn(scene, camera, device, depth=depth, background=background)
+        assert rasterizer.plans.now.rounds >= 8
+        for name in ("image", "alpha"):
+            assert torch.equal(found[name], expected[name]), name
+        for name, value in expected.items():
+            assert torch.allclose(found[name], value, rtol=1e-4, atol=1e-5 * float(value.abs().max())), name
+        if bands == 1:
+            assert all(torch.equal(found[name], value) for name, value in expected.items())
 
 
 @pytest.mark.kernels
@@ -105,7 +133,7 @@ def test_large_images_are_cut_so_that_a_splat_has_few_enough_tiles(
     monkeypatch.setattr("lapgs_wgpu.splat.rasterizer.MAX_BAND_TILES", 20)
     rasterizer = use(Rasterizer(device))
     found = drawn(scene, camera, device)
-    assert rasterizer.plan.bands == 4
+    assert rasterizer.plans.now.bands == 4
     drawing = rasterizer.draw(upload_gaussians(rasterizer.pool, Gaussians(*scene.values())), camera)
     assert max(rasterizer._band_tiles(drawing, band) for band in range(4)) <= 20
     assert torch.equal(found["image"], expected["image"])

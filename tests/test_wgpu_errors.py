@@ -59,7 +59,7 @@ def fail_to_allocate(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(device.wgpu_device, "create_buffer", create)
     rasterizer = rasterizer_of(device)  # what was made so far no longer does
-    rasterizer.plan = replace(rasterizer.plan, capacity=4 * rasterizer.plan.capacity)
+    rasterizer.plans.now = replace(rasterizer.plans.now, capacity=4 * rasterizer.plans.now.capacity)
 
 
 @pytest.mark.parametrize("how", ["lost", pytest.param("memory", marks=pytest.mark.nightly)])

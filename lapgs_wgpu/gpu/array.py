@@ -38,12 +38,12 @@ class DeviceArray:
 
     @staticmethod
     def empty(device: Device, label: str, shape: tuple[int, ...], dtype: str = "float32") -> DeviceArray:
-        """An array of zeros in a buffer of its own."""
+        """Return an array of zeros in a buffer of its own."""
         return DeviceArray(Buffer(device, math.prod(shape) * _ITEM_BYTES[dtype], label), shape, dtype)
 
     @staticmethod
     def upload(device: Device, label: str, values: NDArray[Any]) -> DeviceArray:
-        """A copy of `values`, with their shape and dtype, in a buffer of its own."""
+        """Return a copy of `values`, with their shape and dtype, in a buffer of its own."""
         array = DeviceArray.empty(device, label, values.shape, values.dtype.name)
         array.write(values)
         return array
@@ -79,7 +79,7 @@ class DeviceArray:
         self.buffer.write(values, self.offset)
 
     def read(self) -> NDArray[Any]:
-        """A copy of the array on the host. Waits for the device."""
+        """Return a copy of the array on the host. Waits for the device."""
         return read_all([self])[0]
 
 

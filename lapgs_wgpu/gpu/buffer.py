@@ -32,8 +32,11 @@ def _forget(bound: weakref.WeakSet[BindGroup], device: Device, nbytes: int) -> N
 
 
 def _height(rows: int) -> int:
-    """The height of a texture with room for so many rows: no power of two, unless no more are allowed. Mesa's software
-    driver compiles a shader anew for each combination of textures whose sizes are and are not powers of two."""
+    """Return the height of a texture with room for so many rows: no power of two, unless no more are allowed.
+
+    Mesa's software driver compiles a shader anew for each combination of textures whose sizes are and are not powers of
+    two.
+    """
     if rows.bit_count() > 1 or rows >= _MOST_ROWS:
         return rows
     return max(3, rows + 1)
@@ -120,7 +123,7 @@ class Buffer:
             content[: data.nbytes] = data
 
     def texture(self, encoder: Encoder, texel_format: str, offset: int, size: int) -> Any:
-        """A view of a texture that holds `size` bytes from `offset` on, in rows of TABLE_WIDTH texels.
+        """Return a view of a texture that holds `size` bytes from `offset` on, in rows of TABLE_WIDTH texels.
 
         If the buffer has changed, a copy is recorded in `encoder`.
         """

@@ -63,7 +63,7 @@ class AdapterDetails:
 
 
 def instance_options(platform: str, dxc: str | None) -> dict[str, Any]:
-    """Options of wgpu's instance on a platform, as `sys.platform` names it.
+    """Return options of wgpu's instance on a platform, as `sys.platform` names it.
 
     dxc: path of dxcompiler.dll, if there is one. The compiler that D3D12 has without it, FXC, knows no subgroups and
     refuses barriers in loops, so D3D12 is then left out.
@@ -85,7 +85,7 @@ def _options() -> dict[str, Any]:
 
 
 def _dxc() -> str | None:
-    """The path of dxcompiler.dll: beside wgpu's own library, or in a folder of PATH."""
+    """Return the path of dxcompiler.dll: beside wgpu's own library, or in a folder of PATH."""
     from wgpu._coreutils import get_library_filename
 
     try:

@@ -64,7 +64,7 @@ class Kernel:
 
     @staticmethod
     def get(device: Device, name: str, **defines: int) -> Kernel:
-        """The kernel with these defines (`shader.enabled`), compiled once per device."""
+        """Return the kernel with these defines (`shader.enabled`), compiled once per device."""
         defines = enabled(defines)
         if device.textures:
             defines["TEXTURES"] = 1
@@ -75,7 +75,7 @@ class Kernel:
         return kernel
 
     def uniform(self, struct_name: str, **values: object) -> bytes:
-        """The bytes of one of the shader's structs, by member name."""
+        """Return the bytes of one of the shader's structs, by member name."""
         return pack(self.source, struct_name, values)
 
     def check(self, arrays: dict[str, DeviceArray]) -> None:
@@ -118,7 +118,7 @@ class Kernel:
 
 
 def _scalar(binding: Binding) -> str | None:
-    """The scalar type of a binding's elements, f32, u32 or i32; None for structs."""
+    """Return the scalar type of a binding's elements, f32, u32 or i32; None for structs."""
     if binding.kind == "uniform":
         return None
     if binding.kind == "texture":

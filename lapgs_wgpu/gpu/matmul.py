@@ -29,7 +29,7 @@ class Matrix:
 
     @staticmethod
     def of(array: DeviceArray) -> Matrix:
-        """A whole array (rows, columns)."""
+        """Return a whole array (rows, columns)."""
         rows, columns = array.shape
         return Matrix(array, rows, columns, columns)
 

@@ -25,7 +25,7 @@ class BufferPool:
         self._constants: dict[str, bytes] = {}
 
     def array(self, name: str, shape: tuple[int, ...], dtype: str = "float32") -> DeviceArray:
-        """An array at the start of the named buffer, whose content is lost if it has to grow."""
+        """Return an array at the start of the named buffer, whose content is lost if it has to grow."""
         buffer = self._buffers.get(name)
         nbytes = math.prod(shape) * np.dtype(dtype).itemsize
         if buffer is None or buffer.nbytes < nbytes:
@@ -33,13 +33,13 @@ class BufferPool:
         return DeviceArray(buffer, shape, dtype)
 
     def upload(self, name: str, values: NDArray[Any]) -> DeviceArray:
-        """A copy of `values`, with their shape and dtype, in the buffer of this name."""
+        """Return a copy of `values`, with their shape and dtype, in the buffer of this name."""
         array = self.array(name, values.shape, values.dtype.name)
         array.write(values)
         return array
 
     def constant(self, name: str, content: bytes) -> DeviceArray:
-        """A small array with this content, written only when it changes.
+        """Return a small array with this content, written only when it changes.
 
         The content must not change between recording and submission of a command that reads it.
         """

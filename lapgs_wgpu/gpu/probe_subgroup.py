@@ -13,7 +13,7 @@ _LANES = 64  # of a workgroup, as many as the raster passes have at most
 
 @functools.cache
 def subgroup_size(device: Device) -> int:
-    """Number of lanes of a subgroup; 0 without subgroups. A kernel measures it, since adapters report it unreliably."""
+    """Return the lanes of a subgroup, 0 without subgroups, as a kernel measures them: adapters are unreliable there."""
     if "subgroup" not in device.features:
         return 0
     sizes = DeviceArray.empty(device, "subgroup sizes", (_LANES,), "uint32")

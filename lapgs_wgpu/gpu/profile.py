@@ -63,7 +63,7 @@ class Profile:
 
 
 def _timestamp_period(device: Device) -> float:
-    """Nanoseconds per tick of a timestamp, which is 1 on most devices. wgpu-py does not expose it."""
+    """Return the nanoseconds per tick of a timestamp, which is 1 on most devices. wgpu-py does not expose it."""
     from wgpu.backends.wgpu_native import lib
 
     return float(lib.wgpuQueueGetTimestampPeriod(device.queue._internal))

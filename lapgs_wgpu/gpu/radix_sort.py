@@ -15,7 +15,7 @@ FEW_OWNERS = 32  # of runs: adding up their counters in each lane takes less tim
 
 
 def runs(capacity: int) -> int:
-    """Into how many runs, a lane each, lists with room for so many elements are divided (LANE_RUNS)."""
+    """Return the number of runs, a lane each, of lists with room for so many elements (LANE_RUNS)."""
     return 16 if capacity <= 8 * 4096 else 8 * min(128, max(4, capacity // (8 * 4096)))
 
 
@@ -78,7 +78,7 @@ class RadixSort:
         return keys, second_payload
 
     def _summed(self, commands: Commands, counters: DeviceArray) -> DeviceArray:
-        """The counters' exclusive prefix sums: the place of each counter's first element."""
+        """Return the counters' exclusive prefix sums: the place of each counter's first element."""
         (count,) = counters.shape
         places = self._pool.array(f"{self._name} places", (count,), "uint32")
         total = self._pool.array(f"{self._name} total", (1,), "uint32")

@@ -71,7 +71,7 @@ class Binding:
 
 
 def shader_text(name: str) -> str:
-    """The text of shaders/<name>.wgsl, or of a file elsewhere, whose name is its absolute path without the suffix."""
+    """Return the text of shaders/<name>.wgsl, or of a file elsewhere, named by its absolute path without the suffix."""
     elsewhere = Path(name + ".wgsl")
     return elsewhere.read_text(encoding="utf-8") if elsewhere.is_absolute() else _package_text(name)
 
@@ -85,12 +85,12 @@ def _package_text(name: str) -> str:
 
 
 def enabled(defines: Defines) -> dict[str, int]:
-    """The defines that are there: False stands for one that is absent."""
+    """Return the defines that are there: False stands for one that is absent."""
     return {define: int(value) for define, value in defines.items() if value is not False}
 
 
 def compose(name: str, defines: Defines) -> str:
-    """The WGSL of shaders/<name>.wgsl with the given defines, complete."""
+    """Return the WGSL of shaders/<name>.wgsl with the given defines, complete."""
     defines = enabled(defines)
     imported: set[str] = set()
 
@@ -183,15 +183,18 @@ def _substitute(text: str, defines: Defines, file: str) -> str:
 
 
 def browser_source(source: str) -> str:
-    """Composed WGSL as browsers take it: with the extension that wgpu-native enables unasked, and without Tint's proof
-    of uniform subgroups, which no workgroup of one subgroup needs (RasterConfig)."""
+    """Return composed WGSL as browsers take it.
+
+    It has the extension that wgpu-native enables unasked, and goes without Tint's proof of uniform subgroups, which no
+    workgroup of one subgroup needs (RasterConfig).
+    """
     if "subgroup" not in re.sub(r"//[^\n]*", "", source):
         return source
     return f"enable subgroups;\ndiagnostic(off, subgroup_uniformity);\n{source}"
 
 
 def reflect(source: str) -> dict[str, Binding]:
-    """The bindings of group 0 in composed WGSL, by name."""
+    """Return the bindings of group 0 in composed WGSL, by name."""
     found = {}
     for number, space, access, name, kind in _BINDING.findall(source):
         found[name] = Binding(
@@ -203,7 +206,7 @@ def reflect(source: str) -> dict[str, Binding]:
 
 
 def pack(source: str, struct_name: str, values: Mapping[str, object]) -> bytes:
-    """The bytes of a WGSL struct with these members (matrices column by column)."""
+    """Return the bytes of a WGSL struct with these members (matrices column by column)."""
     size, members = struct_layout(source, struct_name)
     if members.keys() != values.keys():
         difference = members.keys() ^ values.keys()

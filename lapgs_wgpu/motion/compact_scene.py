@@ -72,7 +72,7 @@ def compress(
     *,
     finer: float = 1.0,
 ) -> dict[str, NDArray[Any]]:
-    """The tensors of a compact scene.
+    """Return the tensors of a compact scene.
 
     gaussians: as SceneFile has them, and "static_features" (N, F) where the scene moves. field: as SceneFile has it.
     look: from where and how near it is seen; by default, so near that only the Gaussians' own sizes count.
@@ -107,7 +107,7 @@ def compress(
 
 
 def held_rows(opacity_logits: Floats, config: FieldConfig) -> NDArray[np.integer]:
-    """Which of the Gaussians a compact scene holds, at least one: those that are not too faint at all times."""
+    """Return which of the Gaussians a compact scene holds, at least one: those that are not too faint at all times."""
     least = CONSTANTS["ALPHA_MIN"]
     held = opacity_logits >= math.log(least / (1 - least))
     if config.appearance_size == 4:  # opacities change
@@ -152,7 +152,7 @@ def expand(
 def _allowed_errors(
     stored: Mapping[str, Floats], opacity_changes: bool, look: InitialView | None
 ) -> dict[str, NDArray[np.floating]]:
-    """Largest errors of a Gaussian's values that are hardly seen, (N, 1 or columns) by name."""
+    """Return the largest errors of a Gaussian's values that are hardly seen, (N, 1 or columns) by name."""
     means, scales = stored["means"].astype(np.float64), np.exp(stored["log_scales"].astype(np.float64))
     pixel = _pixels(means, look)[:, None]
     shift = np.maximum(_SHIFT * np.sort(scales, axis=1)[:, 1:2], _SHIFT_PIXELS * pixel)
@@ -171,13 +171,13 @@ def _allowed_errors(
 
 
 def _half_step(values: Floats, bits: int, starts: Sequence[int] = (0,)) -> NDArray[np.floating]:
-    """Largest errors (N, columns) of features, whose effect only the field knows: half a step of their range."""
+    """Return the largest errors (N, columns) of features: half a step of their range, as only the field knows more."""
     largest = np.maximum.reduceat(np.abs(values), starts)
     return np.repeat(largest / ((1 << bits) - 2) * 1.01, np.diff([*starts, len(values)]), axis=0)
 
 
 def _pixels(means: NDArray[np.float64], look: InitialView | None) -> NDArray[np.float64]:
-    """(N,) width of a pixel at each Gaussian, world units, where a camera that turns about the focus is nearest."""
+    """Return the width (N,) of a pixel at Gaussians, world units, where a camera about the focus is nearest."""
     if look is None:
         return np.zeros(len(means))
     camera = look.camera
@@ -217,7 +217,7 @@ class _Reader:
         return array
 
     def _outliers(self, name: str, size: int) -> tuple[NDArray[np.uint32], Floats]:
-        """Places and values of those that are stored exactly, none in most files."""
+        """Return the places and values of those that are stored exactly, none in most files."""
         places = self._tensors.get(f"{name}.outliers", np.zeros(0, np.uint32))
         places = self.tensor(f"{name}.outliers", (places.size,), "u4") if places.size else places
         values = self.tensor(f"{name}.exact", places.shape, "f4") if places.size else np.zeros(0, np.float32)

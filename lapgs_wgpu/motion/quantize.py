@@ -64,7 +64,7 @@ def quantize(
 
 
 def dequantize(quantized: Quantized, starts: Sequence[int] = (0,)) -> Floats:
-    """The values (rows, columns). One rounding to float32, so that every reader has the same bits."""
+    """Return the values (rows, columns). One rounding to float32, so that every reader has the same bits."""
     whole, ranges, outliers, exact = quantized
     factors = ranges.astype(np.float64)
     values = np.empty(whole.shape, np.float32)
@@ -94,7 +94,7 @@ def _round(values: Floats, bits: int, allowed: NDArray[np.float64], centered: bo
 def _interval(
     exact: NDArray[np.float64], allowed: NDArray[np.float64], top: int, centered: bool
 ) -> tuple[float, float]:
-    """Low and step, each a float32, of the interval of top steps that leaves fewest values too far off."""
+    """Return low and step, each a float32, of the interval of top steps that leaves fewest values too far off."""
     low, step = _levels(exact, top, centered)
     if (allowed >= 0.5 * step).all():
         return low, step
@@ -117,7 +117,7 @@ def _interval(
 
 
 def _levels(exact: NDArray[np.float64], top: int, centered: bool) -> tuple[float, float]:
-    """Low and step of an interval that holds all values, each a float32."""
+    """Return low and step of an interval that holds all values, each a float32."""
     low, high = exact.min(initial=np.inf), exact.max(initial=-np.inf)
     if not len(exact):
         return 0.0, 0.0

@@ -93,10 +93,7 @@ class Scene4D:
 
         Args:
             parameters: as the attribute; copied.
-            field_config: configuration of the field.
-            device: that renders.
-            sh_degree: degree of the harmonics in use, 0 to 3.
-            antialiased: how the Gaussians are drawn.
+            field_config, device, sh_degree, antialiased: as the attributes.
             seed: of the field's initial parameters.
             own_field: a module in place of the configured field (docs/api.md).
 
@@ -135,12 +132,9 @@ class Scene4D:
             points: (N, 3) means, world units.
             colors: (N, 3) in [0, 1].
             scales: (N,) standard deviations, world units.
-            field_config: configuration of the field.
             opacity: of all Gaussians, in (0, 1).
-            antialiased: how the Gaussians are drawn.
             device: None for the default adapter.
-            seed: of the field's initial parameters.
-            own_field: a module in place of the configured field (docs/api.md).
+            field_config, antialiased, seed, own_field: as for `Scene4D`.
 
         Returns:
             The scene.
@@ -348,13 +342,9 @@ def scene_of(file: SceneFile, device: Device | None = None, own_field: nn.Module
             antialiased=file.antialiased,
             own_field=own_field,
         )
+        if scene.field is not None:  # a field of one's own checks the shapes; those of the others were checked
+            scene.field.load_state_dict({name: torch.from_numpy(array) for name, array in file.field.items()})
     except InputError as error:
         raise InputError(f"{file.path}: {error}") from error
-    if scene.field is not None:
-        values = {name: torch.from_numpy(array) for name, array in file.field.items()}  # read-only, copied below
-        try:
-            scene.field.load_state_dict(values)
-        except InputError as error:  # of a field of one's own: the shapes of the others were checked
-            raise InputError(f"{file.path}: {error}") from error
     scene.timing, scene.metadata = file.timing, file.metadata
     return scene

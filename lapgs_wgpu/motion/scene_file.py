@@ -99,7 +99,7 @@ def _expanded(
 
 
 def compact_bytes(file: SceneFile, static_features: NDArray[np.float32] | None, *, finer: float = 1.0) -> bytes:
-    """The bytes of a compact scene (docs/format.md). Raises InputError where only torch evaluates the field.
+    """Return the bytes of a compact scene (docs/format.md). Raises InputError where only torch evaluates the field.
 
     static_features: (N, F) of the Gaussians of a checkpoint that moves, else None. finer: see `compress`.
     """
@@ -120,7 +120,7 @@ def compact_bytes(file: SceneFile, static_features: NDArray[np.float32] | None, 
 
 
 def scene_header(config: FieldConfig, sh_degree: int, antialiased: bool, timing: Timing) -> dict[str, str]:
-    """The texts that a file needs beside its arrays, by name."""
+    """Return the texts that a file needs beside its arrays, by name."""
     header = {"field": json.dumps(dataclasses.asdict(config)), "sh_degree": str(sh_degree)}
     if antialiased:
         header["antialiased"] = "true"
@@ -135,7 +135,7 @@ def _texts(metadata: Mapping[str, str]) -> dict[str, str]:
 
 
 def row_shapes(config: FieldConfig) -> dict[str, tuple[int, ...]]:
-    """Parameters of each Gaussian with this field: name -> shape of a row."""
+    """Return the parameters of each Gaussian with this field: name -> shape of a row."""
     size = config.dynamics_size
     return _SHAPES | ({"dynamics": (size,)} if size else {})
 

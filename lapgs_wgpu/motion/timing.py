@@ -28,7 +28,7 @@ class Timing:
     moments: NDArray[np.float64]
 
     def __call__(self, t: float) -> float:
-        """The moment at a time in [0, 1]; at others that of the nearest end. Raises ValueError for NaN."""
+        """Return the moment at a time in [0, 1]; at others that of the nearest end. Raises ValueError for NaN."""
         if np.isnan(t):
             raise ValueError("a time must be a number, got NaN")
         later = float(np.interp(t, self.times, self.moments - self.times)) if len(self.times) else 0.0
@@ -43,7 +43,7 @@ EVEN = Timing(np.zeros(0), np.zeros(0))
 
 
 def timing_of_text(text: str) -> Timing:
-    """The timing that `to_text` wrote. Raises ValueError."""
+    """Return the timing that `to_text` wrote. Raises ValueError."""
     table = parse_json(text, "its timing")
     if not isinstance(table, dict) or table.keys() != {"times", "moments"}:
         raise ValueError("timing is no table of times and moments")
@@ -51,7 +51,7 @@ def timing_of_text(text: str) -> Timing:
 
 
 def checked_timing(times: NDArray[np.float64], moments: NDArray[np.float64]) -> Timing:
-    """A timing of these times and moments, in [0, 1]. Raises ValueError where they are none."""
+    """Return a timing of these times and moments, in [0, 1]. Raises ValueError where they are none."""
     for name, values in (("times", times), ("moments", moments)):
         if values.ndim != 1 or values.dtype != np.float64 or not ((values >= 0) & (values <= 1)).all():
             raise ValueError(f"timing.{name} are not numbers between 0 and 1")

@@ -69,7 +69,7 @@ class Camera:
         width: int,
         height: int,
     ) -> Camera:
-        """A camera with square pixels that looks at a point.
+        """Return a camera with square pixels that looks at a point.
 
         Args:
             position: (3,) of the camera, world units.

@@ -53,7 +53,7 @@ class Drawing:
 
 
 def sh_defines(degree: int | None) -> dict[str, int]:
-    """Defines of color and color_bwd for harmonics of this degree, or for colors (None)."""
+    """Return defines of color and color_bwd for harmonics of this degree, or for colors (None)."""
     if degree is None:
         return {}
     return {"SH": 1, "SH_COUNT": (degree + 1) ** 2} | {f"SH_{d}": 1 for d in range(1, degree + 1)}
@@ -75,7 +75,7 @@ class GaussianGradients(NamedTuple):
     camera: DeviceArray | None = None
 
     def arrays(self) -> list[DeviceArray]:
-        """The arrays of the Gaussians in this order, for `read_all`."""
+        """Return the arrays of the Gaussians in this order, for `read_all`."""
         return [array for array in self[:5] if array is not None]
 
 
@@ -92,6 +92,6 @@ class CameraGradient(NamedTuple):
 
 
 def camera_gradient(sums: NDArray[np.float32]) -> CameraGradient:
-    """The gradient by the camera from the content of `GaussianGradients.camera`."""
+    """Return the gradient by the camera from the content of `GaussianGradients.camera`."""
     turn, shift = sums.sum(axis=1, dtype=np.float64)
     return CameraGradient(-turn[:3], -shift[:3], float(turn[3]))

@@ -31,7 +31,7 @@ class Gaussians(Generic[Array]):
     antialiased: bool = field(default=False, kw_only=True)
 
     def arrays(self) -> dict[str, Array]:
-        """The arrays by name, each with a row for every Gaussian."""
+        """Return the arrays by name, each with a row for every Gaussian."""
         return {name: value for name, value in vars(self).items() if name != "antialiased"}
 
     def __len__(self) -> int:

@@ -13,7 +13,7 @@ _BLOCK = 1 << 13
 
 
 def sh_basis(directions: Floats, degree: int) -> Floats:
-    """(D, (degree + 1)^2) real spherical harmonics of unit vectors (D, 3), in the order and signs of 3DGS."""
+    """Return real spherical harmonics (D, (degree + 1)^2) of unit vectors (D, 3), in the order and signs of 3DGS."""
     c = CONSTANTS
     x, y, z = directions.T
     xx, yy, zz = x * x, y * y, z * z
@@ -27,7 +27,7 @@ def sh_basis(directions: Floats, degree: int) -> Floats:
 
 
 def directions(count: int) -> Floats:
-    """(count, 3) unit vectors, spread evenly (Fibonacci's spiral)."""
+    """Return unit vectors (count, 3), spread evenly (Fibonacci's spiral)."""
     z = 1 - (2 * np.arange(count) + 1) / count
     angle = np.pi * (3 - 5**0.5) * np.arange(count)
     radius = np.sqrt(1 - z * z)
@@ -35,22 +35,22 @@ def directions(count: int) -> Floats:
 
 
 def display_colors(sh: Floats, basis: Floats) -> Floats:
-    """(N, D, 3) colors in [0, 1] of harmonics (N, K, 3) in the directions of a basis (D, K)."""
+    """Return colors (N, D, 3) in [0, 1] of harmonics (N, K, 3) in the directions of a basis (D, K)."""
     return np.clip(np.einsum("dk,nkc->ndc", basis, sh) + CONSTANTS["SH_OFFSET"], 0, 1)
 
 
 def to_linear(display: Floats) -> Floats:
-    """Linear light of sRGB (IEC 61966-2-1), both in [0, 1]."""
+    """Return the linear light of sRGB (IEC 61966-2-1), both in [0, 1]."""
     return np.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4)
 
 
 def to_display(linear: Floats) -> Floats:
-    """sRGB of linear light, both in [0, 1]."""
+    """Return sRGB of linear light, both in [0, 1]."""
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0.003) ** (1 / 2.4) - 0.055)
 
 
 def linear_harmonics(sh: Floats, degree: int) -> Floats:
-    """(N, (degree + 1)^2, 3) harmonics of linear light, without an offset, that fit the colors of sh (N, K, 3)."""
+    """Return harmonics (N, (degree + 1)^2, 3) of linear light, without offset, that fit the colors of sh (N, K, 3)."""
     around = directions(64)
     seen, fit = sh_basis(around, int(sh.shape[1] ** 0.5) - 1), np.linalg.pinv(sh_basis(around, degree))
     found = [

@@ -13,7 +13,7 @@ _BITS = 20  # per axis; three axes fit into int64
 
 
 def morton_order(points: Tensor) -> Tensor:
-    """Indices (N,), int64, that sort points (N, 3) along a Morton curve through their bounding box. Stable."""
+    """Return indices (N,), int64, that sort points (N, 3) along a Morton curve through their bounding box. Stable."""
     if len(points) == 0:
         return torch.zeros(0, dtype=torch.int64)
     low, high = points.min(dim=0).values, points.max(dim=0).values

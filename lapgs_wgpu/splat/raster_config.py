@@ -22,7 +22,6 @@ class RasterConfig:
     """A workgroup of `lanes` draws a tile of tile_width x tile_height pixels, each lane `rows` pixels of a column.
 
     subgroups: the lanes form one subgroup and exchange values by shuffles instead of workgroup memory.
-    split_passes: whose workgroups the driver splits into several subgroups nevertheless; they use workgroup memory.
     lane_runs: use the radix sort for CPU devices, and a polynomial for exp2, which is slow there.
     round_splats: maximum number of splats of a list that one dispatch draws, on devices that limit loops; else None.
     """
@@ -33,7 +32,6 @@ class RasterConfig:
     subgroups: bool
     lane_runs: bool
     round_splats: int | None = None
-    split_passes: tuple[str, ...] = ()
 
     @property
     def rows(self) -> int:
@@ -43,25 +41,17 @@ class RasterConfig:
     def tile_defines(self) -> dict[str, int]:
         return {"TILE_W": self.tile_width, "TILE_H": self.tile_height}
 
-    def shuffles(self, name: str) -> bool:
-        """Whether a pass, rasterize or rasterize_bwd, uses subgroups."""
-        return self.subgroups and name not in self.split_passes
+    def without_subgroups(self) -> RasterConfig:
+        """Return the same for a driver that splits workgroups into several subgroups.
 
-    def without_subgroups(self, name: str) -> RasterConfig:
-        """The same for a driver that splits the workgroups of a pass. Where lists are drawn in rounds, both passes do
-        without subgroups, as they share the rounds, which are then shorter, as loops are longer."""
-        if self.round_splats is None:
-            return replace(self, split_passes=(*self.split_passes, name))
-        return replace(self, subgroups=False, round_splats=self.round_splats * SUBGROUP_TURNS // PLAIN_TURNS)
+        Loops are longer then, and rounds shorter.
+        """
+        rounds = self.round_splats and self.round_splats * SUBGROUP_TURNS // PLAIN_TURNS
+        return replace(self, subgroups=False, round_splats=rounds)
 
-    def raster_defines(self, name: str = "rasterize", *, depth: bool) -> dict[str, int]:
-        """Defines of a pass, rasterize or rasterize_bwd. depth: whether to draw it, too."""
-        flags = {
-            "SUBGROUPS": self.shuffles(name),
-            "DEPTH": depth,
-            "LANES_16": self.lanes > 8,
-            "LANES_32": self.lanes > 16,
-        }
+    def raster_defines(self, *, depth: bool) -> dict[str, int]:
+        """Return the defines of the passes rasterize and rasterize_bwd. depth: whether to draw it, too."""
+        flags = {"SUBGROUPS": self.subgroups, "DEPTH": depth, "LANES_16": self.lanes > 8, "LANES_32": self.lanes > 16}
         values = {"LANES": self.lanes, "ROWS": self.rows, "POLYNOMIAL_EXP2": self.lane_runs}
         if self.round_splats:
             values["ROUND_SPLATS"] = self.round_splats
@@ -69,7 +59,7 @@ class RasterConfig:
 
 
 def cpu_config(subgroup_size: int, max_loop_turns: int = SOFTWARE_LOOP_TURNS) -> RasterConfig:
-    """A workgroup is one vector of the processor, so that no barrier waits."""
+    """Return the configuration for processors: a workgroup is one vector of the processor, so that no barrier waits."""
     lanes = 16 if subgroup_size == 16 else 8
     subgroups = subgroup_size >= lanes
     round_splats = (max_loop_turns + 1) // (SUBGROUP_TURNS if subgroups else PLAIN_TURNS)
@@ -77,12 +67,12 @@ def cpu_config(subgroup_size: int, max_loop_turns: int = SOFTWARE_LOOP_TURNS) ->
 
 
 def gpu_config(subgroup_size: int) -> RasterConfig:
-    """Wider tiles, hence fewer intersections to sort; a subgroup of 16 or 32 lanes per tile."""
+    """Return the configuration for GPUs: wider tiles, hence fewer intersections to sort; a subgroup per tile."""
     lanes = 16 if subgroup_size == 16 else 32
     return RasterConfig(16, 8, lanes, subgroups=subgroup_size >= lanes, lane_runs=False)
 
 
 def raster_config(device: Device) -> RasterConfig:
-    """The configuration for this adapter."""
+    """Return the configuration for this adapter."""
     size = subgroup_size(device)
     return gpu_config(size) if device.max_loop_turns is None else cpu_config(size, device.max_loop_turns)

@@ -41,7 +41,7 @@ class Rendering(NamedTuple):
 
 @functools.cache
 def rasterizer_of(device: Device) -> Rasterizer:
-    """The rasterizer that `rasterize` uses on this device. Its buffers are reused by all calls."""
+    """Return the rasterizer that `rasterize` uses on this device. Its buffers are reused by all calls."""
     return Rasterizer(device)
 
 
@@ -115,16 +115,7 @@ class _Rasterize(torch.autograd.Function):
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
         *tensors, background, probe, camera, antialiased, depth, device = arguments
         rasterizer = rasterizer_of(device)
-        height, width = camera.height, camera.width
         ctx.camera, ctx.antialiased, ctx.depth, ctx.rasterizer = camera, antialiased, depth, rasterizer
-        if len(probe) == 0:
-            ctx.save_for_backward(*tensors, background, background.new_ones((height, width)))
-            ctx.drawing = None
-            image = background.expand(height, width, 3).clone()
-            empty = image.new_zeros((height, width))
-            radii = torch.zeros(0, dtype=torch.int32, device=image.device)
-            ctx.mark_non_differentiable(radii)
-            return image, empty, empty.clone(), radii, probe.detach().clone()
         gaussians = Gaussians(*tensors, antialiased=antialiased)
         ctx.drawing, planes, splats = _draw(
             rasterizer, gaussians, background, camera, depth=depth, gradient=probe.requires_grad
@@ -146,9 +137,6 @@ class _Rasterize(torch.autograd.Function):
         d_background = torch.zeros_like(background) if ctx.needs_input_grad[5] else None
         if d_background is not None and d_image is not None:
             d_background += (d_image * transmittance[..., None]).sum((0, 1))
-        if ctx.drawing is None:
-            empty = [torch.zeros_like(t) for t in tensors]
-            return (*empty, d_background, background.new_zeros((0, 2)), *[None] * 4)
         rasterizer: Rasterizer = ctx.rasterizer
         if not rasterizer.holds(ctx.drawing):  # another image was drawn in between
             gaussians = Gaussians(*tensors, antialiased=ctx.antialiased)
@@ -198,7 +186,7 @@ def radii_and_centres(splats: NDArray[np.float32], device: torch.device) -> tupl
 
 
 def gradient_tensors(arrays: list[NDArray[np.float32]], opacities: Tensor) -> tuple[tuple[Tensor, ...], Tensor]:
-    """Gradients of means, quats, scales, opacities and sh; and of means2d, on the device of the opacities (N,).
+    """Return gradients of means, quats, scales, opacities and sh, and of means2d, on the opacities' torch device.
 
     arrays: GaussianGradients, read back.
     """
@@ -210,5 +198,5 @@ def gradient_tensors(arrays: list[NDArray[np.float32]], opacities: Tensor) -> tu
 
 
 def upload(pool: BufferPool, name: str, tensor: Tensor) -> DeviceArray:
-    """A copy of a tensor, as float32, in the buffer `input NAME` of a pool."""
+    """Return a copy of a tensor, as float32, in the buffer `input NAME` of a pool."""
     return pool.upload(f"input {name}", np.ascontiguousarray(tensor.detach().to("cpu", torch.float32).numpy()))

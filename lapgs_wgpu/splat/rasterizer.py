@@ -19,7 +19,7 @@ from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.gpu.profile import Profile
 from lapgs_wgpu.gpu.radix_sort import RadixSort
 from lapgs_wgpu.gpu.scan import Scan
-from lapgs_wgpu.splat.buffer_plan import BufferPlan, BufferPlans, roomy
+from lapgs_wgpu.splat.buffer_plan import BufferPlans, roomy
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.drawing import Drawing, GaussianGradients, TileLists
 from lapgs_wgpu.splat.gaussians import Gaussians
@@ -55,15 +55,6 @@ class Rasterizer:
         self._drawings = 0
         self._trusted: set[tuple[str, bool, bool]] = set()  # passes whose subgroups were checked
 
-    @property
-    def plan(self) -> BufferPlan:
-        """The plan of the current kind of images."""
-        return self.plans.now
-
-    @plan.setter
-    def plan(self, plan: BufferPlan) -> None:
-        self.plans.now = plan
-
     # Forward ---------------------------------------------------------------------------------------------------------
 
     def draw(
@@ -83,21 +74,21 @@ class Rasterizer:
         self.plans.turn_to((camera.width, camera.height, gradient))
         if self.config.round_splats:
             rows, columns = self._tiles(camera)
-            bands = max(self.plan.bands, -(-rows // max(1, MAX_BAND_TILES // columns)))
-            self.plan = replace(self.plan, bands=bands)
+            bands = max(self.plans.now.bands, -(-rows // max(1, MAX_BAND_TILES // columns)))
+            self.plans.now = replace(self.plans.now, bands=bands)
         self._drawings += 1
         drawing = Drawing(
             gaussians,
             camera,
             background,
             depth,
-            self.plan,
+            self.plans.now,
             self._drawings,
             image=self.pool.array("image", (5 if depth else 4, camera.height, camera.width)),
             splats=self.pool.array("splats", (len(gaussians), SPLAT_FLOATS)),
-            needed=[self.pool.array(f"needed {band}", (3,), "uint32") for band in range(self.plan.bands)],
+            needed=[self.pool.array(f"needed {band}", (3,), "uint32") for band in range(self.plans.now.bands)],
         )
-        for band in range(self.plan.bands):
+        for band in range(self.plans.now.bands):
             with Commands(self.device, profile) as commands:
                 drawing.lists = self._draw_band(commands, drawing, band)
             if self._subgroup_mismatch("rasterize", drawing):
@@ -120,10 +111,10 @@ class Rasterizer:
         most = max(totals)
         if most <= plan.capacity:
             if not self.config.round_splats or not any(count[2] for count in counts):
-                if plan == self.plan:
+                if plan == self.plans.now:
                     self.plans.fitted(most)
                 return False
-            self.plan = replace(plan, rounds=2 * plan.rounds)
+            self.plans.now = replace(plan, rounds=2 * plan.rounds)
             return True
         bands = plan.bands
         rows, _ = self._tiles(drawing.camera)
@@ -134,7 +125,7 @@ class Rasterizer:
                     f"one row of tiles holds {most} intersections, but the device's bindings hold {limit}"
                 )
             bands = min(rows, max(bands + 1, -(-5 * sum(totals) // (4 * limit))))
-        self.plan = replace(plan, capacity=min(limit, roomy(most)), bands=bands)
+        self.plans.now = replace(plan, capacity=min(limit, roomy(most)), bands=bands)
         return True
 
     def _draw_band(self, commands: Commands, drawing: Drawing, band: int) -> TileLists:
@@ -188,7 +179,7 @@ class Rasterizer:
             commands.run(kernel, _groups(colors.shape[0]), arrays | {"part": part, "colors": colors})
 
     def _color_parts(self, kernel: Kernel, colors: DeviceArray) -> list[tuple[DeviceArray, DeviceArray]]:
-        """The kernel's uniform and the rows of colors for each range of Gaussians that fits into one binding."""
+        """Return the kernel's uniform and the rows of colors for each range of Gaussians that fits into one binding."""
         count = colors.shape[0]
         most = self.device.max_binding // (4 * math.prod(colors.shape[1:])) // 64 * 64  # parts begin at 256 bytes
         parts = []
@@ -230,19 +221,19 @@ class Rasterizer:
         return self.pool.constant(f"frame {band}", content)
 
     def _subgroup_mismatch(self, name: str, drawing: Drawing) -> bool:
-        """Whether the driver has split the workgroups of a pass into several subgroups, checked after its first run.
+        """Return whether the driver has split a pass's workgroups into several subgroups, checked after its first run.
 
-        If so, the pass no longer uses subgroups, and has to be run again.
+        If so, no pass uses subgroups from now on, and the image has to be drawn again.
         """
         key = (name, drawing.depth, drawing.plan.rounds > 1)
-        if not self.config.shuffles(name) or key in self._trusted:
+        if not self.config.subgroups or key in self._trusted:
             return False
         self._trusted.add(key)
         ranges = drawing.lists.ranges
         flags = ranges.rows(ranges.shape[0] - 1, 1).read()[0]
         if not flags[3 if name == "rasterize_bwd" else 2]:
             return False
-        self.config = self.config.without_subgroups(name)
+        self.config = self.config.without_subgroups()
         return True
 
     # Backward --------------------------------------------------------------------------------------------------------
@@ -270,10 +261,10 @@ class Rasterizer:
                     drawing.lists = self._draw_band(commands, drawing, band)
                 self._backward_band(commands, drawing, band, d_image, d_splats)
             if self._subgroup_mismatch("rasterize_bwd", drawing):
-                if self.config.round_splats:  # there may be more rounds now
-                    drawing = self._drawn_again(drawing)
-                return self.backward(drawing, d_image, camera=camera, profile=profile)
-        d_sh, d_camera = None, self._camera_sums(n) if camera else None
+                return self.backward(self._drawn_again(drawing), d_image, camera=camera, profile=profile)
+        d_sh = d_camera = None
+        if camera:  # a row for each workgroup of camera_bwd, twice; each half begins at a multiple of 256 bytes
+            d_camera = self.pool.array("d_camera", (2, (_groups(n) + 15) // 16 * 16, 4))
         arrays = gaussians.arrays() | {"frame": self._frame(drawing, 0), "d_splats": d_splats}
         arrays |= {"d_means": d_means, "d_quats": d_quats, "d_scales": d_scales}
         with Commands(self.device, profile) as commands:
@@ -291,15 +282,11 @@ class Rasterizer:
         return GaussianGradients(d_splats, d_means, d_quats, d_scales, d_sh, d_camera)
 
     def _drawn_again(self, drawing: Drawing) -> Drawing:
-        """The same image, drawn with the present config."""
+        """Return the same image, drawn with the present config."""
         while True:
             again = self.draw(drawing.gaussians, drawing.camera, drawing.background, depth=drawing.depth, gradient=True)
             if not self.grow_on_overflow(again):
                 return again
-
-    def _camera_sums(self, n: int) -> DeviceArray:
-        """A row for each workgroup of camera_bwd, twice; each half begins at a multiple of 256 bytes."""
-        return self.pool.array("d_camera", (2, (_groups(n) + 15) // 16 * 16, 4))
 
     def _backward_band(
         self, commands: Commands, drawing: Drawing, band: int, d_image: DeviceArray, d_splats: DeviceArray
@@ -309,7 +296,7 @@ class Rasterizer:
         tails = (3 if drawing.depth else 2) * plan.capacity
         states = 2 * drawing.camera.width * drawing.camera.height if plan.rounds > 1 else 0
         record_tails = self.pool.array("record tails", (tails + states,), "uint32")
-        defines = self.config.raster_defines("rasterize_bwd", depth=drawing.depth)
+        defines = self.config.raster_defines(depth=drawing.depth)
         kernel = Kernel.get(self.device, "rasterize_bwd", ROUNDS=plan.rounds > 1, **defines)
         gather = Kernel.get(self.device, "gather_gradients", DEPTH=drawing.depth)
         arrays = lists._asdict() | {"ids": lists.sorted_ids, "frame": self._frame(drawing, band)}

@@ -117,17 +117,17 @@ class FieldConfig(Options):
         return not self.depth and (self.kind == "grid4d" or (self.kind == "laplacian" and self.motion == "laplacian"))
 
     def grid_time(self, t: float) -> float:
-        """Position on the temporal grids' time axis, in [0, 1], of a time in [0, 1]."""
+        """Return the position on the temporal grids' time axis, in [0, 1], of a time in [0, 1]."""
         return 0.5 * ((2.0 * t - 1.0) * self.time_scale + 1.0)
 
 
 def static_grid(config: FieldConfig) -> GridShape:
-    """The spatial hash grid of the grid fields."""
+    """Return the spatial hash grid of the grid fields."""
     return GridShape(config.static, (0, 1, 2))
 
 
 def temporal_grids(config: FieldConfig) -> list[GridShape]:
-    """The space-time hash grids of the grid fields."""
+    """Return the space-time hash grids of the grid fields."""
     return [GridShape(config.temporal, axes) for axes in (TEMPORAL_AXES if config.temporal_hash else ())]
 
 

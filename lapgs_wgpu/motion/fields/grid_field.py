@@ -86,7 +86,7 @@ class GridField(nn.Module):
         nearby: Nearby | None = None,
         moments: Moments | None = None,
     ) -> list[Deformation]:
-        """The deformation at time t as `forward` gives it, and that of the rows of `moments` at each of its times.
+        """Return the deformation at time t as `forward` does, and that of the rows of `moments` at each of its times.
 
         All are encoded together, which takes much less time than one after another.
         """
@@ -111,9 +111,11 @@ class GridField(nn.Module):
     def _in_torch(
         self, means: Tensor, t: float, dynamics: Tensor | None, nearby: Nearby | None, moments: Moments | None
     ) -> list[Tensor]:
-        """Outputs of the geometry heads (N, 14) and, in further columns, of the appearance head; the same (M, 14) of
-        each moment; and the sums of the squared differences between features of nearby points, for spatial and for
-        space-time features."""
+        """Return outputs of the geometry heads (N, 14) and, in further columns, of the appearance head.
+
+        The same (M, 14) of each moment follow; then the sums of the squared differences between features of nearby
+        points, for spatial and for space-time features.
+        """
         places = [(means, self.config.grid_time(t))]
         if nearby is not None:
             places.append((means[nearby.rows] + nearby.offsets, self.config.grid_time(nearby.time)))
@@ -131,7 +133,7 @@ class GridField(nn.Module):
         return [*outputs, torch.stack(sq_distances) if sq_distances else means.new_zeros(0)]
 
     def _decode(self, t: float, dynamics: Tensor | None, static: Tensor, temporal: Tensor | None = None) -> Tensor:
-        """Outputs of the geometry heads (N, 14) and, in further columns, of the appearance head."""
+        """Return the outputs of the geometry heads (N, 14) and, in further columns, of the appearance head."""
         inputs = static, temporal, dynamics if self.config.dynamics_size else None
         if not len(self.hidden):
             return decode(*inputs, self._weights(t))
@@ -145,7 +147,7 @@ class GridField(nn.Module):
         return torch.cat([decode_block(t, *block) for block in blocks])
 
     def _decode_hidden(self, t: float, static: Tensor, temporal: Tensor | None, dynamics: Tensor | None) -> Tensor:
-        """The same through the hidden layers: `decode` gives what these read, and the gated channels, which the
+        """Return the same after the hidden layers: `decode` gives what these read, and the gated channels, which the
         appearance head reads."""
         fused, *gated = decode(static, temporal, dynamics, self._weights(t)).split(self.config.width, dim=1)
         outputs = [self.heads(self.hidden(fused))]
@@ -156,7 +158,7 @@ class GridField(nn.Module):
     def _on_device(
         self, means: Tensor, t: float, dynamics: Tensor | None, nearby: Nearby | None, moments: Moments | None
     ) -> list[Tensor]:
-        """The same on the device, without transferring features or their gradients."""
+        """Return the same as `_in_torch`, computed on the device, without transferring features or their gradients."""
         others = []
         if moments is not None:
             their_means, their_dynamics = moments.chosen(means, dynamics)
@@ -166,12 +168,9 @@ class GridField(nn.Module):
         if nearby is not None:
             near = means[nearby.rows]
             compared = (near, time), (near + nearby.offsets, self.config.grid_time(nearby.time))
-        ones = means.new_ones(len(means), 1)
         size = self.config.dynamics_size
-        if size:
-            beside = torch.cat([means.new_zeros(len(means), size) if dynamics is None else dynamics, ones], dim=1)
-        else:
-            beside = ones
+        given = means.new_zeros(len(means), size) if dynamics is None or not size else dynamics
+        beside = torch.cat([given, means.new_ones(len(means), 1)], dim=1)
         w = self._weights(t)
         placed = [(w.spatial, w.spatial_bias)]
         heads = w.heads
@@ -190,9 +189,12 @@ class GridField(nn.Module):
         return [outputs + w.heads_bias, *others, sq_distances]
 
     def _weights(self, t: float) -> DecoderWeights:
-        """The decoder's weights at a time. The second layer of the motion, which only linear layers follow, is folded
-        into the heads, and all heads are one matrix, so that the features' gradient (N, width) is written once. Before
-        hidden layers the heads are the identity."""
+        """Return the decoder's weights at a time.
+
+        The second layer of the motion, which only linear layers follow, is folded into the heads, and all heads are one
+        matrix, so that the features' gradient (N, width) is written once. Before hidden layers the heads are the
+        identity.
+        """
         size = self.config.dynamics_size
         if len(self.hidden):
             identity, moved = torch.eye(self.config.width), self.config.width

@@ -25,12 +25,12 @@ Place = tuple[Tensor, float]  # points (N, 3), world units, and a time in [0, 1]
 class Encoded(NamedTuple):
     """Sets of points and their encodings on the device. Valid until the encoder writes other points.
 
-    tables: (entries, 2) of each grid, group by group. encodings: (N, features) of each set and group; where gradients
-    are recorded, they and the tables become their gradients.
+    tables: (entries, 2) of each grid. encodings: (N, features) of each set and group; where gradients are recorded,
+    they and the tables become their gradients.
     """
 
     points: list[PointSet]
-    tables: list[list[DeviceArray]]
+    tables: list[DeviceArray]
     encodings: list[list[DeviceArray]]
 
 
@@ -88,24 +88,17 @@ class HashEncoder:
         count = len(self.groups)
         return [list(outputs[i : i + count]) for i in range(0, len(outputs), count)]
 
-    def encode(self, places: Sequence[Place], tables: Sequence[Tensor]) -> tuple[Encoded, list[Tensor]]:
-        """The forward pass without autograd. Returns the encodings by place, then by group."""
+    def encode(self, places: Sequence[Place], tables: Sequence[Tensor]) -> list[Tensor]:
+        """Return the encodings by place, then by group, without autograd."""
         encoded = self.write(places, tables)
         with Commands(self._device) as commands:
             self.record(commands, encoded)
-        device = places[0][0].device
         arrays = read_all(list(itertools.chain(*encoded.encodings)))
-        return encoded, [torch.from_numpy(array).to(device) for array in arrays]
+        return [torch.from_numpy(array).to(places[0][0].device) for array in arrays]
 
-    def backward(
-        self, places: Sequence[Place], d_encodings: Sequence[Tensor], encoded: Encoded | None = None
-    ) -> list[Tensor]:
-        """Gradients of the tables from those of the encodings, in the order of `encode`.
-
-        encoded: result of `encode`, whose points are reused if the encoder still holds them.
-        """
-        if encoded is None or not self.holds(encoded):
-            encoded = self.write(places)
+    def backward(self, places: Sequence[Place], d_encodings: Sequence[Tensor]) -> list[Tensor]:
+        """Return the gradients of the tables from those of the encodings, in the order of `encode`."""
+        encoded = self.write(places)
         for array, d_encoding in zip(itertools.chain(*encoded.encodings), d_encodings, strict=True):
             array.write(_host(d_encoding))
         with Commands(self._device) as commands:
@@ -117,31 +110,22 @@ class HashEncoder:
 
     def write(self, places: Sequence[Place], tables: Sequence[Tensor] = ()) -> Encoded:
         """Upload points and, if given, tables."""
-        for number, table in enumerate(tables):
-            self._pool.upload(f"table {number}", _host(table))
-        numbers = itertools.count()
-        sets = []
+        arrays = [self._pool.array(f"table {i}", tuple(grid.table.shape)) for i, grid in enumerate(self.grids)]
+        for array, table in zip(arrays, tables, strict=False):
+            array.write(_host(table))
+        self._held = Encoded([], arrays, [])
         for number, (points, time) in enumerate(places):
             padded = _host(torch.nn.functional.pad(points.detach().float(), (0, 1)))
-            sets.append(PointSet(number, self._pool.upload(f"points {number}", padded), len(points), time))
-        self._held = Encoded(
-            sets,
-            [
-                [self._pool.array(f"table {next(numbers)}", tuple(grid.table.shape)) for grid in group]
-                for group in self.groups
-            ],
-            [
-                [
-                    self._pool.array(f"encoding {number} {group}", (len(points), size))
-                    for group, size in enumerate(self.features)
-                ]
-                for number, (points, _) in enumerate(places)
-            ],
-        )
+            uploaded = self._pool.upload(f"points {number}", padded)
+            self._held.points.append(PointSet(number, uploaded, len(points), time))
+            shapes = [(len(points), features) for features in self.features]
+            self._held.encodings.append(
+                [self._pool.array(f"encoding {number} {group}", shape) for group, shape in enumerate(shapes)]
+            )
         return self._held
 
     def holds(self, encoded: Encoded) -> bool:
-        """Whether the device still holds these encodings: neither other points nor gradients have overwritten them."""
+        """Return whether the device still holds these encodings: no other points or gradients have overwritten them."""
         return encoded is self._held
 
     def record(self, commands: Commands, encoded: Encoded) -> None:
@@ -153,17 +137,19 @@ class HashEncoder:
         """Record the backward passes. They read the encodings' gradients from the arrays of the encodings, and write
         those of the tables to the arrays of the tables, which are returned."""
         self._held = None
-        for table in itertools.chain(*encoded.tables):
+        for table in encoded.tables:
             commands.clear(table)
         for points, passes, tables, encoding in self._calls(encoded):
             passes.add_gradient(commands, points, encoding, tables)
-        return list(itertools.chain(*encoded.tables))
+        return encoded.tables
 
     def _calls(self, encoded: Encoded) -> Iterator[tuple[PointSet, HashEncoderPasses, list[DeviceArray], DeviceArray]]:
         for points, encodings in zip(encoded.points, encoded.encodings, strict=True):
-            for passes, tables, encoding in zip(self._passes, encoded.tables, encodings, strict=True):
+            tables = iter(encoded.tables)
+            for passes, encoding in zip(self._passes, encodings, strict=True):
+                of_group = list(itertools.islice(tables, len(passes.grids)))
                 if points.count:
-                    yield points, passes, tables, encoding
+                    yield points, passes, of_group, encoding
 
 
 def _host(tensor: Tensor) -> NDArray[np.float32]:
@@ -175,10 +161,9 @@ class _Encode(torch.autograd.Function):
     def forward(ctx: Any, encoder: HashEncoder, places: Sequence[Place], *tables: Tensor) -> tuple[Tensor, ...]:
         ctx.encoder, ctx.times = encoder, [time for _, time in places]
         ctx.save_for_backward(*[points for points, _ in places])
-        ctx.encoded, encodings = encoder.encode(places, tables)
-        return tuple(encodings)
+        return tuple(encoder.encode(places, tables))
 
     @staticmethod
     def backward(ctx: Any, *d_encodings: Tensor) -> tuple[Tensor | None, ...]:
         places = list(zip(ctx.saved_tensors, ctx.times, strict=True))
-        return (None, None, *ctx.encoder.backward(places, d_encodings, ctx.encoded))
+        return (None, None, *ctx.encoder.backward(places, d_encodings))

@@ -44,7 +44,7 @@ class Level:
 
 
 def make_levels(config: HashConfig) -> list[Level]:
-    """Levels of a grid, whose resolution grows geometrically along each axis."""
+    """Return the levels of a grid, whose resolution grows geometrically along each axis."""
     levels, first = [], 0
     for number in range(config.levels):
         share = number / max(1, config.levels - 1)

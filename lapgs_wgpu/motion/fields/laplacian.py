@@ -55,7 +55,7 @@ class LaplacianMotion(nn.Module):
         return phase.cos() @ self.alpha + phase.sin() @ self.beta
 
     def layers(self, t: float) -> tuple[Layer, Layer]:
-        """The layers of A_L at a time: rectified channels of static features, and features (N, W) of these."""
+        """Return the layers of A_L at a time: rectified channels of static features, and features (N, W) of these."""
         series = self.series(t)
         return (self.first.weight, self.first.bias), (series[:, None] * self.second.weight, series * self.second.bias)
 

@@ -1,4 +1,4 @@
-"""Linear layers, initialized from a generator."""
+"""Linear layers, initialized from a generator or to zero."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ from torch import nn
 
 
 def linear(shape: tuple[int, ...], generator: torch.Generator) -> nn.Linear:
-    """A linear layer with a weight of this shape (outputs, inputs) and torch's own initial distribution."""
-    outputs, inputs = shape
-    layer = nn.Linear(inputs, outputs)
-    reach = inputs**-0.5
+    """Return a linear layer with a weight of this shape (outputs, inputs) and torch's own initial distribution."""
+    layer = zero_head(shape)
+    reach = shape[1] ** -0.5
     with torch.no_grad():
         layer.weight.uniform_(-reach, reach, generator=generator)
         layer.bias.uniform_(-reach, reach, generator=generator)
@@ -18,7 +17,7 @@ def linear(shape: tuple[int, ...], generator: torch.Generator) -> nn.Linear:
 
 
 def zero_head(shape: tuple[int, ...]) -> nn.Linear:
-    """A linear layer with a weight of this shape (outputs, inputs), initialized to zero: it starts without effect."""
+    """Return a linear layer with a weight of this shape (outputs, inputs), all zero: it starts without effect."""
     outputs, inputs = shape
     layer = nn.Linear(inputs, outputs)
     nn.init.zeros_(layer.weight)

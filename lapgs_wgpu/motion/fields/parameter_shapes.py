@@ -21,7 +21,7 @@ Shapes = dict[str, tuple[int, ...]]
 
 
 def parameter_shapes(config: FieldConfig) -> Shapes:
-    """Parameters of the field of this configuration; none for static scenes."""
+    """Return the shapes of the parameters of the field of this configuration; none for static scenes."""
     if config.kind == "mlp":
         return _mlp(config)
     if config.kind == "hexplane":
@@ -30,13 +30,13 @@ def parameter_shapes(config: FieldConfig) -> Shapes:
 
 
 def laplacian_motion(inputs: int, width: int, components: int) -> Shapes:
-    """Parameters of LaplacianMotion."""
+    """Return the shapes of the parameters of LaplacianMotion."""
     series: Shapes = {"alpha": (components, width), "beta": (components, width), "frequencies": (components,)}
     return series | _layer("first", width, inputs) | _layer("second", width, width)
 
 
 def time_motion(inputs: int, width: int) -> Shapes:
-    """Parameters of TimeMotion."""
+    """Return the shapes of the parameters of TimeMotion."""
     return _layer("first", width, inputs + 1) | _layer("second", width, width)
 
 

@@ -49,7 +49,7 @@ class DecoderWeights(NamedTuple):
 
 
 def decode(static: Tensor, temporal: Tensor | None, dynamics: Tensor | None, weights: DecoderWeights) -> Tensor:
-    """The outputs of the heads: with the layers' outputs x (spatial), y (temporal) and z (inner),
+    """Return the outputs of the heads: with the layers' outputs x (spatial), y (temporal) and z (inner),
     relu(y) (2 sigmoid(x) - 1) heads^T + relu(z) motion_heads^T + heads_bias (Grid4D; paper eqs. 6 and 9).
 
     Args:
@@ -142,7 +142,7 @@ def _activations(inputs: _Inputs, w: DecoderWeights) -> _Activations:
 def _backward(
     inputs: _Inputs, activations: _Activations, d: Tensor, w: DecoderWeights, d_inputs: _Inputs
 ) -> DecoderWeights:
-    """The gradients of the weights; writes those of the inputs. d: of the outputs."""
+    """Return the gradients of the weights, and write those of the inputs. d: of the outputs."""
     gate, moving, gated, inner = activations
     d_gated = d @ w.heads
     d_moving = torch.ops.aten.threshold_backward(d_gated * gate, moving, 0)

@@ -63,7 +63,7 @@ class DecoderShape:
 
 
 def decoder_shape(config: FieldConfig) -> DecoderShape:
-    """The decoder of a field that `decodes_on_device`."""
+    """Return the decoder of a field that `decodes_on_device`."""
     return DecoderShape(
         width=config.width,
         beside=config.dynamics_size + 1,
@@ -138,7 +138,7 @@ class DecoderPasses:
         inputs: Mapping[str, DeviceArray],
         weights: Mapping[str, DeviceArray],
     ) -> tuple[Matrix, Matrix]:
-        """Outputs of the layers for a block, and the inputs of the heads."""
+        """Return the outputs of the layers for a block, and the inputs of the heads."""
         shape = self.shape
         layers = Matrix.of(self.pool.array("layers", (count, shape.channels)))
         features = Matrix.of(self.pool.array("features", (count, shape.placed)))

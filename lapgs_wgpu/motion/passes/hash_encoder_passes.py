@@ -104,12 +104,12 @@ class HashEncoderPasses:
         return _Levels(name, sliced, len(words), int(words[:, 4:6].prod(axis=1).max()), array)
 
     def _lookups(self, slices: DeviceArray, tables: Sequence[DeviceArray]) -> list[tuple[_Levels, DeviceArray]]:
-        """The levels of each lookup, with what they are looked up in, or with its gradient."""
+        """Return the levels of each lookup, with what they are looked up in, or with its gradient."""
         direct = [(levels, tables[number]) for number, levels in self._direct.items()]
         return direct if self._slices is None else [(self._slices, slices), *direct]
 
     def _uniform(self, points: PointSet, first: int, count: int, most: int) -> DeviceArray:
-        """The uniform of a block of points, of at most so many (0: of all). All blocks of all sets are submitted
+        """Return the uniform of a block of points, of at most so many (0: of all). All blocks of all sets are submitted
         together, so each has its own."""
         content = Kernel.get(self.device, "hashgrid_slice").uniform(
             "Grid",
@@ -124,7 +124,7 @@ class HashEncoderPasses:
     def _blocks(
         self, points: PointSet, encoding: DeviceArray, most: int | None = None
     ) -> Iterator[tuple[int, int, DeviceArray]]:
-        """First point, number of points and uniform of each dispatch: at most `most` points, with rows that fit into a
+        """Yield first point, number of points and uniform of each dispatch: at most `most` points, whose rows fit in a
         binding."""
         n = points.count
         row = encoding.nbytes // max(n, 1)
@@ -187,7 +187,7 @@ class HashEncoderPasses:
             commands.dispatch_grid(kernel, (-(-cut.cells // self._group_cells), cut.count), **arrays)
 
     def _largest(self, commands: Commands, points: PointSet, d_encoding: DeviceArray) -> DeviceArray:
-        """The largest absolute value of a gradient, which scales fixed-point sums."""
+        """Return the largest absolute value of a gradient, which scales fixed-point sums."""
         largest = self.pool.array(f"largest {points.number}", (1,), "uint32")
         commands.clear(largest)
         kernel = Kernel.get(self.device, "hashgrid_largest")
@@ -198,13 +198,13 @@ class HashEncoderPasses:
 
 
 def _shared(levels: int) -> int:
-    """The number of workgroups whose lanes own levels: as many for each core, and at most eight levels in each."""
+    """Return the number of workgroups whose lanes own levels: as many for each core, at most eight levels in each."""
     cores = os.cpu_count() or 1
     return min(levels, -(-levels // (8 * cores)) * cores)
 
 
 def _level_words(grid: GridShape, first_number: int, first_sliced: int) -> NDArray[np.uint32]:
-    """A grid's levels (levels, 16) as common/hashgrid.wgsl reads them.
+    """Return a grid's levels (levels, 16) as common/hashgrid.wgsl reads them.
 
     first_number: of the grid's first level in a row of the encoding. first_sliced: the first free entry of the slices.
     """

@@ -25,10 +25,12 @@ Floats = NDArray[np.float32]
 _LANES = 64  # deform.wgsl
 _CANONICAL = 16  # deform.wgsl: floats of a Gaussian before its still features
 _BLOCK_BYTES = 128 << 20  # of the features that a dispatch reads: WebGPU's default limit of a binding
+# Where deform.wgsl has the outputs of the heads among its floats: turn, shift, quaternion, scale; color, opacity.
+_PLACES = np.array([*range(4), 8, 9, 10, *range(4, 8), 12, 13, 14, 16, 17, 18, 11])
 
 
 def runs_on_device(config: FieldConfig, device: Device) -> bool:
-    """Whether `GridFieldPlayback` supports this field on the device."""
+    """Return whether `GridFieldPlayback` supports this field on the device."""
     if not config.decodes_on_device or device.max_loop_turns is None:
         return config.decodes_on_device
     sizes = _Sizes(config)
@@ -83,10 +85,7 @@ class GridFieldPlayback:
         self._sizes = sizes = _Sizes(config)
         self._defines = {"POINTS": 4, "QUADS": 2} if device.is_cpu else {"POINTS": 2, "QUADS": 1}
         self._defines["HEADS"] = 5 if config.appearance_size else 4
-        if config.kind == "laplacian":
-            self._defines["MOTION"] = 1
-        if config.appearance_size:
-            self._defines["COLOR"] = 1
+        self._motion_heads = 4 if config.kind == "laplacian" else 0
         self._channels = 4 * self._defines["QUADS"]  # a round
         self._rounds = -(-config.width // self._channels)
         row = max(_CANONICAL + 4 * sizes.still_quads, 4 * sizes.moving_quads)
@@ -163,27 +162,23 @@ class GridFieldPlayback:
 
     def _heads(self, t: float) -> Floats:
         """Return the vectors (V, 4) of the heads: biases, and weights by channel; the Laplacian motion is folded in."""
-        p, width = self._parameters, self._sizes.width
+        p, width, heads = self._parameters, self._sizes.width, self._defines["HEADS"]
+        names = ["heads", "appearance"] if self._config.appearance_size else ["heads"]
         factors = np.array(self._config.head_factors, np.float32)
-        of_geometry, of_look = np.split(factors, [sum(GEOMETRY)])
-        weight, bias = p["heads.weight"] * of_geometry[:, None], p["heads.bias"] * of_geometry
-        heads, channels = self._defines["HEADS"], self._rounds * self._channels
-        columns = np.zeros((channels, heads + 4 if "MOTION" in self._defines else heads, 4), np.float32)
-        start = np.zeros((heads, 4), np.float32)
-        _fill_geometry(columns[:width], weight.T)
-        _fill_geometry(start[None], bias[None])
-        if self._config.kind == "laplacian":
+        weight = np.concatenate([p[f"{name}.weight"] for name in names]) * factors[:, None]
+        bias = np.concatenate([p[f"{name}.bias"] for name in names]) * factors
+        places, moved = _PLACES[: len(factors)], sum(GEOMETRY)
+        start = np.zeros(4 * heads, np.float32)
+        columns = np.zeros((self._rounds * self._channels, 4 * (heads + self._motion_heads)), np.float32)
+        columns[:width, places] = weight.T
+        if self._motion_heads:  # as in GridField, only the geometry heads read A_L
             phase = 2 * math.pi * t * p["motion.frequencies"].astype(np.float64)
             series = np.cos(phase) @ p["motion.alpha"] + np.sin(phase) @ p["motion.beta"]
-            # As GridField: only these heads read A_L.
-            _fill_geometry(columns[:width, heads:], (weight @ (series[:, None] * p["motion.second.weight"])).T)
-            _fill_geometry(start[None], (bias + weight @ (series * p["motion.second.bias"]))[None])
-        if self._config.appearance_size:
-            look = of_look[:, None] * p["appearance.weight"], of_look * p["appearance.bias"]
-            columns[:width, 4, :3], start[4, :3] = look[0][:3].T, look[1][:3]
-            if self._config.appearance_size == 4:
-                columns[:width, 2, 3], start[2, 3] = look[0][3], look[1][3]
-        return np.concatenate([start, columns.reshape(-1, 4)])
+            second = weight[:moved] @ (series[:, None] * p["motion.second.weight"])
+            columns[:width, 4 * heads + places[:moved]] = second.T
+            bias[:moved] += weight[:moved] @ (series * p["motion.second.bias"])
+        start[places] = bias
+        return np.concatenate([start, columns.reshape(-1)]).reshape(-1, 4)
 
     # A time ----------------------------------------------------------------------------------------------------------
 
@@ -192,11 +187,12 @@ class GridFieldPlayback:
 
         Of the colors only the constant part is written, if the field changes colors.
         """
-        kernel = Kernel.get(self._device, "deform", **self._defines)
+        color = self._config.appearance_size > 0
+        kernel = Kernel.get(self._device, "deform", MOTION=self._motion_heads > 0, COLOR=color, **self._defines)
         heads = self._heads(t)
         self._weights.rows(0, len(heads)).write(heads)
         names = {"means": "means", "quats": "quats", "scales": "scales", "opacities": "opacities"}
-        names |= {"colors": "sh"} if "COLOR" in self._defines else {}
+        names |= {"colors": "sh"} if color else {}
         with Commands(self._device) as commands:
             for number, block in enumerate(self._blocks):
                 points = PointSet(number, block.points, block.count, self._config.grid_time(t))
@@ -223,9 +219,3 @@ class GridFieldPlayback:
                     **{name: getattr(out, of).rows(block.first, block.count) for name, of in names.items()},
                 )
                 commands.flush()  # all blocks together may take longer than a watchdog allows
-
-
-def _fill_geometry(quads: NDArray[np.float32], outputs: NDArray[np.floating]) -> None:
-    """Write the geometry heads' outputs (rows, 14) in the layout of deform.wgsl: quads (rows, 4 or more, 4)."""
-    turn, shift, quaternion, scale = np.split(outputs, np.cumsum(GEOMETRY)[:-1], axis=1)
-    quads[:, 0], quads[:, 1], quads[:, 2, :3], quads[:, 3, :3] = turn, quaternion, shift, scale

@@ -81,7 +81,7 @@ def linear_pieces(
 
 
 def piece_errors(playback: Playback, pieces: Pieces) -> Floats:
-    """(P,) largest displacement of each piece from the playback, world units, at _CHECKS times of the clip."""
+    """Return the largest displacements (P,) of pieces from the playback, world units, at _CHECKS times."""
     worst = np.zeros(len(pieces.source))
     for t in np.linspace(0, 1, _CHECKS).tolist():
         shown = np.flatnonzero((pieces.begin <= t) & ((t < pieces.end) | (pieces.end == 1.0)))
@@ -93,7 +93,7 @@ def piece_errors(playback: Playback, pieces: Pieces) -> Floats:
 
 
 def state(playback: Playback, t: float, rows: NDArray[np.integer]) -> Floats:
-    """(rows, 13) of Gaussians at a time: mean, root of the covariance, opacity, color of degree 0."""
+    """Return states (rows, 13) of Gaussians at a time: mean, root of the covariance, opacity, color of degree 0."""
     now = playback.at(t)
     arrays = read_all([now.means, now.quats, now.scales, now.opacities, now.sh])
     means, quats, scales, opacities, sh = (values[rows] for values in arrays)
@@ -102,19 +102,19 @@ def state(playback: Playback, t: float, rows: NDArray[np.integer]) -> Floats:
 
 
 def roots_of(scales: Floats, quats: Floats) -> Floats:
-    """(N, 6) weighted entries of the square roots of covariances. quats: (N, 4) xyzw, of any length."""
+    """Return weighted entries (N, 6) of the square roots of covariances. quats: (N, 4) xyzw, of any length."""
     axes = rotation_matrix(np.roll(quats / np.linalg.norm(quats, axis=1, keepdims=True), 1, axis=1).T)
     return np.einsum("ikn,ikn,nk->ni", axes[_ROWS], axes[_COLUMNS], scales) * _WEIGHTS
 
 
 def displacement(moved: Floats, true: Floats) -> Floats:
-    """At most how far points of ellipsoids of one standard deviation are apart, world units: (...,) of states."""
+    """Return a bound (...,) of how far points of ellipsoids of one standard deviation are apart, world units."""
     means = np.linalg.norm(moved[..., _MEAN] - true[..., _MEAN], axis=-1)
     return means + np.linalg.norm(moved[..., _ROOT] - true[..., _ROOT], axis=-1)
 
 
 def _ellipsoids(roots: Floats) -> tuple[Floats, Floats]:
-    """Scales (N, 3) and quaternions (N, 4) xyzw of roots."""
+    """Return scales (N, 3) and quaternions (N, 4) xyzw of roots."""
     from scipy.spatial.transform import Rotation
 
     matrices = np.empty((len(roots), 3, 3))
@@ -133,7 +133,7 @@ def _halve(
     farthest: float,
     shade: float,
 ) -> Iterator[tuple[Floats, ...]]:
-    """(source, begin, end, state at the middle, slope) of pieces. values: (samples, rows, 13), evenly."""
+    """Yield (source, begin, end, state at the middle, slope) of pieces. values: (samples, rows, 13), evenly."""
     at = np.linspace(-0.5, 0.5, len(values), dtype=np.float32)[:, None, None]
     middle = values.mean(axis=0)
     slope = (at * values[..., _MEAN]).sum(axis=0) / (at**2).sum()
@@ -154,7 +154,7 @@ def _halve(
 
 
 def _sampled(playback: Playback, values: Floats, rows: NDArray[np.integer], begin: float, end: float) -> Floats:
-    """The samples of a piece, with those in between where they are too few."""
+    """Return the samples of a piece, with those in between where they are too few."""
     if len(values) > _PIECE_SAMPLES:
         return values
     fine = np.empty((2 * len(values) - 1, *values.shape[1:]), values.dtype)

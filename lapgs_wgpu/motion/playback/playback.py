@@ -43,7 +43,7 @@ class Playback(Protocol):
     def timing(self) -> Timing: ...
 
     def at(self, t: float) -> Gaussians[DeviceArray]:
-        """The activated Gaussians at a time, on the device. Does not wait for it. Valid until the next call."""
+        """Return the activated Gaussians at a time, on the device. Does not wait for it. Valid until the next call."""
 
     def means(self, t: float) -> Floats:
         """Return the means (count, 3) at a time, world units."""
@@ -120,7 +120,7 @@ class DevicePlayback:
 
 
 def activate(stored: dict[str, Floats], sh_degree: int) -> dict[str, Floats]:
-    """The stored arrays, and the activated Gaussians as in `Scene4D.canonical`."""
+    """Return the stored arrays, and the activated Gaussians as in `Scene4D.canonical`."""
     quats, used = stored["quats"], (sh_degree + 1) ** 2 - 1
     with np.errstate(over="ignore"):
         scales = np.maximum(np.exp(stored["log_scales"]), np.float32(MIN_SCALE))

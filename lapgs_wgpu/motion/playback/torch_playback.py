@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import weakref
-from typing import NamedTuple
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -19,27 +16,6 @@ from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterize import upload_gaussians
 
 
-class _Shown(NamedTuple):
-    """The last upload: its time, degree and parameters, each with torch's version counter."""
-
-    gaussians: Gaussians[DeviceArray]
-    t: float
-    sh_degree: int
-    parameters: list[tuple[weakref.ref[Tensor], int]]  # weak references, since a training replaces large tensors
-
-    def is_of(self, scene: Scene4D, t: float) -> bool:
-        """Whether an evaluation of the scene would give the same result."""
-        parameters = _parameters(scene)
-        return (self.t, self.sh_degree, len(self.parameters)) == (t, scene.sh_degree, len(parameters)) and all(
-            known() is parameter and version == parameter._version
-            for (known, version), parameter in zip(self.parameters, parameters, strict=True)
-        )
-
-
-def _parameters(scene: Scene4D) -> list[Tensor]:
-    return [*scene.parameters.values(), *(scene.field.parameters() if scene.field is not None else [])]
-
-
 class TorchPlayback:
     """A Playback of a Scene4D in its present state: parameters, their number and sh_degree may change between calls.
 
@@ -51,7 +27,10 @@ class TorchPlayback:
         self.scene = scene
         self.device, self.field_config, self.metadata = scene.device, scene.field_config, scene.metadata
         self._pool = BufferPool(scene.device)  # a training uses its own
-        self._shown: _Shown | None = None
+        self._shown: Gaussians[DeviceArray] | None = None
+        # Time and degree of what is shown, and id and version of each parameter.
+        self._shown_of: tuple[float, int, list[tuple[int, int]]] | None = None
+        self._parameters: list[Tensor] = []  # kept, so that no other tensor has their ids
 
     @property
     def count(self) -> int:
@@ -71,13 +50,15 @@ class TorchPlayback:
 
     def at(self, t: float) -> Gaussians[DeviceArray]:
         scene = self.scene
-        if self._shown is None or not self._shown.is_of(scene, t):
+        parameters = [*scene.parameters.values(), *(scene.field.parameters() if scene.field is not None else [])]
+        wanted = t, scene.sh_degree, [(id(parameter), parameter._version) for parameter in parameters]
+        if self._shown is None or self._shown_of != wanted:
             self._shown = None  # after a failure the buffers would be inconsistent
-            known = [(weakref.ref(parameter), parameter._version) for parameter in _parameters(scene)]
             with torch.no_grad():
                 now = scene.at(t)
-            self._shown = _Shown(upload_gaussians(self._pool, now), t, scene.sh_degree, known)
-        return self._shown.gaussians
+            self._shown = upload_gaussians(self._pool, now)
+            self._shown_of, self._parameters = wanted, parameters
+        return self._shown
 
     def means(self, t: float) -> NDArray[np.float32]:
         with torch.no_grad():
