@@ -34,9 +34,7 @@ from helpers.web_pages import (
     shown,
 )
 
-from lapgs_wgpu.gpu.device import Device, _adapters
-from lapgs_wgpu.gpu.kernel import Commands, Kernel
-from lapgs_wgpu.gpu.shader import browser_source
+from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.lapgs_file import MAGIC
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.timing import Timing
@@ -48,7 +46,6 @@ from lapgs_wgpu.viewer.camera import ViewCamera
 from lapgs_wgpu.viewer.controls import ORBIT, ZOOM
 from lapgs_wgpu.viewer.export import export_compact
 from lapgs_wgpu.viewer.loaded_scene import load_scene
-from lapgs_wgpu.viewer.web_page import player_data
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt-get install chromium")
 
@@ -214,31 +211,6 @@ def test_a_scene_of_uneven_timing(window: Browser, folder: Path, device: Device)
 
 
 @pytest.mark.nightly
-def test_the_desktop_runs_the_same_dispatches(browser: Browser, page: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Kernels, workgroups and bindings of a frame, in the shape for GPUs: all that the page's own code decides."""
-    info, adapter = _adapters()[0]
-    gpu = Device(adapter, dataclasses.replace(info, kind="discrete"), subgroups=False)
-    names = {kernel["source"]: name for name, kernel in player_data()["kernels"].items()}
-    found: list[Any] = []
-    dispatch = Commands.dispatch_grid
-
-    def record(commands: Commands, kernel: Kernel, groups: tuple[int, int], **arrays: Any) -> None:
-        bindings = {name: [array.offset, array.bound_bytes] for name, array in arrays.items()}
-        found.append([names[browser_source(kernel.source)], *groups, bindings])
-        dispatch(commands, kernel, groups, **arrays)
-
-    desktop = Desktop(page, gpu)
-    for time in (0.0, 0.2):  # buffers grow alike
-        desktop.picture(time)
-    monkeypatch.setattr(Commands, "dispatch_grid", record)
-    desktop.picture(0.4)
-    call(browser, "setTime", 0.2)
-    assert call(browser, "passes", 0.4) == found
-    assert call(browser, "passes", 0.4) == found, "of the time that is on show"
-    assert len(found) > 50
-
-
-@pytest.mark.nightly
 def test_default_limits(window: Browser, page: Path, desktop: Desktop) -> None:
     """A device without any feature or limit beyond WebGPU's own."""
     script = "GPUAdapter.prototype.requestDevice = function () { return own.call(this, {}); };"
@@ -264,7 +236,6 @@ def test_200_000_gaussians(window: Browser, folder: Path, device: Device) -> Non
     for time in TIMES:
         call(window, "setTime", time)
         assert same(window, desktop, time)
-    assert sum(name.startswith("deform") for name, *_ in call(window, "passes", 0.5)) == 2
 
 
 # Input
@@ -490,19 +461,15 @@ def test_in_a_frame(window: Browser, page: Path, server: str, folder: Path) -> N
 
 @pytest.mark.nightly
 def test_a_lost_device(window: Browser, page: Path) -> None:
-    """A sentence, and the last picture stays on the screen."""
+    """A sentence, and the poster is on the screen again."""
     script = "GPUAdapter.prototype.requestDevice = async function (...given)"
     script += " { return window.device = await own.apply(this, given); };"
     open_page(window, page.as_uri() + "?lost", first=OWN_DEVICE + script)
     page_picture(window)
-    kept = "document.getElementById('poster').src.startsWith('blob:')"
-    wait_for(lambda: window.value(kept), "the picture that is kept")
-    before = window.picture()
     window.value("device.destroy()")
     wait_for(lambda: "The graphics device was lost" in window.note(), "the sentence")
     window.key(".")
-    note = int(window.value("document.getElementById('note').getBoundingClientRect().bottom")) + 1
-    assert np.abs(window.picture() - before)[note : SIZE[1] - BAR].max() < 3
+    assert not window.value("document.getElementById('poster').hidden")
     assert window.value("lapgs.time") == 0
 
 

@@ -28,7 +28,7 @@ from lapgs_wgpu.viewer.viewport import SETTLED, SMALLEST_SCALE, TARGET_SECONDS
 
 # The player's modules, each after those that it imports.
 MODULES = (
-    "refusal", "lapgs_file", "hash_grid", "timing", "scene", "gpu", "scan", "radix_sort", "rasterizer", "hash_encoder",
+    "refusal", "lapgs_file", "hash_grid", "scene", "gpu", "scan", "radix_sort", "rasterizer", "hash_encoder",
     "field", "camera", "clock", "presenter", "viewport", "controls", "transport", "api", "main",
 )  # fmt: skip
 _PLAIN, _SUBGROUPS = gpu_config(0), gpu_config(32)
@@ -111,7 +111,7 @@ def page_html(scene: bytes, title: str, poster: NDArray[np.uint8], *, narrowest:
     """The page. scene: a scene.lapgs. poster: (H, W, 3), shown until the first frame, and where WebGPU is missing.
     narrowest: of the scene's first camera (`InitialView`)."""
     edge = "#" + bytes(np.median(poster[0], axis=0).astype(np.uint8)).hex()
-    style = _file("player.css").replace("{{background}}", edge).replace("{{narrowest}}", f"{narrowest:.4g}")
+    style = web_file("player.css").replace("{{background}}", edge).replace("{{narrowest}}", f"{narrowest:.4g}")
     script = _script()
     policy = "; ".join([
         "default-src 'none'",
@@ -136,7 +136,7 @@ def page_html(scene: bytes, title: str, poster: NDArray[np.uint8], *, narrowest:
         "speeds": _options(f"{speed:g}x" for speed in SPEEDS),
         "loops": _options(LOOPS),
     }
-    return re.sub(r"\{\{(\w+)\}\}", lambda match: values[match[1]], _file("player.html"))
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: values[match[1]], web_file("player.html"))
 
 
 def page_keys() -> list[KeyBinding]:
@@ -164,14 +164,15 @@ def _script() -> str:
 
 def module_script(name: str) -> str:
     """A module of the player as a script: a function of its own, whose exports are the members of `NAME_js`."""
-    text = _file(f"{name}.js")
+    text = web_file(f"{name}.js")
     exports = re.findall(r"^export (?:async )?(?:function|class|const) (\w+)", text, re.M)
     text = re.sub(r"^import (\{.*\}) from \"\./(\w+)\.js\";", r"const \1 = \2_js;", text, flags=re.M)
     text = re.sub(r"^export ", "", text, flags=re.M)
     return f"const {name}_js = (() => {{\n{text}return {{ {', '.join(exports)} }};\n}})();"
 
 
-def _file(name: str) -> str:
+def web_file(name: str) -> str:
+    """The text of a file of viewer/web."""
     return resources.files("lapgs_wgpu.viewer").joinpath("web", name).read_text(encoding="utf-8")
 
 

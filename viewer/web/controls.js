@@ -3,7 +3,7 @@ export class Controls {
     // actions: name -> function. wake: something may have changed. signal: ends it.
     constructor(canvas, state, { keys, fly, orbit, look, zoom, reach }, actions, wake, signal) {
         Object.assign(this, { canvas, state, fly, orbit, look, zoom, reach, actions, wake });
-        this.keys = new Map(Object.entries(keys)).set("/", "toggle_help");
+        this.keys = new Map(Object.entries(keys)).set("/", "show_help");
         this.pointer = [0, 0]; // where it was last
         this.pointers = new Map(); // that are down, by number: where each is
         this.held = new Map(); // keys that fly, and those that say how fast: where each is on the keyboard -> its name
@@ -77,16 +77,11 @@ export class Controls {
         this.wake();
     }
 
-    toggleFlying() {
-        this.flying = !this.flying;
-        this.held.clear();
-    }
-
     // Move the camera by what the held keys say.
     advance(seconds) {
         const held = new Set(this.held.values());
         const moves = [...held].map(key => this.fly[key]).filter(Boolean);
-        if (!moves.length) return;
+        if (!this.flying || !moves.length) return;
         const far = seconds * this.reach * (held.has("Shift") ? 4 : held.has("Alt") ? 0.25 : 1) * this.state.camera.distance;
         this.state.camera.fly(...[0, 1, 2].map(axis => far * moves.reduce((sum, move) => sum + move[axis], 0)));
     }

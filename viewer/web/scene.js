@@ -2,7 +2,6 @@
 import { temporalGrids } from "./hash_grid.js";
 import { readContainer } from "./lapgs_file.js";
 import { Refusal, quoted } from "./refusal.js";
-import { isTiming } from "./timing.js";
 
 const EXACT = "motion.frequencies"; // float32, the other weights are float16
 const GEOMETRY_OUTPUTS = 14;
@@ -53,6 +52,14 @@ function readTable(text, of) {
     } catch {
         throw damaged(`${of} is not JSON`);
     }
+}
+
+// Whether it is of times that ascend and of as many times of the motion that do not descend, all in [0, 1].
+function isTiming(timing) {
+    const rises = (list, least) => Array.isArray(list) && list.every((x, i) => typeof x === "number" && x >= 0 && x <= 1
+        && !(x - list[i - 1] < least));
+    return rises(timing?.times, Number.MIN_VALUE) && rises(timing.moments, 0) && timing.times.length > 0
+        && timing.times.length === timing.moments.length;
 }
 
 function readTiming(text) {

@@ -20,7 +20,7 @@ export class Viewport {
         // frame: on show. scale: of it; 1 is the full resolution. time: of it, in the clip. seconds: that it took. drawn: all
         // that it depends on. held: how many wait for a picture.
         Object.assign(this, { frame: null, scale: 1, movingScale: 1, time: NaN, seconds: NaN, drawn: "", movedAt: 0 });
-        Object.assign(this, { busy: false, held: 0, log: null });
+        Object.assign(this, { busy: false, held: 0 });
     }
 
     // Whether the picture on show is that of the state, in full resolution.
@@ -61,12 +61,12 @@ export class Viewport {
     async drawWhole(scale, depth = false) {
         const { canvas, state, rasterizer } = this;
         const [width, height] = [canvas.width, canvas.height].map(size => Math.max(1, Math.round(scale * size)));
-        const gaussians = this.playback.at(state.clock.time, this.log);
+        const gaussians = this.playback.at(state.clock.time);
         const camera = state.camera.camera(canvas.width, canvas.height);
         const image = { ...camera, width, height, focal: scaled(camera.focal, canvas, width, height),
             center: scaled(camera.center, canvas, width, height) };
         for (;;) {
-            const drawing = rasterizer.draw(gaussians, image, state.background, this.log, depth);
+            const drawing = rasterizer.draw(gaussians, image, state.background, depth);
             const counts = await drawing.counts;
             if (rasterizer.valid(drawing, counts)) return drawing;
         }
