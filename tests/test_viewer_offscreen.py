@@ -377,7 +377,6 @@ def test_the_capture_opens_as_the_training_opened_it(
     (tmp_path / "config.toml").write_text(f'[data]\npath = "{tmp_path}"\nsize = 200\n{line}\n')
     assert open_ground_truth(tmp_path / "checkpoint.ply", {}) is not None
     assert opened == [{"image_size": 200, "normalize": True, "undistort": expected}]
-    assert open_ground_truth(tmp_path / "snapshots" / "step_000005.ply", {}) is not None
 
 
 @pytest.mark.parametrize("compare", ["side", "split", "error"])

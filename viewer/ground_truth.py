@@ -46,9 +46,7 @@ def open_ground_truth(checkpoint: Path, metadata: Mapping[str, str]) -> GroundTr
     from lapgs_wgpu.data import load_dataset  # not before the first picture
 
     try:
-        folder = checkpoint.parent
-        run = folder.parent if folder.name == "snapshots" else folder  # as eval.snapshots saves them
-        data = read_toml(run / "config.toml")["data"]
+        data = read_toml(checkpoint.parent / "config.toml")["data"]
         path, size = Path(data["path"]), int(data["size"])
         dataset = load_dataset(
             path,
