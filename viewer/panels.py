@@ -116,7 +116,7 @@ class Panels:
         tip("another .ply or .lapgs file")
         imgui.same_line()
         if button("Help"):
-            state.toggle_help()
+            state.show_help = not state.show_help
         tip("keys and mouse (?)")
         if state.flying:
             imgui.text_colored(_ACCENT, "flying: W A S D Q E, V ends")
