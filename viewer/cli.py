@@ -26,7 +26,7 @@ _WITHOUT_WINDOW = "take --backend http to look in a browser (also from another m
 
 
 def view_command(arguments: Sequence[str] | None = None) -> int:
-    """lapgs-view: returns the exit code."""
+    """Run lapgs-view and return its exit code."""
     return guarded("lapgs-view", _view, list(sys.argv[1:] if arguments is None else arguments))
 
 
@@ -61,7 +61,7 @@ def _warm_device(name: str | None) -> Device:
 
 
 def _entry(given: Any) -> Entry | None:
-    """Where browsers come in, already listening; None for a window, which can be opened here."""
+    """Start listening for browsers; None for a window, after checking that one can be opened."""
     if given.backend == "http":
         from lapgs_wgpu.viewer.remote import open_entry
 
@@ -84,7 +84,7 @@ def _window(given: Any, scene: LoadedScene, entry: Entry | None) -> None:
 
 
 def _start(given: Any, state: ViewState) -> None:
-    """Put the state as the options say. Raises InputError where the scene lacks the mode or the view."""
+    """Set the state as the options say. Raises InputError where the scene lacks the mode or the view."""
     from lapgs_wgpu.viewer.offscreen import check_mode, find_view
 
     if given.mode is not None:

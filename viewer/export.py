@@ -92,7 +92,7 @@ def export_compact(scene: LoadedScene, file: Path, *, overwrite: bool = False) -
 
 
 def _compact(scene: LoadedScene, opened: SceneFile) -> tuple[bytes, Loss]:
-    """The bytes of a compact scene and what it loses; in finer steps where the usual ones lose what may be seen."""
+    """Encode a compact scene, in finer steps where the usual ones lose what may be seen; also return what it loses."""
     file = dataclasses.replace(opened, metadata=opened.metadata | {"view": scene.initial_view.to_json()})
     features = scene.playback.static_features() if isinstance(scene.playback, DevicePlayback) else None
     rows = held_rows(file.gaussians["opacity_logits"], file.field_config)

@@ -1,4 +1,4 @@
-"""Export to `.4dgs`: the motion as straight pieces, written by the format's own library, with its measured error."""
+"""Export to `.4dgs`: the motion as straight pieces, written by the format's own library."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def export_4dgs(scene: LoadedScene, file: Path, max_error: float, *, overwrite: 
 
 
 def _gaussian_set(pieces: Pieces, sh: NDArray[np.float32], seconds: float) -> Any:
-    """The library's Gaussians, on the clock of the file, with colors as linear light."""
+    """Convert pieces to the library's Gaussians, with times in seconds and colors as linear light."""
     import fourdgs
 
     colors = sh[pieces.source].astype(np.float64)
@@ -106,7 +106,7 @@ def _gaussian_set(pieces: Pieces, sh: NDArray[np.float32], seconds: float) -> An
 
 
 def _shown(scene: Any, device: Device) -> Written:
-    """What a scene of the library shows: its harmonics are of linear light, in which players blend."""
+    """Draw what the library read; its harmonics are of linear light."""
     gaussians = scene.gaussians
     light = gaussians.colors[:, None, :3] / CONSTANTS["SH_C0"]
     if gaussians.sh_degree:
@@ -125,7 +125,7 @@ def _shown(scene: Any, device: Device) -> Written:
 
 
 def best_degree(sh: NDArray[np.floating]) -> int:
-    """The degree whose harmonics, as bytes of linear light, come nearest to the displayed colors of sh (N, K, 3).
+    """Find the degree whose harmonics, as bytes of linear light, come nearest to the displayed colors of sh (N, K, 3).
 
     Bytes are coarse (`harmonics_bytes`), and most so in the dark: where colors hardly depend on the direction, fewer
     harmonics are nearer to them than all.
@@ -144,12 +144,12 @@ def best_degree(sh: NDArray[np.floating]) -> int:
 
 
 def harmonics_bytes(coefficients: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Coefficients as the format's bytes; those beyond its range as the ends of it."""
+    """Quantize coefficients to the format's bytes, clipped to its range."""
     return np.rint((coefficients + _SH_RANGE) * (255 / (2 * _SH_RANGE))).clip(0, 255).astype(np.uint8)
 
 
 def _frame(view: InitialView) -> Any:
-    """Which axes of the file are the nearest to up and ahead."""
+    """Name the axes of the file that are nearest to up and ahead."""
     import fourdgs
 
     up = _axis(view.up)
@@ -159,6 +159,6 @@ def _frame(view: InitialView) -> Any:
 
 
 def _axis(direction: NDArray[np.floating]) -> int:
-    """The nearest of +x +y +z -x -y -z, by its place in this list."""
+    """Return the index of the nearest of +x +y +z -x -y -z."""
     largest = int(np.abs(direction).argmax())
     return largest + (3 if direction[largest] < 0 else 0)

@@ -41,7 +41,7 @@ _ERRORS = {
 
 
 class Loss(NamedTuple):
-    """psnr: of the worst picture, dB, at most 100. reason: which Gaussians differ, where that is seen, else empty."""
+    """psnr: of the worst image, dB, at most 100. reason: which Gaussians differ; empty where the loss is not seen."""
 
     psnr: float
     reason: str
@@ -63,7 +63,7 @@ def measure(scene: LoadedScene, written: Written, time: float | None = None) -> 
 
 
 def of_scene(file: SceneFile, device: Device, rows: Rows | None = None) -> Written:
-    """rows: Gaussians of the scene that the file holds, where not all."""
+    """Draw what a file holds. rows: Gaussians of the scene that are in it, where not all."""
     playback = playback_of(file, device)
     held = np.arange(playback.count) if rows is None else rows
     return lambda camera, t: (playback.at(t), held)
@@ -72,7 +72,7 @@ def of_scene(file: SceneFile, device: Device, rows: Rows | None = None) -> Writt
 def _draw(
     rasterizer: Rasterizer, scene: LoadedScene, gaussians: Gaussians[DeviceArray], camera: Camera
 ) -> NDArray[np.float32]:
-    """(3, height, width), what can be displayed of it."""
+    """Draw an image (3, height, width), clipped to [0, 1]."""
     while True:
         drawing = rasterizer.draw(gaussians, camera, scene.background)
         if not rasterizer.grow_on_overflow(drawing):

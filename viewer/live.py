@@ -1,4 +1,4 @@
-"""Watching a training while it runs: `lapgs-train --view`.
+"""Shows a training while it runs: `lapgs-train --view`.
 
 Training and window share one thread: the window's loop takes a step of the training at a time and looks after mouse
 and keys in between. A picture of the new state is drawn seldom enough to cost the training little, unless the camera

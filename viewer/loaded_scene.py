@@ -33,16 +33,16 @@ class LoadedScene(NamedTuple):
     file: SceneFile | None = None
 
     def camera(self) -> ViewCamera:
-        """A camera where the viewer begins."""
+        """Make a camera where the viewer begins."""
         return ViewCamera.of(self.initial_view.camera, self.initial_view.focus, self.initial_view.up)
 
     def clock(self) -> Clock:
-        """The clip from its start."""
+        """Make the clock of the clip, at its start."""
         return Clock(self.initial_view.frames if self.playback.moves else 1)
 
     @property
     def background(self) -> tuple[float, float, float]:
-        """The one it was trained on, black where that is not known."""
+        """The background of the training; black where it is not known."""
         return BACKGROUNDS.get(self.playback.metadata.get("background", ""), BACKGROUNDS["black"])
 
 
@@ -58,7 +58,7 @@ def load_scene(path: Path, device: Callable[[], Device]) -> LoadedScene:
 
 
 def guess_view(playback: Playback) -> InitialView:
-    """For files that say nothing of cameras: the middle of the Gaussians from a distance that shows most of them.
+    """Guess a view of files that name no camera: the middle of the Gaussians, from where most of them are seen.
 
     Up is -y, as in scenes whose poses come from COLMAP; z where the Gaussians lie flat in x and y, or the file is a
     checkpoint of D-NeRF's scenes.

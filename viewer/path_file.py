@@ -19,7 +19,7 @@ _MOST_SECONDS = 24 * 3600.0
 
 
 class PathFile(NamedTuple):
-    """size: of the pictures, (width, height). fps: pictures a second."""
+    """A path and its video. size: (width, height). fps: images a second."""
 
     path: CameraPath
     size: tuple[int, int]
@@ -66,7 +66,7 @@ def _lens(pose: Pose, time: float, aspect: float) -> dict[str, float]:
 
 
 def _matrix(pose: Pose) -> list[float]:
-    """Camera to world in OpenGL's axes, 16 numbers row by row."""
+    """Write camera to world in OpenGL's axes, 16 numbers row by row."""
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = (OPENGL_TO_OPENCV @ pose.rotation).T, pose.position
     values: list[float] = matrix.ravel().tolist()
@@ -125,7 +125,7 @@ def _key_frames(values: dict[str, Any], keys: list[dict[str, Any]], file: Path) 
 
 
 def _key_frame(second: float, entry: dict[str, Any], matrix: str, where: str) -> KeyFrame:
-    """time: NaN where the entry has none."""
+    """Read an entry; its time is NaN where it has none."""
     from scipy.spatial.transform import Rotation
 
     key = "render_time" if entry.get("render_time") is not None else "time"
@@ -142,7 +142,7 @@ def _key_frame(second: float, entry: dict[str, Any], matrix: str, where: str) ->
 def _within(
     entry: dict[str, Any], name: str, low: float, high: float, where: str, default: float | None = None
 ) -> float:
-    """A number of a table. Raises InputError where it is missing without a default, or outside its range."""
+    """Read a number of a table. Raises InputError where it is missing without a default, or outside its range."""
     value = entry.get(name)
     if value is None and default is not None:
         return default

@@ -44,12 +44,14 @@ class Entry(NamedTuple):
         return int(self.listening.getsockname()[1])
 
     def url(self, name: str) -> str:
-        """To open in a browser that reaches this machine under a name."""
+        """Return the address for a browser that reaches this machine under a name."""
         return f"http://{name}:{self.port}/{self.token}/"
 
     def welcome(self, file: str) -> str:
-        """What the user should know: where to look, and how from another machine."""
-        name = end = "localhost" if self.host in _LOCAL else _bracketed(self.host)
+        """Say which address to open, here and on another machine."""
+        name = end = f"[{self.host}]" if ":" in self.host else self.host
+        if self.host in _LOCAL:
+            name = end = "localhost"
         if self.host in _EVERYWHERE:
             name, end = socket.gethostname(), "localhost"
         lines = [
@@ -129,7 +131,3 @@ def guarded(app: Application, token: str) -> Application:
             await send({"type": "http.response.body", "body": b"Open the address that lapgs-view printed.\n"})
 
     return serve
-
-
-def _bracketed(host: str) -> str:
-    return f"[{host}]" if ":" in host else host

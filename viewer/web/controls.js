@@ -15,7 +15,7 @@ export class Controls {
         }, { ...options, signal });
         listen("pointerdown", this.pointerDown);
         listen("pointermove", this.pointerMove);
-        for (const name of ["pointerup", "pointercancel"]) listen(name, this.pointerUp);
+        for (const name of ["pointerup", "pointercancel"]) listen(name, event => this.pointers.delete(event.pointerId));
         listen("wheel", this.wheel, { passive: false });
         listen("dblclick", event => this.actions.focus(event.clientX, event.clientY));
         listen("contextmenu", event => event.preventDefault());
@@ -54,8 +54,6 @@ export class Controls {
         const [a, b] = [...this.pointers.values()];
         return Math.max(Math.hypot(a[0] - b[0], a[1] - b[1]), 1);
     }
-
-    pointerUp(event) { this.pointers.delete(event.pointerId); }
 
     wheel(event) {
         event.preventDefault();

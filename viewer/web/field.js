@@ -69,10 +69,8 @@ export class Playback {
             copy(still, at + CANONICAL, gaussians.static_features, i, field.staticFeatures);
             if (field.dynamics) copy(moving, movingRow * n, gaussians.dynamics, i, field.dynamics);
         }
-        const arrays = { points, still, moving };
-        const block = { first, count };
-        for (const [name, values] of Object.entries(arrays)) block[name] = this.pool.upload(`${name} from ${first}`, values);
-        return block;
+        const upload = (name, values) => this.pool.upload(`${name} from ${first}`, values);
+        return { first, count, points: upload("points", points), still: upload("still", still), moving: upload("moving", moving) };
     }
 
     // Biases and layers of the decoder, four outputs at a time, in the order in which the pass reads them.

@@ -28,14 +28,10 @@ function advice() {
 }
 
 class Gpu {
-    constructor(device, kernels, subgroups, name) {
-        this.device = device;
-        this.name = name; // of the adapter
-        this.subgroups = subgroups;
+    // kernelData: sources and bindings by key. name: of the adapter. pools: how many there are.
+    constructor(device, kernelData, subgroups, name) {
+        Object.assign(this, { device, kernelData, subgroups, name, kernels: new Map(), pools: 0 });
         this.maxBinding = device.limits.maxStorageBufferBindingSize;
-        this.kernelData = kernels;
-        this.kernels = new Map();
-        this.pools = 0;
     }
 
     // Compile kernels that are not there yet, side by side. step: called after each.

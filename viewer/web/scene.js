@@ -54,17 +54,13 @@ function readTable(text, of) {
     }
 }
 
-// Whether it is of times that ascend and of as many times of the motion that do not descend, all in [0, 1].
-function isTiming(timing) {
-    const rises = (list, least) => Array.isArray(list) && list.every((x, i) => typeof x === "number" && x >= 0 && x <= 1
-        && !(x - list[i - 1] < least));
-    return rises(timing?.times, Number.MIN_VALUE) && rises(timing.moments, 0) && timing.times.length > 0
-        && timing.times.length === timing.moments.length;
-}
-
 function readTiming(text) {
     const timing = readTable(text, "its timing");
-    if (!isTiming(timing)) throw damaged("its timing is not of times and moments that rise from 0 to 1");
+    const rises = (list, least) => Array.isArray(list) && list.length > 0
+        && list.every((x, i) => typeof x === "number" && x >= 0 && x <= 1 && !(x - list[i - 1] < least));
+    if (!rises(timing?.times, Number.MIN_VALUE) || !rises(timing.moments, 0) || timing.times.length !== timing.moments.length) {
+        throw damaged("its timing is not of times and moments that rise from 0 to 1");
+    }
     return timing;
 }
 
