@@ -225,3 +225,4 @@ def _style() -> None:
     style.grab_min_size = 14.0
     style.set_color_(imgui.Col_.window_bg, (0.08, 0.08, 0.09, 0.85))
     style.set_color_(imgui.Col_.slider_grab, _ACCENT)
+    style.set_color_(imgui.Col_.slider_grab_active, _ACCENT)
