@@ -20,9 +20,10 @@ from lapgs_wgpu import Scene4D
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.config import FieldConfig
-from lapgs_wgpu.motion.playback.linear_pieces import linear_pieces, piece_errors, roots_of, state
+from lapgs_wgpu.motion.playback.linear_pieces import Pieces, displacement, linear_pieces, roots_of, state
+from lapgs_wgpu.motion.playback.playback import Playback
 from lapgs_wgpu.splat.linear_light import directions, display_colors, linear_harmonics, sh_basis, to_display, to_linear
-from lapgs_wgpu.viewer.export_4dgs import Baked, best_degree, export_4dgs
+from lapgs_wgpu.viewer.export_4dgs import best_degree, export_4dgs
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene, load_scene
 
 COUNT = 60
@@ -48,23 +49,23 @@ def scene(device: Device, tmp_path_factory: pytest.TempPathFactory) -> LoadedSce
 
 
 @pytest.fixture(scope="module")
-def exported(scene: LoadedScene, tmp_path_factory: pytest.TempPathFactory) -> tuple[Baked, Path]:
+def exported(scene: LoadedScene, tmp_path_factory: pytest.TempPathFactory) -> Path:
     file = tmp_path_factory.mktemp("exported") / "a.4dgs"
-    return export_4dgs(scene, file, 0.5), file
+    assert export_4dgs(scene, file, 0.5).psnr > 30
+    return file
 
 
 def pixel(scene: LoadedScene) -> float:
     """World units at the focus."""
     camera = scene.camera()
-    return float(2 * np.tan(0.5 * camera.fov_y) * camera.distance / scene.look.camera.height)
+    return float(2 * np.tan(0.5 * camera.fov_y) * camera.distance / scene.initial_view.camera.height)
 
 
-def test_gaussians_are_where_the_field_has_them(scene: LoadedScene, exported: tuple[Baked, Path]) -> None:
-    """At times that the bake did not look at: as many as are drawn, each about as near as was measured."""
-    baked, file = exported
-    report = validate(file.read_bytes())
+def test_gaussians_are_where_the_field_has_them(scene: LoadedScene, exported: Path) -> None:
+    """At times that the bake did not look at: as many as are drawn, each about as near as was allowed."""
+    report = validate(exported.read_bytes())
     assert [str(finding) for finding in report.findings if finding.severity != "note"] == []
-    read = fourdgs.read(file)
+    read = fourdgs.read(exported)
     assert read.duration_sec == pytest.approx(scene.clock().seconds)
     gaussians = read.gaussians
     scales, quats = np.asarray(gaussians.scales), np.asarray(gaussians.rotations)
@@ -76,19 +77,19 @@ def test_gaussians_are_where_the_field_has_them(scene: LoadedScene, exported: tu
         now = gaussians.state_at(t * read.duration_sec)
         live = now["indices"]
         away, which = cKDTree(true[:, :3]).query(now["centers"])
-        assert len(set(which.tolist())) == len(live) == baked.gaussians
+        assert len(set(which.tolist())) == len(live) == len(np.unique(gaussians.source_index))
         roots = roots_of(scales[live], quats[live])
         apart = away + np.linalg.norm(roots - true[which, 3:9], axis=1)
         worst = max(worst, float(apart.max()) / pixel(scene))
         np.testing.assert_allclose(now["opacity"], true[which, 9], atol=0.02)
         assert colors[live, :3].min() >= 0
         moved = max(moved, float(np.abs(true[:, :3] - start[:, :3]).max() / pixel(scene)))
-    assert worst <= 1.2 * baked.error < 1.2
+    assert worst <= 1.2 * 0.5
     assert moved > 10  # pixels: there is something to bake
 
 
-def test_camera_and_texts(scene: LoadedScene, exported: tuple[Baked, Path]) -> None:
-    read = fourdgs.read(exported[1])
+def test_camera_and_texts(scene: LoadedScene, exported: Path) -> None:
+    read = fourdgs.read(exported)
     assert read.camera is not None
     np.testing.assert_allclose(read.camera.position, scene.camera().position)
     np.testing.assert_allclose(read.camera.target, scene.camera().focus)
@@ -96,11 +97,22 @@ def test_camera_and_texts(scene: LoadedScene, exported: tuple[Baked, Path]) -> N
     assert read.header.attributes["color_space"] == "linear-rec709-display"
 
 
+def largest_error(playback: Playback, pieces: Pieces) -> float:
+    """Largest displacement of the pieces from the playback, world units, at 97 times; few of them are samples."""
+    worst = 0.0
+    for t in np.linspace(0, 1, 97).tolist():
+        shown = np.flatnonzero((pieces.begin <= t) & ((t < pieces.end) | (pieces.end == 1.0)))
+        way = (t - 0.5 * (pieces.begin + pieces.end)[shown])[:, None] * pieces.slopes[shown]
+        moved = np.concatenate([pieces.means[shown] + way, roots_of(pieces.scales[shown], pieces.quats[shown])], axis=1)
+        worst = max(worst, float(displacement(moved, state(playback, t, pieces.source[shown])).max()))
+    return worst
+
+
 def test_pieces_join_and_are_as_many_as_needed(scene: LoadedScene) -> None:
     coarse, fine = (linear_pieces(scene.playback, far * pixel(scene), 1.0) for far in (2.0, 0.2))
     assert len(fine.source) > len(coarse.source) >= COUNT
     for pieces, far in ((coarse, 2.0), (fine, 0.2)):
-        assert piece_errors(scene.playback, pieces).max() <= 1.2 * far * pixel(scene)
+        assert largest_error(scene.playback, pieces) <= 1.2 * far * pixel(scene)
         same = np.diff(pieces.source) == 0
         assert (pieces.begin[1:][same] == pieces.end[:-1][same]).all()  # all can be seen at all times
         assert (pieces.begin[1:][~same] == 0).all()

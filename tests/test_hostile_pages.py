@@ -51,7 +51,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     (folder / "empty.html").write_text("<!doctype html><title>empty</title>")
     with Browser(folder / "profile", (64, 64)) as browser:
         browser.open((folder / "empty.html").as_uri())
-        for name in ("refusal", "lapgs_file", "hash_grid", "timing", "scene"):
+        for name in ("refusal", "lapgs_file", "hash_grid", "scene"):
             browser.value(module_script(name) + "undefined")
         yield browser
 

@@ -239,7 +239,7 @@ def test_only_the_backward_pass_is_cut(device: Device, use: Callable[[Rasterizer
     rasterizer = use(Rasterizer(device, config=cpu_config(8, 255)))
     mismatches = iter([True])
 
-    def mismatch(name: str, drawn: Drawing) -> bool:
+    def mismatch(name: str, drawn: Any) -> bool:
         if name == "rasterize" or not next(mismatches, False):
             return False
         rasterizer.config = rasterizer.config.without_subgroups()

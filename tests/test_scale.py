@@ -6,6 +6,7 @@ What is large runs with LAPGS_SOAK=1 alone (`make soak`).
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from collections.abc import Callable
 from pathlib import Path

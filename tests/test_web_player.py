@@ -28,9 +28,7 @@ from helpers.web_pages import (
     shown,
 )
 
-from lapgs_wgpu.gpu.device import Device, _adapters
-from lapgs_wgpu.gpu.kernel import Commands, Kernel
-from lapgs_wgpu.gpu.shader import browser_source
+from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.lapgs_file import MAGIC
 from lapgs_wgpu.motion.timing import Timing
 from lapgs_wgpu.run import train
@@ -41,7 +39,6 @@ from lapgs_wgpu.viewer.camera import ViewCamera
 from lapgs_wgpu.viewer.controls import ORBIT, ZOOM
 from lapgs_wgpu.viewer.export import export_compact
 from lapgs_wgpu.viewer.loaded_scene import load_scene
-from lapgs_wgpu.viewer.web_page import player_data
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt-get install chromium")
 
@@ -182,31 +179,6 @@ def test_an_antialiased_scene_of_uneven_timing(window: Browser, folder: Path, de
         call(window, "setTime", time)
         assert same(window, Desktop(made, device), time)
         assert not same(window, without, time)
-
-
-@pytest.mark.nightly
-def test_the_desktop_runs_the_same_dispatches(browser: Browser, page: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Kernels, workgroups and bindings of a frame, in the shape for GPUs: all that the page's own code decides."""
-    info, adapter = _adapters()[0]
-    gpu = Device(adapter, dataclasses.replace(info, kind="discrete"), subgroups=False)
-    names = {kernel["source"]: name for name, kernel in player_data()["kernels"].items()}
-    found: list[Any] = []
-    dispatch = Commands.dispatch_grid
-
-    def record(commands: Commands, kernel: Kernel, groups: tuple[int, int], **arrays: Any) -> None:
-        bindings = {name: [array.offset, array.bound_bytes] for name, array in arrays.items()}
-        found.append([names[browser_source(kernel.source)], *groups, bindings])
-        dispatch(commands, kernel, groups, **arrays)
-
-    desktop = Desktop(page, gpu)
-    for time in (0.0, 0.2):  # buffers grow alike
-        desktop.picture(time)
-    monkeypatch.setattr(Commands, "dispatch_grid", record)
-    desktop.picture(0.4)
-    call(browser, "setTime", 0.2)
-    assert call(browser, "passes", 0.4) == found
-    assert call(browser, "passes", 0.4) == found, "of the time that is on show"
-    assert len(found) > 50
 
 
 # Input

@@ -19,7 +19,7 @@ _LONGEST_STEP = 0.25  # seconds that the clip and a flight go on at once, after 
 
 
 def window_title(path: object) -> str:
-    """Of a window that shows a file."""
+    """Return the title of a window that shows a file."""
     return f"{path} - lapgs-view"
 
 

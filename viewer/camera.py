@@ -32,7 +32,7 @@ class ViewCamera:
 
     @staticmethod
     def of(camera: Camera, focus: ArrayLike, up: ArrayLike) -> ViewCamera:
-        """A camera that starts where another one stands; the focus is moved onto its line of sight."""
+        """Make a camera that starts where another one stands; the focus is moved onto its line of sight."""
         made = ViewCamera(camera.position, focus, up, 2 * math.atan(0.5 * camera.height / camera.K[1, 1]))
         made.snap(camera)
         made.exact = None  # so that the picture fills the window, whatever its aspect
@@ -41,7 +41,7 @@ class ViewCamera:
 
     @property
     def distance(self) -> float:
-        """From the position to the focus, world units."""
+        """Distance from the position to the focus, world units."""
         return float(np.linalg.norm(self.focus - self.position))
 
     def snap(self, camera: Camera) -> None:
@@ -65,7 +65,7 @@ class ViewCamera:
         self.focus, self.exact = self.position + distance * self.rotation[2], None
 
     def reset(self) -> None:
-        """Back to where it started."""
+        """Go back to where the camera started."""
         self.position, self.focus, self.rotation, self.fov_y, self.exact = self._start
 
     def orbit(self, right: float, down: float) -> None:
@@ -101,8 +101,8 @@ class ViewCamera:
         self.exact = None
 
     def camera(self, width: int, height: int) -> Camera:
-        """The rasterizer's camera for a picture of this size; at an exact camera it keeps that one's aspect, and is
-        as large as fits."""
+        """Make the rasterizer's camera for a picture of this size. At an exact camera the picture keeps that one's
+        aspect, and is as large as fits."""
         if self.exact is not None:
             scale = min(width / self.exact.width, height / self.exact.height)
             return self.exact.resized(max(1, round(scale * self.exact.width)), max(1, round(scale * self.exact.height)))

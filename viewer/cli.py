@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,12 +22,11 @@ if TYPE_CHECKING:
     from lapgs_wgpu.viewer.view_state import ViewState
 
 _SIZE = (1280, 720)  # of a window or picture, where nothing else says it
-_AS_IT_IS = "a .html or .lapgs file shows the scene as it is"
 _WITHOUT_WINDOW = "take --backend http to look in a browser (also from another machine), or --screenshot FILE.png"
 
 
 def view_command(arguments: Sequence[str] | None = None) -> int:
-    """lapgs-view: returns the exit code."""
+    """Run lapgs-view and return its exit code."""
     return guarded("lapgs-view", _view, list(sys.argv[1:] if arguments is None else arguments))
 
 
@@ -41,7 +41,7 @@ def _view(arguments: list[str]) -> None:
         # Beside all that follows: the driver and its compiler take longer than the rest together.
         device = other.submit(_warm_device, given.device)
         # Before the scene is read, which may take a while: whether there is a place to show it.
-        entry = _place(given) if job == "window" else None
+        entry = _entry(given) if job == "window" else None
         from lapgs_wgpu.viewer.loaded_scene import load_scene
 
         scene = load_scene(Path(given.file), device.result)
@@ -60,39 +60,31 @@ def _warm_device(name: str | None) -> Device:
     return device
 
 
-def _place(given: Any) -> Entry | None:
-    """Where browsers come in, already listening; None for a window, which can be opened here."""
-    if given.backend != "http":
-        for option in ("host", "port"):
-            if getattr(given, option) is not None:
-                raise InputError(f"--{option} goes with --backend http.")
-        from lapgs_wgpu.viewer.window import check_window
+def _entry(given: Any) -> Entry | None:
+    """Start listening for browsers; None for a window, after checking that one can be opened."""
+    if given.backend == "http":
+        from lapgs_wgpu.viewer.remote import open_entry
 
-        check_window(_WITHOUT_WINDOW)
-        return None
-    if given.size is not None:
-        raise InputError("--size has no use with --backend http: the picture has the size of the browser's window.")
-    from lapgs_wgpu.viewer.remote import DEFAULT_HOST, DEFAULT_PORT, open_entry
+        return open_entry(given.host or "127.0.0.1", 8080 if given.port is None else given.port)
+    from lapgs_wgpu.viewer.window import check_window
 
-    return open_entry(given.host or DEFAULT_HOST, DEFAULT_PORT if given.port is None else given.port)
+    check_window(_WITHOUT_WINDOW)
+    return None
 
 
 def _window(given: Any, scene: LoadedScene, entry: Entry | None) -> None:
-    def start(state: ViewState) -> None:
-        _start(given, state)
-
     if entry is None:
         from lapgs_wgpu.viewer.window import run_window
 
-        run_window(scene, given.size or _SIZE, start)
+        run_window(scene, given.size or _SIZE, partial(_start, given))
     else:
         from lapgs_wgpu.viewer.remote import run_remote
 
-        run_remote(scene, entry, start)
+        run_remote(scene, entry, partial(_start, given))
 
 
 def _start(given: Any, state: ViewState) -> None:
-    """Put the state as the options say. Raises InputError where the scene lacks the mode or the view."""
+    """Set the state as the options say. Raises InputError where the scene lacks the mode or the view."""
     from lapgs_wgpu.viewer.offscreen import check_mode, find_view
 
     if given.mode is not None:
@@ -144,19 +136,22 @@ def _video(given: Any, scene: LoadedScene) -> None:
         raise InputError(f"--path {path}: expected time, view, both, or the .json file of a camera path.")
     if path != "view" and given.time is not None:
         raise InputError(f"--time has no use with --path {path}, along which time passes.")
-    view = find_view(scene, given.view) if given.view is not None else None
     held = None if path in video.PATHS else read_path(Path(path))
-    if held is not None and view is not None:
+    if held is not None and given.view is not None:
         raise InputError("--view has no use with a camera path, which says where the camera is.")
+    view = find_view(scene, given.view) if given.view is not None else None
 
-    size = given.size or (held.size if held else (view.camera.width, view.camera.height) if view else _SIZE)
-    if video.even(size) != size:
-        wide, high = video.even(size)
-        print(f"note: mp4 needs even sizes: {size[0]}x{size[1]} becomes {wide}x{high}", file=sys.stderr)
-        size = (wide, high)
-    fps = given.fps or (held.fps if held else 30.0)
-    usual = held.path.seconds if held else 6.0 if path == "view" else scene.clock().frames / fps
-    frames = video.count_frames(given.seconds or usual, fps)
+    fps, seconds = given.fps or 30.0, 6.0
+    wanted = (view.camera.width, view.camera.height) if view else _SIZE
+    if held is not None:
+        fps, seconds, wanted = given.fps or held.fps, held.path.seconds, held.size
+    elif path != "view":
+        seconds = scene.clock().frames / fps
+    wanted = given.size or wanted
+    size = video.even(wanted)
+    if size != wanted:
+        print(f"note: mp4 needs even sizes: {_by(wanted)} becomes {_by(size)}", file=sys.stderr)
+    frames = video.count_frames(given.seconds or seconds, fps)
 
     if held is not None:
         cameras = video.path_views(held.path, size, frames)
@@ -164,50 +159,41 @@ def _video(given: Any, scene: LoadedScene) -> None:
         camera = framed(view.camera, *size) if view else scene.camera().camera(*size)
         cameras = video.clip_views(camera, frames)
     else:
-        start, arc, time = scene.camera(), scene.look.arc, 0.0
+        start, arc, time = scene.camera(), scene.initial_view.arc, 0.0
         if view is not None:
-            start = ViewCamera.of(view.camera, scene.look.focus, scene.look.up)
-            arc, time = scene.look.arc_from(view.camera), view.time
+            start = ViewCamera.of(view.camera, scene.initial_view.focus, scene.initial_view.up)
+            arc, time = scene.initial_view.arc_from(view.camera), view.time
         if given.time is not None:
             time = given.time
         cameras = video.orbit_views(start, size, frames, None if path == "both" else time, arc)
     video.write_video(file, cameras, frames, fps, _renderer(given, scene))
-    print(f"{file}: {frames} frames of {size[0]}x{size[1]} at {fps:g} a second")
+    print(f"{file}: {frames} frames of {_by(size)} at {fps:g} a second")
 
 
 def _export(given: Any, scene: LoadedScene) -> None:
-    from lapgs_wgpu.viewer.export import export_compact, export_frames, export_still
-    from lapgs_wgpu.viewer.export_loss import report
+    from lapgs_wgpu.viewer import export
 
     file, overwrite = Path(given.export), bool(given.overwrite)
     ending, count = file.suffix.lower(), scene.playback.count
-    takes = {".ply": "time", ".4dgs": "max_error", ".lapgs": None, ".html": None}.get(ending, "frames")
-    for name in ("time", "frames", "max_error"):
-        if getattr(given, name) is not None and name != takes:
-            raise InputError(f"--{name.replace('_', '-')} has no use with --export {given.export}.")
-    if ending == ".ply":
-        loss = export_still(scene, file, given.time or 0.0, overwrite=overwrite)
-        report(f"{file}: {count} Gaussians at time {given.time or 0.0:g}", loss, scene.path, _AS_IT_IS)
-    elif ending in (".lapgs", ".html"):
-        loss = export_compact(scene, file, overwrite=overwrite)
-        line = f"{file}: {count} Gaussians, {file.stat().st_size / 1e6:.2f} MB"
-        report(line, loss, scene.path, "a still .ply, or the opened file itself, shows the scene as it is")
-        return  # our own formats say whether the scene is antialiased
-    elif ending == ".4dgs":
+    if ending == ".4dgs":
         from lapgs_wgpu.viewer.export_4dgs import MAX_ERROR, export_4dgs
 
-        baked = export_4dgs(scene, file, given.max_error or MAX_ERROR, overwrite=overwrite)
-        line = (
-            f"{file}: {baked.gaussians} Gaussians as {baked.pieces} pieces, at most {baked.error:.2f} pixels of the "
-            f"captured images from the learned motion, {file.stat().st_size / 1e6:.2f} MB"
-        )
-        report(line, baked.loss, scene.path, f"a smaller --max-error is nearer, and {_AS_IT_IS}")
-    elif given.frames is None:
-        raise InputError(f"--export {file}: name a .ply, .lapgs, .html or .4dgs file, or a folder and its --frames.")
+        loss = export_4dgs(scene, file, given.max_error or MAX_ERROR, overwrite=overwrite)
+        line = f"{count} Gaussians, {_megabytes(file)}"
+    elif ending in (".lapgs", ".html"):
+        loss = export.export_compact(scene, file, overwrite=overwrite)
+        line = f"{count} Gaussians, {_megabytes(file)}"
+    elif ending == ".ply":
+        loss = export.export_still(scene, file, given.time or 0.0, overwrite=overwrite)
+        line = f"{count} Gaussians at time {given.time or 0.0:g}"
     else:
-        loss = export_frames(scene, file, given.frames, overwrite=overwrite)
-        report(f"{file}: {given.frames} frames of {count} Gaussians", loss, scene.path, _AS_IT_IS)
-    if scene.playback.at(0.0).antialiased:
+        loss = export.export_frames(scene, file, given.frames, overwrite=overwrite)
+        line = f"{given.frames} frames of {count} Gaussians"
+    print(f"{file}: {line}, {loss.psnr:.1f} dB PSNR against {scene.path}")
+    if loss.reason:
+        print(f"warning: the loss is seen: {loss.reason}.", file=sys.stderr)
+    # Our own formats say whether the scene is antialiased.
+    if ending not in (".lapgs", ".html") and scene.playback.at(0.0).antialiased:
         print(
             "note: the scene was trained antialiased, which a file for other viewers cannot say: where they offer "
             "antialiased drawing, turn it on; elsewhere thin places look a little thicker.",
@@ -215,10 +201,18 @@ def _export(given: Any, scene: LoadedScene) -> None:
         )
 
 
+def _megabytes(file: Path) -> str:
+    return f"{file.stat().st_size / 1e6:.2f} MB"
+
+
 def _named(name: str, ending: str, option: str) -> Path:
     if not name.lower().endswith(ending):
         raise InputError(f"{option} {name}: expected a name that ends with {ending}.")
     return Path(name)
+
+
+def _by(size: tuple[int, int]) -> str:
+    return f"{size[0]}x{size[1]}"
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)
 
 @dataclass
 class Clock:
-    """Where in the clip we are, and how it goes on.
+    """The present time in the clip, and how it advances.
 
     time: in [0, 1]. frames: of the clip, the first at time 0, the last at 1. fps: frames shown a second at speed 1.
     forward: the direction, which turns at the ends where `loop` is bounce.

@@ -10,11 +10,12 @@ from lapgs_wgpu.viewer.key_bindings import FLY, KEYS
 from lapgs_wgpu.viewer.view_state import ViewState
 from lapgs_wgpu.viewer.viewport import Viewport
 
-_ACTIONS = {key.key: key.action for key in KEYS} | {"/": "toggle_help"}  # where "?" is told as "/" with Shift
+_ACTIONS = {key.key: key.action for key in KEYS} | {"/": "show_help"}  # where "?" is told as "/" with Shift
 ORBIT = 0.008  # radians a pixel of dragging
 LOOK = 0.4 * ORBIT  # about the camera itself, where a turn moves more of the picture
 ZOOM = 0.0015  # of the distance's logarithm a pixel of the wheel
 FLY_REACH = 0.6  # of the distance to the focus a second
+_SPEEDS = {"Shift": 4.0, "Alt": 0.25}  # of a flight, while the key is held
 _GRIP = 0.01  # of the width: how near to the split it can be dragged
 
 
@@ -40,7 +41,7 @@ class Controls:
         listen(self._on_wheel, "wheel")
         listen(self._on_key_down, "key_down")
         listen(self._on_key_up, "key_up")
-        listen(lambda event: self.release(), "pointer_leave")  # its release may go to another window
+        listen(lambda event: self._held.clear(), "pointer_leave")  # its release may go to another window
         # Panels react to everything, so everything asks for a draw; what has not changed is only presented again.
         everything = ("pointer_down", "pointer_move", "pointer_up", "wheel", "key_down", "key_up", "char", "resize")
         listen(lambda event: wake(), *everything, order=-100)
@@ -48,37 +49,34 @@ class Controls:
     @property
     def flying(self) -> bool:
         """Whether a key is held that moves the camera."""
-        return not self._held.isdisjoint(FLY)
-
-    def release(self) -> None:
-        """As if no key were held."""
-        self._held.clear()
+        return self.state.flying and not self._held.isdisjoint(FLY)
 
     def fly(self, seconds: float) -> None:
         """Move the camera by what the held keys say."""
-        moves = [FLY[key] for key in self._held if key in FLY]
-        if moves:
-            fast = 4.0 if "Shift" in self._held else 0.25 if "Alt" in self._held else 1.0
+        if self.flying:
+            moves = [FLY[key] for key in self._held if key in FLY]
+            fast = math.prod(_SPEEDS[key] for key in self._held if key in _SPEEDS)
             reach = seconds * FLY_REACH * fast * self.state.camera.distance
             right, down, forward = (reach * sum(axis) for axis in zip(*moves, strict=True))
             self.state.camera.fly(right, down, forward)
 
     def _on_key_down(self, event: dict[str, Any]) -> None:
-        key = event["key"]
-        if self.state.flying and (key in ("Shift", "Alt") or key.lower() in FLY):
-            self._held.add(key if key in ("Shift", "Alt") else key.lower())
-        elif "Control" not in event["modifiers"]:
-            action = _ACTIONS.get(key) or _ACTIONS.get(key.lower())
-            if action == "focus":
-                self.viewport.focus(*self.pointer)
-            elif action:
-                getattr(self.state, action)()
-            if action == "toggle_flying":
-                self.release()
+        key = _plain(event["key"])
+        if self.state.flying and (key in _SPEEDS or key in FLY):
+            self._held.add(key)
+            return
+        action = _ACTIONS.get(key) if "Control" not in event["modifiers"] else None
+        if action == "focus":
+            self.viewport.focus(*self.pointer)
+        elif action:
+            value = getattr(self.state, action)
+            if callable(value):
+                value()
+            else:
+                setattr(self.state, action, not value)
 
     def _on_key_up(self, event: dict[str, Any]) -> None:
-        key = event["key"]
-        self._held.discard(key if key in ("Shift", "Alt") else key.lower())
+        self._held.discard(_plain(event["key"]))
 
     def _on_pointer_down(self, event: dict[str, Any]) -> None:
         state = self.state
@@ -122,3 +120,8 @@ class Controls:
         self.pointer = (event["x"], event["y"])
         if not self._covered(*self.pointer):
             self.state.camera.zoom(math.exp(ZOOM * event["dy"]))
+
+
+def _plain(key: str) -> str:
+    """The name of a key without Shift: letters are small."""
+    return key.lower() if len(key) == 1 else key

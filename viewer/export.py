@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import re
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.atomic import atomic_write
-from lapgs_wgpu.io.listing import listed
 from lapgs_wgpu.io.ply import write_ply
 from lapgs_wgpu.motion.compact_scene import held_rows
 from lapgs_wgpu.motion.playback.playback import DevicePlayback
@@ -22,11 +19,17 @@ from lapgs_wgpu.viewer.loaded_scene import LoadedScene
 from lapgs_wgpu.viewer.offscreen import OffscreenRenderer
 from lapgs_wgpu.viewer.web_page import page_html
 
-_FRAME = re.compile(r"frame_\d+\.ply")
-MOST_FRAMES = 100_000
 _POSTER_SIZE = (960, 540)
 _ENOUGH = 45.0  # dB of a compact scene; trained ones have some 55 in the usual steps
 _FINER = (1.0, 1 / 8, 1 / 64, 1 / 512)  # factors of the largest errors, tried one after the other
+
+
+def check_free(scene: LoadedScene, file: Path, overwrite: bool) -> None:
+    """Raises InputError where a file must not be written: over the opened one, or another without `overwrite`."""
+    if scene.path is not None and file.exists() and file.samefile(scene.path):
+        raise InputError(f"{file}: is the opened file; take another name.")
+    if file.exists() and not overwrite:
+        raise InputError(f"{file}: is there already; --overwrite replaces it.")
 
 
 def export_still(scene: LoadedScene, file: Path, time: float, *, overwrite: bool = False) -> Loss:
@@ -35,58 +38,13 @@ def export_still(scene: LoadedScene, file: Path, time: float, *, overwrite: bool
     Raises InputError where it cannot be written, where the file is there already and `overwrite` is not given, and
     always where it is the opened file, whose motion would be lost.
     """
-    if scene.path is not None and file.exists() and file.samefile(scene.path):
-        raise InputError(f"{file}: is the opened file, and a still holds no motion; take another name.")
-    check_free(file, overwrite)
+    check_free(scene, file, overwrite)
     write_ply(file, scene.playback.snapshot(time))
     return _loss_of_still(scene, file, time)
 
 
 def _loss_of_still(scene: LoadedScene, file: Path, time: float) -> Loss:
     return measure(scene, of_scene(read_scene(file), scene.playback.device), time)
-
-
-def export_compact(scene: LoadedScene, file: Path, *, overwrite: bool = False) -> Loss:
-    """Write a compact scene (.lapgs), or a web page with one inside (.html), and compare it with the scene. Atomic.
-
-    Raises InputError where it cannot be written, where the file is there already and `overwrite` is not given, and
-    where only torch evaluates the field.
-    """
-    assert scene.path is not None
-    assert scene.file is not None
-    if file.exists() and file.samefile(scene.path):
-        raise InputError(f"{file}: is the opened file; take another name.")
-    check_free(file, overwrite)
-    with atomic_write(file) as target:  # before a minute of work
-        features = scene.playback.static_features() if isinstance(scene.playback, DevicePlayback) else None
-        metadata = scene.file.metadata | {"view": scene.look.to_json()}
-        content, loss = _compact(scene, dataclasses.replace(scene.file, metadata=metadata), features)
-        if file.suffix.lower() == ".html":
-            camera = scene.camera().camera(*_POSTER_SIZE)
-            poster = OffscreenRenderer(scene)(camera, 0.0)
-            content = page_html(content, file.stem, poster, narrowest=scene.look.narrowest).encode()
-        target.write(content)
-    return loss
-
-
-def _compact(scene: LoadedScene, file: SceneFile, features: NDArray[np.float32] | None) -> tuple[bytes, Loss]:
-    """The bytes of a compact scene and what it loses; in finer steps where the usual ones lose what may be seen."""
-    rows = held_rows(file.gaussians["opacity_logits"], file.field_config)
-    best: tuple[bytes, Loss] | None = None
-    for finer in _FINER:
-        content = compact_bytes(file, features, finer=finer)
-        loss = measure(scene, of_scene(read_compact(content, file.path), scene.playback.device, rows))
-        if best is None or loss.psnr > best[1].psnr + 1:
-            best = content, loss
-        if loss.psnr >= _ENOUGH:
-            break
-    assert best is not None
-    return best
-
-
-def check_free(file: Path, overwrite: bool) -> None:
-    if file.exists() and not overwrite:
-        raise InputError(f"{file}: is there already; --overwrite replaces it.")
 
 
 def export_frames(scene: LoadedScene, folder: Path, frames: int, *, overwrite: bool = False) -> Loss:
@@ -97,19 +55,53 @@ def export_frames(scene: LoadedScene, folder: Path, frames: int, *, overwrite: b
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        held = listed(folder)
+        held = list(folder.iterdir())
     except OSError as error:
         raise InputError(f"{folder}: cannot be used as a folder ({error.strerror or error}).") from error
     if held and not overwrite:
         raise InputError(f"{folder}: is not empty; --overwrite replaces the frames in it.")
-    old = [file for file in held if _FRAME.fullmatch(file.name)]
-    if scene.path is not None and any(file.samefile(scene.path) for file in old):
-        raise InputError(f"{folder}: holds the opened file under a frame's name; take another folder.")
+    old = [file for file in held if file.match("frame_*.ply")]
+    for file in old:
+        check_free(scene, file, overwrite)
     for file in old:
         file.unlink()
     digits = max(4, len(str(frames - 1)))
     with Progress(frames, "frames") as progress:
         for number, time in enumerate(np.linspace(0, 1, frames).tolist()):
-            write_ply(folder / f"frame_{number:0{digits}}.ply", scene.playback.snapshot(time))
+            file = folder / f"frame_{number:0{digits}}.ply"
+            write_ply(file, scene.playback.snapshot(time))
             progress.step()
-    return _loss_of_still(scene, folder / f"frame_{frames - 1:0{digits}}.ply", time)
+    return _loss_of_still(scene, file, time)
+
+
+def export_compact(scene: LoadedScene, file: Path, *, overwrite: bool = False) -> Loss:
+    """Write a compact scene (.lapgs), or a web page with one inside (.html), and compare it with the scene. Atomic.
+
+    Raises InputError where it cannot be written, where the file is there already and `overwrite` is not given, and
+    where only torch evaluates the field.
+    """
+    assert scene.file is not None
+    check_free(scene, file, overwrite)
+    with atomic_write(file) as target:  # before a minute of work
+        content, loss = _compact(scene, scene.file)
+        if file.suffix.lower() == ".html":
+            poster = OffscreenRenderer(scene)(scene.camera().camera(*_POSTER_SIZE), 0.0)
+            content = page_html(content, file.stem, poster, narrowest=scene.initial_view.narrowest).encode()
+        target.write(content)
+    return loss
+
+
+def _compact(scene: LoadedScene, opened: SceneFile) -> tuple[bytes, Loss]:
+    """Encode a compact scene, in finer steps where the usual ones lose what may be seen; also return what it loses."""
+    file = dataclasses.replace(opened, metadata=opened.metadata | {"view": scene.initial_view.to_json()})
+    features = scene.playback.static_features() if isinstance(scene.playback, DevicePlayback) else None
+    rows = held_rows(file.gaussians["opacity_logits"], file.field_config)
+    best = b"", Loss(-np.inf, "")
+    for finer in _FINER:
+        content = compact_bytes(file, features, finer=finer)
+        loss = measure(scene, of_scene(read_compact(content, file.path), scene.playback.device, rows))
+        if loss.psnr > best[1].psnr + 1:
+            best = content, loss
+        if loss.psnr >= _ENOUGH:
+            break
+    return best

@@ -1,24 +1,28 @@
-"""Export to `.4dgs`: the motion as straight pieces, written by the format's own library, with its measured error."""
+"""Export to `.4dgs`: the motion as straight pieces, written by the format's own library."""
 
 from __future__ import annotations
 
 import io
 import math
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.errors import InputError, pip_install
+from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.io.initial_view import InitialView
-from lapgs_wgpu.motion.playback.linear_pieces import Pieces, linear_pieces, piece_errors
+from lapgs_wgpu.motion.playback.linear_pieces import Pieces, linear_pieces
 from lapgs_wgpu.progress import Progress
+from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.constants import CONSTANTS
+from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.linear_light import directions, display_colors, linear_harmonics, sh_basis, to_display
 from lapgs_wgpu.viewer.export import check_free
-from lapgs_wgpu.viewer.export_loss import Loss, measure, of_pieces
+from lapgs_wgpu.viewer.export_loss import Loss, Written, measure, seen, upload
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene
 
 MAX_ERROR = 0.5  # pixels, without --max-error
@@ -27,20 +31,11 @@ _OF_LINES = 0.85  # share of the error that straight lines may use up; the rest 
 _TIME_STEP = 1e-3  # seconds: the library rounds the middles of pieces to it (profile "fine")
 _SH_RANGE = 4.0  # a coefficient is a byte from -this to +this (section 6.5 of the specification)
 _PROGRESS = 1000
+_LAST = 1 - 1e-6  # time in the clip at which its last pieces are still there
 
 
-class Baked(NamedTuple):
-    """gaussians, pieces: how many. error: largest displacement that was found in the written file, pixels. loss: of its
-    pictures."""
-
-    gaussians: int
-    pieces: int
-    error: float
-    loss: Loss
-
-
-def export_4dgs(scene: LoadedScene, file: Path, max_error: float, *, overwrite: bool = False) -> Baked:
-    """Write a `.4dgs` of a scene that moves. Atomic.
+def export_4dgs(scene: LoadedScene, file: Path, max_error: float, *, overwrite: bool = False) -> Loss:
+    """Write a `.4dgs` of a scene that moves, and compare what the library reads in it with the scene. Atomic.
 
     Args:
         max_error: how far a point of the ellipsoid of one standard deviation of a Gaussian may lie from where the field
@@ -53,12 +48,12 @@ def export_4dgs(scene: LoadedScene, file: Path, max_error: float, *, overwrite: 
         import fourdgs
     except ImportError:
         raise InputError(f"writing .4dgs needs fourdgs: {pip_install('export')}") from None
-    check_free(file, overwrite)
+    check_free(scene, file, overwrite)
     playback = scene.playback
     if not playback.moves:
         raise InputError(f"{scene.path}: holds no motion; --export FILE.ply writes it for other viewers.")
     camera, seconds = scene.camera(), scene.clock().seconds
-    pixel = 2 * math.tan(0.5 * camera.fov_y) * camera.distance / scene.look.camera.height  # world units
+    pixel = 2 * math.tan(0.5 * camera.fov_y) * camera.distance / scene.initial_view.camera.height  # world units
     with atomic_write(file) as target:  # before minutes of work
         with Progress(_PROGRESS, "thousandths of the motion") as progress:
             allowed = _OF_LINES * max_error * pixel
@@ -70,7 +65,7 @@ def export_4dgs(scene: LoadedScene, file: Path, max_error: float, *, overwrite: 
             profile="fine",
             library="lapgs_wgpu",
             metadata={"color_space": "linear-rec709-display", "visibility_profile": "box"},
-            provenance=_frame(scene.look),
+            provenance=_frame(scene.initial_view),
             preserve_source_ids=True,
         )
         fov, position, focus = math.degrees(camera.fov_y), tuple(camera.position), tuple(camera.focus)
@@ -79,15 +74,11 @@ def export_4dgs(scene: LoadedScene, file: Path, max_error: float, *, overwrite: 
         written = io.BytesIO()
         fourdgs.write(written, _gaussian_set(pieces, sh, seconds), seconds, options=options, camera=view)
         target.write(written.getvalue())
-    read = fourdgs.read(written.getvalue()).gaussians
-    found = _pieces_of(read, seconds)
-    error = float(piece_errors(playback, found).max()) / pixel
-    loss = measure(scene, of_pieces(found, _light_of(read), playback.device))
-    return Baked(len(np.unique(pieces.source)), len(pieces.source), error, loss)
+    return measure(scene, _shown(fourdgs.read(written.getvalue()), playback.device))
 
 
 def _gaussian_set(pieces: Pieces, sh: NDArray[np.float32], seconds: float) -> Any:
-    """The library's Gaussians, on the clock of the file, with colors as linear light."""
+    """Convert pieces to the library's Gaussians, with times in seconds and colors as linear light."""
     import fourdgs
 
     colors = sh[pieces.source].astype(np.float64)
@@ -114,30 +105,27 @@ def _gaussian_set(pieces: Pieces, sh: NDArray[np.float32], seconds: float) -> An
     )
 
 
-def _pieces_of(gaussians: Any, seconds: float) -> Pieces:
-    """The pieces that a file holds, with times and slopes of the clip."""
-    begin, end = gaussians.win_lo / seconds, gaussians.win_hi / seconds
-    slopes = gaussians.motions.astype(np.float64) * seconds
-    ahead = 0.5 * (begin + end) - gaussians.mu_t / seconds
-    means = gaussians.positions + ahead[:, None] * slopes
-    none = np.zeros((len(begin), 3))
-    return Pieces(
-        gaussians.source_index, begin, end, means, slopes, gaussians.scales, gaussians.rotations,
-        gaussians.colors[:, 3], none,
-    )  # fmt: skip
+def _shown(scene: Any, device: Device) -> Written:
+    """Draw what the library read; its harmonics are of linear light."""
+    gaussians = scene.gaussians
+    light = gaussians.colors[:, None, :3] / CONSTANTS["SH_C0"]
+    if gaussians.sh_degree:
+        others = gaussians.sh.reshape(len(light), 3, -1).transpose(0, 2, 1) * (2 * _SH_RANGE / 255) - _SH_RANGE
+        light = np.concatenate([light, others], axis=1)
 
+    def at(camera: Camera, t: float) -> tuple[Gaussians[DeviceArray], NDArray[np.integer]]:
+        now = gaussians.state_at(min(t, _LAST) * scene.duration_sec)
+        rows, means = now["indices"], now["centers"]
+        colors = to_display(seen(means, light[rows], camera).clip(0, 1))
+        quats = np.roll(gaussians.rotations[rows], 1, axis=1)  # xyzw to wxyz
+        arrays = (means, quats, gaussians.scales[rows], now["opacity"], colors)
+        return Gaussians(*(upload(device, values) for values in arrays)), gaussians.source_index[rows]
 
-def _light_of(gaussians: Any) -> NDArray[np.float64]:
-    """(P, K, 3) harmonics of linear light that a file holds."""
-    base = gaussians.colors[:, None, :3] / CONSTANTS["SH_C0"]
-    if not gaussians.sh_degree:
-        return np.asarray(base, np.float64)
-    others = gaussians.sh.reshape(len(base), 3, -1).transpose(0, 2, 1) * (2 * _SH_RANGE / 255) - _SH_RANGE
-    return np.concatenate([base, others], axis=1)
+    return at
 
 
 def best_degree(sh: NDArray[np.floating]) -> int:
-    """The degree whose harmonics, as bytes of linear light, come nearest to the displayed colors of sh (N, K, 3).
+    """Find the degree whose harmonics, as bytes of linear light, come nearest to the displayed colors of sh (N, K, 3).
 
     Bytes are coarse (`harmonics_bytes`), and most so in the dark: where colors hardly depend on the direction, fewer
     harmonics are nearer to them than all.
@@ -156,23 +144,21 @@ def best_degree(sh: NDArray[np.floating]) -> int:
 
 
 def harmonics_bytes(coefficients: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Coefficients as the format's bytes; those beyond its range as the ends of it."""
+    """Quantize coefficients to the format's bytes, clipped to its range."""
     return np.rint((coefficients + _SH_RANGE) * (255 / (2 * _SH_RANGE))).clip(0, 255).astype(np.uint8)
 
 
-def _frame(look: InitialView) -> Any:
-    """Which axes of the file are up and ahead; None where up is not near to an axis."""
+def _frame(view: InitialView) -> Any:
+    """Name the axes of the file that are nearest to up and ahead."""
     import fourdgs
 
-    up = _axis(look.up)
-    if np.abs(look.up).max() <= 0.9:
-        return None
-    ahead = _axis(look.camera.T_cam_world[2, :3] * (np.arange(3) != up % 3))
+    up = _axis(view.up)
+    ahead = _axis(view.camera.T_cam_world[2, :3] * (np.arange(3) != up % 3))
     frame = fourdgs.CoordinateFrame(handedness=1, up_axis=up, forward_axis=ahead)  # right-handed, of no unit
     return fourdgs.Provenance(frames=[frame])
 
 
 def _axis(direction: NDArray[np.floating]) -> int:
-    """The nearest of +x +y +z -x -y -z, by its place in this list."""
+    """Return the index of the nearest of +x +y +z -x -y -z."""
     largest = int(np.abs(direction).argmax())
     return largest + (3 if direction[largest] < 0 else 0)

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -14,13 +12,12 @@ from numpy.typing import NDArray
 
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.motion.playback.linear_pieces import Pieces
 from lapgs_wgpu.motion.playback.playback import playback_of
 from lapgs_wgpu.motion.scene_file import SceneFile
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.constants import CONSTANTS
 from lapgs_wgpu.splat.gaussians import Gaussians
-from lapgs_wgpu.splat.linear_light import sh_basis, to_display
+from lapgs_wgpu.splat.linear_light import sh_basis
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene
 from lapgs_wgpu.viewer.video import orbit_views
@@ -32,7 +29,6 @@ Written = Callable[[Camera, float], tuple[Gaussians[DeviceArray], Rows]]
 
 _PICTURES = 4
 _SIZE = (320, 240)
-_EQUAL = 100.0  # dB; more is not told apart
 _VISIBLE = 40.0  # dB; below it a file has lost what is seen
 # Property -> from which error on a Gaussian counts, and what it then does.
 _ERRORS = {
@@ -45,17 +41,10 @@ _ERRORS = {
 
 
 class Loss(NamedTuple):
-    """psnr: of the worst picture, dB, at most 100. reason: which Gaussians differ, where that is seen, else empty."""
+    """psnr: of the worst image, dB, at most 100. reason: which Gaussians differ; empty where the loss is not seen."""
 
     psnr: float
     reason: str
-
-
-def report(line: str, loss: Loss, source: Path | None, remedy: str) -> None:
-    """Print what was exported with its loss, and a warning where that is seen. remedy: what would help."""
-    print(f"{line}, {loss.psnr:.1f} dB PSNR against {source}")
-    if loss.reason:
-        print(f"warning: below {_VISIBLE:g} dB the loss is seen: {loss.reason}; {remedy}.", file=sys.stderr)
 
 
 def measure(scene: LoadedScene, written: Written, time: float | None = None) -> Loss:
@@ -64,43 +53,26 @@ def measure(scene: LoadedScene, written: Written, time: float | None = None) -> 
     rasterizer = Rasterizer(scene.playback.device)
     if time is None and not scene.playback.moves:
         time = 0.0
-    worst, place, true = _EQUAL, None, None
-    for camera, t in orbit_views(scene.camera(), _SIZE, _PICTURES, time, scene.look.arc):
+    pictures = []
+    for camera, t in orbit_views(scene.camera(), _SIZE, _PICTURES, time, scene.initial_view.arc):
         wanted = _draw(rasterizer, scene, scene.playback.at(t), camera)
-        found = _psnr(wanted, _draw(rasterizer, scene, written(camera, t)[0], camera))
-        if found < worst:
-            worst, place, true = found, (camera, t), wanted
-    if worst >= _VISIBLE or place is None or true is None:
-        return Loss(worst, "")
-    return Loss(worst, _reason(rasterizer, scene, written, *place, true))
+        psnr = _psnr(wanted, _draw(rasterizer, scene, written(camera, t)[0], camera))
+        pictures.append((psnr, camera, t, wanted))
+    psnr, *worst = min(pictures, key=lambda picture: picture[0])
+    return Loss(psnr, "" if psnr >= _VISIBLE else _reason(rasterizer, scene, written, *worst))
 
 
 def of_scene(file: SceneFile, device: Device, rows: Rows | None = None) -> Written:
-    """rows: Gaussians of the scene that the file holds, where not all."""
+    """Draw what a file holds. rows: Gaussians of the scene that are in it, where not all."""
     playback = playback_of(file, device)
     held = np.arange(playback.count) if rows is None else rows
     return lambda camera, t: (playback.at(t), held)
 
 
-def of_pieces(pieces: Pieces, light: Floats, device: Device) -> Written:
-    """light: (P, K, 3) harmonics of linear light of the pieces, without an offset."""
-
-    def at(camera: Camera, t: float) -> tuple[Gaussians[DeviceArray], Rows]:
-        shown = np.flatnonzero((pieces.begin <= t) & ((t < pieces.end) | (pieces.end >= 1)))
-        middle = 0.5 * (pieces.begin + pieces.end)[shown]
-        means = pieces.means[shown] + (t - middle)[:, None] * pieces.slopes[shown]
-        colors = to_display(_seen(means, light[shown], camera).clip(0, 1))
-        quats = np.roll(pieces.quats[shown], 1, axis=1)  # xyzw to wxyz
-        arrays = (means, quats, pieces.scales[shown], pieces.opacities[shown], colors)
-        return Gaussians(*(_upload(device, values) for values in arrays)), pieces.source[shown]
-
-    return at
-
-
 def _draw(
     rasterizer: Rasterizer, scene: LoadedScene, gaussians: Gaussians[DeviceArray], camera: Camera
 ) -> NDArray[np.float32]:
-    """(3, height, width), what can be displayed of it."""
+    """Draw an image (3, height, width), clipped to [0, 1]."""
     while True:
         drawing = rasterizer.draw(gaussians, camera, scene.background)
         if not rasterizer.grow_on_overflow(drawing):
@@ -110,7 +82,7 @@ def _draw(
 
 def _psnr(true: Floats, found: Floats) -> float:
     error = float(np.mean((found.astype(np.float64) - true) ** 2))
-    return min(_EQUAL, -10 * math.log10(max(error, 1e-20)))
+    return min(100.0, -10 * math.log10(max(error, 1e-20)))
 
 
 def _reason(
@@ -124,7 +96,7 @@ def _reason(
     true = {name: array.read()[rows] for name, array in exact.arrays().items()}
     gains = {}
     for name, values in true.items():
-        mended = Gaussians(**(shown.arrays() | {name: _upload(device, values)}), antialiased=shown.antialiased)
+        mended = Gaussians(**(shown.arrays() | {name: upload(device, values)}), antialiased=shown.antialiased)
         gains[name] = _psnr(wanted, _draw(rasterizer, scene, mended, camera))
     mended = dataclasses.replace(shown, antialiased=exact.antialiased)
     if _psnr(wanted, _draw(rasterizer, scene, mended, camera)) > max(gains.values()):
@@ -133,13 +105,7 @@ def _reason(
     found = {name: array.read() for name, array in shown.arrays().items()}
     most, differ = _ERRORS[name]
     count = int((_errors(name, true, found, camera) > most).sum())
-    reason = f"{count:,} of {scene.playback.count:,} Gaussians {differ}"
-    if name == "means":
-        far = np.linalg.norm(true["means"] - scene.look.focus, axis=1)
-        reason += f" (half of all lie within {np.median(far):.3g} of the focus, the farthest {far.max():.3g} away)"
-    if name == "sh":
-        reason += f" (colors reach {_colors(true['means'], true['sh'], camera).max():.3g}, where 1 is white)"
-    return reason
+    return f"{count:,} of {scene.playback.count:,} Gaussians {differ}"
 
 
 def _errors(name: str, true: dict[str, Floats], found: dict[str, Floats], camera: Camera) -> Floats:
@@ -160,15 +126,15 @@ def _errors(name: str, true: dict[str, Floats], found: dict[str, Floats], camera
 
 def _colors(means: Floats, sh: Floats, camera: Camera) -> Floats:
     """(N, 3) colors from a camera, of harmonics (N, K, 3) or as they are."""
-    return sh if sh.ndim == 2 else np.maximum(_seen(means, sh, camera) + CONSTANTS["SH_OFFSET"], 0)
+    return sh if sh.ndim == 2 else np.maximum(seen(means, sh, camera) + CONSTANTS["SH_OFFSET"], 0)
 
 
-def _seen(means: Floats, sh: Floats, camera: Camera) -> Floats:
+def seen(means: Floats, sh: Floats, camera: Camera) -> Floats:
     """(N, 3) sums of harmonics (N, K, 3) in the directions from a camera."""
     towards = means - camera.position
     basis = sh_basis(towards / np.linalg.norm(towards, axis=1, keepdims=True), int(sh.shape[1] ** 0.5) - 1)
     return np.asarray(np.einsum("nk,nkc->nc", basis, sh))
 
 
-def _upload(device: Device, values: Floats) -> DeviceArray:
+def upload(device: Device, values: Floats) -> DeviceArray:
     return DeviceArray.upload(device, "export loss", np.ascontiguousarray(values, np.float32))

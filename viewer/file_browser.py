@@ -12,7 +12,7 @@ from lapgs_wgpu.viewer.widgets import printable
 
 
 class FileBrowser:
-    """A section of a panel, closed at first. open_file: gets the .ply or .lapgs that the user chooses."""
+    """A section of a panel that is closed at first. open_file: called with the .ply or .lapgs that is chosen."""
 
     def __init__(self, folder: Path, open_file: Callable[[Path], None]) -> None:
         self._folder, self._open_file = folder, open_file

@@ -1,4 +1,4 @@
-"""Drawing a frame: the scene at a time, seen by a camera, as its colors or as one of its values."""
+"""Draws a frame: the scene at a time, seen by a camera, as its colors or as one of its values."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class FrameRequest(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Frame:
-    """A drawn frame. layout: for the presenter, at the origin in its own size. seconds: it took, all passes waited for.
+    """A drawn frame. layout: for the presenter, at the origin in its own size. seconds: until all passes were done.
     splats: how many touched the picture."""
 
     request: FrameRequest
@@ -61,11 +61,11 @@ class FrameRenderer:
         self._values: dict[tuple[Mode, float], tuple[DeviceArray, float, float]] = {}
 
     def forget(self) -> None:
-        """The scene has changed: what was measured of it is out of date."""
+        """Drop what was measured of the scene, because it has changed."""
         self._values.clear()
 
     def modes(self) -> list[Mode]:
-        """Those that this scene has something to show in."""
+        """List the modes in which this scene has something to show."""
         missing = set() if self.playback.moves else {"motion"}
         if not self.playback.field_config.dynamics_size:
             missing.add("dynamics")
@@ -96,7 +96,7 @@ class FrameRenderer:
         return Frame(request, layout, time.perf_counter() - start, int(visible[0]))
 
     def depth_at(self, frame: Frame, column: int, row: int) -> float | None:
-        """Depth along the camera's axis of what a pixel shows, world units; None where it shows next to nothing."""
+        """Measure the depth along the camera's axis at a pixel, world units; None where it shows next to nothing."""
         drawn = self.draw(frame.request._replace(mode="depth"))
         planes = drawn.layout.planes.read()
         alpha = 1.0 - float(planes[3, row, column])
@@ -111,7 +111,7 @@ class FrameRenderer:
         return float(low), float(high)
 
     def _value(self, mode: Mode, t: float) -> tuple[DeviceArray, float, float]:
-        """A value of each Gaussian as its color (N, 3), and the values at the ends of the scale."""
+        """Return a value of each Gaussian as its color (N, 3), and the values at the ends of the scale."""
         key = (mode, t if mode == "scale" else 0.0)
         held = self._values.get(key)
         if held is None:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class GroundTruth:
-    """views: those held out first, then the training's."""
+    """The views of a capture, those held out first, then the training's."""
 
     def __init__(self, views: tuple[View, ...]) -> None:
         self.views = views
@@ -25,7 +25,7 @@ class GroundTruth:
         self._held: Any = None
 
     def truth(self, view: int, background: tuple[float, float, float], device: Device) -> dict[str, Any]:
-        """What `ImageLayout` has to know of the picture of a view, laid on a background."""
+        """Return the fields `truth` and `truth_size` of `ImageLayout` for a view on a background."""
         key = (view, background)
         if self._held is None or self._held[0] != key:
             from lapgs_wgpu.data import composite
@@ -40,15 +40,13 @@ class GroundTruth:
 
 
 def open_ground_truth(checkpoint: Path, metadata: Mapping[str, str]) -> GroundTruth | None:
-    """The capture that the config.toml of a checkpoint's run names; None where there is none, or it is not here.
+    """Open the capture that the config.toml beside a checkpoint names; None where it is not here.
 
     metadata: of the checkpoint, empty for files of other projects; it tells whether the capture was normalized."""
     from lapgs_wgpu.data import load_dataset  # not before the first picture
 
     try:
-        folder = checkpoint.parent
-        run = folder.parent if folder.name == "snapshots" else folder  # as eval.snapshots saves them
-        data = read_toml(run / "config.toml")["data"]
+        data = read_toml(checkpoint.parent / "config.toml")["data"]
         path, size = Path(data["path"]), int(data["size"])
         dataset = load_dataset(
             path,

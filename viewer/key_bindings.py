@@ -6,7 +6,10 @@ from typing import NamedTuple
 
 
 class KeyBinding(NamedTuple):
-    """key: as the canvas names it. shown: in the help. action: a method of ViewState, or focus (of Viewport)."""
+    """A key and what it does.
+
+    key: as the canvas names it. shown: in the help. action: a method or a flag of ViewState, or focus (of Viewport).
+    """
 
     key: str
     shown: str
@@ -27,16 +30,16 @@ KEYS = (
     KeyBinding("b", "B", "next_background", "background: black, white or grey"),
     KeyBinding("f", "F", "focus", "turn about what lies under the pointer (a double click does the same)"),
     KeyBinding("r", "R", "reset_camera", "camera back to where it started"),
-    KeyBinding("v", "V", "toggle_flying", "fly: W A S D move, Q E down and up, Shift fast, Alt slow"),
+    KeyBinding("v", "V", "flying", "fly: W A S D move, Q E down and up, Shift fast, Alt slow"),
     KeyBinding("n", "N", "next_view", "stand at the capture's next camera, at its time"),
     KeyBinding("c", "C", "next_compare", "compare with the capture: side by side, split, error"),
     KeyBinding("k", "K", "add_key_frame", "add a key-frame to the camera path"),
     KeyBinding("p", "P", "toggle_pause", "pause a training that is watched, or let it go on"),
     KeyBinding("s", "S", "step_training", "one step of a training, then pause"),
-    KeyBinding("o", "O", "toggle_overlay", "frames a second, milliseconds, splats, adapter"),
-    KeyBinding("t", "T", "toggle_transport", "the time slider"),
-    KeyBinding("h", "H", "toggle_panels", "all panels"),
-    KeyBinding("?", "?", "toggle_help", "this help"),
+    KeyBinding("o", "O", "show_overlay", "frames a second, milliseconds, splats, adapter"),
+    KeyBinding("t", "T", "show_transport", "the time slider"),
+    KeyBinding("h", "H", "show_panels", "all panels"),
+    KeyBinding("?", "?", "show_help", "this help"),
 )
 MOUSE = (
     ("left drag", "turn about the focus"),
@@ -44,11 +47,5 @@ MOUSE = (
     ("wheel", "nearer or farther"),
     ("double click", "turn about what lies there"),
 )
-FLY = {
-    "w": (0, 0, 1),
-    "s": (0, 0, -1),
-    "a": (-1, 0, 0),
-    "d": (1, 0, 0),
-    "q": (0, 1, 0),
-    "e": (0, -1, 0),
-}  # right, down, ahead
+# Direction of a flight: right, down, ahead.
+FLY = {"w": (0, 0, 1), "s": (0, 0, -1), "a": (-1, 0, 0), "d": (1, 0, 0), "q": (0, 1, 0), "e": (0, -1, 0)}

@@ -1,4 +1,4 @@
-"""Watching a training while it runs: `lapgs-train --view`.
+"""Shows a training while it runs: `lapgs-train --view`.
 
 Training and window share one thread: the window's loop takes a step of the training at a time and looks after mouse
 and keys in between. A picture of the new state is drawn seldom enough to cost the training little, unless the camera
@@ -34,13 +34,13 @@ def check_window() -> None:
     window.check_window("leave out --view")
 
 
-def watch(scene: Scene4D, look: InitialView, steps: Iterator[TrainingStep]) -> None:
+def watch(scene: Scene4D, initial_view: InitialView, steps: Iterator[TrainingStep]) -> None:
     """Show the scene in a window and take the training's steps, until the window is closed.
 
     An error of a step closes the window and goes on to the caller.
     """
     canvas, loop = window.make_canvas("training - lapgs-train", (1280, 720))
-    app = App(canvas, loop, LoadedScene(None, TorchPlayback(scene), look))
+    app = App(canvas, loop, LoadedScene(None, TorchPlayback(scene), initial_view))
     state, viewport = app.state, app.viewport
     state.training = training = TrainingControl()
     interrupt = signal.getsignal(signal.SIGINT)

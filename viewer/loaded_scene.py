@@ -24,25 +24,25 @@ _FRAMES = 150  # of a clip whose file does not say how many it has
 
 
 class LoadedScene(NamedTuple):
-    """path: where it came from, None for a training under way. look: camera, focus, up and frames to begin with. file:
-    its content, None for a training."""
+    """path: where it came from, None for a training under way. initial_view: camera, focus, up and frames to
+    begin with. file: its content, None for a training."""
 
     path: Path | None
     playback: Playback
-    look: InitialView
+    initial_view: InitialView
     file: SceneFile | None = None
 
     def camera(self) -> ViewCamera:
-        """A camera where the viewer begins."""
-        return ViewCamera.of(self.look.camera, self.look.focus, self.look.up)
+        """Make a camera where the viewer begins."""
+        return ViewCamera.of(self.initial_view.camera, self.initial_view.focus, self.initial_view.up)
 
     def clock(self) -> Clock:
-        """The clip from its start."""
-        return Clock(self.look.frames if self.playback.moves else 1)
+        """Make the clock of the clip, at its start."""
+        return Clock(self.initial_view.frames if self.playback.moves else 1)
 
     @property
     def background(self) -> tuple[float, float, float]:
-        """The one it was trained on, black where that is not known."""
+        """The background of the training; black where it is not known."""
         return BACKGROUNDS.get(self.playback.metadata.get("background", ""), BACKGROUNDS["black"])
 
 
@@ -53,12 +53,12 @@ def load_scene(path: Path, device: Callable[[], Device]) -> LoadedScene:
     """
     file = read_scene(path)
     playback = playback_of(file, device())
-    look = InitialView.from_json(playback.metadata.get("view", ""))
-    return LoadedScene(path, playback, look or guess_look(playback), file)
+    initial_view = InitialView.from_json(playback.metadata.get("view", ""))
+    return LoadedScene(path, playback, initial_view or guess_view(playback), file)
 
 
-def guess_look(playback: Playback) -> InitialView:
-    """For files that say nothing of cameras: the middle of the Gaussians from a distance that shows most of them.
+def guess_view(playback: Playback) -> InitialView:
+    """Guess a view of files that name no camera: the middle of the Gaussians, from where most of them are seen.
 
     Up is -y, as in scenes whose poses come from COLMAP; z where the Gaussians lie flat in x and y, or the file is a
     checkpoint of D-NeRF's scenes.

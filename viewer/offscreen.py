@@ -1,4 +1,4 @@
-"""Rendering without a window: screenshots and the frames of videos."""
+"""Renders without a window: screenshots and the frames of videos."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class OffscreenRenderer:
         self._background = scene.background if background is None else background
 
     def __call__(self, camera: Camera, time: float) -> NDArray[np.uint8]:
-        """(height, width, 3) uint8: what the camera sees at a time in [0, 1]."""
+        """Draw what the camera sees at a time in [0, 1]: (height, width, 3) uint8."""
         frame = self._renderer.draw(FrameRequest(camera, time, self._mode, self._background))
         return self._offscreen((camera.width, camera.height), [frame.layout], self._background)
 
@@ -60,7 +60,7 @@ def find_view(scene: LoadedScene, wanted: str) -> View:
 
 
 def framed(camera: Camera, width: int, height: int) -> Camera:
-    """The same camera on a picture of another size and aspect: its vertical field of view stays, pixels stay square
+    """Put the camera on a picture of another size and aspect: its vertical field of view stays, pixels stay square
     where they were, and what was in the middle stays there."""
     scale = height / camera.height
     K = camera.K.copy()

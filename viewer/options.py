@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import re
 from collections.abc import Callable, Sequence
+from pathlib import PurePath
 from typing import Any
 
 from lapgs_wgpu.command import DEVICE_HELP, LIST_DEVICES_HELP, HelpFormatter, Parser
@@ -34,35 +35,50 @@ Without a display:
 [Values in brackets] are defaults.
 """
 
-# Job -> the options that it takes; every job but window is chosen by the option of its name.
-_COMMON = {"device"}
-_PICTURE = _COMMON | {"time", "mode", "background", "size", "view"}
+# What a call does -> the options that it takes beside --device and the one that chooses it.
+_PICTURE = {"time", "mode", "background", "view"}
+_WINDOW = _PICTURE | {"time_slider", "play", "fps", "speed", "loop", "backend"}
 _TAKES = {
-    "list_devices": set[str](),
-    "screenshot": _PICTURE,
-    "video": _PICTURE | {"path", "fps", "seconds"},
-    "export": _COMMON | {"time", "frames", "max_error", "overwrite"},
-    "window": _PICTURE | {"time_slider", "play", "fps", "speed", "loop", "backend", "host", "port"},
+    "a window": _WINDOW | {"size"},
+    "--backend http": _WINDOW | {"host", "port"},  # the browser's window says the size
+    "--list-devices": set[str](),
+    "--screenshot": _PICTURE | {"size"},
+    "--video": _PICTURE | {"size", "path", "fps", "seconds"},
+    "--export FILE.ply": {"time", "overwrite"},
+    "--export FILE.lapgs": {"overwrite"},
+    "--export FILE.html": {"overwrite"},
+    "--export FILE.4dgs": {"max_error", "overwrite"},
+    "--export DIR": {"frames", "overwrite"},
 }
+_JOBS = ("list_devices", "screenshot", "video", "export")
 
 
 def parse_options(arguments: Sequence[str]) -> tuple[Any, str]:
-    """The options, None where not given, and the job: one of _TAKES. Raises InputError where options conflict."""
+    """Parse the command line.
+
+    Returns:
+        The options, None where not given, and the job: one of _JOBS, or window.
+
+    Raises:
+        InputError: options do not go together; none is silently ignored.
+    """
     given = _parse(arguments)
-    return given, _job(given)
-
-
-def _job(given: Any) -> str:
-    """What is to be done. Raises InputError for options that do not go together: none is silently ignored."""
-    jobs = [name for name in _TAKES if getattr(given, name, None) is not None]
+    jobs = [name for name in _JOBS if getattr(given, name) is not None]
     if len(jobs) > 1:
         raise InputError(f"{_option(jobs[0])} and {_option(jobs[1])} do not go together: one at a time.")
     job = jobs[0] if jobs else "window"
+    place = _option(job) if jobs else "--backend http" if given.backend == "http" else "a window"
+    if job == "export":
+        ending = PurePath(given.export).suffix.lower()
+        place = f"--export FILE{ending}" if f"--export FILE{ending}" in _TAKES else "--export DIR"
+        if place == "--export DIR" and given.frames is None:
+            raise InputError(
+                f"--export {given.export}: name a .ply, .lapgs, .html or .4dgs file, or a folder and its --frames."
+            )
     for name, value in vars(given).items():
-        if value is not None and name not in ("file", job) and name not in _TAKES[job]:
-            place = f"with {_option(job)}" if job != "window" else "in a window"
-            raise InputError(f"{_option(name)} has no use {place}.")
-    return job
+        if value is not None and name not in {"file", "device", job} | _TAKES[place]:
+            raise InputError(f"{_option(name)} has no use with {place}.")
+    return given, job
 
 
 def _option(name: str) -> str:
@@ -98,7 +114,7 @@ def _parse(arguments: Sequence[str]) -> Any:
     add("--backend", choices=("glfw", "http"), help="glfw: desktop window; http: web server for a browser (pip install "
         "'lapgs-wgpu[remote]') [glfw]")
     add("--host", metavar="ADDRESS", help="with --backend http: address to listen on [127.0.0.1: this machine only]")
-    add("--port", type=_port, metavar="N", help="with --backend http: TCP port; 0: any free port [8080]")
+    add("--port", type=_whole(0, 65535), metavar="N", help="with --backend http: TCP port; 0: any free port [8080]")
 
     add = parser.add_argument_group("screenshot and video (no window); existing files are replaced").add_argument
     add("--screenshot", metavar="FILE.png", help="render one image")
@@ -115,25 +131,18 @@ def _parse(arguments: Sequence[str]) -> Any:
         "install 'lapgs-wgpu[export]'); DIR: a static file for each of --frames")
     add("--max-error", type=_number(0.01, 100.0), metavar="PX", help="of a .4dgs: how far lines may be off the learned "
         "motion, pixels of the captured images at the focus [0.5]")
-    add("--frames", type=_count, metavar="N", help="number of files in DIR, at times evenly from 0 to 1")
+    add("--frames", type=_whole(1, 100_000), metavar="N", help="number of files in DIR, at times evenly from 0 to 1")
     add("--overwrite", action="store_const", const=True, help="replace an existing file, or the frame_*.ply in DIR")
     # fmt: on
     return parser.parse_args(arguments)
 
 
-def _port(text: str) -> int:
-    if not (text.isascii() and text.isdigit() and int(text) <= 65535):
-        raise argparse.ArgumentTypeError(f"expected a number from 0 to 65535, got {text!r}")
-    return int(text)
-
-
 def _size(text: str) -> tuple[int, int]:
-    found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text)
-    if found is None or not (0 < int(found[1]) <= 16384 and 0 < int(found[2]) <= 16384):
-        raise argparse.ArgumentTypeError(
-            f"expected WIDTHxHEIGHT in pixels, such as 1280x720, each at most 16384, got {text!r}"
-        )
-    return int(found[1]), int(found[2])
+    found = re.fullmatch(r"([0-9]{1,5})x([0-9]{1,5})", text)
+    size = (int(found[1]), int(found[2])) if found else (0, 0)
+    if not (min(size) >= 1 and max(size) <= 16384):
+        raise argparse.ArgumentTypeError(f"expected WIDTHxHEIGHT in pixels, each from 1 to 16384, got {text!r}")
+    return size
 
 
 def _number(low: float, high: float) -> Callable[[str], float]:
@@ -149,9 +158,10 @@ def _number(low: float, high: float) -> Callable[[str], float]:
     return number
 
 
-def _count(text: str) -> int:
-    from lapgs_wgpu.viewer.export import MOST_FRAMES
+def _whole(low: int, high: int) -> Callable[[str], int]:
+    def whole(text: str) -> int:
+        if not (re.fullmatch(r"[0-9]{1,9}", text) and low <= int(text) <= high):
+            raise argparse.ArgumentTypeError(f"expected a whole number from {low} to {high}, got {text!r}")
+        return int(text)
 
-    if re.fullmatch(r"\d{1,9}", text) is None or not 1 <= int(text) <= MOST_FRAMES:
-        raise argparse.ArgumentTypeError(f"expected a whole number from 1 to {MOST_FRAMES}, got {text!r}")
-    return int(text)
+    return whole

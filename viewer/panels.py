@@ -30,7 +30,7 @@ _COMPARE_NAMES = ("no comparison", "side by side", "split", "error, 4 times")
 
 
 class _Renderer(ImguiRenderer):
-    """wgpu's, but keys are kept from the viewer only while text is typed: after a click on a panel, imgui would
+    """Keeps keys from the viewer only while text is typed: after a click on a panel, imgui would
     otherwise hold on to them. And a button goes down where its event says: a finger is there without a move."""
 
     def _on_mouse(self, event: dict[str, Any]) -> None:
@@ -68,7 +68,7 @@ class Panels:
         return any(left <= x < right and top <= y < bottom for left, top, right, bottom in self._covered)
 
     def _end(self) -> None:
-        """The panel that was begun last is whole."""
+        """End a panel, and note where it lies."""
         (x, y), (width, height) = imgui.get_window_pos(), imgui.get_window_size()
         self._covered.append((x, y, x + width, y + height))
         imgui.end()
@@ -116,7 +116,7 @@ class Panels:
         tip("another .ply or .lapgs file")
         imgui.same_line()
         if button("Help"):
-            state.toggle_help()
+            state.show_help = not state.show_help
         tip("keys and mouse (?)")
         if state.flying:
             imgui.text_colored(_ACCENT, "flying: W A S D Q E, V ends")
@@ -204,7 +204,7 @@ class Panels:
 
 
 def _legend(low: float, high: float) -> None:
-    """The scale of colors with the values at its ends."""
+    """Draw the scale of colors with the values at its ends."""
     x, y = imgui.get_cursor_screen_pos()
     width = imgui.get_content_region_avail().x
     step = width / (len(HEAT) - 1)
@@ -223,10 +223,6 @@ def _style() -> None:
     style.window_rounding, style.frame_rounding, style.grab_rounding = 6.0, 4.0, 4.0
     style.window_border_size = 0.0
     style.grab_min_size = 14.0
-    for name, color in (
-        (imgui.Col_.window_bg, (0.08, 0.08, 0.09, 0.85)),
-        (imgui.Col_.slider_grab, _ACCENT),
-        (imgui.Col_.slider_grab_active, (1.0, 0.75, 0.4, 1.0)),
-        (imgui.Col_.check_mark, _ACCENT),
-    ):
-        style.set_color_(name, color)
+    style.set_color_(imgui.Col_.window_bg, (0.08, 0.08, 0.09, 0.85))
+    style.set_color_(imgui.Col_.slider_grab, _ACCENT)
+    style.set_color_(imgui.Col_.slider_grab_active, _ACCENT)

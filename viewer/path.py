@@ -26,14 +26,14 @@ class Pose(NamedTuple):
     fov_y: float
 
     def camera(self, width: int, height: int) -> Camera:
-        """The rasterizer's camera for a picture of this size."""
+        """Make the rasterizer's camera for a picture of this size."""
         f = 0.5 * height / math.tan(0.5 * self.fov_y)
         K = np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]])
         return Camera(K, world_to_camera(self.rotation.T, self.position), width, height)
 
 
 class KeyFrame(NamedTuple):
-    """second: when the path comes by. time: in the clip, 0 to 1."""
+    """A pose on a path. second: when the path comes by. time: in the clip, 0 to 1."""
 
     second: float
     time: float
@@ -72,11 +72,11 @@ class CameraPath:
 
     @property
     def seconds(self) -> float:
-        """How long the path takes."""
+        """Length of the path."""
         return self.keys[-1].second
 
     def at(self, second: float) -> tuple[Pose, float]:
-        """The camera and the time in the clip at a second of the path; beyond its ends those of the end."""
+        """Return camera and time in the clip at a second of the path; beyond its ends those of the end."""
         from scipy.spatial.transform import Rotation
 
         if self._curve is None:

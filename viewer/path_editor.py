@@ -13,8 +13,8 @@ _CLOSEST = 0.05  # seconds between two key-frames
 
 
 class PathEditor:
-    """keys: in the order of their seconds, the first at 0. chosen: number of a key-frame, or None. started: second
-    (of any clock) at which the preview began, None where there is none."""
+    """The path under edit. keys: in the order of their seconds, the first at 0. chosen: number of a key-frame, or
+    None. started: second (of any clock) at which the preview began, None where there is none."""
 
     def __init__(self) -> None:
         self.keys: list[KeyFrame] = []
@@ -79,5 +79,5 @@ class PathEditor:
 
 
 def path_file_of(ply: Path) -> Path:
-    """The file of the camera path that belongs to a .ply file."""
+    """Name the file of the camera path that belongs to a .ply file."""
     return ply.with_name(f"{ply.stem}.camera_path.json")

@@ -19,7 +19,7 @@ _MOST_SECONDS = 24 * 3600.0
 
 
 class PathFile(NamedTuple):
-    """size: of the pictures, (width, height). fps: pictures a second."""
+    """A path and its video. size: (width, height). fps: images a second."""
 
     path: CameraPath
     size: tuple[int, int]
@@ -66,7 +66,7 @@ def _lens(pose: Pose, time: float, aspect: float) -> dict[str, float]:
 
 
 def _matrix(pose: Pose) -> list[float]:
-    """Camera to world in OpenGL's axes, 16 numbers row by row."""
+    """Write camera to world in OpenGL's axes, 16 numbers row by row."""
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = (OPENGL_TO_OPENCV @ pose.rotation).T, pose.position
     values: list[float] = matrix.ravel().tolist()
@@ -103,29 +103,29 @@ def read_path(file: Path) -> PathFile:
 
 def _key_frames(values: dict[str, Any], keys: list[dict[str, Any]], file: Path) -> list[KeyFrame]:
     closed = values.get("is_cycle") is True and len(keys) > 1
-    usual = 0.0
     if values.get("default_transition_sec") is not None:
         usual = _within(values, "default_transition_sec", 1e-3, _MOST_SECONDS, str(file))
-    elif len(keys) > 1:  # older files say how long the whole path takes
-        usual = _within(values, "seconds", 1e-3, _MOST_SECONDS, str(file)) / (len(keys) - 1 + closed)
+    else:  # older files say how long the whole path takes
+        whole = _within(values, "seconds", 1e-3, _MOST_SECONDS, str(file), default=0.0 if len(keys) == 1 else None)
+        usual = whole / max(1, len(keys) - 1 + closed)
     found: list[KeyFrame] = []
-    second = 0.0
-    waits = []  # seconds before each key-frame; the first one's counts where the path is closed
+    second = back = 0.0  # back: seconds from the last key-frame to the first, where the path is closed
     for i, key in enumerate(keys):
-        where = f"{file}: keyframes[{i}]"
-        wait = usual
+        where, wait = f"{file}: keyframes[{i}]", usual
         if key.get("override_transition_enabled") and key.get("override_transition_sec") is not None:
             wait = _within(key, "override_transition_sec", 1e-3 if i else 0.0, _MOST_SECONDS, where)
-        waits.append(wait)
-        second += wait if i else 0.0
+        if i:
+            second += wait
+        else:
+            back = wait
         found.append(_key_frame(second, key, "matrix", where))
-    if closed and waits[0] > 0:
-        found.append(found[0]._replace(second=second + waits[0]))
+    if closed and back > 0:
+        found.append(found[0]._replace(second=second + back))
     return found
 
 
 def _key_frame(second: float, entry: dict[str, Any], matrix: str, where: str) -> KeyFrame:
-    """time: NaN where the entry has none."""
+    """Read an entry; its time is NaN where it has none."""
     from scipy.spatial.transform import Rotation
 
     key = "render_time" if entry.get("render_time") is not None else "time"
@@ -142,7 +142,7 @@ def _key_frame(second: float, entry: dict[str, Any], matrix: str, where: str) ->
 def _within(
     entry: dict[str, Any], name: str, low: float, high: float, where: str, default: float | None = None
 ) -> float:
-    """A number of a table. Raises InputError where it is missing without a default, or outside its range."""
+    """Read a number of a table. Raises InputError where it is missing without a default, or outside its range."""
     value = entry.get(name)
     if value is None and default is not None:
         return default

@@ -1,4 +1,4 @@
-"""`present`: a drawn picture on a window's texture, or on one of our own, without a way through the host."""
+"""The pass `present`: draws an image onto a window's texture, or one of our own, without a host copy."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ class Presenter:
 
 
 class Offscreen:
-    """A texture of our own to present on, and the way back to the host."""
+    """Presents onto a texture of its own and reads it back."""
 
     def __init__(self, device: Device) -> None:
         self._presenter = Presenter(device, OFFSCREEN_FORMAT)
@@ -120,7 +120,7 @@ class Offscreen:
     def __call__(
         self, size: tuple[int, int], pictures: list[ImageLayout], margin: tuple[float, float, float]
     ) -> NDArray[np.uint8]:
-        """(height, width, 3) uint8 of the pictures on a target of (width, height)."""
+        """Draw the pictures on a target of (width, height); returns (height, width, 3) uint8."""
         native = self._device.wgpu_device
         if self._texture is None or self._texture.size[:2] != size:
             usage = wgpu.TextureUsage.RENDER_ATTACHMENT | wgpu.TextureUsage.COPY_SRC

@@ -21,40 +21,15 @@ from lapgs_wgpu.errors import InputError, pip_install
 from lapgs_wgpu.viewer.gui_library import check_imgui
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene
 from lapgs_wgpu.viewer.view_state import ViewState
+from lapgs_wgpu.viewer.web_page import web_file
 
 Message = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[Message]]
 Send = Callable[[Message], Awaitable[None]]
 Application = Callable[[Message, Receive, Send], Awaitable[None]]
 
-DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 8080
 _LOCAL = ("localhost", "127.0.0.1", "::1")
 _EVERYWHERE = ("0.0.0.0", "::")
-# Of rendercanvas's page, whose scripts it uses; the canvas fills the window.
-_PAGE = """<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta name="referrer" content="no-referrer">
-<title>TITLE</title>
-<link rel="icon" href="data:,">
-<link rel="stylesheet" href="renderview.css">
-<style>
-html, body { margin: 0; height: 100%; overflow: hidden; background: #1c1c1f; color: #eee; font: 13px system-ui; }
-div.renderview-wrapper { position: absolute; border: none; }
-#status { position: absolute; top: 0; left: 50%; transform: translateX(-50%); opacity: 0.7; }
-</style>
-<script>
-// Browsers keep pages that one has left, and their connections: another browser is to take over.
-addEventListener("pagehide", () => window.websocket?.close())
-</script>
-<script type="module" src="renderview.js"></script>
-<script type="module" src="renderview-client.js"></script>
-</head>
-<body><div id="canvas" style="width: 100%; height: 100%"></div><div id="status"></div></body>
-</html>
-"""
 
 
 class Entry(NamedTuple):
@@ -69,13 +44,16 @@ class Entry(NamedTuple):
         return int(self.listening.getsockname()[1])
 
     def url(self, name: str) -> str:
-        """To open in a browser that reaches this machine under a name."""
-        return f"http://{_bracketed(name)}:{self.port}/{self.token}/"
+        """Return the address for a browser that reaches this machine under a name."""
+        return f"http://{name}:{self.port}/{self.token}/"
 
     def welcome(self, file: str) -> str:
-        """What the user should know: where to look, and how from another machine."""
-        name = "localhost" if self.host in _LOCAL else socket.gethostname() if self.host in _EVERYWHERE else self.host
-        end = "localhost" if self.host in (*_LOCAL, *_EVERYWHERE) else _bracketed(self.host)
+        """Say which address to open, here and on another machine."""
+        name = end = f"[{self.host}]" if ":" in self.host else self.host
+        if self.host in _LOCAL:
+            name = end = "localhost"
+        if self.host in _EVERYWHERE:
+            name, end = socket.gethostname(), "localhost"
         lines = [
             f"lapgs-view: {file} is shown at {self.url(name)} until Ctrl-C.",
             f"From another machine: ssh -L {self.port}:{end}:{self.port} USER@THIS_MACHINE, then open "
@@ -110,10 +88,11 @@ def run_remote(scene: LoadedScene, entry: Entry, start: Callable[[ViewState], No
     from lapgs_wgpu.viewer.app import App
     from lapgs_wgpu.viewer.remote_canvas import RemoteCanvas
 
+    # The page is rendercanvas's, whose scripts it uses, but its canvas fills the window.
     # rendercanvas takes Ctrl-C from uvicorn when its loop starts, closes the canvas and leaves the server running.
     loop._BaseLoop__setup_interrupt_hooks = dict
     name = scene.path.name if scene.path else "lapgs-view"
-    resources["index.html"] = "text/html", _PAGE.replace("TITLE", html.escape(name))
+    resources["index.html"] = "text/html", web_file("remote.html").replace("{{title}}", html.escape(name))
     app = App(RemoteCanvas(title=name, update_mode="ondemand", max_fps=60), loop, scene)
     start(app.state)
     config = uvicorn.Config(
@@ -152,7 +131,3 @@ def guarded(app: Application, token: str) -> Application:
             await send({"type": "http.response.body", "body": b"Open the address that lapgs-view printed.\n"})
 
     return serve
-
-
-def _bracketed(host: str) -> str:
-    return f"[{host}]" if ":" in host else host

@@ -1,4 +1,4 @@
-"""rendercanvas's canvas for browsers, which is experimental, with what it gets wrong made right."""
+"""rendercanvas's canvas for browsers, which is experimental, with corrections."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ def draw_time_slider(state: ViewState) -> None:
 
 
 def _slider_value() -> float:
-    """0 to 1 where the grab of the last item, a slider, stands in its middle under the mouse."""
+    """Return the value, 0 to 1, at which the grab of the last item, a slider, lies under the mouse."""
     half_grab = imgui.get_style().grab_min_size / 2 + 2  # imgui's own padding
     left, right = imgui.get_item_rect_min().x + half_grab, imgui.get_item_rect_max().x - half_grab
     return float((imgui.get_mouse_pos().x - left) / max(right - left, 1.0))

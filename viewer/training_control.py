@@ -17,7 +17,7 @@ class TrainingStep(Protocol):
 
 
 class TrainingControl:
-    """last: the last finished step. single: steps that still run although the training is paused."""
+    """Pauses a training. last: the last finished step. single: steps that still run although the training is paused."""
 
     def __init__(self) -> None:
         self.last: TrainingStep | None = None

@@ -24,7 +24,7 @@ _MOST_FRAMES = 1_000_000
 
 
 def count_frames(seconds: float, fps: float) -> int:
-    """Number of frames of a video. Raises InputError if it is 0 or above the limit."""
+    """Count the frames of a video. Raises InputError if it is 0 or above the limit."""
     frames = round(seconds * fps)
     if not 1 <= frames <= _MOST_FRAMES:
         raise InputError(f"{seconds:g} s at {fps:g} frames a second are {frames} frames; give --seconds or --fps.")
@@ -32,7 +32,7 @@ def count_frames(seconds: float, fps: float) -> int:
 
 
 def clip_views(camera: Camera, frames: int) -> Iterator[TimedCamera]:
-    """A static camera while the clip plays once."""
+    """Keep the camera still while the clip plays once."""
     return ((camera, share) for share in np.linspace(0, 1, frames).tolist())
 
 
@@ -43,7 +43,7 @@ def orbit_views(
     time: float | None,
     arc: tuple[float, float] | None = None,
 ) -> Iterator[TimedCamera]:
-    """One closed orbit around the focus. time: fixed, in [0, 1]; None plays the clip once. arc: swing to these degrees
+    """Go around the focus once. time: fixed, in [0, 1]; None plays the clip once. arc: swing to these degrees
     clockwise and counterclockwise (`InitialView.arc`) instead of going all around."""
     times = np.linspace(0, 1, frames).tolist()
     for number in range(frames):
@@ -53,7 +53,7 @@ def orbit_views(
 
 
 def _turned(share: float, arc: tuple[float, float] | None) -> float:
-    """Radians clockwise after a share of a closed orbit."""
+    """Return the radians clockwise after a share of a closed orbit."""
     if arc is None:
         return 2 * math.pi * share
     wave = math.sin(2 * math.pi * share)
@@ -61,14 +61,14 @@ def _turned(share: float, arc: tuple[float, float] | None) -> float:
 
 
 def path_views(path: CameraPath, size: tuple[int, int], frames: int) -> Iterator[TimedCamera]:
-    """Along a camera path, from its first to its last key frame."""
+    """Follow a camera path from its first to its last key-frame."""
     for second in np.linspace(0, path.seconds, frames).tolist():
         pose, time = path.at(second)
         yield pose.camera(*size), time
 
 
 def even(size: tuple[int, int]) -> tuple[int, int]:
-    """The largest size, at most this one, that the pixel format yuv420p allows: even and at least 2x2."""
+    """Round a size down to what the pixel format yuv420p allows: even and at least 2x2."""
     return max(2, size[0] // 2 * 2), max(2, size[1] // 2 * 2)
 
 

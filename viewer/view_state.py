@@ -15,7 +15,8 @@ from lapgs_wgpu.viewer.training_control import TrainingControl
 
 
 class ViewState:
-    """Panels read and set the attributes; keys call the methods (viewer/key_bindings). Knows no window and no GUI.
+    """Panels read and set the attributes; keys call the methods and turn the flags (viewer/key_bindings). Knows no
+    window and no GUI.
 
     split: divider of the comparison, share of the width. view: number of the capture's camera that was chosen last, or
     None. message: one sentence for the user, or None. training: the training under way; None where a file is shown.
@@ -76,7 +77,7 @@ class ViewState:
         self.clock.playing = False
         self.clock.seek(time)
 
-    # Actions of keys (viewer/key_bindings) ---------------------------------------------------------------------------
+    # Actions of keys (viewer/key_bindings), which also turn the flags ------------------------------------------------
 
     def toggle_playing(self) -> None:
         if self.scene.playback.moves:
@@ -112,9 +113,6 @@ class ViewState:
     def reset_camera(self) -> None:
         self.camera.reset()
 
-    def toggle_flying(self) -> None:
-        self.flying = not self.flying
-
     def next_view(self) -> None:
         if self.ground_truth is not None:
             self.stand_at((self.view + 1 if self.view is not None else 0) % len(self.ground_truth.views))
@@ -138,18 +136,6 @@ class ViewState:
     def add_key_frame(self) -> None:
         self.path.add(self.camera.pose, self.clock.time)
         self.show_path = True
-
-    def toggle_overlay(self) -> None:
-        self.show_overlay = not self.show_overlay
-
-    def toggle_transport(self) -> None:
-        self.show_transport = not self.show_transport
-
-    def toggle_panels(self) -> None:
-        self.show_panels = not self.show_panels
-
-    def toggle_help(self) -> None:
-        self.show_help = not self.show_help
 
 
 def _next(choices: Any, present: Any) -> Any:

@@ -45,7 +45,7 @@ class Viewport:
 
     @property
     def fps(self) -> float:
-        """Frames of the scene drawn in the last second."""
+        """Count the frames of the scene drawn in the last second."""
         recent = [drawn for drawn in self._times if drawn > time.perf_counter() - 1.0]
         return len(recent) - 1.0 if len(recent) > 1 else 0.0
 
@@ -55,7 +55,7 @@ class Viewport:
         return self.scale == 1 and self.frame is not None
 
     def refresh(self) -> None:
-        """The scene itself has changed: draw it again."""
+        """Draw again, because the scene itself has changed."""
         self.stale = True
         self.canvas.request_draw()
 
@@ -92,7 +92,7 @@ class Viewport:
         self._presenter(target.create_view(), self._layouts(*target.size[:2]), MARGIN)
 
     def _full_camera(self) -> Camera:
-        """The camera at full resolution: the canvas's, or that of the image that is subtracted."""
+        """Make the camera at full resolution: the canvas's, or that of the image that is subtracted."""
         comparing, camera = self.state.comparing(), self.state.camera
         if comparing == "error" and camera.exact is not None:
             return camera.exact
@@ -100,7 +100,7 @@ class Viewport:
         return camera.camera(max(1, width // 2 if comparing == "side" else width), max(1, height))
 
     def _layouts(self, width: int, height: int) -> list[ImageLayout]:
-        """The layout on a canvas of this size, pixels."""
+        """Lay the frame out on a canvas of this size, pixels."""
         assert self.frame is not None
         layout = self.frame.layout._replace(**self._truth())
         compare = self.state.comparing()
@@ -159,7 +159,7 @@ def _camera_key(camera: Camera) -> tuple[bytes, bytes, int, int]:
 
 
 def _fit(layout: ImageLayout, width: int, height: int, left: int) -> ImageLayout:
-    """The image as large as fits between columns left and left + width, centred."""
+    """Center the image, as large as fits, between columns left and left + width."""
     columns, rows = layout.picture
     scale = min(width / columns, height / rows)
     # An image drawn for this canvas at a lower resolution fills it again, whatever rounding did to its size.

@@ -28,7 +28,7 @@ from lapgs_wgpu.viewer.viewport import SETTLED, SMALLEST_SCALE, TARGET_SECONDS
 
 # The player's modules, each after those that it imports.
 MODULES = (
-    "refusal", "lapgs_file", "hash_grid", "timing", "scene", "gpu", "scan", "radix_sort", "rasterizer", "hash_encoder",
+    "refusal", "lapgs_file", "hash_grid", "scene", "gpu", "scan", "radix_sort", "rasterizer", "hash_encoder",
     "field", "camera", "clock", "presenter", "viewport", "controls", "transport", "api", "main",
 )  # fmt: skip
 _PLAIN, _SUBGROUPS = gpu_config(0), gpu_config(32)
@@ -62,7 +62,7 @@ _DESKTOP_ACTIONS = ("next_mode", "next_view", "next_compare", "add_key_frame", "
 
 
 def player_data() -> dict[str, Any]:
-    """The data of the player: its passes with their bindings and uniforms, and the viewer's constants."""
+    """Collect the data of the player: its passes with their bindings and uniforms, and the viewer's constants."""
     always = [name for name in PASSES if name not in _FIELD and name.split()[0] not in _CHOSEN]
     return {
         "kernels": {name: _shader(browser_source(compose(*shape))) for name, shape in PASSES.items()},
@@ -99,7 +99,7 @@ def _shader(source: str) -> dict[str, Any]:
 
 
 def _uniform(source: str, binding: Binding) -> dict[str, Any]:
-    """Size in bytes, and of each member its offset, f or I, and how many numbers it has."""
+    """Describe a uniform: its size in bytes, and offset, type (f or I) and length of each member."""
     size, members = struct_layout(source, binding.type)
     return {
         "size": size,
@@ -108,10 +108,10 @@ def _uniform(source: str, binding: Binding) -> dict[str, Any]:
 
 
 def page_html(scene: bytes, title: str, poster: NDArray[np.uint8], *, narrowest: float = 1.0) -> str:
-    """The page. scene: a scene.lapgs. poster: (H, W, 3), shown until the first frame, and where WebGPU is missing.
+    """Make the page. scene: a scene.lapgs. poster: (H, W, 3), shown until the first frame, and where WebGPU is missing.
     narrowest: of the scene's first camera (`InitialView`)."""
     edge = "#" + bytes(np.median(poster[0], axis=0).astype(np.uint8)).hex()
-    style = _file("player.css").replace("{{background}}", edge).replace("{{narrowest}}", f"{narrowest:.4g}")
+    style = web_file("player.css").replace("{{background}}", edge).replace("{{narrowest}}", f"{narrowest:.4g}")
     script = _script()
     policy = "; ".join([
         "default-src 'none'",
@@ -124,6 +124,11 @@ def page_html(scene: bytes, title: str, poster: NDArray[np.uint8], *, narrowest:
     ])  # fmt: skip
     picture = io.BytesIO()
     iio.imwrite(picture, poster, extension=".jpg", quality=80)
+    gestures = [
+        *((key.shown, key.help) for key in page_keys()),
+        *MOUSE,
+        ("two fingers", "move sideways, nearer or farther"),
+    ]
     values = {
         "policy": policy,
         "title": html.escape(title),
@@ -132,11 +137,11 @@ def page_html(scene: bytes, title: str, poster: NDArray[np.uint8], *, narrowest:
         "player": json.dumps(player_data(), separators=(",", ":")).replace("<", "\\u003c"),
         "scene": base64.b64encode(scene).decode(),
         "script": script,
-        "help": "".join(f"<dt>{html.escape(shown)}</dt><dd>{html.escape(what)}</dd>" for shown, what in _gestures()),
+        "help": "".join(f"<dt>{html.escape(shown)}</dt><dd>{html.escape(what)}</dd>" for shown, what in gestures),
         "speeds": _options(f"{speed:g}x" for speed in SPEEDS),
         "loops": _options(LOOPS),
     }
-    return re.sub(r"\{\{(\w+)\}\}", lambda match: values[match[1]], _file("player.html"))
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: values[match[1]], web_file("player.html"))
 
 
 def page_keys() -> list[KeyBinding]:
@@ -144,34 +149,26 @@ def page_keys() -> list[KeyBinding]:
     return [key for key in KEYS if key.action not in _DESKTOP_ACTIONS]
 
 
-def _gestures() -> list[tuple[str, str]]:
-    """What to press or move, and what it does."""
-    return [
-        *((key.shown, key.help) for key in page_keys()),
-        *MOUSE,
-        ("two fingers", "move sideways, nearer or farther"),
-    ]
-
-
 def _options(texts: Iterable[str]) -> str:
     return "".join(f"<option>{html.escape(text)}</option>" for text in texts)
 
 
 def _script() -> str:
-    """The modules one after another: pages from file:// cannot import others."""
+    """Join the modules, because pages from file:// cannot import others."""
     return "\n".join(module_script(name) for name in MODULES)
 
 
 def module_script(name: str) -> str:
-    """A module of the player as a script: a function of its own, whose exports are the members of `NAME_js`."""
-    text = _file(f"{name}.js")
+    """Turn a module of the player into a script: a function of its own, whose exports are the members of `NAME_js`."""
+    text = web_file(f"{name}.js")
     exports = re.findall(r"^export (?:async )?(?:function|class|const) (\w+)", text, re.M)
     text = re.sub(r"^import (\{.*\}) from \"\./(\w+)\.js\";", r"const \1 = \2_js;", text, flags=re.M)
     text = re.sub(r"^export ", "", text, flags=re.M)
     return f"const {name}_js = (() => {{\n{text}return {{ {', '.join(exports)} }};\n}})();"
 
 
-def _file(name: str) -> str:
+def web_file(name: str) -> str:
+    """Read a file of viewer/web."""
     return resources.files("lapgs_wgpu.viewer").joinpath("web", name).read_text(encoding="utf-8")
 
 

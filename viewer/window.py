@@ -47,7 +47,7 @@ def run_window(scene: LoadedScene, size: tuple[int, int], start: Callable[[ViewS
 
 
 def make_canvas(title: str, size: tuple[int, int], drop: Callable[[Path], None] | None = None) -> tuple[Any, Any]:
-    """A window that draws when it is asked to, and its event loop. drop: is told of a file dropped on it."""
+    """Make a window that draws on request, and its event loop. drop: called with a file dropped on it."""
     from rendercanvas.glfw import RenderCanvas, glfw, loop
 
     canvas = RenderCanvas(title=title, size=size, update_mode="ondemand", max_fps=60)

@@ -141,9 +141,10 @@ def disorder(names: Sequence[ImageName], times: Sequence[float]) -> list[str]:
     a, b = spans[first_camera]
     disjoint = [camera for camera in further if spans[camera][0] > b or spans[camera][1] < a]
     if disjoint:
-        c, d = spans[disjoint[0]]
+        other = disjoint[0]
+        c, d = spans[other]
         warnings.append(
-            f"cameras film at different times: {first_camera} from {a:g} to {b:g} and {disjoint[0]} from {c:g} to {d:g}; "
+            f"cameras film at different times: {first_camera} from {a:g} to {b:g} and {other} from {c:g} to {d:g}; "
             "if they filmed together, number their frames from a common time on."
         )
     return warnings

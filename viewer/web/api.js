@@ -41,18 +41,5 @@ export function makeApi(state, viewport, wake) {
         pause() { state.clock.playing = false; wake(); },
         // {width, height, time, values}: of the frame on show while the clip plays, else of the final one.
         picture: () => viewport.planes(),
-        // The dispatches of the final picture of a time: [pass, columns, rows, {binding: [offset, bytes]}] each.
-        async passes(t) {
-            await this.picture();
-            const { movingScale } = viewport;
-            const log = viewport.log = [];
-            viewport.movingScale = 1; // so that the first picture is the final one
-            viewport.playback.time = NaN; // also where it is on show
-            viewport.drawn = "";
-            this.setTime(t);
-            await this.picture();
-            Object.assign(viewport, { log: null, movingScale });
-            return log;
-        },
     };
 }

@@ -3,7 +3,7 @@ export class Controls {
     // actions: name -> function. wake: something may have changed. signal: ends it.
     constructor(canvas, state, { keys, fly, orbit, look, zoom, reach }, actions, wake, signal) {
         Object.assign(this, { canvas, state, fly, orbit, look, zoom, reach, actions, wake });
-        this.keys = new Map(Object.entries(keys)).set("/", "toggle_help");
+        this.keys = new Map(Object.entries(keys)).set("/", "show_help");
         this.pointer = [0, 0]; // where it was last
         this.pointers = new Map(); // that are down, by number: where each is
         this.held = new Map(); // keys that fly, and those that say how fast: where each is on the keyboard -> its name
@@ -15,7 +15,7 @@ export class Controls {
         }, { ...options, signal });
         listen("pointerdown", this.pointerDown);
         listen("pointermove", this.pointerMove);
-        for (const name of ["pointerup", "pointercancel"]) listen(name, this.pointerUp);
+        for (const name of ["pointerup", "pointercancel"]) listen(name, event => this.pointers.delete(event.pointerId));
         listen("wheel", this.wheel, { passive: false });
         listen("dblclick", event => this.actions.focus(event.clientX, event.clientY));
         listen("contextmenu", event => event.preventDefault());
@@ -55,8 +55,6 @@ export class Controls {
         return Math.max(Math.hypot(a[0] - b[0], a[1] - b[1]), 1);
     }
 
-    pointerUp(event) { this.pointers.delete(event.pointerId); }
-
     wheel(event) {
         event.preventDefault();
         const pixels = event.deltaY * (event.deltaMode === 0 ? 1 : event.deltaMode === 1 ? 16 : this.canvas.clientHeight);
@@ -77,16 +75,11 @@ export class Controls {
         this.wake();
     }
 
-    toggleFlying() {
-        this.flying = !this.flying;
-        this.held.clear();
-    }
-
     // Move the camera by what the held keys say.
     advance(seconds) {
         const held = new Set(this.held.values());
         const moves = [...held].map(key => this.fly[key]).filter(Boolean);
-        if (!moves.length) return;
+        if (!this.flying || !moves.length) return;
         const far = seconds * this.reach * (held.has("Shift") ? 4 : held.has("Alt") ? 0.25 : 1) * this.state.camera.distance;
         this.state.camera.fly(...[0, 1, 2].map(axis => far * moves.reduce((sum, move) => sum + move[axis], 0)));
     }

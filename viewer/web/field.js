@@ -2,7 +2,6 @@
 import { Commands, Pool, part } from "./gpu.js";
 import { HashEncoder } from "./hash_encoder.js";
 import { temporalGrids } from "./hash_grid.js";
-import { momentAt } from "./timing.js";
 
 const LANES = 64;
 const POINTS = 2; // Gaussians of a lane, deform.wgsl
@@ -70,58 +69,38 @@ export class Playback {
             copy(still, at + CANONICAL, gaussians.static_features, i, field.staticFeatures);
             if (field.dynamics) copy(moving, movingRow * n, gaussians.dynamics, i, field.dynamics);
         }
-        const arrays = { points, still, moving };
-        const block = { first, count };
-        for (const [name, values] of Object.entries(arrays)) block[name] = this.pool.upload(`${name} from ${first}`, values);
-        return block;
+        const upload = (name, values) => this.pool.upload(`${name} from ${first}`, values);
+        return { first, count, points: upload("points", points), still: upload("still", still), moving: upload("moving", moving) };
     }
 
-    // Columns of a layer (width, inputs) by round and quad of inputs: 4 inputs of 4 outputs each.
-    columns(weight, inputs, quads) {
-        const { width } = this.scene.field;
-        const out = new Float32Array(this.rounds * quads * 16);
-        for (let output = 0; output < width; output++) {
-            for (let input = 0; input < inputs; input++) {
-                out[((output >> 2) * 4 * quads + input) * 4 + output % 4] = weight[output * inputs + input];
-            }
-        }
-        return out;
-    }
-
-    // Biases and layers of the decoder, round by round, in the order in which the pass reads them.
+    // Biases and layers of the decoder, four outputs at a time, in the order in which the pass reads them.
     stream(features) {
-        const { field, parameters } = this.scene;
-        const { width, dynamics, laplacian } = field;
+        const { field: { width, dynamics, staticFeatures, laplacian }, parameters } = this.scene;
         const halved = name => parameters[name].map(value => 0.5 * value); // see common/gate.wgsl
-        const spatial = this.columns(halved("spatial.weight"), field.staticFeatures, this.stillQuads);
-        const motion = laplacian && this.columns(parameters["motion.first.weight"], field.staticFeatures, this.stillQuads);
-        const inputs = this.firstTemporal + features;
-        const spread = new Float32Array(width * inputs); // as the features lie, with the gap behind the dynamics
-        const given = parameters["temporal.weight"].length / width;
-        for (let output = 0; output < width; output++) {
-            for (let i = 0; i < dynamics + features; i++) {
-                spread[output * inputs + (i < dynamics ? i : i - dynamics + this.firstTemporal)] = parameters["temporal.weight"][output * given + i];
-            }
-        }
-        const temporal = this.columns(spread, inputs, this.movingQuads);
+        const layer = (weight, inputs) => (output, input) => (output < width && input < inputs ? weight[output * inputs + input] : 0);
         const biases = [halved("spatial.bias"), parameters["temporal.bias"]];
-        if (laplacian) biases.push(parameters["motion.first.bias"]);
-        const length = 4 * (biases.length + 4 * this.stillQuads * (laplacian ? 2 : 1) + 4 * this.movingQuads);
-        const out = new Float32Array(this.rounds * length);
-        for (let round = 0; round < this.rounds; round++) {
-            let at = round * length;
-            const put = (values, first) => {
-                out.set(values.subarray(first, first + 4), at);
-                at += 4;
-            };
-            for (const bias of biases) put(bias, 4 * round);
-            for (let input = 0; input < 4 * this.stillQuads; input++) {
-                put(spatial, 4 * (round * 4 * this.stillQuads + input));
-                if (motion) put(motion, 4 * (round * 4 * this.stillQuads + input));
-            }
-            for (let input = 0; input < 4 * this.movingQuads; input++) put(temporal, 4 * (round * 4 * this.movingQuads + input));
+        const spatial = [layer(halved("spatial.weight"), staticFeatures)];
+        if (laplacian) {
+            biases.push(parameters["motion.first.bias"]);
+            spatial.push(layer(parameters["motion.first.weight"], staticFeatures));
         }
-        return out;
+        const temporal = layer(parameters["temporal.weight"], dynamics + features);
+        const gap = this.firstTemporal - dynamics; // behind the dynamics
+        const out = [];
+        for (let round = 0; round < this.rounds; round++) {
+            const put = value => {
+                for (let output = 4 * round; output < 4 * round + 4; output++) out.push(value(output));
+            };
+            for (const bias of biases) put(output => bias[output] ?? 0);
+            for (let input = 0; input < 4 * this.stillQuads; input++) {
+                for (const weight of spatial) put(output => weight(output, input));
+            }
+            for (let input = 0; input < 4 * this.movingQuads; input++) {
+                const inGap = input >= dynamics && input < dynamics + gap;
+                put(output => (inGap ? 0 : temporal(output, input < dynamics ? input : input - gap)));
+            }
+        }
+        return new Float32Array(out);
     }
 
     // Biases and, by channel, weights of the heads; with the Laplacian motion at a time folded in.
@@ -170,19 +149,19 @@ export class Playback {
     }
 
     // The Gaussians at a time in [0, 1]: submitted, not waited for.
-    at(t, log = null) {
-        if (this.scene.field && t !== this.time) this.move(momentAt(this.scene.timing, t), log);
+    at(t) {
+        if (this.scene.field && t !== this.time) this.move(momentAt(this.scene.timing, t));
         this.time = t;
         return this.gaussians;
     }
 
-    move(t, log) {
+    move(t) {
         const { gpu, pool, gaussians: out, scene: { field, shDegree } } = this;
         gpu.device.queue.writeBuffer(this.weights.buffer, 0, this.headsAt(t));
         const time = 0.5 * ((2 * t - 1) * field.timeScale + 1);
         const coefficients = (shDegree + 1) ** 2;
         this.blocks.forEach(({ first, count, points, still, moving }, number) => {
-            const commands = new Commands(gpu, log); // a submission each: all together may take longer than watchdogs allow
+            const commands = new Commands(gpu); // a submission each: all together may take longer than watchdogs allow
             this.encoder.record(commands, number, { points, encoding: moving, tables: this.tables, n: count, time });
             const deform = pool.uniform(`deform ${number}`, gpu.kernel(this.deform), "deform", {
                 gaussians: count, rounds: this.rounds, still_quads: this.stillQuads,
@@ -213,4 +192,15 @@ function activate({ count, shDegree, gaussians: g }, minScale) {
     const scales = g.log_scales.map(value => Math.max(Math.exp(value), minScale));
     const opacities = g.opacity_logits.map(value => 0.5 + 0.5 * Math.tanh(0.5 * value));
     return { means: g.means, quats, scales, opacities, sh };
+}
+
+// The time of the motion at a time of the capture (motion/timing.py), both in [0, 1]; of no timing (null) the time itself.
+function momentAt(timing, t) {
+    if (!timing) return t;
+    const { times, moments } = timing;
+    const after = times.findIndex(time => time > t), before = after < 0 ? times.length - 1 : Math.max(0, after - 1);
+    const late = i => moments[i] - times[i];
+    const share = after > 0 ? (t - times[before]) / (times[after] - times[before]) : 0;
+    const shift = share ? late(before) + share * (late(after) - late(before)) : late(before);
+    return Math.min(Math.max(t + shift, 0), 1);
 }

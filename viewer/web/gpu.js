@@ -28,14 +28,10 @@ function advice() {
 }
 
 class Gpu {
-    constructor(device, kernels, subgroups, name) {
-        this.device = device;
-        this.name = name; // of the adapter
-        this.subgroups = subgroups;
+    // kernelData: sources and bindings by key. name: of the adapter. pools: how many there are.
+    constructor(device, kernelData, subgroups, name) {
+        Object.assign(this, { device, kernelData, subgroups, name, kernels: new Map(), pools: 0 });
         this.maxBinding = device.limits.maxStorageBufferBindingSize;
-        this.kernelData = kernels;
-        this.kernels = new Map();
-        this.pools = 0;
     }
 
     // Compile kernels that are not there yet, side by side. step: called after each.
@@ -92,7 +88,7 @@ export function bindGroupLayout(device, bindings, visibility) {
         { binding, visibility, buffer: { type: KINDS[kind] } })) });
 }
 
-export const bound = bytes => Math.max(16, Math.ceil(bytes / 16) * 16); // of an array of so many bytes
+const bound = bytes => Math.max(16, Math.ceil(bytes / 16) * 16); // of an array of so many bytes
 export const resource = array => ({ buffer: array.buffer, offset: array.offset, size: bound(array.bytes) });
 export const part = (array, offset, bytes) => ({ buffer: array.buffer, offset: array.offset + offset, bytes });
 
@@ -154,11 +150,10 @@ export class Pool {
     }
 }
 
-// A list of dispatches. log: where given, each dispatch is noted in it (viewer tests).
+// A list of dispatches.
 export class Commands {
-    constructor(gpu, log = null) {
+    constructor(gpu) {
         this.gpu = gpu;
-        this.log = log;
         this.encoder = gpu.device.createCommandEncoder();
         this.pass = null;
     }
@@ -172,8 +167,6 @@ export class Commands {
     dispatchGrid(key, columns, rows, arrays) {
         if (Math.min(columns, rows) <= 0) return;
         const kernel = this.gpu.kernel(key);
-        this.log?.push([key, columns, rows, Object.fromEntries(
-            Object.keys(kernel.bindings).map(name => [name, [arrays[name].offset, bound(arrays[name].bytes)]]))]);
         this.pass ??= this.encoder.beginComputePass();
         this.pass.setPipeline(kernel.pipeline);
         this.pass.setBindGroup(0, kernel.bind(arrays));

@@ -1,6 +1,5 @@
 // The temporal features of Gaussians at a time (motion/passes/hash_encoder_passes.py).
 import { Pool } from "./gpu.js";
-import { isSliced } from "./hash_grid.js";
 
 const LEVEL_WORDS = 16; // common/hashgrid.wgsl: struct Level
 
@@ -9,18 +8,17 @@ export class HashEncoder {
     // `column` on.
     constructor(gpu, grids, bound, row, column) {
         Object.assign(this, { gpu, bound, row, pool: new Pool(gpu), cuts: [], sliceEntries: 0 });
-        const [direct, slices] = [[], []];
+        this.lookups = [];
+        const slices = [];
         grids.forEach((grid, number) => {
             const records = grid.levels.map((level, i) => this.levelRecord(grid, level, column / 2 + i));
-            const of = sliced => records.filter((_, i) => isSliced(grid.levels[i]) === sliced);
-            if (of(true).length) {
-                this.cuts.push(this.levels(`cut ${number}`, number, of(true)));
-                slices.push(...of(true));
-            }
-            if (of(false).length) direct.push(this.levels(`direct ${number}`, number, of(false)));
+            const [cut, direct] = [true, false].map(sliced => records.filter((_, i) => grid.levels[i].sliced === sliced));
+            if (cut.length) this.cuts.push(this.levels(`cut ${number}`, number, cut));
+            if (direct.length) this.lookups.push(this.levels(`direct ${number}`, number, direct));
+            slices.push(...cut);
             column += grid.features;
         });
-        this.lookups = slices.length ? [this.levels("slices", null, slices), ...direct] : direct;
+        if (slices.length) this.lookups.unshift(this.levels("slices", null, slices));
     }
 
     // What the device knows of a level, and the number of cells of its plane.
@@ -29,7 +27,7 @@ export class HashEncoder {
         new Float32Array(words.buffer, 0, 3).set(level.scale);
         words.set([Number(level.dense), ...level.resolution, level.entries, ...grid.axes, number, level.first, this.sliceEntries], 3);
         const cells = level.resolution[0] * level.resolution[1];
-        if (isSliced(level)) this.sliceEntries += cells;
+        if (level.sliced) this.sliceEntries += cells;
         return { words, cells };
     }
 

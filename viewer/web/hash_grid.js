@@ -1,5 +1,5 @@
 // Shapes of hash grids, as motion/fields/hash_grid_config.py makes them.
-export const TIME = 3; // the axis number of time
+const TIME = 3; // the axis number of time
 const SLICE_CELLS = 1 << 14;
 const TEMPORAL_AXES = [[0, 1, TIME], [1, 2, TIME], [0, 2, TIME]];
 
@@ -13,7 +13,10 @@ function makeLevels(config) {
         const resolution = exact.map(size => Math.ceil(size - 1e-9));
         const all = resolution[0] * resolution[1] * resolution[2];
         const entries = Math.min(2 ** config.table_log2, all);
-        levels.push({ scale: exact.map(size => size - 1), resolution, entries, first, dense: all <= entries });
+        const dense = all <= entries;
+        // Whether it is cut at the time that is shown, instead of looked up at each point.
+        const sliced = dense && resolution[0] * resolution[1] <= SLICE_CELLS;
+        levels.push({ scale: exact.map(size => size - 1), resolution, entries, first, dense, sliced });
         first += entries;
     }
     return levels;
@@ -25,9 +28,4 @@ export function temporalGrids(config) {
     const levels = makeLevels(config.temporal);
     const last = levels.at(-1);
     return TEMPORAL_AXES.map(axes => ({ axes, levels, entries: last.first + last.entries, features: 2 * levels.length }));
-}
-
-// Whether a level is cut at the time that is shown, instead of looked up at each point.
-export function isSliced(level) {
-    return level.dense && level.resolution[0] * level.resolution[1] <= SLICE_CELLS;
 }

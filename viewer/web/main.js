@@ -17,18 +17,9 @@ const find = name => document.getElementById(name);
 const LONGEST_STEP = 0.25; // seconds that the clock goes on at once, after a tab was in the background
 const OPENING = "Opening the graphics adapter";
 let shown = null; // ends what is on the page
-const KEPT = 1000; // milliseconds at rest, after which a picture is kept
 const STEADY = 10_000; // milliseconds on show, after which a scene whose device is lost is opened again
 let wanted = 0; // number of the scene that was asked for last
 let newest = 0; // number of the scene on show
-
-// Keep a picture for the time when there is no device to draw another.
-function keep(blob) {
-    const poster = find("poster");
-    if (!blob) return;
-    if (poster.src.startsWith("blob:")) URL.revokeObjectURL(poster.src);
-    poster.src = URL.createObjectURL(blob);
-}
 
 // Say one sentence over the picture; an empty one goes away.
 function say(text) {
@@ -124,7 +115,6 @@ function start(gpu, { scene, playback, rasterizer }, state, data, reopen) {
     const { clock, camera } = state;
     const begun = performance.now();
     let last = begun;
-    let kept = null; // the frame of which a picture is kept
     const wake = () => transport.update();
     const stop = reason => {
         ended.abort(reason);
@@ -150,11 +140,11 @@ function start(gpu, { scene, playback, rasterizer }, state, data, reopen) {
         next_background: () => setBackground(after(Object.values(data.backgrounds), state.background)),
         focus: (x, y) => viewport.focus(x, y).catch(fail),
         reset_camera: () => camera.reset(),
-        toggle_flying: () => controls.toggleFlying(),
-        toggle_overlay: () => toggle("overlay"),
-        toggle_transport: () => scene.field && toggle("bar"),
-        toggle_panels: () => toggle("panels"),
-        toggle_help: () => toggle("help"),
+        flying: () => (controls.flying = !controls.flying),
+        show_overlay: () => toggle("overlay"),
+        show_transport: () => scene.field && toggle("bar"),
+        show_panels: () => toggle("panels"),
+        show_help: () => toggle("help"),
     };
     const transport = new Transport(document, state, { actions, wake, signal });
     const controls = new Controls(canvas, state, data.controls, actions, wake, signal);
@@ -193,12 +183,7 @@ function start(gpu, { scene, playback, rasterizer }, state, data, reopen) {
                 wake();
             }
             resize();
-            if (!await viewport.draw(now)) {
-                if (kept === viewport.frame || !viewport.atRest || now - viewport.movedAt < KEPT) return;
-                kept = viewport.frame;
-                presenter.present(kept); // a canvas holds its picture for this task alone
-                return canvas.toBlob(keep);
-            }
+            if (!await viewport.draw(now)) return;
         } catch (error) {
             return fail(error);
         }

@@ -10,12 +10,9 @@ const SPLAT_BYTES = 48;
 const RECORD_BYTES = 32; // of the desktop's backward pass: plans are made alike
 const FIRST_CAPACITY = 1 << 16;
 const BAND_CAPACITY = 1 << 24;
-const WATCHED = 256; // drawings, after which a plan that is too large for all of them shrinks
 
 const roomy = intersections => Math.floor((Math.floor(5 * intersections / 4) + 4095) / 4096) * 4096;
 const groups = count => Math.ceil(count / LANES);
-// drawings: that went by the plan, most: intersections that one of their bands had.
-const newPlan = (capacity, bands) => ({ capacity, bands, drawings: 0, most: 0 });
 
 export class Rasterizer {
     // raster: tile sizes and kernel keys (viewer/web_page.py).
@@ -26,7 +23,7 @@ export class Rasterizer {
         this.plain = raster.plain;
         this.depth = raster.depth;
         this.pool = new Pool(gpu);
-        this.plan = newPlan(FIRST_CAPACITY, 1);
+        this.plan = { capacity: FIRST_CAPACITY, bands: 1 };
         this.maxCapacity = Math.floor(gpu.maxBinding / RECORD_BYTES);
         this.size = "";
         this.flagsScan = new Scan(gpu, this.pool, "visible", "FLAGS");
@@ -37,9 +34,9 @@ export class Rasterizer {
 
     // Submit the passes that draw an image. It is valid once `valid` says so of what `counts` reads.
     // gaussians: {count, degree, antialiased, means, quats, scales, opacities, sh}. camera: see camera.js. depth: as a fifth plane.
-    draw(gaussians, camera, background, log = null, depth = false) {
+    draw(gaussians, camera, background, depth = false) {
         if (this.size !== `${camera.width}x${camera.height}`) { // the bands of another size would slow this one down
-            this.plan = newPlan(this.plan.capacity, 1);
+            this.plan = { ...this.plan, bands: 1 };
             this.size = `${camera.width}x${camera.height}`;
         }
         const { bands } = this.plan;
@@ -50,7 +47,7 @@ export class Rasterizer {
         };
         const counts = [];
         for (let band = 0; band < bands; band++) {
-            const commands = new Commands(this.gpu, log);
+            const commands = new Commands(this.gpu);
             const { needed, flags } = this.drawBand(commands, drawing, band);
             counts.push(needed);
             if (band < bands - 1) commands.submit();
@@ -68,10 +65,7 @@ export class Rasterizer {
         }
         const totals = Array.from({ length: plan.bands }, (_, band) => counts[3 * band]);
         const most = Math.max(...totals);
-        if (most <= plan.capacity) {
-            if (plan === this.plan) this.fitted(most);
-            return true;
-        }
+        if (most <= plan.capacity) return true;
         let { bands } = plan;
         const [rows] = this.tiles(drawing.camera);
         const limit = bands < rows ? Math.min(this.maxCapacity, BAND_CAPACITY) : this.maxCapacity;
@@ -83,17 +77,8 @@ export class Rasterizer {
             const all = totals.reduce((sum, each) => sum + each, 0);
             bands = Math.min(rows, Math.max(bands + 1, Math.ceil(5 * all / (4 * limit))));
         }
-        this.plan = newPlan(Math.min(limit, roomy(most)), bands);
+        this.plan = { capacity: Math.min(limit, roomy(most)), bands };
         return false;
-    }
-
-    // After a close look the passes would go on with all the room that it took (splat/drawing_plan.py).
-    fitted(most) {
-        const { plan } = this;
-        plan.most = Math.max(plan.most, most);
-        if (++plan.drawings < WATCHED) return;
-        const least = roomy(plan.most);
-        this.plan = newPlan(2 * least <= plan.capacity ? least : plan.capacity, plan.bands);
     }
 
     tiles(camera) {

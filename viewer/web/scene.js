@@ -2,7 +2,6 @@
 import { temporalGrids } from "./hash_grid.js";
 import { readContainer } from "./lapgs_file.js";
 import { Refusal, quoted } from "./refusal.js";
-import { isTiming } from "./timing.js";
 
 const EXACT = "motion.frequencies"; // float32, the other weights are float16
 const GEOMETRY_OUTPUTS = 14;
@@ -57,7 +56,11 @@ function readTable(text, of) {
 
 function readTiming(text) {
     const timing = readTable(text, "its timing");
-    if (!isTiming(timing)) throw damaged("its timing is not of times and moments that rise from 0 to 1");
+    const rises = (list, least) => Array.isArray(list) && list.length > 0
+        && list.every((x, i) => typeof x === "number" && x >= 0 && x <= 1 && !(x - list[i - 1] < least));
+    if (!rises(timing?.times, Number.MIN_VALUE) || !rises(timing.moments, 0) || timing.times.length !== timing.moments.length) {
+        throw damaged("its timing is not of times and moments that rise from 0 to 1");
+    }
     return timing;
 }
 

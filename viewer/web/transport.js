@@ -10,7 +10,7 @@ export class Transport {
             wake();
         }, { signal });
         change(this.button, "click", actions.toggle_playing);
-        change(this.more, "click", actions.toggle_help);
+        change(this.more, "click", actions.show_help);
         change(root.getElementById("home"), "click", actions.reset_camera);
         change(this.slider, "input", () => {
             clock.playing = false;

@@ -8,9 +8,7 @@ const PIXEL_BYTES = 20; // of an image with depth, which lies in one binding
 export function canvasSize(width, height, density, { maxTextureDimension2D, maxStorageBufferBindingSize }) {
     const most = Math.floor(maxStorageBufferBindingSize / PIXEL_BYTES);
     const ratio = Math.min(density, maxTextureDimension2D / Math.max(width, height, 1), Math.sqrt(most / Math.max(width * height, 1)));
-    const size = rounded => [width, height].map(length => Math.max(1, rounded(ratio * length)));
-    const [columns, rows] = size(Math.round);
-    return columns * rows > most ? size(Math.floor) : [columns, rows];
+    return [width, height].map(length => Math.max(1, Math.floor(ratio * length)));
 }
 
 export class Viewport {
@@ -20,7 +18,7 @@ export class Viewport {
         // frame: on show. scale: of it; 1 is the full resolution. time: of it, in the clip. seconds: that it took. drawn: all
         // that it depends on. held: how many wait for a picture.
         Object.assign(this, { frame: null, scale: 1, movingScale: 1, time: NaN, seconds: NaN, drawn: "", movedAt: 0 });
-        Object.assign(this, { busy: false, held: 0, log: null });
+        Object.assign(this, { busy: false, held: 0 });
     }
 
     // Whether the picture on show is that of the state, in full resolution.
@@ -50,7 +48,10 @@ export class Viewport {
             this.presenter.present(this.frame);
             Object.assign(this, { scale, time, drawn: key });
             this.seconds = (performance.now() - start) / 1000;
-            if (moving) this.adapt(scale, this.seconds);
+            if (moving) {
+                const ideal = 0.5 * (this.movingScale + scale * Math.sqrt(this.target / Math.max(this.seconds, 1e-4)));
+                this.movingScale = Math.min(Math.max(Math.floor(16 * ideal) / 16, this.smallest), 1);
+            }
             return true;
         } finally {
             this.busy = false;
@@ -61,20 +62,15 @@ export class Viewport {
     async drawWhole(scale, depth = false) {
         const { canvas, state, rasterizer } = this;
         const [width, height] = [canvas.width, canvas.height].map(size => Math.max(1, Math.round(scale * size)));
-        const gaussians = this.playback.at(state.clock.time, this.log);
+        const gaussians = this.playback.at(state.clock.time);
         const camera = state.camera.camera(canvas.width, canvas.height);
         const image = { ...camera, width, height, focal: scaled(camera.focal, canvas, width, height),
             center: scaled(camera.center, canvas, width, height) };
         for (;;) {
-            const drawing = rasterizer.draw(gaussians, image, state.background, this.log, depth);
+            const drawing = rasterizer.draw(gaussians, image, state.background, depth);
             const counts = await drawing.counts;
             if (rasterizer.valid(drawing, counts)) return drawing;
         }
-    }
-
-    adapt(scale, seconds) {
-        const ideal = 0.5 * (this.movingScale + scale * Math.sqrt(this.target / Math.max(seconds, 1e-4)));
-        this.movingScale = Math.min(Math.max(Math.floor(16 * ideal) / 16, this.smallest), 1);
     }
 
     // Turn about the surface under a point of the canvas from now on; x and y are CSS pixels.

@@ -24,7 +24,6 @@ SAMPLES = 128  # of the clip at least; a field's spectrum has up to 16 cycles
 _PIECE_SAMPLES = 8  # of a piece at least
 _SHORTEST = 2.0**-9  # of the clip: shorter pieces are not halved
 _BLOCK = 1 << 21  # samples at once: 0.1 GB
-_CHECKS = 97  # times at which finished pieces are compared; few of them are samples
 _MEAN, _ROOT, _REST = slice(0, 3), slice(3, 9), slice(9, 13)  # columns of a state: mean, root; opacity and color
 _ROWS, _COLUMNS = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]  # entries of a root
 _WEIGHTS = np.array([1, 1, 1, 2, 2, 2]) ** 0.5  # so that the norm of the six is that of the matrix
@@ -78,18 +77,6 @@ def linear_pieces(
         source[order], begin[order], end[order], middle[:, _MEAN], slopes[order], scales, quats,
         middle[:, 9], middle[:, 10:] / CONSTANTS["SH_C0"],
     )  # fmt: skip
-
-
-def piece_errors(playback: Playback, pieces: Pieces) -> Floats:
-    """Return the largest displacements (P,) of pieces from the playback, world units, at _CHECKS times."""
-    worst = np.zeros(len(pieces.source))
-    for t in np.linspace(0, 1, _CHECKS).tolist():
-        shown = np.flatnonzero((pieces.begin <= t) & ((t < pieces.end) | (pieces.end == 1.0)))
-        way = (t - 0.5 * (pieces.begin + pieces.end)[shown])[:, None] * pieces.slopes[shown]
-        moved = np.concatenate([pieces.means[shown] + way, roots_of(pieces.scales[shown], pieces.quats[shown])], axis=1)
-        error = displacement(moved, state(playback, t, pieces.source[shown]))
-        worst[shown] = np.maximum(worst[shown], error)
-    return worst
 
 
 def state(playback: Playback, t: float, rows: NDArray[np.integer]) -> Floats:
