@@ -35,7 +35,7 @@ def test_gradients_of_a_step_are_the_mean_over_its_views(
     for views in ([0], [1], [0, 1]):
         config = configure(schedule__batch=str(len(views)), schedule__warm_up="0", smoothness__share="0")
         training = Trainer(config, dataset, device)
-        training._images.order = list(views)
+        training._order.left = list(views)
         monkeypatch.setattr(training._optimizer, "step", lambda step, share: None)
         training.step()
         gradients = {name: [g.clone() for g in group] for name, group in training._gradients().items()}
@@ -64,13 +64,13 @@ def test_every_process_draws_the_same_numbers_and_other_views(
     dataset: Dataset, device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     looked: list[str] = []
-    original = Trainer._loss
+    original = Trainer._descend
 
-    def note(self: Trainer, sample: Sample) -> object:
+    def note(self: Trainer, sample: Sample, **share: int) -> object:
         looked.append(sample.view.name)
-        return original(self, sample)
+        return original(self, sample, **share)
 
-    monkeypatch.setattr(Trainer, "_loss", note)
+    monkeypatch.setattr(Trainer, "_descend", note)
     monkeypatch.setattr(Ranks, "all_gather", lambda self, tensors: [[tensor] * self.count for tensor in tensors])
     monkeypatch.setattr(Ranks, "any_rank", lambda self, here: here)
     monkeypatch.setattr(Ranks, "of_first", lambda self, value: value)

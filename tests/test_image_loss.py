@@ -33,8 +33,8 @@ from lapgs_wgpu.splat.rasterizer import Rasterizer
 from lapgs_wgpu.train import fused_loss, image_metrics
 from lapgs_wgpu.train.config import LossWeights
 from lapgs_wgpu.train.fused_loss import RenderLoss
+from lapgs_wgpu.train.ground_truth import upload_rgba
 from lapgs_wgpu.train.image_loss import ImageLoss
-from lapgs_wgpu.train.truth_cache import TruthCache, upload_rgba
 
 pytestmark = pytest.mark.kernels
 
@@ -281,32 +281,3 @@ def test_drawing_in_between_does_no_harm(device: Device) -> None:
     draw(other).backward()
     assert one.means.grad is not None
     assert torch.equal(one.means.grad, other.means.grad)
-
-
-# Pictures on the device
-
-
-def test_pictures_are_uploaded_once(device: Device) -> None:
-    cache, loads = TruthCache(device, 10_000), list[str]()
-
-    def get(name: str, side: int = 20) -> DeviceArray:
-        def load() -> NDArray[np.uint8]:
-            loads.append(name)
-            return np.full((side, side, 3), len(name), np.uint8)
-
-        return cache.get(name, load)
-
-    assert get("a") is get("a")
-    assert (get("a").read() == 0xFF010101).all()
-    for name in "bcdef":  # 1600 bytes each: six fit
-        get(name)
-    assert loads == list("abcdef")
-    get("a")
-    get("g")  # b was used least recently
-    assert "b" not in cache
-    assert "a" in cache
-    assert cache.used_bytes == 9600
-    get("huge", side=60)  # more than the bound
-    get("huge", side=60)
-    assert loads == [*"abcdefg", "huge", "huge"]
-    assert cache.used_bytes == 9600

@@ -23,11 +23,11 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.fields.deformation import Deformation
 from lapgs_wgpu.motion.scene import Scene4D, load
-from lapgs_wgpu.motion.timing import EVEN
+from lapgs_wgpu.motion.timing import EVEN, Timing
 from lapgs_wgpu.run import resume, train
-from lapgs_wgpu.train import trainer
 from lapgs_wgpu.train.distributed import SINGLE_PROCESS, Ranks
-from lapgs_wgpu.train.timing_refinement import FARTHEST, TimingRefinement, image_to_fit, running_median
+from lapgs_wgpu.train.ground_truth import GroundTruth, HostImage
+from lapgs_wgpu.train.timing_refinement import FARTHEST, TimingRefinement, running_median
 from lapgs_wgpu.train.trainer import Trainer
 
 TIMES = np.linspace(0, 1, 11)
@@ -65,10 +65,14 @@ def views_at(times: Sequence[float]) -> list[View]:
 def refinement(
     scene: Scene4D, truth: Callable[[View], Tensor], times: Sequence[float] = TIMES, ranks: Ranks = SINGLE_PROCESS
 ) -> TimingRefinement:
-    def picture(view: View) -> Tensor:
-        return scene.render(view.camera, view.time).image
+    def picture(view: View, timing: Timing) -> Tensor:
+        return scene.render(view.camera, view.time, timing=timing).image
 
-    return TimingRefinement(scene, views_at(times), truth, picture, time_step(np.asarray(times)), ranks)
+    def image(view: View) -> HostImage:
+        pixels = truth(view)
+        return HostImage(pixels, pixels.isnan()[..., :1])
+
+    return TimingRefinement(scene, views_at(times), image, picture, time_step(np.asarray(times)), ranks)
 
 
 def refine(scene: Scene4D, truth: Callable[[View], Tensor]) -> None:
@@ -198,10 +202,10 @@ def test_a_correction_that_fails_changes_nothing(
 ) -> None:
     """The state of the steps before can be saved."""
 
-    def lost(view: View, color: Tensor) -> Tensor:
+    def lost(self: GroundTruth, view: View, color: Tensor) -> HostImage:
         raise InputError("the disk is gone")
 
-    monkeypatch.setattr(trainer, "image_to_fit", lost)
+    monkeypatch.setattr(GroundTruth, "on_host", lost)
     with Trainer(configure(**GIVEN), dataset, device) as training:
         for _ in range(14):
             training.step()
@@ -224,7 +228,7 @@ def test_it_sees_what_the_losses_see(dataset: Dataset, device: Device) -> None:
         with torch.no_grad():
             training._exposures.values[0, :, 3] += 0.25
         plain = training.scene.render(first.camera, first.time, torch.zeros(3)).image
-        torch.testing.assert_close(training._picture(first), plain + 0.25)
-        truth = image_to_fit(first, torch.zeros(3))
-        assert bool(truth[:5].isnan().all())
-        assert not truth[5:].isnan().any()
+        torch.testing.assert_close(training._picture(first, EVEN), plain + 0.25)
+        left_out = training._truth.on_host(first, torch.zeros(3)).left_out
+        assert bool(left_out[:5].all())
+        assert not left_out[5:].any()

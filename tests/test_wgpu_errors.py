@@ -31,10 +31,10 @@ from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.wgpu_errors import TranslatedErrors
 from lapgs_wgpu.run import resume, train
 from lapgs_wgpu.splat.rasterize import rasterizer_of
-from lapgs_wgpu.train.dataloader import ImageLoader
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.run_folder import STATE, load_state
 from lapgs_wgpu.train.step_result import StepResult
+from lapgs_wgpu.train.view_order import ViewOrder
 
 NO_MEMORY = "Validation Error\n\nCaused by:\n  In wgpuDeviceCreateBuffer\n    Not enough memory left.\n"
 
@@ -125,13 +125,13 @@ def test_a_step_that_broke_off_halfway_is_not_saved(
 def test_nothing_is_saved_before_the_first_step(
     dataset: Dataset, doomed: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    original = ImageLoader.choose
+    original = ViewOrder.next
 
-    def choose(self: ImageLoader) -> Any:
+    def choose(self: ViewOrder) -> Any:
         doomed.wgpu_device.destroy()
         return original(self)
 
-    monkeypatch.setattr(ImageLoader, "choose", choose)
+    monkeypatch.setattr(ViewOrder, "next", choose)
     with pytest.raises(DeviceLostError, match=r"was lost, .*; nothing was saved yet\."):
         train(configure(), dataset, tmp_path, device=doomed)
     assert not (tmp_path / STATE).exists()
