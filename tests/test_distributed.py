@@ -36,9 +36,9 @@ def test_gradients_of_a_step_are_the_mean_over_its_views(
         config = configure(schedule__batch=str(len(views)), schedule__warm_up="0", smoothness__share="0")
         training = Trainer(config, dataset, device)
         training._order.left = list(views)
-        monkeypatch.setattr(training._optimizer, "step", lambda step, share: None)
+        monkeypatch.setattr(training._learners.optimizer, "step", lambda step, share: None)
         training.step()
-        gradients = {name: [g.clone() for g in group] for name, group in training._gradients().items()}
+        gradients = {name: [g.clone() for g in group] for name, group in training._learners.gradients().items()}
         found.append((gradients, training._density.statistics.gradients.clone()))
         training.close()
     (first, seen_first), (second, seen_second), (both, seen_both) = found

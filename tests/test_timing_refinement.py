@@ -224,9 +224,9 @@ def test_it_sees_what_the_losses_see(dataset: Dataset, device: Device) -> None:
     first = dataclasses.replace(dataset.train[0], ignored=lambda: ignored)
     masked = dataclasses.replace(dataset, train=(first, *dataset.train[1:]))
     with Trainer(configure(exposure__enabled="true", cameras__refine="on", **GIVEN), masked, device) as training:
-        assert training._exposures is not None
+        assert training._learners.exposures is not None
         with torch.no_grad():
-            training._exposures.values[0, :, 3] += 0.25
+            training._learners.exposures.values[0, :, 3] += 0.25
         plain = training.scene.render(first.camera, first.time, torch.zeros(3)).image
         torch.testing.assert_close(training._picture(first, EVEN), plain + 0.25)
         left_out = training._truth.on_host(first, torch.zeros(3)).left_out

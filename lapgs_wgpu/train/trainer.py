@@ -7,7 +7,7 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,38 +20,27 @@ from lapgs_wgpu.io.initial_view import InitialView, captured_arc
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.motion.timing import Timing
-from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.rasterize import rasterizer_of
-from lapgs_wgpu.train.camera_refinement import CameraRefinement, RefinedCamera, scene_points
+from lapgs_wgpu.train.camera_refinement import CameraRefinement
 from lapgs_wgpu.train.config import BACKGROUND_LEVELS, Config
 from lapgs_wgpu.train.densify import Statistics
 from lapgs_wgpu.train.density_control import DensityControl
 from lapgs_wgpu.train.distributed import SINGLE_PROCESS, Ranks
 from lapgs_wgpu.train.evaluate import evaluate, mean_psnr
-from lapgs_wgpu.train.exposure import Exposures
 from lapgs_wgpu.train.ground_truth import GroundTruth
 from lapgs_wgpu.train.host_threads import step_threads, torch_threads
+from lapgs_wgpu.train.learners import Learners
 from lapgs_wgpu.train.nonfinite import SkipCounter, Skipped, cause, check_parameters, finite
 from lapgs_wgpu.train.objective import Objective, Sample, ViewResult
-from lapgs_wgpu.train.optimizer import FrequencyOptimizer, Optimizer
 from lapgs_wgpu.train.parts import Parts
-from lapgs_wgpu.train.resolve_config import nyquist_frequency
 from lapgs_wgpu.train.setup import set_up
-from lapgs_wgpu.train.start import Start, max_field_rates, start_from_points
+from lapgs_wgpu.train.start import Start, start_from_points
 from lapgs_wgpu.train.step_result import StepResult
 from lapgs_wgpu.train.timing_refinement import KeptTiming, TimingRefinement
 from lapgs_wgpu.train.view_order import ViewOrder
 
 MAX_SH_DEGREE = 3
 AHEAD = 8  # images that are decoded before they are needed
-
-
-class Stateful(Protocol):
-    """A part of a training whose state outlasts a step."""
-
-    def state(self) -> Mapping[str, Tensor]: ...
-
-    def restore(self, state: Mapping[str, Tensor]) -> None: ...
 
 
 class Trainer:
@@ -70,7 +59,6 @@ class Trainer:
         callbacks: a list of functions of the trainer and the StepResult, called after each step.
         discovery: what motion discovery found, a sentence; None where it was left out.
         discovery_seconds: that it took; 0 where it was left out.
-        cameras: the corrections of the training cameras; None where they are kept.
         timing: the corrections of the training images' times; None where they are kept.
         ranks: this process among those that train together.
         whole: False while a step is partly applied, and after an error in that part of it.
@@ -129,42 +117,25 @@ class Trainer:
         color = None if self._random_color else self._color
         self._truth = GroundTruth(scene.device, color, int(config.data.cache_gb * 1e9))
         self._order = ViewOrder(dataset.train, self._generator)
-        self._numbers = {view.name: number for number, view in enumerate(dataset.train)}
-
         if isinstance(scene.field, GridField):
             scene.field.on_device = config.decoder == "device"
-        groups = scene.field.parameter_groups() if scene.field else {}
-        rates = self.parts.rates_of(config.rates.schedules(), scene.parameters, groups)
-        self._optimizer = Optimizer(scene.parameters, groups, rates)
+        self._learners = Learners(config, dataset, self.parts, start)
         self._objective = Objective(config, scene, self.parts.losses, dataset.moments, extent)
-        self._limit_field_rates(field_fitted=start.field_fitted)
+        self._set_field_fitted(start.field_fitted)
         self._density = DensityControl(
             config,
             scene,
-            self._optimizer,
+            self._learners.optimizer,
             self.parts.density,
             dataset.train,
-            self._camera_of,
+            self._learners.camera,
             extent,
             self._generator,
             self.ranks,
         )
-        frequencies = exposures = cameras = timing = None
-        if scene.spectrum is not None:
-            limit = nyquist_frequency(dataset)
-            frequencies = FrequencyOptimizer(scene.spectrum, config.rates.frequencies, limit)
-        if config.exposure.enabled:
-            exposures = Exposures(len(dataset.train), config.exposure.rate)
-        if config.cameras.refines(own_footage=dataset.own_footage):
-            cameras = CameraRefinement(
-                dataset.cameras,
-                extent,
-                config.cameras,
-                lambda: scene_points(scene.parameters["means"], scene.parameters["opacity_logits"].sigmoid()),
-                start.corrections,
-            )
+        self.timing = None
         if config.timing.refine and scene.field is not None and len(dataset.times) > 2:
-            timing = TimingRefinement(
+            self.timing = TimingRefinement(
                 scene,
                 dataset.train,
                 lambda view: self._truth.on_host(view, self._color),
@@ -172,26 +143,25 @@ class Trainer:
                 dataset.time_gap,
                 self.ranks,
             )
-        self.cameras, self.timing, self._exposures = cameras, timing, exposures
-        self._timing_steps = config.timing.corrections(config.schedule.steps) if timing else []
-        self._refiners = [each for each in (frequencies, exposures, cameras) if each is not None]
-        self._learners: dict[str, Stateful | None] = {
-            "adam": self._optimizer,
-            "frequencies": frequencies,
-            "exposure": exposures,
-            "cameras": cameras,
-            "timing": timing or KeptTiming(scene),
-        }
+        self._timing_steps = config.timing.corrections(config.schedule.steps) if self.timing else []
         self._skips = SkipCounter()
         self._plans, camera = rasterizer_of(scene.device).plans, dataset.train[0].camera
         self._drawn = (camera.width, camera.height, True)  # the kind of images that the steps draw
         self._plans.set_bands(self._drawn, 1)
 
-    def _limit_field_rates(self, *, field_fitted: bool) -> None:
-        """Hold the field's learning rates low where discovery has fitted it to nearly all that moves."""
+    def _set_field_fitted(self, field_fitted: bool) -> None:
+        """Say whether discovery has fitted the field to nearly all that moves."""
         self._objective.field_fitted = field_fitted
-        field = self.scene.field
-        self._optimizer.highest = max_field_rates(field.parameter_groups()) if field_fitted and field else {}
+        self._learners.limit_field_rates(field_fitted=field_fitted)
+
+    @property
+    def cameras(self) -> CameraRefinement | None:
+        """The corrections of the training cameras; None where they are kept."""
+        return self._learners.cameras
+
+    def exposure_of(self, view: View) -> Tensor | None:
+        """The correction (3, 4) of the colors of a training view; None where they are taken as they are."""
+        return self._learners.exposure(view)
 
     def close(self) -> None:
         """End what goes on beside the steps."""
@@ -269,7 +239,7 @@ class Trainer:
         mine = samples[ranks.rank :: ranks.count]
         self._truth.prefetch([*(sample.view for sample in mine), *self._order.coming(AHEAD)])
 
-        self._zero_grad()
+        self._learners.zero_grad()
         seen = self._density.nothing_seen()
         results, totals = [], Counter[str]()
         for sample in mine:
@@ -278,7 +248,7 @@ class Trainer:
             results.append(result)
             totals.update({"loss": result.loss, "psnr": result.psnr, **result.terms})
         if ranks.count > 1:
-            self._all_reduce_gradients()
+            self._learners.all_reduce_gradients(ranks)
         sums = ranks.all_reduce_sum([torch.tensor(list(totals.values()), dtype=torch.float64)])[0] / len(samples)
         means = dict(zip(totals, sums.tolist(), strict=True))
         loss, psnr = means.pop("loss"), means.pop("psnr")
@@ -290,15 +260,13 @@ class Trainer:
             field_times = self.timing.fitted(self._timing_steps.index(step))
         self.whole = False
         if skipped is None:
-            self._optimizer.step(step, min(1.0, step / self._ramp_steps) if self._ramp_steps else 1.0)
-            for refiner in self._refiners:
-                refiner.step(step)
+            self._learners.step(step, min(1.0, step / self._ramp_steps) if self._ramp_steps else 1.0)
             # After the optimizer's step, so that no gradient is lost with the rows that change.
             if step < config.density.stop:
                 self._density.statistics.merge(self._seen_by_all(seen))
         else:
             self._generator.set_state(drawn)
-            self._zero_grad()
+            self._learners.zero_grad()
         if self.timing is not None and field_times is not None:
             self.timing.set(field_times)
         pruned = self._density.change(step, moving=moving)
@@ -317,48 +285,24 @@ class Trainer:
     def _descend(self, sample: Sample, *, share: int) -> ViewResult:
         """`Objective.descend` for a view, as its camera and its colors are corrected."""
         view = sample.view
-        camera = RefinedCamera(view.camera, None) if self.cameras is None else self.cameras.refined(view.camera)
-        truth, correction = self._truth.on_device(view), self.exposure_of(view)
+        truth, camera = self._truth.on_device(view), self._learners.refined_camera(view)
+        correction = self._learners.exposure(view)
         return self._objective.descend(sample, self.done + 1, truth, camera, correction, share=share)
-
-    def _camera_of(self, view: View) -> Camera:
-        """The camera of a training view, corrected where it is."""
-        return view.camera if self.cameras is None else self.cameras.refined(view.camera).camera
 
     def _as_seen(self, views: Sequence[View]) -> list[View]:
         """The views, those by cameras of the training with the corrections of these."""
         trained = set(self.dataset.cameras)
         return [
-            dataclasses.replace(view, camera=self._camera_of(view)) if view.camera in trained else view
+            dataclasses.replace(view, camera=self._learners.camera(view)) if view.camera in trained else view
             for view in views
         ]
-
-    def exposure_of(self, view: View) -> Tensor | None:
-        """The correction (3, 4) of the colors of a training view; None where they are taken as they are."""
-        return None if self._exposures is None else self._exposures.values[self._numbers[view.name]]
 
     @torch.no_grad()
     def _picture(self, view: View, timing: Timing) -> Tensor:
         """The scene's picture (H, W, 3) of a training view, with the corrections of its camera and of its colors."""
-        image = self.scene.render(self._camera_of(view), view.time, self._color, depth=False, timing=timing).image
+        image = self.scene.render(self._learners.camera(view), view.time, self._color, depth=False, timing=timing).image
         correction = self.exposure_of(view)
         return image if correction is None else image @ correction[:, :3].T + correction[:, 3]
-
-    def _gradients(self) -> dict[str, list[Tensor]]:
-        """By group, of all parameters that have one."""
-        gradients = self._optimizer.gradients()
-        return gradients | {each.name: [each.values.grad] for each in self._refiners if each.values.grad is not None}
-
-    def _zero_grad(self) -> None:
-        self._optimizer.zero_grad()
-        for each in self._refiners:
-            each.values.grad = None
-
-    def _all_reduce_gradients(self) -> None:
-        """Every rank's gradients become the sums over the ranks."""
-        mine = [gradient for group in self._gradients().values() for gradient in group]
-        for gradient, total in zip(mine, self.ranks.all_reduce_sum(mine), strict=True):
-            gradient.copy_(total)
 
     def _seen_by_all(self, seen: Statistics) -> list[Statistics]:
         return [Statistics(*values) for values in zip(*self.ranks.all_gather(list(vars(seen).values())), strict=True)]
@@ -368,8 +312,7 @@ class Trainer:
 
         Raises NumericalError for a parameter, whose values a step cannot mend.
         """
-        parameters, gradients = self._optimizer.parameters(), self._gradients()
-        parameters |= {each.name: [each.values] for each in self._refiners}
+        parameters, gradients = self._learners.parameters(), self._learners.gradients()
         gradients["the places in the image"] = [result.d_means2d for result in results]
         if not self.ranks.any_rank(not (math.isfinite(loss) and finite(parameters, gradients))):
             return ""
@@ -386,7 +329,8 @@ class Trainer:
         parts: dict[str, Mapping[str, Tensor]] = {
             "gaussians": scene.parameters,
             "field": scene.field.state_dict() if scene.field else {},
-            **{name: learner.state() for name, learner in self._learners.items() if learner is not None},
+            **self._learners.state(),
+            "timing": (self.timing or KeptTiming(scene)).state(),
             "statistics": vars(self._density.statistics),
             "training": {
                 "done": torch.tensor(self.done),
@@ -418,12 +362,11 @@ class Trainer:
         for name, value in parts["gaussians"].items():
             if value.shape[1:] != scene.parameters[name].shape[1:]:
                 raise ValueError(f"its {name} have the shape {tuple(value.shape)}")
-            self._optimizer.reset(name, value)
+            self._learners.optimizer.reset(name, value)
         if scene.field is not None:
             scene.field.load_state_dict(parts["field"])
-        for name, learner in self._learners.items():
-            if learner is not None:
-                learner.restore(parts.get(name, {}))
+        self._learners.restore(parts)
+        (self.timing or KeptTiming(scene)).restore(parts.get("timing", {}))
         self._density.statistics = Statistics(**parts["statistics"])
         own = parts["training"]
         self.done, scene.sh_degree = int(own["done"]), int(own["sh_degree"])
@@ -431,7 +374,7 @@ class Trainer:
         self._ramp_steps = int(own.get("rising", self.config.schedule.warm_up - self.warm_up_steps))
         if self._ramp_steps < 0:
             raise ValueError("its rates rise over a negative number of steps")
-        self._limit_field_rates(field_fitted=bool(own.get("field_fitted", False)))
+        self._set_field_fitted(bool(own.get("field_fitted", False)))
         self._generator.set_state(own["random"])
         self._order.left = own["order"].tolist()
         self._plans.set_bands(self._drawn, int(own.get("bands", 1)))
