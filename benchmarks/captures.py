@@ -14,7 +14,6 @@ import shutil
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from contextlib import closing
 from pathlib import Path
@@ -94,7 +93,9 @@ def draw(folder: Path, cache_gb: float, steps: int, step: float) -> dict[str, fl
 
     from lapgs_wgpu.data import load_dataset
     from lapgs_wgpu.gpu.device import open_device
-    from lapgs_wgpu.train.dataloader import ImageLoader
+    from lapgs_wgpu.train.ground_truth import GroundTruth
+    from lapgs_wgpu.train.trainer import AHEAD
+    from lapgs_wgpu.train.view_order import ViewOrder
 
     start = time.perf_counter()
     data = load_dataset(folder)
@@ -103,27 +104,16 @@ def draw(folder: Path, cache_gb: float, steps: int, step: float) -> dict[str, fl
     for frame in data.train[:: len(data.times)]:
         frame.load()
     unpacking, after_unpacking = time.perf_counter() - start, megabytes()
-    with closing(
-        ImageLoader(data.train, "black", cache_gb, torch.Generator().manual_seed(0), open_device())
-    ) as pictures:
-        waits, decodes = [], []
-        get = pictures._cache.get
-
-        def timed(view):
-            start = time.perf_counter()
-            try:
-                return get(view)
-            finally:
-                if threading.current_thread() is threading.main_thread():  # not the threads that decode ahead
-                    decodes.append(1e3 * (time.perf_counter() - start))
-
-        pictures._cache.get = timed
+    order = ViewOrder(data.train, torch.Generator().manual_seed(0))
+    with closing(GroundTruth(open_device(), torch.zeros(3), int(cache_gb * 1e9))) as truth:
+        waits = []
         for _ in range(steps):
             start = time.perf_counter()
-            pictures.on_device(pictures.choose()[0])
+            view = order.next()
+            truth.prefetch([view, *order.coming(AHEAD)])
+            truth.on_device(view)
             waits.append(1e3 * (time.perf_counter() - start))
             time.sleep(step)
-    decodes = np.sort(decodes[len(decodes) // 5 :])
     steady = np.sort(waits[len(waits) // 5 :])
     stored = sum(file.stat().st_size for file in Path(os.environ["XDG_CACHE_HOME"]).rglob("*.png"))
     return {
@@ -133,9 +123,6 @@ def draw(folder: Path, cache_gb: float, steps: int, step: float) -> dict[str, fl
         "unpacked, GB": stored / 1e9,
         "peak memory after unpacking, MB": after_unpacking,
         "peak memory, MB": megabytes(),
-        "pictures that the device did not hold, of the last 80 %": len(decodes),
-        "waiting for a decode, median, ms": float(np.median(decodes)),
-        "waiting for a decode, 95 %, ms": float(decodes[int(0.95 * len(decodes))]),
         "draw, median, ms": float(np.median(steady)),
         "draw, 95 %, ms": float(steady[int(0.95 * len(steady))]),
         "draw, largest, ms": float(steady[-1]),

@@ -15,8 +15,8 @@ from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands
 from lapgs_wgpu.train.config import LossWeights
+from lapgs_wgpu.train.ground_truth import upload_rgba
 from lapgs_wgpu.train.image_loss import ImageLoss
-from lapgs_wgpu.train.truth_cache import upload_rgba
 
 WEIGHTS = LossWeights(0.8, 0.2, pyramid=0.2, ncc=0.05)  # the paper's
 

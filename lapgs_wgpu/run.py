@@ -196,8 +196,8 @@ def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None)
         seconds = log.seconds
         if training.done == config.schedule.steps and (outside := _outside(scene)):
             log.tell(outside)
-        if (moved := training.camera_report()) is not None:
-            log.tell(_moved(moved))
+        if training.cameras is not None:
+            log.tell(_moved(training.cameras.report()))
         if training.timing is not None and (retimed := training.timing.report())["frames_most"] > 0:
             log.tell(_retimed(retimed))
 
@@ -211,8 +211,8 @@ def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None)
             f"lapgs-train --resume {quoted(out)} goes on."
         )
     measured: dict[str, Any] = {"steps": done, "seconds": round(seconds, 3)}
-    if (moved := training.camera_report()) is not None:
-        measured["cameras"] = moved
+    if training.cameras is not None:
+        measured["cameras"] = training.cameras.report()
     if training.timing is not None:
         measured["image_times"] = training.timing.report()
     try:

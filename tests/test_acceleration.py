@@ -11,9 +11,9 @@ from torch import Tensor, nn
 from lapgs_wgpu.data import Dataset
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.config import FieldConfig
-from lapgs_wgpu.motion.fields.deformation import Deformation, Moments
+from lapgs_wgpu.motion.fields.deformation import Deformation, TimeSamples
 from lapgs_wgpu.motion.scene import Scene4D
-from lapgs_wgpu.train.acceleration import WOBBLE, acceleration_loss, draw_moments
+from lapgs_wgpu.train.acceleration import WOBBLE, acceleration_loss, draw_times
 from lapgs_wgpu.train.config import AccelerationConfig
 from lapgs_wgpu.train.trainer import Trainer
 
@@ -45,8 +45,8 @@ def test_value_is_the_robust_distance_from_the_chord(device: Device) -> None:
     """Of a parabola: |bend| (t - before) (after - t), of means and, a tenth, of scales."""
     curve = Curve()
     scene = scene_of(device, FieldConfig(kind="own"), curve)
-    moments = Moments(torch.tensor([0, 3, 3]), (0.33, 0.37))
-    loss = acceleration_loss(scene.deformed(0.35, moments=moments), 0.35, moments)
+    samples = TimeSamples(torch.tensor([0, 3, 3]), (0.33, 0.37))
+    loss = acceleration_loss(scene.deformed(0.35, time_samples=samples), 0.35, samples)
     loss.backward()
     bend = torch.tensor(0.4, dtype=torch.float64, requires_grad=True)
     lengths = bend * 0.02 * 0.02 * torch.tensor([1.0, 0.1], dtype=torch.float64)
@@ -68,23 +68,23 @@ def test_chosen_rows_move_as_all_do(device: Device, on_device: bool) -> None:
     for parameter in scene.field.parameters():
         nn.init.normal_(parameter, std=0.1, generator=torch.Generator().manual_seed(1))
     rows = torch.tensor([7, 2, 2, 5])
-    found = scene.deformed(0.7, moments=Moments(rows, (0.4, 0.5)))
-    for t, (means, scales) in zip((0.4, 0.5), found.moments, strict=True):
+    found = scene.deformed(0.7, time_samples=TimeSamples(rows, (0.4, 0.5)))
+    for t, (means, scales) in zip((0.4, 0.5), found.at_times, strict=True):
         every = scene.at(t)
         torch.testing.assert_close(means, every.means[rows], rtol=1e-5, atol=1e-6)
         torch.testing.assert_close(scales, every.scales[rows], rtol=1e-5, atol=1e-6)
-    assert not torch.allclose(found.moments[0][0], found.moments[1][0])
+    assert not torch.allclose(found.at_times[0][0], found.at_times[1][0])
 
 
 def test_times_lie_half_to_whole_the_reach_apart() -> None:
     generator = torch.Generator().manual_seed(0)
     for _ in range(50):
-        moments = draw_moments(CONFIG, 40, 0.5, 101, generator)
-        assert moments is not None
-        assert len(moments.rows) == 20
-        assert 0.01 <= 0.5 - moments.times[0] <= 0.02
-        assert moments.times[1] - 0.5 == pytest.approx(0.5 - moments.times[0])
-    near_end = draw_moments(CONFIG, 40, 0.995, 101, generator)
+        samples = draw_times(CONFIG, 40, 0.5, 101, generator)
+        assert samples is not None
+        assert len(samples.rows) == 20
+        assert 0.01 <= 0.5 - samples.times[0] <= 0.02
+        assert samples.times[1] - 0.5 == pytest.approx(0.5 - samples.times[0])
+    near_end = draw_times(CONFIG, 40, 0.995, 101, generator)
     assert near_end is not None
     assert near_end.times[1] == 1
 
@@ -94,7 +94,7 @@ def test_times_lie_half_to_whole_the_reach_apart() -> None:
 )
 def test_nowhere_to_look(config: AccelerationConfig, count: int, times: int) -> None:
     generator = torch.Generator().manual_seed(0)
-    assert draw_moments(config, count, 0.5, times, generator) is None
+    assert draw_times(config, count, 0.5, times, generator) is None
 
 
 def test_it_rests_where_discovery_explains_what_moves(dataset: Dataset, device: Device) -> None:

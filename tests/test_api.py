@@ -42,12 +42,12 @@ from lapgs_wgpu.run import train
 from lapgs_wgpu.splat.rotation import rotate, rotation_matrices
 from lapgs_wgpu.train.config import LossWeights
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
+from lapgs_wgpu.train.ground_truth import LEFT_OUT, upload_rgba
 from lapgs_wgpu.train.learning_rate import Rate
 from lapgs_wgpu.train.loss_terms import LossTerm, torch_loss
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.run_folder import load_state, save_state
 from lapgs_wgpu.train.tensorboard import scalars
-from lapgs_wgpu.train.truth_cache import LEFT_OUT, upload_rgba
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
@@ -523,7 +523,7 @@ def test_losses_that_cannot_be_are_refused(dataset: Dataset, device: Device, tmp
     taken = [([TorchLoss(name, charbonnier)], name) for name in ("l1", "loss", "psnr")]
     for losses, name in ((twice, "mine"), *taken):
         with pytest.raises(InputError, match=f"two loss terms named '{name}'"):
-            Trainer(configure(), dataset, device, parts=Parts(losses=losses))
+            Parts(losses=losses)
     with pytest.raises(InputError, match=r"nothing\.wgsl: a loss needs a file of WGSL"):
         WgslLoss("mine", tmp_path / "nothing.wgsl")
     (tmp_path / "odd.wgsl").write_text("@compute @workgroup_size(64) fn main() {}")

@@ -38,11 +38,11 @@ from lapgs_wgpu.train.camera_refinement import (
 from lapgs_wgpu.train.config import CamerasConfig
 from lapgs_wgpu.train.evaluate import evaluate
 from lapgs_wgpu.train.fused_loss import render_loss
+from lapgs_wgpu.train.ground_truth import upload_rgba
 from lapgs_wgpu.train.learning_rate import Rate
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.static_config import static_config
 from lapgs_wgpu.train.trainer import Trainer
-from lapgs_wgpu.train.truth_cache import upload_rgba
 from lapgs_wgpu.train.view_alignment import aligned_view
 
 CONFIG = CamerasConfig("on", Rate(1e-2, 1e-2, 1), 0.0, True, 1)
@@ -273,7 +273,7 @@ def test_an_interrupted_run_goes_on_to_the_same_bytes(
 def test_own_footage_is_refined(device: Device, dataset: Dataset, refine: str, own: bool, refined: bool) -> None:
     data = dataclasses.replace(dataset, own_footage=own)
     training = Trainer(configure("static", cameras__refine=refine), data, device)
-    assert (training.camera_report() is not None) == refined
+    assert (training.cameras is not None) == refined
     training.close()
 
 

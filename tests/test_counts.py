@@ -26,7 +26,7 @@ from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterize import rasterizer_of
 from lapgs_wgpu.train.config import LossWeights
 from lapgs_wgpu.train.fused_loss import image_loss_of, render_loss
-from lapgs_wgpu.train.truth_cache import TruthCache
+from lapgs_wgpu.train.ground_truth import upload_rgba
 
 pytestmark = pytest.mark.kernels
 
@@ -78,18 +78,17 @@ def scene(device: Device) -> Scene:
 
 
 @pytest.fixture(scope="module")
-def truths(device: Device, scene: Scene) -> TruthCache:
+def truth(device: Device, scene: Scene) -> DeviceArray:
     """The ground truth of a step that was taken before."""
-    truths = TruthCache(device, 1 << 20)
-    step(scene, truths, device)
-    return truths
+    truth = upload_rgba(device, np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8))
+    step(scene, truth, device)
+    return truth
 
 
-def step(scene: Scene, truths: TruthCache, device: Device) -> None:
+def step(scene: Scene, truth: DeviceArray, device: Device) -> None:
     """A training step: forward, losses, backward."""
     leaves = {name: value.clone().requires_grad_() for name, value in scene.items()}
     gaussians = Gaussians(sh=leaves.pop("colors"), **leaves)
-    truth = truths.get("view", lambda: np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8))
     render_loss(gaussians, CAMERA, truth, torch.zeros(3), WEIGHTS, device).loss.backward()
 
 
@@ -102,17 +101,17 @@ def totals(events: list[Event]) -> dict[str, int]:
     return {kind: sum(event.nbytes for event in events if event.kind == kind) for kind in ("read", "write")}
 
 
-def test_one_read_back_a_step(device: Device, scene: Scene, truths: TruthCache, events: list[Event]) -> None:
+def test_one_read_back_a_step(device: Device, scene: Scene, truth: DeviceArray, events: list[Event]) -> None:
     """After the last dispatch: gradients, what density control needs, losses, and whether the buffers sufficed."""
-    step(scene, truths, device)
+    step(scene, truth, device)
     assert waits(events) == 1
     last_dispatch = max(i for i, event in enumerate(events) if event.kind == "dispatch")
     assert not [event for event in events[:last_dispatch] if event.kind == "read"]
 
 
-def test_dispatches_a_step(device: Device, scene: Scene, truths: TruthCache, events: list[Event]) -> None:
+def test_dispatches_a_step(device: Device, scene: Scene, truth: DeviceArray, events: list[Event]) -> None:
     """By the plan: what a sort needs follows from the width of its digits, all else is counted."""
-    step(scene, truths, device)
+    step(scene, truth, device)
     names = [event.name for event in events if event.kind == "dispatch"]
     shape = rasterizer_of(device).config
     tiles = math.ceil(CAMERA.width / shape.tile_width) * math.ceil(CAMERA.height / shape.tile_height)
@@ -136,9 +135,9 @@ def test_dispatches_a_step(device: Device, scene: Scene, truths: TruthCache, eve
     assert len(names) - len(losses) - len(pyramid) <= 11 + 2 * scans + 2 * digits
 
 
-def test_bytes_that_cross_over_in_a_step(device: Device, scene: Scene, truths: TruthCache, events: list[Event]) -> None:
+def test_bytes_that_cross_over_in_a_step(device: Device, scene: Scene, truth: DeviceArray, events: list[Event]) -> None:
     """Inputs and gradients once each, and next to nothing else: neither images nor their gradients nor ground truth."""
-    step(scene, truths, device)
+    step(scene, truth, device)
     geometry, harmonics, splat = 4 * (3 + 4 + 3 + 1), 4 * HARMONICS * 3, 4 * 12
     written = COUNT * (geometry + harmonics)
     read = COUNT * splat + COUNT * (splat + 4 * (3 + 4 + 3) + harmonics)
@@ -184,7 +183,7 @@ def test_a_decoder_on_the_device_keeps_its_features_there(device: Device, events
 
 
 def test_nothing_grows_in_steady_state(
-    device: Device, scene: Scene, truths: TruthCache, monkeypatch: pytest.MonkeyPatch
+    device: Device, scene: Scene, truth: DeviceArray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """No buffer, texture, kernel or bind group is made for a step like the one before."""
     pools = (rasterizer_of(device).pool, image_loss_of(device).pool)
@@ -201,7 +200,7 @@ def test_nothing_grows_in_steady_state(
         monkeypatch.setattr(type(device.wgpu_device), method, spy)
     for seed in (1, 2):
         moved = scene | {"means": scene["means"] + 1e-3 * seed}
-        step(moved, truths, device)
+        step(moved, truth, device)
         torch_step(moved, CAMERA, device, sh_degree=DEGREE)
     assert made == []
     assert [pool.nbytes for pool in pools] == held

@@ -5,12 +5,11 @@ from __future__ import annotations
 import dataclasses
 import threading
 from collections import Counter
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 
-from lapgs_wgpu.data import Dataset, ImageCache, View, composite
+from lapgs_wgpu.data import Dataset, View, composite
 from lapgs_wgpu.data.focus import focus_of, spread
 from lapgs_wgpu.data.normalize import BOX
 from lapgs_wgpu.data.views import spread_views
@@ -161,89 +160,3 @@ def test_cameras_at_one_place_have_the_extent_of_the_scene(count: int) -> None:
     away = [dataclasses.replace(view.camera, T_cam_world=np.eye(4)) for view in views]  # the origin is not before it
     np.testing.assert_allclose(focus_of(away, origin=True), [0, 0, 1], atol=1e-9)
     assert spread([camera, CAMERA]) == pytest.approx(0.5 * np.linalg.norm(eye - CAMERA.position))
-
-
-def test_cache_keeps_the_most_recently_used() -> None:
-    sources = [Source(i) for i in range(3)]
-    views = [view_of(source) for source in sources]
-    cache = ImageCache(2 * BYTES)
-    for index, decodes in [
-        (0, (1, 0, 0)),
-        (1, (1, 1, 0)),
-        (0, (1, 1, 0)),
-        (2, (1, 1, 1)),
-        (0, (1, 1, 1)),
-        (1, (1, 2, 1)),
-    ]:
-        assert cache.get(views[index])[0, 0, 0] == index
-        assert tuple(source.decodes for source in sources) == decodes
-        assert cache.used_bytes <= 2 * BYTES
-    with pytest.raises(ValueError, match="read-only"):
-        cache.get(views[0])[0] = 1
-    cache.close()
-
-
-def test_cache_without_room_still_serves() -> None:
-    source = Source(9)
-    view = view_of(source)
-    cache = ImageCache(BYTES - 1)
-    assert cache.get(view)[0, 0, 0] == cache.get(view)[0, 0, 0] == 9
-    assert source.decodes == 2
-    assert cache.used_bytes == 0
-    cache.close()
-
-
-def test_cache_decodes_once_for_many_threads() -> None:
-    gate = threading.Event()
-    source = Source(5, gate)
-    view = view_of(source)
-    cache = ImageCache(BYTES)
-    with ThreadPoolExecutor(8) as pool:
-        results = [pool.submit(cache.get, view) for _ in range(8)]
-        gate.set()
-        assert all(result.result(10)[0, 0, 0] == 5 for result in results)
-    assert source.decodes == 1
-    cache.close()
-
-
-def test_cache_bound_holds_under_threads() -> None:
-    sources = [Source(i) for i in range(10)]
-    views = [view_of(source) for source in sources]
-    cache = ImageCache(3 * BYTES, workers=4)
-    cache.prefetch(views)
-    rng = np.random.default_rng(0)
-    with ThreadPoolExecutor(8) as pool:
-        order = rng.integers(0, 10, 400)
-        for i, image in zip(order, pool.map(lambda i: cache.get(views[i]), order), strict=True):
-            assert (image == i).all()
-    cache.close()
-    assert 0 < cache.used_bytes <= 3 * BYTES
-
-
-def test_prefetched_views_are_not_decoded_again() -> None:
-    sources = [Source(i) for i in range(3)]
-    views = [view_of(source) for source in sources]
-    cache = ImageCache(3 * BYTES)
-    cache.prefetch(views)
-    for view in views:
-        cache.get(view)
-    cache.close()
-    assert [source.decodes for source in sources] == [1, 1, 1]
-
-
-def test_failures_are_raised_by_get_and_not_kept() -> None:
-    broken = [True]
-
-    def pixels() -> np.ndarray:
-        if broken[0]:
-            raise InputError("r_000.png cannot be decoded.")
-        return np.zeros((4, 5, 3), dtype=np.uint8)
-
-    view = View("train_000", CAMERA, 0.0, "r_000.png", pixels)
-    cache = ImageCache(BYTES)
-    cache.prefetch([view])
-    with pytest.raises(InputError, match="r_000"):
-        cache.get(view)
-    broken[0] = False
-    assert cache.get(view).shape == (4, 5, 3)
-    cache.close()

@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from lapgs_wgpu.splat.camera import Camera
-from lapgs_wgpu.splat.rasterize import Rendering
 from lapgs_wgpu.train.config import DensityConfig
 from lapgs_wgpu.train.densify import Change, Statistics, densify, reset_opacities, split_rows
 from lapgs_wgpu.train.presets import load_config
@@ -48,18 +47,11 @@ def change(
     return densify(rows, statistics, config, EXTENT, torch.Generator().manual_seed(0), bound_sizes=bound_sizes)
 
 
-def rendering(radii: list[int], gradient: list[list[float]]) -> Rendering:
-    means2d = torch.zeros(len(radii), 2, requires_grad=True)
-    means2d.grad = torch.tensor(gradient)
-    empty = torch.zeros(0)
-    return Rendering(empty, empty, empty, torch.tensor(radii, dtype=torch.int32), means2d)
-
-
 def test_statistics_are_means_over_visible_views_in_normalised_device_coordinates() -> None:
     camera = Camera(np.eye(3), np.eye(4), 200, 100)
     statistics = Statistics.zeros(3, torch.device("cpu"))
-    statistics.add(rendering([4, 0, 0], [[0.03, 0.08], [9.0, 9.0], [0.0, 0.0]]), camera)
-    statistics.add(rendering([2, 7, 0], [[0.0, 0.0], [0.01, 0.0], [0.0, 0.0]]), camera)
+    statistics.add(torch.tensor([4, 0, 0]), torch.tensor([[0.03, 0.08], [9.0, 9.0], [0.0, 0.0]]), camera)
+    statistics.add(torch.tensor([2, 7, 0]), torch.tensor([[0.0, 0.0], [0.01, 0.0], [0.0, 0.0]]), camera)
     # Pixel gradients times half the image's width and height; what is not visible does not count.
     assert statistics.mean_gradients.tolist() == pytest.approx([math.hypot(3, 4) / 2, 1.0, 0.0])
     assert statistics.radii.tolist() == [4, 7, 0]

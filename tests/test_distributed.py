@@ -33,10 +33,10 @@ def test_gradients_of_a_step_are_the_mean_over_its_views(
     for views in ([0], [1], [0, 1]):
         config = configure(schedule__batch=str(len(views)), schedule__warm_up="0", smoothness__share="0")
         training = Trainer(config, dataset, device)
-        training._images.order = list(views)
-        monkeypatch.setattr(training._optimizer, "step", lambda step, share: None)
+        training._order.left = list(views)
+        monkeypatch.setattr(training._learners.optimizer, "step", lambda step, share: None)
         training.step()
-        gradients = {name: [g.clone() for g in group] for name, group in training._gradients().items()}
+        gradients = {name: [g.clone() for g in group] for name, group in training._learners.gradients().items()}
         found.append((gradients, training._density.statistics.gradients.clone()))
         training.close()
     (first, seen_first), (second, seen_second), (both, seen_both) = found
@@ -56,6 +56,33 @@ def test_a_batch_repeats_to_the_last_bit(dataset: Dataset, device: Device, tmp_p
 def test_processes_share_views_evenly_or_not_at_all(dataset: Dataset, device: Device) -> None:
     with pytest.raises(InputError, match=r"2 processes cannot share 3 views a step evenly; give --batch 2"):
         Trainer(configure(schedule__batch="3"), dataset, device, Ranks(0, 2))
+
+
+def test_every_process_draws_the_same_numbers_and_other_views(
+    dataset: Dataset, device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looked: list[str] = []
+    original = Trainer._descend
+
+    def note(self: Trainer, sample: Sample, **share: int) -> object:
+        looked.append(sample.view.name)
+        return original(self, sample, **share)
+
+    monkeypatch.setattr(Trainer, "_descend", note)
+    monkeypatch.setattr(Ranks, "all_gather", lambda self, tensors: [[tensor] * self.count for tensor in tensors])
+    monkeypatch.setattr(Ranks, "any_rank", lambda self, here: here)
+    monkeypatch.setattr(Ranks, "of_first", lambda self, value: value)
+    states, views = [], []
+    for rank in range(2):
+        training = Trainer(configure(schedule__batch="2", schedule__warm_up="0"), dataset, device, Ranks(rank, 2))
+        looked.clear()
+        training.step()
+        states.append(training._generator.get_state())
+        views.append(list(looked))
+        training.close()
+    assert torch.equal(states[0], states[1])
+    assert len(views[0]) == len(views[1]) == 1
+    assert views[0] != views[1]
 
 
 def test_all_start_as_the_first_one_does(dataset: Dataset, device: Device, monkeypatch: pytest.MonkeyPatch) -> None:

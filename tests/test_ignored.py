@@ -17,14 +17,14 @@ from PIL import Image
 
 from lapgs_wgpu import cli
 from lapgs_wgpu.data import Dataset, load_dataset
-from lapgs_wgpu.data.views import small_views
+from lapgs_wgpu.data.views import View, small_views
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.run import train
 from lapgs_wgpu.splat.rasterize import rasterize
 from lapgs_wgpu.train.fused_loss import render_loss
+from lapgs_wgpu.train.ground_truth import marked_pixels, upload_rgba
 from lapgs_wgpu.train.run_folder import start_run_folder
-from lapgs_wgpu.train.truth_cache import LEFT_OUT, upload_rgba, without
 
 IGNORED = np.zeros(TRUTH.shape[:2], np.bool_)
 IGNORED[10:30, 20:45] = True
@@ -35,7 +35,8 @@ IGNORED[40, ::3] = True
 @pytest.mark.parametrize("name", WEIGHTS)
 def test_the_loss_is_that_of_an_image_with_the_truth_in_the_ignored_pixels(device: Device, name: str) -> None:
     scene, other = gaussians(), gaussians()
-    done = render_loss(scene, CAMERA, upload_rgba(device, without(TRUTH, IGNORED)), BACKGROUND, WEIGHTS[name], device)
+    view = View("train_000", CAMERA, 0.0, "made up", lambda: TRUTH, ignored=lambda: IGNORED)
+    done = render_loss(scene, CAMERA, upload_rgba(device, marked_pixels(view, None)), BACKGROUND, WEIGHTS[name], device)
     done.loss.backward()
     drawn = rasterize(
         other.means, other.quats, other.scales, other.opacities, other.sh, CAMERA,
@@ -51,28 +52,6 @@ def test_the_loss_is_that_of_an_image_with_the_truth_in_the_ignored_pixels(devic
     assert relative(scene.means.grad, other.means.grad) < 1e-3
     assert relative(scene.sh.grad, other.sh.grad) < 1e-3
     assert all(bool(gradient.isfinite().all()) for gradient in gradients(scene, done).values())
-
-
-def test_transparent_pixels_still_count() -> None:
-    rgba = np.full((2, 3, 4), 7, np.uint8)
-    rgba[0, 0] = (1, 2, 3, 0)
-    ignored = np.zeros((2, 3), np.bool_)
-    ignored[1, 2] = True
-    marked = without(rgba, ignored)
-    assert marked[0, 0].tolist() == [0, 0, 0, 0]
-    assert marked[1, 2].tolist() == [1, 0, 0, 0]
-    assert marked[0, 1].tolist() == [7, 7, 7, 7]
-    opaque = rgba[..., :3]
-    assert without(opaque, None) is opaque
-
-
-def test_colors_under_transparency_leave_nothing_out() -> None:
-    """The mark of what is left out is a color that a file may hold."""
-    rgba = np.full((2, 3, 4), 7, np.uint8)
-    rgba[0, 0] = LEFT_OUT
-    cleaned = without(rgba, None)
-    assert cleaned[0, 0].tolist() == [0, 0, 0, 0]
-    np.testing.assert_array_equal(cleaned[1], rgba[1])
 
 
 def test_what_is_ignored_does_not_change_a_bit(device: Device, dataset: Dataset, tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.run import resume, train
 from lapgs_wgpu.train import objective
 from lapgs_wgpu.train.fused_loss import RenderLoss
-from lapgs_wgpu.train.nonfinite import IN_A_ROW, SHARE, SkipCounter, Skipped
+from lapgs_wgpu.train.nonfinite import LIMIT, SKIPPED, SkipCounter, Skipped
 from lapgs_wgpu.train.run_folder import STATE, load_state
 from lapgs_wgpu.train.trainer import Trainer
 
@@ -116,9 +116,7 @@ def test_a_training_that_stays_bad_stops_with_its_state(
     error = capfd.readouterr().err
     assert "step 5 was skipped: on view train_" in error
     last = error.splitlines()[-1]
-    assert last.startswith(
-        f"lapgs-train: {IN_A_ROW} steps in a row had values that are not finite; the last: step 14 was"
-    )
+    assert last.startswith("lapgs-train: too many steps had values that are not finite; the last: step 14 was")
     assert last.endswith(f"stopped after step 14, from which lapgs-train --resume {tmp_path / 'run'} goes on.")
     state = load_state(tmp_path / "run")
     assert state is not None
@@ -165,18 +163,15 @@ def test_a_bad_parameter_stops_the_training_and_leaves_the_older_state(
 
 def test_repeated_and_frequent_skips_end_a_training() -> None:
     health = SkipCounter()
-    for _ in range(IN_A_ROW - 1):
+    for _ in range(LIMIT // SKIPPED - 1):
         health.note(BAD)
-    health.note(None)
-    for _ in range(IN_A_ROW - 1):
-        health.note(BAD)
-    with pytest.raises(NumericalError, match=r"10 steps in a row .*; the last: step 3 was skipped: on view r_003"):
+    with pytest.raises(NumericalError, match=r"the last: step 3 was skipped: on view r_003"):
         health.note(BAD)
     health = SkipCounter()
-    for _ in range(SHARE - 1):
+    for _ in range(18):
         for each in (BAD, None, None):
             health.note(each)
-    with pytest.raises(NumericalError, match=f"{SHARE} of the last .* steps had values that are not finite"):
+    with pytest.raises(NumericalError):
         health.note(BAD)
     health = SkipCounter()
     for _ in range(1000):  # one in five

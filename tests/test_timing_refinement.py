@@ -21,9 +21,10 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.fields.deformation import Deformation
 from lapgs_wgpu.motion.scene import Scene4D, load
-from lapgs_wgpu.motion.timing import EVEN
+from lapgs_wgpu.motion.timing import EVEN, Timing
 from lapgs_wgpu.run import resume, train
 from lapgs_wgpu.train.distributed import SINGLE_PROCESS, Ranks
+from lapgs_wgpu.train.ground_truth import GroundTruth, HostImage
 from lapgs_wgpu.train.timing_refinement import FARTHEST, TimingRefinement, running_median
 from lapgs_wgpu.train.trainer import Trainer
 
@@ -62,10 +63,14 @@ def views_at(times: Sequence[float]) -> list[View]:
 def refinement(
     scene: Scene4D, truth: Callable[[View], Tensor], times: Sequence[float] = TIMES, ranks: Ranks = SINGLE_PROCESS
 ) -> TimingRefinement:
-    def picture(view: View) -> Tensor:
-        return scene.render(view.camera, view.time).image
+    def picture(view: View, timing: Timing) -> Tensor:
+        return scene.render(view.camera, view.time, timing=timing).image
 
-    return TimingRefinement(scene, views_at(times), truth, picture, time_step(np.asarray(times)), ranks)
+    def image(view: View) -> HostImage:
+        pixels = truth(view)
+        return HostImage(pixels, pixels.isnan()[..., :1])
+
+    return TimingRefinement(scene, views_at(times), image, picture, time_step(np.asarray(times)), ranks)
 
 
 def refine(scene: Scene4D, truth: Callable[[View], Tensor]) -> None:
@@ -180,3 +185,48 @@ def test_a_state_of_other_times_is_refused(dataset: Dataset, device: Device, mom
         state = training.state() | {"timing.moments": np.array(moments)}
         with pytest.raises(ValueError, match="moments"):
             training.restore(state)
+
+
+def test_times_stay_until_the_first_step_that_is_planned(dataset: Dataset, device: Device) -> None:
+    with Trainer(configure(**GIVEN), dataset, device) as training:
+        for result in training:
+            assert (training.scene.timing is EVEN) == (result.step < 15)
+    with Trainer(configure(timing__refine="false"), dataset, device) as training:
+        assert training.timing is None
+
+
+def test_a_correction_that_fails_changes_nothing(
+    dataset: Dataset, device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The state of the steps before can be saved."""
+
+    def lost(self: GroundTruth, view: View, color: Tensor) -> HostImage:
+        raise InputError("the disk is gone")
+
+    monkeypatch.setattr(GroundTruth, "on_host", lost)
+    with Trainer(configure(**GIVEN), dataset, device) as training:
+        for _ in range(14):
+            training.step()
+        before = training.state()
+        with pytest.raises(InputError, match="the disk is gone"):
+            training.step()
+        assert training.whole
+        for name, value in training.state().items():
+            np.testing.assert_array_equal(value, before[name])
+
+
+def test_it_sees_what_the_losses_see(dataset: Dataset, device: Device) -> None:
+    """Colors and cameras with their corrections; pixels that are ignored do not count."""
+    ignored = np.zeros((32, 32), bool)
+    ignored[:5] = True
+    first = dataclasses.replace(dataset.train[0], ignored=lambda: ignored)
+    masked = dataclasses.replace(dataset, train=(first, *dataset.train[1:]))
+    with Trainer(configure(exposure__enabled="true", cameras__refine="on", **GIVEN), masked, device) as training:
+        assert training._learners.exposures is not None
+        with torch.no_grad():
+            training._learners.exposures.values[0, :, 3] += 0.25
+        plain = training.scene.render(first.camera, first.time, torch.zeros(3)).image
+        torch.testing.assert_close(training._picture(first, EVEN), plain + 0.25)
+        left_out = training._truth.on_host(first, torch.zeros(3)).left_out
+        assert bool(left_out[:5].all())
+        assert not left_out[5:].any()

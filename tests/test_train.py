@@ -7,7 +7,6 @@ import io
 import json
 import re
 import signal
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +26,6 @@ from lapgs_wgpu.motion.scene import Scene4D, load
 from lapgs_wgpu.run import train
 from lapgs_wgpu.train import objective
 from lapgs_wgpu.train.config import LossWeights
-from lapgs_wgpu.train.dataloader import ImageLoader
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
 from lapgs_wgpu.train.initial_points import initial_points
 from lapgs_wgpu.train.log import Log
@@ -300,47 +298,6 @@ def test_overwriting_replaces_a_run_and_nothing_else(dataset: Dataset, device: D
     train(configure(schedule__steps="2"), dataset, tmp_path, device=device, overwrite=True)
     assert (tmp_path / "notes.txt").read_text() == "mine"
     assert not (tmp_path / "eval" / "old.png").exists()
-
-
-def test_every_picture_is_drawn_once_an_epoch(dataset: Dataset, device: Device) -> None:
-    with closing(ImageLoader(dataset.train, "black", 1.0, torch.Generator().manual_seed(3), device)) as pictures:
-        epochs = [[pictures.choose()[0].name for _ in dataset.train] for _ in range(3)]
-    assert all(sorted(epoch) == sorted(view.name for view in dataset.train) for epoch in epochs)
-    assert epochs[0] != epochs[1]
-
-
-def test_memory_and_device_share_one_bound_where_they_are_one(dataset: Dataset, device: Device) -> None:
-    """Whatever it is; and what is decoded ahead finds room."""
-    picture = 32 * 32 * 4
-    for pictures_held, decoded_again in ((1, True), (4, True), (100, False)):
-        bound = pictures_held * picture / 1e9
-        with closing(ImageLoader(dataset.train, "random", bound, torch.Generator().manual_seed(3), device)) as pictures:
-            for _ in range(3 * len(dataset.train)):
-                truth = pictures.on_device(pictures.choose()[0])
-                held = pictures._truths.used_bytes
-                if device.info.kind in ("cpu", "integrated"):
-                    assert pictures._cache.max_bytes + pictures._truths.max_bytes <= 1e9 * bound
-                assert held <= 1e9 * bound
-                assert truth.nbytes == picture
-            assert (held < len(dataset.train) * picture) == decoded_again
-
-
-@pytest.mark.parametrize("background", ["black", "white", "random"])
-def test_pictures_lie_on_their_background(background: str, dataset: Dataset, device: Device) -> None:
-    """On a fixed background they lie before they are uploaded, on a random one in the loss's first pass."""
-    generator = torch.Generator().manual_seed(3)
-    with closing(ImageLoader(dataset.train, background, 1.0, generator, device)) as pictures:  # type: ignore[arg-type]
-        drawn = [(view, pictures.on_device(view), color) for view, color in (pictures.choose() for _ in range(4))]
-    for view, truth, color in drawn:
-        picture = truth.read().view(np.uint8).reshape(32, 32, 4)
-        if background == "random":
-            assert (picture == view.load()).all()
-        else:
-            assert color.tolist() == [float(background == "white")] * 3
-            assert (picture[..., 3] == 255).all()
-            assert (picture[0, 0, :3] == 255 * int(background == "white")).all()
-    if background == "random":
-        assert not torch.equal(drawn[0][2], drawn[1][2])
 
 
 def test_seconds_before_the_first_step_count_once(tmp_path: Path) -> None:

@@ -3,6 +3,6 @@
 from __future__ import annotations
 
 from lapgs_wgpu.data.load import load_dataset
-from lapgs_wgpu.data.views import Dataset, ImageCache, View, composite
+from lapgs_wgpu.data.views import Dataset, View, composite
 
-__all__ = ["Dataset", "ImageCache", "View", "composite", "load_dataset"]
+__all__ = ["Dataset", "View", "composite", "load_dataset"]

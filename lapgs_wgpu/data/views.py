@@ -1,16 +1,14 @@
-"""Datasets: views with lazily decoded 8-bit images, and a cache of images with a limit in bytes."""
+"""Datasets: views with lazily decoded 8-bit images."""
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
-from collections import Counter, OrderedDict
-from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property, partial
 from pathlib import Path
-from threading import Lock
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -216,59 +214,3 @@ def composite(image: NDArray[np.uint8], background: ArrayLike) -> NDArray[np.uin
     alpha = image[..., 3:].astype(np.float32)
     mixed = image[..., :3] * alpha + (255.0 - alpha) * (255.0 * below)
     return np.floor(mixed / 255.0 + 0.5).astype(np.uint8)
-
-
-class ImageCache:
-    """A least-recently-used cache of decoded images with a limit in bytes. Thread-safe.
-
-    max_bytes: limit; a larger image is returned and not kept.
-    used_bytes: of the pixels kept at present.
-    workers: threads for `prefetch`; each may hold one image beyond the limit while it decodes.
-    """
-
-    def __init__(self, max_bytes: int, *, workers: int = 1) -> None:
-        self.max_bytes = max_bytes
-        self._lock = Lock()
-        self._entries: OrderedDict[View, Future[NDArray[np.uint8]]] = OrderedDict()
-        self.used_bytes = 0
-        self._pool = ThreadPoolExecutor(workers, thread_name_prefix="decode")
-
-    def get(self, view: View) -> NDArray[np.uint8]:
-        """The result of `View.load`. If several threads request a view, it is decoded once."""
-        with self._lock:
-            entry = self._entries.get(view)
-            if entry is not None:
-                self._entries.move_to_end(view)
-            else:
-                mine = self._entries[view] = Future()
-        if entry is not None:
-            return entry.result()
-        try:
-            image = view.load()
-        except BaseException as error:
-            with self._lock:  # a later call tries again
-                del self._entries[view]
-            mine.set_exception(error)
-            raise
-        mine.set_result(image)
-        with self._lock:
-            self.used_bytes += image.nbytes
-            self._evict()
-        return image
-
-    def prefetch(self, views: Iterable[View]) -> None:
-        """Decode views in the background. Errors are raised by `get`."""
-        for view in views:
-            self._pool.submit(self.get, view)
-
-    def close(self) -> None:
-        """Cancel queued decodes and wait for running ones."""
-        self._pool.shutdown(cancel_futures=True)
-
-    def _evict(self) -> None:
-        for view, entry in list(self._entries.items()):
-            if self.used_bytes <= self.max_bytes:
-                return
-            if entry.done():
-                self.used_bytes -= entry.result().nbytes
-                del self._entries[view]

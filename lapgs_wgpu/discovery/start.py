@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 
 from torch import nn
 
 from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.discovery.discover import discover
-from lapgs_wgpu.gpu.device import Device, open_device
+from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.make_field import check_own
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.distributed import SINGLE_PROCESS, Ranks
 from lapgs_wgpu.train.host_threads import step_threads, torch_threads
-from lapgs_wgpu.train.open_dataset import open_dataset, resolve_data
 from lapgs_wgpu.train.parts import Parts
-from lapgs_wgpu.train.trainer import Trainer, check_arguments, resolved_configs
+from lapgs_wgpu.train.setup import set_up
+from lapgs_wgpu.train.trainer import Trainer
 
 
 def start_training(
@@ -46,12 +45,7 @@ def start_training(
         InputError: the configuration, the data and the parts do not fit each other, or the images show nothing.
     """
     parts = parts or Parts()
-    check_arguments(config, dataset, parts, ranks)
-    if dataset is None:
-        config = resolve_data(config, Path("runs"))
-        dataset = open_dataset(config)
-    device = device or open_device()
-    _, resolved = resolved_configs(config, dataset, device, parts)
+    user_config, resolved, dataset, device = set_up(config, dataset, device, parts, ranks)
     check_own(resolved.field, parts.field)
     start, notes = None, []
     if ranks.first and resolved.discovery.enabled and resolved.field.kind != "static":
@@ -60,7 +54,7 @@ def start_training(
         else:
             with torch_threads(step_threads(resolved.field, device)):
                 start = discover(resolved, dataset, device, parts.field)
-    trainer = Trainer(config, dataset, device, ranks, start=start, parts=parts)
+    trainer = Trainer(user_config, dataset, device, ranks, start=start, parts=parts)
     for note in [*notes, *_unused_settings(trainer)] if ranks.first else ():
         print(f"note: {note}", file=sys.stderr, flush=True)
     return trainer

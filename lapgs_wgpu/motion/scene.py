@@ -16,7 +16,7 @@ from lapgs_wgpu.gpu.device import Device, open_device
 from lapgs_wgpu.io.checkpoint import write_checkpoint
 from lapgs_wgpu.io.ply import GaussianSnapshot
 from lapgs_wgpu.motion.fields.config import MIN_SCALE, FieldConfig
-from lapgs_wgpu.motion.fields.deformation import Deformation, Moments, Nearby
+from lapgs_wgpu.motion.fields.deformation import Deformation, Nearby, TimeSamples
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.fields.laplacian import LaplacianMotion
 from lapgs_wgpu.motion.fields.make_field import Field, check_own, make_field
@@ -35,12 +35,12 @@ class Deformed(NamedTuple):
     Attributes:
         gaussians: activated.
         smoothness: the weighted smoothness loss, if it was asked for.
-        moments: means (M, 3) and scales (M, 3) of chosen Gaussians at each further time that was asked for.
+        at_times: means (M, 3) and scales (M, 3) of chosen Gaussians at each further time that was asked for.
     """
 
     gaussians: Gaussians[Tensor]
     smoothness: Tensor | None
-    moments: list[tuple[Tensor, Tensor]]
+    at_times: list[tuple[Tensor, Tensor]]
 
 
 def isotropic_rows(
@@ -74,7 +74,7 @@ class Scene4D:
         device: that renders.
         sh_degree: degree of the harmonics in use, 0 to 3.
         antialiased: how the Gaussians are drawn, see Gaussians.
-        timing: of the capture: the moment of the motion at each time.
+        timing: of the capture: the time of the field at each time of an image.
         metadata: texts by name that the checkpoint holds.
     """
 
@@ -176,7 +176,7 @@ class Scene4D:
         self,
         t: float,
         nearby: Nearby | None = None,
-        moments: Moments | None = None,
+        time_samples: TimeSamples | None = None,
         *,
         timing: Timing | None = None,
     ) -> Deformed:
@@ -185,7 +185,7 @@ class Scene4D:
         Args:
             t: time in [0, 1].
             nearby: where the smoothness loss looks; None without it.
-            moments: some of the Gaussians and further times of the field.
+            time_samples: some of the Gaussians and further times of the field.
             timing: takes the place of the scene's; None for the scene's.
 
         Returns:
@@ -195,7 +195,7 @@ class Scene4D:
         canonical = self.canonical()
         if self.field is None or len(self) == 0:
             return Deformed(canonical, None, [])
-        move, *others = self._moves((timing or self.timing)(t), nearby, moments)
+        move, *others = self._moves((timing or self.timing)(t), nearby, time_samples)
         quats, sh, opacities = canonical.quats, canonical.sh, canonical.opacities
         if move.orientation is not None:
             quats = quat_multiply(move.orientation, quats)
@@ -207,22 +207,22 @@ class Scene4D:
             opacities = (p["opacity_logits"] + move.d_opacity).sigmoid()
         means, scales = self._moved(move, canonical.means, canonical.scales)
         at_times = []
-        if moments is not None:
-            rows = p["means"][moments.rows], canonical.scales[moments.rows]
+        if time_samples is not None:
+            rows = p["means"][time_samples.rows], canonical.scales[time_samples.rows]
             at_times = [self._moved(other, *rows) for other in others]
         gaussians = Gaussians(means, quats, scales, opacities, sh, antialiased=self.antialiased)
         return Deformed(gaussians, move.smoothness, at_times)
 
-    def _moves(self, t: float, nearby: Nearby | None, moments: Moments | None) -> list[Deformation]:
+    def _moves(self, t: float, nearby: Nearby | None, time_samples: TimeSamples | None) -> list[Deformation]:
         field, means, dynamics = self.field, self.parameters["means"], self.parameters.get("dynamics")
         assert field is not None
         if isinstance(field, GridField):
-            return field.at_times(means, t, dynamics, nearby, moments)
+            return field.at_times(means, t, dynamics, nearby, time_samples)
         move = field(means, t, dynamics, nearby)
-        if moments is None:
+        if time_samples is None:
             return [move]
-        rows = moments.chosen(means, dynamics)
-        return [move, *(field(rows[0], time, rows[1]) for time in moments.times)]
+        rows = time_samples.chosen(means, dynamics)
+        return [move, *(field(rows[0], time, rows[1]) for time in time_samples.times)]
 
     def _moved(self, move: Deformation, means: Tensor, scales: Tensor) -> tuple[Tensor, Tensor]:
         """Means and scales after a move."""

@@ -1,6 +1,6 @@
 """The acceleration loss: how far Gaussians are from where and how large they would be if they moved evenly.
 
-A moment that one camera sees says nothing of how far away things are; its neighbours in time, seen from elsewhere, do.
+A time that one camera sees says nothing of how far away things are; its neighbours in time, seen from elsewhere, do.
 Distances saturate, so that what really turns quickly is not held back.
 """
 
@@ -9,36 +9,40 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from lapgs_wgpu.motion.fields.deformation import Moments
+from lapgs_wgpu.motion.fields.deformation import TimeSamples
 from lapgs_wgpu.motion.scene import Deformed
 from lapgs_wgpu.train.config import AccelerationConfig
 
 WOBBLE = 1e-2  # world units: distances far below it count as they are, those far above it all as much as it
 EPSILON = 1e-12  # world units squared: keeps the gradient of a distance of 0 finite
-# Largest distance in time of the two moments, in distances of two images; drawn between half of it and all.
+# Largest distance of the two times from the view's, in distances of two images; drawn between half of it and all.
 LARGEST_DISTANCE = 2.0
 
 
-def draw_moments(
-    config: AccelerationConfig, count: int, t: float, clip_moments: int, generator: torch.Generator
-) -> Moments | None:
-    """Where the acceleration loss of `count` Gaussians looks in a step at time t; None where it is off. At an end of
-    the clip one of the times is t itself, and the loss 0. clip_moments: how many moments the clip has; with two,
-    both are ends."""
+def draw_times(
+    config: AccelerationConfig, count: int, t: float, time_count: int, generator: torch.Generator
+) -> TimeSamples | None:
+    """Draw the times before and after t at which the acceleration loss looks, and at which of `count` Gaussians.
+
+    None where the loss is off. At an end of the clip one of the times is t itself, and the loss is 0; of a clip of
+    time_count = 2 times both are ends.
+    """
     chosen = round(config.share * count)
-    if chosen == 0 or config.weight == 0 or clip_moments < 3:
+    if chosen == 0 or config.weight == 0 or time_count < 3:
         return None
     rows = torch.randint(count, (chosen,), generator=generator)
-    reach = LARGEST_DISTANCE / (clip_moments - 1) * (1 + float(torch.rand((), generator=generator))) / 2
-    return Moments(rows, (max(t - reach, 0.0), min(t + reach, 1.0)))
+    reach = LARGEST_DISTANCE / (time_count - 1) * (1 + float(torch.rand((), generator=generator))) / 2
+    return TimeSamples(rows, (max(t - reach, 0.0), min(t + reach, 1.0)))
 
 
-def acceleration_loss(now: Deformed, t: float, moments: Moments) -> Tensor:
-    """The robust distance of means from the straight line between those before and after, and likewise of scales, on
-    the average over the chosen Gaussians; world units. now: the Gaussians at time t and at these moments."""
-    rows, (before, after) = moments
+def acceleration_loss(now: Deformed, t: float, samples: TimeSamples) -> Tensor:
+    """The robust distance of means from the straight line between those before and after, and likewise of scales.
+
+    It is the average over the chosen Gaussians, in world units. now: the Gaussians at time t and at the sampled times.
+    """
+    rows, (before, after) = samples
     share = (t - before) / (after - before)
-    (first_means, first_scales), (last_means, last_scales) = now.moments
+    (first_means, first_scales), (last_means, last_scales) = now.at_times
     means = now.gaussians.means[rows] - torch.lerp(first_means, last_means, share)
     scales = now.gaussians.scales[rows] - torch.lerp(first_scales, last_scales, share)
     return robust_length(means) + robust_length(scales)

@@ -30,7 +30,7 @@ class DataConfig(Options):
     background: Background = option(
         "color behind the Gaussians and behind transparent images; random: a new one each step, black in evaluation"
     )
-    cache_gb: float = option("memory limit for decoded images, gigabytes, in host memory and on the device")
+    cache_gb: float = option("memory limit for the images that are kept on the device, gigabytes")
     undistort: bool = option("resample images of lenses with distortion or skew to those of a pinhole camera", True)
     units: Units = option(
         "length unit of rates.means, smoothness.reach, field.bound and field.unit; capture: that of its files",

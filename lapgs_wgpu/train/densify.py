@@ -16,11 +16,9 @@ from torch import Tensor
 
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
-from lapgs_wgpu.splat.rasterize import Rendering
 from lapgs_wgpu.splat.rotation import rotation_matrices
 from lapgs_wgpu.train.adaptive_split import adaptive_split
 from lapgs_wgpu.train.config import DensityConfig
-from lapgs_wgpu.train.fused_loss import RenderLoss
 
 CHILDREN = 2  # of a split Gaussian
 # The most opaque Gaussians stay, these many or a quarter of all: where images show little but the background, all
@@ -48,16 +46,16 @@ class Statistics:
         """Nothing was seen yet."""
         return Statistics(*torch.zeros(3, count, device=device).unbind())
 
-    def add(self, rendering: Rendering | RenderLoss, camera: Camera, *, scale: float = 1.0) -> None:
-        """Take in a rendering after its backward pass. scale: of its gradients, where its loss had a share in a sum."""
-        pixels = rendering.means2d.grad
-        if pixels is None:
-            raise ValueError("Statistics.add needs a rendering whose means2d have a gradient: call backward() first")
-        to_ndc = pixels.new_tensor([camera.width / 2, camera.height / 2])
-        visible = rendering.radii > 0
-        self.gradients += torch.where(visible, (pixels * (scale * to_ndc)).norm(dim=1), 0.0)
+    def add(self, radii: Tensor, d_means2d: Tensor, camera: Camera, *, scale: float = 1.0) -> None:
+        """Take in a view: radii (N,), pixels, and gradients (N, 2) by the centers on the image, per pixel.
+
+        scale: of the gradients, where the view's loss had a share in a sum.
+        """
+        to_ndc = d_means2d.new_tensor([camera.width / 2, camera.height / 2])
+        visible = radii > 0
+        self.gradients += torch.where(visible, (d_means2d * (scale * to_ndc)).norm(dim=1), 0.0)
         self.views += visible
-        self.radii = torch.maximum(self.radii, rendering.radii.to(self.radii.dtype))
+        self.radii = torch.maximum(self.radii, radii.to(self.radii.dtype))
 
     def merge(self, others: Iterable[Statistics]) -> None:
         """Take in what others have seen of the same Gaussians, in this order."""

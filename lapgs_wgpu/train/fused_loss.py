@@ -25,9 +25,15 @@ from lapgs_wgpu.train.loss_terms import TorchLoss, WgslLoss, torch_loss
 
 
 class RenderLoss(NamedTuple):
-    """loss: a scalar, differentiable in the Gaussians' tensors and in the correction. terms: l1, mse (mean squared
-    error), ssim, pyramid and ncc (losses), as far as they were computed, and the terms of one's own by name. radii (N,)
-    and means2d (N, 2): as those of splat.rasterize.Rendering."""
+    """A rendering that was compared with its ground truth.
+
+    Attributes:
+        loss: a scalar, differentiable in the Gaussians' tensors, in the correction and in the camera's change.
+        terms: l1, mse (mean squared error), ssim, pyramid and ncc (losses), as far as they were computed, and further
+            terms by name; without weights.
+        radii: (N,) as in splat.rasterize.Rendering.
+        means2d: (N, 2) likewise.
+    """
 
     loss: Tensor
     terms: dict[str, float]
@@ -40,7 +46,7 @@ class RenderLoss(NamedTuple):
         return psnr_of(self.terms["mse"])
 
 
-class _Step(NamedTuple):
+class _Comparison(NamedTuple):
     """What `_FusedLoss` takes besides tensors; see `render_loss`. wanted: whether any tensor wants a gradient."""
 
     camera: Camera
@@ -72,14 +78,21 @@ def render_loss(
 ) -> RenderLoss:
     """The weighted sum of the image losses of the rendered Gaussians, computed on the device from end to end.
 
-    gaussians: activated, float32, with harmonics. truth: (H, W) as `upload_rgba` leaves it, of the camera's size.
-    background: (3,) in [0, 1], under both; not differentiable. weights: of the terms. correction: (3, 4), of the
-    image's colors before they are compared (train/exposure); none where None. own: further terms of the image, with
-    their weights.
-    camera_change: (7,) zeros, which get the gradient by a small change of the camera: rotation, shift in units of
-    `camera_unit`, log of the focal lengths (splat.drawing.CameraGradient); none where None.
     The same bits on every run of one adapter and driver. Under torch.no_grad(), or where no tensor wants a gradient,
     none is computed.
+
+    Args:
+        gaussians: activated, float32, with harmonics.
+        camera: that sees them.
+        truth: (H, W) as `upload_rgba` leaves it, of the camera's size.
+        background: (3,) in [0, 1], under both; not differentiable.
+        weights: of the terms.
+        device: that computes.
+        correction: (3, 4) of the image's colors before they are compared (train/exposure); None for none.
+        own: further terms of the image, with their weights.
+        camera_change: (7,) zeros, which get the gradient by a small change of the camera: rotation, shift in units of
+            `camera_unit`, log of the focal lengths (splat.drawing.CameraGradient); None for none.
+        camera_unit: world units.
     """
     tensors = (
         gaussians.means,
@@ -93,8 +106,10 @@ def render_loss(
     wanted = torch.is_grad_enabled() and any(tensor is not None and tensor.requires_grad for tensor in tensors)
     probe = gaussians.means.new_empty((len(gaussians), 2)).requires_grad_(wanted)
     red, green, blue = background.tolist()
-    step = _Step(camera, camera_unit, gaussians.antialiased, truth, (red, green, blue), weights, device, own, wanted)
-    loss, computed, radii, centres = _FusedLoss.apply(step, *tensors, probe)
+    comparison = _Comparison(
+        camera, camera_unit, gaussians.antialiased, truth, (red, green, blue), weights, device, own, wanted
+    )
+    loss, computed, radii, centres = _FusedLoss.apply(comparison, *tensors, probe)
     probe.data = centres
     names = ("l1", "mse", "ssim", "pyramid", "ncc", *(term.name for term, _ in own))
     used = (True, True, weights.ssim, weights.pyramid, weights.ncc, *[True] * len(own))
@@ -103,13 +118,16 @@ def render_loss(
 
 
 class _FusedLoss(torch.autograd.Function):
-    """forward: all passes, those of the gradient included, are submitted at once, and one read-back brings what the
-    host needs. backward: multiplies the gradients that are then already there."""
+    """The loss, whose gradients are computed together with it.
+
+    forward submits all passes at once, and one read-back brings what the host needs; backward multiplies the gradients
+    that are then already there.
+    """
 
     @staticmethod
     def forward(
         ctx: Any,
-        step: _Step,
+        comparison: _Comparison,
         means: Tensor,
         quats: Tensor,
         scales: Tensor,
@@ -119,7 +137,7 @@ class _FusedLoss(torch.autograd.Function):
         change: Tensor | None,
         probe: Tensor,
     ) -> tuple[Tensor, ...]:
-        camera, unit, antialiased, truth, background, weights, device, own, wanted = step
+        camera, unit, antialiased, truth, background, weights, device, own, wanted = comparison
         rasterizer, losses, exposing = rasterizer_of(device), image_loss_of(device), exposure_of(device)
         leaves = Gaussians(means, quats, scales, opacities, sh=sh, antialiased=antialiased)
         gaussians = upload_gaussians(rasterizer.pool, leaves)

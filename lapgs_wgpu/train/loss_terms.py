@@ -13,7 +13,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lapgs_wgpu.data.views import composite
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.array import DeviceArray, read_all
 from lapgs_wgpu.gpu.device import Device
@@ -21,7 +20,7 @@ from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.gaussians import Gaussians
-from lapgs_wgpu.train.truth_cache import LEFT_OUT
+from lapgs_wgpu.train.ground_truth import host_image
 
 SIDE = 8  # pixels; a workgroup of a WGSL loss is a square
 
@@ -133,19 +132,15 @@ class WgslLoss:
 
 
 LossTerm = Regularizer | TorchLoss | WgslLoss
+# Names of the terms of the configuration, and of what stands beside them in the log.
+TAKEN_NAMES = frozenset(
+    {"l1", "mse", "ssim", "pyramid", "ncc", "smoothness", "acceleration", "dynamics", "loss", "psnr"}
+)
 
 
 def weight_at(term: LossTerm, step: int) -> float:
     """The weight of a term in a step, counted from 1."""
     return float(term.weight(step) if callable(term.weight) else term.weight)
-
-
-def check_terms(terms: tuple[LossTerm, ...], taken: frozenset[str]) -> None:
-    """Raises InputError where two terms have one name. taken: names of the configuration's terms."""
-    names = [term.name for term in terms]
-    for name in names:
-        if name in taken or names.count(name) > 1:
-            raise InputError(f"there are two loss terms named {name!r}; give each a name of its own.")
 
 
 def torch_loss(
@@ -156,11 +151,9 @@ def torch_loss(
     Raises InputError for a result that is no scalar.
     """
     planes, texels = read_all([image, truth])
-    rgba = texels.view(np.uint8).reshape(*truth.shape, 4)
-    target = torch.from_numpy(composite(rgba, np.array(background)).astype(np.float32) / 255)
+    target, left_out = host_image(texels, torch.tensor(background))
     with torch.enable_grad():
         shown = torch.from_numpy(planes[:3]).permute(1, 2, 0).requires_grad_()
-        left_out = torch.from_numpy((rgba == LEFT_OUT).all(axis=2))[..., None]
         value = term.function(shown, torch.where(left_out, shown.detach(), target))
         if not isinstance(value, Tensor) or value.ndim:
             raise InputError(
@@ -170,6 +163,6 @@ def torch_loss(
         if value.requires_grad:
             (found,) = torch.autograd.grad(value, shown, allow_unused=True)
             gradient = gradient if found is None else found.masked_fill(left_out, 0.0)
-    d_image = np.zeros(planes.shape[1:], np.float32)[None].repeat(4, axis=0)
+    d_image = np.zeros((4, *truth.shape), np.float32)
     d_image[:3] = weight * gradient.permute(2, 0, 1).numpy()
     return float(value.detach()), d_image

@@ -7,7 +7,6 @@ finite where a value is not, and where a gradient's square overflows, which woul
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -16,8 +15,8 @@ from torch import Tensor
 
 from lapgs_wgpu.errors import NumericalError
 
-IN_A_ROW = 10  # steps skipped one after the other that end a training
-WINDOW, SHARE = 100, 25  # and so many of the last hundred
+# A skipped step counts so much, and each other step takes 1 of it back: one in five may be skipped for ever.
+SKIPPED, LIMIT = 4, 40  # ten in a row reach the limit, which ends a training
 
 Tensors = Mapping[str, Sequence[Tensor]]  # by name of a group, such as an optimizer's
 
@@ -34,15 +33,13 @@ class Skipped(NamedTuple):
 
 
 def finite(*groups: Tensors) -> bool:
-    """Whether all values are, and their squares can be summed up."""
+    """Whether all values are finite, and the sum of their squares is."""
     tensors = [tensor.detach() for group in groups for each in group.values() for tensor in each if tensor.numel()]
-    if not tensors:
-        return True
-    return math.isfinite(torch.nn.utils.get_total_norm(tensors).item())
+    return not tensors or math.isfinite(torch.nn.utils.get_total_norm(tensors).item())
 
 
 def describe(kind: str, group: Tensors) -> list[str]:
-    """For each name how many of its values are not finite, or too large to be squared; [] where all are well."""
+    """A clause for each name whose values are not finite, or too large to be squared."""
     found = []
     for name, tensors in group.items():
         count = sum(int((~tensor.detach().isfinite()).sum()) for tensor in tensors)
@@ -53,34 +50,26 @@ def describe(kind: str, group: Tensors) -> list[str]:
     return found
 
 
-def cause(loss: float, terms: Sequence[Mapping[str, float]], gradients: Tensors) -> str:
-    """What is not finite in a step: of its loss, of the terms of each view's loss, of its gradients."""
+def cause(terms: Sequence[Mapping[str, float]], gradients: Tensors) -> str:
+    """What is not finite in a step: of the terms of each view's loss, and of the gradients."""
     bad = [f"the loss term {name} is {value}" for of in terms for name, value in of.items() if not math.isfinite(value)]
-    bad = bad or ([] if math.isfinite(loss) else [f"the loss is {loss}"])
-    return "; ".join([*bad, *describe("gradient", gradients)] or ["the gradients together are too large"])
-
-
-class SkipCounter:
-    """Counts the steps that were skipped."""
-
-    def __init__(self) -> None:
-        self._recent: deque[bool] = deque(maxlen=WINDOW)  # whether a step was skipped
-
-    def note(self, skipped: Skipped | None) -> None:
-        """Take in a step. Raises NumericalError where too many were skipped."""
-        self._recent.append(skipped is not None)
-        if skipped is None:
-            return
-        last = list(self._recent)[-IN_A_ROW:]
-        if len(last) == IN_A_ROW and all(last):
-            raise NumericalError(f"{IN_A_ROW} steps in a row had values that are not finite; the last: {skipped}")
-        if sum(self._recent) >= SHARE:
-            raise NumericalError(
-                f"{SHARE} of the last {len(self._recent)} steps had values that are not finite; the last: {skipped}"
-            )
+    return "; ".join([*bad, *describe("gradient", gradients)] or ["the loss or all gradients together are too large"])
 
 
 def check_parameters(parameters: Tensors) -> None:
     """Raises NumericalError where a parameter is not finite: no step can come from it."""
     if not finite(parameters):
         raise NumericalError("; ".join(describe("parameters", parameters)))
+
+
+class SkipCounter:
+    """Ends a training of which too many steps are skipped."""
+
+    def __init__(self) -> None:
+        self._level = 0
+
+    def note(self, skipped: Skipped | None) -> None:
+        """Take in a step. Raises NumericalError where too many were skipped."""
+        self._level = max(0, self._level - 1) if skipped is None else self._level + SKIPPED
+        if skipped is not None and self._level >= LIMIT:
+            raise NumericalError(f"too many steps had values that are not finite; the last: {skipped}")

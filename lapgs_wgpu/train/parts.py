@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import math
+from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -14,7 +15,7 @@ from torch import nn
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.train.densify import DensityRule, published_rule
 from lapgs_wgpu.train.learning_rate import Rate
-from lapgs_wgpu.train.loss_terms import LossTerm, Regularizer, TorchLoss
+from lapgs_wgpu.train.loss_terms import TAKEN_NAMES, LossTerm, Regularizer, WgslLoss
 from lapgs_wgpu.train.optimizer import FrequencyOptimizer
 from lapgs_wgpu.train.step_result import StepResult
 
@@ -52,15 +53,18 @@ class Parts:
         for name, values in (("losses", self.losses), ("callbacks", self.callbacks)):
             if not isinstance(values, Sequence):
                 raise InputError(f"Parts({name}=...) must be a list, got a {type(values).__name__}.")
+        names = Counter(TAKEN_NAMES)
         for term in self.losses:
             if not isinstance(term, LossTerm):
                 raise InputError(
                     f"Parts(losses=...) must list Regularizer, TorchLoss and WgslLoss, got a {type(term).__name__}."
                 )
-            if isinstance(term, Regularizer):
-                _check_call(term.function, f"the function of the loss {term.name!r}", "scene, gaussians, t")
-            if isinstance(term, TorchLoss):
-                _check_call(term.function, f"the function of the loss {term.name!r}", "image, truth")
+            names[term.name] += 1
+            if names[term.name] > 1:
+                raise InputError(f"there are two loss terms named {term.name!r}; give each a name of its own.")
+            if not isinstance(term, WgslLoss):
+                arguments = "scene, gaussians, t" if isinstance(term, Regularizer) else "image, truth"
+                _check_call(term.function, f"the function of the loss {term.name!r}", arguments)
         for callback in self.callbacks:
             _check_call(callback, "a callback", "trainer, result")
         _check_call(self.density, "the rule of density control", "state")

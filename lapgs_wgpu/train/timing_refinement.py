@@ -2,9 +2,9 @@
 
 Films lose and repeat frames, and scenes are rendered from animations of another frame rate, so motion that is even in
 the world goes by jerks in the images. A field that is smooth in time then fits no image. Of each training image, the
-shift in time that fits it best follows by least squares (a step of Gauss-Newton) from pictures of a moment shortly
-before and shortly after its own. What the images around it have in common is the field's delay, not theirs, and is left
-to the field. Images that are measured have the timing between those of the training.
+shift in time that fits it best follows by least squares (a step of Gauss-Newton) from pictures of the scene shortly
+before and shortly after. What the images around it have in common is the field's delay, not theirs, and is left to the
+field. Images that are measured have the timing between those of the training.
 """
 
 from __future__ import annotations
@@ -16,26 +16,27 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lapgs_wgpu.data.views import View, composite
+from lapgs_wgpu.data.views import View
 from lapgs_wgpu.motion.scene import Scene4D
-from lapgs_wgpu.motion.timing import EVEN, Timing
+from lapgs_wgpu.motion.timing import EVEN, Timing, checked_timing
 from lapgs_wgpu.train.distributed import Ranks
+from lapgs_wgpu.train.ground_truth import HostImage
 
-# Of gaps between images (the usual one), before and after: at which pictures are compared, and the largest step.
-REACH = 0.5
-FARTHEST = 1.5  # gaps between images, of a moment from its time
-LEAST = 0.05  # share of an image's squared error that its shift must take away; of even films few shifts do
+# Distances in time are in gaps between images (the usual one).
+LARGEST_SHIFT = 0.5  # of one step, and the distance before and after at which pictures are compared
+FARTHEST = 1.5  # of a field time from its image's time
+LEAST_GAIN = 0.05  # share of an image's squared error that its shift must take away; of even films few shifts do
 AROUND = 8  # images before and after one, whose median shift is the field's delay
 
 
 class TimingRefinement:
-    """How the timing of a scene is learnt.
+    """How the timing of a scene is learnt: for the time of each image the time of the field that the image shows.
 
     Args:
         scene: whose timing it is.
         views: of the training.
-        truth: the image (H, W, 3) of a view; NaN where it does not count.
-        picture: the scene's picture (H, W, 3) of a view, which is compared with it.
+        truth: the image of a view.
+        picture: the scene's picture (H, W, 3) of a view under a timing, which is compared with it.
         gap: the usual distance in time of two images of a camera.
         ranks: which share the work.
     """
@@ -44,84 +45,79 @@ class TimingRefinement:
         self,
         scene: Scene4D,
         views: Sequence[View],
-        truth: Callable[[View], Tensor],
-        picture: Callable[[View], Tensor],
+        truth: Callable[[View], HostImage],
+        picture: Callable[[View, Timing], Tensor],
         gap: float,
         ranks: Ranks,
     ) -> None:
-        self._scene, self._truth, self._picture, self._ranks = scene, truth, picture, ranks
+        self._scene, self._truth, self._picture, self._gap, self._ranks = scene, truth, picture, gap, ranks
         self._times = np.unique([view.time for view in views])
         self._views = [[view for view in views if view.time == t] for t in self._times.tolist()]
-        self._gap = gap
-        self._moments = np.array([scene.timing(t) for t in self._times.tolist()])
+        self._field_times = np.array([scene.timing(t) for t in self._times.tolist()])
 
     def fitted(self, number: int) -> NDArray[np.float64]:
-        """(T,) all moments a step on. number: of the step, from 0 on: of several views of a time, it takes one.
+        """(T,) all field times a step on. number: of the step, from 0 on: of several views of a time, it takes one.
 
         The same bits on every run of one adapter and driver. Raises InputError where an image cannot be read.
         """
         mine = torch.zeros(len(self._times), 2, dtype=torch.float64)
         for row in range(len(mine))[self._ranks.rank :: self._ranks.count]:
             views = self._views[row]
-            mine[row] = torch.tensor(self._fit(views[number % len(views)], float(self._moments[row])))
-        shifts, mended = self._ranks.all_reduce_sum([mine])[0].numpy().T
+            mine[row] = torch.tensor(self._fit(views[number % len(views)], float(self._field_times[row])))
+        shifts, gains = self._ranks.all_reduce_sum([mine])[0].numpy().T
         shifts = shifts - running_median(shifts, AROUND)
-        shifts[shifts**2 * mended < LEAST] = 0.0
-        moved = self._moments + self._gap * shifts.clip(-REACH, REACH)
+        shifts[shifts**2 * gains < LEAST_GAIN] = 0.0
+        moved = self._field_times + self._gap * shifts.clip(-LARGEST_SHIFT, LARGEST_SHIFT)
         farthest = FARTHEST * self._gap
         moved = np.clip(moved, self._times - farthest, self._times + farthest)
         return np.maximum.accumulate(np.clip(moved, 0.0, 1.0))
 
-    def set(self, moments: NDArray[np.float64]) -> None:
-        """Give the scene its timing. moments: (T,), never descending."""
-        self._moments = moments
-        self._scene.timing = EVEN if (moments == self._times).all() else Timing(self._times, moments)
+    def set(self, field_times: NDArray[np.float64]) -> None:
+        """Give the scene its timing. field_times: (T,), never descending."""
+        self._field_times = field_times
+        self._scene.timing = EVEN if (field_times == self._times).all() else Timing(self._times, field_times)
 
-    def _fit(self, view: View, moment: float) -> tuple[float, float]:
-        """How much later the moment is that fits a view best, in gaps between images; and the share of the view's
+    def _fit(self, view: View, now: float) -> tuple[float, float]:
+        """How much later the field time is that fits a view best, in gaps between images; and the share of the view's
         squared error that goes with a shift by one gap, as the square of the shift."""
-        gap = self._gap
-        first, last = max(moment - REACH * gap, 0.0), min(moment + REACH * gap, 1.0)
-        before, now, after = (self._at(view, each).double() for each in (first, moment, last))
-        truth = self._truth(view).double()
-        counts = ~truth.isnan()
-        error, speed = (now - truth)[counts], ((after - before) * (gap / (last - first)))[counts]
+        before, after = max(now - LARGEST_SHIFT * self._gap, 0.0), min(now + LARGEST_SHIFT * self._gap, 1.0)
+        times = np.array([view.time])
+        first, middle, last = (self._picture(view, Timing(times, np.array([t]))).double() for t in (before, now, after))
+        truth, left_out = self._truth(view)
+        counts = ~left_out[..., 0]
+        error = (middle - truth.double())[counts].flatten()
+        speed = ((last - first) * (self._gap / (after - before)))[counts].flatten()
         along, size, whole = (float(a @ b) for a, b in ((speed, error), (speed, speed), (error, error)))
         return (-along / size, size / whole) if size > 0 and whole > 0 else (0.0, 0.0)
 
-    def _at(self, view: View, moment: float) -> Tensor:
-        """The picture of a view at a moment."""
-        known = self._scene.timing
-        self._scene.timing = Timing(np.array([view.time]), np.array([moment]))
-        try:
-            return self._picture(view)
-        finally:
-            self._scene.timing = known
-
     def report(self) -> dict[str, float]:
-        """Of the moments' differences from their times: root mean square and largest, in gaps between images."""
-        apart = np.abs(self._moments - self._times) / self._gap
-        return {"frames": float(np.sqrt(np.mean(apart**2))), "frames_most": float(apart.max())}
+        """Differences of field times from image times: root mean square and largest, in gaps between images."""
+        differences = np.abs(self._field_times - self._times) / self._gap
+        return {"frames": float(np.sqrt(np.mean(differences**2))), "frames_most": float(differences.max())}
 
     def state(self) -> dict[str, Tensor]:
         """Everything that the next step depends on."""
-        return {"moments": torch.from_numpy(self._moments)}
+        return {"moments": torch.from_numpy(self._field_times)}
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
         """Go on from what `state` gave. Raises ValueError where it is of another capture."""
-        moments = state["moments"].numpy()
-        if moments.shape != self._moments.shape or moments.dtype != np.float64:
-            raise ValueError(f"its moments are {moments.dtype} of shape {moments.shape}")
-        if not (((moments >= 0) & (moments <= 1)).all() and (np.diff(moments) >= 0).all()):
-            raise ValueError("its moments do not rise from 0 to 1")
-        self.set(moments)
+        self.set(checked_timing(self._times, state["moments"].numpy()).moments)
 
 
-def image_to_fit(view: View, color: Tensor) -> Tensor:
-    """The image (H, W, 3) of a training view on a background (3,); NaN where the loss ignores it. Raises InputError."""
-    image = torch.from_numpy(composite(view.load(), color.numpy()).astype(np.float32) / 255)
-    ignored = view.load_ignored()
-    return image if ignored is None else image.masked_fill(torch.from_numpy(ignored)[..., None], torch.nan)
+class KeptTiming:
+    """The timing of a scene that this training does not change: part of the state where the scene began with one."""
+
+    def __init__(self, scene: Scene4D) -> None:
+        self._scene = scene
+
+    def state(self) -> dict[str, Tensor]:
+        """Times and field times; nothing where the timing is even."""
+        return {name: torch.from_numpy(values) for name, values in vars(self._scene.timing).items() if len(values)}
+
+    def restore(self, state: Mapping[str, Tensor]) -> None:
+        """Take over what `state` gave. Raises ValueError where it is no timing."""
+        if state:
+            self._scene.timing = checked_timing(state["times"].numpy(), state["moments"].numpy())
 
 
 def running_median(values: NDArray[np.float64], around: int) -> NDArray[np.float64]:

@@ -17,8 +17,8 @@ from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.camera_refinement import CameraDescent, changed_camera, image_motion, scene_points, whitening
 from lapgs_wgpu.train.config import LossWeights
 from lapgs_wgpu.train.fused_loss import render_loss
+from lapgs_wgpu.train.ground_truth import marked_pixels, upload_rgba
 from lapgs_wgpu.train.learning_rate import Rate
-from lapgs_wgpu.train.truth_cache import upload_rgba, without
 
 STEPS = 24
 RATE = Rate(4e-3, 2e-4, STEPS)  # radians of image motion: 1.5 degrees together
@@ -35,7 +35,8 @@ def aligned_view(scene: Scene4D, view: View, background: Tensor, unit: float) ->
     with torch.no_grad():
         gaussians = scene.at(view.time)
     points = scene_points(gaussians.means, gaussians.opacities)
-    truth, descent, camera = upload_rgba(scene.device, without(view.load(), None)), CameraDescent(1), view.camera
+    truth = upload_rgba(scene.device, marked_pixels(view, background))
+    descent, camera = CameraDescent(1), view.camera
     for step in range(1, STEPS + 1):
         change = torch.zeros(7, requires_grad=True)
         render_loss(

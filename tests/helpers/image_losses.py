@@ -13,7 +13,7 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.train.config import LossWeights
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
-from lapgs_wgpu.train.truth_cache import upload_rgba
+from lapgs_wgpu.train.ground_truth import upload_rgba
 
 WEIGHTS = {
     "l1": LossWeights(1.0, 0.0),

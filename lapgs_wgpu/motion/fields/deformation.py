@@ -29,7 +29,7 @@ class Nearby(NamedTuple):
     temporal_weight: float
 
 
-class Moments(NamedTuple):
+class TimeSamples(NamedTuple):
     """Some of the Gaussians at further times. rows: (M,) indices. times: in [0, 1]."""
 
     rows: Tensor

@@ -10,7 +10,7 @@ from torch.utils.checkpoint import checkpoint
 
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.config import GEOMETRY, TEMPORAL_AXES, FieldConfig
-from lapgs_wgpu.motion.fields.deformation import Deformation, Moments, Nearby
+from lapgs_wgpu.motion.fields.deformation import Deformation, Nearby, TimeSamples
 from lapgs_wgpu.motion.fields.device_decoder import Decoder
 from lapgs_wgpu.motion.fields.hash_encoder import HashEncoder, HashGrid
 from lapgs_wgpu.motion.fields.laplacian import LaplacianMotion, TimeMotion
@@ -84,14 +84,14 @@ class GridField(nn.Module):
         t: float,
         dynamics: Tensor | None = None,
         nearby: Nearby | None = None,
-        moments: Moments | None = None,
+        time_samples: TimeSamples | None = None,
     ) -> list[Deformation]:
-        """Return the deformation at time t as `forward` does, and that of the rows of `moments` at each of its times.
+        """Return the deformation at time t as `forward` does, and that of the rows of `time_samples` at each of its times.
 
         All are encoded together, which takes much less time than one after another.
         """
         evaluate = self._on_device if self.on_device and torch.is_grad_enabled() else self._in_torch
-        now, *others, sq_distances = evaluate(means, t, dynamics, nearby, moments)
+        now, *others, sq_distances = evaluate(means, t, dynamics, nearby, time_samples)
         smoothness = _smoothness(sq_distances, nearby) if nearby is not None else None
         return [self._deformation(now)._replace(smoothness=smoothness), *map(self._deformation, others)]
 
@@ -109,21 +109,19 @@ class GridField(nn.Module):
         )
 
     def _in_torch(
-        self, means: Tensor, t: float, dynamics: Tensor | None, nearby: Nearby | None, moments: Moments | None
+        self, means: Tensor, t: float, dynamics: Tensor | None, nearby: Nearby | None, time_samples: TimeSamples | None
     ) -> list[Tensor]:
-        """Return outputs of the geometry heads (N, 14) and, in further columns, of the appearance head.
-
-        The same (M, 14) of each moment follow; then the sums of the squared differences between features of nearby
-        points, for spatial and for space-time features.
-        """
+        """Return outputs of the geometry heads (N, 14) and, in further columns, of the appearance head; the same (M, 14) of
+        each sampled time; and the sums of the squared differences between features of nearby points, for spatial and
+        for space-time features."""
         places = [(means, self.config.grid_time(t))]
         if nearby is not None:
             places.append((means[nearby.rows] + nearby.offsets, self.config.grid_time(nearby.time)))
         decoded = [(t, dynamics)]
-        if moments is not None:
-            their_means, their_dynamics = moments.chosen(means, dynamics)
-            places += [(their_means, self.config.grid_time(time)) for time in moments.times]
-            decoded += [(time, their_dynamics) for time in moments.times]
+        if time_samples is not None:
+            their_means, their_dynamics = time_samples.chosen(means, dynamics)
+            places += [(their_means, self.config.grid_time(time)) for time in time_samples.times]
+            decoded += [(time, their_dynamics) for time in time_samples.times]
         here, *others = self._encoder.encode_all(places)
         sq_distances = []
         if nearby is not None:
@@ -156,13 +154,13 @@ class GridField(nn.Module):
         return torch.cat(outputs, dim=1) * self._head_factors()
 
     def _on_device(
-        self, means: Tensor, t: float, dynamics: Tensor | None, nearby: Nearby | None, moments: Moments | None
+        self, means: Tensor, t: float, dynamics: Tensor | None, nearby: Nearby | None, time_samples: TimeSamples | None
     ) -> list[Tensor]:
         """Return the same as `_in_torch`, computed on the device, without transferring features or their gradients."""
         others = []
-        if moments is not None:
-            their_means, their_dynamics = moments.chosen(means, dynamics)
-            others = [self._on_device(their_means, time, their_dynamics, None, None)[0] for time in moments.times]
+        if time_samples is not None:
+            their_means, their_dynamics = time_samples.chosen(means, dynamics)
+            others = [self._on_device(their_means, time, their_dynamics, None, None)[0] for time in time_samples.times]
         time = self.config.grid_time(t)
         compared = None
         if nearby is not None:

@@ -1,0 +1,127 @@
+"""The images that a training compares its renderings with: decoded, composited and kept in one place.
+
+An image is prepared on the host once: laid on the background where that is one color, with the pixels marked that the
+losses leave out. It then stays on the device, from where the host reads it back where it needs it.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import OrderedDict
+from collections.abc import Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lapgs_wgpu.data.views import View, composite
+from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.device import Device
+
+LEFT_OUT = (1, 0, 0, 0)  # RGBA of a pixel that the losses leave out
+DECODERS = min(4, os.cpu_count() or 1)  # threads that decode images before they are needed
+
+
+class GroundTruth:
+    """The ground truth of training views. The most recently used images stay on the device.
+
+    Args:
+        device: that compares.
+        color: (3,) in [0, 1] that transparent images are laid on; None where each step draws its own.
+        max_bytes: bound on what is kept on the device, 4 bytes a pixel. A larger image is given and not kept.
+    """
+
+    def __init__(self, device: Device, color: Tensor | None, max_bytes: int) -> None:
+        self._device, self._color, self._max_bytes = device, color, max_bytes
+        self._kept: OrderedDict[View, DeviceArray] = OrderedDict()
+        self._coming: dict[View, Future[NDArray[np.uint8]]] = {}
+        self._threads = ThreadPoolExecutor(DECODERS, thread_name_prefix="decode")
+
+    @property
+    def used_bytes(self) -> int:
+        """Bytes that are kept on the device at present."""
+        return sum(array.buffer.nbytes for array in self._kept.values())
+
+    def prefetch(self, views: Iterable[View]) -> None:
+        """Decode the images that are needed next, in the background; `on_device` raises what goes wrong there."""
+        self._coming = {
+            view: self._coming.get(view) or self._threads.submit(marked_pixels, view, self._color)
+            for view in views
+            if view not in self._kept
+        }
+
+    def on_device(self, view: View) -> DeviceArray:
+        """The image of a view, as `render_loss` takes it (`upload_rgba`). Raises InputError where it cannot be read."""
+        array = self._kept.pop(view, None)
+        if array is None:
+            coming = self._coming.pop(view, None)
+            array = upload_rgba(self._device, coming.result() if coming else marked_pixels(view, self._color))
+        if array.buffer.nbytes <= self._max_bytes:
+            while self.used_bytes + array.buffer.nbytes > self._max_bytes:
+                self._kept.popitem(last=False)
+            self._kept[view] = array
+        return array
+
+    def on_host(self, view: View, color: Tensor) -> HostImage:
+        """The image of a view on a background (3,). Raises InputError where it cannot be read."""
+        return host_image(self.on_device(view).read(), color)
+
+    def close(self) -> None:
+        """End the decoding, and forget all images: what follows a training needs the memory."""
+        self._threads.shutdown(cancel_futures=True)
+        self._coming.clear()
+        self._kept.clear()
+
+
+class HostImage(NamedTuple):
+    """An image (H, W, 3) of float32 in [0, 1], and where losses leave it out, (H, W, 1) bool."""
+
+    image: Tensor
+    left_out: Tensor
+
+
+def host_image(texels: NDArray[np.uint32], color: Tensor) -> HostImage:
+    """What `upload_rgba` brought to the device, (H, W), laid on a background (3,) in [0, 1]."""
+    rgba = texels.view(np.uint8).reshape(*texels.shape, 4)
+    image = composite(rgba, color.numpy()).astype(np.float32) / 255
+    return HostImage(torch.from_numpy(image), torch.from_numpy((rgba == LEFT_OUT).all(axis=2))[..., None])
+
+
+def marked_pixels(view: View, color: Tensor | None) -> NDArray[np.uint8]:
+    """The image of a view, (H, W, 3) RGB or (H, W, 4) straight RGBA in 8 bits, with ignored pixels marked.
+
+    A transparent pixel gets no color, whatever the file says: with red 1 it is left out of the losses
+    (shaders/common/on_background.wgsl), with 0 it counts.
+
+    Args:
+        view: of the training.
+        color: (3,) that a transparent image is laid on; None to keep the transparency.
+
+    Raises:
+        InputError: the image or its mask cannot be read.
+    """
+    pixels, ignored = view.load(), view.load_ignored()
+    if color is not None:
+        pixels = composite(pixels, color.numpy())
+    if ignored is None and pixels.shape[2] == 3:
+        return pixels
+    rgba = _rgba(pixels)
+    rgba[rgba[..., 3] == 0] = 0
+    if ignored is not None:
+        rgba[ignored] = LEFT_OUT
+    return rgba
+
+
+def upload_rgba(device: Device, pixels: NDArray[np.uint8]) -> DeviceArray:
+    """(H, W) uint32 on the device, red in the lowest byte, of (H, W, 3) RGB or (H, W, 4) straight RGBA in 8 bits."""
+    return DeviceArray.upload(device, "truth", _rgba(pixels).view(np.uint32)[..., 0])
+
+
+def _rgba(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """A new array (H, W, 4), opaque where the pixels (H, W, 3 or 4) have no alpha."""
+    rgba = np.full((*pixels.shape[:2], 4), 255, np.uint8)
+    rgba[..., : pixels.shape[2]] = pixels
+    return rgba

@@ -1,0 +1,127 @@
+"""Everything that learns in a training, and by what: the Gaussians, the field, and corrections of the images."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+from torch import Tensor
+
+from lapgs_wgpu.data.views import Dataset, View
+from lapgs_wgpu.motion.scene import Scene4D
+from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.train.camera_refinement import CameraRefinement, RefinedCamera, ScenePoints, scene_points
+from lapgs_wgpu.train.config import Config
+from lapgs_wgpu.train.distributed import Ranks
+from lapgs_wgpu.train.exposure import Exposures
+from lapgs_wgpu.train.nonfinite import Tensors
+from lapgs_wgpu.train.optimizer import FrequencyOptimizer, Optimizer
+from lapgs_wgpu.train.parts import Parts
+from lapgs_wgpu.train.resolve_config import nyquist_frequency
+from lapgs_wgpu.train.start import Start, max_field_rates
+
+Refiner = FrequencyOptimizer | Exposures | CameraRefinement
+
+
+class Learners:
+    """The optimizer of the Gaussians and the field, and what learns beside it.
+
+    Args:
+        config: resolved for the dataset.
+        dataset: the capture.
+        parts: learning rates beside those of the configuration.
+        start: the scene, and what cameras were corrected by before.
+
+    Attributes:
+        optimizer: of the Gaussians and the field.
+        cameras: the corrections of the training cameras; None where they are kept.
+        exposures: the corrections of the training images' colors; None where they are taken as they are.
+    """
+
+    def __init__(self, config: Config, dataset: Dataset, parts: Parts, start: Start) -> None:
+        scene = start.scene
+        self._groups = scene.field.parameter_groups() if scene.field else {}
+        rates = parts.rates_of(config.rates.schedules(), scene.parameters, self._groups)
+        self.optimizer = Optimizer(scene.parameters, self._groups, rates)
+        self._frequencies = None
+        if scene.spectrum is not None:
+            limit = nyquist_frequency(dataset)
+            self._frequencies = FrequencyOptimizer(scene.spectrum, config.rates.frequencies, limit)
+        self.exposures = Exposures(len(dataset.train), config.exposure.rate) if config.exposure.enabled else None
+        self.cameras = None
+        if config.cameras.refines(own_footage=dataset.own_footage):
+            self.cameras = CameraRefinement(
+                dataset.cameras, dataset.extent, config.cameras, lambda: _points_of(scene), start.corrections
+            )
+        self._numbers = {view.name: number for number, view in enumerate(dataset.train)}
+
+    def limit_field_rates(self, *, field_fitted: bool) -> None:
+        """Hold the field's learning rates low where discovery has fitted it to nearly all that moves."""
+        self.optimizer.highest = max_field_rates(self._groups) if field_fitted else {}
+
+    def refined_camera(self, view: View) -> RefinedCamera:
+        """The camera of a training view, corrected where it is, and what gets the gradient by it."""
+        return RefinedCamera(view.camera, None) if self.cameras is None else self.cameras.refined(view.camera)
+
+    def camera(self, view: View) -> Camera:
+        """The camera of a training view, corrected where it is."""
+        return self.refined_camera(view).camera
+
+    def exposure(self, view: View) -> Tensor | None:
+        """The correction (3, 4) of the colors of a training view; None where they are taken as they are."""
+        return None if self.exposures is None else self.exposures.values[self._numbers[view.name]]
+
+    def parameters(self) -> Tensors:
+        """All that learns, by group."""
+        return {**self.optimizer.parameters(), **{each.name: [each.values] for each in self._refiners()}}
+
+    def gradients(self) -> dict[str, list[Tensor]]:
+        """Of all parameters that have one, by group."""
+        gradients = self.optimizer.gradients()
+        return gradients | {each.name: [each.values.grad] for each in self._refiners() if each.values.grad is not None}
+
+    def zero_grad(self) -> None:
+        """Forget the gradients."""
+        self.optimizer.zero_grad()
+        for each in self._refiners():
+            each.values.grad = None
+
+    def all_reduce_gradients(self, ranks: Ranks) -> None:
+        """Make every rank's gradients the sums over the ranks."""
+        mine = [gradient for group in self.gradients().values() for gradient in group]
+        for gradient, total in zip(mine, ranks.all_reduce_sum(mine), strict=True):
+            gradient.copy_(total)
+
+    def step(self, step: int, share: float) -> None:
+        """Move all that has a gradient, the Gaussians and the field at a share of the rates of this step."""
+        self.optimizer.step(step, share)
+        for each in self._refiners():
+            each.step(step)
+
+    def state(self) -> dict[str, Mapping[str, Tensor]]:
+        """Everything that the next step depends on, besides the scene and the gradients, by part."""
+        return {
+            "adam": self.optimizer.state(),
+            "frequencies": self._frequencies.state() if self._frequencies else {},
+            "exposure": self.exposures.state() if self.exposures else {},
+            "cameras": self.cameras.state() if self.cameras else {},
+        }
+
+    def restore(self, state: Mapping[str, Mapping[str, Tensor]]) -> None:
+        """Go on from what `state` gave. Raises KeyError or ValueError where it is of another training."""
+        self.optimizer.restore(state.get("adam", {}))
+        if self._frequencies is not None:
+            self._frequencies.restore(state["frequencies"])
+        if self.exposures is not None:
+            self.exposures.restore(state["exposure"])
+        if self.cameras is not None:
+            self.cameras.restore(state["cameras"])
+
+    def _refiners(self) -> Iterator[Refiner]:
+        for each in (self._frequencies, self.exposures, self.cameras):
+            if each is not None:
+                yield each
+
+
+def _points_of(scene: Scene4D) -> ScenePoints:
+    """What moves in the images when a camera moves: the canonical Gaussians."""
+    return scene_points(scene.parameters["means"], scene.parameters["opacity_logits"].sigmoid())

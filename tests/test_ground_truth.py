@@ -1,0 +1,118 @@
+"""The images that a training compares with: which are kept, how they are laid and marked, and their order."""
+
+from __future__ import annotations
+
+import dataclasses
+from contextlib import closing
+
+import numpy as np
+import pytest
+import torch
+from helpers.scenes import front_camera
+
+from lapgs_wgpu.data import Dataset, View, composite
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.train.ground_truth import LEFT_OUT, GroundTruth, marked_pixels
+from lapgs_wgpu.train.view_order import ViewOrder
+
+BLACK = torch.zeros(3)
+
+
+class Source:
+    """A view of a gray image, and the number of times that it was decoded."""
+
+    def __init__(self, level: int, side: int = 20) -> None:
+        self.decodes, self._level, self._side = 0, level, side
+        self.view = View(f"train_{level:03}", front_camera(side, side), 0.0, "made up", self.pixels)
+
+    def pixels(self) -> np.ndarray:
+        self.decodes += 1
+        return np.full((self._side, self._side, 3), self._level, np.uint8)
+
+
+def test_the_most_recently_used_images_stay_on_the_device(device: Device) -> None:
+    sources = [Source(level) for level in range(7)]
+    huge = Source(9, side=60)
+    with closing(GroundTruth(device, BLACK, 10_000)) as truth:
+        for source in sources[:6]:  # 1600 bytes each: six fit
+            assert truth.on_device(source.view) is truth.on_device(source.view)
+            assert (truth.on_device(source.view).read() & 255 == source._level).all()
+        truth.on_device(sources[0].view)
+        truth.on_device(sources[6].view)  # 1 was used least recently
+        for source in (huge, huge, *sources):  # the huge one is larger than the bound
+            truth.on_device(source.view)
+        assert truth.used_bytes == 9600
+    assert huge.decodes == 2
+    assert sources[1].decodes == 2
+
+
+def test_images_that_are_coming_are_decoded_once(device: Device) -> None:
+    sources = [Source(level) for level in range(3)]
+    with closing(GroundTruth(device, BLACK, 0)) as truth:
+        for _ in range(2):
+            truth.prefetch(source.view for source in sources)
+        for source in sources:
+            assert truth.on_host(source.view, BLACK).image[0, 0, 0] == torch.tensor(source._level / 255)
+    assert [source.decodes for source in sources] == [1, 1, 1]
+
+
+def test_a_failure_is_raised_where_the_image_is_needed_and_not_kept(device: Device) -> None:
+    broken = [True]
+
+    def pixels() -> np.ndarray:
+        if broken[0]:
+            raise InputError("r_000.png cannot be decoded.")
+        return np.zeros((4, 5, 3), dtype=np.uint8)
+
+    view = View("train_000", front_camera(5, 4), 0.0, "r_000.png", pixels)
+    with closing(GroundTruth(device, None, 1000)) as truth:
+        truth.prefetch([view])
+        with pytest.raises(InputError, match="r_000"):
+            truth.on_device(view)
+        broken[0] = False
+        assert truth.on_device(view).shape == (4, 5)
+
+
+@pytest.mark.parametrize("color", [(0.0, 0.0, 0.0), (1.0, 1.0, 1.0), None])
+def test_images_lie_on_their_background(color: tuple[float, ...] | None, dataset: Dataset, device: Device) -> None:
+    """On one color they lie before they are uploaded, on a random one in the loss's first pass."""
+    view = dataset.train[0]
+    gray = torch.full((3,), 0.5)
+    with closing(GroundTruth(device, None if color is None else torch.tensor(color), 0)) as truth:
+        rgba = truth.on_device(view).read().view(np.uint8).reshape(*truth.on_device(view).shape, 4)
+        image, left_out = truth.on_host(view, gray)
+    assert not left_out.any()
+    if color is None:
+        assert (rgba == view.load()).all()
+    else:
+        assert (rgba[..., 3] == 255).all()
+        assert (rgba[..., :3] == composite(view.load(), color)).all()
+    expected = composite(view.load(), gray.numpy() if color is None else color)
+    np.testing.assert_array_equal(image.numpy(), expected.astype(np.float32) / 255)
+
+
+def test_ignored_pixels_are_marked_and_transparent_ones_count() -> None:
+    """The mark is a color that a file may hold."""
+    rgba = np.full((2, 3, 4), 7, np.uint8)
+    rgba[0, 0] = LEFT_OUT
+    ignored = np.zeros((2, 3), np.bool_)
+    ignored[1, 2] = True
+    view = View("train_000", front_camera(3, 2), 0.0, "made up", lambda: rgba.copy(), ignored=lambda: ignored)
+    marked = marked_pixels(view, None)
+    assert marked[0, 0].tolist() == [0, 0, 0, 0]
+    assert marked[1, 2].tolist() == list(LEFT_OUT)
+    assert marked[0, 1].tolist() == [7, 7, 7, 7]
+    assert marked_pixels(view, BLACK)[1, 2].tolist() == list(LEFT_OUT)
+    opaque = dataclasses.replace(view, pixels=lambda: rgba[..., :3].copy(), ignored=None)
+    assert marked_pixels(opaque, BLACK).shape == (2, 3, 3)
+
+
+def test_every_view_is_drawn_once_an_epoch(dataset: Dataset) -> None:
+    order = ViewOrder(dataset.train, torch.Generator().manual_seed(3))
+    epochs = [[order.next().name for _ in dataset.train] for _ in range(3)]
+    assert all(sorted(epoch) == sorted(view.name for view in dataset.train) for epoch in epochs)
+    assert epochs[0] != epochs[1]
+    first = order.next()
+    assert [view.name for view in order.coming(3)] == [order.next().name for _ in range(3)]
+    assert first.name not in [view.name for view in order.coming(100)]
