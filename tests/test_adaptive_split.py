@@ -21,7 +21,7 @@ from lapgs_wgpu.train.adaptive_split import (
     shape_difference,
     split_scores,
 )
-from lapgs_wgpu.train.densify import Change, Statistics, densify
+from lapgs_wgpu.train.densify import Change, DensityState, Statistics, published_rule
 from lapgs_wgpu.train.learning_rate import Rate
 from lapgs_wgpu.train.optimizer import Optimizer
 from lapgs_wgpu.train.presets import load_config
@@ -55,7 +55,7 @@ def everyone(rows: Mapping[str, Tensor]) -> Tensor:
 def change(rows: Mapping[str, Tensor], gradients: Tensor) -> Change:
     statistics = Statistics.zeros(len(gradients), torch.device("cpu"))
     statistics.gradients, statistics.views = gradients, torch.ones_like(gradients)
-    return densify(rows, statistics, CONFIG, EXTENT, torch.Generator().manual_seed(0), bound_sizes=False)
+    return published_rule(DensityState(1, rows, statistics, CONFIG, EXTENT, torch.Generator().manual_seed(0)))
 
 
 # Neighbours
@@ -193,7 +193,7 @@ def test_quantile_zero_is_the_plain_split() -> None:
     rows, statistics = make_rows(30), Statistics.zeros(30, torch.device("cpu"))
     statistics.gradients, statistics.views = torch.ones(30), torch.ones(30)
     changes = [
-        densify(rows, statistics, config, EXTENT, torch.Generator().manual_seed(0), bound_sizes=False)
+        published_rule(DensityState(1, rows, statistics, config, EXTENT, torch.Generator().manual_seed(0)))
         for config in (dataclasses.replace(CONFIG, split="plain"), dataclasses.replace(CONFIG, split_quantile=0.0))
     ]
     assert not changes[0].keep.any()
