@@ -97,6 +97,5 @@ def explained_share(clouds: PointClouds, tracks: Tracks, half_side: float) -> fl
     """Of the surface points, those that lie on a track."""
     near = 0
     for cloud, path in zip(clouds.clouds, tracks.paths, strict=True):
-        if len(cloud.scores):
-            near += int((cKDTree(path).query(cloud.positions)[0] < NEAR * half_side).sum())
+        near += int((cKDTree(path).query(cloud.positions)[0] < NEAR * half_side).sum())
     return near / max(clouds.total, 1)
