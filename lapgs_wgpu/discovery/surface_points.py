@@ -119,8 +119,8 @@ def _points(image: Residual, neighbors: list[_Neighbor], always: _Always, half_s
     votes, tolerant, weights = np.zeros(depths.shape), np.zeros(depths.shape), np.zeros(depths.shape)
     for neighbor in neighbors:
         samples = neighbor.image.sample(places)
-        apart = ((samples.colors - rays.blurred[:, None]) ** 2).sum(axis=2)
-        agreement = 1.0 - COLOR_SHARE + COLOR_SHARE * np.exp(-apart / (2 * COLOR_SPREAD**2))
+        sq_distances = ((samples.colors - rays.blurred[:, None]) ** 2).sum(axis=2)
+        agreement = 1.0 - COLOR_SHARE + COLOR_SHARE * np.exp(-sq_distances / (2 * COLOR_SPREAD**2))
         vote = neighbor.weight * samples.mask * agreement
         votes += vote
         tolerant += _blur_along_rays(vote, neighbor.doubt(eye, half_side) / spacing)

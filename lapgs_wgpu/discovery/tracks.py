@@ -244,9 +244,9 @@ def _smoothed(
     """Paths (T, n, 3), each a parabola fitted to the times around: the image of a time shows one side of a part, and
     pulls it towards that side."""
     clock = times / time_step(times)
-    apart = clock[:, None] - clock
-    falloff = np.exp(-0.5 * (apart / SMOOTHING) ** 2)
-    basis = np.stack([np.ones_like(apart), -apart / SMOOTHING, (apart / SMOOTHING) ** 2], axis=2)
+    lapses = clock[:, None] - clock
+    falloff = np.exp(-0.5 * (lapses / SMOOTHING) ** 2)
+    basis = np.stack([np.ones_like(lapses), -lapses / SMOOTHING, (lapses / SMOOTHING) ** 2], axis=2)
     ridge = np.diag([0.0, RIDGE, RIDGE])
     smooth = np.empty_like(paths)
     for k in range(int(part.max()) + 1):
