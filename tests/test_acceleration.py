@@ -97,18 +97,6 @@ def test_nowhere_to_look(config: AccelerationConfig, count: int, times: int) -> 
     assert draw_moments(config, count, 0.5, times, generator) is None
 
 
-@pytest.mark.nightly
-def test_a_training_moves_more_evenly_with_it(dataset: Dataset, device: Device) -> None:
-    bends = []
-    for weight in ("0", "30"):
-        with Trainer(configure(acceleration__weight=weight, schedule__warm_up="0"), dataset, device) as training:
-            results = list(training)
-            assert ("acceleration" in {name for result in results for name in result.terms}) == (weight != "0")
-            before, now, after = (training.scene.at(t).means.detach() for t in (0.4, 0.5, 0.6))
-            bends.append(float((now - (before + after) / 2).norm(dim=1).median()))
-    assert bends[1] < 0.9 * bends[0]
-
-
 def test_it_rests_where_discovery_explains_what_moves(dataset: Dataset, device: Device) -> None:
     with Trainer(
         configure(acceleration__weight="1", acceleration__interval="1", schedule__warm_up="0"), dataset, device

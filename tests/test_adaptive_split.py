@@ -8,22 +8,18 @@ from collections.abc import Mapping
 
 import pytest
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from lapgs_wgpu.splat.rotation import rotation_matrices
 from lapgs_wgpu.train import adaptive_split as module
 from lapgs_wgpu.train.adaptive_split import (
     adaptive_split,
-    covariances,
     divergence,
     nearest,
     probabilities,
     shape_difference,
     split_scores,
 )
-from lapgs_wgpu.train.densify import Change, DensityState, Statistics, published_rule
-from lapgs_wgpu.train.learning_rate import Rate
-from lapgs_wgpu.train.optimizer import Optimizer
+from lapgs_wgpu.train.densify import DensityState, Statistics, published_rule
 from lapgs_wgpu.train.presets import load_config
 
 CONFIG = dataclasses.replace(load_config("dnerf").density, split="adaptive")
@@ -50,12 +46,6 @@ def equals(count: int) -> dict[str, Tensor]:
 
 def everyone(rows: Mapping[str, Tensor]) -> Tensor:
     return torch.ones(len(rows["means"]), dtype=torch.bool)
-
-
-def change(rows: Mapping[str, Tensor], gradients: Tensor) -> Change:
-    statistics = Statistics.zeros(len(gradients), torch.device("cpu"))
-    statistics.gradients, statistics.views = gradients, torch.ones_like(gradients)
-    return published_rule(DensityState(1, rows, statistics, CONFIG, EXTENT, torch.Generator().manual_seed(0)))
 
 
 # Neighbours
@@ -89,37 +79,11 @@ def test_fewer_gaussians_than_neighbours(count: int) -> None:
 # Shapes
 
 
-def test_covariances_are_those_of_the_axes() -> None:
-    quarter_turn_about_z = torch.tensor([[1.0, 0.0, 0.0, 1.0]])
-    scales = torch.tensor([[2.0, 3.0, 4.0]])
-    expected = torch.diag(torch.tensor([9.0, 4.0, 16.0]))[None]
-    assert torch.allclose(covariances(scales.log(), quarter_turn_about_z), expected, atol=1e-5)
-
-
 def test_shape_difference_by_hand() -> None:
     own, other = torch.diag(torch.tensor([4.0, 0.0, 3.0])), torch.diag(torch.tensor([0.0, 0.0, 3.0]))
     two = torch.stack([other, own])[None]
     # |S - S'| = 4, |S| = 5, |S'| = 3; and none from the neighbour that is equal.
     assert shape_difference(own[None], two).tolist() == pytest.approx([(4 / 8 + 0) / 2])
-
-
-def test_rotating_the_world_changes_no_score() -> None:
-    rows, of = make_rows(60), torch.arange(60)
-    turn = torch.tensor([0.3, -0.8, 0.5, 0.1])
-    w, axis = turn[:1] / turn.norm(), turn[1:] / turn.norm()
-    real, imaginary = rows["quats"][:, :1], rows["quats"][:, 1:]
-    turned = rows | {
-        "means": rows["means"] @ rotation_matrices(turn[None])[0].T,
-        "quats": torch.cat(  # the quaternions' product, turn first
-            [
-                w * real - imaginary @ axis[:, None],
-                w * imaginary + real * axis + torch.linalg.cross(axis.expand_as(imaginary), imaginary),
-            ],
-            dim=1,
-        ),
-    }
-    del rows["dynamics"], turned["dynamics"]  # so that distances between means count, too
-    assert torch.allclose(split_scores(turned, of, 10, 0.5), split_scores(rows, of, 10, 0.5), atol=1e-5)
 
 
 # Dynamics
@@ -199,33 +163,3 @@ def test_quantile_zero_is_the_plain_split() -> None:
     assert not changes[0].keep.any()
     assert len(changes[0].added["means"]) == 60
     assert all(torch.equal(changes[0].added[name], changes[1].added[name]) for name in rows)
-
-
-def test_dynamics_and_their_moments_survive_clone_split_and_prune() -> None:
-    rows = make_rows(60)
-    rows["log_scales"][:10] = -9.0
-    rows["opacity_logits"][20:30] = -9.0  # pruned
-    gaussians = {name: nn.Parameter(row.clone()) for name, row in rows.items()}
-    optimizer = Optimizer(gaussians, {}, {name: Rate(1e-3, 1e-3, 1) for name in gaussians})
-    torch.stack([parameter.square().sum() for parameter in gaussians.values()]).sum().backward()
-    optimizer.step(1)
-
-    before = gaussians["dynamics"].detach().clone()
-    moments = {key: moment.clone() for key, moment in optimizer.moments("dynamics").items()}
-    result = change(gaussians, torch.ones(60))
-    assert len(result.added["means"]) > 10
-    assert not result.keep[20:30].any()
-    assert 0 < int(result.keep.sum()) < 60
-    optimizer.edit_rows(result.keep, result.added)
-    kept = int(result.keep.sum())
-    after = gaussians["dynamics"]
-    assert after.shape == (kept + len(result.added["means"]), 16)
-    assert torch.equal(after[:kept], before[result.keep])
-    assert torch.equal(after[kept : kept + 10], before[:10]), "clones"
-    for key, moment in optimizer.moments("dynamics").items():
-        assert moment[:kept].count_nonzero() > 0
-        assert torch.equal(moment[:kept], moments[key][result.keep])
-        assert moment[kept:].count_nonzero() == 0
-        assert len(moment) == len(after)
-    after.square().sum().backward()
-    optimizer.step(2)

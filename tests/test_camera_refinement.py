@@ -36,7 +36,7 @@ from lapgs_wgpu.train.camera_refinement import (
     whitening,
 )
 from lapgs_wgpu.train.config import CamerasConfig
-from lapgs_wgpu.train.evaluate import evaluate, mean_psnr
+from lapgs_wgpu.train.evaluate import evaluate
 from lapgs_wgpu.train.fused_loss import render_loss
 from lapgs_wgpu.train.learning_rate import Rate
 from lapgs_wgpu.train.presets import load_config
@@ -116,30 +116,6 @@ def test_the_change_of_a_camera_is_that_of_the_gradient() -> None:
     assert report["shift_percent"]["largest"] == pytest.approx(100 * np.linalg.norm(change[3:]))
 
 
-def test_corrections_that_are_known_are_gone_on_from() -> None:
-    """Those of shrunk cameras serve the cameras themselves; then the rate is the final one, from the first step on."""
-    given = cameras()
-    small = [camera.resized(20, 15) for camera in given]
-    config = dataclasses.replace(CONFIG, start=100, rate=Rate(1e-2, 1e-4, 50))
-    refinement = CameraRefinement(small, 3.0, dataclasses.replace(config, start=1), lambda: POINTS)
-    refinement.values.grad = torch.randn(5, 7, generator=torch.Generator().manual_seed(0))
-    refinement.step(1)
-    known = refinement.corrections_of({4: small[4], 2: small[2]})
-    later = CameraRefinement(given, 2.0, config, lambda: POINTS, known)
-    for number in (2, 4):
-        moved, expected = later.camera(number), refinement.camera(number)
-        assert np.abs(moved.T_cam_world - given[number].T_cam_world).max() > 1e-4
-        np.testing.assert_allclose(moved.T_cam_world, expected.T_cam_world, atol=1e-14)
-        np.testing.assert_allclose(moved.K[0, 0] / given[number].K[0, 0], expected.K[0, 0] / small[number].K[0, 0])
-    np.testing.assert_allclose(later.camera(0).T_cam_world, given[0].T_cam_world, atol=1e-14)
-    before = later._learnt.clone()
-    later._common = torch.zeros(30, 0, dtype=torch.float64)
-    later.values.grad = torch.ones(5, 7)
-    later.step(1)
-    change = (later._learnt - before)[0].numpy()
-    assert 0.1e-4 < np.sqrt(change @ image_motion(given[0], POINTS, 2.0) @ change) < 2e-4  # the rate is 1e-4
-
-
 def test_what_moves_all_cameras_alike_is_taken_out() -> None:
     """A shift, a turn and a scaling of the whole scene change no image."""
     given = cameras()
@@ -180,16 +156,15 @@ def test_corrections_are_pulled_back() -> None:
     assert torch.equal(pulled._zoom, twin._zoom * factor)
 
 
-@pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize(("focal", "rows"), [(True, 5), (True, 2), (False, 5)])
-def test_the_zoom_goes_down_its_gradient(sign: float, focal: bool, rows: int) -> None:
+def test_the_zoom_goes_down_its_gradient(focal: bool, rows: int) -> None:
     """By the rate in a step, times the share of the cameras with a gradient; only where focal lengths are refined."""
     refinement = refinement_of(cameras(), dataclasses.replace(CONFIG, focal=focal))
     for number in range(3):
         refinement.values.grad = torch.zeros(5, 7)
-        refinement.values.grad[:rows, 6] = sign
+        refinement.values.grad[:rows, 6] = 1.0
         refinement.step(number + 1)
-    expected = -sign * 3 * CONFIG.rate.start * rows / 5 if focal else 0.0
+    expected = -3 * CONFIG.rate.start * rows / 5 if focal else 0.0
     assert float(refinement._zoom) == pytest.approx(expected, rel=1e-6)
     assert not refinement._learnt.any()
 
@@ -278,7 +253,7 @@ def test_test_views_are_aligned_beside_the_unaligned_measures(
 def test_an_interrupted_run_goes_on_to_the_same_bytes(
     device: Device, dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config = configure(cameras__refine="on", cameras__start="5", schedule__save_interval="12")
+    config = configure(cameras__refine="on", cameras__start="5", schedule__save_interval="12", schedule__steps="24")
     train(config, dataset, tmp_path / "one", device=device)
     with monkeypatch.context() as patched:
         interrupt_at(20, patched)
@@ -312,23 +287,6 @@ def test_what_discovery_corrected_stays_corrected(device: Device, dataset: Datas
         training.step()  # at once, though cameras.start is later
         later = [training.cameras.refined(camera).camera for camera in dataset.cameras]
         assert any(np.abs(a.T_cam_world - b.T_cam_world).max() > 1e-7 for a, b in zip(start, later, strict=True))
-
-
-@pytest.mark.nightly
-def test_training_views_are_measured_by_their_corrected_cameras(
-    refined_walk: tuple[Trainer, list[Camera]],
-) -> None:
-    training, _ = refined_walk
-    views = training.dataset.train[:4]
-    as_given = mean_psnr(training.scene, views, "black")
-    assert training.psnr(views) > as_given + 1
-    assert training.evaluate(views)["psnr"] == training.psnr(views)
-    other = [
-        dataclasses.replace(view, camera=view.camera.resized(50, 40), pixels=lambda: np.zeros((40, 50, 3), np.uint8))
-        for view in views
-    ]
-    assert training.psnr(other) == mean_psnr(training.scene, other, "black"), "by cameras that it does not know"
-    assert training.psnr(training.dataset.test) == mean_psnr(training.scene, training.dataset.test, "black")
 
 
 def test_state_of_other_cameras_is_refused() -> None:

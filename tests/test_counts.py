@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,10 +16,7 @@ from wgpu.backends.wgpu_native import GPUBuffer, GPUQueue
 from lapgs_wgpu.gpu import array as array_module
 from lapgs_wgpu.gpu import buffer as buffer_module
 from lapgs_wgpu.gpu import native
-from lapgs_wgpu.gpu.array import DeviceArray
-from lapgs_wgpu.gpu.buffer import Buffer
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.radix_sort import FEW_OWNERS, runs
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.fields.deformation import Nearby
@@ -28,7 +24,6 @@ from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.fields.hash_grid_config import HashConfig
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterize import rasterizer_of
-from lapgs_wgpu.splat.rasterizer import Rasterizer
 from lapgs_wgpu.train.config import LossWeights
 from lapgs_wgpu.train.fused_loss import image_loss_of, render_loss
 from lapgs_wgpu.train.truth_cache import TruthCache
@@ -183,28 +178,6 @@ def test_a_decoder_on_the_device_keeps_its_features_there(device: Device, events
     read = outputs + 4 * 2 * pairs + beside + weights + tables
     assert written <= totals(events)["write"] <= written + 4096
     assert read <= totals(events)["read"] <= read + 256
-
-
-def test_no_buffer_is_made_for_nothing(
-    device: Device, use: Callable[[Rasterizer], Rasterizer], scene: Scene, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A pass works with each buffer that the rasterizer holds."""
-    rasterizer = use(Rasterizer(device))
-    bound: set[Buffer] = set()
-    check, copy = Kernel.check, Commands.copy
-
-    def spy(self: Kernel, arrays: dict[str, DeviceArray]) -> None:
-        bound.update(array.buffer for array in arrays.values())
-        check(self, arrays)
-
-    def copying(self: Commands, source: DeviceArray, target: DeviceArray) -> None:
-        bound.update((source.buffer, target.buffer))
-        copy(self, source, target)
-
-    monkeypatch.setattr(Kernel, "check", spy)
-    monkeypatch.setattr(Commands, "copy", copying)
-    torch_step(scene, oblique_camera(200, 120), device, sh_degree=DEGREE)  # of so many tiles that no sort has one pass
-    assert [name for name, buffer in rasterizer.pool._buffers.items() if buffer not in bound] == []
 
 
 def test_nothing_grows_in_steady_state(

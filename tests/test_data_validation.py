@@ -54,7 +54,7 @@ def turned(camera: Camera) -> Camera:
 
 
 def views(taken: list[Camera], cloud: Cloud = CLOUD) -> list[str]:
-    return check_views(cloud, taken, [f"{i}.png" for i in range(len(taken))], WHERE, "turn them")
+    return check_views(cloud, taken, [f"{i}.png" for i in range(len(taken))], WHERE)
 
 
 def test_nothing_is_wrong_with_a_good_capture(device: Device, tmp_path: Path) -> None:
@@ -180,7 +180,6 @@ def test_a_gap_in_time() -> None:
     assert "between 0.4 and 1," in warning
     (warning,) = check_times(timed([*np.linspace(0.2, 0.4, 10), *np.linspace(0.8, 1, 10)]), moving=True)
     assert "between 0.4 and 0.8" in warning
-    assert "(1 more such gaps)" in warning
 
 
 def test_one_camera_twice_at_a_time() -> None:
@@ -197,7 +196,7 @@ def test_cameras_that_look_away_for_a_while() -> None:
     for i in (1, 4, 5, 6):
         taken[i] = turned(taken[i])
     (warning,) = check_in_view(timed(times, taken=taken), CLOUD.points)
-    assert "toy: all cameras look away from time 0.4 to 0.6 (1 more such spans): train_4, train_5, train_6" in warning
+    assert "toy: all cameras look away from time 0.4 to 0.6: train_4, train_5, train_6" in warning
     together = timed(np.repeat(times, 2), taken=[camera for one in taken for camera in (one, cameras(1)[0])])
     assert check_in_view(together, CLOUD.points) == [], "another camera sees it"
     with pytest.raises(InputError, match="none of 11 training cameras sees where the first Gaussians lie"):

@@ -127,22 +127,9 @@ def test_sizes_are_bounded_from_the_first_reset_on() -> None:
     assert change(make_rows(scales), make_statistics([0.0] * 3, radii), bound_sizes=True, config=unbounded).keep.all()
 
 
-def test_children_are_not_judged_by_their_parents_radius() -> None:
-    result = change(make_rows([SMALL]), make_statistics([1.0], [500.0]), bound_sizes=True)
-    assert result.keep.tolist() == [False]
-    assert len(result.added["means"]) == 1
-
-
 def test_reset_lowers_only() -> None:
     logits = torch.tensor([0.9, 0.009, 0.01]).logit()
     assert reset_opacities(logits, 0.01).sigmoid().tolist() == pytest.approx([0.01, 0.009, 0.01], rel=1e-5)
-
-
-def test_nothing_is_left_to_change() -> None:
-    rows = {name: row[:0] for name, row in make_rows([SMALL]).items()}
-    result = change(rows, Statistics.zeros(0, torch.device("cpu")))
-    assert len(result.keep) == 0
-    assert all(len(row) == 0 for row in result.added.values())
 
 
 def test_schedule() -> None:

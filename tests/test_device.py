@@ -51,10 +51,6 @@ def test_the_best_adapter_is_the_default(opened: Any) -> None:
     [
         ("cpu", SOFTWARE),
         ("integrated", INTEGRATED),
-        ("discrete", DISCRETE),
-        ("CPU", SOFTWARE),
-        ("llvmpipe", SOFTWARE),
-        ("chip", INTEGRATED),
         ("card 9000", DISCRETE),
         ("vulkan", DISCRETE),
     ],

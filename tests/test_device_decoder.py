@@ -21,7 +21,6 @@ from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.fields.deformation import Nearby
 from lapgs_wgpu.motion.fields.device_decoder import Decoder
 from lapgs_wgpu.motion.fields.grid_field import GridField
-from lapgs_wgpu.motion.passes.decoder_passes import DecoderShape
 
 pytestmark = pytest.mark.kernels
 
@@ -211,9 +210,3 @@ def test_without_gradients_the_field_is_torchs(device: Device) -> None:
 )
 def test_which_fields(config: FieldConfig, *, there: bool) -> None:
     assert config.decodes_on_device == there
-
-
-def test_shapes() -> None:
-    shape = DecoderShape(width=8, beside=5, static=6, temporal=0, outputs=17, motion=True)
-    assert shape.inputs == {"beside": (5, 0, 24), "static": (6, 0, 16)}
-    assert shape.weights == {"beside": (24, 5), "static": (16, 6), "heads": (17, 16)}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -11,13 +10,10 @@ import pytest
 import torch
 from motion_scenes import MotionScene
 from motion_writer import write_motion
-from torch import nn
 
-from lapgs_wgpu.data import Dataset, View, load_dataset
-from lapgs_wgpu.data.synthetic import camera_at, cameras
+from lapgs_wgpu.data import Dataset, load_dataset
+from lapgs_wgpu.data.synthetic import cameras
 from lapgs_wgpu.data.views import small_views
-from lapgs_wgpu.discovery import discover as discover_module
-from lapgs_wgpu.discovery import static_fit as static_fit_module
 from lapgs_wgpu.discovery.acceptance import explained_share, rows_with, tracks_in_images
 from lapgs_wgpu.discovery.discover import RAMP_STEPS, discover
 from lapgs_wgpu.discovery.field_fit import fit_field
@@ -30,7 +26,6 @@ from lapgs_wgpu.discovery.trajectories import find_trajectories
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.config import FieldConfig
-from lapgs_wgpu.motion.fields.deformation import Deformation
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.run import train
 from lapgs_wgpu.splat.camera import Camera
@@ -126,27 +121,6 @@ def test_surface_points_lie_on_the_ball_at_every_time(residuals: list[Residual])
     assert np.allclose(np.concatenate([c.colors for c in clouds.clouds]), (0.9, 0.5, 0.2), atol=1e-5)
 
 
-@pytest.mark.nightly
-def test_a_camera_that_walks_slowly_sees_what_moves_in_the_middle_of_the_scene() -> None:
-    """Its images of neighbouring times agree on depths that the ball's own motion feigns."""
-    times = np.linspace(0, 1, 60)
-    walk = [camera_at(1.5 * t, 0.4, size=64, fov_x=0.69) for t in times]
-    black = np.zeros((64, 64, 3), np.float32)
-    views = zip(walk, times, path(times), strict=True)
-    images = [Residual(camera, float(t), disc(camera, center, (0.9, 0.5, 0.2)), black) for camera, t, center in views]
-    clouds = surface_points(images, BOX)
-    for camera, center, points in zip(walk, path(times), clouds.clouds, strict=True):
-        rays = points.positions - camera.position
-        depths = -rays @ camera.position / np.linalg.norm(camera.position) ** 2
-        assert np.abs(depths - 1.0).max() < 0.2  # the middle, where the ball is not: it moves by 0.2 around it
-        towards = center - camera.position
-        apart = np.linalg.norm(np.cross(rays, towards), axis=1) / np.linalg.norm(rays, axis=1)
-        assert apart.max() < 1.3 * RADIUS
-    tracks = find_tracks(clouds, BOX)
-    assert tracks is not None
-    assert tracks.supported.mean() > 0.95
-
-
 def test_what_is_residual_at_all_times_is_no_motion() -> None:
     times = np.linspace(0, 1, 30)
     black = np.zeros((64, 64, 3), np.float32)
@@ -233,6 +207,7 @@ def test_a_trajectory_does_not_change_over_to_another_color_at_a_crossing() -> N
         assert min(np.linalg.norm(each.centers - center, axis=1)[[0, 10, 50, 59]].max() for each in found) < RADIUS
 
 
+@pytest.mark.nightly
 def test_two_balls_are_followed_over_the_whole_clip() -> None:
     t = np.linspace(0, 1, 80)
     one = path(t)
@@ -246,54 +221,12 @@ def test_two_balls_are_followed_over_the_whole_clip() -> None:
         assert (errors(tracks, center) < 0.8).mean() > 0.95
 
 
-@pytest.mark.nightly
-def test_a_track_is_not_drawn_to_the_side_that_is_seen() -> None:
-    """Each time shows one side, whose points are half a radius from the center on average."""
-    center = path(np.linspace(0, 1, 80))
-    tracks = find_tracks(balls(center), BOX)
-    assert tracks is not None
-    middle = tracks.paths.mean(axis=1) - center
-    wander = np.linalg.norm(middle - np.median(middle, axis=0), axis=1)
-    assert np.median(wander) < 0.2 * RADIUS
-
-
-@pytest.mark.nightly
-def test_a_ball_that_is_hidden_for_a_while_is_found_again() -> None:
-    center = path(np.linspace(0, 1, 80))
-    tracks = find_tracks(balls(center, gone=range(50, 54)), BOX)
-    assert tracks is not None
-    assert (errors(tracks, center) < 1.0).mean() > 0.9
-    assert not tracks.supported[51].any()
-
-
-@pytest.mark.nightly
-def test_a_ball_that_enters_late_has_a_key_time_of_its_own() -> None:
-    first, late = path(np.linspace(0, 1, 60)), np.tile([0.0, 0.0, -0.9], (60, 1))
-    early, both = balls(first), balls(first, late)
-    clouds = PointClouds(both.times, early.clouds[:40] + both.clouds[40:])
-    tracks = find_tracks(clouds, BOX)
-    assert tracks is not None
-    assert (errors(tracks, late)[42:] < 0.8).all()
-
-
 def test_patches_that_come_and_go_are_not_followed() -> None:
     """Six places, of which one at a time shows a ball: what a static fit only blurs looks like that."""
     rng = np.random.default_rng(3)
     places = rng.uniform(-0.8, 0.8, (6, 3))
     leaping = places[rng.integers(0, 6, 80)]
     assert find_tracks(balls(leaping), BOX) is None
-
-
-@pytest.mark.nightly
-def test_a_slow_ball_is_followed_though_its_points_jitter(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It jitters by more than it moves from time to time, as what leaps does, but always explains as many points."""
-    center = np.linspace([-0.5, 0, 0], [0.5, 0, 0], 120)
-    clouds = balls(center + 0.03 * np.random.default_rng(4).normal(size=center.shape))
-    tracks = find_tracks(clouds, BOX)
-    assert tracks is not None
-    assert errors(tracks, center).max() < 0.5
-    monkeypatch.setattr("lapgs_wgpu.discovery.tracks.EVEN", 0.0)
-    assert find_tracks(clouds, BOX) is None
 
 
 # The static fit and what it loses ------------------------------------------------------------------------------------
@@ -365,42 +298,6 @@ def test_the_static_fit_has_no_motion_and_small_images(dataset: Dataset) -> None
     assert small_views(dataset.train[:1], 48) == [dataset.train[0]]
 
 
-class FittedAlready:
-    """The training of a static fit that is done, and has learnt by how much each image is too bright."""
-
-    def __init__(self, scene: Scene4D, gains: dict[str, float] | None) -> None:
-        self.scene, self.gains, self.cameras = scene, gains, None
-
-    def exposure_of(self, view: View) -> torch.Tensor | None:
-        return None if self.gains is None else self.gains[view.name] * torch.eye(3, 4)
-
-    def __iter__(self) -> Iterator[None]:
-        return iter(())
-
-    def __enter__(self) -> FittedAlready:
-        return self
-
-    def __exit__(self, *error: object) -> None: ...
-
-
-def test_what_is_exposed_otherwise_does_not_move(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    static, camera, still = still_view(device, 48, 32)
-    gains = {"train_000": 1.3, "train_001": 0.7}
-
-    def exposed(name: str) -> View:
-        image = np.round(255 * (gains[name] * still).clip(0, 1)).astype(np.uint8)
-        return View(name, camera, 0.5, "made up", lambda: image)
-
-    data = Dataset("made up", tuple(exposed(name) for name in gains), ())
-    for known, moving in ((gains, False), (None, True)):
-        training = FittedAlready(static, known)
-        monkeypatch.setattr(static_fit_module, "Trainer", lambda *_, of=training: of)
-        found = static_fit(configure(), data, device, lambda step: None)
-        assert any(image.mask.any() for image in found.images) == moving
-        error = np.abs(found.images[0].still - found.images[0].image).mean()
-        assert (error < 1e-3) == (not moving)
-
-
 # The field, and all together -----------------------------------------------------------------------------------------
 
 
@@ -418,42 +315,6 @@ def test_every_field_learns_tracks(device: Device, kind: str) -> None:
     times, generator = np.linspace(0, 1, 20), torch.Generator().manual_seed(0)
     error = fit_field(scene, tracks, times, 0, 250, generator, lambda step: None)
     assert error < {"laplacian": 0.35, "grid4d": 0.35, "hexplane": 0.65, "mlp": 0.65}[kind] * at_rest
-
-
-def test_a_long_clip_of_several_cameras_is_still_one(
-    dataset: Dataset, device: Device, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Of its images discovery looks at some, no two of one time perhaps; the capture says how many cameras see each."""
-    told: list[bool] = []
-    monkeypatch.setattr(discover_module, "find_tracks", lambda clouds, half_side: object())
-    monkeypatch.setattr(discover_module, "tracks_in_images", lambda *_, together: told.append(together))
-    again = tuple(dataclasses.replace(view, name=f"{view.name} again") for view in dataset.train)
-    monkeypatch.setattr(static_fit_module, "MOST_VIEWS", len(dataset.train))
-    for views in (dataset.train, dataset.train + again):
-        config = configure(discovery__steps="4", discovery__field_steps="2")
-        discover(config, dataclasses.replace(dataset, train=views), device)
-    assert told == [False, True]
-
-
-class Fading(nn.Module):
-    """Changes colors alone."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.rate = nn.Parameter(torch.zeros(3))
-
-    def forward(self, means: torch.Tensor, t: float) -> Deformation:
-        return Deformation(d_dc=(t * self.rate).expand(len(means), -1))
-
-
-@pytest.mark.nightly
-def test_a_field_that_moves_nothing_starts_from_the_static_fit(dataset: Dataset, device: Device) -> None:
-    config = configure()
-    config = dataclasses.replace(config, field=dataclasses.replace(config.field, kind="own"))
-    found = discover(config, dataset, device, Fading())
-    assert "the field moves nothing: nothing is added" in found.summary
-    assert f"a static fit of {len(found.scene)} Gaussians" in found.summary
-    assert not found.field_fitted
 
 
 @pytest.fixture(scope="module")
@@ -530,17 +391,6 @@ def test_a_field_that_knows_the_tracks_learns_slowly_also_when_resumed(
         assert resumed._optimizer.highest == {}
         resumed.restore(started[1])
         assert resumed._optimizer.highest == max_field_rates(["hash", "mlp"])
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize("nearly_all", [0.0, 1.01])
-def test_a_field_that_knows_nearly_all_that_moves_keeps_it(
-    dataset: Dataset, device: Device, monkeypatch: pytest.MonkeyPatch, nearly_all: float
-) -> None:
-    monkeypatch.setattr("lapgs_wgpu.discovery.discover.NEARLY_ALL", nearly_all)
-    found = discover(configure(discovery__field_steps="20"), dataset, device)
-    assert "moving parts" in found.summary
-    assert found.field_fitted == (nearly_all == 0)
 
 
 @pytest.mark.nightly

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -22,7 +21,6 @@ from lapgs_wgpu.motion.scene import load
 from lapgs_wgpu.run import train
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.distributed import Ranks
-from lapgs_wgpu.train.objective import Sample
 from lapgs_wgpu.train.presets import write_toml
 from lapgs_wgpu.train.trainer import Trainer
 
@@ -60,33 +58,6 @@ def test_processes_share_views_evenly_or_not_at_all(dataset: Dataset, device: De
         Trainer(configure(schedule__batch="3"), dataset, device, Ranks(0, 2))
 
 
-def test_every_process_draws_the_same_numbers_and_other_views(
-    dataset: Dataset, device: Device, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    looked: list[str] = []
-    original = Trainer._loss
-
-    def note(self: Trainer, sample: Sample) -> object:
-        looked.append(sample.view.name)
-        return original(self, sample)
-
-    monkeypatch.setattr(Trainer, "_loss", note)
-    monkeypatch.setattr(Ranks, "all_gather", lambda self, tensors: [[tensor] * self.count for tensor in tensors])
-    monkeypatch.setattr(Ranks, "any_rank", lambda self, here: here)
-    monkeypatch.setattr(Ranks, "of_first", lambda self, value: value)
-    states, views = [], []
-    for rank in range(2):
-        training = Trainer(configure(schedule__batch="2", schedule__warm_up="0"), dataset, device, Ranks(rank, 2))
-        looked.clear()
-        training.step()
-        states.append(training._generator.get_state())
-        views.append(list(looked))
-        training.close()
-    assert torch.equal(states[0], states[1])
-    assert len(views[0]) == len(views[1]) == 1
-    assert views[0] != views[1]
-
-
 def test_all_start_as_the_first_one_does(dataset: Dataset, device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     """Devices of different makers would not find the same."""
     config = configure(schedule__batch="2")
@@ -100,31 +71,6 @@ def test_all_start_as_the_first_one_does(dataset: Dataset, device: Device, monke
     assert training.done == 3
     assert found.keys() == first.keys()
     assert all(np.array_equal(found[name], first[name]) for name in first)
-
-
-GROUP_OF_ONE = """
-import atexit, os, pathlib, torch
-atexit.register(lambda: print([task.read_text() for task in pathlib.Path("/proc/self/task").glob("*/comm")]))
-from lapgs_wgpu.train.distributed import join_ranks
-ranks = join_ranks()
-ranks.barrier()
-weight = torch.ones(3, requires_grad=True)
-torch.optim.Adam([weight])
-"""
-
-
-@pytest.mark.nightly
-@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="lists threads by Linux's /proc")
-def test_threads_of_the_group_end_before_python_does() -> None:
-    """Else they abort the process, once in some tens of runs."""
-    place = {"TORCHELASTIC_RUN_ID": "one", "RANK": "0", "LOCAL_RANK": "0", "WORLD_SIZE": "1"}
-    where = {"MASTER_ADDR": "localhost", "MASTER_PORT": "0"}
-    done = subprocess.run(
-        [sys.executable, "-c", GROUP_OF_ONE], capture_output=True, text=True, env={**os.environ, **place, **where}
-    )
-    assert done.returncode == 0, done.stderr
-    assert "python" in done.stdout
-    assert "gloo" not in done.stdout
 
 
 def torchrun(config: Path, out: Path) -> str:

@@ -204,23 +204,6 @@ def test_a_driver_that_rounds_otherwise_loses_no_tile(
     assert np.array_equal(*touched)
 
 
-@pytest.mark.nightly
-@pytest.mark.parametrize("name", ["small", "faint"])
-def test_pads_change_no_bit(monkeypatch: pytest.MonkeyPatch, device: Device, name: str) -> None:
-    """Neither of the image nor of a gradient: as if exactly what is written had been counted, or far more."""
-    scene, camera = SCENES[name]
-    results = []
-    for padding in ("0.025", "0.02", "2.0"):
-        with monkeypatch.context() as patch:
-            altered(patch, device, counted_within(padding))
-            leaves = {key: value.clone().requires_grad_() for key, value in scene.items()}
-            image = rasterize(**leaves, camera=camera, device=device).image
-            image.square().sum().backward()
-            results.append([image.detach(), *(leaf.grad for leaf in leaves.values())])
-    for other in results[1:]:
-        assert all(map(torch.equal, results[0], other))
-
-
 def test_equal_depths_go_by_index(monkeypatch: pytest.MonkeyPatch, device: Device) -> None:
     scene, camera = random_scene(500, 8), front_camera(101, 61)
     scene["means"][:, 2] = 2.0 + 0.5 * (torch.arange(500) % 3)

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
 import math
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,9 +15,7 @@ from helpers.scenes import relative
 from helpers.training import configure
 from numpy.typing import NDArray
 
-from lapgs_wgpu.data import Dataset, load_dataset
-from lapgs_wgpu.data.synthetic import write_synthetic
-from lapgs_wgpu.data.views import View, composite
+from lapgs_wgpu.data import Dataset
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands
@@ -131,41 +126,3 @@ def test_an_interrupted_run_goes_on_to_the_same_bytes(
     resume(config, dataset, tmp_path / "run", device=device)
     first, second = (tmp_path / name / "checkpoint.ply" for name in ("run", "whole"))
     assert first.read_bytes() == second.read_bytes()
-
-
-def flickering(dataset: Dataset) -> Dataset:
-    """All pictures opaque, on dark grey. Each training picture has a gain and an offset of its own for each channel;
-    their means over all pictures are 1 and 0."""
-    rng = np.random.default_rng(0)
-    count = len(dataset.train)
-    gains = np.stack([rng.permutation(np.linspace(0.7, 1.3, count)) for _ in range(3)], axis=1)
-    offsets = np.stack([rng.permutation(np.linspace(-0.1, 0.1, count)) for _ in range(3)], axis=1)
-
-    def pixels(view: View, gain: NDArray[np.float64], offset: NDArray[np.float64]) -> NDArray[np.uint8]:
-        colors = 0.2 + 0.5 * composite(view.load(), np.zeros(3)) / 255
-        return (255 * (gain * colors + offset)).clip(0, 255).round().astype(np.uint8)
-
-    def changed(views: tuple[View, ...], gains: NDArray[np.float64], offsets: NDArray[np.float64]) -> tuple[View, ...]:
-        return tuple(
-            dataclasses.replace(view, pixels=partial(pixels, view, *change))
-            for view, *change in zip(views, gains, offsets, strict=True)
-        )
-
-    plain = np.ones((len(dataset.test), 3))
-    return dataclasses.replace(
-        dataset,
-        train=changed(dataset.train, gains, offsets),
-        test=changed(dataset.test, plain, 0 * plain),
-    )
-
-
-@pytest.mark.nightly
-def test_corrections_recover_the_scene_from_flickering_pictures(device: Device, tmp_path: Path) -> None:
-    still = write_synthetic(tmp_path / "scene", size=48, train_views=16, test_views=4, frequencies=[0.0])
-    data = flickering(load_dataset(still))
-    changes = {"schedule__steps": "400", "density__start": "400", "points__count": "1500"}
-    found = {}
-    for name in ("false", "true"):
-        train(configure("static", exposure__enabled=name, **changes), data, tmp_path / name, device=device)
-        found[name] = json.loads((tmp_path / name / "metrics.json").read_text())["psnr"]
-    assert found["true"] > found["false"] + 1, found

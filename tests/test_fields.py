@@ -94,29 +94,6 @@ def test_every_parameter_is_in_one_group_but_the_frequencies(device: Device, kin
 # The paper's field over Grid4D's
 
 
-def test_without_its_additions_it_is_grid4d(device: Device) -> None:
-    """A_L = 0, d = 0, no appearance head."""
-    for depth in (0, 2):
-        ours = grid_field(device, replace(OURS, appearance="none", depth=depth))
-        theirs = grid_field(device, replace(OURS, kind="grid4d", depth=depth))
-        assert isinstance(ours.motion, LaplacianMotion)
-        with torch.no_grad():
-            ours.motion.alpha.zero_()
-            ours.motion.beta.zero_()
-            weights = ours.state_dict()
-            weights["temporal.weight"] = weights["temporal.weight"][:, OURS.dynamics :]
-        theirs.load_state_dict({name: weights[name] for name in theirs.state_dict()})
-        a, b = ours(POINTS, 0.3, torch.zeros(COUNT, 5)), theirs(POINTS, 0.3)
-        for found, expected in zip(parts(a), parts(b), strict=True):
-            assert float((found - expected).detach().abs().max()) < 1e-6
-        with torch.no_grad():
-            ours.motion.alpha.fill_(0.1)
-        assert float((ours(POINTS, 0.3, torch.zeros(COUNT, 5)).translation - b.translation).detach().abs().max()) > 1e-3
-        with torch.no_grad():
-            ours.motion.alpha.zero_()
-        assert float((ours(POINTS, 0.3, DYNAMICS).translation - b.translation).detach().abs().max()) > 1e-3
-
-
 WRITTEN_OUT = {
     "grid4d": {"kind": "grid4d"},
     "laplacian": {},

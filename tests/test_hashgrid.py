@@ -192,47 +192,7 @@ def test_all_points_in_one_cell(device: Device, lane_levels: bool) -> None:
     check(encoder, 0.2 + 1e-4 * random_points(3000), 0.5)
 
 
-def test_the_levels_go_every_way() -> None:
-    """That the grids above are what their names say."""
-    grids = dict(zip(GRIDS, make_grids(*GRIDS), strict=True))
-    assert all(level.dense for level in grids["dense"].levels)
-    assert not all(level.dense for level in grids["hashed"].levels)
-    assert len(grids["sliced"].sliced) == 9
-    mixed = grids["sliced and hashed"]
-    assert 0 < len(mixed.sliced) < len(mixed.levels)
-    assert {level.dense for i, level in enumerate(mixed.levels) if i not in mixed.sliced} == {False}
-    large = grids["too large to slice"]
-    assert {level.dense for i, level in enumerate(large.levels) if i not in large.sliced} == {True}
-    assert not grids["dense"].sliced
-
-
 # Known values
-
-
-def corner(*place: int, resolution: int) -> list[float]:
-    return [BOUND * (2 * p / (resolution - 1) - 1) for p in place]
-
-
-def test_entries_are_met_at_the_corners(device: Device) -> None:
-    grid = make_grids("one level")[0]
-    points = torch.tensor([corner(x, y, z, resolution=7) for z in range(7) for y in range(7) for x in range(7)])
-    (found,) = HashEncoder(device, [[grid]], BOUND)(points.clamp(-BOUND, BOUND))
-    torch.testing.assert_close(found, grid.table.detach(), rtol=0, atol=1e-4)
-
-
-def test_interpolation_is_smooth_and_keeps_constants(device: Device) -> None:
-    """Weights f^2 (3 - 2f) along each axis."""
-    grid = make_grids("one level")[0]
-    with torch.no_grad():
-        table = grid.table.view(7, 7, 7, 2)  # z, y, x
-        table[..., 0], table[..., 1] = 1.0, 0.0
-        table[:, :, 3, 1] = 1.0  # a wall at the fourth entry along x
-    share = torch.linspace(0, 1, 11)
-    x = BOUND * (2 * (2 + share) / 6 - 1)
-    points = torch.stack([x, 0.3 * torch.ones(11), -0.7 * torch.ones(11)], dim=1)
-    (found,) = HashEncoder(device, [[grid]], BOUND)(points)
-    torch.testing.assert_close(found[:, 0], torch.ones(11), rtol=0, atol=1e-6)
-    torch.testing.assert_close(found[:, 1], share * share * (3 - 2 * share), rtol=0, atol=1e-5)
 
 
 @both_shapes
@@ -289,19 +249,6 @@ def test_fixed_point_does_not_depend_on_the_order(device: Device) -> None:
     shuffled = encoder.backward([(points[order], 0.4)], [d[order] for d in upstream])
     assert torch.equal(forwards[0], shuffled[0])
     assert torch.equal(forwards[1], shuffled[1])
-
-
-def test_both_shapes_agree(device: Device) -> None:
-    """64-bit fixed point keeps what float32 keeps."""
-    names = ("sliced", "too large to slice", "hashed")
-    results = []
-    for lane_levels in (True, False):
-        encoder = HashEncoder(device, apart(make_grids(*names)), BOUND, lane_levels=lane_levels)
-        results.append(run(encoder, random_points(3000), 0.4))
-    (encodings, gradients), (other_encodings, other_gradients) = results
-    assert all(torch.equal(a, b) for a, b in zip(encodings, other_encodings, strict=True))
-    for a, b in zip(gradients, other_gradients, strict=True):
-        assert relative(b, a) < 1e-6
 
 
 @pytest.mark.parametrize("size", [1e-30, 1e30])

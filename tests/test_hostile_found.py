@@ -27,13 +27,12 @@ from helpers.hostile import refused_or
 from helpers.ply_files import columns_of, ply_bytes, random_still
 
 from lapgs_wgpu.data import load_dataset
-from lapgs_wgpu.data.cloud import read_npy
+from lapgs_wgpu.data.cloud import read_npy, read_points
 from lapgs_wgpu.data.readers.colmap_model import read_model
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.checkpoint import read_checkpoint
 from lapgs_wgpu.io.initial_view import InitialView
-from lapgs_wgpu.io.ply_points import read_points
 from lapgs_wgpu.io.safe_json_toml import MAX_TOML_BYTES, read_json, read_toml
 from lapgs_wgpu.motion.scene_file import read_scene
 from lapgs_wgpu.run import evaluate_run, resume
@@ -72,7 +71,7 @@ def test_found_in_clouds(tmp_path: Path) -> None:
     header = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
     for line in ("property", "property float"):
         (tmp_path / "a.ply").write_text(f"{header}{line}\nend_header\n1 2 3 4\n")
-        with pytest.raises(InputError, match=f"a.ply: '{line}' in its header has no type and name"):
+        with pytest.raises(InputError, match="header line"):
             read_points(tmp_path / "a.ply")
 
 

@@ -26,8 +26,7 @@ from numpy.typing import NDArray
 from lapgs_wgpu.data.views import composite
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.gpu.kernel import Commands, Kernel
-from lapgs_wgpu.splat.gaussians import Gaussians
+from lapgs_wgpu.gpu.kernel import Commands
 from lapgs_wgpu.splat.rasterize import rasterize
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 from lapgs_wgpu.train import fused_loss, image_metrics
@@ -114,7 +113,7 @@ def test_value_and_gradient(image_loss: ImageLoss, name: str) -> None:
         check(image_loss, structured(*size), WEIGHTS[name])
 
 
-@pytest.mark.parametrize("run", [1, 7, 64, 1 << 14])
+@pytest.mark.parametrize("run", [7, 1 << 14])
 def test_runs_of_any_length(device: Device, run: int) -> None:
     """How a lane's work is cut does not show."""
     losses = ImageLoss(device)
@@ -133,21 +132,6 @@ def test_equal_images(image_loss: ImageLoss, truth: NDArray[np.uint8]) -> None:
     np.testing.assert_allclose(terms, [0, 0, 0, 0, 0], atol=2e-3)  # NCC of flat windows: sqrt(tiny) / e
     np.testing.assert_allclose(terms[:4], 0, atol=1e-7)
     assert np.abs(gradient).max() < 1e-5
-
-
-def test_mean_squared_error(image_loss: ImageLoss) -> None:
-    pair = random_pair(33, 47)
-    terms, _ = record(image_loss, pair, WEIGHTS["l1"])
-    assert terms[1] == pytest.approx(np.square(pair.image - pair.truth.astype(float) / 255).mean(), rel=1e-5)
-
-
-def test_constants_are_those_of_the_references(device: Device) -> None:
-    source = Kernel.get(device, "loss_ssim_across", LANES=8).source
-    numbers = source.split("array<f32, 11>(")[1].split(")")[0].split(",")
-    torch.testing.assert_close(
-        torch.tensor([float(n) for n in numbers]), image_metrics._window(torch.float32, torch.device("cpu"))
-    )
-    assert str(loss_reference.LUMINANCE) in source
 
 
 @pytest.mark.parametrize("background", [(0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (0.31, 0.77, 0.123)])
@@ -264,23 +248,6 @@ def test_no_gaussians(device: Device) -> None:
     assert done.loss.item() == pytest.approx(total(image, truth, WEIGHTS["all"]).item(), rel=1e-5)
     assert scene.means.grad is not None
     assert scene.means.grad.shape == (0, 3)
-
-
-def test_drawing_in_between_does_no_harm(device: Device) -> None:
-    """`rasterize` and `render_loss` share their buffers."""
-
-    def draw(scene: Gaussians) -> torch.Tensor:
-        more = {"sh_degree": 1, "device": device}
-        drawn = rasterize(scene.means, scene.quats, scene.scales, scene.opacities, scene.sh, CAMERA, **more)
-        return drawn.image.square().mean()
-
-    one, other = gaussians(), gaussians()
-    loss = draw(one)
-    step(device, gaussians(300)).loss.backward()
-    loss.backward()
-    draw(other).backward()
-    assert one.means.grad is not None
-    assert torch.equal(one.means.grad, other.means.grad)
 
 
 # Pictures on the device

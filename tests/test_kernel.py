@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import struct
 import threading
-import weakref
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 
 from lapgs_wgpu.gpu import shader
 from lapgs_wgpu.gpu.array import DeviceArray, read_all
-from lapgs_wgpu.gpu.buffer import Buffer, _height
+from lapgs_wgpu.gpu.buffer import Buffer
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.pool import BufferPool
@@ -67,16 +66,6 @@ def test_missing_and_unknown_arrays_are_named(device: Device, wgsl: dict[str, st
     expected = r"shaders/add\.wgsl: missing arrays \['sum'\], unknown arrays \['summ'\]"
     with Commands(device) as commands, pytest.raises(ShaderError, match=expected):
         commands.dispatch(add(device), 1, a=a, summ=a)
-
-
-def test_what_is_no_array_is_named(device: Device, wgsl: dict[str, str]) -> None:
-    a = numbers(device, [1])
-    for given, expected in (
-        ({"a": a, "sum": np.zeros(4)}, r"add\.wgsl: sum must be a DeviceArray, got ndarray"),
-        ({"a": None, "sum": a}, r"add\.wgsl: a must be a DeviceArray, got NoneType"),
-    ):
-        with Commands(device) as commands, pytest.raises(ShaderError, match=expected):
-            commands.dispatch(add(device), 1, **given)
 
 
 def test_another_dtype_is_refused(device: Device, wgsl: dict[str, str]) -> None:
@@ -180,19 +169,6 @@ def test_dispatches_see_what_those_before_them_wrote(device: Device, wgsl: dict[
     assert b.read().tolist() == [fibonacci[20] * k for k in (1, 2, 3, 4)]
 
 
-def test_nothing_runs_where_the_block_fails(device: Device, wgsl: dict[str, str]) -> None:
-    a, b = numbers(device, [1]), numbers(device, [5])
-
-    def fail() -> None:
-        with Commands(device) as commands:
-            commands.dispatch(add(device), 1, a=a, sum=b)
-            raise ZeroDivisionError
-
-    with pytest.raises(ZeroDivisionError):
-        fail()
-    assert b.read()[0] == 5
-
-
 def test_a_flush_submits_what_there_is(device: Device, wgsl: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
     """Only where there is a watchdog. What follows sees it, and a later error takes nothing back."""
     kernel = add(device)
@@ -290,14 +266,6 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>) {{
     with Commands(device) as commands:
         commands.clear(source)
     np.testing.assert_array_equal(run(change=None), 0 * values)
-
-
-@pytest.mark.parametrize("rows", [1, 2, 3, 4, 5, 4096, 8191, 8192])
-def test_the_height_of_a_table_is_no_power_of_two(rows: int) -> None:
-    """For which the driver would compile shaders anew; but the largest, which would not be allowed."""
-    height = _height(rows)
-    assert rows <= height <= 8192
-    assert height == 8192 or height.bit_count() > 1
 
 
 def test_a_table_whose_copy_was_never_submitted(device: Device, wgsl: dict[str, str]) -> None:
@@ -409,30 +377,6 @@ def test_threads_read_and_write_at_once(configuration: str, wgsl: dict[str, str]
         thread.join(60)
         assert not thread.is_alive()
     assert right == [300, 300]
-
-
-def test_what_is_written_once_keeps_no_staging_buffer(monkeypatch: pytest.MonkeyPatch) -> None:
-    device = open_test_device("gpu-shape")
-    held: weakref.WeakSet[Any] = weakref.WeakSet()
-    made: list[str] = []
-    create = device.wgpu_device.create_buffer
-
-    def spy(**options: Any) -> Any:
-        buffer = create(**options)
-        held.add(buffer)
-        made.append(options["label"])
-        return buffer
-
-    monkeypatch.setattr(device.wgpu_device, "create_buffer", spy)
-    values = np.arange(100_000, dtype=np.uint32)
-    pictures = [numbers(device, values + k, f"picture {k}") for k in range(3)]
-    assert len(held) == 3
-    for _ in range(3):  # what is written again has a staging buffer to itself, and makes none for a third write
-        pictures[0].write(values)
-    assert made == [f"picture {k}" for k in (0, 0, 1, 1, 2, 2, 0)]
-    assert len(held) == 4
-    for k, picture in enumerate(pictures):
-        np.testing.assert_array_equal(picture.read(), values + k)
 
 
 # The pool

@@ -65,13 +65,6 @@ def test_the_stand_in_is_an_mlp_of_features_and_time() -> None:
     torch.testing.assert_close(features(m, t), m.second(inner))
 
 
-def test_the_stand_in_depends_on_time_and_has_as_many_weights() -> None:
-    m = TimeMotion(INPUTS, WIDTH, torch.Generator().manual_seed(0)).double()
-    assert not torch.allclose(features(m, 0.1), features(m, 0.9))
-    ours = sum(p.numel() for name, p in motion().named_parameters() if "first" in name or "second" in name)
-    assert sum(p.numel() for p in m.parameters()) == ours + WIDTH  # time's column
-
-
 # Equation 5
 
 
@@ -116,11 +109,6 @@ def test_variances_stay_within_a_factor_of_their_middle() -> None:
     torch.testing.assert_close(variances[2:], raw[2:])
 
 
-def test_the_gradient_is_asked_for_too_early() -> None:
-    with pytest.raises(ValueError, match="call backward"):
-        motion().frequency_gradient()
-
-
 # The optimizer of the frequencies
 
 STEADY = Rate(1e-3, 1e-3, 1)
@@ -155,12 +143,7 @@ def test_frequencies_stay_below_nyquist_and_steps_are_bounded() -> None:
     assert m.frequencies.tolist() == pytest.approx([0.02, 1.0, 2.0, 3.0, 3.98])
 
 
-def test_without_a_gradient_nothing_moves() -> None:
-    m = motion()
-    FrequencyOptimizer(m, STEADY, limit=4).step(1)
-    assert m.frequencies.tolist() == [0, 1, 2, 3, 4]
-
-
+@pytest.mark.nightly
 def test_frequencies_find_a_motion() -> None:
     """Two tones of 1.3 and 2.6 cycles from a start at 1 and 3: the factor does not keep them from converging."""
     generator = torch.Generator().manual_seed(2)

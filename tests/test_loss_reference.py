@@ -23,9 +23,6 @@ def test_loss_is_the_weighted_sum_of_its_parts() -> None:
     assert total(a, b, LossWeights(0.8, 0.2, 0.3, 0.4)).item() == pytest.approx(more, abs=1e-12)
 
 
-SIZES = [(1, 1), (2, 9), (3, 3), (3, 4), (4, 7), (13, 12), (16, 11), (40, 33)]
-
-
 def test_pyramid_of_a_dot_by_hand() -> None:
     """5x5, a dot in the middle: the first level below is 3x3, then 2x2, where division ends."""
     assert pyramid_sizes(5, 5) == [(5, 5), (3, 3), (2, 2)]
@@ -72,7 +69,7 @@ def test_ncc_of_an_image_without_a_window() -> None:
     assert not a.grad.any()
 
 
-@pytest.mark.parametrize("size", [(2, 4), (3, 4), (12, 13), (9, 16)])
+@pytest.mark.parametrize("size", [(2, 4), (3, 4), (12, 13)])
 @pytest.mark.parametrize("loss", [pyramid_loss, ncc_loss])
 def test_gradients_of_pyramid_and_ncc(loss: Callable[[Tensor, Tensor], Tensor], size: tuple[int, int]) -> None:
     a, b = noisy_pair(*size)

@@ -1,21 +1,14 @@
 """Blocks of memory that are freed and asked for again are not cleared by the system each time, and given back in the
-end; and a step of a training leaves none behind."""
+end."""
 
 from __future__ import annotations
 
-import ctypes
-import gc
 import os
 import platform
 import subprocess
 import sys
 
 import pytest
-from helpers.training import configure
-
-from lapgs_wgpu.data import Dataset
-from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.train.trainer import Trainer
 
 SCRIPT = """
 import resource, sys
@@ -59,6 +52,7 @@ def page_faults(how: str) -> int:
     return int(subprocess.run(command, check=True, capture_output=True, text=True, timeout=120, env=start).stdout)
 
 
+@pytest.mark.nightly
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc can be told")
 def test_freed_memory_is_used_again() -> None:
     assert page_faults("keep") < 100
@@ -70,40 +64,3 @@ def test_freed_memory_is_given_back() -> None:
     command = [sys.executable, "-c", RETURNED]
     freed = int(subprocess.run(command, check=True, capture_output=True, text=True, timeout=120).stdout)
     assert freed > 150e6  # of 200 MB
-
-
-class _Heap(ctypes.Structure):
-    """glibc's struct mallinfo2."""
-
-    _fields_ = [
-        (name, ctypes.c_size_t)
-        for name in ("arena", "ordblks", "smblks", "hblks", "hblkhd", "usmblks", "fsmblks", "used", "fordblks", "top")
-    ]
-
-
-def heap_in_use() -> int:
-    """Bytes that the process has asked the C library for and not freed."""
-    gc.collect()
-    query = ctypes.CDLL(None).mallinfo2
-    query.restype = _Heap
-    heap = query()
-    return int(heap.used + heap.hblkhd)
-
-
-@pytest.mark.nightly
-@pytest.mark.skipif(
-    platform.libc_ver()[0] != "glibc" or not hasattr(ctypes.CDLL(None), "mallinfo2"),
-    reason="the C library does not tell",
-)
-@pytest.mark.parametrize("antialiased", ["true", "false"])
-def test_a_step_leaves_no_memory_behind(dataset: Dataset, device: Device, antialiased: str) -> None:
-    """The shaders' included: Mesa's software driver lost memory in one of them, 3.5 kB for each workgroup."""
-    calm = {"schedule__steps": "1000", "density__start": "900", "density__stop": "950", "points__count": "4000"}
-    with Trainer(configure(antialiased=antialiased, discovery__enabled="false", **calm), dataset, device) as trainer:
-        for _ in range(40):
-            trainer.step()
-        before = heap_in_use()
-        for _ in range(40):
-            trainer.step()
-        left = (heap_in_use() - before) / 40
-    assert left < 30e3

@@ -19,9 +19,8 @@ from lapgs_wgpu.errors import NumericalError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.run import resume, train
 from lapgs_wgpu.train import objective
-from lapgs_wgpu.train.adaptive_split import adaptive_split
 from lapgs_wgpu.train.fused_loss import RenderLoss
-from lapgs_wgpu.train.nonfinite import IN_A_ROW, SHARE, SkipCounter, Skipped, describe, finite
+from lapgs_wgpu.train.nonfinite import IN_A_ROW, SHARE, SkipCounter, Skipped
 from lapgs_wgpu.train.run_folder import STATE, load_state
 from lapgs_wgpu.train.trainer import Trainer
 
@@ -183,41 +182,3 @@ def test_repeated_and_frequent_skips_end_a_training() -> None:
     for _ in range(1000):  # one in five
         for each in (BAD, None, None, None, None):
             health.note(each)
-
-
-def test_every_bad_value_is_found_wherever_it_is() -> None:
-    for bad in (math.nan, math.inf, -math.inf):
-        for at in (0, 1, 15, 16, 17, 62, 99_999):
-            values = torch.ones(100_000)
-            values[at] = bad
-            assert not finite({"a": [torch.zeros(3)], "b": [torch.zeros(0), values]})
-            assert describe("gradient", {"b": [torch.ones(4), values]}) == [
-                "1 of 100004 values of the gradient of b are not finite"
-            ]
-    assert finite({"a": [torch.full((1000,), 1e15)]}, {})
-    assert finite({})
-
-
-def rows(count: int) -> dict[str, torch.Tensor]:
-    generator = torch.Generator().manual_seed(1)
-    return {
-        "means": torch.randn(count, 3, generator=generator),
-        "log_scales": torch.randn(count, 3, generator=generator) - 1,
-        "quats": torch.randn(count, 4, generator=generator),
-        "opacity_logits": torch.zeros(count),
-        "dynamics": torch.randn(count, 16, generator=generator),
-    }
-
-
-@pytest.mark.parametrize(("name", "bad"), [("means", math.nan), ("dynamics", math.inf)])
-def test_the_adaptive_split_leaves_out_what_is_not_finite(name: str, bad: float) -> None:
-    config = configure().density
-    whole = rows(60)
-    candidates = torch.arange(60) % 2 == 0
-    sound = torch.arange(60) % 4 != 0
-    expected = adaptive_split({k: v[sound] for k, v in whole.items()}, candidates[sound], config)
-    assert expected.any()
-    whole[name][~sound, 0] = bad
-    found = adaptive_split(whole, candidates, config)
-    assert torch.equal(found[sound], expected)
-    assert not found[~sound].any()

@@ -53,15 +53,6 @@ def test_dispatches_are_timed_beyond_a_flush(device: Device, profile: Profile, m
     assert min(times) > 0.0
 
 
-@pytest.mark.kernels
-def test_reading_empties_the_profile(device: Device, profile: Profile) -> None:
-    run(device, profile, [1, 1, 1, 1])
-    assert len(profile.read()) == 4
-    assert profile.read() == []
-    run(device, profile, [1])
-    assert len(profile.read()) == 1
-
-
 def test_a_full_profile_says_so(device: Device, profile: Profile) -> None:
     with pytest.raises(RuntimeError, match="Profile of 4 dispatches is full"):
         run(device, profile, [1] * 5)

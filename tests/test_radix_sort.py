@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from lapgs_wgpu.gpu.array import DeviceArray
@@ -131,41 +129,3 @@ def test_one_pool_serves_long_and_short_lists_in_turn(device: Device, lane_runs:
         found, carried = sort(device, keys, lane_runs=lane_runs, pool=pool)
         np.testing.assert_array_equal(found, np.sort(keys))
         np.testing.assert_array_equal(carried, np.argsort(keys, kind="stable"))
-
-
-def test_positive_floats_sort_by_their_bits(device: Device) -> None:
-    depths = np.random.default_rng(0).lognormal(0, 3, 3000).astype(np.float32)
-    for lane_runs in (True, False):
-        found, _ = sort(device, depths.view(np.uint32), lane_runs=lane_runs)
-        np.testing.assert_array_equal(found.view(np.float32), np.sort(depths))
-
-
-@settings(max_examples=25, deadline=None, derandomize=True)
-@given(
-    lane_runs=st.booleans(),
-    given_payload=st.booleans(),
-    bits=st.sampled_from([8, 16, 32]),
-    capacity=st.integers(1, 9000),
-    length=st.integers(0, 10_000),
-    distinct=st.sampled_from([1, 2, 17, LAST]),
-    seed=st.integers(0, 1000),
-)
-def test_any_list(
-    device: Device,
-    lane_runs: bool,
-    given_payload: bool,
-    bits: int,
-    capacity: int,
-    length: int,
-    distinct: int,
-    seed: int,
-) -> None:
-    keys = random_keys(capacity, seed, bits)
-    check(
-        device,
-        keys % np.uint32(distinct),
-        lane_runs=lane_runs,
-        bits=bits,
-        given_payload=given_payload,
-        length=length,
-    )

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 
 import numpy as np
 import pytest
 import torch
 from helpers.scenes import Scene, Step, Weights, front_camera, oblique_camera, random_scene, relative, step
-from helpers.stages import watch
 
-from lapgs_wgpu.gpu import shader
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.splat import buffer_plan
-from lapgs_wgpu.splat import rasterizer as rasterizer_module
 from lapgs_wgpu.splat.rasterize import rasterize, rasterizer_of
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 
@@ -70,19 +65,6 @@ def test_the_same_step_again(device: Device, use: Use, scene: Scene, expected: S
     same(one_step(scene, device), expected)
 
 
-@pytest.mark.nightly
-def test_after_other_images(device: Device, scene: Scene, expected: Step) -> None:
-    """More and fewer Gaussians, another size, another kind of color, nothing at all."""
-    for other, camera, degree in (
-        (random_scene(3000, 2, size=0.3), oblique_camera(130, 90), None),
-        (random_scene(5, 3, sh=16), oblique_camera(7, 3), 3),
-        (random_scene(0, 4), oblique_camera(20, 20), None),
-        (random_scene(10, 5) | {"opacities": torch.zeros(10)}, CAMERA, None),
-    ):
-        step(other, camera, device, sh_degree=degree)
-        same(one_step(scene, device), expected)
-
-
 def test_backward_after_another_image_was_drawn(device: Device, scene: Scene, expected: Step) -> None:
     """Its buffers are gone by then: it is drawn again. Two images of one loss, as with two cameras a step."""
     leaves = {name: value.clone().requires_grad_() for name, value in scene.items()}
@@ -133,21 +115,6 @@ def test_capacity_does_not_matter(device: Device, use: Use, scene: Scene, expect
         assert rasterizer.plan.bands == 1
 
 
-@pytest.mark.nightly
-def test_growing_on_a_later_image(device: Device, use: Use, scene: Scene, expected: Step) -> None:
-    """Small images first; then an overflow between a forward pass and its backward pass."""
-    use(Rasterizer(device, capacity=64))
-    few = random_scene(4, 7, size=0.02)
-    alone = step(few, CAMERA, device)
-    leaves = {name: value.clone().requires_grad_() for name, value in few.items()}
-    drawn = rasterize(**leaves, camera=CAMERA, device=device)
-    same(one_step(scene, device), expected)
-    torch.autograd.backward([drawn.image, drawn.alpha, drawn.depth], list(Weights.random(CAMERA)))
-    for name, leaf in leaves.items():
-        assert leaf.grad is not None
-        assert torch.equal(leaf.grad, alone.gradients[name])
-
-
 def test_a_small_image_does_not_pay_for_a_large_one(device: Device, use: Use, scene: Scene, expected: Step) -> None:
     """Each size has its plan, and finds it again."""
     rasterizer = use(Rasterizer(device, capacity=64))
@@ -161,25 +128,6 @@ def test_a_small_image_does_not_pay_for_a_large_one(device: Device, use: Use, sc
     assert rasterizer.plan == large
     same(step(scene, small, device, sh_degree=DEGREE), first)
     assert rasterizer._drawings == drawings + 2  # none was drawn twice
-
-
-@pytest.mark.nightly
-def test_a_plan_shrinks_when_no_image_needs_it(
-    device: Device, use: Use, monkeypatch: pytest.MonkeyPatch, scene: Scene, expected: Step, total: int
-) -> None:
-    monkeypatch.setattr(buffer_plan, "_WATCHED", 3)
-    rasterizer = use(Rasterizer(device, capacity=100 * total))
-    if rasterizer.config.round_splats:
-        rasterizer.plan = dataclasses.replace(rasterizer.plan, rounds=2)
-    for count in (1, 2, 3, 4):
-        same(one_step(scene, device), expected)
-        assert (rasterizer.plan.capacity < 2 * total + 4096) == (count >= 3)
-    assert rasterizer.plan.rounds == 1
-    assert rasterizer._drawings == 4
-    kept = rasterizer.plan
-    for _ in range(4):
-        same(one_step(scene, device), expected)
-    assert rasterizer.plan == kept
 
 
 @pytest.mark.nightly
@@ -217,36 +165,6 @@ def test_bands_draw_the_same_image(
     again = banded(device, use, total // share)
     same(one_step(scene, device), found)
     assert again.plan.bands == rasterizer.plan.bands
-
-
-@pytest.mark.nightly
-def test_bands_are_no_larger_than_need_be(
-    device: Device, use: Use, scene: Scene, expected: Step, total: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Bindings may hold more than memory and watchdogs bear; a row of tiles still has all that a binding holds."""
-    monkeypatch.setattr(rasterizer_module, "_BAND_CAPACITY", total // 3)
-    rasterizer = use(Rasterizer(device, capacity=64))
-    assert one_step(scene, device).bits["image"] == expected.bits["image"]
-    assert 3 < rasterizer.plan.bands < -(-CAMERA.height // rasterizer.config.tile_height)
-    assert rasterizer.plan.capacity <= total // 3
-    monkeypatch.setattr(rasterizer_module, "_BAND_CAPACITY", 16)
-    rasterizer = use(Rasterizer(device, capacity=16))
-    assert one_step(scene, device).bits["image"] == expected.bits["image"]
-    assert rasterizer.plan.bands == -(-CAMERA.height // rasterizer.config.tile_height)
-    assert rasterizer.plan.capacity > 16
-
-
-@pytest.mark.nightly
-def test_bands_with_backward_after_another_image(device: Device, use: Use, scene: Scene, total: int) -> None:
-    banded(device, use, total // 3)
-    expected = one_step(scene, device)
-    leaves = {name: value.clone().requires_grad_() for name, value in scene.items()}
-    drawn = rasterize(**leaves, camera=CAMERA, sh_degree=DEGREE, background=BACKGROUND, device=device)
-    rasterize(**random_scene(300, 9), camera=oblique_camera(40, 90), device=device)
-    torch.autograd.backward([drawn.image, drawn.alpha, drawn.depth], list(Weights.random(CAMERA)))
-    for name, leaf in leaves.items():
-        assert leaf.grad is not None
-        assert torch.equal(leaf.grad, expected.gradients[name])
 
 
 def test_pictures_that_are_looked_at_change_no_gradients(
@@ -294,37 +212,3 @@ def test_the_order_of_the_gaussians_changes_nothing_but_their_rows(device: Devic
         assert found.bits[name] == expected.bits[name]
     for name in scene:
         assert torch.equal(found.gradients[name], expected.gradients[name][order])
-
-
-def test_the_passes_are_the_same_each_time(
-    device: Device, monkeypatch: pytest.MonkeyPatch, scene: Scene, expected: Step
-) -> None:
-    """Nothing is skipped, or done twice, because of what happened before."""
-    seen: list[str] = []
-    watch(monkeypatch, seen.append)
-    rounds = []
-    for _ in range(2):
-        seen.clear()
-        one_step(scene, device)
-        rounds.append(tuple(seen))
-    assert rounds[0] == rounds[1]
-
-
-@pytest.mark.nightly
-def test_tiles_that_were_counted_and_not_found(device: Device, use: Use, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Should a driver round differently in the passes that count tiles and that list them: the slots that are left over
-    have no record, and take none of an earlier image."""
-    text = shader.shader_text
-    found, one_fewer = "&& slot < end;", "&& slot + select(0u, 1u, id % 50u == 0u) < end;"
-    assert found in text("duplicate_with_keys")
-    monkeypatch.setattr(device, "kernel_cache", {})
-    monkeypatch.setattr(shader, "shader_text", lambda name: text(name).replace(found, one_fewer))
-    scene, other = random_scene(1500, 1, size=0.08), random_scene(1500, 2, size=0.12)
-    use(Rasterizer(device))
-    fresh = step(scene, CAMERA, device)
-    use(Rasterizer(device))
-    step(other, CAMERA, device)
-    used = step(scene, CAMERA, device)
-    assert torch.equal(used.image, fresh.image)
-    for name, gradient in fresh.gradients.items():
-        assert torch.equal(used.gradients[name], gradient)

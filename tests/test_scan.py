@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from lapgs_wgpu.gpu.array import DeviceArray
@@ -103,16 +101,3 @@ def test_sums_end_at_the_largest_word(device: Device, length: int) -> None:
     sums, total = scan(device, values[:2000], source="values", length=2000)
     np.testing.assert_array_equal(sums, np.arange(2000) * ((1 << 21) - 1))
     assert total == 2000 * ((1 << 21) - 1)
-
-
-@settings(max_examples=25, deadline=None, derandomize=True)
-@given(
-    source=st.sampled_from(SOURCES),
-    length=st.integers(0, 7000),
-    spare=st.integers(0, 5000),
-    largest=st.sampled_from([1, 2, 255, (1 << 18) - 1]),
-    seed=st.integers(0, 1000),
-)
-def test_any_length(device: Device, source: str, length: int, spare: int, largest: int, seed: int) -> None:
-    values = np.random.default_rng(seed).integers(0, largest, length + spare + 1, dtype=np.uint32, endpoint=True)
-    check(device, values, source=source, length=length, capacity=length + spare, seed=seed)

@@ -73,15 +73,6 @@ def test_a_static_scene_stands_still(device: Device) -> None:
     assert torch.equal(still.scales, later.scales)
 
 
-def test_an_untrained_field_leaves_the_scene_as_it_is(device: Device) -> None:
-    trained = moving_scene(device)
-    scene = Scene4D(trained.parameters, CONFIG, device)
-    canonical, found = scene.canonical(), scene.at(0.6)
-    torch.testing.assert_close(found.means, canonical.means)
-    torch.testing.assert_close(found.quats, canonical.quats)
-    torch.testing.assert_close(found.scales, canonical.scales)
-
-
 def test_a_picture_trains_every_parameter(device: Device) -> None:
     scene = moving_scene(device)
     now = scene.at(0.4)

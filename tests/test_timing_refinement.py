@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import ClassVar
@@ -18,16 +17,14 @@ from torch import Tensor, nn
 from lapgs_wgpu.data import Dataset
 from lapgs_wgpu.data.timestamps import time_step
 from lapgs_wgpu.data.views import View
-from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.fields.deformation import Deformation
 from lapgs_wgpu.motion.scene import Scene4D, load
 from lapgs_wgpu.motion.timing import EVEN
 from lapgs_wgpu.run import resume, train
-from lapgs_wgpu.train import trainer
 from lapgs_wgpu.train.distributed import SINGLE_PROCESS, Ranks
-from lapgs_wgpu.train.timing_refinement import FARTHEST, TimingRefinement, image_to_fit, running_median
+from lapgs_wgpu.train.timing_refinement import FARTHEST, TimingRefinement, running_median
 from lapgs_wgpu.train.trainer import Trainer
 
 TIMES = np.linspace(0, 1, 11)
@@ -166,7 +163,7 @@ GIVEN = {"timing__refine": "true", "timing__start": "15", "timing__interval": "6
 def test_an_interrupted_training_goes_on_to_the_same_bytes(
     dataset: Dataset, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config = configure(**GIVEN)
+    config = configure(**GIVEN, schedule__steps="28")
     train(config, dataset, tmp_path / "whole", device=device)
     assert load(tmp_path / "whole" / "checkpoint.ply", device).timing is not EVEN
     with monkeypatch.context() as patched:
@@ -183,48 +180,3 @@ def test_a_state_of_other_times_is_refused(dataset: Dataset, device: Device, mom
         state = training.state() | {"timing.moments": np.array(moments)}
         with pytest.raises(ValueError, match="moments"):
             training.restore(state)
-
-
-def test_times_stay_until_the_first_step_that_is_planned(dataset: Dataset, device: Device) -> None:
-    with Trainer(configure(**GIVEN), dataset, device) as training:
-        for result in training:
-            assert (training.scene.timing is EVEN) == (result.step < 15)
-    with Trainer(configure(timing__refine="false"), dataset, device) as training:
-        assert training.timing is None
-
-
-def test_a_correction_that_fails_changes_nothing(
-    dataset: Dataset, device: Device, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The state of the steps before can be saved."""
-
-    def lost(view: View, color: Tensor) -> Tensor:
-        raise InputError("the disk is gone")
-
-    monkeypatch.setattr(trainer, "image_to_fit", lost)
-    with Trainer(configure(**GIVEN), dataset, device) as training:
-        for _ in range(14):
-            training.step()
-        before = training.state()
-        with pytest.raises(InputError, match="the disk is gone"):
-            training.step()
-        assert training.whole
-        for name, value in training.state().items():
-            np.testing.assert_array_equal(value, before[name])
-
-
-def test_it_sees_what_the_losses_see(dataset: Dataset, device: Device) -> None:
-    """Colors and cameras with their corrections; pixels that are ignored do not count."""
-    ignored = np.zeros((32, 32), bool)
-    ignored[:5] = True
-    first = dataclasses.replace(dataset.train[0], ignored=lambda: ignored)
-    masked = dataclasses.replace(dataset, train=(first, *dataset.train[1:]))
-    with Trainer(configure(exposure__enabled="true", cameras__refine="on", **GIVEN), masked, device) as training:
-        assert training._exposures is not None
-        with torch.no_grad():
-            training._exposures.values[0, :, 3] += 0.25
-        plain = training.scene.render(first.camera, first.time, torch.zeros(3)).image
-        torch.testing.assert_close(training._picture(first), plain + 0.25)
-        truth = image_to_fit(first, torch.zeros(3))
-        assert bool(truth[:5].isnan().all())
-        assert not truth[5:].isnan().any()

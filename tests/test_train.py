@@ -25,13 +25,12 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.checkpoint import read_checkpoint
 from lapgs_wgpu.motion.scene import Scene4D, load
 from lapgs_wgpu.run import train
-from lapgs_wgpu.train import objective, trainer
+from lapgs_wgpu.train import objective
 from lapgs_wgpu.train.config import LossWeights
 from lapgs_wgpu.train.dataloader import ImageLoader
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
 from lapgs_wgpu.train.initial_points import initial_points
 from lapgs_wgpu.train.log import Log
-from lapgs_wgpu.train.optimizer import Optimizer
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.resolve_config import resolve_decoder, resolve_for_dataset
 from lapgs_wgpu.train.step_result import StepResult
@@ -123,7 +122,9 @@ def test_the_checkpoint_is_the_last_model(trained_run: Path, dataset: Dataset, d
 def test_the_format_names_what_a_checkpoint_says_of_itself(dataset: Dataset, device: Device, tmp_path: Path) -> None:
     moved = dataclasses.replace(dataset, normalization=Normalization(np.zeros(3), 1.0))
     # Whose times are corrected.
-    config = configure(schedule__warm_up="0", timing__refine="true", timing__start="20", timing__interval="1")
+    config = configure(
+        schedule__warm_up="0", schedule__steps="8", timing__refine="true", timing__start="6", timing__interval="1"
+    )
     train(config, moved, tmp_path / "run", device=device)
     written = read_checkpoint(tmp_path / "run" / "checkpoint.ply").metadata
     text = (Path(__file__).parents[1] / "docs" / "format.md").read_text(encoding="utf-8")
@@ -217,18 +218,11 @@ def test_where_the_decoder_works_follows_from_the_device(
     assert resolve_decoder(config, device) == dataclasses.replace(config, decoder=place)
 
 
-def test_the_place_of_the_decoder_is_told_and_recorded(
-    dataset: Dataset,
-    device: Device,
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+def test_the_place_of_the_decoder_is_recorded(
+    dataset: Dataset, device: Device, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    train(configure(schedule__steps="1"), dataset, tmp_path / "cpu", device=device)
-    assert "decoder:" not in capsys.readouterr().out
     monkeypatch.setattr(device, "is_cpu", False)
     train(configure(schedule__steps="1"), dataset, tmp_path / "gpu", device=device)
-    assert "decoder: on the device\n" in capsys.readouterr().out
     assert load_config(str(tmp_path / "gpu/config.toml")).decoder == "device"
 
 
@@ -247,30 +241,6 @@ def test_nothing_moves_during_the_warm_up(dataset: Dataset, device: Device, tmp_
         torch.equal(ours, initial)
         for ours, initial in zip(moved.field.parameters(), fresh.field.parameters(), strict=True)
     )
-
-
-def test_rates_rise_where_a_training_starts_from_a_scene(
-    dataset: Dataset, device: Device, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Over the steps of the warm-up, which such a training goes without."""
-    shares: list[float] = []
-    original = Optimizer.step
-
-    def noted(self: Optimizer, step: int, share: float = 1.0) -> None:
-        shares.append(share)
-        original(self, step, share)
-
-    monkeypatch.setattr(Optimizer, "step", noted)
-    config = configure(schedule__steps="6", schedule__warm_up="4")
-    with trainer.Trainer(config, dataset, device) as first:
-        for _ in first:
-            pass
-    assert shares == [1.0] * 6
-    shares.clear()
-    with trainer.Trainer(config, dataset, device, scene=first.scene) as second:
-        for _ in second:
-            pass
-    assert shares == [0.25, 0.5, 0.75, 1.0, 1.0, 1.0]
 
 
 def test_cross_correlation_counts_once_the_warm_up_is_over(
@@ -293,21 +263,6 @@ def test_cross_correlation_counts_once_the_warm_up_is_over(
         terms = {"ncc": 0.0} | done.terms
         loss = 0.8 * terms["l1"] + 0.2 * terms["ssim"] + 0.2 * terms["pyramid"] + weights.ncc * terms["ncc"]
         assert done.loss.item() == pytest.approx(loss, rel=1e-5)
-
-
-def test_test_views_are_not_decoded_before_the_training_is_over(
-    dataset: Dataset, device: Device, tmp_path: Path
-) -> None:
-    def fail() -> np.ndarray:
-        assert (tmp_path / "run" / "checkpoint.ply").exists()
-        raise InputError("a test view was read")
-
-    hidden = tuple(dataclasses.replace(view, pixels=fail) for view in dataset.test)
-    with pytest.raises(InputError, match="a test view was read"):
-        train(
-            configure(schedule__steps="3"), dataclasses.replace(dataset, test=hidden), tmp_path / "run", device=device
-        )
-    assert (tmp_path / "run" / "checkpoint.ply").exists()
 
 
 def test_ctrl_c_leaves_a_whole_checkpoint(

@@ -84,17 +84,6 @@ def test_options_of_the_server_need_it(capsys: pytest.CaptureFixture[str]) -> No
         assert capsys.readouterr().err.count("\n") == 1
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere there is always a display")
-def test_without_a_display_it_says_what_works(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    pytest.importorskip("glfw")
-    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
-        monkeypatch.delenv(name, raising=False)
-    assert cli.view_command(["scene.ply"]) == 2
-    assert "--backend http" in capsys.readouterr().err
-
-
 def test_a_missing_library_of_the_system_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -141,24 +130,6 @@ def test_the_lossless_picture_comes_also_after_a_slow_network(sent: Any) -> None
 
     asyncio.run(slow())
     assert log[2:] == [(1, "image/png", 3)]
-
-
-def test_another_browser_takes_over(sent: Any) -> None:
-    """In its own size, without the keys that the former one held; and closing a page closes no canvas."""
-    canvas, _ = sent
-    left: list[str] = []
-    canvas._events.flush()
-    canvas.add_event_handler(lambda event: left.append(event["event_type"]), "pointer_leave")
-    canvas._on_event({"type": "_clients_change", "ids": (1, 2)}, 0)
-    for browser, width in ((1, 300), (2, 200)):
-        canvas._on_event({"type": "resize", "pwidth": width, "pheight": 100, "ratio": 1}, browser)
-    assert canvas.get_physical_size() == (300, 100)
-    canvas._on_event({"type": "close"}, 1)
-    assert not canvas.get_closed()
-    canvas._on_event({"type": "_clients_change", "ids": (2,)}, 0)
-    canvas._events.flush()
-    assert canvas.get_physical_size() == (200, 100)
-    assert left == ["pointer_leave"]
 
 
 # In a browser
@@ -224,6 +195,7 @@ def apart(a: NDArray[np.int16], b: NDArray[np.int16]) -> float:
     return float(np.abs(a - b)[24:].max()) if a.shape == b.shape else np.inf
 
 
+@pytest.mark.nightly
 @pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
 def test_in_a_browser(server: Server, scene: Path, device: Device, tmp_path: Path) -> None:
     first, last = (expected(scene, device, SIZE, time) for time in (0.0, 1.0))

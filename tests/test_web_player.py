@@ -6,24 +6,18 @@ On every push the two must agree; the rest runs every night.
 from __future__ import annotations
 
 import dataclasses
-import functools
-import http.server
 import os
 import struct
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from helpers.browser import CHROMIUM, WEBGPU, Browser
-from helpers.scene_files import moving_scene
 from helpers.trained_scenes import CONFIGS, OURS, trained
 from helpers.waiting import wait_for
 from helpers.web_pages import (
-    FRAMES,
     SIZE,
     Desktop,
     call,
@@ -38,7 +32,6 @@ from lapgs_wgpu.gpu.device import Device, _adapters
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.shader import browser_source
 from lapgs_wgpu.io.lapgs_file import MAGIC
-from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.timing import Timing
 from lapgs_wgpu.run import train
 from lapgs_wgpu.train.open_dataset import open_dataset, resolve_data
@@ -52,7 +45,6 @@ from lapgs_wgpu.viewer.web_page import player_data
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt-get install chromium")
 
-BAR = 106  # pixels at the bottom of a window of SIZE, which the time slider and its buttons cover
 SAME = 90.0  # dB: less is another picture
 TIMES = (0.0, 0.37, 1.0)
 OWN_DEVICE = "const own = GPUAdapter.prototype.requestDevice;"
@@ -179,31 +171,10 @@ def test_every_field(window: Browser, folder: Path, device: Device, name: str) -
 
 
 @pytest.mark.nightly
-def test_a_still_scene(window: Browser, folder: Path, device: Device) -> None:
-    """No time slider, and nothing that plays."""
-    made = export_scene(moving_scene(device, FieldConfig(kind="static"), sh_degree=3), folder, device, "still")
-    open_page(window, made.as_uri())
-    assert same(window, Desktop(made, device), 0.0)
-    assert window.value("document.getElementById('bar').hidden")
-    window.key(" ")
-    assert not window.value("lapgs.playing")
-
-
-@pytest.mark.nightly
-def test_an_antialiased_scene(window: Browser, folder: Path, device: Device) -> None:
-    scene = trained(device, OURS, 300)
-    without = Desktop(export_scene(scene, folder, device, "aliased"), device)
-    scene.antialiased = True
-    made = export_scene(scene, folder, device, "antialiased")
-    open_page(window, made.as_uri())
-    assert same(window, Desktop(made, device), 0.0)
-    assert not same(window, without, 0.0)
-
-
-@pytest.mark.nightly
-def test_a_scene_of_uneven_timing(window: Browser, folder: Path, device: Device) -> None:
+def test_an_antialiased_scene_of_uneven_timing(window: Browser, folder: Path, device: Device) -> None:
     scene = trained(device, OURS, 300)
     without = Desktop(export_scene(scene, folder, device, "even"), device)
+    scene.antialiased = True
     scene.timing = Timing(np.array([0.2, 0.4, 0.8]), np.array([0.1, 0.5, 0.7]))
     made = export_scene(scene, folder, device, "uneven")
     open_page(window, made.as_uri())
@@ -238,35 +209,6 @@ def test_the_desktop_runs_the_same_dispatches(browser: Browser, page: Path, monk
     assert len(found) > 50
 
 
-@pytest.mark.nightly
-def test_default_limits(window: Browser, page: Path, desktop: Desktop) -> None:
-    """A device without any feature or limit beyond WebGPU's own."""
-    script = "GPUAdapter.prototype.requestDevice = function () { return own.call(this, {}); };"
-    open_page(window, page.as_uri() + "?default", first=OWN_DEVICE + script)
-    call(window, "setTime", 0.37)
-    assert same(window, desktop, 0.37)
-
-
-@pytest.mark.nightly
-@pytest.mark.skipif("LAPGS_SOAK" not in os.environ, reason="takes minutes: LAPGS_SOAK=1, or make soak")
-def test_200_000_gaussians(window: Browser, folder: Path, device: Device) -> None:
-    """With grids as those of the preset dnerf: rows of features are more than a binding holds, hence two blocks."""
-    config = dataclasses.replace(OURS, temporal=dataclasses.replace(OURS.temporal, levels=32))
-    scene = trained(device, config, 200_000)
-    assert scene.field is not None
-    with torch.no_grad():
-        scene.parameters["log_scales"] -= 3
-        # Not needles, 350 pixels long and thinner than one, whose rims depend on the last bits (docs/notes/web.md).
-        dict(scene.field.named_parameters())["heads.weight"][-3:] *= 0.1
-    made = export_scene(scene, folder, device, "many")
-    open_page(window, made.as_uri(), seconds=300)
-    desktop = Desktop(made, device)
-    for time in TIMES:
-        call(window, "setTime", time)
-        assert same(window, desktop, time)
-    assert sum(name.startswith("deform") for name, *_ in call(window, "passes", 0.5)) == 2
-
-
 # Input
 
 
@@ -290,24 +232,6 @@ def test_play_pause_and_scrub(browser: Browser, desktop: Desktop) -> None:
 
 
 @pytest.mark.nightly
-def test_keys(browser: Browser, desktop: Desktop) -> None:
-    for key, frame in ((".", 1), (".", 2), (",", 1), ("End", FRAMES - 1), ("Home", 0)):
-        browser.key(key)
-        assert browser.value("lapgs.time") == pytest.approx(frame / (FRAMES - 1))
-    for key, speed in (("]", "2x"), ("[", "1x"), ("[", "0.5x")):
-        browser.key(key)
-        assert browser.value("document.getElementById('speed').value") == speed
-    browser.key("l")
-    assert browser.value("document.getElementById('loop').value") == "bounce"
-    browser.key("?")
-    assert "play or pause" in browser.value("document.getElementById('help').innerText")
-    browser.key("?")
-    assert browser.value("document.getElementById('help').hidden")
-    browser.key("b")
-    assert same(browser, desktop, 0.0, background="black")
-
-
-@pytest.mark.nightly
 def test_orbit_zoom_and_reset(browser: Browser, desktop: Desktop) -> None:
     browser.mouse("mousePressed", 100, 80, down=True)
     browser.mouse("mouseMoved", 160, 100, down=True)
@@ -323,67 +247,6 @@ def test_orbit_zoom_and_reset(browser: Browser, desktop: Desktop) -> None:
     assert same(browser, desktop, 0.0, zoomed)
     browser.key("r")
     assert same(browser, desktop, 0.0)
-
-
-@pytest.mark.nightly
-def test_focus(browser: Browser, page: Path, device: Device) -> None:
-    """A double click, and F where the pointer is, turn about what lies there, as on the desktop."""
-    desktop = Desktop(page, device)
-    for place, act in (((190, 130), "double click"), ((176, 136), "f")):
-        browser.key("r")
-        page_picture(browser)
-        if act == "f":
-            browser.mouse("mouseMoved", *place)
-            browser.key("f")
-        else:
-            for kind, down in (("mousePressed", True), ("mouseReleased", False)):
-                browser.mouse(kind, *place, down=down, clicks=2)
-
-        def focus(camera: ViewCamera, place: tuple[int, int] = place) -> None:
-            depth = desktop.depth(camera, place)
-            K, T = (seen := camera.camera(*SIZE)).K, seen.T_cam_world
-            ray = [(place[0] + 0.5 - K[0, 2]) / K[0, 0], (place[1] + 0.5 - K[1, 2]) / K[1, 1], 1.0]
-            camera.focus_on(camera.position + depth * (T[:3, :3].T @ ray))
-
-        wait_for(lambda focus=focus: same(browser, desktop, 0.0, focus), act)  # type: ignore[misc]
-        assert psnr(desktop.picture(0.0), desktop.picture(0.0, focus)) < 40
-
-
-@pytest.mark.nightly
-def test_fingers(browser: Browser, desktop: Desktop) -> None:
-    """One turns the scene; two, moved apart, come nearer."""
-
-    def touch(kind: str, *points: tuple[float, float]) -> None:
-        fingers = [{"x": x, "y": y, "id": number} for number, (x, y) in enumerate(points)]
-        browser.call("Input.dispatchTouchEvent", type=kind, touchPoints=fingers)
-
-    touch("touchStart", (100, 80))
-    touch("touchMove", (130, 80))
-    touch("touchEnd")
-    assert same(browser, desktop, 0.0, lambda camera: camera.orbit(30 * ORBIT, 0))
-    browser.key("r")
-    touch("touchStart", (100, 100), (140, 100))
-    touch("touchMove", (80, 100), (160, 100))
-    touch("touchEnd")
-
-    def spread(camera: ViewCamera) -> None:  # the browser reports one finger after the other
-        for right, factor in ((20, 40 / 60), (-20, 60 / 80)):
-            camera.pan(0.5 * right / SIZE[1], 0)  # of their middle
-            camera.zoom(factor)
-
-    assert same(browser, desktop, 0.0, spread)
-
-
-@pytest.mark.nightly
-def test_resize_and_density(browser: Browser, desktop: Desktop) -> None:
-    browser.resize((250, 311))
-    wait_for(lambda: browser.value("document.getElementById('canvas').width") == 250, "the canvas")
-    # In a narrow window the width has the field of view that the height has in a wide one: nothing is cut off.
-    narrow = 2 * np.arctan(311 / 250 * np.tan(0.5 * desktop.scene.camera().fov_y))
-    assert same(browser, desktop, 0.0, lambda camera: setattr(camera, "fov_y", narrow), size=(250, 311))
-    browser.call("Emulation.setDeviceMetricsOverride", width=200, height=150, deviceScaleFactor=2, mobile=False)
-    wait_for(lambda: browser.value("document.getElementById('canvas').width") == 400, "the canvas")
-    assert same(browser, desktop, 0.0, size=(400, 300))
 
 
 @pytest.mark.nightly
@@ -406,22 +269,12 @@ def test_address_and_script(window: Browser, page: Path, desktop: Desktop) -> No
         assert "Error" in window.value(f"(() => {{ try {{ {act} }} catch (error) {{ return String(error) }} }})()")
 
 
-# Served, dropped, refused
+# Dropped, lost, refused
 
 
 def header(size: int) -> bytes:
     """Of a compact scene that declares so many bytes."""
     return struct.pack("<8sIQ", MAGIC, 1, size)
-
-
-@pytest.fixture(scope="module")
-def server(folder: Path) -> Iterator[str]:
-    handler = functools.partial(http.server.SimpleHTTPRequestHandler, directory=str(folder))
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as running:
-        handler.log_message = lambda *_: None  # type: ignore[attr-defined]
-        threading.Thread(target=running.serve_forever, daemon=True).start()
-        yield f"http://127.0.0.1:{running.server_port}"
-        running.shutdown()
 
 
 @pytest.mark.nightly
@@ -455,55 +308,6 @@ def test_a_dropped_file(browser: Browser, device: Device, folder: Path, desktop:
     browser.key("End")
     assert same(browser, Desktop(made, device), 1.0)
     browser.open("about:blank")  # the next test begins anew
-
-
-@pytest.mark.nightly
-def test_what_cannot_be_fetched(window: Browser, page: Path, server: str) -> None:
-    for address, reason in (
-        (f"{server}/{page.name}?src=missing.lapgs", "the server says 404"),
-        (f"{server}/{page.name}?src=http://127.0.0.1:9/scene.lapgs", "only files beside this page"),
-        (f"{server}/{page.name}?src={page.name}", "do not begin as a scene does"),
-    ):
-        window.open(address)
-        wait_for(lambda reason=reason: reason in window.note(), reason)  # type: ignore[misc]
-
-
-@pytest.mark.nightly
-def test_in_a_frame(window: Browser, page: Path, server: str, folder: Path) -> None:
-    """Of another page, whose scripts find it in the frame's window."""
-    listen = "<script>window.told = []; addEventListener('message', ({ data }) => told.push(data))</script>"
-    (folder / "outer.html").write_text(
-        f"<!doctype html>{listen}<iframe src='{page.name}#t=0.3&speed=0.1&play'></iframe>"
-    )
-    window.open(f"{server}/outer.html")
-    inner = "document.querySelector('iframe').contentWindow.lapgs"
-    wait_for(lambda: window.value("window.told?.length"), "the scene")
-    assert window.value("told") == [{"lapgs": "ready"}]
-    wait_for(lambda: window.value(f"{inner}.time") > 0.32, "time goes on")
-    window.value(f"{inner}.setTime(0.9)")
-    assert window.value(f"[{inner}.time, {inner}.playing]") == [0.9, False]
-    window.value("document.querySelector('iframe').src = 'scene.html?src=missing.lapgs'")
-    wait_for(lambda: window.value("told.length > 1"), "the message")
-    reason = "missing.lapgs cannot be fetched: the server says 404; check the address."
-    assert window.value("told[1]") == {"lapgs": "failed", "reason": reason}
-
-
-@pytest.mark.nightly
-def test_a_lost_device(window: Browser, page: Path) -> None:
-    """A sentence, and the last picture stays on the screen."""
-    script = "GPUAdapter.prototype.requestDevice = async function (...given)"
-    script += " { return window.device = await own.apply(this, given); };"
-    open_page(window, page.as_uri() + "?lost", first=OWN_DEVICE + script)
-    page_picture(window)
-    kept = "document.getElementById('poster').src.startsWith('blob:')"
-    wait_for(lambda: window.value(kept), "the picture that is kept")
-    before = window.picture()
-    window.value("device.destroy()")
-    wait_for(lambda: "The graphics device was lost" in window.note(), "the sentence")
-    window.key(".")
-    note = int(window.value("document.getElementById('note').getBoundingClientRect().bottom")) + 1
-    assert np.abs(window.picture() - before)[note : SIZE[1] - BAR].max() < 3
-    assert window.value("lapgs.time") == 0
 
 
 @pytest.mark.nightly

@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 
 from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.errors import InputError
-from lapgs_wgpu.io.ply_points import read_points
+from lapgs_wgpu.io.ply_elements import Floats, open_ply
 from lapgs_wgpu.splat.camera import Camera
 
 Array = NDArray[np.float64]
 
-PROBES = 64  # cameras that suffice to determine which points are seen
+CAMERA_SAMPLES = 64  # cameras that suffice to determine which points are seen
+COLORS = ["red", "green", "blue"]
 DENSITY, MIN_CELLS = 8, 4  # points per cell, on average; cells along an axis
 FILLED = 0.95  # share of cells with points from which on a cloud is random: the surfaces of a scene leave most empty
 
@@ -60,6 +61,20 @@ def read_cloud(path: Path) -> Cloud:
     return Cloud(points, np.full_like(points, 0.5) if colors is None else colors)
 
 
+def read_points(path: Path) -> tuple[Floats, Floats | None]:
+    """Read positions (N, 3) of a .ply file, and colors (N, 3) in [0, 1], None unless red, green and blue are bytes.
+
+    Values may be NaN or infinite. Raises InputError if the file is not a point cloud.
+    """
+    with open_ply(path) as ply:
+        vertex = ply.elements.get("vertex")
+        if vertex is None or not {"x", "y", "z"} <= set(vertex.properties):
+            raise InputError(f"{path}: has no element vertex with properties x, y, z, so it is no cloud of points.")
+        colored = all(vertex.properties.get(name) == np.uint8 for name in COLORS)
+        values = ply.columns(vertex, ["x", "y", "z", *(COLORS if colored else [])])
+        return values[:, :3].copy(), values[:, 3:] / np.float32(255) if colored else None
+
+
 def read_npy(path: Path) -> NDArray[np.floating]:
     """Read a .npy file of numbers. Raises InputError."""
     try:
@@ -76,9 +91,9 @@ def read_npy(path: Path) -> NDArray[np.floating]:
 
 
 def views_of(points: Array, cameras: Sequence[Camera], near: float = 0.0, far: float = np.inf) -> NDArray[np.int64]:
-    """Count the cameras that see each point (N, 3) at a depth between near and far, of at most PROBES cameras: (N,)."""
+    """Count the cameras, of at most CAMERA_SAMPLES, that see each point (N, 3) at depths between near and far: (N,)."""
     seen = np.zeros(len(points), dtype=np.int64)
-    for camera in evenly(cameras, PROBES):
+    for camera in evenly(cameras, CAMERA_SAMPLES):
         depths, inside = in_view(points, camera)
         seen += inside & (depths >= near) & (depths <= far)
     return seen

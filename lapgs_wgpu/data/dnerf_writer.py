@@ -97,13 +97,15 @@ def _already_holds(folder: Path, record: str, parameters: Mapping[str, object]) 
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         return False
     try:
-        found = json.loads((folder / record).read_text())
+        recorded = json.loads((folder / record).read_text())
     except (OSError, ValueError):
-        found = None
+        recorded = None
     what = "is not empty"
-    if isinstance(found, dict):
+    if isinstance(recorded, dict):
         other = [
-            f"{key} {found.get(key)} instead of {value}" for key, value in parameters.items() if found.get(key) != value
+            f"{key} {recorded.get(key)} instead of {value}"
+            for key, value in parameters.items()
+            if recorded.get(key) != value
         ]
         if not other:
             return True

@@ -69,7 +69,6 @@ class Capture:
     shares_cameras: frames of equal lens and pose are of one camera that stands still.
     own_footage: poses and cloud come from structure from motion. Then `load` orders the frames by camera and time,
         checks the images and the poses for what goes wrong with own footage, and fills up a sparse cloud.
-    axes_hint: advice for own footage whose cameras look the wrong way.
     """
 
     frames: Sequence[Frame]
@@ -82,7 +81,6 @@ class Capture:
     keeps_coordinates: bool = False
     shares_cameras: bool = False
     own_footage: bool = False
-    axes_hint: str = ""
 
 
 class Reader(NamedTuple):

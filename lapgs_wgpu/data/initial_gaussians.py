@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from lapgs_wgpu.data.cloud import PROBES, in_view, points_in_view
+from lapgs_wgpu.data.cloud import CAMERA_SAMPLES, in_view, points_in_view
 from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.splat.camera import Camera
@@ -71,7 +71,7 @@ def limit_optical_depth(
 
     points: (n, 3), world units. scales: (n,), world units. opacity: of each Gaussian. Returns (n,) scales.
     """
-    depths = [_optical_depth(points, scales, opacity, camera) for camera in evenly(cameras, PROBES)]
+    depths = [_optical_depth(points, scales, opacity, camera) for camera in evenly(cameras, CAMERA_SAMPLES)]
     return (scales * min(1.0, (MAX_OPTICAL_DEPTH / max(float(np.median(depths)), 1e-9)) ** 0.5)).astype(np.float32)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import sys
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
@@ -33,23 +34,21 @@ class Fields:
 
     def required(self, name: str) -> Any:
         """Return a field of any type. Raises InputError where it is missing."""
-        return required(self.values, name, self.where, "which this format needs")
+        if name not in self.values:
+            raise InputError(f"{self.where} has no field {name}, which this format needs.")
+        return self.values[name]
 
     def number(self, name: str, least: float = -LARGEST_ENTRY, most: float = LARGEST_ENTRY) -> float:
-        """Return a finite number within bounds. Raises InputError."""
-        value = finite(self.required(name), name, self.where)
-        if not least <= value <= most:
-            raise InputError(f"{self.where}: {name} is {value:g}, and must be {least:g} to {most:g}.")
-        return value
+        """Return a number within bounds. Raises InputError."""
+        return number(self.required(name), name, self.where, least, most)
 
     def side(self, name: str) -> int:
         """Return a side of an image in pixels. Raises InputError."""
         return round(self.number(name, 1, LARGEST_SIDE))
 
-    def vector(self, name: str, length: int, default: list[float] | None = None) -> NDArray[np.float64]:
-        """Return (length,) finite numbers, `default` where the field is missing. Raises InputError."""
-        return vector(self.required(name) if default is None else self.values.get(name, default), length, name,
-                      self.where)  # fmt: skip
+    def vector(self, name: str, length: int) -> NDArray[np.float64]:
+        """Return (length,) numbers of at most LARGEST_ENTRY. Raises InputError."""
+        return vector(self.required(name), length, name, self.where)
 
     def entries(self, name: str, count: int | None = None) -> list[Any]:
         """Return a list of at least one entry, or of `count`. Raises InputError."""
@@ -76,36 +75,26 @@ def read_json(path: Path) -> Fields:
     return as_fields(safe_json_toml.read_json(path), str(path))
 
 
-def required(data: dict[str, Any], name: str, where: str | Path, hint: str) -> Any:
-    """Return a required field. hint: the reason, which ends the error after a comma. Raises InputError."""
-    if name not in data:
-        raise InputError(f"{where} has no field {name}, {hint}.")
-    return data[name]
-
-
-def number(value: Any, name: str, where: str | Path) -> float:
-    """Convert a JSON number to a float; infinity if it exceeds the range, NaN is allowed. Raises InputError."""
+def number(
+    value: Any, name: str, where: str | Path, least: float = -sys.float_info.max, most: float = sys.float_info.max
+) -> float:
+    """Convert a JSON number within bounds to a float; NaN and infinity never are. Raises InputError."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise InputError(f"{where}: {name} must be made of numbers, got {kind(value)}.")
     try:
-        return float(value)
+        converted = float(value)
     except OverflowError:  # an integer of more than 308 digits
-        return math.inf
-
-
-def finite(value: Any, name: str, where: str | Path) -> float:
-    """Convert a finite JSON number to a float. Raises InputError."""
-    converted = number(value, name, where)
-    if not math.isfinite(converted):
-        raise InputError(f"{where}: {name} must be a finite number, got {converted:g}.")
+        converted = math.inf
+    if not least <= converted <= most:  # true for NaN, too
+        raise InputError(f"{where}: {name} must be a finite number from {least:g} to {most:g}, got {converted:g}.")
     return converted
 
 
 def vector(value: Any, length: int, name: str, where: str | Path) -> NDArray[np.float64]:
-    """Convert a JSON list to (length,) finite numbers. Raises InputError."""
+    """Convert a JSON list to (length,) numbers of at most LARGEST_ENTRY. Raises InputError."""
     if not isinstance(value, list) or len(value) != length:
         raise InputError(f"{where}: {name} must be a list of {length} numbers, got {kind(value)}.")
-    return np.array([finite(entry, name, where) for entry in value])
+    return np.array([number(entry, name, where, -LARGEST_ENTRY, LARGEST_ENTRY) for entry in value])
 
 
 def check_inside(name: str, field: str, where: str | Path) -> None:

@@ -203,7 +203,7 @@ def _check_cloud(capture: Capture, shots: Sequence[_Shot], training: Sequence[Ca
     warnings = []
     if capture.own_footage:
         cameras, names = [shot.camera for shot in shots], [shot.frame.name.file for shot in shots]
-        warnings = check_views(capture.cloud, cameras, names, capture.source, capture.axes_hint)
+        warnings = check_views(capture.cloud, cameras, names, capture.source)
     check_cloud(capture.cloud, training, capture.source)
     return warnings
 

@@ -11,12 +11,15 @@ from lapgs_wgpu.data.cloud import Cloud, points_in_view
 from lapgs_wgpu.data.focus import are_parallel, focus_of
 from lapgs_wgpu.data.frames import Capture, Frame
 from lapgs_wgpu.data.normalize import BOX, Cube, Normalization, cube_in_view, cube_of_points
+from lapgs_wgpu.data.poses import AXES_HINT
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
 
 CUBE_POINTS = 4096  # random points that determine the cube of a capture without a cloud
-DENSE = 4096  # points; a smaller cloud is filled up: Gaussians multiply too slowly to fill what it leaves empty
-NEAREST, FURTHEST = 0.25, 2.0  # depths relative to the distance of the focus, for own footage without a cloud
+MIN_CLOUD_POINTS = (
+    4096  # points; a smaller cloud is filled up: Gaussians multiply too slowly to fill what it leaves empty
+)
+NEAR_FACTOR, FAR_FACTOR = 0.25, 2.0  # depths relative to the distance of the focus, for own footage without a cloud
 
 
 class Placement(NamedTuple):
@@ -77,9 +80,9 @@ def _depths(
     if 2 * behind > len(cameras):
         raise InputError(
             f"{capture.source}: there is no cloud, and {behind} of {len(cameras)} cameras look away from the point "
-            f"nearest to all optical axes: {capture.axes_hint}, or give a cloud."
+            f"nearest to all optical axes: {AXES_HINT}, or give a cloud."
         )
-    near, far = NEAREST * float(depth[depth > 0].min()), FURTHEST * float(depth.max())
+    near, far = NEAR_FACTOR * float(depth[depth > 0].min()), FAR_FACTOR * float(depth.max())
     if not are_parallel(cameras):
         return (near, far), []
     return (near, far), [
@@ -99,14 +102,14 @@ def _cube(capture: Capture, cameras: Sequence[Camera], depths: tuple[float, floa
 
 
 def _filled(cloud: Cloud, cameras: Sequence[Camera]) -> Cloud:
-    """Fill up a cloud to DENSE points.
+    """Fill up a cloud to MIN_CLOUD_POINTS points.
 
     The new points are random where views overlap, between the depths of the cloud. Each has the color of the nearest
     old one.
     """
     from scipy.spatial import cKDTree  # slow to import
 
-    missing = DENSE - len(cloud.points)
+    missing = MIN_CLOUD_POINTS - len(cloud.points)
     if missing <= 0:
         return cloud
     points = cloud.points.astype(np.float64)

@@ -23,17 +23,17 @@ Array = NDArray[np.float64]
 SIDE = 168  # pixels, of the images that are compared
 IMAGES = 25  # of a camera, whose median shows what stands still
 CAMERAS = 24  # of a rig, at most
-OTHERS = 6  # the nearest cameras, with which one is compared
+NEIGHBOURS = 6  # the nearest cameras, with which one is compared
 DEPTHS = 128  # planes, evenly in 1 / depth
 WINDOW = 7  # pixels; side of the square whose colors are compared
-LEAST = 0.6  # normalized cross-correlation of a surface's image in two cameras
+MIN_CORRELATION = 0.6  # normalized cross-correlation of a surface's image in two cameras
 CONFIRMED = 2  # other cameras that must find the same depth
 NEAR = 2.5  # planes by which two cameras' depths may differ
 FLAT = 1e-8  # product of two variances, below which windows are flat and look like nothing
 
 
 class Surface(NamedTuple):
-    """points: (N, 3) world units. colors: (N, 3) in [0, 1]. share: of all pixels, those whose depth is known."""
+    """points: (N, 3) world units. colors: (N, 3) in [0, 1]. share: of all pixels, those whose depth is point_count."""
 
     points: NDArray[np.float32]
     colors: NDArray[np.float32]
@@ -61,7 +61,7 @@ def still_surface(dataset: Dataset) -> Surface | None:
     near, far = dataset.depths
     planes = np.linspace(1 / far, 1 / near, DEPTHS)
     maps = [_sweep(still, _nearest(still, stills), planes) for still in stills]
-    points, colors, known, every = [], [], 0, 0
+    points, colors, point_count, pixel_count = [], [], 0, 0
     for i, (still, inverse) in enumerate(zip(stills, maps, strict=True)):
         places = _places(still.camera, 1 / inverse.ravel())
         agreeing = sum(
@@ -72,27 +72,27 @@ def still_surface(dataset: Dataset) -> Surface | None:
         kept = np.isfinite(inverse.ravel()) & (agreeing >= CONFIRMED)
         points.append(places[kept].astype(np.float32))
         colors.append(still.colors.reshape(-1, 3)[kept])
-        known, every = known + int(kept.sum()), every + kept.size
-    return Surface(np.concatenate(points), np.concatenate(colors), known / every)
+        point_count, pixel_count = point_count + int(kept.sum()), pixel_count + kept.size
+    return Surface(np.concatenate(points), np.concatenate(colors), point_count / pixel_count)
 
 
 def _stills(dataset: Dataset) -> list[_Still]:
-    found = []
+    stills = []
     for camera in evenly(dataset.cameras, CAMERAS):
         views = sorted((view for view in dataset.train if view.camera is camera), key=lambda view: view.time)
         small = small_views(evenly(views, IMAGES), SIDE)
         colors = (np.median([view.load()[..., :3] for view in small], axis=0) / 255).astype(np.float32)
         gray = colors.mean(axis=2, dtype=np.float64)
         mean = _box(gray)
-        found.append(_Still(small[0].camera, colors, gray, mean, _box(gray**2) - mean**2))
-    return found
+        stills.append(_Still(small[0].camera, colors, gray, mean, _box(gray**2) - mean**2))
+    return stills
 
 
 def _nearest(still: _Still, stills: list[_Still]) -> list[_Still]:
     def distance(other: _Still) -> float:
         return float(np.linalg.norm(other.camera.position - still.camera.position))
 
-    return sorted((other for other in stills if other is not still), key=distance)[:OTHERS]
+    return sorted((other for other in stills if other is not still), key=distance)[:NEIGHBOURS]
 
 
 def _sweep(still: _Still, others: list[_Still], planes: Array) -> Array:
@@ -105,7 +105,7 @@ def _sweep(still: _Still, others: list[_Still], planes: Array) -> Array:
     between = (bend < 0) & (best > 0) & (best < len(planes) - 1)
     shift = np.where(between, 0.5 * (before - after) / np.minimum(bend, -1e-9), 0.0).clip(-0.5, 0.5)
     inverse = planes[best] + shift * (planes[1] - planes[0])
-    return np.where(score >= LEAST, inverse, np.nan)[0]
+    return np.where(score >= MIN_CORRELATION, inverse, np.nan)[0]
 
 
 def _likeness(still: _Still, others: list[_Still], plane: float) -> Array:
@@ -113,7 +113,7 @@ def _likeness(still: _Still, others: list[_Still], plane: float) -> Array:
     fewer than two see it."""
     height, width = still.gray.shape
     places = _places(still.camera, np.full(height * width, 1 / plane))
-    found = []
+    correlations = []
     for other in others:
         x, y, inside = _pixels(places, other.camera)
         at = np.stack([y, x]).reshape(2, height, width) - 0.5
@@ -121,8 +121,8 @@ def _likeness(still: _Still, others: list[_Still], plane: float) -> Array:
         its_mean = _box(there)
         both = still.variance * (_box(there**2) - its_mean**2)
         likeness = (_box(still.gray * there) - still.mean * its_mean) / np.sqrt(np.maximum(both, FLAT))
-        found.append(np.where(inside.reshape(height, width), likeness, np.nan))
-    ordered = np.sort(found, axis=0)  # NaN last
+        correlations.append(np.where(inside.reshape(height, width), likeness, np.nan))
+    ordered = np.sort(correlations, axis=0)  # NaN last
     seeing = np.isfinite(ordered).sum(axis=0)
     taken = np.maximum(2, (seeing + 1) // 2)
     sums = np.concatenate([np.zeros((1, height, width)), np.cumsum(np.nan_to_num(ordered), axis=0)])

@@ -7,13 +7,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.data.json_fields import LARGEST_ENTRY, kind, number
+from lapgs_wgpu.data.json_fields import kind, vector
 from lapgs_wgpu.errors import InputError
 
 Array = NDArray[np.float64]
 
 # Largest deviation of R^T R from the identity: files store about seven digits; scale or shear exceeds this by far.
 ROTATION_TOLERANCE = 1e-3
+AXES_HINT = "poses may be in OpenCV's axes where the format has OpenGL's (y up, z backward), or the other way round"
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0])  # y up, z backward -> y down, z forward
 
 
@@ -47,17 +48,9 @@ def opengl_pose(value: Any, where: str) -> Array:
     the matrix is a rigid motion.
     """
     name = f"{where}: transform_matrix"
-    rows = value if isinstance(value, list) else []
-    if len(rows) != 4 or not all(isinstance(row, list) and len(row) == 4 for row in rows):
+    if not isinstance(value, list) or len(value) != 4:
         raise InputError(f"{name} must be 4 rows of 4 numbers, got {kind(value)}.")
-    T = np.array([[number(entry, "transform_matrix", where) for entry in row] for row in rows])
-    bad = np.argwhere(~(np.abs(T) <= LARGEST_ENTRY))  # true for NaN, too
-    if len(bad):
-        row, column = bad[0]
-        raise InputError(
-            f"{name} holds {T[row, column]:g} in row {row}, column {column}; "
-            f"its entries must be finite and at most {LARGEST_ENTRY:g}."
-        )
+    T = np.stack([vector(row, 4, "transform_matrix", where) for row in value])
     if np.abs(T[3] - [0, 0, 0, 1]).max() > ROTATION_TOLERANCE:
         raise InputError(f"{name} must end with the row 0 0 0 1, got {' '.join(f'{x:g}' for x in T[3])}.")
     R, position = T[:3, :3], T[:3, 3]

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.data.json_fields import finite, read_json
+from lapgs_wgpu.data.json_fields import number, read_json
 from lapgs_wgpu.errors import InputError
 
 TIMES = "times.json"
@@ -52,14 +52,14 @@ def in_step(names: Sequence[ImageName], values: Sequence[float]) -> list[float]:
     time from an image of a camera to its next: their mean. Films start at times of their own, and keep time roughly."""
     cameras = [name.camera for name in names]
     times = np.array(values, np.float64)
-    apart = [np.diff(np.unique(times[[c == camera for c in cameras]])) for camera in dict.fromkeys(cameras)]
-    if len(apart) < 2 or not len(np.concatenate(apart)):
+    steps = [np.diff(np.unique(times[[c == camera for c in cameras]])) for camera in dict.fromkeys(cameras)]
+    if len(steps) < 2 or not len(np.concatenate(steps)):
         return list(values)
-    apart_at_most = IN_STEP * float(np.median(np.concatenate(apart)))
+    closest = IN_STEP * float(np.median(np.concatenate(steps)))
     groups: list[list[int]] = []
     for i in np.argsort(times, kind="stable").tolist():
         group = groups[-1] if groups else []
-        if group and times[i] - times[group[0]] < apart_at_most and cameras[i] not in {cameras[j] for j in group}:
+        if group and times[i] - times[group[0]] < closest and cameras[i] not in {cameras[j] for j in group}:
             group.append(i)
         else:
             groups.append([i])
@@ -78,7 +78,7 @@ def _listed(names: Sequence[ImageName], path: Path) -> list[float]:
             f"{path} has {len(times)} times{example}, but none for {len(missing)} of {len(names)} images, such "
             f"as {missing[0]}; name each image by its path below images/."
         )
-    return [finite(times[file], f"the time of {file}", path) for file in listed]
+    return [number(times[file], f"the time of {file}", path) for file in listed]
 
 
 def frame_numbers(names: Sequence[ImageName]) -> list[int]:
@@ -86,7 +86,7 @@ def frame_numbers(names: Sequence[ImageName]) -> list[int]:
 
     Raises InputError if no number differs, or more than one.
     """
-    found: dict[int, int] = {}
+    number_of: dict[int, int] = {}
     for camera in dict.fromkeys(name.camera for name in names):
         mine = [i for i, name in enumerate(names) if name.camera == camera]
         files = [names[i].file for i in mine]
@@ -111,11 +111,11 @@ def frame_numbers(names: Sequence[ImageName]) -> list[int]:
         column = varying[0] if varying else len(rows[0]) - 1
         numbers: dict[int, str] = {}
         for i, file, row in zip(mine, files, rows, strict=True):
-            found[i] = row[column]
+            number_of[i] = row[column]
             if row[column] in numbers:
                 raise InputError(f"{file} has the frame number {row[column]}, as {numbers[row[column]]} has.")
             numbers[row[column]] = file
-    return [found[i] for i in range(len(names))]
+    return [number_of[i] for i in range(len(names))]
 
 
 def disorder(names: Sequence[ImageName], times: Sequence[float]) -> list[str]:
@@ -137,13 +137,13 @@ def disorder(names: Sequence[ImageName], times: Sequence[float]) -> list[str]:
                 f"frames are out of order: time goes back {len(back)} times in {len(ordered)} images, first from "
                 f"{first.file} at {at:g} to {second.file} at {then:g}; check the times."
             )
-    first_camera, *others = spans
+    first_camera, *further = spans
     a, b = spans[first_camera]
-    apart = [camera for camera in others if spans[camera][0] > b or spans[camera][1] < a]
-    if apart:
-        c, d = spans[apart[0]]
+    disjoint = [camera for camera in further if spans[camera][0] > b or spans[camera][1] < a]
+    if disjoint:
+        c, d = spans[disjoint[0]]
         warnings.append(
-            f"cameras film at different times: {first_camera} from {a:g} to {b:g} and {apart[0]} from {c:g} to {d:g}; "
+            f"cameras film at different times: {first_camera} from {a:g} to {b:g} and {disjoint[0]} from {c:g} to {d:g}; "
             "if they filmed together, number their frames from a common time on."
         )
     return warnings

@@ -19,6 +19,7 @@ from lapgs_wgpu.data.frames import Frame
 from lapgs_wgpu.data.images import check_image, gray_thumbnail, size_text
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.masks import check_measured
+from lapgs_wgpu.data.poses import AXES_HINT
 from lapgs_wgpu.data.thumbnails import BLURRED, EQUAL, THUMBNAIL, blurred, repeats, sharpness, sharpness_around
 from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.errors import InputError
@@ -142,16 +143,15 @@ def _gaps(dataset: Dataset, source: str) -> list[str]:
     edges = np.concatenate([[0.0], times, [1.0]])
     gaps = np.diff(edges)
     usual = float(np.median(np.diff(times)))
-    found = np.flatnonzero((gaps > GAP) & (gaps > GAP_FACTOR * usual))
-    if not len(found):
+    wide = np.flatnonzero((gaps > GAP) & (gaps > GAP_FACTOR * usual))
+    if not len(wide):
         return []
-    longest = found[np.argmax(gaps[found])]
+    longest = wide[np.argmax(gaps[wide])]
     low, high = edges[longest], edges[longest + 1]
     tested = sum(low < view.time < high for view in dataset.test)
-    others = f" ({len(found) - 1} more such gaps)" if len(found) > 1 else ""
     return [
         f"{source}: no training image has a time between {low:.4g} and {high:.4g}, though the usual step is "
-        f"{usual:.2g}{others}; the motion there, in {tested} test images too, is unconstrained: add images, or cut "
+        f"{usual:.2g}; the motion there, in {tested} test images too, is unconstrained: add images, or cut "
         "the clip there."
     ]
 
@@ -177,19 +177,18 @@ def check_in_view(dataset: Dataset, points: NDArray[np.floating]) -> list[str]:
         return []
     longest = max(spans, key=len)
     names = [view.name for view in dataset.train if longest[0] <= view.time <= longest[-1]]
-    others = f" ({len(spans) - 1} more such spans)" if len(spans) > 1 else ""
     return [
-        f"{dataset.name}: all cameras look away from time {longest[0]:.4g} to {longest[-1]:.4g}{others}: "
+        f"{dataset.name}: all cameras look away from time {longest[0]:.4g} to {longest[-1]:.4g}: "
         f"{_named(names)} show nothing of the scene, so its motion there is a guess; check these poses, or remove "
         "these images."
     ]
 
 
-def check_views(cloud: Cloud, cameras: Sequence[Camera], names: Sequence[str], where: Path, axes: str) -> list[str]:
+def check_views(cloud: Cloud, cameras: Sequence[Camera], names: Sequence[str], where: Path) -> list[str]:
     """Warn about cameras that see no point of the cloud or hardly move, and about a sparse cloud.
 
     cameras, names: of each image, in the coordinates of the cloud; a camera counts once, by its first image's name.
-    axes: advice for cameras that look the wrong way. Raises InputError if more than half of the cameras see no point.
+    Raises InputError if more than half of the cameras see no point.
     """
     first_name = dict(zip(reversed(cameras), reversed(names), strict=True))
     cameras = list(dict.fromkeys(cameras))
@@ -200,7 +199,7 @@ def check_views(cloud: Cloud, cameras: Sequence[Camera], names: Sequence[str], w
     if 2 * len(blind) > len(cameras):
         back = [Camera(c.K, np.diag([1.0, -1, -1, 1]) @ c.T_cam_world, c.width, c.height) for c in cameras]
         turned = float(np.mean([views_of(points, [camera]).any() for camera in back]))
-        hint = f"; turned round, {100 * turned:.0f} % of them would see some: {axes}" if turned > 0.5 else ""
+        hint = f"; turned round, {100 * turned:.0f} % of them would see some: {AXES_HINT}" if turned > 0.5 else ""
         raise InputError(
             f"{where}: cameras look away from the cloud: {len(blind)} of {len(cameras)} see none of its {len(points)} "
             f"points{hint or '; cloud and cameras have different coordinates or scales'}."
@@ -235,13 +234,13 @@ def check_film(images: Sequence[Path]) -> list[str]:
         thumbnails = list(pool.map(lambda path: gray_thumbnail(path, THUMBNAIL), images))
     values = np.array([sharpness(thumbnail) for thumbnail in thumbnails])
     warnings = []
-    found: list[int] = np.flatnonzero(blurred(values)).tolist()
-    if found:
+    blurry: list[int] = np.flatnonzero(blurred(values)).tolist()
+    if blurry:
         around = sharpness_around(values)
-        shares = {i: float(values[i] / around[i]) for i in found}
-        worst = min(found, key=shares.__getitem__)
+        shares = {i: float(values[i] / around[i]) for i in blurry}
+        worst = min(blurry, key=shares.__getitem__)
         warnings.append(
-            f"blurred images: {_named([images[i].name for i in found])} ({len(found)} of {len(images)}) have less "
+            f"blurred images: {_named([images[i].name for i in blurry])} ({len(blurry)} of {len(images)}) have less "
             f"than {BLURRED:g} of their neighbours' sharpness, {images[worst].name} {shares[worst]:.2g}; leave them "
             "out."
         )

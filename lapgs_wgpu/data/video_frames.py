@@ -128,8 +128,8 @@ class Video:
                         written.popleft().result()
                     written.append(pool.submit(_write, image, size, unfinished / f"{count:05d}.png"))
                     count += 1
-                for each in written:
-                    each.result()
+                for pending in written:
+                    pending.result()
             if count != self.frames:
                 raise InputError(f"{self.path} has {self.frames} frames, and {count} can be decoded; copy it again.")
             move(unfinished, folder)

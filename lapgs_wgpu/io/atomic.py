@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import secrets
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -16,11 +14,6 @@ from lapgs_wgpu.errors import InputError
 
 _HELD_OPEN = (5, 32, 33)  # Windows' errors: access denied, sharing violation, lock violation
 _WAITS = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6)  # seconds
-_NO_FOLDERS = (
-    errno.EINVAL,
-    errno.ENOTSUP,
-    errno.EOPNOTSUPP,
-)  # of network file systems that force no folder to the disk
 
 
 @contextmanager
@@ -37,7 +30,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         with open(temporary, "xb") as file:  # x: do not follow a symbolic link that another user created
             yield file
             file.flush()
-            _sync(file.fileno())
+            os.fsync(file.fileno())
         move(temporary, path)
     except OSError as error:
         _remove(temporary)
@@ -68,36 +61,16 @@ def move(source: Path, target: Path) -> None:
             time.sleep(wait)
 
 
-def _sync(file: int) -> None:
-    """Force a file to the disk."""
-    if sys.platform == "darwin":  # whose fsync leaves it in the drive's own memory
-        import fcntl
-
-        with suppress(OSError):  # the file system does not know it
-            fcntl.fcntl(file, fcntl.F_FULLFSYNC)
-            return
-    os.fsync(file)
-
-
 def _remove(path: Path) -> None:
     with suppress(OSError):  # the folder may be missing or read-only; report the first error
         path.unlink()
 
 
 def _sync_folder(path: Path) -> None:
-    """Sync the folder to disk, so that the new name survives a power cut."""
-    if os.name != "posix":  # other systems cannot open a folder
-        return
-    try:
+    """Force the new name to the disk where the system can, so that it survives a power cut; else the old file may."""
+    with suppress(OSError):  # some file systems force no folder, and Windows opens none
         folder = os.open(path.parent, os.O_RDONLY)
         try:
             os.fsync(folder)
         finally:
             os.close(folder)
-    except OSError as error:
-        if error.errno in _NO_FOLDERS:
-            return
-        raise InputError(
-            f"{path}: written, but its folder could not be forced to the disk ({error.strerror or error}), "
-            "so a power cut may bring the old file back; check the disk"
-        ) from error

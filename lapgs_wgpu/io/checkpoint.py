@@ -8,15 +8,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.atomic import atomic_write
-from lapgs_wgpu.io.ply import GaussianSnapshot, ply_header, read_vertices, vertex_rows
-from lapgs_wgpu.io.ply_header import Element, PathLike, open_ply
+from lapgs_wgpu.io.ply import GaussianSnapshot, ply_header, read_gaussians, vertex_rows
+from lapgs_wgpu.io.ply_elements import PathLike, PlyFile, open_ply
 from lapgs_wgpu.io.safetensors_file import pack_tensors, unpack_tensors
 
 VERSION = 1
@@ -58,31 +58,30 @@ def read_checkpoint(path: PathLike) -> Checkpoint:
 
     Raises InputError when the file is neither, is damaged, or holds NaN or infinity.
     """
-    with open_ply(path) as (file, elements):
-        still = read_vertices(file, elements, path)
-        if _ELEMENT not in elements:
-            return Checkpoint(still, {}, {})
-        return Checkpoint(still, *_read_payload(file, elements[_ELEMENT], path))
+    with open_ply(path) as ply:
+        still = read_gaussians(ply)
+        return Checkpoint(still, *(_read_motion(ply) if _ELEMENT in ply.elements else ({}, {})))
 
 
-def _read_payload(file: BinaryIO, element: Element, path: PathLike) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
-    comments = [comment for comment in element.comments if comment.startswith(f"{_ELEMENT} ")]
-    found = re.fullmatch(rf"{_ELEMENT} v([0-9]{{1,9}}) safetensors ([0-9]{{1,18}})", comments[0]) if comments else None
-    if found is None or element.properties != {"word": np.dtype("<u4")}:
+def _read_motion(ply: PlyFile) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
+    """Tensors and metadata in the element `lapgs4d`. Raises InputError."""
+    element, where = ply.elements[_ELEMENT], f"{ply.path}: element {_ELEMENT}"
+    pattern = rf"^{_ELEMENT} v([0-9]{{1,9}}) safetensors ([0-9]{{1,18}})$"
+    declared = re.search(pattern, "\n".join(element.comments), re.MULTILINE)
+    if declared is None or element.properties != {"word": np.dtype("<u4")} or ply.encoding != "binary_little_endian":
         raise InputError(
-            f"{path}: its element {_ELEMENT} lacks the line 'comment {_ELEMENT} v{VERSION} safetensors BYTES' or the "
-            "one property 'uint word'; the file is damaged"
+            f"{where} lacks the line 'comment {_ELEMENT} v{VERSION} safetensors BYTES' or the one binary property "
+            "'uint word'; the file is damaged"
         )
-    version, size = int(found[1]), int(found[2])
+    version, size = int(declared[1]), int(declared[2])
     if version != VERSION:
         raise InputError(
-            f"{path}: its element {_ELEMENT} has version {version}, and this program reads version {VERSION}; "
-            "use the program that wrote the file"
+            f"{where} has version {version}, and this program reads version {VERSION}; use the program that wrote the "
+            "file"
         )
     if not 0 <= 4 * element.count - size < 4:
         raise InputError(
-            f"{path}: its element {_ELEMENT} declares {size} bytes of safetensors in {element.count} words of 4 bytes; "
-            "the file is damaged"
+            f"{where} declares {size} bytes of safetensors in {element.count} words of 4 bytes; the file is damaged"
         )
-    file.seek(element.offset)
-    return unpack_tensors(file, size, f"{path}: element {_ELEMENT}")
+    ply.file.seek(element.offset)
+    return unpack_tensors(ply.file, size, where)

@@ -46,7 +46,9 @@ def pack_lapgs(tensors: Mapping[str, NDArray[Any]], metadata: Mapping[str, str])
     content = b"".join(bytes(part) for part in pack_tensors(tensors, metadata))
     if len(content) > MAX_BYTES:
         raise InputError(f"a compact scene holds at most {MAX_BYTES} bytes, and this one needs {len(content)}")
-    version = 2 if any(name.endswith(".outliers") for name in tensors) else 1
+    quantized = [name.removesuffix(".range") for name in tensors if name.endswith(".range")]
+    newer = any(f"{name}.outliers" in tensors or tensors[name].dtype.kind == "f" for name in quantized)
+    version = VERSION if newer else 1  # version 1 has whole numbers alone; earlier programs read it
     packed = zlib.compress(content, 9)
     if len(content) > _MOST_RATIO * len(packed):  # no repeats then, so that a byte takes a bit or more
         packer = zlib.compressobj(9, strategy=zlib.Z_HUFFMAN_ONLY)

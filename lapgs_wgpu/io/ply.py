@@ -7,19 +7,15 @@ found by name, since other programs use other orders and add properties.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.atomic import atomic_write
-from lapgs_wgpu.io.ply_header import Element, PathLike
-
-Floats = NDArray[np.float32]
+from lapgs_wgpu.io.ply_elements import Element, Floats, PathLike, PlyFile
 
 MAX_LOG_SCALE = 44.0  # exp(2 * 44) still fits in float32: the variance is finite
-_BLOCK_BYTES = 1 << 20  # rows are converted in blocks that stay in the cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,24 +97,25 @@ def vertex_rows(still: GaussianSnapshot, path: PathLike) -> Floats:
     return rows
 
 
-def read_vertices(file: BinaryIO, elements: dict[str, Element], path: PathLike) -> GaussianSnapshot:
+def read_gaussians(ply: PlyFile) -> GaussianSnapshot:
     """The Gaussians of an opened 3DGS .ply: properties in any order, SH degree 0 to 3, further scalar ones skipped.
 
     Takes memory for about twice the Gaussians. Raises InputError when the file is not such a file, is damaged, or holds
     a value that cannot be rendered.
     """
-    if "vertex" not in elements:
-        raise InputError(f"{path}: has no element vertex, so it holds no Gaussians; give a 3DGS .ply file")
-    vertex = elements["vertex"]
-    rest = _rest_count(vertex, path)
+    if "vertex" not in ply.elements:
+        raise InputError(
+            f"{ply.path}: has no element vertex without a list, so it holds no Gaussians; give a 3DGS .ply file"
+        )
+    vertex = ply.elements["vertex"]
+    rest = _rest_count(vertex, ply.path)
     names = _names(rest)
-    values = read_columns(file, vertex, names, path)
-    _check_values(values, names, f"{path}:")
+    values = ply.columns(vertex, names)
+    _check_values(values, names, f"{ply.path}:")
     end = 6 + rest  # of the colors
     sh = np.empty((len(values), 1 + rest // 3, 3), np.float32)
     sh[:, 0] = values[:, 3:6]
-    for channel in range(3):  # channel-major: all of red, then green, then blue
-        sh[:, 1:, channel] = values[:, 6 + channel * rest // 3 : 6 + (channel + 1) * rest // 3]
+    sh[:, 1:] = values[:, 6:end].reshape(len(values), 3, rest // 3).transpose(0, 2, 1)  # channel-major in the file
     return GaussianSnapshot(
         means=values[:, 0:3].copy(),
         sh=sh,
@@ -151,34 +148,6 @@ def _rest_count(vertex: Element, path: PathLike) -> int:
     if vertex.count == 0:
         raise InputError(f"{path}: holds 0 Gaussians; at least 1 is needed")
     return rest
-
-
-def read_columns(file: BinaryIO, vertex: Element, names: list[str], path: PathLike) -> Floats:
-    """(N, len(names)) float32: the named properties of all rows."""
-    offsets, offset = {}, 0
-    for name, dtype in vertex.properties.items():
-        offsets[name] = offset
-        offset += dtype.itemsize
-    row = np.dtype(
-        {
-            "names": names,
-            "formats": [vertex.properties[name] for name in names],
-            "offsets": [offsets[name] for name in names],
-            "itemsize": vertex.stride,
-        }
-    )
-    values = np.empty((vertex.count, len(names)), np.float32)
-    block = max(1, _BLOCK_BYTES // vertex.stride)
-    file.seek(vertex.offset)
-    for start in range(0, vertex.count, block):
-        wanted = min(block, vertex.count - start)
-        rows = np.fromfile(file, row, wanted)
-        if len(rows) != wanted:
-            raise InputError(f"{path}: became shorter while it was read, at row {start + len(rows)} of {vertex.count}")
-        with np.errstate(all="ignore"):  # a double beyond float32 becomes infinite, which _check_values reports
-            for column, name in enumerate(names):
-                values[start : start + wanted, column] = rows[name]
-    return values
 
 
 def _check_values(values: Floats, names: list[str], where: str) -> None:

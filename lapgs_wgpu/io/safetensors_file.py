@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,14 +26,6 @@ _DTYPES = {
 }  # fmt: skip
 _NAMES = {np.dtype(code): name for name, code in _DTYPES.items()}
 _METADATA = "__metadata__"
-
-
-class _Spec(NamedTuple):
-    begin: int  # bytes from the end of the header
-    end: int
-    name: str
-    dtype: np.dtype[Any]
-    shape: tuple[int, ...]
 
 
 def pack_tensors(tensors: Mapping[str, Array], metadata: Mapping[str, str]) -> list[bytes | memoryview]:
@@ -78,9 +70,21 @@ def unpack_tensors(file: BinaryIO, size: int, where: str) -> tuple[dict[str, Arr
     metadata = header.pop(_METADATA, {})
     if not isinstance(metadata, dict) or not all(isinstance(text, str) for text in metadata.values()):
         raise InputError(f"{where}: its {_METADATA} is not a table of texts; the file is damaged")
-    specs = sorted(_parse_entry(name, entry, where) for name, entry in header.items())
-    _check_cover(specs, size - 8 - length, where)
-    return {spec.name: _read_array(file, spec, where) for spec in specs}, metadata
+    rest = size - 8 - length
+    entries = sorted((_parse_entry(name, entry, where), name) for name, entry in header.items())
+    position = 0
+    for ((begin, end), _, _), name in entries:  # before anything is read: they follow one another without a gap
+        if begin != position:
+            raise InputError(
+                f"{where}: tensor {name[:80]!r} begins at byte {begin}, but the one before it ends at {position}; "
+                "the file is damaged"
+            )
+        position = end
+    if position != rest:
+        raise InputError(f"{where}: its tensors end at byte {position}, its data at {rest}; the file is damaged")
+    return {
+        name: _read_array(file, shape, code, f"{where}: tensor {name[:80]!r}") for (_, shape, code), name in entries
+    }, metadata
 
 
 def _parse_json(data: bytes, where: str) -> dict[str, Any]:
@@ -101,7 +105,9 @@ def _parse_json(data: bytes, where: str) -> dict[str, Any]:
     return header
 
 
-def _parse_entry(name: str, entry: Any, where: str) -> _Spec:
+def _parse_entry(name: str, entry: Any, where: str) -> tuple[tuple[int, int], tuple[int, ...], str]:
+    """The bytes (begin, end) after the header, the shape and the dtype that a tensor's entry declares."""
+
     def sizes(value: Any, most: int) -> bool:
         return isinstance(value, list) and len(value) <= most and all(type(i) is int and 0 <= i < 2**53 for i in value)
 
@@ -113,39 +119,23 @@ def _parse_entry(name: str, entry: Any, where: str) -> _Spec:
         raise InputError(f"{where} has the unknown dtype {str(code)[:40]!r}; known are {', '.join(_DTYPES)}")
     if not sizes(shape, 8) or not sizes(offsets, 2) or len(offsets) != 2:
         raise InputError(f"{where} has a shape of {str(shape)[:80]} at bytes {str(offsets)[:80]}; the file is damaged")
-    dtype = np.dtype(_DTYPES[code])
-    needed = math.prod(shape) * dtype.itemsize
+    needed = math.prod(shape) * np.dtype(_DTYPES[code]).itemsize
     if needed != offsets[1] - offsets[0] or math.prod(max(i, 1) for i in shape) >= 2**53:
         raise InputError(
             f"{where} of shape {shape} and dtype {code} needs {needed} bytes, but its data_offsets {offsets} "
             f"hold {offsets[1] - offsets[0]}; the file is damaged"
         )
-    return _Spec(offsets[0], offsets[1], name, dtype, tuple(shape))
+    return (offsets[0], offsets[1]), tuple(shape), code
 
 
-def _check_cover(specs: list[_Spec], size: int, where: str) -> None:
-    """The tensors must follow one another without gap or overlap and end with the data."""
-    position = 0
-    for spec in specs:
-        if spec.begin != position:
-            raise InputError(
-                f"{where}: tensor {spec.name[:80]!r} begins at byte {spec.begin}, but the one before it ends at "
-                f"{position}; the file is damaged"
-            )
-        position = spec.end
-    if position != size:
-        raise InputError(f"{where}: its tensors end at byte {position}, its data at {size}; the file is damaged")
-
-
-def _read_array(file: BinaryIO, spec: _Spec, where: str) -> Array:
-    count = math.prod(spec.shape)
-    array = np.empty(count, spec.dtype)
-    if file.readinto(array.view(np.uint8)) != array.nbytes:  # type: ignore[attr-defined]  # all binary files have it
-        raise InputError(f"{where}: became shorter while it was read, in tensor {spec.name[:80]!r}")
-    _check_finite(array, f"{where}: tensor {spec.name[:80]!r}")
+def _read_array(file: BinaryIO, shape: tuple[int, ...], code: str, where: str) -> Array:
+    array = np.empty(shape, _DTYPES[code])
+    if file.readinto(array.reshape(-1).view(np.uint8)) != array.nbytes:  # type: ignore[attr-defined]  # all have it
+        raise InputError(f"{where}: became shorter while it was read")
+    _check_finite(array, where)
     if array.dtype == np.bool_ and (array.view(np.uint8) > 1).any():
-        raise InputError(f"{where}: tensor {spec.name[:80]!r} has truth values other than 0 and 1; the file is damaged")
-    return array.reshape(spec.shape)
+        raise InputError(f"{where}: has truth values other than 0 and 1; the file is damaged")
+    return array
 
 
 def _check_finite(array: Array, what: str) -> None:

@@ -110,9 +110,9 @@ class Browser:
         data = self.call("Page.captureScreenshot", format="png")["data"]
         return iio.imread(base64.b64decode(data), extension=".png")[..., :3].astype(np.int16)
 
-    def mouse(self, kind: str, x: float, y: float, *, down: bool = False, clicks: int = 1) -> None:
-        """kind: mouseMoved, mousePressed or mouseReleased, of the left button. clicks: 2 for the second of two."""
-        pressed = {"button": "left", "clickCount": clicks} if kind != "mouseMoved" or down else {}
+    def mouse(self, kind: str, x: float, y: float, *, down: bool = False) -> None:
+        """kind: mouseMoved, mousePressed or mouseReleased, of the left button."""
+        pressed = {"button": "left", "clickCount": 1} if kind != "mouseMoved" or down else {}
         self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, buttons=int(down), **pressed)
 
     def key(self, key: str) -> None:

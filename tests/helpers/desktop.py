@@ -71,15 +71,15 @@ class Desktop:
         command = ["xdotool", *map(str, words)]
         subprocess.run(command, env=self._environment(), check=True, timeout=PATIENCE)
 
-    def drag(self, start: tuple[int, int], end: tuple[int, int], button: int = 1, steps: int = 8) -> None:
-        """Press a button, move in steps, release."""
+    def drag(self, start: tuple[int, int], end: tuple[int, int], steps: int = 8) -> None:
+        """Press the left button, move in steps, release."""
         self.events("mousemove", *start)
         time.sleep(0.2)
-        self.events("mousedown", button)
+        self.events("mousedown", 1)
         for i in range(1, steps + 1):
             self.events("mousemove", *(round(a + (b - a) * i / steps) for a, b in zip(start, end, strict=True)))
             time.sleep(0.05)
-        self.events("mouseup", button)
+        self.events("mouseup", 1)
 
     def picture(self) -> NDArray[np.int32]:
         """(height, width, 3) of the whole screen, from the server's frame buffer in xwd's format."""

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from lapgs_wgpu.io.checkpoint import read_checkpoint
 from lapgs_wgpu.io.ply import GaussianSnapshot
-from lapgs_wgpu.io.ply_header import PathLike
+from lapgs_wgpu.io.ply_elements import PathLike
 
 FIELDS = ["means", "sh", "opacity_logits", "log_scales", "quats"]
 # Written out by hand, so that it checks the code's own lists.

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 from helpers.browser import Browser
-from helpers.waiting import PATIENCE, wait_for
+from helpers.waiting import wait_for
 from numpy.typing import NDArray
 
 from lapgs_wgpu.gpu.device import Device
@@ -49,11 +49,11 @@ def export_scene(scene: Scene4D, folder: Path, device: Device, name: str = "scen
     return folder / f"{name}.html"
 
 
-def open_page(browser: Browser, url: str, *, seconds: float = PATIENCE, first: str = "") -> None:
+def open_page(browser: Browser, url: str, *, first: str = "") -> None:
     """Open a page and wait until it shows its scene. first: a script that runs before the page's own."""
     made = browser.call("Page.addScriptToEvaluateOnNewDocument", source=first)
     browser.open(url)
-    wait_for(lambda: shown(browser), "the scene", seconds)
+    wait_for(lambda: shown(browser), "the scene")
     browser.call("Page.removeScriptToEvaluateOnNewDocument", identifier=made["identifier"])
 
 
@@ -92,13 +92,6 @@ class Desktop:
         frame = self.renderer.draw(FrameRequest(camera.camera(*size), time, "rgb", BACKGROUNDS[background]))
         planes: NDArray[np.float32] = frame.layout.planes.read()
         return planes[:3].transpose(1, 2, 0)
-
-    def depth(self, camera: ViewCamera, place: tuple[int, int]) -> float:
-        """Along the camera's axis, of what a pixel (column, row) shows at time 0."""
-        frame = self.renderer.draw(FrameRequest(camera.camera(*SIZE), 0.0, "rgb", BACKGROUNDS["grey"]))
-        depth = self.renderer.depth_at(frame, *place)
-        assert depth is not None
-        return depth
 
 
 def psnr(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:

@@ -16,14 +16,13 @@ import numpy as np
 from lapgs_wgpu.data.cloud import Cloud
 from lapgs_wgpu.data.frames import Capture, Frame, Reader
 from lapgs_wgpu.data.images import SUFFIXES, check_image
-from lapgs_wgpu.data.json_fields import LARGEST_ENTRY, absent_image
+from lapgs_wgpu.data.json_fields import absent_image
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.poses import check_rotation
 from lapgs_wgpu.data.readers.colmap_model import (
     ColmapCamera,
     ColmapImage,
     ColmapModel,
-    count_images,
     is_model,
     read_model,
 )
@@ -33,7 +32,6 @@ from lapgs_wgpu.io.listing import is_desktop_file
 from lapgs_wgpu.splat.camera import rotation_matrix
 
 IMAGES, SPARSE = "images", "sparse"
-AXES = "the model is damaged, since COLMAP keeps only points in front of its cameras"
 
 
 def _matches(folder: Path) -> bool:
@@ -44,24 +42,17 @@ def _read(folder: Path, image_size: int | None) -> Capture:
     images = folder / IMAGES
     if not images.is_dir():
         raise InputError(f"{images} does not exist; put the images from which COLMAP made {folder / SPARSE} there.")
-    models = {path: count_images(path) for path in _models(folder)}
-    chosen = max(models, key=lambda path: models[path])  # the first of equal ones
-    model = read_model(chosen)
-    where = chosen / ("cameras.bin" if (chosen / "cameras.bin").is_file() else "cameras.txt")
+    models = {path: read_model(path) for path in _models(folder)}
+    chosen, model = max(models.items(), key=lambda item: len(item[1].images))  # the first of equal ones
     if not model.images:
         raise InputError(f"{chosen} holds no image with a pose; COLMAP could not register any.")
     files = _files(images)
     for image in model.images:
         if image.name not in files:
             raise absent_image(images / image.name, f"{image.where} names it")
-    bad = np.flatnonzero(~(np.abs(model.points) <= LARGEST_ENTRY).all(axis=1))
-    if len(bad):
-        raise InputError(
-            f"{model.points_file}: {len(bad)} of {len(model.points)} points are not finite, first {bad[0]}."
-        )
-    frames, warnings = _frames(model, images, files, where)
+    frames, warnings = _frames(model, images, files)
     if len(models) > 1:
-        sizes = ", ".join(f"{path.name} with {count}" for path, count in models.items())
+        sizes = ", ".join(f"{path.name} with {len(other.images)}" for path, other in models.items())
         warnings.append(f"{folder / SPARSE} holds {len(models)} models ({sizes} images): {chosen.name} is taken.")
     cloud = None
     if len(model.points):
@@ -78,7 +69,6 @@ def _read(folder: Path, image_size: int | None) -> Capture:
         warnings=warnings,
         shares_cameras=True,
         own_footage=True,
-        axes_hint=AXES,
     )
 
 
@@ -104,7 +94,7 @@ def _files(images: Path) -> dict[str, Path]:
     return dict(sorted(files.items(), key=lambda item: natural_key(item[0])))
 
 
-def _frames(model: ColmapModel, images: Path, files: dict[str, Path], where: Path) -> tuple[list[Frame], list[str]]:
+def _frames(model: ColmapModel, images: Path, files: dict[str, Path]) -> tuple[list[Frame], list[str]]:
     """Return the images with a pose, their own or that of their still camera, and a warning about those without."""
     by_name = {image.name: image for image in model.images}
     by_camera: dict[str, list[ColmapImage]] = {}
@@ -119,7 +109,7 @@ def _frames(model: ColmapModel, images: Path, files: dict[str, Path], where: Pat
         if registered is None:
             left_out.append(name)
             continue
-        entry = f"{where}, camera {registered.camera},"
+        entry = f"{model.cameras_file}, camera {registered.camera},"
         lens, pose = _lens(model.cameras[registered.camera]), _pose(registered)
         frames.append(Frame(check_image(path), lens, pose, entry, ImageName(name, camera)))
     warnings = []

@@ -55,12 +55,13 @@ class ColmapImage(NamedTuple):
 
 
 class ColmapModel(NamedTuple):
-    """cameras: by id. images: in file order. points: (N, 3), colors: (N, 3) uint8. points_file: their file."""
+    """cameras: by id. images: in file order. points: (N, 3), colors: (N, 3) uint8."""
 
     cameras: dict[int, ColmapCamera]
     images: list[ColmapImage]
     points: Array
     colors: NDArray[np.uint8]
+    cameras_file: Path
     points_file: Path
 
 
@@ -72,8 +73,7 @@ def is_model(folder: Path) -> bool:
 def read_model(folder: Path) -> ColmapModel:
     """The sparse model in a folder; binary files go before text. Raises InputError."""
     binary = (folder / "cameras.bin").is_file()
-    suffix = "bin" if binary else "txt"
-    files = {name: folder / f"{name}.{suffix}" for name in ("cameras", "images", "points3D")}
+    files = {name: folder / f"{name}.{'bin' if binary else 'txt'}" for name in ("cameras", "images", "points3D")}
     for path in files.values():
         if not path.is_file():
             raise InputError(f"{path} does not exist, but {files['cameras']} does; a sparse model needs both.")
@@ -86,24 +86,18 @@ def read_model(folder: Path) -> ColmapModel:
                 f"{image.where} was taken by camera {image.camera}, which is not among the {len(cameras)} of "
                 f"{files['cameras']}."
             )
-    return ColmapModel(cameras, images, points, colors, files["points3D"])
-
-
-def count_images(folder: Path) -> int:
-    """Count the images of a model, without reading all of a binary one."""
-    path = folder / "images.bin"
-    if path.is_file():
-        return _Bytes(path).count(BINARY_IMAGE_BYTES, "images")
-    path = folder / "images.txt"
-    return len(_text_images(path)) if path.is_file() else 0
+    bad = np.flatnonzero(~(np.abs(points) <= LARGEST_ENTRY).all(axis=1))  # true for NaN, too
+    if len(bad):
+        raise InputError(f"{files['points3D']}: {len(bad)} of {len(points)} points are not finite, first {bad[0]}.")
+    return ColmapModel(cameras, images, points, colors, files["cameras"], files["points3D"])
 
 
 def _camera(where: str, model: str, width: float, height: float, values: list[float]) -> ColmapCamera:
     """Check the values of a camera. Raises InputError."""
     if model not in PARAMETERS:
         raise InputError(
-            f"{where}: its model {model[:40]} is not among those that are read ({', '.join(PARAMETERS)}); run COLMAP "
-            "again with --ImageReader.camera_model OPENCV, or undistort the images with colmap image_undistorter."
+            f"{where}: its model {model[:40]} is not among those that are read ({', '.join(PARAMETERS)}); undistort "
+            "the images with colmap image_undistorter."
         )
     names = PARAMETERS[model]
     if len(values) != len(names):
@@ -134,79 +128,67 @@ def _image(name: str, camera: int, pose: Array, where: str) -> ColmapImage:
 # Text
 
 
-def _lines(path: Path, *, blank: bool = False) -> Iterator[tuple[str, list[str]]]:
-    """Yield the place of each line, for errors, and its words; skip comments and, unless `blank`, empty lines."""
+def _lines(path: Path, fields: str, *, skipped: bool = False) -> Iterator[tuple[str, list[str]]]:
+    """Yield the place of each line, for errors, and its words, at least those that `fields` lists; skip comments.
+
+    skipped: whether another line, which may be empty, follows each and is left out.
+    """
+    least = fields.count(",") + 1
     try:
         with path.open(encoding="utf-8") as file:
-            for number, line in enumerate(file, start=1):
-                if not line.startswith("#") and (blank or line.strip()):
-                    yield f"{path}, line {number}", line.split()
+            lines = ((number, line) for number, line in enumerate(file, start=1) if not line.startswith("#"))
+            for number, line in lines:
+                words = line.split()
+                if not words:
+                    continue
+                if len(words) < least:
+                    raise InputError(f"{path}, line {number} has {len(words)} fields, and needs {least}: {fields}.")
+                yield f"{path}, line {number}", words
+                if skipped:
+                    next(lines, None)
     except UnicodeDecodeError as error:
         raise InputError(f"{path} is not text ({error.reason}); copy it or export the model again.") from None
 
 
-def _numbers(words: list[str], where: str, kind: Callable[[str], Any]) -> list[Any]:
-    for word in words:
-        try:
-            kind(word)
-        except ValueError:
-            what = "a whole number" if kind is int else "a number"
-            raise InputError(f"{where}: {word[:40]!r} is not {what}; export the model again.") from None
-    return [kind(word) for word in words]
+def _numbers(words: list[str], where: str, kind: Callable[[str], Any] = float) -> list[Any]:
+    try:
+        return [kind(word) for word in words]
+    except ValueError as error:
+        raise InputError(f"{where}: {str(error)[:80]}; export the model again.") from None
 
 
 def _text_cameras(path: Path) -> dict[int, ColmapCamera]:
     cameras = {}
-    for where, words in _lines(path):
-        if len(words) < 4:
-            raise InputError(f"{where} has {len(words)} fields; id, model, width, height and parameters are needed.")
+    for where, words in _lines(path, "id, model, width, height"):
         identity, width, height = _numbers([words[0], *words[2:4]], where, int)
-        cameras[identity] = _camera(where, words[1], width, height, _numbers(words[4:], where, float))
+        cameras[identity] = _camera(where, words[1], width, height, _numbers(words[4:], where))
     return cameras
 
 
 def _text_images(path: Path) -> list[ColmapImage]:
     """Two lines per image: pose and name, then its points, which may be none."""
     images = []
-    lines = _lines(path, blank=True)
-    for where, words in lines:
-        if not words:
-            continue
-        if len(words) < 10:
-            raise InputError(f"{where} has {len(words)} fields; 10 are needed, the last one the image's name.")
-        _, camera = _numbers([words[0], words[8]], where, int)
-        pose = np.array(_numbers(words[1:8], where, float))
-        images.append(_image(" ".join(words[9:]), camera, pose, f"{where} ({' '.join(words[9:])[:80]})"))
-        next(lines, None)
+    for where, words in _lines(path, "id, QW, QX, QY, QZ, TX, TY, TZ, camera, name", skipped=True):
+        name = " ".join(words[9:])
+        (camera,) = _numbers(words[8:9], where, int)
+        images.append(_image(name, camera, np.array(_numbers(words[1:8], where)), f"{where} ({name[:80]})"))
     return images
 
 
 def _text_points(path: Path) -> tuple[Array, NDArray[np.uint8]]:
-    rows = []
-    for where, words in _lines(path):
-        if len(words) < 8:
-            raise InputError(f"{where} has {len(words)} fields; id, X, Y, Z, R, G, B and error are needed.")
-        rows.append(_numbers(words[1:7], where, float))
+    rows = [_numbers(words[1:7], where) for where, words in _lines(path, "id, X, Y, Z, R, G, B, error")]
     values = np.array(rows, dtype=np.float64).reshape(-1, 6)
     return values[:, :3], np.clip(np.nan_to_num(values[:, 3:]), 0, 255).astype(np.uint8)
 
 
 # Binary: little-endian, each file begins with a count of 8 bytes
 
-BINARY_CAMERA_BYTES = 24 + 3 * 8  # at least: id, model, width, height, parameters
-BINARY_IMAGE_BYTES = 4 + 7 * 8 + 4 + 1 + 8  # at least: id, pose, camera, the name's end, count of points
-BINARY_POINT_BYTES = 8 + 3 * 8 + 3 + 8 + 8  # at least: id, position, color, error, length of the track
-
 
 class _Bytes:
     """A binary file in memory, and the position up to which it was read."""
 
     def __init__(self, path: Path) -> None:
-        self.path, self.at = path, 0
-        try:
-            self.data = path.read_bytes()
-        except OSError as error:
-            raise InputError(f"{path} cannot be read ({error.strerror}).") from None
+        self.path, self.at, self.data = path, 0, path.read_bytes()
 
     def damaged(self, problem: str) -> InputError:
         return InputError(f"{self.path} {problem}; it is damaged, so copy it again.")
@@ -246,7 +228,7 @@ class _Bytes:
 
 def _binary_cameras(path: Path) -> dict[int, ColmapCamera]:
     cameras, file = {}, _Bytes(path)
-    for index in range(file.count(BINARY_CAMERA_BYTES, "cameras")):
+    for index in range(file.count(24 + 3 * 8, "cameras")):
         identity, model, width, height = file.take("iiQQ")
         name, names = MODELS.get(model, (OTHER_MODELS.get(model, f"number {model}"), ()))
         values = list(file.take(f"{len(names)}d"))
@@ -257,7 +239,7 @@ def _binary_cameras(path: Path) -> dict[int, ColmapCamera]:
 
 def _binary_images(path: Path) -> list[ColmapImage]:
     images, file = [], _Bytes(path)
-    for index in range(file.count(BINARY_IMAGE_BYTES, "images")):
+    for index in range(file.count(69 + 8, "images")):
         _, *pose, camera = file.take("i7di")
         name = file.name()
         file.skip(24 * file.count(24, f"points of {name[:80]}"))
@@ -268,7 +250,7 @@ def _binary_images(path: Path) -> list[ColmapImage]:
 
 def _binary_points(path: Path) -> tuple[Array, NDArray[np.uint8]]:
     file = _Bytes(path)
-    count = file.count(BINARY_POINT_BYTES, "points")
+    count = file.count(43 + 8, "points")
     points, colors = np.empty((count, 3)), np.empty((count, 3), np.uint8)
     for index in range(count):
         _, *values, _ = file.take("Q3d3Bd")

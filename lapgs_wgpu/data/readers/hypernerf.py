@@ -17,12 +17,12 @@ from lapgs_wgpu.data.cloud import find_cloud, read_cloud
 from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
 from lapgs_wgpu.data.images import check_image
 from lapgs_wgpu.data.json_fields import (
-    LARGEST_ENTRY,
     LARGEST_SIDE,
     Fields,
     absent_image,
     as_fields,
     kind,
+    number,
     read_json,
     vector,
 )
@@ -34,6 +34,7 @@ from lapgs_wgpu.data.timestamps import ImageName
 from lapgs_wgpu.errors import InputError
 
 CLOUDS = ("points.npy", "points3D_downsample*.ply", "points3D.ply")  # all in the coordinates of the camera files
+TINY = 1e-12  # what is smaller is 0
 STRIDE = 4  # without val_ids: every fourth id from the first on is for training, from the third on for testing
 
 
@@ -48,8 +49,8 @@ def _read(folder: Path, image_size: int | None) -> Capture:
     """Images come from the folder rgb/Nx with the smallest that are at least of the wanted size, else the largest."""
     ids, train_ids, test_ids = _splits(_object(folder / "dataset.json"))
     scene = _object(folder / "scene.json")
-    moved = Normalization(scene.vector("center", 3), _positive(scene, "scale"))
-    depths = _positive(scene, "near"), _positive(scene, "far")
+    moved = Normalization(scene.vector("center", 3), scene.number("scale", TINY))
+    depths = scene.number("near", TINY), scene.number("far", TINY)
     if depths[0] >= depths[1]:
         raise InputError(f"{scene.where}: near must be below far, got {depths[0]:g} and {depths[1]:g}.")
     times = _times(_object(folder / "metadata.json"), ids)
@@ -113,10 +114,7 @@ def _times(metadata: Fields, ids: Sequence[str]) -> dict[str, int]:
     field = "time_id" if any("time_id" in entry for entry in entries.values()) else "warp_id"
     times = {}
     for name, entry in entries.items():
-        value = entry.required(field)
-        if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= LARGEST_ENTRY:
-            raise InputError(f"{entry.where}: {field} must be a whole number from 0 up, got {kind(value)}.")
-        times[name] = value
+        times[name] = int(entry.number(field, 0))
     return times
 
 
@@ -125,24 +123,19 @@ def _read_camera(data: Fields) -> tuple[Lens, np.ndarray]:
     rows = data.entries("orientation", 3)
     R_cam_world = np.stack([vector(row, 3, "orientation", data.where) for row in rows])
     check_rotation(R_cam_world.T, f"{data.where}: orientation")
-    position = data.vector("position", 3)
-    if np.abs(position).max() > LARGEST_ENTRY:
-        raise InputError(
-            f"{data.where}: position holds {np.abs(position).max():g}; at most {LARGEST_ENTRY:g} is allowed."
-        )
-    width, height = (int(side) for side in data.vector("image_size", 2))
-    if not (1 <= width <= LARGEST_SIDE and 1 <= height <= LARGEST_SIDE):
-        raise InputError(f"{data.where}: image_size must be 1 to {LARGEST_SIDE:g} pixels a side, got {width}x{height}.")
-    focal = _positive(data, "focal_length")
-    aspect = _positive(data, "pixel_aspect_ratio") if "pixel_aspect_ratio" in data else 1.0
+    width, height = (
+        int(number(side, "image_size", data.where, 1, LARGEST_SIDE)) for side in data.entries("image_size", 2)
+    )
+    focal = data.number("focal_length", TINY)
+    aspect = data.number("pixel_aspect_ratio", TINY) if "pixel_aspect_ratio" in data else 1.0
     cx, cy = data.vector("principal_point", 2).tolist()
     skew = data.number("skew") if "skew" in data else 0.0
-    k1, k2, k3 = data.vector("radial_distortion", 3, [0.0] * 3).tolist()
+    k1, k2, k3 = data.vector("radial_distortion", 3).tolist() if "radial_distortion" in data else [0.0] * 3
     # nerfies has written the second name, and its first releases the first one.
     tangential = "tangential" if "tangential" in data else "tangential_distortion"
-    p1, p2 = data.vector(tangential, 2, [0.0] * 2).tolist()
+    p1, p2 = data.vector(tangential, 2).tolist() if tangential in data else [0.0] * 2
     lens = Lens(width, height, focal, focal * aspect, cx, cy, skew, (k1, k2, k3), (p1, p2))
-    return lens, world_to_camera(R_cam_world.T, position)
+    return lens, world_to_camera(R_cam_world.T, data.vector("position", 3))
 
 
 def _factor_folders(folder: Path) -> list[Path]:
@@ -176,9 +169,7 @@ def _object(path: Path) -> Fields:
 
 def _names(data: Fields, field: str) -> list[str]:
     """Return a list of ids, each of which is safe as a file name."""
-    names = data.required(field)
-    if not isinstance(names, list):
-        raise InputError(f"{data.where}: {field} must be a list of ids, got {kind(names)}.")
+    names = data.entries(field)
     for name in names:
         if not isinstance(name, str) or not re.fullmatch(r"\w[\w.-]{0,99}", name):
             raise InputError(
@@ -189,13 +180,6 @@ def _names(data: Fields, field: str) -> list[str]:
             f"{data.where}: {field} holds {len(names)} ids of which {len(set(names))} differ; name each once."
         )
     return names
-
-
-def _positive(data: Fields, name: str) -> float:
-    value = data.number(name)
-    if value <= 0:
-        raise InputError(f"{data.where}: {name} must be above 0, got {value:g}.")
-    return value
 
 
 READER = Reader("HyperNeRF", "dataset.json beside camera/ and rgb/", _matches, _read)

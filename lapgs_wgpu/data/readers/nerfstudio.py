@@ -14,13 +14,11 @@ from pathlib import Path, PurePosixPath
 from lapgs_wgpu.data.cloud import read_cloud
 from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
 from lapgs_wgpu.data.images import check_image
-from lapgs_wgpu.data.json_fields import Fields, check_inside, finite, image_path, kind, read_json
+from lapgs_wgpu.data.json_fields import Fields, check_inside, image_path, kind, read_json
 from lapgs_wgpu.data.poses import opengl_pose
 from lapgs_wgpu.data.readers.transforms import read_lens, timed_frames
 from lapgs_wgpu.data.timestamps import ImageName
 from lapgs_wgpu.errors import InputError
-
-AXES = "transform_matrix must be camera to world in OpenGL's axes (y up, z backward), and it may be in OpenCV's"
 
 
 def _matches(folder: Path) -> bool:
@@ -43,7 +41,7 @@ def _read(folder: Path, image_size: int | None) -> Capture:
                 opengl_pose(entry.required("transform_matrix"), entry.where),
                 entry.where,
                 ImageName(str(relative), str(relative.parent)),
-                time=None if stated is None else finite(stated, time_field, entry.where),
+                time=stated,
                 black=_optional_file(entry, "mask_path", folder),
             )
         )
@@ -69,7 +67,6 @@ def _read(folder: Path, image_size: int | None) -> Capture:
         time_source=f"{time_field} in {path}",
         shares_cameras=True,
         own_footage=True,
-        axes_hint=AXES,
     )
 
 

@@ -19,8 +19,6 @@ from lapgs_wgpu.data.timestamps import ImageName, natural_key
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.listing import listed
 
-AXES = "t_00 ... t_23 must be camera to world in ARKit's axes (y up, z backward)"
-
 
 def _subfolder(folder: Path, name: str) -> Path:
     """Return keyframes/corrected_NAME where it exists, else keyframes/NAME."""
@@ -67,7 +65,6 @@ def _read(folder: Path, image_size: int | None) -> Capture:
         if left_out
         else [],
         own_footage=True,
-        axes_hint=AXES,
     )
 
 

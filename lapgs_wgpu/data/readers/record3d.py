@@ -14,14 +14,13 @@ import numpy as np
 
 from lapgs_wgpu.data.frames import Capture, Frame, Reader
 from lapgs_wgpu.data.images import SUFFIXES, check_image
-from lapgs_wgpu.data.json_fields import LARGEST_ENTRY, finite, read_json, vector
+from lapgs_wgpu.data.json_fields import number, read_json, vector
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.poses import OPENGL_TO_OPENCV, world_to_camera
 from lapgs_wgpu.data.timestamps import ImageName
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import rotation_matrix
 
-AXES = "poses must be camera to world in ARKit's axes (y up, z backward)"
 UNIT = 1e-2  # largest deviation of a quaternion's length from 1
 
 
@@ -61,7 +60,7 @@ def _read(folder: Path, image_size: int | None) -> Capture:
     for index, file in sorted(files.items()):
         where = f"{path}, frame {index}"
         fx, fy, cx, cy = vector(intrinsics[index], 4, "perFrameIntrinsicCoeffs", where).tolist()
-        time = index / rate if times is None else finite(times[index], "frameTimestamps", where)
+        time = index / rate if times is None else number(times[index], "frameTimestamps", where)
         frames.append(
             Frame(
                 check_image(file),
@@ -82,7 +81,6 @@ def _read(folder: Path, image_size: int | None) -> Capture:
         time_source=f"{timed} in {path}",
         warnings=warnings,
         own_footage=True,
-        axes_hint=AXES,
     )
 
 
@@ -90,11 +88,8 @@ def _pose(value: Any, where: str) -> np.ndarray:
     """Return the (4, 4) pose in OpenCV's axes."""
     x, y, z, w, *position = vector(value, 7, "poses", where)
     length = float(np.linalg.norm([x, y, z, w]))
-    if abs(length - 1) > UNIT or np.abs(position).max() > LARGEST_ENTRY:
-        raise InputError(
-            f"{where}: poses must hold a quaternion of length 1 and a position of at most {LARGEST_ENTRY:g}, got the "
-            f"length {length:.4g} and {', '.join(f'{coordinate:g}' for coordinate in position)}."
-        )
+    if abs(length - 1) > UNIT:
+        raise InputError(f"{where}: poses must begin with a quaternion of length 1, got the length {length:.4g}.")
     R_world_cam = rotation_matrix(np.array([w, x, y, z]) / length)
     return world_to_camera(R_world_cam @ OPENGL_TO_OPENCV, np.array(position))
 

@@ -1,0 +1,205 @@
+"""PLY files: the elements that a header declares, and their values in any of the three encodings.
+
+Files are untrusted: the header's length is limited, and declared sizes are compared with the file size before any
+allocation. Elements with lists, such as the faces of a mesh, may be declared; neither they nor what follows is read.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any, BinaryIO, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lapgs_wgpu.errors import InputError
+
+PathLike = str | os.PathLike[str]
+Floats = NDArray[np.float32]
+
+MAX_HEADER_BYTES = 64 * 1024
+_BLOCK_BYTES = 1 << 20  # rows are converted in blocks that stay in the cache
+_BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
+_SCALARS = {
+    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
+    "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
+    "float32": "f4", "float64": "f8",
+}  # fmt: skip
+
+
+@dataclass
+class Element:
+    """An element: `count` rows of scalar `properties`.
+
+    offset: byte of the file at which it begins; line after the header in a text file. comments: those below its line.
+    has_lists: whether it declares lists, too, so that its size is unknown.
+    """
+
+    name: str
+    count: int
+    properties: dict[str, np.dtype[Any]] = field(default_factory=dict)
+    comments: list[str] = field(default_factory=list)
+    offset: int = 0
+    has_lists: bool = False
+
+    @property
+    def stride(self) -> int:
+        """Bytes of a row."""
+        return sum(dtype.itemsize for dtype in self.properties.values())
+
+
+class PlyFile(NamedTuple):
+    """An opened file. header_bytes: its header's length. elements: by name, those whose place is known."""
+
+    file: BinaryIO
+    path: PathLike
+    encoding: str
+    header_bytes: int
+    elements: dict[str, Element]
+
+    def columns(self, element: Element, names: list[str]) -> Floats:
+        """(N, len(names)) float32: the named properties of all rows of an element. Raises InputError."""
+        values = np.empty((element.count, len(names)), np.float32)
+        with np.errstate(all="ignore"):  # a double beyond float32 becomes infinite, which callers report
+            if self.encoding == "ascii":
+                columns = [list(element.properties).index(name) for name in names]
+                for index, row in enumerate(self._text_rows(element)):
+                    values[index] = row[columns]
+            else:
+                start = 0
+                for rows in self._binary_blocks(element, names):
+                    for column, name in enumerate(names):
+                        values[start : start + len(rows), column] = rows[name]
+                    start += len(rows)
+        return values
+
+    def _binary_blocks(self, element: Element, names: list[str]) -> Iterator[NDArray[Any]]:
+        layout = np.dtype(list(element.properties.items()))[names]
+        size = max(1, _BLOCK_BYTES // element.stride)
+        self.file.seek(element.offset)
+        for start in range(0, element.count, size):
+            rows = np.fromfile(self.file, layout, min(size, element.count - start))
+            if start + len(rows) < min(start + size, element.count):
+                raise InputError(
+                    f"{self.path}: became shorter while it was read, at row {start + len(rows)} of {element.count}."
+                )
+            yield rows
+
+    def _text_rows(self, element: Element) -> Iterator[NDArray[np.float64]]:
+        self.file.seek(self.header_bytes)
+        lines = self.file.read().decode(errors="replace").splitlines()[element.offset :][: element.count]
+        if len(lines) < element.count:
+            raise InputError(
+                f"{self.path}: declares {element.count} rows of {element.name}, but {len(lines)} lines follow; it is "
+                "truncated."
+            )
+        for number, line in enumerate(lines):
+            try:
+                yield np.array(line.split(), dtype=np.float64).reshape(len(element.properties))
+            except ValueError:
+                raise InputError(
+                    f"{self.path}: row {number} of {element.name}, {line[:80]!r}, does not hold "
+                    f"{len(element.properties)} numbers; the file is damaged."
+                ) from None
+
+
+@contextmanager
+def open_ply(path: PathLike) -> Iterator[PlyFile]:
+    """Open a file and read its header. The sizes of the elements add up to the file size. Raises InputError."""
+    try:
+        mode = os.stat(path).st_mode  # before opening: a pipe would block, a device could be endless
+        if stat.S_ISDIR(mode):
+            raise InputError(f"{path}: is a folder; give a .ply file, for example the checkpoint.ply in it.")
+        if not stat.S_ISREG(mode):
+            raise InputError(f"{path}: is not a regular file; give a .ply file.")
+        with open(path, "rb") as file:
+            yield _read_header(file, path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the path.") from error
+
+
+def _read_header(file: BinaryIO, path: PathLike) -> PlyFile:
+    head = file.read(MAX_HEADER_BYTES)
+    if head[:64].lstrip().lower().startswith(b"<!doctype html"):
+        raise InputError(f"{path}: is a web page, and this is not a browser; give the checkpoint that it was made of.")
+    if re.match(rb"ply\r?\n", head) is None:
+        what = f"begins with {head[:8]!r}" if head else "is empty (0 bytes)"
+        raise InputError(f"{path}: {what}, where a PLY file begins with the line 'ply'; give a 3DGS .ply file.")
+    end = re.search(rb"^end_header\r?\n", head, re.MULTILINE)
+    if end is None:
+        raise InputError(
+            f"{path}: has no line 'end_header' in its first {len(head)} bytes (at most {MAX_HEADER_BYTES} are read): "
+            "it is truncated or not a .ply file."
+        )
+    lines = head[: end.start()].decode(errors="replace").split("\n")[1:-1]  # comments may be in any encoding
+    encoding, elements = _parse_lines(lines, path)
+    size = os.fstat(file.fileno()).st_size
+    return PlyFile(file, path, encoding, end.end(), _place(elements, encoding, end.end(), size, path))
+
+
+def _parse_lines(lines: list[str], path: PathLike) -> tuple[str, dict[str, Element]]:
+    """Parse the header's lines between `ply` and `end_header`: the encoding, and the elements in their order."""
+    elements: dict[str, Element] = {}
+    last: Element | None = None
+    encoding = ""
+    for number, line in enumerate(lines, start=2):
+        where = f"{path}: header line {number}, {line[:80]!r},"
+        match line.split():
+            case ["comment" | "obj_info", *words]:
+                if last is not None:
+                    last.comments.append(" ".join(words))
+            case ["format", encoding, _]:
+                if encoding not in _BYTE_ORDERS:
+                    raise InputError(f"{where} has none of the encodings {', '.join(_BYTE_ORDERS)}.")
+            case ["element", name, count]:
+                if name in elements:
+                    raise InputError(f"{where} declares an element a second time; the file is damaged.")
+                if not re.fullmatch("[0-9]{1,18}", count):
+                    raise InputError(f"{where} does not declare a count from 0 to 10^18 - 1; the file is damaged.")
+                last = elements[name] = Element(name, int(count))
+            case ["property", "list", *_] if last is not None:
+                last.has_lists = True
+            case ["property", kind, name]:
+                if last is None or kind not in _SCALARS:
+                    what = "stands before any element" if last is None else f"has an unknown type {kind[:40]!r}"
+                    raise InputError(f"{where} {what}; the file is damaged.")
+                if name in last.properties:
+                    raise InputError(f"{where} declares a property a second time; the file is damaged.")
+                last.properties[name] = np.dtype(_BYTE_ORDERS.get(encoding, "<") + _SCALARS[kind])
+            case _:
+                raise InputError(f"{where} is not a line of a PLY header; the file is damaged.")
+    if not encoding:
+        raise InputError(f"{path}: its header has no line 'format binary_little_endian 1.0'; the file is damaged.")
+    return encoding, elements
+
+
+def _place(elements: dict[str, Element], encoding: str, start: int, size: int, path: PathLike) -> dict[str, Element]:
+    """Set the offsets of the elements before the first with lists, and return them. They must fill the file."""
+    text = encoding == "ascii"
+    end, line = start, 0
+    placed: dict[str, Element] = {}
+    for element in elements.values():
+        if element.has_lists:
+            return placed
+        placed[element.name] = element
+        element.offset = line if text else end
+        # In text, a value takes a character and the blank or the line's end behind it.
+        stride = max(2 * len(element.properties), 1) if text else element.stride
+        end += element.count * stride
+        line += element.count
+        if end > size + text:  # the last line needs no end
+            raise InputError(
+                f"{path}: element {element.name[:40]!r} ({element.count} rows of {stride} bytes) would end at byte "
+                f"{end}, but the file has {size} bytes: it is truncated or its header is wrong."
+            )
+    if end < size and not text:
+        raise InputError(
+            f"{path}: its header declares {end} bytes, but the file has {size}: a count is wrong or something was "
+            "appended."
+        )
+    return placed
