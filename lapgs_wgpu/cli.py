@@ -84,9 +84,7 @@ def _resume(
     from lapgs_wgpu.train.run_folder import changes_since, check_same_data, result_text
 
     _check_alone("resume", options, [key for key in overrides if key not in RESUME_KEYS], allowed=("view",))
-    _check_files("--resume", "a run", run / "config.toml")
-    config = load_config(str(run / "config.toml"), overrides)
-    _check_capture(run, config)
+    config = _config_of(run, overrides, "--resume needs the folder of a run")
     device = open_device(options["device"], number=ranks.local_rank)
     config, dataset = _open_data(config, run.parent, ranks)
     if "data.path" in overrides:
@@ -108,9 +106,10 @@ def _evaluate(run: Path, options: dict[str, typing.Any], overrides: dict[str, ty
 
     _check_alone("eval", options, [key for key in overrides if key not in EVAL_KEYS])
     lpips = _lpips(options)
-    _check_files("--eval", "a finished run", run / "config.toml", run / "checkpoint.ply")
-    config = load_config(str(run / "config.toml"), {**overrides, "data.masks": ""})  # masks are for the training alone
-    _check_capture(run, config)
+    if not (run / "checkpoint.ply").is_file():
+        raise InputError(f"{run / 'checkpoint.ply'} does not exist; --eval needs the folder of a finished run.")
+    overrides["data.masks"] = ""  # masks are for the training alone
+    config = _config_of(run, overrides, "--eval needs the folder of a finished run")
     device = open_device(options["device"])
     scene = load(run / "checkpoint.ply", device)
     config, dataset = _open_data(config, run.parent, SINGLE_PROCESS, normalize="placement" in scene.metadata)
@@ -146,19 +145,17 @@ def _lpips(options: dict[str, typing.Any]) -> Lpips | None:
     return Lpips(Path(options["lpips_weights"])) if options["lpips_weights"] else None
 
 
-def _check_files(option: str, what: str, *files: Path) -> None:
-    for file in files:
-        if not file.is_file():
-            raise InputError(f"{file} does not exist; {option} needs the folder of {what}.")
-
-
-def _check_capture(run: Path, config: Config) -> None:
-    """Raises InputError where the capture of a run is gone."""
+def _config_of(run: Path, overrides: dict[str, typing.Any], advice: str) -> Config:
+    """The configuration of a run. Raises InputError where it or the run's capture is gone."""
+    if not (run / "config.toml").is_file():
+        raise InputError(f"{run / 'config.toml'} does not exist; {advice}.")
+    config = load_config(str(run / "config.toml"), overrides)
     if config.data.path != "synthetic" and not Path(config.data.path).exists():
         raise InputError(
             f"{config.data.path}, the capture of {run / 'config.toml'}, does not exist; give --data the folder where "
             "it is now."
         )
+    return config
 
 
 def _open_data(config: Config, parent: Path, ranks: Ranks, *, normalize: bool = True) -> tuple[Config, Dataset]:

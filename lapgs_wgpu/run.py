@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from functools import partial
@@ -13,7 +14,7 @@ from typing import Any
 
 from lapgs_wgpu.data.initial_gaussians import first_points
 from lapgs_wgpu.data.validation import check_in_view, check_times
-from lapgs_wgpu.data.views import Dataset
+from lapgs_wgpu.data.views import Dataset, spread_views
 from lapgs_wgpu.discovery.start import start_training
 from lapgs_wgpu.errors import DeviceError, InputError, NumericalError, quoted
 from lapgs_wgpu.gpu.device import Device, open_device
@@ -28,8 +29,7 @@ from lapgs_wgpu.train.evaluate import evaluate, write_metrics
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.lpips import Lpips
 from lapgs_wgpu.train.malloc import keep_freed_memory, return_freed_memory
-from lapgs_wgpu.train.monitor import Monitor
-from lapgs_wgpu.train.parts import Callback, Parts
+from lapgs_wgpu.train.parts import Parts
 from lapgs_wgpu.train.run_folder import (
     STATE,
     check_run_folder,
@@ -47,6 +47,7 @@ from lapgs_wgpu.train.tensorboard import TensorBoard, check_tensorboard
 from lapgs_wgpu.train.trainer import Trainer
 
 PROBES = 2048  # points of the scene that say whether a camera sees it
+TRAINING_VIEWS = 8  # that are measured during the training where there are no validation views
 OUTSIDE = 0.05  # warn if this share of the Gaussians, or more, is outside the encoder's box
 
 # Takes over a training's steps, such as a viewer does: called with the scene, where to look at it from, and the steps,
@@ -161,19 +162,11 @@ def _outside(scene: Scene4D) -> str:
 def _assist(training: Trainer) -> Scene4D:
     """Take the steps of a process that is not the first: nothing is written."""
     with _interruptible() as interrupted:
-        try:
-            while _goes_on(training, interrupted):
-                training.step()
-        finally:
-            training.close()
+        for _ in _steps(training, None, interrupted):
+            pass
     if training.done < training.config.schedule.steps:
         raise KeyboardInterrupt(f"stopped after step {training.done}.")
     return training.scene
-
-
-def _goes_on(training: Trainer, interrupted: threading.Event) -> bool:
-    """Whether a step is left, and no process was interrupted."""
-    return training.done < training.config.schedule.steps and not training.ranks.any_rank(interrupted.is_set())
 
 
 def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None) -> Scene4D:
@@ -183,7 +176,11 @@ def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None)
     with log, _interruptible() as interrupted:
         if training.discovery is not None:
             log.discovered(training.discovery)
-        training.callbacks += [log.after_step, *_monitors(training, log, out)]
+        if config.eval.tensorboard:
+            log.listeners.append(TensorBoard(out / "tensorboard", done=training.done))
+        training.callbacks.append(log.after_step)
+        if config.eval.interval:
+            training.callbacks.append(partial(_log_psnr, log))
         if config.schedule.save_interval:
             training.callbacks.append(partial(_save_now_and_then, out))
         steps = _steps(training, out, interrupted)
@@ -193,16 +190,19 @@ def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None)
             pass
         if not training.whole:  # nothing of it may be saved
             raise RuntimeError(f"step {training.done + 1} broke off halfway, and what watched it kept its error.")
-        seconds = log.seconds
-        if training.done == config.schedule.steps and (outside := _outside(scene)):
+        done, all_steps = training.done, config.schedule.steps
+        measured: dict[str, Any] = {"steps": done, "seconds": round(log.seconds, 3)}
+        if done == all_steps and (outside := _outside(scene)):
             log.tell(outside)
         if training.cameras is not None:
-            log.tell(_moved(training.cameras.report()))
-        if training.timing is not None and (retimed := training.timing.report())["frames_most"] > 0:
-            log.tell(_retimed(retimed))
+            measured["cameras"] = training.cameras.report()
+            log.tell(_moved(measured["cameras"]))
+        if training.timing is not None:
+            retimed = measured["image_times"] = training.timing.report()
+            if retimed["frames_most"] > 0:
+                log.tell(_retimed(retimed))
 
     return_freed_memory()
-    done, all_steps = training.done, config.schedule.steps
     save_state(out, training.state())
     training.save(out / "checkpoint.ply")
     if done < all_steps:
@@ -210,11 +210,6 @@ def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None)
             f"stopped after step {done} of {all_steps}; {out / 'checkpoint.ply'} holds it, and "
             f"lapgs-train --resume {quoted(out)} goes on."
         )
-    measured: dict[str, Any] = {"steps": done, "seconds": round(seconds, 3)}
-    if training.cameras is not None:
-        measured["cameras"] = training.cameras.report()
-    if training.timing is not None:
-        measured["image_times"] = training.timing.report()
     try:
         evaluate_run(out, scene, training.dataset, config.data, measured, lpips)
     except KeyboardInterrupt:
@@ -226,15 +221,13 @@ def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None)
     return scene
 
 
-def _monitors(training: Trainer, log: Log, out: Path) -> list[Callback]:
-    """The callbacks that the table eval of the configuration asks for. Raises InputError."""
-    config = training.config.eval
-    found: list[Callback] = []
-    if config.tensorboard:
-        log.listeners.append(TensorBoard(out / "tensorboard", done=training.done))
-    if config.interval:
-        found.append(Monitor(training.dataset, log))
-    return found
+def _log_psnr(log: Log, training: Trainer, result: StepResult) -> None:
+    """Log the mean PSNR of the validation views, or of some training views, every eval.interval steps."""
+    if result.step % training.config.eval.interval == 0:
+        start, data = time.perf_counter(), training.dataset
+        name, views = ("val", data.val) if data.val else ("train", spread_views(data.train, TRAINING_VIEWS))
+        psnr = training.psnr(views)
+        log.evaluated(result.step, psnr, name, time.perf_counter() - start)
 
 
 def _save_now_and_then(out: Path, training: Trainer, result: StepResult) -> None:
@@ -242,10 +235,11 @@ def _save_now_and_then(out: Path, training: Trainer, result: StepResult) -> None
         save_state(out, training.state())
 
 
-def _steps(training: Trainer, out: Path, interrupted: threading.Event) -> Iterator[StepResult]:
-    """The steps that are left, until `interrupted` is set."""
+def _steps(training: Trainer, out: Path | None, interrupted: threading.Event) -> Iterator[StepResult]:
+    """Take the steps that are left, until `interrupted` is set in any process. An error saves the state in `out`."""
+    ranks, last = training.ranks, training.config.schedule.steps
     try:
-        while _goes_on(training, interrupted):
+        while training.done < last and not ranks.any_rank(interrupted.is_set()):
             yield training.step()
     except (DeviceError, NumericalError, MemoryError) as error:
         kind = MemoryError if not isinstance(error, DeviceError | NumericalError) else type(error)  # numpy has its own
@@ -257,8 +251,10 @@ def _steps(training: Trainer, out: Path, interrupted: threading.Event) -> Iterat
         training.close()
 
 
-def _saved(training: Trainer, out: Path) -> str:
+def _saved(training: Trainer, out: Path | None) -> str:
     """Save the state of a training that cannot go on, if it has one worth saving; what a user should know of it."""
+    if out is None:
+        return ""
     if training.whole and training.done:
         try:
             save_state(out, training.state())

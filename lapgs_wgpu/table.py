@@ -28,7 +28,7 @@ from lapgs_wgpu.io.safe_json_toml import read_json, read_toml
 from lapgs_wgpu.stop_signals import on_stop_signals
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.open_dataset import SYNTHETIC
-from lapgs_wgpu.train.presets import Table, build_config, load_config, merge, shorthands, write_toml
+from lapgs_wgpu.train.presets import load_config, write_toml
 from lapgs_wgpu.train.run_folder import has_state
 
 _NAME = re.compile(
@@ -75,25 +75,26 @@ def read_spec(path: Path) -> list[Run]:
     for name in (*spec.scenes, *spec.rows):
         if not _NAME.fullmatch(name):
             raise InputError(f"{path}: {name!r} must be a name of letters, digits, spaces and . + = _ - only.")
-    common = _copied(spec.common or {}, f"{path}: common")
+    common = _dotted(spec.common or {}, f"{path}: common")
     runs = []
-    for scene, of_scene in spec.scenes.items():
-        of_scene = _copied({"folder": of_scene} if isinstance(of_scene, str) else of_scene, f"{path}: scenes.{scene}")
+    for scene, value in spec.scenes.items():
+        of_scene = _dotted({"folder": value} if isinstance(value, str) else value, f"{path}: scenes.{scene}")
         folder = checked(str, of_scene.pop("folder", None), f"{path}: scenes.{scene}.folder")
-        for row, of_row in spec.rows.items():
+        for row, row_table in spec.rows.items():
             where = f"{path}: rows.{row}"
-            of_row = _copied(of_row, where)
+            of_row = _dotted(row_table, where)
             scenes = checked(tuple[str, ...], of_row.pop("scenes", list(spec.scenes)), f"{where}.scenes")
             seeds = checked(tuple[int, ...], of_row.pop("seeds", list(spec.seeds)), f"{where}.seeds")
             if unknown := [name for name in scenes if name not in spec.scenes]:
                 raise InputError(f"{where}.scenes: {shown(unknown[0])} is no scene of this table.")
             ablate = checked(tuple[str, ...], of_row.pop("ablate", []), f"{where}.ablate")
-            short = shorthands(of_row.pop("method", None), ablate, (f"{where}.method", f"{where}.ablate"))
-            if scene not in scenes:
-                continue
-            values = merge(merge(common, of_scene), of_row)
-            for seed in seeds:
-                config = build_config(spec.preset, merge(values, {"seed": seed}), f"{path}: {scene}, {row}", short)
+            method = of_row.pop("method", None)
+            for seed in seeds if scene in scenes else ():
+                try:
+                    values = {**common, **of_scene, **of_row, "seed": seed}
+                    config = load_config(spec.preset, values, method=method, ablate=ablate)
+                except InputError as error:
+                    raise InputError(f"{path}: scenes.{scene}, rows.{row}: {error}") from None
                 runs.append(Run(scene, row, seed, folder, config))
     return runs
 
@@ -195,14 +196,17 @@ def _is_number(value: object) -> bool:
     return isinstance(value, int | float)
 
 
-def _copied(value: Any, where: str) -> Table:
-    """A copy of a table of keys of the configuration. Raises InputError where a key is not the spec's to set."""
-    if not isinstance(value, dict):
-        raise InputError(f"{where} must be a table of keys of the configuration, got {shown(value)}.")
-    data = value.get("data")
-    if "seed" in value or (isinstance(data, dict) and "path" in data):
-        raise InputError(f"{where} must set neither seed nor data.path: the keys seeds and scenes do.")
-    return dict(value)
+def _dotted(table: Any, where: str, prefix: str = "") -> dict[str, Any]:
+    """Dotted key -> value of a nested table. Raises InputError where a key is not the spec's to set."""
+    if not isinstance(table, dict):
+        raise InputError(f"{where} must be a table of keys of the configuration, got {shown(table)}.")
+    keys: dict[str, Any] = {}
+    for name, value in table.items():
+        key = f"{prefix}{name}"
+        if key in ("seed", "data.path"):
+            raise InputError(f"{where} must set neither seed nor data.path: the keys seeds and scenes do.")
+        keys |= _dotted(value, where, f"{key}.") if isinstance(value, dict) else {key: value}
+    return keys
 
 
 def _holds(folder: Path, config: Config) -> bool:

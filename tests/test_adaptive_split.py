@@ -19,7 +19,7 @@ from lapgs_wgpu.train.adaptive_split import (
     shape_difference,
     split_scores,
 )
-from lapgs_wgpu.train.densify import Statistics, densify
+from lapgs_wgpu.train.densify import DensityState, Statistics, published_rule
 from lapgs_wgpu.train.presets import load_config
 
 CONFIG = dataclasses.replace(load_config("dnerf").density, split="adaptive")
@@ -157,7 +157,7 @@ def test_quantile_zero_is_the_plain_split() -> None:
     rows, statistics = make_rows(30), Statistics.zeros(30, torch.device("cpu"))
     statistics.gradients, statistics.views = torch.ones(30), torch.ones(30)
     changes = [
-        densify(rows, statistics, config, EXTENT, torch.Generator().manual_seed(0), bound_sizes=False)
+        published_rule(DensityState(1, rows, statistics, config, EXTENT, torch.Generator().manual_seed(0)))
         for config in (dataclasses.replace(CONFIG, split="plain"), dataclasses.replace(CONFIG, split_quantile=0.0))
     ]
     assert not changes[0].keep.any()

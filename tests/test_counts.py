@@ -16,6 +16,7 @@ from wgpu.backends.wgpu_native import GPUBuffer, GPUQueue
 from lapgs_wgpu.gpu import array as array_module
 from lapgs_wgpu.gpu import buffer as buffer_module
 from lapgs_wgpu.gpu import native
+from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.radix_sort import FEW_OWNERS, runs
 from lapgs_wgpu.motion.fields.config import FieldConfig

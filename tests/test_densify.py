@@ -12,7 +12,7 @@ from torch import Tensor
 
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train.config import DensityConfig
-from lapgs_wgpu.train.densify import Change, Statistics, densify, reset_opacities, split_rows
+from lapgs_wgpu.train.densify import Change, DensityState, Statistics, published_rule, reset_opacities, split_rows
 from lapgs_wgpu.train.presets import load_config
 
 CONFIG = dataclasses.replace(load_config("dnerf").density, max_screen_radius=20)
@@ -44,7 +44,8 @@ def make_statistics(gradients: list[float], radii: list[float] | None = None) ->
 def change(
     rows: dict[str, Tensor], statistics: Statistics, *, bound_sizes: bool = False, config: DensityConfig = CONFIG
 ) -> Change:
-    return densify(rows, statistics, config, EXTENT, torch.Generator().manual_seed(0), bound_sizes=bound_sizes)
+    step = config.reset_interval + int(bound_sizes)
+    return published_rule(DensityState(step, rows, statistics, config, EXTENT, torch.Generator().manual_seed(0)))
 
 
 def test_statistics_are_means_over_visible_views_in_normalised_device_coordinates() -> None:

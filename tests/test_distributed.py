@@ -21,6 +21,7 @@ from lapgs_wgpu.motion.scene import load
 from lapgs_wgpu.run import train
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.distributed import Ranks
+from lapgs_wgpu.train.objective import Sample
 from lapgs_wgpu.train.presets import write_toml
 from lapgs_wgpu.train.trainer import Trainer
 

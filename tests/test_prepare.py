@@ -24,7 +24,7 @@ from lapgs_wgpu.prepare.film import Film
 from lapgs_wgpu.prepare.hdr import to_sdr
 from lapgs_wgpu.prepare.reconstruct import _logging_to, neighbouring_pairs
 from lapgs_wgpu.prepare_cli import prepare_command
-from lapgs_wgpu.train.log import resident_bytes
+from lapgs_wgpu.train.environment import resident_bytes
 
 av = pytest.importorskip("av")
 pycolmap = pytest.importorskip("pycolmap")

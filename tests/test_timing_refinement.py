@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import ClassVar
@@ -17,6 +18,7 @@ from torch import Tensor, nn
 from lapgs_wgpu.data import Dataset
 from lapgs_wgpu.data.timestamps import time_step
 from lapgs_wgpu.data.views import View
+from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.fields.deformation import Deformation

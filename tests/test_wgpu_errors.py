@@ -102,7 +102,7 @@ def test_a_step_that_broke_off_halfway_is_not_saved(
     def fail(*_: Any, **__: Any) -> None:
         np.empty(1 << 58)
 
-    monkeypatch.setattr("lapgs_wgpu.train.densify.densify", fail)
+    monkeypatch.setattr("lapgs_wgpu.train.densify.split_rows", fail)
     expected = r"Unable to allocate 2\.00 EiB .*; lapgs-train --resume .* goes on from the state that was saved last\."
     with pytest.raises(MemoryError, match=expected):
         train(configure(schedule__save_interval="4", density__start="9"), dataset, tmp_path, device=device)

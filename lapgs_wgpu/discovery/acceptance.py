@@ -30,15 +30,12 @@ GAIN = 0.05  # or share of the static fit's error there that it takes away: wher
 NEAR = 0.1  # box half sides; distance within which a track explains a surface point
 
 
-def track_gaussians(tracks: Tracks) -> dict[str, Tensor]:
-    """A Gaussian for each track, at its place at the key time: the parameters of a scene without a field, float32."""
-    scales = SCALE * initial_scales(tracks.positions)
-    return isotropic_rows(tracks.positions, tracks.colors, scales, OPACITY)
-
-
 def rows_with(static: Scene4D, tracks: Tracks) -> dict[str, Tensor]:
-    """The Gaussians of the static fit, then those of the tracks, in host memory."""
-    new = track_gaussians(tracks)
+    """The Gaussians of the static fit, then one for each track at its place at the key time, in host memory.
+
+    They are the parameters of a scene without a field, float32.
+    """
+    new = isotropic_rows(tracks.positions, tracks.colors, SCALE * initial_scales(tracks.positions), OPACITY)
     return {name: torch.cat([static.parameters[name].detach().cpu(), values]) for name, values in new.items()}
 
 
@@ -97,6 +94,5 @@ def explained_share(clouds: PointClouds, tracks: Tracks, half_side: float) -> fl
     """Of the surface points, those that lie on a track."""
     near = 0
     for cloud, path in zip(clouds.clouds, tracks.paths, strict=True):
-        if len(cloud.scores):
-            near += int((cKDTree(path).query(cloud.positions)[0] < NEAR * half_side).sum())
+        near += int((cKDTree(path).query(cloud.positions)[0] < NEAR * half_side).sum())
     return near / max(clouds.total, 1)

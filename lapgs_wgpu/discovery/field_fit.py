@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from lapgs_wgpu.discovery.tracks import Tracks
 from lapgs_wgpu.motion.scene import Scene4D
@@ -37,7 +36,7 @@ def fit_field(
     field = scene.field
     assert field is not None
     groups = field.parameter_groups()
-    rates = _rates(groups)
+    rates = {name: HASH_RATE if name == "hash" else MLP_RATE for name in groups}
     optimizer = torch.optim.Adam(
         [{"params": parameters, "lr": rates[name]} for name, parameters in groups.items()], eps=ADAM_EPS, fused=True
     )
@@ -68,16 +67,8 @@ def fit_field(
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-        errors.append(_mean_distance(squared[: len(moving)].detach(), weights[: len(moving)]))
+        distances, seen = squared[: len(moving)].detach().sqrt(), weights[: len(moving)]
+        errors.append(float((seen * distances).sum() / seen.sum().clamp(min=1.0)))
         progress(step + 1)
     optimizer.zero_grad()
-    last = errors[-max(1, len(errors) // 10) :]
-    return float(np.mean(last)) if last else 0.0
-
-
-def _rates(groups: Iterable[str]) -> dict[str, float]:
-    return {name: HASH_RATE if name == "hash" else MLP_RATE for name in groups}
-
-
-def _mean_distance(squared: Tensor, weights: Tensor) -> float:
-    return float((weights * squared.sqrt()).sum() / weights.sum().clamp(min=1.0))
+    return float(np.mean(errors[-max(1, steps // 10) :]))

@@ -50,8 +50,8 @@ class Follower:
         self._members = [np.flatnonzero(self.part == k) for k in np.argsort(-sizes, kind="stable")]
         self._unit, self._half_side = unit, half_side
         same = self.part[:, None] == self.part[None]
-        apart = ((self.positions[:, None] - self.positions[None]) ** 2).sum(axis=2)
-        self._kernels = [np.exp(-apart / (2 * (h * unit) ** 2)).astype(np.float32) * same for h in (STIFF, SOFT)]
+        sq_distances = ((self.positions[:, None] - self.positions[None]) ** 2).sum(axis=2)
+        self._kernels = [np.exp(-sq_distances / (2 * (h * unit) ** 2)).astype(np.float32) * same for h in (STIFF, SOFT)]
         rough = unit * _grid(SEARCH, SEARCH_STEPS[0])
         self._rough = rough[np.linalg.norm(rough, axis=1) < (SEARCH + 1e-3) * unit]
         self._fine = unit * _grid(SEARCH_STEPS[1], SEARCH_STEPS[1])
@@ -117,11 +117,11 @@ class Follower:
         for k, members in enumerate(self._members):
             free *= 1.0 - 0.9 * self._search(k, members, positions, points, free, expected[k], first=first)
         data, weights = points.positions, points.scores[:, None]
-        alike = 0.2 + 0.8 * np.exp(-_squared(points.colors, self.colors) / (2 * COLOR_SPREAD**2))
+        alike = 0.2 + 0.8 * np.exp(-_sq_distances(points.colors, self.colors) / (2 * COLOR_SPREAD**2))
         for step in range(ROUNDS):
             share = step / (ROUNDS - 1)
             spread = self._unit * WIDE ** (1 - share) * NARROW**share
-            belongs = alike * np.exp(-_squared(data, positions) / (2 * spread**2))
+            belongs = alike * np.exp(-_sq_distances(data, positions) / (2 * spread**2))
             belongs *= weights / (belongs.sum(axis=1, keepdims=True) + NOISE)
             mass = belongs.sum(axis=0)[:, None]
             kernel = self._kernels[0] if share < 0.6 else self._kernels[1]
@@ -149,8 +149,9 @@ class Follower:
         reaches, spreads = np.array([reach, 1.0], np.float32), np.array([widening, 1.0]) * PRIOR * self._unit
 
         def prior(shifts: Floats) -> NDArray[np.float64]:
-            apart = [((shifts - start) ** 2).sum(axis=1) for start in starts]
-            return np.max([np.exp(-a / (2 * spread**2)) for a, spread in zip(apart, spreads, strict=False)], axis=0)
+            sq_distances = [((shifts - start) ** 2).sum(axis=1) for start in starts]
+            likely = [np.exp(-sq / (2 * spread**2)) for sq, spread in zip(sq_distances, spreads, strict=False)]
+            return np.max(likely, axis=0)
 
         shifts = np.concatenate([start + scale * self._rough for start, scale in zip(starts, reaches, strict=False)])
         rough, _ = self._explained(members, positions, points, free, shifts, SEARCH_SPREADS[0])
@@ -184,7 +185,7 @@ class Follower:
         moved = (points.positions.T[:, None] - shifts.T[:, :, None]).reshape(3, -1)
         nearest, squared = _nearest(moved, positions[some])
         near = np.exp(-squared / (2 * (spread * self._unit) ** 2)).reshape(len(shifts), -1)
-        pairs = 0.3 + 0.7 * np.exp(-_squared(points.colors, self.colors[some]) / (2 * 0.35**2))
+        pairs = 0.3 + 0.7 * np.exp(-_sq_distances(points.colors, self.colors[some]) / (2 * 0.35**2))
         alike = pairs[np.arange(len(points.colors)), nearest.reshape(near.shape)]
         return (near * alike * free * points.scores).sum(axis=1), near
 
@@ -210,7 +211,7 @@ def _nearest(a: Floats, b: Floats) -> tuple[NDArray[np.uint8], Floats]:
     return nearest, np.maximum(squared, 0.0)
 
 
-def _squared(a: Floats, b: Floats) -> Floats:
+def _sq_distances(a: Floats, b: Floats) -> Floats:
     """(n, m) squared distances of rows (n, d) and (m, d)."""
     product: Floats = (a**2).sum(axis=1)[:, None] + (b**2).sum(axis=1)[None] - 2 * (a @ b.T)
     return np.maximum(product, 0.0)

@@ -93,15 +93,13 @@ class Residual:
 
 
 def moving_pixels(image: Floats, still: Floats) -> Mask:
-    """(H, W): where an image (H, W, 3) differs from the static fit's, but for thin lines and single pixels."""
-    residual = interval_residual(image, still)
-    core = ndimage.binary_opening(residual > THRESHOLD)
-    return ndimage.binary_dilation(core, iterations=2) & (residual > 0.5 * THRESHOLD)
+    """(H, W) bool: where an image (H, W, 3) differs from the static fit's, but for thin lines and single pixels.
 
-
-def interval_residual(image: Floats, still: Floats) -> Floats:
-    """(H, W): distance of an image's colors (H, W, 3) to the range of the static fit's colors within REACH pixels,
-    the largest over the channels."""
+    The residual is the distance of a color to the range of the static fit's colors within REACH pixels, the largest
+    over the channels.
+    """
     size = (2 * REACH + 1, 2 * REACH + 1, 1)
     low, high = ndimage.minimum_filter(still, size), ndimage.maximum_filter(still, size)
-    return np.maximum(np.maximum(low - image, image - high), 0.0).max(axis=2)
+    residual = np.maximum(np.maximum(low - image, image - high), 0.0).max(axis=2)
+    core = ndimage.binary_opening(residual > THRESHOLD)
+    return ndimage.binary_dilation(core, iterations=2) & (residual > 0.5 * THRESHOLD)

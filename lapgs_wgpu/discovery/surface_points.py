@@ -8,8 +8,8 @@ static fit blurs. They get no points.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,21 +43,29 @@ class Points(NamedTuple):
     colors: Floats
     scores: Floats
 
+    def chosen(self, rows: NDArray[Any]) -> Points:
+        """The points of an index or a mask (n,)."""
+        return Points(*(values[rows] for values in self))
+
     def thinned(self, most: int) -> Points:
         """At most `most` of the points, evenly chosen."""
-        chosen = evenly_indices(len(self.scores), most)
-        return Points(*(values[chosen] for values in self))
+        return self.chosen(evenly_indices(len(self.scores), most))
+
+
+def merged(parts: Iterable[Points]) -> Points:
+    """All points of several sets, at least one, in their order."""
+    return Points(*(np.concatenate(values) for values in zip(*parts, strict=True)))
 
 
 class PointClouds(NamedTuple):
-    """The surface points of all times. times: (T,) ascending. clouds: of each."""
+    """The surface points of all times (T,), ascending, and the cloud of each."""
 
     times: NDArray[np.float64]
     clouds: tuple[Points, ...]
 
     @property
     def total(self) -> int:
-        """Of points, over all times."""
+        """Number of points over all times."""
         return sum(len(cloud.scores) for cloud in self.clouds)
 
 
@@ -68,8 +76,9 @@ def surface_points(images: Sequence[Residual], half_side: float) -> PointClouds:
     times = np.unique([image.time for image in images])
     clouds = []
     for time in times:
-        parts = [points for points, image in zip(found, images, strict=True) if image.time == time]
-        clouds.append(_dense(Points(*(np.concatenate(values) for values in zip(*parts, strict=True))), half_side))
+        clouds.append(
+            _dense(merged(points for points, image in zip(found, images, strict=True) if image.time == time), half_side)
+        )
     return PointClouds(times, tuple(clouds))
 
 
@@ -110,8 +119,8 @@ def _points(image: Residual, neighbors: list[_Neighbor], always: _Always, half_s
     votes, tolerant, weights = np.zeros(depths.shape), np.zeros(depths.shape), np.zeros(depths.shape)
     for neighbor in neighbors:
         samples = neighbor.image.sample(places)
-        apart = ((samples.colors - rays.blurred[:, None]) ** 2).sum(axis=2)
-        agreement = 1.0 - COLOR_SHARE + COLOR_SHARE * np.exp(-apart / (2 * COLOR_SPREAD**2))
+        sq_distances = ((samples.colors - rays.blurred[:, None]) ** 2).sum(axis=2)
+        agreement = 1.0 - COLOR_SHARE + COLOR_SHARE * np.exp(-sq_distances / (2 * COLOR_SPREAD**2))
         vote = neighbor.weight * samples.mask * agreement
         votes += vote
         tolerant += _blur_along_rays(vote, neighbor.doubt(eye, half_side) / spacing)
@@ -158,12 +167,11 @@ def _middle_of_best(scores: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def _dense(points: Points, half_side: float) -> Points:
-    """The points without those that are alone."""
+    """The points without isolated ones."""
     if len(points.scores) < 5:
-        return Points(*(values[:0] for values in points))
+        return points.thinned(0)
     distances, _ = cKDTree(points.positions).query(points.positions, k=5)
-    kept = distances[:, 4] < LONELY * half_side
-    return Points(*(values[kept] for values in points))
+    return points.chosen(distances[:, 4] < LONELY * half_side)
 
 
 def parts_of(positions: Floats, link: float) -> NDArray[np.int64]:

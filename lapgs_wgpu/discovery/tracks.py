@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from lapgs_wgpu.data.timestamps import time_step
 from lapgs_wgpu.discovery.follower import LEAST_PART, LINK, Follower
 from lapgs_wgpu.discovery.residual import Floats
-from lapgs_wgpu.discovery.surface_points import PointClouds, Points, parts_of
+from lapgs_wgpu.discovery.surface_points import PointClouds, Points, merged, parts_of
 from lapgs_wgpu.discovery.trajectories import Trajectory, find_trajectories
 
 KEY_TIMES = 4  # from which is tracked, at most
@@ -80,21 +80,24 @@ def _closeness(clouds: PointClouds, tracks: Tracks | None, half_side: float) -> 
     """Of all points, how close they lie to the tracks, from 0 to their number."""
     if tracks is None:
         return 0.0
-    close = 0.0
-    for points, path in zip(clouds.clouds, tracks.paths, strict=True):
-        if len(points.scores):
-            distances = cKDTree(path).query(points.positions)[0]
-            close += float(np.exp(-0.5 * (distances / (CLOSE * half_side)) ** 2).sum())
-    return close
+    return sum(
+        float(np.exp(-0.5 * (_nearest(path, points)[0] / (CLOSE * half_side)) ** 2).sum())
+        for points, path in zip(clouds.clouds, tracks.paths, strict=True)
+    )
+
+
+def _nearest(path: Floats, points: Points) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """(n,) distance of each point to the nearest track at its time, path (m, 3), and the number of that track."""
+    distances, of = cKDTree(path).query(points.positions)
+    return distances, of
 
 
 def _tracks_by(many: float, clouds: PointClouds, trajectories: list[Trajectory], half_side: float) -> Tracks | None:
     """The tracks from key times at which as many parts are apart as this quantile of all times has."""
     free = [np.ones(len(cloud.scores), bool) for cloud in clouds.clouds]
     found: list[Tracks] = []
-    steady: list[NDArray[np.bool_]] = []
     for _ in range(KEY_TIMES):
-        rest = [Points(*(values[mask] for values in cloud)) for cloud, mask in zip(clouds.clouds, free, strict=True)]
+        rest = [cloud.chosen(mask) for cloud, mask in zip(clouds.clouds, free, strict=True)]
         key = _key_time(rest, many, half_side)
         if sum(len(points.scores) for points in rest) < LEAST_REST * clouds.total or key is None:
             break
@@ -105,22 +108,20 @@ def _tracks_by(many: float, clouds: PointClouds, trajectories: list[Trajectory],
         followed = _tracks_from(key, _merged(rest, key), clouds.times, weighted, trajectories, half_side)
         if followed is None:
             break
-        found.append(followed[0])
-        steady.append(_steady(*followed, clouds.clouds, half_side))
+        if (steady := followed[0].of_parts(_steady(*followed, clouds.clouds, half_side))) is not None:
+            found.append(steady)
         for mask, points, path in zip(free, clouds.clouds, followed[1], strict=True):
-            if len(points.scores):
-                mask &= cKDTree(path).query(points.positions)[0] >= REACH * half_side
+            mask &= _nearest(path, points)[0] >= REACH * half_side
     if not found:
         return None
     offsets = np.cumsum([0, *(tracks.part.max() + 1 for tracks in found[:-1])])
-    tracks = Tracks(
+    return Tracks(
         np.concatenate([each.positions for each in found]),
         np.concatenate([each.colors for each in found]),
         np.concatenate([each.part + offset for each, offset in zip(found, offsets, strict=True)]),
         np.concatenate([each.paths for each in found], axis=1),
         np.concatenate([each.supported for each in found], axis=1),
     )
-    return tracks.of_parts(np.concatenate(steady))
 
 
 def _key_time(clouds: list[Points], many: float, half_side: float) -> int | None:
@@ -138,8 +139,7 @@ def _key_time(clouds: list[Points], many: float, half_side: float) -> int | None
 
 def _merged(clouds: list[Points], i: int) -> Points:
     """The points of a time and of its neighbours."""
-    near = clouds[max(0, i - 1) : i + 2]
-    return Points(*(np.concatenate(values) for values in zip(*near, strict=True)))
+    return merged(clouds[max(0, i - 1) : i + 2])
 
 
 def _count_parts(points: Points, half_side: float) -> int:
@@ -203,11 +203,10 @@ def _supported(paths: Floats, part: NDArray[np.int64], clouds: list[Points], hal
 
 
 def _steady(tracks: Tracks, paths: Floats, clouds: Sequence[Points], half_side: float) -> NDArray[np.bool_]:
-    """(p,) whether a part is seen for long enough, and is one thing: it moves more from time to time than it jitters,
-    or not at all, or explains as many points at one time as at another.
+    """(p,) bool: parts that are visible long enough and do not jump between objects.
 
-    Patches of a thing that the static fit only blurs come and go; what is followed there leaps from one to the next, or
-    waits for the next.
+    Patches that the static fit only blurs come and go, and a part that follows them leaps from one to the next. A part
+    is one object if it stands still, moves more than it jitters, or explains as many points at one time as at another.
     paths: (T, n, 3), before they were smoothed.
     """
     explained = _explained(paths, tracks.part, clouds, half_side)
@@ -234,9 +233,8 @@ def _explained(paths: Floats, part: NDArray[np.int64], clouds: Sequence[Points],
     """(T, p) how many of the points of a time each part is the nearest to, and explains."""
     counts = np.zeros((len(paths), int(part.max()) + 1), np.int64)
     for count, path, points in zip(counts, paths, clouds, strict=True):
-        if len(points.scores):
-            distances, of = cKDTree(path).query(points.positions)
-            count += np.bincount(part[of[distances < REACH * half_side]], minlength=len(count))
+        distances, of = _nearest(path, points)
+        count += np.bincount(part[of[distances < REACH * half_side]], minlength=len(count))
     return counts
 
 
@@ -246,9 +244,9 @@ def _smoothed(
     """Paths (T, n, 3), each a parabola fitted to the times around: the image of a time shows one side of a part, and
     pulls it towards that side."""
     clock = times / time_step(times)
-    apart = clock[:, None] - clock
-    falloff = np.exp(-0.5 * (apart / SMOOTHING) ** 2)
-    basis = np.stack([np.ones_like(apart), -apart / SMOOTHING, (apart / SMOOTHING) ** 2], axis=2)
+    lapses = clock[:, None] - clock
+    falloff = np.exp(-0.5 * (lapses / SMOOTHING) ** 2)
+    basis = np.stack([np.ones_like(lapses), -lapses / SMOOTHING, (lapses / SMOOTHING) ** 2], axis=2)
     ridge = np.diag([0.0, RIDGE, RIDGE])
     smooth = np.empty_like(paths)
     for k in range(int(part.max()) + 1):
@@ -264,10 +262,8 @@ def _at_key_time(key: int, paths: Floats, clouds: list[Points], half_side: float
     """All points of the clip that a track (paths: (T, n, 3)) explains, moved with it to the key time."""
     parts = []
     for points, path in zip(clouds, paths, strict=True):
-        if len(points.scores):
-            distances, of = cKDTree(path).query(points.positions)
-            near = distances < REACH * half_side
-            moved = points.positions[near] + (paths[key] - path)[of[near]]
-            parts.append(Points(moved, points.colors[near], points.scores[near]))
-    merged = Points(*(np.concatenate(values) for values in zip(*parts, strict=True)))
-    return _voxels(merged, VOXEL * half_side, least=3)
+        distances, of = _nearest(path, points)
+        near = distances < REACH * half_side
+        moved = points.positions[near] + (paths[key] - path)[of[near]]
+        parts.append(points.chosen(near)._replace(positions=moved))
+    return _voxels(merged(parts), VOXEL * half_side, least=3)

@@ -100,8 +100,8 @@ def _best_path(groups: _Groups, times: int, half_side: float) -> tuple[list[int]
         velocity = (center - groups.centers[a]) / lapse[:, None]
         near = np.abs(velocity).max(axis=1, initial=0.0) <= STEP * half_side
         a, lapse, velocity = a[near], lapse[near], velocity[near]
-        apart = ((color - groups.colors[a]) ** 2).sum(axis=1) / (2 * COLOR_SPREAD**2)
-        gain = groups.worth[b] - SKIPPED * (time - groups.time[a] - 1) - np.minimum(SHARP, apart)
+        change = ((color - groups.colors[a]) ** 2).sum(axis=1) / (2 * COLOR_SPREAD**2)
+        gain = groups.worth[b] - SKIPPED * (time - groups.time[a] - 1) - np.minimum(SHARP, change)
         worth, origin = groups.worth[a], np.full(len(a), -1)
         for i, group in enumerate(a):
             if len(starts[group]):
@@ -129,11 +129,11 @@ def _best_path(groups: _Groups, times: int, half_side: float) -> tuple[list[int]
 def _smooth(groups: _Groups, path: list[int], clock: NDArray[np.float64]) -> Trajectory:
     """The path at every time (T,): a straight line fitted to the groups around it, by weights that fall off in time."""
     centers = groups.centers[path]
-    apart = groups.clock[path] - clock[:, None]
-    nearest = np.abs(apart).min(axis=1)[:, None]
-    weights = np.exp(-0.5 * (apart / (WINDOW + nearest)) ** 2)
+    lapses = groups.clock[path] - clock[:, None]
+    nearest = np.abs(lapses).min(axis=1)[:, None]
+    weights = np.exp(-0.5 * (lapses / (WINDOW + nearest)) ** 2)
     result = np.zeros((len(clock), 3), np.float32)
-    for i, (weight, lapse) in enumerate(zip(weights, apart, strict=True)):
+    for i, (weight, lapse) in enumerate(zip(weights, lapses, strict=True)):
         basis = np.stack([np.ones_like(lapse), lapse], axis=1)
         product = basis.T * weight
         ridge = np.diag([0.0, 1e-3 + nearest[i, 0]])  # beyond its ends a path hardly goes on

@@ -113,19 +113,6 @@ class DensityState(NamedTuple):
 DensityRule = Callable[[DensityState], Change]
 
 
-def published_rule(state: DensityState) -> Change:
-    """Density control as configured: 3DGS's, with the paper's adaptive split.
-
-    Args:
-        state: after a step.
-
-    Returns:
-        Which Gaussians stay, and which are added.
-    """
-    bound_sizes = state.step > state.config.reset_interval
-    return densify(state.rows, state.statistics, state.config, state.extent, state.generator, bound_sizes=bound_sizes)
-
-
 def check_change(change: Change, rows: Rows) -> None:
     """Raises InputError where a rule's result does not fit the Gaussians."""
     count = len(rows["means"])
@@ -135,52 +122,45 @@ def check_change(change: Change, rows: Rows) -> None:
         raise InputError(f"added must have the rows {', '.join(rows)}, got {', '.join(change.added)}.")
     born = len(change.added["means"])
     for name, row in change.added.items():
-        if row.shape != (born, *rows[name].shape[1:]) or row.dtype != rows[name].dtype:
-            expected = (born, *rows[name].shape[1:])
+        expected = (born, *rows[name].shape[1:])
+        if row.shape != expected or row.dtype != rows[name].dtype:
             raise InputError(
                 f"added[{name!r}] must be float32 of shape {expected}, got {row.dtype} {tuple(row.shape)}."
             )
 
 
 @torch.no_grad()
-def densify(
-    rows: Rows,
-    statistics: Statistics,
-    config: DensityConfig,
-    extent: float,
-    generator: torch.Generator,
-    *,
-    bound_sizes: bool,
-) -> Change:
-    """What becomes of the Gaussians: small ones with a large gradient are doubled, large ones split, faint ones go.
+def published_rule(state: DensityState) -> Change:
+    """Density control as configured: 3DGS's, with the paper's adaptive split.
 
-    Large ones that the adaptive split passes over stay as they are.
-    extent: of the cameras, world units. generator: where the children of a split are drawn from, on the CPU.
-    bound_sizes: whether the bounds on screen and world size hold, which they do after the first opacity reset.
+    Small Gaussians with a large gradient are cloned and large ones split, unless the adaptive split passes over them;
+    faint and oversized ones are pruned.
+
+    Args:
+        state: after a step.
+
+    Returns:
+        Which Gaussians stay, and which are added.
     """
-    gradients = statistics.mean_gradients
+    rows, config, gradients = state.rows, state.config, state.statistics.mean_gradients
+    faint, oversized = _faint(rows, config), _oversized(state, rows, state.statistics.radii)
     # Clones and children of faint ones are faint: they would go at once, and a split parent with them.
-    wanted = (gradients >= config.gradient) & ~_faint(rows, config)
-    large = rows["log_scales"].amax(dim=1) > math.log(config.split_size * extent)
-    clone = wanted & ~large
-    split = wanted & large
+    wanted = (gradients >= config.gradient) & ~faint
+    large = rows["log_scales"].amax(dim=1) > math.log(config.split_size * state.extent)
+    clone, split = wanted & ~large, wanted & large
     if config.split == "adaptive":
         split = adaptive_split(rows, split, config)
-    prune = prunable(rows, statistics.radii, config, extent, bound_sizes=bound_sizes)
-    rescued = largest(rows["opacity_logits"], min(LEAST_KEPT, len(prune) // 4))
-    prune &= ~rescued | oversized(rows, statistics.radii, config, extent, bound_sizes=bound_sizes)
+    prune = (faint & ~largest(rows["opacity_logits"], min(LEAST_KEPT, len(faint) // 4))) | oversized
     if config.limit:
         room = config.limit - int((~prune).sum())
         most = largest(torch.where((clone | split) & ~prune, gradients, -1.0), room)
         clone, split = clone & most, split & most
     clones = {name: row[clone] for name, row in rows.items()}
-    children = split_rows({name: row[split] for name, row in rows.items()}, generator)
+    children = split_rows({name: row[split] for name, row in rows.items()}, state.generator)
     born = {name: torch.cat([clones[name], children[name]]) for name in rows}
-
-    # A Gaussian that was just born has not been seen on any image.
-    unseen = torch.zeros_like(born["opacity_logits"])
-    stillborn = prunable(born, unseen, config, extent, bound_sizes=bound_sizes)
-    return Change(keep=~(split | prune), added={name: row[~stillborn] for name, row in born.items()})
+    unseen = torch.zeros_like(born["opacity_logits"])  # no image has shown them yet
+    alive = ~(_faint(born, config) | _oversized(state, born, unseen))
+    return Change(keep=~(split | prune), added={name: row[alive] for name, row in born.items()})
 
 
 def split_rows(parents: Rows, generator: torch.Generator) -> dict[str, Tensor]:
@@ -193,22 +173,19 @@ def split_rows(parents: Rows, generator: torch.Generator) -> dict[str, Tensor]:
     return rows
 
 
-def prunable(rows: Rows, radii: Tensor, config: DensityConfig, extent: float, *, bound_sizes: bool) -> Tensor:
-    """(N,) which Gaussians are too faint, or too large (radii: (N,) largest so far on an image, pixels)."""
-    return _faint(rows, config) | oversized(rows, radii, config, extent, bound_sizes=bound_sizes)
-
-
 def _faint(rows: Rows, config: DensityConfig) -> Tensor:
+    """(N,) bool: Gaussians that are too faint."""
     return rows["opacity_logits"] < _logit(config.min_opacity)
 
 
-def oversized(rows: Rows, radii: Tensor, config: DensityConfig, extent: float, *, bound_sizes: bool) -> Tensor:
-    """(N,) which Gaussians are too large; see `prunable`."""
-    large = torch.zeros_like(rows["opacity_logits"], dtype=torch.bool)
-    if bound_sizes and config.max_screen_radius > 0:
-        large |= radii > config.max_screen_radius
-    if bound_sizes and config.max_world_size > 0:
-        large |= rows["log_scales"].amax(dim=1) > math.log(config.max_world_size * extent)
+def _oversized(state: DensityState, rows: Rows, radii: Tensor) -> Tensor:
+    """(N,) bool: Gaussians that are too large, after the first opacity reset. radii: (N,) pixels, largest so far."""
+    config, large = state.config, torch.zeros_like(rows["opacity_logits"], dtype=torch.bool)
+    if state.step > config.reset_interval:
+        if config.max_screen_radius > 0:
+            large |= radii > config.max_screen_radius
+        if config.max_world_size > 0:
+            large |= rows["log_scales"].amax(dim=1) > math.log(config.max_world_size * state.extent)
     return large
 
 

@@ -13,7 +13,6 @@ from lapgs_wgpu.data.views import View, spread_views
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.camera import Camera
-from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.morton import morton_order
 from lapgs_wgpu.splat.rasterize import rasterize
 from lapgs_wgpu.train.config import Config
@@ -113,16 +112,12 @@ def contributions(scene: Scene4D, views: Sequence[View], *, moving: bool) -> Ten
     for view in views:
         with torch.no_grad():
             gaussians = scene.at(view.time) if moving else scene.canonical()
-        most = torch.maximum(most, _blending_weights(gaussians, view, scene))
+        colors = torch.zeros_like(gaussians.means, requires_grad=True)
+        shape = gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities
+        rendering = rasterize(
+            *shape, colors, view.camera, antialiased=gaussians.antialiased, depth=False, device=scene.device
+        )
+        # The sums of the weights are the gradient of the sum of the image by the colors.
+        (gradient,) = torch.autograd.grad(rendering.image[..., 0].sum(), colors)
+        most = torch.maximum(most, gradient[:, 0])
     return most
-
-
-def _blending_weights(gaussians: Gaussians[Tensor], view: View, scene: Scene4D) -> Tensor:
-    """(N,) their sums over the pixels of a view: the gradient of the sum of the image by the colors."""
-    colors = torch.zeros_like(gaussians.means, requires_grad=True)
-    shape = gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities
-    rendering = rasterize(
-        *shape, colors, view.camera, antialiased=gaussians.antialiased, depth=False, device=scene.device
-    )
-    (gradient,) = torch.autograd.grad(rendering.image[..., 0].sum(), colors)
-    return gradient[:, 0]

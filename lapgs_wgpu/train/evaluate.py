@@ -27,8 +27,8 @@ from lapgs_wgpu.progress import Progress
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train.camera_refinement import rotation_vector
 from lapgs_wgpu.train.config import BACKGROUND_LEVELS
+from lapgs_wgpu.train.environment import environment
 from lapgs_wgpu.train.image_metrics import MS_SSIM_SMALLEST, SSIM_WINDOW, masked_ssim, ms_ssim, psnr, ssim
-from lapgs_wgpu.train.log import environment
 from lapgs_wgpu.train.lpips import SMALLEST, Lpips
 from lapgs_wgpu.train.view_alignment import aligned_view
 

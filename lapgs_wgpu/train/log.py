@@ -4,39 +4,23 @@ from __future__ import annotations
 
 import json
 import math
-import os
-import platform
-import subprocess
-import sys
 import time
 from collections import Counter, deque
 from collections.abc import Callable
 from contextlib import suppress
-from importlib import metadata
 from pathlib import Path
 from types import TracebackType
-from typing import Any, BinaryIO, Protocol, TextIO
-
-import torch
+from typing import Any, BinaryIO, TextIO
 
 from lapgs_wgpu.errors import InputError, quoted
-from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.atomic import atomic_write
-from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.progress import Progress, duration
+from lapgs_wgpu.train.environment import resident_bytes
 from lapgs_wgpu.train.step_result import StepResult
+from lapgs_wgpu.train.trainer import Trainer
 
 INTERVAL = 50  # steps from one line of log.jsonl to the next, over which loss and PSNR are averaged
 _MOST_SECONDS = 1e9  # that a training takes
-
-
-class Watched(Protocol):
-    """A training, as `Trainer` is one."""
-
-    scene: Scene4D
-
-    @property
-    def dead_scales(self) -> float: ...
 
 
 class Log:
@@ -66,9 +50,8 @@ class Log:
         self._file, so_far = _continued(path, done)
         self._recent: deque[StepResult] = deque(maxlen=INTERVAL)
         self.listeners: list[Callable[[dict[str, Any]], None]] = []
-        now = time.perf_counter()
-        self._start = now - (so_far or before)
-        self._began = now
+        self._began = time.perf_counter()
+        self._start = self._began - (so_far or before)
         self._times: deque[float] = deque(maxlen=INTERVAL + 1)  # at which steps ended
         self._pruned = self._pruned_before = 0  # in all, and until the last line
 
@@ -86,7 +69,7 @@ class Log:
         """Since the start, motion discovery included."""
         return time.perf_counter() - self._start
 
-    def after_step(self, trainer: Watched, result: StepResult, /) -> None:
+    def after_step(self, trainer: Trainer, result: StepResult, /) -> None:
         """Take in a step that is done; the loss of one that was skipped does not count. A callback of `Trainer`."""
         if result.skipped is not None:
             self.tell(str(result.skipped))
@@ -168,9 +151,8 @@ def _continued(path: Path, done: int) -> tuple[BinaryIO, float]:
     """The log of the first `done` steps, open at its end, and the seconds that they took."""
     kept, seconds = [], 0.0
     if done:
-        with suppress(
-            OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError
-        ):  # a damaged log is no reason to stop
+        # A damaged log is no reason to stop.
+        with suppress(OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
             for text in path.read_text(encoding="utf-8").splitlines():
                 line = json.loads(text)
                 if line["step"] <= done:
@@ -181,7 +163,7 @@ def _continued(path: Path, done: int) -> tuple[BinaryIO, float]:
     return path.open("ab", buffering=0), seconds  # a line is one write, and none waits for a later one to fail
 
 
-def _now(trainer: Watched) -> dict[str, Any]:
+def _now(trainer: Trainer) -> dict[str, Any]:
     """Of the scene after a step: the share of dead scales, the motion's spectrum where there is one, and memory."""
     values = {}
     if (motion := trainer.scene.spectrum) is not None:
@@ -193,34 +175,3 @@ def _now(trainer: Watched) -> dict[str, Any]:
         **spectrum,
         "memory": {name: value for name, value in memory.items() if value is not None},
     }
-
-
-def resident_bytes() -> int | None:
-    """Memory of this process at present; where the system does not tell, the most so far; None where it tells
-    neither."""
-    with suppress(OSError, ValueError):
-        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    with suppress(ImportError):
-        import resource
-
-        most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        return most if sys.platform == "darwin" else 1024 * most
-    return None
-
-
-def environment(device: Device) -> dict[str, str]:
-    """With what a run was made: versions, adapter, driver, torch's threads, the git revision of a checkout."""
-    packages = ("lapgs-wgpu", "torch", "wgpu", "numpy")
-    found = {name.replace("-", "_"): metadata.version(name) for name in packages}
-    found |= {"python": platform.python_version(), "system": f"{platform.system()} {platform.machine()}"}
-    found |= {"adapter": device.info.name, "backend": device.info.backend, "driver": device.info.driver}
-    found["torch_threads"] = str(torch.get_num_threads())
-    checkout = Path(__file__).parents[2]
-    if (checkout / ".git").exists():
-        command = ["git", "-C", str(checkout), "describe", "--always", "--dirty", "--abbrev=12"]
-        try:
-            done = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
-            found["revision"] = done.stdout.strip()
-        except (OSError, subprocess.SubprocessError):
-            pass  # no git here, or not ours to read: the versions must do
-    return found

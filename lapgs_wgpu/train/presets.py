@@ -80,42 +80,27 @@ def load_config(
     """
     preset = os.fspath(preset)
     known = config_keys()
-    table: Table = {}
-    for key, value in (overrides or {}).items():
+    base = _read(preset)
+    for key, value in {**_shorthands(method, ablate), **(overrides or {})}.items():
         if key not in known:
             hint = f" any more: {REMOVED[key]}." if key in REMOVED else did_you_mean(key, known)
             raise InputError(f"there is no key {key!r}{hint}")
         texts = isinstance(value, str) or (isinstance(value, list) and all(isinstance(each, str) for each in value))
-        _set(table, key, from_text(value, known[key]) if texts else value)
-    return build_config(preset, table, preset, shorthands(method, ablate, ("--field", "--ablate")))
+        _set(base, key, from_text(value, known[key]) if texts else value)
+    return build_dataclass(Config, base, preset, advice=ADVICE)
 
 
-def build_config(preset: str, table: Table, source: str, short: Mapping[str, Any]) -> Config:
-    """A preset, by name or by path, with `shorthands` and then a nested table of values laid over it.
-
-    source: where the table stands, for the text of an InputError.
-    """
-    base = _read(preset)
-    for key, value in short.items():
-        _set(base, key, value)
-    return build_dataclass(Config, merge(base, table), source, advice=ADVICE)
-
-
-def shorthands(method: str | None, ablate: Iterable[str], names: tuple[str, str]) -> dict[str, Any]:
-    """Key of the configuration -> value of what `method` and `ablate` of `load_config` stand for.
-
-    names: how the text of an InputError calls the two.
-    """
+def _shorthands(method: str | None, ablate: Iterable[str]) -> dict[str, Any]:
+    """Key of the configuration -> value of what `method` and `ablate` of `load_config` stand for."""
     values: dict[str, Any] = {}
     if method is not None:
-        values["field.kind"] = checked(Method, method, names[0])
+        values["field.kind"] = checked(Method, method, "method")
         values |= PAPER_ONLY if method != "laplacian" else {}
     for part in ablate:
         if part not in ABLATIONS:
-            hint = did_you_mean(part, ABLATIONS)
-            raise InputError(f"{names[1]} knows {', '.join(ABLATIONS)}, not {shown(part)}{hint}")
+            raise InputError(f"ablate knows {', '.join(ABLATIONS)}, not {shown(part)}{did_you_mean(part, ABLATIONS)}")
         if method not in (None, "laplacian") and (method, part) != ("grid4d", "hash"):
-            raise InputError(f"{names[1]} {part}: only the method laplacian has this part, not {method}.")
+            raise InputError(f"ablate {part}: only the method laplacian has this part, not {method}.")
         _, key, value = ABLATIONS[part]
         values[key] = value
     return values
@@ -145,7 +130,7 @@ def _read(preset: str, seen: tuple[str, ...] = ()) -> Table:
         return table
     if not isinstance(base, str):
         raise InputError(f"{preset}: base must be the name of a preset, got {shown(base)}.")
-    return merge(_read(base, (*seen, preset)), table)
+    return _merge(_read(base, (*seen, preset)), table)
 
 
 def _read_file(path: str) -> Table:
@@ -189,12 +174,12 @@ def _remove(table: Any, key: str) -> bool:
     return True
 
 
-def merge(below: Table, above: Table) -> Table:
+def _merge(below: Table, above: Table) -> Table:
     """A nested table with another one laid over it."""
     merged = dict(below)
     for key, value in above.items():
         both = isinstance(value, dict) and isinstance(below.get(key), dict)
-        merged[key] = merge(below[key], value) if both else value
+        merged[key] = _merge(below[key], value) if both else value
     return merged
 
 

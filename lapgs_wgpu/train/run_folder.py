@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import shutil
-import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -18,26 +16,27 @@ from numpy.typing import NDArray
 from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.io.atomic import atomic_write, move
+from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.io.listing import listed
 from lapgs_wgpu.io.safe_json_toml import read_toml
 from lapgs_wgpu.io.safetensors_file import pack_tensors, unpack_tensors
 from lapgs_wgpu.train.config import Config
+from lapgs_wgpu.train.environment import environment
 from lapgs_wgpu.train.host_threads import step_threads
-from lapgs_wgpu.train.log import environment
 from lapgs_wgpu.train.presets import write_toml
 
-STATE, STATE_BEFORE, LOCK = "state.safetensors", "state.before.safetensors", ".lock"
+STATE, LOCK = "state.safetensors", ".lock"
+OLD_STATE = "state.before.safetensors"  # that earlier versions wrote, too
 RUN_FILES = (
     "config.toml", "log.jsonl", "metrics.json", "metrics.csv", "checkpoint.ply", "eval", "tensorboard",
-    STATE, STATE_BEFORE,
+    STATE, OLD_STATE,
 )  # fmt: skip
 
 State = Mapping[str, NDArray[Any]]
 
 
 def check_run_folder(out: Path, *, overwrite: bool) -> None:
-    """InputError where a run cannot be written there."""
+    """Raises InputError where a run cannot be written there."""
     if out.exists() and not out.is_dir():
         raise InputError(f"{out} is a file; name a folder for the run with --out.")
     if not out.exists() or all(entry.name == LOCK or entry.match(".*.tmp") for entry in listed(out)):
@@ -61,32 +60,22 @@ def locked_folder(out: Path) -> Iterator[None]:
 
     new = not out.exists()
     out.mkdir(parents=True, exist_ok=True)
-    path, lock = out / LOCK, FileLock(out / LOCK, blocking=False)  # follows no symbolic link
+    lock = FileLock(out / LOCK, blocking=False)  # follows no symbolic link
     try:
         lock.acquire()
     except Timeout:
-        who = ""
-        with suppress(OSError):
-            who = path.read_text(encoding="ascii", errors="replace")[:20].strip()
         raise InputError(
-            f"{out} is being written by another lapgs-train (process {who if who.isdecimal() else 'unknown'}); wait "
-            "for it, or name another folder."
+            f"{out} is being written by another lapgs-train; wait for it, or name another folder."
         ) from None
     try:
-        with suppress(OSError), open(path, "w", opener=_open_no_follow) as file:  # the disk may be full
-            file.write(str(os.getpid()))
         yield
     finally:
         with suppress(OSError):
-            path.unlink(missing_ok=True)
+            (out / LOCK).unlink(missing_ok=True)
         lock.release()
         if new:
             with suppress(OSError):  # it is not empty, unless something went wrong
                 out.rmdir()
-
-
-def _open_no_follow(path: str, flags: int) -> int:
-    return os.open(path, flags | getattr(os, "O_NOFOLLOW", 0), 0o666)
 
 
 def start_run_folder(out: Path, config: Config, device: Device, dataset: Dataset) -> None:
@@ -104,7 +93,7 @@ def start_run_folder(out: Path, config: Config, device: Device, dataset: Dataset
 
 
 def changes_since(out: Path, config: Config, device: Device, dataset: Dataset) -> list[tuple[str, str, str]]:
-    """What is not as it was when the run in this folder began, though its bits may depend on it: name, then, now."""
+    """Name, former and present value of what a run's bits depend on, where it has changed since the run began."""
     now, then = _record(config, device, dataset), _recorded(out)
     return [(name, then[name][:200], now[name]) for name in now if then.get(name, now[name]) != now[name]]
 
@@ -159,48 +148,34 @@ def _record(config: Config, device: Device, dataset: Dataset) -> dict[str, str]:
 
 
 def save_state(out: Path, state: State) -> None:
-    """Write the state of a training; the one before it is kept under another name. Raises InputError where the disk
-    does not allow it; what was there before is then unchanged."""
+    """Write the state of a training. Raises InputError where the disk does not allow it; the one before is then
+    unchanged."""
     with atomic_write(out / STATE) as file:
         for buffer in pack_tensors(state, {}):
             file.write(buffer)
-        file.flush()
-        if (out / STATE).exists():
-            move(out / STATE, out / STATE_BEFORE)
 
 
 def has_state(out: Path) -> bool:
     """Whether the folder holds a state, from which a training goes on; a finished one has none."""
-    return any((out / name).is_file() for name in (STATE, STATE_BEFORE))
+    return (out / STATE).is_file()
 
 
 def load_state(out: Path) -> dict[str, NDArray[Any]] | None:
-    """The last state that is whole; None where there is none yet. Raises InputError where all there is is damaged."""
-    damaged: InputError | None = None
-    for name in (STATE, STATE_BEFORE):
-        path = out / name
-        if not path.exists():
-            continue
-        try:
-            if not path.is_file():  # a pipe would block
-                raise InputError(f"{path}: is not a regular file")
-            with path.open("rb") as file:
-                state = unpack_tensors(file, path.stat().st_size, str(path))[0]
-        except (InputError, OSError) as error:
-            reason = str(error) if isinstance(error, InputError) else f"{path}: cannot be read ({error.strerror})"
-            damaged = damaged or InputError(reason)
-            continue
-        if damaged is not None:
-            print(f"{damaged}; going on from {name}, which is older.", file=sys.stderr)
-        return state
-    if damaged is not None:
-        raise damaged
-    return None
+    """The state that was saved last; None where there is none. Raises InputError where it is damaged."""
+    path = out / STATE
+    if not path.exists():
+        return None
+    if not path.is_file():  # a pipe would block
+        raise InputError(f"{path}: is not a regular file")
+    try:
+        with path.open("rb") as file:
+            return unpack_tensors(file, path.stat().st_size, str(path))[0]
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
 
 
 def check_state(state: State, *, views: int, steps: int) -> None:
-    """That a training of so many views and steps can go on from it, as far as the shapes of its parameters do not tell.
-    Raises KeyError or ValueError."""
+    """Check that a state matches view and step counts, and is consistent. Raises KeyError or ValueError."""
     done, degree, order = (state[f"training.{name}"] for name in ("done", "sh_degree", "order"))
     for name, value, most in (("done", done, steps), ("sh_degree", degree, 3)):
         if value.shape != () or value.dtype.kind != "i" or not 0 <= value <= most:
@@ -216,7 +191,7 @@ def check_state(state: State, *, views: int, steps: int) -> None:
 
 
 def drop_states(out: Path) -> None:
-    """Remove the states of a training that is finished, and what killed processes left of files under way."""
-    for path in (out / STATE, out / STATE_BEFORE, *out.glob(".*.tmp")):
+    """Remove the state of a training that is finished, and temporary files of killed processes."""
+    for path in (out / STATE, out / OLD_STATE, *out.glob(".*.tmp")):
         with suppress(OSError):
             path.unlink(missing_ok=True)

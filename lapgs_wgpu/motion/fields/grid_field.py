@@ -86,7 +86,7 @@ class GridField(nn.Module):
         nearby: Nearby | None = None,
         time_samples: TimeSamples | None = None,
     ) -> list[Deformation]:
-        """Return the deformation at time t as `forward` does, and that of the rows of `time_samples` at each of its times.
+        """Return the deformation at time t as `forward` does, and that of `time_samples` at each of its times.
 
         All are encoded together, which takes much less time than one after another.
         """
@@ -111,9 +111,11 @@ class GridField(nn.Module):
     def _in_torch(
         self, means: Tensor, t: float, dynamics: Tensor | None, nearby: Nearby | None, time_samples: TimeSamples | None
     ) -> list[Tensor]:
-        """Return outputs of the geometry heads (N, 14) and, in further columns, of the appearance head; the same (M, 14) of
-        each sampled time; and the sums of the squared differences between features of nearby points, for spatial and
-        for space-time features."""
+        """Return outputs of the geometry heads (N, 14) and, in further columns, of the appearance head.
+
+        The same (M, 14) of each sampled time follow; then the sums of the squared differences between features of
+        nearby points, for spatial and for space-time features.
+        """
         places = [(means, self.config.grid_time(t))]
         if nearby is not None:
             places.append((means[nearby.rows] + nearby.offsets, self.config.grid_time(nearby.time)))
