@@ -14,8 +14,8 @@ from PIL import Image, ImageFilter
 
 from lapgs_wgpu.command import beside
 from lapgs_wgpu.prepare.diagnosis import _mask, diagnose
-from lapgs_wgpu.prepare.image_measures import blur
-from lapgs_wgpu.prepare.measure import Measure
+from lapgs_wgpu.prepare.measures import blur
+from lapgs_wgpu.prepare.measures import Measure
 from lapgs_wgpu.prepare.report import write_report
 from lapgs_wgpu.prepare_cli import prepare_command
 from lapgs_wgpu.splat.camera import Camera

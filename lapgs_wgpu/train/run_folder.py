@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import shutil
 import sys
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.atomic import atomic_write, move
+from lapgs_wgpu.io.folder_lock import LOCK
 from lapgs_wgpu.io.listing import listed
 from lapgs_wgpu.io.safe_json_toml import read_toml
 from lapgs_wgpu.io.safetensors_file import pack_tensors, unpack_tensors
@@ -27,7 +27,7 @@ from lapgs_wgpu.train.host_threads import step_threads
 from lapgs_wgpu.train.log import environment
 from lapgs_wgpu.train.presets import write_toml
 
-STATE, STATE_BEFORE, LOCK = "state.safetensors", "state.before.safetensors", ".lock"
+STATE, STATE_BEFORE = "state.safetensors", "state.before.safetensors"
 RUN_FILES = (
     "config.toml", "log.jsonl", "metrics.json", "metrics.csv", "checkpoint.ply", "eval", "tensorboard",
     STATE, STATE_BEFORE,
@@ -51,42 +51,6 @@ def check_run_folder(out: Path, *, overwrite: bool) -> None:
         raise InputError(
             f"{out} holds files, but no run that --overwrite could replace; name another folder with --out."
         )
-
-
-@contextmanager
-def locked_folder(out: Path) -> Iterator[None]:
-    """Create the folder if needed and lock it for one writer; a folder that stays empty is removed again. Raises
-    InputError if another process holds the lock."""
-    from filelock import FileLock, Timeout
-
-    new = not out.exists()
-    out.mkdir(parents=True, exist_ok=True)
-    path, lock = out / LOCK, FileLock(out / LOCK, blocking=False)  # follows no symbolic link
-    try:
-        lock.acquire()
-    except Timeout:
-        who = ""
-        with suppress(OSError):
-            who = path.read_text(encoding="ascii", errors="replace")[:20].strip()
-        raise InputError(
-            f"{out} is being written by another lapgs-train (process {who if who.isdecimal() else 'unknown'}); wait "
-            "for it, or name another folder."
-        ) from None
-    try:
-        with suppress(OSError), open(path, "w", opener=_open_no_follow) as file:  # the disk may be full
-            file.write(str(os.getpid()))
-        yield
-    finally:
-        with suppress(OSError):
-            path.unlink(missing_ok=True)
-        lock.release()
-        if new:
-            with suppress(OSError):  # it is not empty, unless something went wrong
-                out.rmdir()
-
-
-def _open_no_follow(path: str, flags: int) -> int:
-    return os.open(path, flags | getattr(os, "O_NOFOLLOW", 0), 0o666)
 
 
 def start_run_folder(out: Path, config: Config, device: Device, dataset: Dataset) -> None:
