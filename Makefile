@@ -61,7 +61,6 @@ soak: $(READY)
 	  tests/test_hostile_pages.py tests/test_full_disks.py
 	LAPGS_SOAK_KILLS=20 $(PYTEST) tests/test_resume.py
 	LAPGS_SOAK=1 $(PYTEST) tests/test_scale.py
-	LAPGS_SOAK=1 $(PYTEST) tests/test_prepare.py -k 4_gb
 	LAPGS_SOAK=1 $(PYTEST) tests/test_web_player.py -k trained_scene
 	LAPGS_SOAK_MINUTES=$(LAPGS_SOAK_MINUTES) $(PYTEST) tests/soak
 

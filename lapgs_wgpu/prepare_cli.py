@@ -42,11 +42,10 @@ def options() -> Parser:
     add("--out", metavar="DIR", help="output folder for the capture; must be new or empty")
     add("--fps", type=float, help="maximum number of images per second of film [10 for a moving camera, 30 for "
         "static ones; less if a film would give more than 300 images]")
-    add("--size", type=int, metavar="PIXELS", help="longer side of the images; larger frames are shrunk [1920]")
     add("--masks", metavar="DIR", help="for one moving camera: folder of PNG masks, white where something moves, "
         "with the file names of the images that an earlier run wrote; replaces the masks that are otherwise detected")
     add("--check", metavar="DIR", help="instead of films: measure the existing capture in DIR, of any format that "
-        "lapgs-train reads, print parallax, motion, coverage, blur, exposure and time gaps, and write DIR/report.html. "
+        "lapgs-train reads, print parallax, motion, coverage, blur and exposure, and write DIR/report.html. "
         "Can be combined with --train and --minutes only")
     add("--train", action="store_true", help="then train. Preset, image size and number of steps are chosen from the "
         "graphics adapter, the capture and a short measurement; the run folder is runs/NAME, NAME that of the capture")
@@ -79,7 +78,7 @@ def _prepare(arguments: list[str]) -> None:
 def check_options(given: argparse.Namespace) -> None:
     """Raises InputError for options that do not go together."""
     if given.check:
-        others = [name for name in ("out", "fps", "size", "masks") if getattr(given, name) is not None]
+        others = [name for name in ("out", "fps", "masks") if getattr(given, name) is not None]
         if given.films or others:
             word = given.films[0] if given.films else f"--{others[0]}"
             raise InputError(f"--check measures a capture that exists, so {word} cannot be given.")
@@ -95,35 +94,34 @@ def check_options(given: argparse.Namespace) -> None:
 
 def _convert(given: argparse.Namespace, out: Path) -> Diagnosis:
     from lapgs_wgpu.prepare.capture import prepare  # after --help: numpy and Pillow take a moment
-    from lapgs_wgpu.prepare.extract import LONGER_SIDE
 
-    done = prepare(
-        [Path(film) for film in given.films],
-        out,
-        fps=given.fps,
-        longer_side=LONGER_SIDE if given.size is None else given.size,
-        masks=Path(given.masks) if given.masks else None,
-    )
-    for measure in done.diagnosis.measures:
-        if measure.good is False:
-            print(measure, file=sys.stderr)
-    then = "" if given.train else f"; {beside('lapgs-prepare')} --check {quoted(done.folder)} --train"
-    print(f"{done.folder}: {done.images} images, {done.placed} of {done.cameras} cameras placed{then}", flush=True)
-    return done.diagnosis
+    films, masks = [Path(film) for film in given.films], Path(given.masks) if given.masks else None
+    done = prepare(films, out, fps=given.fps, masks=masks)
+    diagnosis = _diagnosed(out)
+    for line in (*(each for each in diagnosis.measures if each.good is False), *diagnosis.dataset.warnings):
+        print(line, file=sys.stderr)
+    then = "" if given.train else f"; {beside('lapgs-prepare')} --check {quoted(out)} --train"
+    print(f"{out}: {done.images} images, {done.placed} of {done.cameras} cameras placed{then}", flush=True)
+    return diagnosis
 
 
 def _check(folder: Path) -> Diagnosis:
+    diagnosis = _diagnosed(folder)
+    print(f"{folder}: {diagnosis}", flush=True)
+    return diagnosis
+
+
+def _diagnosed(folder: Path) -> Diagnosis:
+    """Measure a capture, and write the report into its folder."""
     from lapgs_wgpu.prepare.diagnosis import diagnose
     from lapgs_wgpu.prepare.report import REPORT, write_report
 
     diagnosis = diagnose(folder)
-    print(diagnosis, flush=True)
     try:
         write_report(diagnosis, folder / REPORT, folder.resolve().name)
+        print(f"{folder / REPORT} shows what was found", flush=True)
     except InputError as error:  # a training can follow all the same
         print(f"note: {error}", file=sys.stderr, flush=True)
-    else:
-        print(f"{folder / REPORT} shows it with pictures", flush=True)
     return diagnosis
 
 

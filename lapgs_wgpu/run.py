@@ -18,6 +18,7 @@ from lapgs_wgpu.data.views import Dataset, spread_views
 from lapgs_wgpu.discovery.start import start_training
 from lapgs_wgpu.errors import DeviceError, InputError, NumericalError, quoted
 from lapgs_wgpu.gpu.device import Device, open_device
+from lapgs_wgpu.io.folder_lock import locked_folder
 from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.scene import Scene4D
@@ -37,7 +38,6 @@ from lapgs_wgpu.train.run_folder import (
     drop_states,
     has_state,
     load_state,
-    locked_folder,
     note_paths,
     save_state,
     start_run_folder,

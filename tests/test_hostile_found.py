@@ -32,6 +32,7 @@ from lapgs_wgpu.data.readers.colmap_model import read_model
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.checkpoint import read_checkpoint
+from lapgs_wgpu.io.folder_lock import locked_folder
 from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.io.safe_json_toml import MAX_TOML_BYTES, read_json, read_toml
 from lapgs_wgpu.motion.scene_file import read_scene
@@ -40,7 +41,7 @@ from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.table import read_spec
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.presets import load_config
-from lapgs_wgpu.train.run_folder import STATE, load_state, locked_folder, save_state, start_run_folder
+from lapgs_wgpu.train.run_folder import STATE, load_state, save_state, start_run_folder
 from lapgs_wgpu.train.step_result import StepResult
 from lapgs_wgpu.train.trainer import Trainer
 from lapgs_wgpu.viewer.ground_truth import open_ground_truth

@@ -39,7 +39,7 @@ ALLOWED = {
     "run": {"errors", "progress", "stop_signals", "gpu", "motion", "data", "io", "train", "discovery"},
     "command": {"errors", "gpu"},
     "viewer": {"errors", "command", "progress", "gpu", "splat", "motion", "data", "io"},
-    "prepare": {"errors", "progress", "data", "splat.camera", "io.atomic", "io.listing"},
+    "prepare": {"errors", "progress", "data", "splat.camera", "io.atomic", "io.folder_lock", "io.listing"},
     "prepare_cli": {"errors", "command", "gpu", "prepare", "train", "run", "io.listing"},
     "doctor": {"errors", "command", "gpu", "splat"},
     "doctor_cli": {"errors", "command", "gpu", "doctor"},

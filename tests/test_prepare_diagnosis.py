@@ -14,8 +14,7 @@ from PIL import Image, ImageFilter
 
 from lapgs_wgpu.command import beside
 from lapgs_wgpu.prepare.diagnosis import _mask, diagnose
-from lapgs_wgpu.prepare.image_measures import blur
-from lapgs_wgpu.prepare.measure import Measure
+from lapgs_wgpu.prepare.measures import Measure, blur
 from lapgs_wgpu.prepare.report import write_report
 from lapgs_wgpu.prepare_cli import prepare_command
 from lapgs_wgpu.splat.camera import Camera
@@ -96,30 +95,21 @@ def test_a_camera_that_turns_on_the_spot(pictures, tmp_path: Path) -> None:
     parallax = measured(tmp_path, "parallax")
     assert parallax.good is False
     assert parallax.number == pytest.approx(np.degrees(0.11 / 5.5), rel=0.4)
-    assert "Walk around" in str(parallax)
     assert measured(tmp_path, "coverage").good is False
 
 
 def test_share_that_moves(pictures, tmp_path: Path) -> None:
     cameras, images, masks = pictures
     folder = write_capture(tmp_path, cameras, images)
-    unknown = measured(folder, "moving share")
-    assert unknown.good is None
-    assert "masks" in str(unknown)
+    assert measured(folder, "moving share").good is None
     write_masks(folder, np.zeros_like(masks))
-    assert "ardly anything moves" in str(measured(folder, "moving share"))
+    assert measured(folder, "moving share").good is False
     for path in (folder / "masks").iterdir():
         Image.fromarray(np.pad(np.full((60, 120), 255, np.uint8), ((60, 0), (40, 0)))).save(path)
     assert measured(folder, "moving share").good is True
-    assert measured(folder, "cut off").number == 1.0
-    assert measured(folder, "cut off").good is False
-    for room, reaches in ((4, 1.0), (8, 0.0)):  # pixels; nothing is followed nearer to the edge, so masks end before it
-        for path in (folder / "masks").iterdir():
-            Image.fromarray(np.pad(np.full((60, 100), 255, np.uint8), ((30, 30), (room, 60 - room)))).save(path)
-        assert measured(folder, "cut off").number == reaches
     for path in (folder / "masks").iterdir():
         Image.fromarray(np.full((9, 12), 255, np.uint8)).save(path)
-    assert "ore of what stands still" in str(measured(folder, "moving share"))
+    assert measured(folder, "moving share").good is False
 
 
 def test_blur(pictures, tmp_path: Path) -> None:
@@ -130,7 +120,6 @@ def test_blur(pictures, tmp_path: Path) -> None:
     assert blur(np.full((20, 20), 7.0)) == 1.0
     found = measured(write_capture(tmp_path, cameras, soft), "blur")
     assert found.good is False
-    assert "ore slowly" in str(found)
 
 
 def test_exposure_is_told_from_what_the_camera_sees(pictures, tmp_path: Path) -> None:
@@ -143,16 +132,6 @@ def test_exposure_is_told_from_what_the_camera_sees(pictures, tmp_path: Path) ->
     found = measured(write_capture(tmp_path, cameras, brighter), "exposure")
     assert found.number == pytest.approx(1, abs=0.2)
     assert found.good is False
-    assert "exposure.enabled" in str(found)
-
-
-def test_time_gaps(pictures, tmp_path: Path) -> None:
-    cameras, images, _ = pictures
-    times = [0.0, 1, 2, 3, 4, 5, 15, 16, 17, 18, 19, 20]
-    found = measured(write_capture(tmp_path, cameras, images, times), "time gaps")
-    assert found.number == pytest.approx(0.5)
-    assert found.good is False
-    assert "10.0 usual steps, from 25% on" in found.value
 
 
 @pytest.mark.parametrize("seeing", [1, 4])
@@ -161,12 +140,12 @@ def test_still_cameras(tmp_path: Path, seeing: int) -> None:
     cameras = walk(4, *SIZE)
     used, images, times, names = [], [], [], []
     for number, camera in enumerate(cameras):
-        for moment in range(5):
-            t = moment / 4 if number < seeing else 0.0
+        for time in range(5):
+            t = time / 4 if number < seeing else 0.0
             used.append(camera)
             images.append(drawn(camera, t, Board(0.4))[0])
-            times.append(moment / 4)
-            names.append(f"cam{number}/{moment}.png")
+            times.append(time / 4)
+            names.append(f"cam{number}/{time}.png")
     found = diagnose(write_capture(tmp_path, used, images, times, names))
     assert found.still
     assert found.measure("coverage").number == seeing
@@ -185,35 +164,27 @@ def test_the_report_needs_no_other_file(pictures, tmp_path: Path) -> None:
     assert "&lt;walk&gt; &amp; more" in page
     assert "<walk>" not in page
     assert page.count("data:image/jpeg;base64,") == COUNT
-    assert page.count("<svg") == 2
-    assert len(re.findall(r'<circle cx="[\d.]+" cy="[\d.]+" r="3"/>', page)) == 2 * COUNT
+    assert page.count("<svg") == 1
+    assert len(re.findall(r'<circle cx="[\d.]+" cy="[\d.]+" r="3"/>', page)) == COUNT
     assert not re.findall(r'(?:src|href)="(?!data:)', page)
     assert "what moves in red" in page
-    for name in ("parallax", "moving share", "coverage", "cut off", "blur", "exposure", "time gaps"):
+    for name in ("parallax", "moving share", "coverage", "blur", "exposure"):
         assert f"<td>{name}</td>" in page
 
 
 def test_check_prints_and_writes(pictures, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     cameras, images, _ = pictures
     folder = write_capture(tmp_path, cameras, images)
-    assert prepare_command(["--check", str(folder)]) == 0
-    said = capsys.readouterr().out
-    assert "12 images, a camera that moves" in said
-    assert said.count("(wanted: ") == 7
-    assert (folder / "report.html").is_file()
-    assert prepare_command(["--check", str(folder / "images")]) == 2
-    assert "is no scene in a known format" in capsys.readouterr().err
-
-
-def test_a_page_of_another_program_stays(pictures, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    cameras, images, _ = pictures
-    folder = write_capture(tmp_path, cameras, images)
+    for _ in range(2):  # the page of an earlier run is replaced
+        assert prepare_command(["--check", str(folder)]) == 0
+        said = capsys.readouterr()
+        assert said.out.count("(wanted: ") == 5
+        assert "note: " not in said.err
     (folder / "report.html").write_text("<title>mine</title>")
     assert prepare_command(["--check", str(folder)]) == 0
-    said = capsys.readouterr()
-    assert "report.html is of another program and stays as it is" in said.err
-    assert "shows it with pictures" not in said.out
-    assert (folder / "report.html").read_text() == "<title>mine</title>"
+    assert "report.html" in capsys.readouterr().err
+    assert (folder / "report.html").read_text() == "<title>mine</title>", "a page of another program stays"
+    assert prepare_command(["--check", str(folder / "images")]) == 2
 
 
 def test_photos_beside_masks_are_no_masks(tmp_path: Path) -> None:
@@ -237,31 +208,11 @@ def test_train_goes_on_to_a_scene(
     assert prepare_command(["--check", "walk", "--train", "--minutes", "0.04"]) == 0
     said = capsys.readouterr().out.splitlines()
     (chosen,) = [line for line in said if line.startswith("training: ")]
-    assert "hypernerf-tiny (one moving camera" in chosen
-    assert "colors of each image corrected" in chosen
-    assert " 16 steps (its schedule has 2500)" in chosen
-    assert said[-2].startswith(f"{Path('runs', 'walk')}: ")
+    assert "hypernerf-tiny" in chosen
     assert said[-1] == f"{beside('lapgs-view')} {Path('runs', 'walk', 'checkpoint.ply')}"
     assert Path(said[-1].split()[1]).is_file()
     config = load_config("runs/walk/config.toml")
     assert config.schedule.steps == 16
     assert config.exposure.enabled
     assert prepare_command(["--check", "walk", "--train"]) == 2  # before anything is measured
-    assert "walk is there already, and the training would be written to it" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["film.mp4", "--check", "DIR"], "film.mp4 cannot be given"),
-        (["--check", "DIR", "--fps", "3"], "--fps cannot be given"),
-        (["--out", "DIR"], "name the films"),
-        (["film.mp4"], "with --out"),
-        (["film.mp4", "--out", "DIR", "--minutes", "3"], "--minutes goes with --train"),
-        (["film.mp4", "--out", "DIR", "--train", "--minutes", "-3"], "--minutes must be above 0"),
-        (["film.mp4", "--out", "DIR", "--train", "--minutes", "nan"], "--minutes must be above 0"),
-    ],
-)
-def test_options_that_do_not_go_together(arguments: list[str], words: str, capsys: pytest.CaptureFixture) -> None:
-    assert prepare_command(arguments) == 2
-    assert words in capsys.readouterr().err
+    assert str(Path("runs", "walk")) in capsys.readouterr().err

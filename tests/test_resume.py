@@ -28,13 +28,14 @@ from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io import atomic
+from lapgs_wgpu.io.folder_lock import locked_folder
 from lapgs_wgpu.io.safe_json_toml import read_toml
 from lapgs_wgpu.run import resume, train
 from lapgs_wgpu.train import run_folder
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.host_threads import step_threads
 from lapgs_wgpu.train.presets import write_toml
-from lapgs_wgpu.train.run_folder import STATE, load_state, locked_folder, save_state
+from lapgs_wgpu.train.run_folder import STATE, load_state, save_state
 from lapgs_wgpu.train.trainer import Trainer
 
 KILLS = int(os.environ.get("LAPGS_SOAK_KILLS", "3"))
@@ -157,7 +158,7 @@ def test_two_writers_are_kept_apart(tmp_path: Path) -> None:
     with locked_folder(tmp_path / "run"):
         program = (
             "import sys; from pathlib import Path\n"
-            "from lapgs_wgpu.train.run_folder import locked_folder\n"
+            "from lapgs_wgpu.io.folder_lock import locked_folder\n"
             "from lapgs_wgpu.errors import InputError\n"
             "try:\n    with locked_folder(Path(sys.argv[1])): print('both')\n"
             "except InputError as error: print(error)"

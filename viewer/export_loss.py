@@ -58,8 +58,8 @@ def measure(scene: LoadedScene, written: Written, time: float | None = None) -> 
         wanted = _draw(rasterizer, scene, scene.playback.at(t), camera)
         psnr = _psnr(wanted, _draw(rasterizer, scene, written(camera, t)[0], camera))
         pictures.append((psnr, camera, t, wanted))
-    psnr, *worst = min(pictures, key=lambda picture: picture[0])
-    return Loss(psnr, "" if psnr >= _VISIBLE else _reason(rasterizer, scene, written, *worst))
+    psnr, camera, t, wanted = min(pictures, key=lambda picture: picture[0])
+    return Loss(psnr, "" if psnr >= _VISIBLE else _reason(rasterizer, scene, written, camera, t, wanted))
 
 
 def of_scene(file: SceneFile, device: Device, rows: Rows | None = None) -> Written:

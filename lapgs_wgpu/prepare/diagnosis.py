@@ -2,23 +2,31 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 
 from lapgs_wgpu.data import Dataset, View, load_dataset
 from lapgs_wgpu.data.cloud import points_in_view
 from lapgs_wgpu.data.evenly import evenly
-from lapgs_wgpu.data.images import check_image, decode
 from lapgs_wgpu.data.readers.colmap import IMAGES
-from lapgs_wgpu.prepare.geometry_measures import gaps, motion, parallax
-from lapgs_wgpu.prepare.image_measures import blur_measure, exposure
-from lapgs_wgpu.prepare.masks import MASKS, Mask
-from lapgs_wgpu.prepare.measure import Floats, Look, Measure, distinct_cameras, gray
+from lapgs_wgpu.prepare.masks import MASKS, Mask, read_mask
+from lapgs_wgpu.prepare.measures import (
+    Floats,
+    Look,
+    Measure,
+    blur_measure,
+    coverage_of_moving,
+    coverage_of_still,
+    distinct_cameras,
+    exposure,
+    gray,
+    moving_share,
+    parallax,
+)
 from lapgs_wgpu.progress import Progress
 from lapgs_wgpu.splat.camera import Camera
 
@@ -32,7 +40,6 @@ LEVELS = 16.0  # of 255 from the median over the clip: the pixel of a still came
 class Diagnosis:
     """dataset: images of SIZE pixels. still: the cameras stand still. looks: by camera, then time."""
 
-    folder: Path
     dataset: Dataset
     still: bool
     measures: tuple[Measure, ...]
@@ -44,7 +51,7 @@ class Diagnosis:
     def __str__(self) -> str:
         views = (*self.dataset.train, *self.dataset.test)
         layout = f"{len(distinct_cameras(views))} cameras that stand still" if self.still else "a camera that moves"
-        lines = [f"{self.folder}: {len(views)} images, {layout}", *map(str, self.measures)]
+        lines = [f"{len(views)} images, {layout}", *map(str, self.measures)]
         return "\n".join([*lines, *(f" note  {warning}" for warning in self.dataset.warnings)])
 
 
@@ -58,22 +65,22 @@ def diagnose(folder: Path) -> Diagnosis:
     points = _points(dataset)
     measures = [
         parallax(cameras, points),
-        *motion(looks, still, cameras, points),
+        moving_share(looks),
+        coverage_of_still(looks) if still else coverage_of_moving(cameras, points),
         blur_measure(looks),
         exposure(looks, points if dataset.cloud is not None else None, still),
-        gaps(np.unique([view.time for view in views])),
     ]
-    return Diagnosis(folder, dataset, still, tuple(measures), tuple(looks))
+    return Diagnosis(dataset, still, tuple(measures), tuple(looks))
 
 
 def _looks(folder: Path, views: Sequence[View], cameras: Sequence[Camera] | None) -> list[Look]:
-    """The images of some views by time, with masks. cameras: those that stand still; then all show the same moments."""
+    """The images of some views by time, with masks. cameras: those that stand still; then all show the same times."""
     if cameras is None:
         chosen = evenly(views, MOST_VIEWS)
     else:
         each = [[view for view in views if view.camera is camera] for camera in cameras]
-        moments = max(3, MOST_VIEWS // len(cameras))
-        chosen = [view for own in each for view in evenly(own, moments)]
+        times = max(3, MOST_VIEWS // len(cameras))
+        chosen = [view for own in each for view in evenly(own, times)]
     with ThreadPoolExecutor(4) as pool, Progress(len(chosen), "images looked at") as progress:
         images = []
         for image in pool.map(lambda view: view.load()[..., :3], chosen):
@@ -91,17 +98,11 @@ def _looks(folder: Path, views: Sequence[View], cameras: Sequence[Camera] | None
 
 def _mask(folder: Path, view: View) -> Mask | None:
     """The mask that lapgs-prepare wrote for the image of a view."""
-    try:
-        name = PurePosixPath(Path(os.path.relpath(view.source, folder / IMAGES)).as_posix())
-    except ValueError:  # of another drive
+    image = Path(view.source)
+    if not image.is_relative_to(folder / IMAGES):
         return None
-    if ".." in name.parts:  # not among the images that lapgs-prepare wrote
-        return None
-    path = folder / MASKS / name.with_suffix(".png")
-    if not path.is_file():
-        return None
-    check_image(path, whole=False)
-    return decode(path)[..., 0] >= 128
+    path = folder / MASKS / image.relative_to(folder / IMAGES).with_suffix(".png")
+    return read_mask(path) if path.is_file() else None
 
 
 def _points(dataset: Dataset) -> Floats:

@@ -22,10 +22,9 @@ _ATTACHED_PICTURE = 0x400  # libavformat's flag of a cover image
 
 @dataclass(frozen=True, eq=False)
 class FilmFrame:
-    """A decoded frame. number: from 0. seconds: since the film's first frame. gray: (h, w) float32, levels 0 to 255,
-    upright, longer side THUMBNAIL at most."""
+    """A decoded frame. seconds: since the film's first frame. gray: (h, w) float32, levels 0 to 255, upright, longer
+    side THUMBNAIL at most."""
 
-    number: int
     seconds: float
     gray: NDArray[np.float32]
     _frame: Any
@@ -104,7 +103,7 @@ class Film:
                         guessed, seconds = True, last + 1 / rate
                     seconds = max(seconds, 0.0)
                     gray = _gray(frame, shown, turns)
-                    yield FilmFrame(number, seconds, gray, frame, shown, turns, transfer_of(frame))
+                    yield FilmFrame(seconds, gray, frame, shown, turns, transfer_of(frame))
                     number, last = number + 1, seconds
         except (av.error.FFmpegError, OSError) as error:
             if number < 2:

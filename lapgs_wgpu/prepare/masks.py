@@ -7,7 +7,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from lapgs_wgpu.data.images import Size, decode, encode_png
+from lapgs_wgpu.data.images import Size, check_image, decode, encode_png
 from lapgs_wgpu.data.masks import WHITE, Mask, check_mask_size, find_masks
 
 MASKS = "masks"  # folder of a capture
@@ -31,4 +31,10 @@ def read_masks(folder: Path, names: Sequence[str], size: Size) -> dict[str, Mask
     )
     for path in paths.values():
         check_mask_size(path, size)
-    return {name: decode(path)[..., 0] >= WHITE for name, path in paths.items()}
+    return {name: read_mask(path) for name, path in paths.items()}
+
+
+def read_mask(path: Path) -> Mask:
+    """(h, w), white where something moves. Raises InputError."""
+    check_image(path, whole=False)
+    return decode(path)[..., 0] >= WHITE

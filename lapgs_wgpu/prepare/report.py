@@ -19,7 +19,7 @@ from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.prepare.diagnosis import Diagnosis
 from lapgs_wgpu.prepare.masks import Mask
-from lapgs_wgpu.prepare.measure import Look, Measure
+from lapgs_wgpu.prepare.measures import Look, Measure
 
 REPORT = "report.html"
 THUMBNAILS = 24  # evenly chosen from the views that were looked at
@@ -41,7 +41,7 @@ td, th { padding: .45rem .8rem .45rem 0; border-bottom: 1px solid var(--line); v
 .grid { display: grid; gap: .8rem; grid-template-columns: repeat(auto-fill, minmax(11rem, 1fr)); }
 figure { margin: 0; } figure img { width: 100%; display: block; border-radius: 4px; }
 figcaption { font-size: .8rem; overflow-wrap: anywhere; }
-.drawings { display: flex; flex-wrap: wrap; gap: 2rem; } svg { max-width: 100%; height: auto; }
+svg { max-width: 100%; height: auto; }
 @media (prefers-color-scheme: dark) { :root { --good: #56d364; --poor: #ff7b72; --soft: #aaa; } }
 """
 
@@ -63,7 +63,7 @@ def _page(diagnosis: Diagnosis, title: str) -> str:
     masked = any(look.mask is not None and look.mask.any() for look in chosen)
     count = len(dataset.train) + len(dataset.test)
     layout = "cameras that stand still" if diagnosis.still else "one camera that moves"
-    cameras = "Cameras" if diagnosis.still else "Cameras from dark (first) to light (last)"
+    cameras = "Cameras" if diagnosis.still else "Cameras, dark (first) to light (last),"
     notes = "".join(f"<li>{escape(note)}</li>" for note in dataset.warnings)
     body = [
         f"<h1>{escape(title)}</h1>",
@@ -72,10 +72,9 @@ def _page(diagnosis: Diagnosis, title: str) -> str:
         f"<th>what to film differently</th></tr>{''.join(map(_row, diagnosis.measures))}</table></div>",
         f"<h2>Also noticed</h2><ul>{notes}</ul>" if notes else "",
         "<h2>Where the cameras stood</h2>",
-        f'<p class="soft">{cameras}, each with the direction that it looks in; gray: points of the scene.</p>'
-        '<div class="drawings">',
-        *(_drawing(dataset, name) for name in ("from above", "as the cameras look")),
-        f"</div><h2>Images{', what moves in red' if masked else ''}</h2>",
+        f'<p class="soft">{cameras} from above, each with its viewing direction; gray: points of the scene.</p>',
+        _drawing(dataset),
+        f"<h2>Images{', what moves in red' if masked else ''}</h2>",
         f'<div class="grid">{"".join(map(_figure, chosen))}</div>',
     ]
     return (
@@ -116,53 +115,39 @@ def _jpeg(image: Pixels, mask: Mask | None) -> bytes:
     return file.getvalue()
 
 
-def _drawing(dataset: Dataset, name: str) -> str:
-    """Cameras and points as an SVG, along the images' up direction or across it."""
+def _drawing(dataset: Dataset) -> str:
+    """Cameras, with the direction that each looks in, and points of the scene from above, as an SVG."""
     views = sorted((*dataset.train, *dataset.test), key=lambda view: view.time)
     views = list({id(view.camera): view for view in reversed(views)}.values())[::-1]  # each camera once
-    right, deep, up = _axes(dataset.up, views)
-    plane = np.stack([right, deep if name == "from above" else up])
-    centers = np.stack([view.camera.position for view in views]) @ plane.T
-    ahead = np.stack([view.camera.T_cam_world[2, :3] for view in views]) @ plane.T
-    points = np.zeros((0, 2))
-    if dataset.cloud is not None:
-        points = dataset.cloud.at_most(_MOST_POINTS, 0).points.astype(np.float64) @ plane.T
-    low, high = np.percentile(points, [2, 98], axis=0) if len(points) else (centers.min(0), centers.max(0))
-    low, high = np.minimum(low, centers.min(axis=0)), np.maximum(high, centers.max(axis=0))
-    length = 0.06 * float(np.max(high - low)) or 1.0
-    low, high = low - 2 * length, high + 2 * length
-    scale = _DRAWING / float(np.max(high - low))
-    size = np.maximum((high - low) * scale, 60)
+    plane = _ground(dataset.up, views)
+    centers = np.stack([view.camera.position for view in views]) @ plane
+    ahead = np.stack([view.camera.T_cam_world[2, :3] for view in views]) @ plane
+    points = centers if dataset.cloud is None else dataset.cloud.at_most(_MOST_POINTS, 0).points @ plane
+    shown = np.concatenate([centers, np.percentile(points, [2, 98], axis=0)])
+    middle, length = (shown.max(axis=0) + shown.min(axis=0)) / 2, float(np.ptp(shown, axis=0).max()) or 1.0
 
-    def at(places: NDArray[np.float64]) -> NDArray[np.float64]:
-        middle = (places - (low + high) / 2) * scale
-        return np.round(middle * [1, -1] + size / 2, 1)
+    def at(places: NDArray[np.floating]) -> NDArray[np.float64]:
+        """To the drawing's pixels, with a margin around what is shown."""
+        return np.round(_DRAWING * (0.5 + 0.8 * (places - middle) / length * [1, -1]), 1)
 
-    inside = ((points >= low) & (points <= high)).all(axis=1)
-    dots = "".join(f'<circle cx="{x}" cy="{y}" r="1"/>' for x, y in at(points[inside]))
+    dots = "".join(f'<circle cx="{x}" cy="{y}" r="1"/>' for x, y in at(points))
     cameras = []
-    for view, (x, y), (x1, y1) in zip(views, at(centers), at(centers + length * ahead), strict=True):
+    for view, (x, y), (x1, y1) in zip(views, at(centers), at(centers + 0.07 * length * ahead), strict=True):
         color = f"hsl(265 70% {35 + 40 * view.time:.0f}%)"
         cameras.append(
             f'<g stroke="{color}" fill="{color}"><line x1="{x}" y1="{y}" x2="{x1}" y2="{y1}" stroke-width="1.5"/>'
             f'<circle cx="{x}" cy="{y}" r="3"/></g>'
         )
-    width, height = size.round()
     return (
-        f'<figure><svg width="{width:.0f}" height="{height:.0f}" viewBox="0 0 {width:.0f} {height:.0f}" role="img" '
-        f'aria-label="cameras {name}"><g fill="#999" opacity="0.6">{dots}</g>{"".join(cameras)}</svg>'
-        f"<figcaption>{name}</figcaption></figure>"
+        f'<svg width="{_DRAWING}" height="{_DRAWING}" viewBox="0 0 {_DRAWING} {_DRAWING}" role="img" '
+        f'aria-label="cameras from above"><g fill="#999" opacity="0.6">{dots}</g>{"".join(cameras)}</svg>'
     )
 
 
-def _axes(up: NDArray[np.float64], views: Sequence[View]) -> tuple[NDArray[np.float64], ...]:
-    """Right, forward and up of the cameras' mean, unit vectors (3,)."""
-    ahead = np.mean([view.camera.T_cam_world[2, :3] for view in views], axis=0)
-    right = np.cross(ahead, up)
+def _ground(up: NDArray[np.float64], views: Sequence[View]) -> NDArray[np.float64]:
+    """(3, 2) unit vectors across `up`: to the right of the cameras' mean, and forward."""
+    right = np.cross(np.mean([view.camera.T_cam_world[2, :3] for view in views], axis=0), up)
     if np.linalg.norm(right) < 1e-6:  # cameras that look all around, or straight down
-        right = np.mean([view.camera.T_cam_world[0, :3] for view in views], axis=0)
-        right = right - up * (right @ up)
-    if np.linalg.norm(right) < 1e-6:
         right = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
     right = right / np.linalg.norm(right)
-    return right, np.cross(up, right), up
+    return np.stack([right, np.cross(up, right)], axis=1)

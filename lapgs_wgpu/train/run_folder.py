@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.atomic import atomic_write
+from lapgs_wgpu.io.folder_lock import LOCK
 from lapgs_wgpu.io.listing import listed
 from lapgs_wgpu.io.safe_json_toml import read_toml
 from lapgs_wgpu.io.safetensors_file import pack_tensors, unpack_tensors
@@ -25,7 +26,7 @@ from lapgs_wgpu.train.environment import environment
 from lapgs_wgpu.train.host_threads import step_threads
 from lapgs_wgpu.train.presets import write_toml
 
-STATE, LOCK = "state.safetensors", ".lock"
+STATE = "state.safetensors"
 OLD_STATE = "state.before.safetensors"  # that earlier versions wrote, too
 RUN_FILES = (
     "config.toml", "log.jsonl", "metrics.json", "metrics.csv", "checkpoint.ply", "eval", "tensorboard",
@@ -50,32 +51,6 @@ def check_run_folder(out: Path, *, overwrite: bool) -> None:
         raise InputError(
             f"{out} holds files, but no run that --overwrite could replace; name another folder with --out."
         )
-
-
-@contextmanager
-def locked_folder(out: Path) -> Iterator[None]:
-    """Create the folder if needed and lock it for one writer; a folder that stays empty is removed again. Raises
-    InputError if another process holds the lock."""
-    from filelock import FileLock, Timeout
-
-    new = not out.exists()
-    out.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(out / LOCK, blocking=False)  # follows no symbolic link
-    try:
-        lock.acquire()
-    except Timeout:
-        raise InputError(
-            f"{out} is being written by another lapgs-train; wait for it, or name another folder."
-        ) from None
-    try:
-        yield
-    finally:
-        with suppress(OSError):
-            (out / LOCK).unlink(missing_ok=True)
-        lock.release()
-        if new:
-            with suppress(OSError):  # it is not empty, unless something went wrong
-                out.rmdir()
 
 
 def start_run_folder(out: Path, config: Config, device: Device, dataset: Dataset) -> None:

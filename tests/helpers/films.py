@@ -104,6 +104,13 @@ def room_cloud(count: int, noise: float, seed: int = 0) -> tuple[Floats, Floats]
     return points + rng.normal(scale=noise, size=points.shape), np.concatenate(colors, axis=1).T
 
 
+def noise_pictures(count: int, width: int = 64, height: int = 48) -> list[NDArray[np.uint8]]:
+    """Pictures (H, W, 3) of squares of random colors, each another one."""
+    rng = np.random.default_rng(0)
+    squares = rng.integers(40, 216, (count, height // 8, width // 8, 3), dtype=np.uint8)
+    return list(squares.repeat(8, axis=1).repeat(8, axis=2))
+
+
 def write_film(
     path: Path,
     pictures: Sequence[NDArray[np.uint8]],

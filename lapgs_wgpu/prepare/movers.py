@@ -7,7 +7,7 @@ the part that covers more of the images stands still. The rest is masked, and th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from lapgs_wgpu.data.images import Size
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.prepare.masks import Mask
-from lapgs_wgpu.prepare.measure import Floats
-from lapgs_wgpu.prepare.reconstruct import Reconstruction, import_pycolmap
+from lapgs_wgpu.prepare.measures import Floats
+from lapgs_wgpu.prepare.poses import Reconstruction, import_pycolmap
+from lapgs_wgpu.progress import say
 
 Ints = NDArray[np.int64]
 
@@ -35,19 +36,31 @@ BEHIND = 1e6  # pixels: error of a point behind its camera
 
 
 class World(NamedTuple):
-    """What stands still. model: a pycolmap.Reconstruction, None where nothing fits together. masks: of what moves, by
-    image (h, w); empty where there is too little to matter. moving: share of the images that moves."""
+    """What a reconstruction takes for still. model: a pycolmap.Reconstruction, None where nothing fits together.
+    errors: of all tracks. masks: of what moves, by image, (h, w)."""
 
     model: Any
+    errors: Floats
     masks: dict[str, Mask]
-    moving: float
+
+    @property
+    def moving(self) -> float:
+        """Share of the images that moves."""
+        return float(np.mean([mask.mean() for mask in self.masks.values()]))
+
+    @property
+    def noise(self) -> float:
+        """Pixels: error of the tracks that fit well; infinite without tracks."""
+        known = self.errors[np.isfinite(self.errors)]
+        return float(np.percentile(known, 25)) if len(known) else np.inf
 
 
-def solve_world(matched: Reconstruction, size: Size, say: Callable[[str], None]) -> World:
+def solve_masked(matched: Reconstruction, size: Size) -> tuple[Any, dict[str, Mask]]:
     """Place the cameras by what stands still. matched: with verified matches; size: (width, height) of its images.
 
     Where much disagrees with a first reconstruction, a second one is made of the images' rims alone. The one that
-    explains more of the images' area tells what moves. Raises InputError for a camera that stands still.
+    explains more of the images' area tells what moves. Returns a pycolmap.Reconstruction, None where nothing fits
+    together, and the masks of what moves, by image. Raises InputError for a camera that stands still.
     """
     with matched.database() as database:
         tracks = find_tracks(database)
@@ -63,44 +76,25 @@ def solve_world(matched: Reconstruction, size: Size, say: Callable[[str], None])
         say(f"{best.moving:.0%} of the image area disagrees with the first cameras: trying the images' rims alone.")
         other = _judged(_without(matched, dict.fromkeys(matched.names, rim(size)), size, "rim"), tracks, size)
         # What is nearly rigid fits a wrong reconstruction nearly: the better fit of the two sets the standard.
-        limit = SHARP * min(judged.noise for judged in (best, other))
-        best = max(best, other, key=lambda judged: judged.area_within(tracks, limit, size))
-    if best.model is None or best.moving < LITTLE:
-        return World(best.model, {}, best.moving)
+        limit = SHARP * min(best.noise, other.noise)
+        best = max(best, other, key=lambda world: _still_area(tracks, world.errors, size, limit))
+    if best.moving < LITTLE:
+        return best.model, dict.fromkeys(matched.names, np.zeros_like(rim(size)))
     say(f"{best.moving:.0%} of the image area moves: masked, and the cameras are placed again.")
     again = _judged(_without(matched, best.masks, size, "masked"), tracks, size)
     if again.model is None or again.model.num_reg_images() < best.model.num_reg_images():  # the masks took too much
-        return World(best.model, best.masks, best.moving)
-    return World(again.model, again.masks, again.moving)
+        again = best
+    return again.model, again.masks
 
 
-class _Judged(NamedTuple):
-    """A reconstruction, the errors of all tracks in it, and the masks that follow."""
-
-    model: Any
-    errors: Floats
-    masks: dict[str, Mask]
-
-    @property
-    def moving(self) -> float:
-        return area(self.masks)
-
-    @property
-    def noise(self) -> float:
-        """Pixels: error of the tracks that fit well; infinite without tracks."""
-        known = self.errors[np.isfinite(self.errors)]
-        return float(np.percentile(known, 25)) if len(known) else np.inf
-
-    def area_within(self, tracks: Tracks, limit: float, size: Size) -> float:
-        """Share of the images where tracks have errors below `limit` pixels."""
-        return area(agreement(tracks, self.errors, size, limit)[0]) if len(tracks) else 0.0
+def _judged(model: Any, tracks: Tracks, size: Size) -> World:
+    errors = np.full(len(tracks), np.nan) if model is None or not len(tracks) else track_errors(tracks, model)
+    return World(model, errors, agreement(tracks, errors, size, tolerance(size))[1])
 
 
-def _judged(model: Any, tracks: Tracks, size: Size) -> _Judged:
-    if model is None or len(tracks) == 0:
-        return _Judged(model, np.full(len(tracks), np.nan), {})
-    errors = track_errors(tracks, model)
-    return _Judged(model, errors, agreement(tracks, errors, size, tolerance(size))[1])
+def _still_area(tracks: Tracks, errors: Floats, size: Size, limit: float) -> float:
+    """Share of the images where tracks have errors below `limit` pixels."""
+    return float(np.mean([mask.mean() for mask in agreement(tracks, errors, size, limit)[0].values()]))
 
 
 def _without(matched: Reconstruction, masks: Mapping[str, Mask], size: Size, name: str) -> Any:
@@ -268,8 +262,3 @@ def rim(size: Size) -> Mask:
     rows, columns = (round(side * (1 - MIDDLE) / 2) for side in mask.shape)
     mask[rows : height - rows, columns : width - columns] = True
     return mask
-
-
-def area(masks: Mapping[str, Mask]) -> float:
-    """Mean share of the images that masks cover."""
-    return float(np.mean([mask.mean() for mask in masks.values()])) if masks else 0.0

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lapgs_wgpu.errors import InputError, pip_install
 from lapgs_wgpu.progress import Progress
@@ -48,7 +47,7 @@ class Reconstruction:
         extraction = colmap.FeatureExtractionOptions()
         extraction.max_image_size = FEATURE_SIDE
         extraction.sift.max_num_features = MOST_FEATURES
-        with _logging_to(colmap, self.work), Progress(len(self.names), "images searched for features") as progress:
+        with Progress(len(self.names), "images searched for features") as progress:
             for names in _chunks(self.names, EXTRACTED_AT_ONCE):
                 colmap.extract_features(
                     self._database, self.images, names, colmap.CameraMode.SINGLE, options, extraction, colmap.Device.cpu
@@ -63,15 +62,14 @@ class Reconstruction:
         options.camera_model = self.model
         with self.database():  # makes the file
             pass
-        with _logging_to(colmap, self.work):
-            colmap.import_images(self._database, self.images, colmap.CameraMode.SINGLE, self.names, options)
+        colmap.import_images(self._database, self.images, colmap.CameraMode.SINGLE, self.names, options)
 
     def match(self, pairs: Sequence[Pair]) -> None:
         """Match the features of pairs of images, and keep what an epipolar geometry explains."""
         colmap, listed = self._colmap, self.work / "pairs.txt"
         options = colmap.ImportedPairingOptions()
         options.match_list_path = listed
-        with _logging_to(colmap, self.work), Progress(len(pairs), "pairs of images matched") as progress:
+        with Progress(len(pairs), "pairs of images matched") as progress:
             for number, some in enumerate(_chunks(pairs, MATCHED_AT_ONCE)):
                 listed.write_text("".join(f"{a} {b}\n" for a, b in some), encoding="utf-8")
                 colmap.match_image_pairs(
@@ -92,7 +90,7 @@ class Reconstruction:
         options.extract_colors = True
         folder = self.work / "models"
         folder.mkdir(exist_ok=True)
-        with _logging_to(colmap, self.work), Progress(len(self.names), "cameras placed") as progress:
+        with Progress(len(self.names), "cameras placed") as progress:
             placed = itertools.count(1)
             found = colmap.incremental_mapping(
                 self._database,
@@ -123,8 +121,7 @@ class Reconstruction:
         colmap = self._colmap
         with self.database() as database:
             database.clear_two_view_geometries()
-        with _logging_to(colmap, self.work):
-            colmap.geometric_verification(self._database, two_view_geometry_options=self._verification())
+        colmap.geometric_verification(self._database, two_view_geometry_options=self._verification())
 
     def _verification(self) -> Any:
         options = self._colmap.TwoViewGeometryOptions()
@@ -146,27 +143,15 @@ def all_pairs(names: Sequence[str]) -> list[Pair]:
 
 
 def import_pycolmap() -> Any:
-    """The module pycolmap. Raises InputError where it is not installed."""
+    """The module pycolmap, which logs nothing. Raises InputError where it is not installed."""
     try:
         import pycolmap
     except ImportError:
         raise InputError(
             f"pycolmap, which finds out where the cameras stood, is not installed: {pip_install('prepare')}."
         ) from None
+    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
     return pycolmap
-
-
-@contextmanager
-def _logging_to(colmap: Any, folder: Path) -> Iterator[None]:
-    """Send COLMAP's log to the file `colmap.log` in a folder, and nothing to the terminal."""
-    colmap.logging.set_log_destination(colmap.logging.INFO, str(folder / "colmap.log."))
-    colmap.logging.logtostderr = False
-    colmap.logging.alsologtostderr = False
-    colmap.logging.stderrthreshold = int(colmap.logging.FATAL)
-    try:
-        yield
-    finally:
-        colmap.logging.set_log_destination(colmap.logging.INFO, "")  # closes the file, so that its folder can be moved
 
 
 def _chunks(items: Sequence[Any], size: int) -> Iterator[list[Any]]:
@@ -200,8 +185,3 @@ def merged(source: Reconstruction, groups: Sequence[Sequence[str]], work: Path) 
             new.write_matches(own[one[0]], own[other[0]], np.concatenate(matches))
     result.verify()
     return result
-
-
-def centers(model: Any) -> dict[str, NDArray[np.float64]]:
-    """The camera centers (3,) of a reconstruction's images, by name, its own units."""
-    return {model.image(i).name: np.array(model.image(i).projection_center()) for i in model.reg_image_ids()}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -10,24 +12,15 @@ from helpers.films import Board, drawn, pose_errors, walk, write_film
 from PIL import Image
 
 from lapgs_wgpu.data.images import encode_png
-from lapgs_wgpu.prepare.moving import Tracks, agreement, in_mask, rim, standing_share, track_errors
-from lapgs_wgpu.prepare_cli import prepare_command
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.prepare.capture import prepare
+from lapgs_wgpu.prepare.masks import read_masks
+from lapgs_wgpu.prepare.movers import Tracks, agreement, in_mask, rim, standing_share, track_errors
 
 pycolmap = pytest.importorskip("pycolmap")
 pytest.importorskip("av")
 
 COUNT, SIZE = 16, (240, 180)
-BOARD = Board(1.1, 0.35, 1.5)
-
-
-@pytest.fixture(scope="module")
-def film(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray]:
-    """A film in which a board wanders, and its true masks (COUNT, H, W)."""
-    taken = [drawn(camera, i / (COUNT - 1), BOARD) for i, camera in enumerate(walk(COUNT, *SIZE))]
-    masks = np.stack([mask for _, mask in taken])
-    assert 0.35 < masks.mean() < 0.5
-    path = tmp_path_factory.mktemp("film") / "film.mp4"
-    return write_film(path, [picture for picture, _ in taken], rate=10), masks
 
 
 def errors(out: Path) -> np.ndarray:
@@ -38,63 +31,53 @@ def errors(out: Path) -> np.ndarray:
     return pose_errors(found, {str(i): camera.position for i, camera in enumerate(walk(COUNT, *SIZE))})
 
 
-def test_cameras_follow_what_stands_still(film: tuple[Path, np.ndarray], tmp_path: Path) -> None:
-    path, masks = film
-    out = tmp_path / "out"
-    assert prepare_command([str(path), "--out", str(out)]) == 0
-    assert errors(out).max() < 0.02
+def test_cameras_follow_what_stands_still(tmp_path: Path) -> None:
+    """In a film in which a board wanders."""
+    taken = [drawn(camera, i / (COUNT - 1), Board(1.1, 0.35, 1.5)) for i, camera in enumerate(walk(COUNT, *SIZE))]
+    assert 0.35 < np.mean([mask.mean() for _, mask in taken]) < 0.5
+    film = write_film(tmp_path / "film.mp4", [picture for picture, _ in taken], rate=10)
+    prepare([film], tmp_path / "out")
+    assert errors(tmp_path / "out").max() < 0.02
     overlaps = []
-    for i, mask in enumerate(masks):
-        found = np.asarray(Image.open(out / f"masks/{100 * i:08d}.png").resize(SIZE, Image.Resampling.NEAREST)) > 0
+    for i, (_, mask) in enumerate(taken):
+        image = Image.open(tmp_path / f"out/masks/{100 * i:08d}.png")
+        found = np.asarray(image.resize(SIZE, Image.Resampling.NEAREST)) > 0
         overlaps.append((found & mask).sum() / (found | mask).sum())
     assert np.median(overlaps) > 0.8
     # What was found serves as a user's own masks.
-    again = tmp_path / "again"
-    assert prepare_command([str(path), "--out", str(again), "--masks", str(out / "masks")]) == 0
-    assert errors(again).max() < 0.02
+    prepare([film], tmp_path / "again", masks=tmp_path / "out/masks")
+    assert errors(tmp_path / "again").max() < 0.02
 
 
 @pytest.mark.parametrize(
-    ("spoil", "words"),
+    "spoil",
     [
-        (lambda folder: (folder / "00000300.png").unlink(), "lacks 1 of 16 masks, such as 00000300.png"),
-        (lambda folder: (folder / "00000300.png").write_bytes(encode_png(np.zeros((60, 60), np.uint8))), "is 60x60 "),
-        (lambda folder: (folder / "00000300.png").write_text("hello"), "is not a readable image"),
+        lambda path: path.unlink(),
+        lambda path: path.write_bytes(encode_png(np.zeros((60, 60), np.uint8))),
+        lambda path: path.write_text("hello"),
+        lambda path: shutil.rmtree(path.parent),
     ],
-    ids=["one is missing", "another size", "no image"],
-)  # fmt: skip
-def test_masks_that_do_not_fit(
-    film: tuple[Path, np.ndarray], spoil, words: str, tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
+    ids=["one is missing", "another size", "no image", "no folder"],
+)
+def test_masks_that_do_not_fit(spoil: Callable[[Path], object], tmp_path: Path) -> None:
     folder = tmp_path / "masks"
     folder.mkdir()
-    for i, mask in enumerate(film[1]):
-        (folder / f"{100 * i:08d}.png").write_bytes(encode_png(mask.astype(np.uint8) * 255))
-    spoil(folder)
-    assert prepare_command([str(film[0]), "--out", str(tmp_path / "out"), "--masks", str(folder)]) == 2
-    assert words in capsys.readouterr().err.splitlines()[-1]
+    for name in "abc":
+        (folder / f"{name}.png").write_bytes(encode_png(np.eye(60, 80, dtype=np.uint8) * 255))
+    names = [f"{name}.jpg" for name in "abc"]
+    assert read_masks(folder, names, (160, 120))["b.jpg"].sum() == 60
+    spoil(folder / "b.png")
+    with pytest.raises(InputError, match="masks"):
+        read_masks(folder, names, (160, 120))
 
 
-def test_masks_need_a_folder_and_one_camera(
-    film: tuple[Path, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
-    options = ["--out", str(tmp_path / "out"), "--masks", str(tmp_path / "none")]
-    assert prepare_command([str(film[0]), *options]) == 2
-    assert "none is not a folder" in capsys.readouterr().err
-    assert prepare_command([str(film[0]), str(film[0]), *options]) == 2
-    assert "--masks goes with one moving camera" in capsys.readouterr().err
-
-
-def test_a_camera_that_stands_still(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_a_camera_that_stands_still(tmp_path: Path) -> None:
     """Alone before a board that wanders."""
     camera = walk(3, *SIZE)[1]
     pictures = [drawn(camera, i / 9, Board(0.5, 0.35, 0.7))[0] for i in range(10)]
-    path = write_film(tmp_path / "film.mp4", pictures, rate=10)
-    assert prepare_command([str(path), "--out", str(tmp_path / "out")]) == 2
-    said = capsys.readouterr().err.splitlines()[-1]
-    assert said.startswith("lapgs-prepare: the camera stands still: ")
-    assert "(at most 30% may)" in said
-    assert "several cameras" in said
+    film = write_film(tmp_path / "film.mp4", pictures, rate=10)
+    with pytest.raises(InputError, match="the camera stands still"):
+        prepare([film], tmp_path / "out")
     assert [child.name for child in tmp_path.iterdir()] == ["film.mp4"]
 
 

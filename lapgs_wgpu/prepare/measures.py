@@ -1,0 +1,212 @@
+"""What a capture is worth, property by property: a number, its threshold, and what to film differently."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lapgs_wgpu.data import View
+from lapgs_wgpu.data.cloud import in_view
+from lapgs_wgpu.data.evenly import evenly
+from lapgs_wgpu.data.images import Pixels
+from lapgs_wgpu.prepare.masks import Mask
+from lapgs_wgpu.splat.camera import Camera
+
+MOST_CAMERAS = 48  # between which angles are measured
+PARALLAX = 5.0  # degrees; half a pixel of a phone's image is then 1 % of the depth
+SPAN = 20.0  # degrees around what moves
+CAMERAS = 3.0  # that see what moves at one time
+LITTLE, MUCH = 0.01, 0.5  # share of the images that moves
+SEEN = 0.002  # share of an image that moves, from which on it shows something that does
+BLUR = 0.45  # Crete et al.'s measure, of images of 320 pixels
+STOPS = 0.3  # of exposure, between the darkest and the brightest images
+POINTS_SEEN = 30  # in an image whose exposure is measured
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Measure:
+    """One property. number: its value, NaN where it cannot be measured. value, threshold: as texts with units. good:
+    None where it cannot be measured. advice: what to film differently, or why there is no number."""
+
+    name: str
+    number: float
+    value: str
+    threshold: str
+    good: bool | None
+    advice: str
+
+    def __str__(self) -> str:
+        mark = {True: "good", False: "POOR", None: "-"}[self.good]
+        return f"{mark:>5}  {self.name}: {self.value} (wanted: {self.threshold})" + (
+            "" if self.good else f". {self.advice[0].upper()}{self.advice[1:]}."
+        )
+
+
+def not_measured(name: str, threshold: str, why: str) -> Measure:
+    return Measure(name, float("nan"), "not measured", threshold, None, why)
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """A view that was looked at. image: (h, w, 3) RGB. mask: (h', w') of what moves, None where there is none."""
+
+    view: View
+    image: Pixels
+    mask: Mask | None
+
+
+def distinct_cameras(views: Sequence[View]) -> list[Camera]:
+    return list({id(view.camera): view.camera for view in views}.values())
+
+
+def gray(image: Pixels) -> NDArray[np.float32]:
+    """Gray levels (h, w), 0 to 255, of RGB."""
+    return (image.astype(np.float32) @ np.array([0.299, 0.587, 0.114], np.float32)).astype(np.float32)
+
+
+def parallax(cameras: Sequence[Camera], points: Floats) -> Measure:
+    """The largest angle between two cameras that see a point, the median over the points."""
+    chosen = evenly(cameras, MOST_CAMERAS)
+    seen = np.stack([in_view(points, camera)[1] for camera in chosen])
+    away = points - np.stack([camera.position for camera in chosen])[:, None]
+    rays = np.where(seen[..., None], away / np.maximum(np.linalg.norm(away, axis=2, keepdims=True), 1e-12), np.nan)
+    least = np.full(len(points), 1.0)
+    for ray in rays:
+        cosines = np.einsum("cni,ni->cn", rays, ray)
+        least = np.fmin(least, np.fmin.reduce(cosines, axis=0))
+    several = seen.sum(axis=0) > 1
+    degrees = float(np.median(np.degrees(np.arccos(np.clip(least[several], -1, 1))))) if several.any() else 0.0
+    return Measure(
+        "parallax",
+        degrees,
+        f"{degrees:.1f} degrees between the two cameras furthest apart that see a point",
+        f"{PARALLAX:g} or more",
+        degrees >= PARALLAX,
+        "walk around what moves instead of turning on the spot, or put the cameras further apart: depth is a guess",
+    )
+
+
+def moving_share(looks: Sequence[Look]) -> Measure:
+    """Share of the images that moves."""
+    name, threshold = "moving share", f"{LITTLE:.0%} to {MUCH:.0%}"
+    masks = [look.mask for look in looks if look.mask is not None]
+    if not masks:
+        return not_measured(name, threshold, "no masks of what moves, which lapgs-prepare makes of films")
+    share = float(np.mean([mask.mean() for mask in masks]))
+    advice = "leave more of what stands still in the picture, since the cameras are placed by that"
+    if share < LITTLE:
+        advice = "film longer, or closer, or train with --field static: hardly anything moves"
+    return Measure(name, share, f"{share:.1%} of the image area moves", threshold, LITTLE <= share <= MUCH, advice)
+
+
+def coverage_of_still(looks: Sequence[Look]) -> Measure:
+    """Of cameras that stand still: how many see something move at one time."""
+    counts: dict[float, int] = {}  # of cameras that see something move, by time
+    for look in looks:
+        time = round(look.view.time, 6)
+        counts[time] = counts.get(time, 0) + (look.mask is not None and bool(look.mask.mean() > SEEN))
+    moving = [count for count in counts.values() if count]
+    cameras = float(np.median(moving)) if moving else 0.0
+    return Measure(
+        "coverage",
+        cameras,
+        f"{cameras:g} cameras see something move at one time",
+        f"{CAMERAS:g} or more",
+        cameras >= CAMERAS,
+        "aim more cameras at what moves: where less than three see it, its place in depth is a guess",
+    )
+
+
+def coverage_of_moving(cameras: Sequence[Camera], points: Floats) -> Measure:
+    """Of a camera that moves: the angle that it goes around the middle of the scene."""
+    away = np.stack([camera.position for camera in cameras]) - np.median(points, axis=0)
+    directions = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
+    degrees = float(np.degrees(np.arccos(np.clip((directions @ directions.T).min(), -1, 1))))
+    return Measure(
+        "coverage",
+        degrees,
+        f"the camera goes {degrees:.0f} degrees around the scene",
+        f"{SPAN:g} or more",
+        degrees >= SPAN,
+        "walk further around what moves: its other sides stay empty, and few views of each side tell its depth",
+    )
+
+
+def blur_measure(looks: Sequence[Look]) -> Measure:
+    values = [blur(gray(look.image)) for look in looks]
+    middle = float(np.median(values))
+    worst = looks[int(np.argmax(values))]
+    return Measure(
+        "blur",
+        middle,
+        f"{middle:.2f} on a scale from 0 to 1, at most {max(values):.2f} ({Path(worst.view.source).name})",
+        f"{BLUR:g} or less",
+        middle <= BLUR,
+        "move more slowly, use more light or a shorter exposure, and lock the focus",
+    )
+
+
+def blur(gray: NDArray[np.floating]) -> float:
+    """How blurred an image (h, w) is, 0 to 1: what another blur takes from the differences of neighbouring pixels.
+    Crete, Dolmiere, Ladret, Nicolas, "The blur effect", 2007. A flat image counts as 1."""
+    from scipy.ndimage import uniform_filter1d  # slow to import
+
+    found = []
+    for axis in (0, 1):
+        before = np.abs(np.diff(gray, axis=axis))
+        after = np.abs(np.diff(uniform_filter1d(gray, 9, axis=axis), axis=axis))
+        total = float(before.sum())
+        found.append(1 - float(np.maximum(before - after, 0).sum()) / total if total > 0 else 1.0)
+    return max(found)
+
+
+def exposure(looks: Sequence[Look], points: Floats | None, still: bool) -> Measure:
+    """How the same places change in brightness: stops between the images, 5 to 95 % of them.
+
+    A place is a pixel of a camera that stands still, else a point of the cloud.
+    """
+    name, threshold = "exposure", f"{STOPS:g} stops or less"
+    if points is None and not still:
+        return not_measured(name, threshold, "no cloud of points, by which the same places are found in other images")
+    cameras = distinct_cameras([look.view for look in looks])
+    groups = [[look for look in looks if look.view.camera is camera] for camera in cameras] if still else [looks]
+    gains = []
+    for group in groups:
+        stops = np.stack([_stops(look, None if still else points) for look in group])
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # of places that no image shows
+            relative = stops - np.nanmedian(stops, axis=0)
+            gains += [np.nanmedian(row) for row in relative if np.isfinite(row).sum() >= POINTS_SEEN]
+    if len(gains) < 3:
+        return not_measured(name, threshold, f"less than 3 images show {POINTS_SEEN} points of the cloud")
+    low, high = np.percentile(gains, [5, 95])
+    span = float(high - low)
+    return Measure(
+        name,
+        span,
+        f"changes by {span:.2f} stops between dark and bright images",
+        threshold,
+        span <= STOPS,
+        "lock exposure and white balance; or train with --exposure.enabled true, which corrects each image's colors",
+    )
+
+
+def _stops(look: Look, points: Floats | None) -> Floats:
+    """Brightness at the points, NaN where they are out of view; without points, of some pixels."""
+    stops = np.log2(np.maximum((gray(look.image) / 255) ** 2.2, 1e-3))
+    if points is None:
+        return stops[::8, ::8].ravel()
+    camera = look.view.camera
+    _, seen = in_view(points, camera)
+    pixels, _ = camera.project(points[seen])
+    column, row = np.clip(np.floor(pixels).astype(np.int64), 0, [camera.width - 1, camera.height - 1]).T
+    values = np.full(len(points), np.nan)
+    values[seen] = stops[row, column]
+    return values

@@ -1,0 +1,165 @@
+"""Films as phones and cameras record them, and the images that are taken of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.films import noise_pictures, turn_film, write_film
+from PIL import Image
+
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.prepare.film import Film
+from lapgs_wgpu.prepare.hdr import Transfer, to_sdr
+from lapgs_wgpu.prepare.images import Picture, common_times, extract, extract_in_step, images_per_second
+
+av = pytest.importorskip("av")
+
+
+def seconds(path: Path) -> list[float]:
+    return [frame.seconds for frame in Film(path).frames()]
+
+
+def test_times_of_a_film_of_variable_rate(tmp_path: Path) -> None:
+    times = [0.0, 0.033, 0.05, 0.2, 0.7, 0.71]
+    assert seconds(write_film(tmp_path / "film.mkv", noise_pictures(6), times=times)) == pytest.approx(times, abs=2e-3)
+
+
+def test_frames_without_time_stamps_are_counted(tmp_path: Path) -> None:
+    """A bare H.264 stream has none."""
+    times = seconds(write_film(tmp_path / "film.h264", noise_pictures(6), rate=25))
+    assert len(times) == 6
+    assert np.diff(times) == pytest.approx(1 / 25)
+
+
+@pytest.mark.parametrize("degrees", [0, 90, 180, 270])
+def test_frames_stand_upright_and_have_square_pixels(tmp_path: Path, degrees: int) -> None:
+    """As of cameras that record 1440x1080 to be shown as 1920x1080, held in any way."""
+    picture = np.full((48, 48, 3), 30, np.uint8)
+    picture[:24, :24] = 220  # the top left of what is stored
+    path = write_film(tmp_path / "film.mp4", [picture] * 3, aspect="4/3")
+    if degrees:
+        turn_film(path, degrees)
+    film = Film(path)
+    expected = np.rot90(np.repeat(picture[:, :, 0], 4, axis=1)[:, ::3], -degrees // 90)
+    for frame in film.frames():
+        assert film.size == expected.shape[::-1]
+        assert frame.pixels(1000).shape == (*expected.shape, 3)
+        assert np.abs(frame.pixels(1000)[..., 0].astype(int) - expected).mean() < 5
+        assert np.abs(frame.gray - expected).mean() < 8
+        assert max(frame.pixels(32).shape) == 32
+
+
+@pytest.mark.parametrize(
+    ("trc", "transfer", "white", "half", "plain"),
+    [("arib-std-b67", "HLG", 0.75, 0.632, 133), ("smpte2084", "PQ", 0.58, 0.508, 140)],
+)
+def test_hdr_films_look_like_ordinary_ones(
+    tmp_path: Path, trc: str, transfer: Transfer, white: float, half: float, plain: int
+) -> None:
+    """Gray of the reference white in 10 bits becomes (almost) white; half of its light sRGB's level for half."""
+    for signal, level in ((white, 233), (half, 188)):
+        deep = np.full((4, 4, 3), round(65535 * signal), np.uint16)
+        assert np.abs(to_sdr(deep, transfer).astype(int) - level).max() <= 12
+    options = {"x264-params": f"colorprim=bt2020:transfer={trc}:colormatrix=bt2020nc"}
+    gray = [np.full((48, 64, 3), 140, np.uint8)] * 3
+    path = write_film(tmp_path / "film.mkv", gray, options=options, pix_fmt="yuv420p10le")
+    for frame in Film(path).frames():
+        pixels = frame.pixels(1000)
+        assert np.ptp(pixels) <= 3
+        assert abs(int(pixels[0, 0, 0]) - plain) > 5, "it was taken for an ordinary film"
+
+
+def test_a_film_cut_in_the_middle_of_a_packet(tmp_path: Path) -> None:
+    """What comes before is used, and the user is told."""
+    path = write_film(tmp_path / "film.mkv", noise_pictures(40), options={"g": "5"})
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2 + 7])
+    film = Film(path)
+    assert 10 < len(list(film.frames())) < 30
+    assert len(film.notes) == 1
+
+
+def test_the_larger_of_two_streams_is_used(tmp_path: Path) -> None:
+    path = tmp_path / "film.mkv"
+    with av.open(str(path), "w") as file:
+        streams = []
+        for width, height in ((32, 32), (64, 48)):
+            stream = file.add_stream("libx264", rate=30)
+            stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+            streams.append(stream)
+        for stream in streams:
+            for picture in noise_pictures(5, stream.width, stream.height):
+                file.mux(stream.encode(av.VideoFrame.from_ndarray(picture, "rgb24")))
+            file.mux(stream.encode())
+    assert [frame.pixels(1000).shape for frame in Film(path).frames()] == [(48, 64, 3)] * 5
+
+
+def test_frames_larger_than_may_be_held(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_film(tmp_path / "film.mp4", noise_pictures(2))
+    monkeypatch.setattr("lapgs_wgpu.prepare.film.LARGEST_FRAME", 64 * 47)
+    with pytest.raises(InputError, match="64x48"):
+        Film(path)
+
+
+def test_the_sharpest_frame_of_each_span(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pictures = noise_pictures(12)
+    soft = [p if i % 3 == 1 else np.full_like(p, p.mean()) // 2 + p // 2 for i, p in enumerate(pictures)]
+    film = Film(write_film(tmp_path / "film.mkv", soft))
+    monkeypatch.setattr("lapgs_wgpu.prepare.images.LONGER_SIDE", 32)
+    found = extract(film, tmp_path, 10)
+    assert [picture.name for picture in found] == [f"{round(100 * i + 33.3):08d}.jpg" for i in range(4)]
+    assert sorted(path.name for path in tmp_path.glob("*.jpg")) == [picture.name for picture in found]
+    with Image.open(tmp_path / found[0].name) as image:
+        assert image.size == (32, 24)
+
+
+def test_repeated_and_blurred_frames_are_left_out(tmp_path: Path) -> None:
+    pictures = noise_pictures(12)
+    pictures[2] = pictures[1]
+    pictures[6] = np.full_like(pictures[6], 90) + pictures[6] // 20
+    found = extract(Film(write_film(tmp_path / "film.mkv", pictures, rate=10)), tmp_path, 10)
+    kept = [i for i in range(12) if i not in (2, 6)]
+    assert [round(10 * picture.seconds) for picture in found] == kept
+    assert sorted(path.name for path in tmp_path.glob("*.jpg")) == [f"{100 * i:08d}.jpg" for i in kept]
+
+
+def test_a_long_film_gives_fewer_images_a_second(tmp_path: Path) -> None:
+    short, long = (Film(write_film(tmp_path / f"{i}.mkv", noise_pictures(3))) for i in range(2))
+    short.seconds, long.seconds = 5.0, 60.0
+    assert images_per_second([long], None) == 5
+    assert images_per_second([long], 12) == 12
+    assert images_per_second([short], None) == 10
+    assert images_per_second([short, long], None) == 30
+    short.seconds = 12.0
+    assert images_per_second([short, long], None) == 25
+
+
+def test_films_of_still_cameras_are_taken_in_step(tmp_path: Path) -> None:
+    films = [Film(write_film(tmp_path / f"{n}.mkv", noise_pictures(n))) for n in (12, 18)]
+    found = extract_in_step(films, tmp_path / "images", 10)
+    for number, pictures in enumerate(found):
+        names = [f"cam{number:02d}/{100 * i:08d}.jpg" for i in range(4)]
+        assert [picture.name for picture in pictures] == names
+        assert sorted(path.name for path in (tmp_path / f"images/cam{number:02d}").iterdir()) == [n[6:] for n in names]
+    with pytest.raises(InputError, match=r"80x48.*64x48"):
+        extract_in_step([films[0], Film(write_film(tmp_path / "w.mkv", noise_pictures(4, 80)))], tmp_path / "w", 10)
+
+
+def test_common_times() -> None:
+    """Where one camera has no image for a while, and one has another rate."""
+
+    def camera(number: int, seconds: list[float]) -> list[Picture]:
+        return [Picture(f"cam{number}/{s:.3f}", s) for s in seconds]
+
+    even = [0.1 * i for i in range(20)]
+    cameras = [camera(0, even), camera(1, [s for s in even if not 0.45 < s < 0.95])]
+    cameras.append(camera(2, [0.04 * i for i in range(48)]))
+    found = common_times(cameras, 10, 5)
+    assert len(found) == 5
+    for pictures in found:
+        assert [picture.name[:4] for picture in pictures] == ["cam0", "cam1", "cam2"]
+        assert np.ptp([picture.seconds for picture in pictures]) < 1e-6, "0, 0.2, ... are those of all three"
+        assert not 0.45 < pictures[0].seconds < 0.95
+    assert common_times(cameras[:2], 10, 99)[5][1].seconds == pytest.approx(1.0)
