@@ -50,7 +50,9 @@ class TorchPlayback:
 
     def at(self, t: float) -> Gaussians[DeviceArray]:
         scene = self.scene
-        parameters: list[Tensor] = [*scene.parameters.values(), *(scene.field.parameters() if scene.field is not None else [])]
+        parameters: list[Tensor] = list(scene.parameters.values())
+        if scene.field is not None:
+            parameters += scene.field.parameters()
         wanted = t, scene.sh_degree, [(id(parameter), parameter._version) for parameter in parameters]
         if self._shown is None or self._shown_of != wanted:
             self._shown = None  # after a failure the buffers would be inconsistent
