@@ -143,8 +143,8 @@ def disorder(names: Sequence[ImageName], times: Sequence[float]) -> list[str]:
     if disjoint:
         c, d = spans[disjoint[0]]
         warnings.append(
-            f"cameras film at different times: {first_camera} from {a:g} to {b:g} and {disjoint[0]} from {c:g} to {d:g}; "
-            "if they filmed together, number their frames from a common time on."
+            f"cameras film at different times: {first_camera} from {a:g} to {b:g} and {disjoint[0]} from {c:g} to "
+            f"{d:g}; if they filmed together, number their frames from a common time on."
         )
     return warnings
 
