@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lapgs_wgpu.data.raytrace import Floats, Hits, Solid, Vector, pixel_rays, plane_hits, rays_around, solid_hits
+from lapgs_wgpu.data.raytrace import SAMPLES, Floats, Hits, Ints, Solid, Vector, pixel_rays, plane_hits, solid_hits
 from lapgs_wgpu.data.synthetic import camera_at, jumps
 from lapgs_wgpu.io.dataclass_table import Options, option
 from lapgs_wgpu.splat.camera import Camera
@@ -152,13 +152,33 @@ def trace(scene: MotionScene, camera: Camera, time: float) -> list[Hits]:
     surfaces = []
     for one in moving_objects(scene):
         centre = one.positions([time])[0]
-        among = rays_around(camera, centre, one.reach)
+        among = _rays_around(camera, centre, one.reach)
         surfaces.append(solid_hits(one.solid, centre, eye, rays, among=among))
     if scene.background == "room":
         surfaces.append(plane_hits(2, FLOOR, 1, _floor, eye, rays))
         surfaces.append(plane_hits(0, -WALL, 1, _bricks, eye, rays))
         surfaces.append(plane_hits(1, WALL, -1, _panels, eye, rays))
     return surfaces
+
+
+def _rays_around(camera: Camera, centre: Floats, reach: float) -> Ints:
+    """Indices (n,) of all rays that can meet the ball of radius `reach` around `centre`, and of some more."""
+    corners = np.array(np.meshgrid([-reach, reach], [-reach, reach], [-reach, reach])).reshape(3, 8)
+    R, t = camera.T_cam_world[:3, :3], camera.T_cam_world[:3, 3]
+    x, y, z = R @ (centre[:, None] + corners) + t[:, None]
+    columns, rows = camera.width * SAMPLES, camera.height * SAMPLES
+    if z.max() <= 0:
+        return np.empty(0, dtype=np.int64)
+    if z.min() <= 0:
+        return np.arange(rows * columns)
+    K = camera.K
+    left, right = _bounds((K[0, 0] * x / z + K[0, 2]) * SAMPLES, columns)
+    top, bottom = _bounds((K[1, 1] * y / z + K[1, 2]) * SAMPLES, rows)
+    return (np.arange(top, bottom)[:, None] * columns + np.arange(left, right)).ravel()
+
+
+def _bounds(values: Floats, limit: int) -> tuple[int, int]:
+    return max(math.floor(values.min()) - 1, 0), min(math.ceil(values.max()) + 1, limit)
 
 
 def _floor(x: Floats, y: Floats) -> tuple[NDArray[np.bool_], Floats]:

@@ -102,14 +102,11 @@ def _already_holds(folder: Path, record: str, parameters: Mapping[str, object]) 
         recorded = None
     what = "is not empty"
     if isinstance(recorded, dict):
-        other = [
-            f"{key} {recorded.get(key)} instead of {value}"
-            for key, value in parameters.items()
-            if recorded.get(key) != value
-        ]
-        if not other:
+        differing = [key for key, value in parameters.items() if recorded.get(key) != value]
+        if not differing:
             return True
-        what = f"holds another built-in scene ({', '.join(other)})"
+        named = ", ".join(f"{key} {recorded.get(key)} instead of {parameters[key]}" for key in differing)
+        what = f"holds another built-in scene ({named})"
     raise InputError(
         f"{folder} {what} and is left alone; name another folder for the built-in scene, or remove this one."
     )

@@ -16,9 +16,7 @@ from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
 
 CUBE_POINTS = 4096  # random points that determine the cube of a capture without a cloud
-MIN_CLOUD_POINTS = (
-    4096  # points; a smaller cloud is filled up: Gaussians multiply too slowly to fill what it leaves empty
-)
+MIN_CLOUD_POINTS = 4096  # a smaller cloud is filled up: Gaussians multiply too slowly to fill what it leaves empty
 NEAR_FACTOR, FAR_FACTOR = 0.25, 2.0  # depths relative to the distance of the focus, for own footage without a cloud
 
 

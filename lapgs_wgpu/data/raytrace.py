@@ -60,26 +60,6 @@ def pixel_rays(camera: Camera) -> Floats:
     return rays
 
 
-def rays_around(camera: Camera, centre: Floats, reach: float) -> Ints:
-    """Indices (n,) of all rays that can meet the ball of radius `reach` around `centre`, and of some more."""
-    corners = np.array(np.meshgrid([-reach, reach], [-reach, reach], [-reach, reach])).reshape(3, 8)
-    R, t = camera.T_cam_world[:3, :3], camera.T_cam_world[:3, 3]
-    x, y, z = R @ (centre[:, None] + corners) + t[:, None]
-    columns, rows = camera.width * SAMPLES, camera.height * SAMPLES
-    if z.max() <= 0:
-        return np.empty(0, dtype=np.int64)
-    if z.min() <= 0:
-        return np.arange(rows * columns)
-    K = camera.K
-    left, right = _bounds((K[0, 0] * x / z + K[0, 2]) * SAMPLES, columns)
-    top, bottom = _bounds((K[1, 1] * y / z + K[1, 2]) * SAMPLES, rows)
-    return (np.arange(top, bottom)[:, None] * columns + np.arange(left, right)).ravel()
-
-
-def _bounds(values: Floats, limit: int) -> tuple[int, int]:
-    return max(math.floor(values.min()) - 1, 0), min(math.ceil(values.max()) + 1, limit)
-
-
 def solid_hits(
     solid: Solid, centre: Floats, eye: Floats, rays: Floats, *, angle: float = 0.0, among: Ints | None = None
 ) -> Hits:
