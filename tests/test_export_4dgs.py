@@ -62,7 +62,7 @@ def pixel(scene: LoadedScene) -> float:
 
 
 def test_gaussians_are_where_the_field_has_them(scene: LoadedScene, exported: Path) -> None:
-    """At times that the bake did not look at: as many as are drawn, each about as near as was allowed."""
+    """At times that the bake did not look at: as many as are drawn, each nearer than about a pixel."""
     report = validate(exported.read_bytes())
     assert [str(finding) for finding in report.findings if finding.severity != "note"] == []
     read = fourdgs.read(exported)
@@ -84,7 +84,7 @@ def test_gaussians_are_where_the_field_has_them(scene: LoadedScene, exported: Pa
         np.testing.assert_allclose(now["opacity"], true[which, 9], atol=0.02)
         assert colors[live, :3].min() >= 0
         moved = max(moved, float(np.abs(true[:, :3] - start[:, :3]).max() / pixel(scene)))
-    assert worst <= 1.2 * 0.5
+    assert worst < 1.2  # pixels: lines are held to 0.5 at the samples alone, and the format rounds
     assert moved > 10  # pixels: there is something to bake
 
 
@@ -189,4 +189,4 @@ def test_what_cannot_be_written_is_refused_before_the_work(
 
 def test_fields_of_torch_are_baked_too(device: Device, tmp_path: Path) -> None:
     moving_scene(device, FieldConfig(kind="hexplane", width=8), count=4).save(tmp_path / "a.ply")
-    assert export_4dgs(load_scene(tmp_path / "a.ply", lambda: device), tmp_path / "a.4dgs", 20.0).gaussians > 0
+    assert export_4dgs(load_scene(tmp_path / "a.ply", lambda: device), tmp_path / "a.4dgs", 20.0).psnr > 0
