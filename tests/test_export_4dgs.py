@@ -23,7 +23,7 @@ from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.playback.linear_pieces import Pieces, displacement, linear_pieces, roots_of, state
 from lapgs_wgpu.motion.playback.playback import Playback
 from lapgs_wgpu.splat.linear_light import directions, display_colors, linear_harmonics, sh_basis, to_display, to_linear
-from lapgs_wgpu.viewer.export_4dgs import best_degree, export_4dgs
+from lapgs_wgpu.viewer.export_4dgs import _largest_shift, best_degree, export_4dgs
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene, load_scene
 
 COUNT = 60
@@ -86,6 +86,7 @@ def test_gaussians_are_where_the_field_has_them(scene: LoadedScene, exported: Pa
         moved = max(moved, float(np.abs(true[:, :3] - start[:, :3]).max() / pixel(scene)))
     assert worst < 1.2  # pixels: lines are held to 0.5 at the samples alone, and the format rounds
     assert moved > 10  # pixels: there is something to bake
+    assert 0 < _largest_shift(read, scene.playback) < 1.2 * pixel(scene)
 
 
 def test_camera_and_texts(scene: LoadedScene, exported: Path) -> None:
