@@ -30,18 +30,6 @@ VIEWS = tuple(
 ROOM = Dataset("room", VIEWS, VIEWS[:1], depths=(0.9, 3.7))
 
 
-def test_random_points() -> None:
-    means, colors = random_points(5000, -1.3, 1.3, 0)
-    assert means.dtype == colors.dtype == np.float32
-    assert means.shape == colors.shape == (5000, 3)
-    assert -1.3 <= means.min() < -1.29
-    assert 1.29 < means.max() <= 1.3
-    np.testing.assert_allclose(means.mean(axis=0), 0, atol=0.05)
-    np.testing.assert_array_equal(colors, np.float32(0.5))
-    np.testing.assert_array_equal(means, random_points(5000, -1.3, 1.3, 0)[0])
-    assert (means != random_points(5000, -1.3, 1.3, 1)[0]).any()
-
-
 def test_scales_match_all_pairs() -> None:
     points, _ = random_points(200, -1.0, 2.0, 3)
     squared = ((points[:, None].astype(np.float64) - points[None]) ** 2).sum(axis=-1)
@@ -63,15 +51,6 @@ def test_scales_match_all_pairs() -> None:
 )
 def test_few_and_coinciding_points(points: list[list[float]], scales: list[float]) -> None:
     np.testing.assert_allclose(initial_scales(np.array(points, dtype=np.float32)), np.array(scales), rtol=1e-6)
-
-
-def test_misuse() -> None:
-    with pytest.raises(ValueError, match="n >= 1"):
-        random_points(0, -1, 1, 0)
-    with pytest.raises(ValueError, match="low < high"):
-        random_points(3, 1, -1, 0)
-    with pytest.raises(ValueError, match=r"\(n, 3\)"):
-        initial_scales(np.zeros((0, 3)))
 
 
 def first_picture(dataset: Dataset, device: Device) -> tuple[Rendering, torch.Tensor]:

@@ -12,8 +12,7 @@ from lapgs_wgpu.data import Dataset, load, load_dataset
 from lapgs_wgpu.data.frames import Capture, Frame, Reader
 from lapgs_wgpu.data.images import ImageFile, check_image, decode, encode_png
 from lapgs_wgpu.data.lens import Lens, Undistortion
-from lapgs_wgpu.data.timestamps import ImageName, frame_numbers
-from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.data.timestamps import ImageName
 from lapgs_wgpu.splat.camera import Camera
 
 COUNT = 6
@@ -73,21 +72,6 @@ def test_undistorting_leaves_the_color_of_transparent_pixels_behind() -> None:
     assert ((alpha > 0) & (alpha < 255)).sum() > 50
     assert (straight[alpha > 0] >= 254)[:, :3].all()
     np.testing.assert_array_equal(alpha, undistortion.apply(image[..., :3])[..., 0])
-
-
-def test_a_name_without_a_frame_number_is_told_beside_one_with() -> None:
-    names = [ImageName(f"images/{name}.png") for name in ("clip", "clip_1", "clip_2")]
-    with pytest.raises(InputError, match=r"clip\.png does not state .*: images/clip_1\.png has 1 numbers and it has 0"):
-        frame_numbers(names)
-    with pytest.raises(InputError, match=r"images/clip\.png does not state a frame number: it has no numbers"):
-        frame_numbers(names[:1])
-
-
-def test_an_image_that_changes_its_size_is_named(folder: Path) -> None:
-    view = load_dataset(folder).train[0]
-    Path(view.source).write_bytes(encode_png(np.zeros((2 * HEIGHT, 2 * WIDTH, 3), np.uint8)))
-    with pytest.raises(InputError, match=r"000\.png is 128x96 pixels now and was 64x48"):
-        view.load()
 
 
 @pytest.mark.parametrize("shape", [(3, 5), (3, 5, 3), (2, 4, 4), (1, 1, 3)])

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.captures import write_colmap, write_nerfies, write_nerfstudio, write_neu3d
-from helpers.external_captures import write_endonerf, write_polycam, write_record3d
+from helpers.captures import WRITERS
+from helpers.damaged_files import with_checksums
 from helpers.hostile import (
     ByteEdits,
     TreeEdits,
@@ -32,31 +32,38 @@ from lapgs_wgpu.gpu.device import Device
 
 pytestmark = pytest.mark.nightly
 
-MODEL = ("cameras", "images", "points3D")
 WORDS = [
     *(b"PINHOLE", b"OPENCV_FISHEYE", b" nan", b" inf", b" 1e308", b" 99999999999", b"#", b"\t", b" ../../x.png"),
     *(b"\xff" * 7, b"\0\0\0\0\0\0\xf8\x7f", b"\0\0\0\0\0\0\xf0\x7f", b"\0\0\0\0\0\0\0\x80"),
+    *(b"'<f8'", b"'|O'", b"'<U9'", b"'|V9'", b"(4, 17)", b"(99999999999, 17)", b"(0, 17)", b"True", b"\x93NUMPY\3"),
+    *(b"IHDR", b"IDAT", b"PLTE", b"tRNS", b"\0\0\xff\xff", b"moov", b"stsz", b"stts", b"avcC", b"mdat", b"hev1"),
 ]
+# Files that are no JSON, and how many bytes of them declare sizes.
+FILES = {
+    "COLMAP binary": ("sparse/0/*.bin", 120),
+    "COLMAP": ("sparse/0/*.txt", 120),
+    "Neu3D": ("poses_bounds.npy", 130),
+    "nerfies": ("covisible/1x/val/*.png", 60),
+    "EndoNeRF": ("depth/000000.png", 60),
+    "D-NeRF": ("train/*.png", 60),
+    "Record3D": ("rgb/*.jpg", 60),
+    "films": ("*.mp4", 1500),
+}
 
 
 @pytest.fixture(scope="module")
-def captures(device: Device, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    folder = tmp_path_factory.mktemp("captures")
-    return {
-        "bin": write_colmap(folder / "bin", device),
-        "txt": write_colmap(folder / "txt", device, binary=False),
-        "neu3d": write_neu3d(folder / "neu3d", device),
-        "films": write_neu3d(folder / "films", device, count=3, video=True),
-        "nerfies": write_nerfies(folder / "nerfies", device),
-        "nerfstudio": write_nerfstudio(folder / "nerfstudio", device),
-        "record3d": write_record3d(folder / "record3d", device),
-        "polycam": write_polycam(folder / "polycam", device),
-        "endonerf": write_endonerf(folder / "endonerf", device),
-    }
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Of all captures."""
+    return tmp_path_factory.mktemp("captures")
+
+
+def capture_of(folder: Path, layout: str, device: Device) -> Path:
+    """Written when it is first needed."""
+    return folder / layout if (folder / layout).exists() else WRITERS[layout](folder / layout, device)
 
 
 def opened(folder: Path, file: Path, damaged: bytes) -> None:
-    """Open the capture, its first and last picture, and a test picture with its mask, while one file is damaged."""
+    """Open the capture, its first and last image, and a test image with its mask, while one file is damaged."""
     good = file.read_bytes()
     file.write_bytes(damaged)
     try:
@@ -72,60 +79,35 @@ def opened(folder: Path, file: Path, damaged: bytes) -> None:
 
 
 @fuzzed()
-@given(st.sampled_from(MODEL), byte_edits(WORDS))
-@pytest.mark.parametrize("suffix", ["bin", "txt"])
-def test_sparse_models(captures: dict[str, Path], suffix: str, name: str, edits: ByteEdits) -> None:
-    file = captures[suffix] / "sparse/0" / f"{name}.{suffix}"
-    opened(captures[suffix], file, edit_bytes(file.read_bytes(), edits, head=120))
+@given(st.integers(0, 2), byte_edits(WORDS), st.booleans())
+@pytest.mark.parametrize("layout", FILES)
+def test_bytes(folder: Path, device: Device, layout: str, number: int, edits: ByteEdits, other: bool) -> None:
+    """Of sparse models, arrays, masks, depth maps, images and videos.
 
-
-@fuzzed()
-@given(
-    byte_edits(
-        [b"'<f8'", b"'|O'", b"'<U9'", b"'|V9'", b"(4, 17)", b"(99999999999, 17)", b"(0, 17)", b"True", b"\x93NUMPY\3"]
-    )
-)
-@pytest.mark.parametrize("layout", ["neu3d", "endonerf"])
-def test_arrays(captures: dict[str, Path], layout: str, edits: ByteEdits) -> None:
-    file = captures[layout] / "poses_bounds.npy"
-    opened(captures[layout], file, edit_bytes(file.read_bytes(), edits, head=130))
-
-
-@fuzzed()
-@given(byte_edits([b"IHDR", b"IDAT", b"PLTE", b"tRNS", b"\0\0\xff\xff"]))
-def test_masks(captures: dict[str, Path], edits: ByteEdits) -> None:
-    file = captures["nerfies"] / "covisible/1x/val/left_000004.png"
-    opened(captures["nerfies"], file, edit_bytes(file.read_bytes(), edits, head=60))
-
-
-@fuzzed()
-@given(byte_edits([b"IHDR", b"IDAT", b"PLTE", b"tRNS", b"\0\0\xff\xff"]))
-def test_depth_maps(captures: dict[str, Path], edits: ByteEdits) -> None:
-    file = captures["endonerf"] / "depth/000000.png"
-    opened(captures["endonerf"], file, edit_bytes(file.read_bytes(), edits, head=60))
-
-
-@fuzzed()
-@given(byte_edits([b"moov", b"stsz", b"stts", b"avcC", b"mdat", b"hev1", b"vp09", b"\0\0\0\x01", b"\0\0\xff\xff"]))
-def test_videos(captures: dict[str, Path], tmp_path_factory: pytest.TempPathFactory, edits: ByteEdits) -> None:
-    """What stands before the frames is at both ends of the file."""
-    file = captures["films"] / "cam01.mp4"
+    other: checksums of a PNG that fit, so that the damage gets further in; damage at the end of a video.
+    """
+    files, head = FILES[layout]
+    capture = capture_of(folder, layout, device)
+    found = sorted(capture.glob(files))
+    file = found[number % len(found)]
     data = file.read_bytes()
-    front = len(edits) % 2 == 0
-    damaged = edit_bytes(data if front else data[::-1], edits, head=1500)
-    unpacked = tmp_path_factory.getbasetemp() / "unpacked"
+    damaged = edit_bytes(data, edits, head=head)
+    if other and layout == "films":
+        damaged = edit_bytes(data[::-1], edits, head=head)[::-1]
+    elif other and file.suffix == ".png":
+        damaged = with_checksums(damaged)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(unpacked))
-        opened(captures["films"], file, damaged if front else damaged[::-1])
-    shutil.rmtree(unpacked, ignore_errors=True)
+        patch.setenv("XDG_CACHE_HOME", str(folder / "unpacked"))
+        opened(capture, file, damaged)
+    shutil.rmtree(folder / "unpacked", ignore_errors=True)
 
 
 @fuzzed()
 @given(st.data(), tree_edits, byte_edits([b"[", b"{", b'"', b",", b":"], least=0).filter(lambda edits: len(edits) < 2))
-@pytest.mark.parametrize("layout", ["nerfies", "nerfstudio", "record3d", "polycam"])
+@pytest.mark.parametrize("layout", ["D-NeRF", "nerfies", "nerfstudio", "Record3D", "Polycam"])
 def test_descriptions(
-    captures: dict[str, Path], layout: str, data: st.DataObject, changes: TreeEdits, edits: ByteEdits
+    folder: Path, device: Device, layout: str, data: st.DataObject, changes: TreeEdits, edits: ByteEdits
 ) -> None:
-    files = sorted(captures[layout].rglob("*.json"))
-    file = data.draw(st.sampled_from(files))
-    opened(captures[layout], file, edit_bytes(json_text(edit_tree(json.loads(file.read_text()), changes)), edits))
+    capture = capture_of(folder, layout, device)
+    file = data.draw(st.sampled_from(sorted(capture.rglob("*.json"))))
+    opened(capture, file, edit_bytes(json_text(edit_tree(json.loads(file.read_text()), changes)), edits))

@@ -1,7 +1,7 @@
 """Files of every format that is read, damaged at random: each is read or refused in one sentence, and nothing else.
 
 A few hundred inputs a format, always the same; LAPGS_FUZZ=10000 takes as many new ones (make soak). What was found so
-far stands in test_hostile_found.py as plain tests.
+far stands in test_hostile_found.py as plain tests; captures are in test_hostile_captures.py.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from helpers.damaged_files import (
     FOREIGN,
     KINDS,
     SPEC,
+    compact_scenes,
     short_config,
     small_scene,
-    with_checksums,
     with_table,
 )
 from helpers.damaged_lapgs import CompactDamage, damage_compact, damaged_compact_scenes
@@ -40,18 +40,14 @@ from helpers.hostile import (
     tree_edits,
 )
 from helpers.playback import open_playback
-from helpers.scene_files import scene_of_outliers
 from hypothesis import given
 from hypothesis import strategies as st
-from PIL import Image
 
 from lapgs_wgpu.data import Dataset, load_dataset
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.initial_view import InitialView
-from lapgs_wgpu.motion.playback.playback import DevicePlayback
-from lapgs_wgpu.motion.scene_file import compact_bytes, read_scene
+from lapgs_wgpu.motion.scene_file import read_scene
 from lapgs_wgpu.table import read_spec
-from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.run_folder import STATE, check_state, load_state, save_state
@@ -78,79 +74,9 @@ def checkpoints(device: Device, tmp_path_factory: pytest.TempPathFactory) -> lis
     return found
 
 
-# PLY -----------------------------------------------------------------------------------------------------------------
-
-WORDS = [
-    b"element vertex 4\n", b"element vertex 999999999999999999\n", b"property double x\n",
-    b"property list uchar int x\n",
-    b"end_header\n", b"comment lapgs4d v1 safetensors 4\n", b"format ascii 1.0\n", b"obj_info\n", b"f_rest_", b"double",
-    b"uchar", b"element empty 999999999999999999\n", b"\r\n", b"lapgs4d", b"{\"a\":", b"\"shape\":[0,9007199254740991]",
-    b"safetensors 18446744073709551615", b"packed_position",
-]  # fmt: skip
-COMPRESSED = (
-    b"ply\nformat binary_little_endian 1.0\nelement chunk 1\nproperty float min_x\nelement vertex 2\n"
-    b"property uint packed_position\nproperty uint packed_rotation\nproperty uint packed_scale\n"
-    b"property uint packed_color\nend_header\n" + bytes(4 + 2 * 16)
-)
-
-
-@fuzzed()
-@given(st.sampled_from([*FOREIGN, COMPRESSED]), byte_edits(WORDS))
-def test_foreign_splats(folder: Path, data: bytes, edits: ByteEdits) -> None:
-    (folder / "a.ply").write_bytes(edit_bytes(data, edits, head=data.index(b"end_header") + 20))
-    scene = refused_or(lambda: read_scene(folder / "a.ply"))
-    if scene is not None:
-        assert all(np.isfinite(values).all() for values in scene.gaussians.values())
-
-
-@fuzzed()
-@given(st.integers(0, len(KINDS) - 1), byte_edits(WORDS))
-def test_checkpoints_with_other_bytes(
-    checkpoints: list[bytes], device: Device, folder: Path, kind: int, edits: ByteEdits
-) -> None:
-    (folder / "a.ply").write_bytes(edit_bytes(checkpoints[kind], edits, head=4000))
-    refused_or(lambda: shown_at_all_times(folder / "a.ply", device))
-
-
-@fuzzed()
-@given(st.integers(0, len(KINDS) - 1), tree_edits, st.booleans())
-def test_checkpoints_with_another_description(
-    checkpoints: list[bytes], device: Device, folder: Path, kind: int, edits: TreeEdits, inner: bool
-) -> None:
-    """Mutations of the table of tensors, or of the field's configuration in its metadata."""
-
-    def change(table: dict[str, Any]) -> bytes:
-        if not inner:
-            return json_text(edit_tree(table, edits))
-        values = edit_tree(json.loads(table["__metadata__"]["field"]), edits)
-        table["__metadata__"]["field"] = json_text(values).decode("utf-8", "replace")
-        return json_text(table)
-
-    (folder / "a.ply").write_bytes(with_table(checkpoints[kind], change))
-    refused_or(lambda: shown_at_all_times(folder / "a.ply", device))
-
-
-# Compact scenes ------------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
-def compact_scenes(device: Device, tmp_path_factory: pytest.TempPathFactory) -> list[bytes]:
-    """One of each field that such a file can hold, and one with outliers."""
-    file = tmp_path_factory.mktemp("compact") / "a.ply"
-    found = []
-    for kind in ("static", "grid4d", "laplacian"):
-        small_scene(kind, device).save(file, {"background": "white"})
-        playback = open_playback(file, device)
-        assert isinstance(playback, DevicePlayback)
-        found.append(compact_bytes(read_scene(file), playback.static_features()))
-    return [*found, compact_bytes(scene_of_outliers(20), None)]
-
-
-@fuzzed()
-@given(damaged_compact_scenes(4))
-def test_compact_scenes(compact_scenes: list[bytes], device: Device, folder: Path, damage: CompactDamage) -> None:
-    (folder / "a.lapgs").write_bytes(damage_compact(compact_scenes, damage))
-    refused_or(lambda: shown_at_all_times(folder / "a.lapgs", device))
+def compact(device: Device, tmp_path_factory: pytest.TempPathFactory) -> list[bytes]:
+    return compact_scenes(tmp_path_factory.mktemp("compact"), device)
 
 
 @np.errstate(all="ignore")
@@ -161,35 +87,92 @@ def shown_at_all_times(file: Path, device: Device) -> None:
     assert len(playback.snapshot(1.0)) == playback.count
 
 
-# The state of a training ---------------------------------------------------------------------------------------------
+WORDS = [
+    b"element vertex 4\n", b"element vertex 999999999999999999\n", b"property double x\n",
+    b"property list uchar int x\n",
+    b"end_header\n", b"comment lapgs4d v1 safetensors 4\n", b"format ascii 1.0\n", b"obj_info\n", b"f_rest_", b"double",
+    b"uchar", b"element empty 999999999999999999\n", b"\r\n", b"lapgs4d", b"{\"a\":", b"\"shape\":[0,9007199254740991]",
+    b"safetensors 18446744073709551615", b"packed_position",
+]  # fmt: skip
+
+
+@fuzzed()
+@given(st.sampled_from(FOREIGN), byte_edits(WORDS))
+def test_foreign_splats(folder: Path, data: bytes, edits: ByteEdits) -> None:
+    (folder / "a.ply").write_bytes(edit_bytes(data, edits, head=data.index(b"end_header") + 20))
+    scene = refused_or(lambda: read_scene(folder / "a.ply"))
+    if scene is not None:
+        assert all(np.isfinite(values).all() for values in scene.gaussians.values())
+
+
+@fuzzed(400)
+@given(st.integers(0, len(KINDS) - 1), st.sampled_from(["bytes", "table", "field"]), byte_edits(WORDS), tree_edits)
+def test_checkpoints(
+    checkpoints: list[bytes], device: Device, folder: Path, kind: int, place: str, edits: ByteEdits, changes: TreeEdits
+) -> None:
+    """Other bytes, another table of tensors, or another configuration of the field in its metadata."""
+
+    def change(table: dict[str, Any]) -> bytes:
+        if place == "table":
+            return json_text(edit_tree(table, changes))
+        values = edit_tree(json.loads(table["__metadata__"]["field"]), changes)
+        table["__metadata__"]["field"] = json_text(values).decode("utf-8", "replace")
+        return json_text(table)
+
+    good = checkpoints[kind]
+    damaged = edit_bytes(good, edits, head=4000) if place == "bytes" else with_table(good, change)
+    (folder / "a.ply").write_bytes(damaged)
+    refused_or(lambda: shown_at_all_times(folder / "a.ply", device))
+
+
+@fuzzed()
+@given(damaged_compact_scenes(4))
+def test_compact_scenes(compact: list[bytes], device: Device, folder: Path, damage: CompactDamage) -> None:
+    (folder / "a.lapgs").write_bytes(damage_compact(compact, damage))
+    refused_or(lambda: shown_at_all_times(folder / "a.lapgs", device))
+
+
+# The state of a training
 
 
 @pytest.fixture(scope="module")
-def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    return load_dataset(make_scene(tmp_path_factory.mktemp("scene") / "toy"))
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_scene(tmp_path_factory.mktemp("scene") / "toy")
 
 
 @pytest.fixture(scope="module")
-def config() -> Config:
-    return short_config()
+def dataset(scene: Path) -> Dataset:
+    return load_dataset(scene)
 
 
 @pytest.fixture(scope="module")
-def training(config: Config, dataset: Dataset, device: Device) -> Trainer:
-    training = Trainer(config, dataset, device)
+def training(dataset: Dataset, device: Device) -> Trainer:
+    training = Trainer(short_config(), dataset, device)
     training.step()
     return training
+
+
+@pytest.fixture(scope="module")
+def state(training: Trainer) -> dict[str, Any]:
+    """Before any damage."""
+    return training.state()
 
 
 @fuzzed()
 @given(byte_edits([b'"shape":[0', b'"dtype":"F64"', b'"I64"', b'"U8"'], least=0), tree_edits, st.booleans())
 def test_states(
-    training: Trainer, dataset: Dataset, folder: Path, edits: ByteEdits, changes: TreeEdits, whole: bool
+    training: Trainer,
+    state: dict[str, Any],
+    dataset: Dataset,
+    folder: Path,
+    edits: ByteEdits,
+    changes: TreeEdits,
+    whole: bool,
 ) -> None:
     """A state that is accepted is one that a training can go on from."""
     run = folder / "run"
     run.mkdir(exist_ok=True)
-    save_state(run, SAVED.setdefault("state", training.state()))
+    save_state(run, state)
     data = (run / STATE).read_bytes()
     length = int.from_bytes(data[:8], "little")
     if whole:
@@ -199,52 +182,26 @@ def test_states(
     for other in run.iterdir():
         if other.name != STATE:
             other.unlink()
-    state = refused_or(lambda: load_state(run))
-    if state is None:
+    found = refused_or(lambda: load_state(run))
+    if found is None:
         return
     try:
-        check_state(state, views=len(dataset.train), steps=5)
-        training.restore(state)
+        check_state(found, views=len(dataset.train), steps=5)
+        training.restore(found)
     except (IndexError, KeyError, RuntimeError, TypeError, ValueError):
         return  # what train.run.resume tells as an InputError
     assert 0 <= training.done <= 5
     assert len({len(value) for value in training.scene.parameters.values()}) == 1
 
 
-SAVED: dict[str, Any] = {}  # the state before any damage
-
-
-# JSON ----------------------------------------------------------------------------------------------------------------
-
-
-def damaged_json(tree: Any, changes: TreeEdits, edits: ByteEdits) -> bytes:
-    return edit_bytes(json_text(edit_tree(tree, changes)), edits)
-
-
-JSON_EDITS = (tree_edits, byte_edits([b"[", b"{", b'"', b",", b":"], least=0).filter(lambda edits: len(edits) < 2))
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
-    scene = make_scene(tmp_path_factory.mktemp("capture") / "toy")
-    return scene, json.loads((scene / "transforms_train.json").read_text())
-
-
-@fuzzed()
-@given(*JSON_EDITS)
-def test_transforms(capture: tuple[Path, dict[str, Any]], changes: TreeEdits, edits: ByteEdits) -> None:
-    scene, tree = capture
-    (scene / "transforms_train.json").write_bytes(damaged_json(tree, changes, edits))
-    found = refused_or(lambda: load_dataset(scene))
-    for view in found.train if found else ():
-        assert view.load().dtype == np.uint8
+# JSON and TOML
 
 
 @fuzzed(300)
-@given(*JSON_EDITS, st.booleans(), st.booleans())
+@given(tree_edits, byte_edits([b"[", b"{", b'"', b",", b":"], least=0), st.booleans(), st.booleans())
 def test_camera_paths(folder: Path, changes: TreeEdits, edits: ByteEdits, cycle: bool, old: bool) -> None:
     tree = nerfstudio(is_cycle=cycle, **({"keyframes": []} if old else {}))
-    (folder / "a.json").write_bytes(damaged_json(tree, changes, edits))
+    (folder / "a.json").write_bytes(edit_bytes(json_text(edit_tree(tree, changes)), edits[:1]))
     held = refused_or(lambda: read_path(folder / "a.json"))
     if held is not None:
         for second in np.linspace(0, held.path.seconds, 5).tolist():
@@ -261,68 +218,26 @@ def test_logs(folder: Path, changes: TreeEdits, edits: ByteEdits, done: int) -> 
          "timing": {"seconds": 1.0, "steps_per_second": 2.0}}
         for step in (3, 6)
     ]  # fmt: skip
-    damaged = edit_tree(lines, changes)
-    data = b"\n".join(json_text(line) for line in damaged)
+    data = b"\n".join(json_text(line) for line in edit_tree(lines, changes))
     (folder / "log.jsonl").write_bytes(edit_bytes(data, edits))
     with Log(folder / "log.jsonl", 10, done=done, terminal=io.StringIO()) as log:
         assert 0 <= log.seconds < 1e10
 
 
-# TOML ----------------------------------------------------------------------------------------------------------------
+TOML_EDITS = (tree_edits, byte_edits([b"[", b"]", b"a.b.", b'"""', b"= "], least=0))
 
 
 @fuzzed(300)
-@given(tree_edits, byte_edits([b"[", b"]", b"a.b.", b'"""', b"= "], least=0))
-def test_configurations(folder: Path, config: Config, changes: TreeEdits, edits: ByteEdits) -> None:
-    tree = {**dataclasses.asdict(config), "base": "tiny", "record": {"torch": "2"}}
+@given(*TOML_EDITS)
+def test_configurations(folder: Path, changes: TreeEdits, edits: ByteEdits) -> None:
+    tree = {**dataclasses.asdict(short_config()), "base": "tiny", "record": {"torch": "2"}}
     (folder / "config.toml").write_bytes(edit_bytes(toml_text(edit_tree(tree, changes)), edits))
     refused_or(lambda: load_config(str(folder / "config.toml")))
 
 
 @fuzzed()
-@given(tree_edits, byte_edits([b"[", b"]", b"a.b.", b'"""', b"= "], least=0))
+@given(*TOML_EDITS)
 def test_specs_of_tables(folder: Path, changes: TreeEdits, edits: ByteEdits) -> None:
     (folder / "spec.toml").write_bytes(edit_bytes(toml_text(edit_tree(tomllib.loads(SPEC), changes)), edits))
     for run in refused_or(lambda: read_spec(folder / "spec.toml")) or ():
         assert ".." not in Path(run.scene, run.row).parts  # they become folders
-
-
-# Pictures ------------------------------------------------------------------------------------------------------------
-
-
-def encoded(kind: str, mode: str) -> bytes:
-    pixels = np.random.default_rng(0).integers(0, 256, (8, 12, 4), dtype=np.uint8)
-    file = io.BytesIO()
-    picture = Image.fromarray(pixels).convert("RGB" if kind == "JPEG" else "RGBA").convert(mode)
-    picture.save(file, kind, **({"pnginfo": None, "transparency": 1} if mode == "P" else {}))
-    return file.getvalue()
-
-
-PICTURES = [encoded("PNG", "RGBA"), encoded("PNG", "RGB"), encoded("PNG", "P"), encoded("JPEG", "RGB")]
-CHUNKS = [
-    b"IHDR",
-    b"IDAT",
-    b"tRNS",
-    b"PLTE",
-    b"iCCP",
-    b"zTXt",
-    b"acTL",
-    b"fcTL",
-    b"eXIf",
-    b"IEND",
-    b"\xff\xd8",
-    b"\xff\xe1",
-]
-
-
-@fuzzed()
-@given(st.sampled_from(PICTURES), byte_edits(CHUNKS), st.booleans())
-def test_pictures(capture: tuple[Path, dict[str, Any]], data: bytes, edits: ByteEdits, summed: bool) -> None:
-    scene, tree = capture
-    (scene / "transforms_train.json").write_text(json.dumps(tree))
-    damaged = edit_bytes(data, edits, head=60)
-    for frame in tree["frames"]:
-        (scene / f"{frame['file_path']}.png").write_bytes(with_checksums(damaged) if summed else damaged)
-    found = refused_or(lambda: load_dataset(scene))
-    for view in found.train if found else ():
-        refused_or(view.load)

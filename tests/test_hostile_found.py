@@ -14,24 +14,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.damaged_files import (
-    FOREIGN,
-    changes_since_without_device,
-    short_config,
-    small_scene,
-    with_checksums,
-    with_table,
-)
+from helpers.damaged_files import FOREIGN, changes_since_without_device, short_config, small_scene, with_table
 from helpers.dnerf_scene import make_scene
 from helpers.hostile import refused_or
 from helpers.ply_files import columns_of, ply_bytes, random_still
 
 from lapgs_wgpu.data import load_dataset
-from lapgs_wgpu.data.cloud import read_npy, read_points
-from lapgs_wgpu.data.readers.colmap_model import read_model
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.io.checkpoint import read_checkpoint
 from lapgs_wgpu.io.folder_lock import locked_folder
 from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.io.safe_json_toml import MAX_TOML_BYTES, read_json, read_toml
@@ -47,82 +37,58 @@ from lapgs_wgpu.train.trainer import Trainer
 from lapgs_wgpu.viewer.ground_truth import open_ground_truth
 from lapgs_wgpu.viewer.path_file import read_path
 
-FOUND_TOML = {
-    "deep lists": ("seed = " + "[" * 5000 + "]" * 5000, "nested too deeply"),
-    "a key of many parts": ("[points]\n" + "count." * 20_000 + "a = 1", "dotted key of more than 16 parts"),
-    "a key of many quoted parts": ("a" + '."b".c' * 5000 + " = 1", "dotted key of more than 16 parts"),
-    "a number of 9000 digits in hexadecimal": ("seed = 0x" + "f" * 9000, "seed must lie between 0 and"),
-    "a rate of 400 digits": ("rates.quats = 1" + "0" * 400, "rates.quats must lie between 0 and"),
-    "a text of 100 kB": ('seed = "' + "x" * 100_000 + '"', "seed must be a whole number, got 'xxx"),
-    "an escape sequence": ('"\\u001b]0;title\\u0007" = 1', r"there is no key \\x1b\]0;title\\x07"),
-}
+TABLE = "__metadata__"
 
 
-@pytest.mark.parametrize("name", FOUND_TOML)
-def test_found_in_toml(name: str, tmp_path: Path) -> None:
-    text, message = FOUND_TOML[name]
-    (tmp_path / "a.toml").write_text(f'base = "tiny"\n{text}\n')
-    with pytest.raises(InputError, match=message) as error:
-        load_config(str(tmp_path / "a.toml"))
+def field_of(table: dict[str, Any], **changes: Any) -> bytes:
+    """The table of tensors, with another configuration of the field."""
+    table[TABLE]["field"] = json.dumps(json.loads(table[TABLE]["field"]) | changes)
+    return json.dumps(table).encode()
+
+
+def without_field(text: str) -> Callable[[dict[str, Any]], bytes]:
+    """The table of tensors, with other text where the field's configuration stands."""
+    return lambda table: json.dumps(table | {TABLE: table[TABLE] | {"field": text}}).encode()
+
+
+# The text of a config.toml, or what makes the table of a checkpoint's tensors anew; and what the error names.
+FOUND: list[tuple[str | Callable[[dict[str, Any]], bytes], str]] = [
+    ("seed = " + "[" * 5000 + "]" * 5000, "nested"),
+    ("[points]\n" + "count." * 20_000 + "a = 1", "dotted key"),
+    ("a" + '."b".c' * 5000 + " = 1", "dotted key"),
+    ("seed = 0x" + "f" * 9000, "seed"),
+    ("rates.quats = 1" + "0" * 400, "rates.quats"),
+    ('seed = "' + "x" * 100_000 + '"', "seed"),
+    ('"\\u001b]0;title\\u0007" = 1', "\\x1b]0;title\\x07"),
+    *((without_field(text), "field") for text in ("[" * 100_000, "9" * 5000, "null", '{"size": 1}')),
+    # 4096 channels and 16 hidden layers are a gigabyte, which a file of some kB must not make us take.
+    (lambda table: field_of(table, width=4096, depth=16), "tensor"),
+]
+
+
+@pytest.mark.parametrize("number", range(len(FOUND)))
+def test_found_in_configurations_and_checkpoints(number: int, device: Device, tmp_path: Path) -> None:
+    damage, named = FOUND[number]
+    if isinstance(damage, str):
+        (tmp_path / "a.toml").write_text(f'base = "tiny"\n{damage}\n')
+    else:
+        small_scene("grid4d", device).save(tmp_path / "a.ply")
+        (tmp_path / "a.ply").write_bytes(with_table((tmp_path / "a.ply").read_bytes(), damage))
+    with pytest.raises(InputError) as error:
+        load_config(str(tmp_path / "a.toml")) if isinstance(damage, str) else read_scene(tmp_path / "a.ply")
+    assert named in str(error.value)
     assert str(error.value).isprintable()
     assert len(str(error.value)) < 2100
 
 
-def test_found_in_clouds(tmp_path: Path) -> None:
-    header = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
-    for line in ("property", "property float"):
-        (tmp_path / "a.ply").write_text(f"{header}{line}\nend_header\n1 2 3 4\n")
-        with pytest.raises(InputError, match="header line"):
-            read_points(tmp_path / "a.ply")
-
-
-def test_found_in_models(tmp_path: Path) -> None:
-    for name in ("images", "points3D"):
-        (tmp_path / f"{name}.txt").touch()
-    (tmp_path / "cameras.txt").write_text(f"1 SIMPLE_PINHOLE {'9' * 400} 48 50 32 24\n")
-    with pytest.raises(InputError, match=r"cameras.txt, line 1: width and height must be .* got 999.*\.\.\.x48\."):
-        read_model(tmp_path)
-
-
-@pytest.mark.parametrize(
-    "arc", [[], [1], [1, 2, 3], "ab", 7, {"a": 1}, [-1, 20], [200, 200], [float("nan"), 1], [[1], 2]]
-)
-def test_an_arc_that_is_none(arc: object) -> None:
+@pytest.mark.parametrize("arc", [[], [1, 2, 3], "ab", 7, {"a": 1}, [-1, 20], [200, 200], [float("nan"), 1], [[1], 2]])
+def test_a_place_to_look_from_is_left_out_where_it_is_no_good(arc: object) -> None:
     camera = Camera.looking_at([0, -4, 0], [0, 0, 0], up=[0, 0, 1], fov_x=0.7, width=8, height=6)
     look = InitialView(camera, np.zeros(3), np.array([0.0, 0.0, 1.0]), 3, (10.0, 20.0))
     values = json.loads(look.to_json())
     assert InitialView.from_json(json.dumps(values)) is not None
-    assert InitialView.from_json(json.dumps(values | {"arc": arc})) is None
-
-
-@pytest.mark.parametrize("text", ["[" * 100_000, "9" * 5000, "null", '{"size": 1}'])
-def test_found_in_metadata(text: str, device: Device, tmp_path: Path) -> None:
-    """A place to look from is left out where it is no good; the description of a field is needed."""
-    small_scene("grid4d", device).save(tmp_path / "a.ply", {"view": text})
-    assert InitialView.from_json(read_checkpoint(tmp_path / "a.ply").metadata["view"]) is None
-
-    def change(table: dict[str, Any]) -> bytes:
-        table["__metadata__"]["field"] = text
-        return json.dumps(table).encode()
-
-    (tmp_path / "a.ply").write_bytes(with_table((tmp_path / "a.ply").read_bytes(), change))
-    with pytest.raises(InputError, match="description of its field cannot be read"):
-        read_scene(tmp_path / "a.ply")
-
-
-@pytest.mark.parametrize("kind", ["mlp", "hexplane", "grid4d", "laplacian"])
-def test_a_wide_network_takes_no_memory_that_the_file_does_not_hold(kind: str, device: Device, tmp_path: Path) -> None:
-    """4096 channels and 16 hidden layers are a gigabyte, which a file of some kB must not make us take."""
-    small_scene(kind, device).save(tmp_path / "a.ply")
-
-    def change(table: dict[str, Any]) -> bytes:
-        values = json.loads(table["__metadata__"]["field"])
-        table["__metadata__"]["field"] = json.dumps(values | {"width": 4096, "depth": 16})
-        return json.dumps(table).encode()
-
-    (tmp_path / "a.ply").write_bytes(with_table((tmp_path / "a.ply").read_bytes(), change))
-    with pytest.raises(InputError, match=r"but the scene needs|has no tensor"):
-        read_scene(tmp_path / "a.ply")
+    for text in (json.dumps(values | {"arc": arc}), "[" * 100_000, "9" * 5000, "null", '{"size": 1}'):
+        assert InitialView.from_json(text) is None
 
 
 def test_found_in_states(device: Device, tmp_path: Path) -> None:
@@ -155,58 +121,6 @@ def test_found_in_a_run_folder(tmp_path: Path) -> None:
     assert changes_since_without_device(tmp_path) == []
     (tmp_path / "config.toml").write_text(f'[data]\npath = "{tmp_path}"\nsize = inf\n')
     assert open_ground_truth(tmp_path / "checkpoint.ply", {}) is None
-
-
-# Names that lead elsewhere -------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("name", ["../other/r", "/etc/passwd", "train/../../other/r", "C:\\r", "\\\\host\\r", "..\\r"])
-def test_pictures_of_transforms_lie_in_the_scene(name: str, tmp_path: Path) -> None:
-    other = make_scene(tmp_path / "other") / "train" / "r_000.png"
-    (tmp_path / "other" / "r.png").write_bytes(other.read_bytes())
-
-    def change(folder: Path, scene: dict[str, Any]) -> None:
-        scene["train"]["frames"][1]["file_path"] = name
-
-    with pytest.raises(InputError, match="leads out of the scene's folder"):
-        load_dataset(make_scene(tmp_path / "toy", change))
-
-
-def test_a_link_in_a_scene_is_followed(tmp_path: Path) -> None:
-    make_scene(tmp_path / "other")
-
-    def change(folder: Path, scene: dict[str, Any]) -> None:
-        (folder / "elsewhere").symlink_to(tmp_path / "other" / "train")
-        scene["train"]["frames"][1]["file_path"] = "train/../elsewhere/./r_000"
-
-    assert len(load_dataset(make_scene(tmp_path / "toy", change)).train) == 3
-
-
-def test_a_picture_without_pixels(tmp_path: Path) -> None:
-    """Pillow ends in an IndexError where a PNG has no IDAT."""
-    folder = make_scene(tmp_path / "toy")
-    file = folder / "train" / "r_000.png"
-    file.write_bytes(with_checksums(file.read_bytes().replace(b"IDAT", b"IDAU")))
-    with pytest.raises(InputError, match="is not a readable image"):
-        load_dataset(folder)
-
-
-@pytest.mark.parametrize(
-    ("old", "new"),
-    [
-        (b"'descr'", b"\0\0\0\0\0\0\0"),  # Python's tokeniser
-        (b"'<f8'", b"'|O' "),  # a pickle
-        (b"(2, 17)", b"(9999999999, 17)"),  # 1.4 TB
-    ],
-)
-def test_found_in_arrays(old: bytes, new: bytes, tmp_path: Path) -> None:
-    path = tmp_path / "poses_bounds.npy"
-    np.save(path, np.zeros((2, 17)))
-    data = path.read_bytes()
-    assert old in data
-    path.write_bytes(data.replace(old, new))
-    with pytest.raises(InputError, match=r"poses_bounds\.npy cannot be read as a NumPy array"):
-        read_npy(path)
 
 
 def test_nothing_is_written_through_a_link(tmp_path: Path) -> None:
@@ -252,7 +166,7 @@ def test_pipes_and_devices_do_not_hang(tmp_path: Path) -> None:
             action()
 
 
-# Bounds on memory (docs/reliability.md) ------------------------------------------------------------------------------
+# Bounds on memory (docs/reliability.md)
 
 
 def peak_of(action: Callable[[], Any]) -> int:
@@ -264,9 +178,9 @@ def peak_of(action: Callable[[], Any]) -> int:
         tracemalloc.stop()
 
 
-@pytest.mark.parametrize("part", ["{},", "[],", "[0],", '{"":0},', "1.5,", "[" * 30 + "0" + "]" * 30 + ","])
+@pytest.mark.parametrize("part", ["[],", '{"":0},', "[" * 30 + "0" + "]" * 30 + ","])
 def test_json_takes_at_most_64_times_its_size(part: str, tmp_path: Path) -> None:
-    size = 1 << 20
+    size = 1 << 18
     (tmp_path / "a.json").write_text("[" + part * (size // len(part)) + "0]")
     assert peak_of(lambda: read_json(tmp_path / "a.json")) < 64 * size + (1 << 20)
 
@@ -275,25 +189,17 @@ def test_toml_of_the_largest_size_is_quick(tmp_path: Path) -> None:
     line = ".".join("abcdefghijklmno") + ".{} = 1\n"
     text = "".join(line.format(f"k{i}") for i in range(MAX_TOML_BYTES // (len(line) + 4)))
     (tmp_path / "a.toml").write_text(text)
-    command = [
-        sys.executable,
-        "-c",
-        "import sys; from lapgs_wgpu.io.safe_json_toml import read_toml; read_toml(sys.argv[1])",
-    ]
-    subprocess.run([*command, str(tmp_path / "a.toml")], check=True, timeout=60)
+    program = "import sys; from lapgs_wgpu.io.safe_json_toml import read_toml; read_toml(sys.argv[1])"
+    subprocess.run([sys.executable, "-c", program, str(tmp_path / "a.toml")], check=True, timeout=60)
     (tmp_path / "a.toml").write_text("#" * (MAX_TOML_BYTES + 1))
-    with pytest.raises(InputError, match=f"has {MAX_TOML_BYTES + 1} bytes, over {MAX_TOML_BYTES}"):
+    with pytest.raises(InputError, match=str(MAX_TOML_BYTES)):
         read_toml(tmp_path / "a.toml")
 
 
-@pytest.mark.parametrize("kind", ["uchar", "float", "double"])
-def test_splats_take_at_most_24_times_the_file(kind: str, tmp_path: Path) -> None:
+def test_splats_take_at_most_24_times_the_file(tmp_path: Path) -> None:
     """The smallest rows, of 17 bytes, become 236 bytes each: harmonics are padded to degree 3."""
-    still = random_still(100_000, 0)
-    columns = {name: (kind, np.ones(100_000)) for name in columns_of(still)}
-    data = ply_bytes(
-        {name: (code, values.astype(int) if kind == "uchar" else values) for name, (code, values) in columns.items()}
-    )
+    ones = np.ones(100_000, int)
+    data = ply_bytes(dict.fromkeys(columns_of(random_still(1, 0)), ("uchar", ones)))
     (tmp_path / "a.ply").write_bytes(data)
     assert peak_of(lambda: read_scene(tmp_path / "a.ply")) < 24 * len(data) + (16 << 20)
 
@@ -318,6 +224,7 @@ def test_sizes_that_a_file_only_declares_take_no_memory(tmp_path: Path) -> None:
     assert told.stdout.split() == ["refused"] * 3, told.stderr
 
 
+@pytest.mark.nightly
 def test_a_hostile_checkpoint_ends_the_command_in_one_sentence(device: Device, tmp_path: Path) -> None:
     """The whole way: no traceback, exit code 2; a step that is no number does not matter."""
     small_scene("grid4d", device).save(tmp_path / "checkpoint.ply", {"step": "x\x1b"})
@@ -326,4 +233,3 @@ def test_a_hostile_checkpoint_ends_the_command_in_one_sentence(device: Device, t
     done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1
-    assert "nested too deeply" in done.stderr

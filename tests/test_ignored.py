@@ -67,7 +67,7 @@ def test_what_is_ignored_does_not_change_a_bit(device: Device, dataset: Dataset,
             views.append(dataclasses.replace(view, pixels=pixels.copy, ignored=ignored.copy))
         return dataclasses.replace(dataset, train=tuple(views))
 
-    config = configure(discovery__steps="20", discovery__size="32")
+    config = configure(schedule__steps="8", schedule__warm_up="2", discovery__steps="8", discovery__size="32")
     for level in (10, 250):
         train(config, capture(level), tmp_path / str(level), device=device)
     train(config, dataset, tmp_path / "whole", device=device)

@@ -6,15 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.captures import write_colmap, write_nerfstudio, write_neu3d
-from helpers.external_captures import write_endonerf, write_polycam, write_record3d
+from helpers.captures import WRITERS
 
 from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.listing import listed
 from lapgs_wgpu.train.run_folder import check_run_folder
-
-WRITERS = [write_colmap, write_nerfstudio, write_neu3d, write_record3d, write_polycam, write_endonerf]
 
 
 def scatter(folder: Path) -> None:
@@ -26,9 +23,9 @@ def scatter(folder: Path) -> None:
             (each / name).write_bytes(b"\x00")
 
 
-@pytest.mark.parametrize("write", WRITERS)
-def test_a_capture_is_read_without_them(write: object, tmp_path: Path, device: Device) -> None:
-    folder = write(tmp_path / "capture", device)
+@pytest.mark.parametrize("layout", WRITERS)
+def test_a_capture_is_read_without_them(layout: str, tmp_path: Path, device: Device) -> None:
+    folder = WRITERS[layout](tmp_path / "capture", device)
     before = load_dataset(folder)
     scatter(folder)
     after = load_dataset(folder)

@@ -10,10 +10,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from lapgs_wgpu.data import Dataset, View
-from lapgs_wgpu.data.plane_sweep import _stills, _sweep, still_surface
+from lapgs_wgpu.data.plane_sweep import still_surface
 from lapgs_wgpu.splat.camera import Camera
-from lapgs_wgpu.train.initial_points import initial_points
-from lapgs_wgpu.train.presets import load_config
 
 NORMAL, DISTANCE = np.array([0.2, 0.1, 1.0]), 4.0  # of the wall: NORMAL . point = DISTANCE
 TEXTURE = ndimage.gaussian_filter(np.random.default_rng(0).random((200, 200, 3)), (1.5, 1.5, 0), mode="wrap")
@@ -60,26 +58,6 @@ def test_the_surface_is_where_the_wall_is() -> None:
     assert np.abs(found.colors - true).mean() < 0.03
 
 
-def test_no_depth_is_beyond_the_stated_ones() -> None:
-    """Where the wall is behind the furthest plane, that plane looks most like it."""
-    stills = _stills(rig(moments=2))
-    planes = np.linspace(1 / 3.9, 1 / 2, 4)
-    for still in stills:
-        inverse = _sweep(still, [other for other in stills if other is not still], planes)
-        found = inverse[np.isfinite(inverse)]
-        assert len(found)
-        assert found.min() >= planes[0]
-
-
-@pytest.mark.nightly
-def test_what_looks_the_same_everywhere_has_no_depth() -> None:
-    data = rig(moments=2)
-    blank = [dataclasses.replace(view, pixels=lambda: np.full((60, 80, 3), 90, np.uint8)) for view in data.train]
-    found = still_surface(dataclasses.replace(data, train=tuple(blank)))
-    assert found is not None
-    assert (len(found.points), found.share) == (0, 0.0)
-
-
 @pytest.mark.parametrize("lacking", ["cameras", "depths", "stillness"])
 def test_other_captures_have_none(lacking: str) -> None:
     data = rig(2 if lacking == "cameras" else 4, 3)
@@ -89,18 +67,3 @@ def test_other_captures_have_none(lacking: str) -> None:
         own = [dataclasses.replace(view, camera=dataclasses.replace(view.camera)) for view in data.train]
         data = dataclasses.replace(data, train=tuple(own))
     assert still_surface(data) is None
-
-
-@pytest.mark.nightly
-def test_a_training_starts_from_it() -> None:
-    """As large a share of the points as of the pixels lies on the surface."""
-    data, config = rig(), load_config("neu3d-tiny").points
-    points, colors, scales = initial_points(config, data, 0)
-    found = still_surface(data)
-    assert found is not None
-    assert points.shape == colors.shape == (config.count, 3)
-    off = np.abs(points @ NORMAL - DISTANCE) / np.linalg.norm(NORMAL)
-    assert (off < 0.1).mean() == pytest.approx(found.share, abs=0.1)
-    assert scales.shape == (config.count,)
-    again = initial_points(config, rig(), 0)
-    np.testing.assert_array_equal(again[0], points)

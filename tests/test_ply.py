@@ -5,10 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import stat
-import subprocess
-import sys
 import time
-import tracemalloc
 from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
@@ -22,19 +19,15 @@ from helpers.ply_files import (
     SPLIT,
     assert_same,
     columns_of,
-    mutate,
     ply_bytes,
     random_still,
     read_ply,
+    refused_within,
 )
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.io.ply import GaussianSnapshot, write_ply
-
-REAL_FILES = Path(__file__).parents[2] / "shared" / "data" / "ply"
 
 
 def test_written_bytes_are_inrias_layout(tmp_path: Path) -> None:
@@ -58,9 +51,9 @@ def test_written_bytes_are_inrias_layout(tmp_path: Path) -> None:
     np.testing.assert_array_equal(column["rot_0"], still.quats[:, 0])  # w
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-@pytest.mark.parametrize("n", [1, 5000])  # 5000 rows are read in several blocks
+@pytest.mark.parametrize(("n", "degree"), [(1, 0), (1, 2), (5000, 1), (5000, 3)])
 def test_round_trip_pads_sh_to_degree_3(tmp_path: Path, degree: int, n: int) -> None:
+    """5000 rows are read in several blocks."""
     still = random_still(n, degree)
     write_ply(tmp_path / "a.ply", still)
     back = read_ply(tmp_path / "a.ply")
@@ -68,8 +61,7 @@ def test_round_trip_pads_sh_to_degree_3(tmp_path: Path, degree: int, n: int) -> 
     padded = np.zeros((n, 16, 3), np.float32)
     padded[:, :k] = still.sh
     assert_same(back, GaussianSnapshot(still.means, padded, still.opacity_logits, still.log_scales, still.quats))
-    assert back.sh_degree == 3
-    assert len(back) == n
+    assert (back.sh_degree, len(back)) == (3, n)
     assert all(getattr(back, name).flags.c_contiguous for name in FIELDS)
 
 
@@ -125,119 +117,61 @@ def with_value(name: str, value: float, rows: tuple[int, ...] = (2,)) -> bytes:
     return ply_bytes(columns)
 
 
-ROW = 4 * 23  # x y z, 3 + 9 colors, opacity, 3 scales, 4 of rotation
-BAD = {
-    "empty": (b"", ["empty", "0 bytes"]),
-    "not a PLY": (b"\x89PNG\r\n\x1a\n" + bytes(100), ["begins with", "PNG"]),
-    "plymouth": (b"plymouth\n", ["begins with"]),
-    "unknown encoding": (edit(b"binary_little_endian", b"binary"), ["line 2", "'format binary 1.0'"]),
-    "no format": (edit(b"format binary_little_endian 1.0\n", b""), ["no line 'format"]),
-    "header cut off": (GOOD[:200], ["end_header", "200 bytes"]),
-    "header too long": (edit(b"element", b"comment " + b"a" * 70000 + b"\nelement"), ["end_header", "65536"]),
-    "nonsense line": (edit(b"property float z", b"floats z"), ["line 6", "'floats z'"]),
-    "empty line": (edit(b"property float z", b""), ["line 6"]),
-    "list property": (edit(b"property float z", b"property list uchar int z"), ["vertex", "list"]),
-    "unknown type": (edit(b"property float z", b"property half z"), ["line 6", "'half'"]),
-    "object type": (edit(b"property float z", b"property O z"), ["line 6", "'O'"]),
-    "property twice": (edit(b"property float z", b"property float y"), ["line 6", "second time"]),
-    "element twice": (edit(b"end_header", b"element vertex 4\nend_header"), ["element", "second time"]),
-    "property first": (edit(b"element vertex 4\n", b""), ["line 3", "before any element"]),
-    "no vertex": (edit(b"element vertex", b"element vortex"), ["no element vertex"]),
-    "negative count": (edit(b"vertex 4", b"vertex -4"), ["vertex -4", "count"]),
-    "count not a number": (edit(b"vertex 4", b"vertex 1_0"), ["vertex 1_0", "count"]),
-    "count of 5000 digits": (edit(b"vertex 4", b"vertex " + b"9" * 5000), ["count"]),
-    "zero Gaussians": (GOOD[:SPLIT].replace(b"vertex 4", b"vertex 0") + b"end_header\n", ["0 Gaussians"]),
-    "10 GB by its header": (edit(b"vertex 4", b"vertex 100000000"), ["100000000 rows of 92", f"{len(GOOD) + 8} bytes"]),
-    "count over memory": (edit(b"vertex 4", b"vertex 999999999999999999"), ["9999999 rows", f"{len(GOOD) + 17} bytes"]),
-    "truncated": (GOOD[:-1], [str(len(GOOD)), str(len(GOOD) - 1)]),
-    "one row short": (GOOD[:-ROW], [str(len(GOOD)), str(len(GOOD) - ROW)]),
-    "trailing bytes": (GOOD + b"\n", [str(len(GOOD)), str(len(GOOD) + 1), "appended"]),
-    "count too low": (edit(b"vertex 4", b"vertex 3"), [str(len(GOOD)), str(len(GOOD) - ROW)]),
-    "second element lies": (edit(b"end_header", b"element e 9\nproperty int a\nend_header"), ["'e'", "9 rows of 4"]),
-    "a property missing": (edit(b"scale_2", b"scale_9"), ["lacks", "scale_2"]),
-    "many missing": (ply_bytes({"x": ("float", np.zeros(2))}), ["lacks", "y, z, f_dc_0", "more", "1 properties"]),
-    "SH of no degree": (edit(b"f_rest_8", b"e_rest_8"), ["8 properties f_rest_*", "9, 24 or 45"]),
-    "SH not numbered on": (edit(b"f_rest_8", b"f_rest_9"), ["lacks", "f_rest_8"]),
-    "PlayCanvas compressed": (
-        ply_bytes({f"packed_{name}": ("uint", [0, 0]) for name in ["position", "rotation", "scale", "color"]}),
-        ["PlayCanvas", "packed_position", "convert"],
-    ),
-    "NaN": (with_value("f_rest_3", np.nan, (1, 3)), ["f_rest_3", "NaN", "2 of 4 rows", "row 1"]),
-    "Inf": (with_value("x", -np.inf), ["property x", "1 of 4 rows", "row 2"]),
-    "scale overflows": (with_value("scale_1", 45.0), ["scale_1", "44", "row 2"]),
-    "double beyond float32": (
-        ply_bytes(columns_of(random_still(4, 0)) | {"opacity": ("double", np.full(4, 1e300))}),
-        ["opacity", "4 of 4 rows"],
-    ),
-    "quaternion of length 0": (
-        ply_bytes(columns_of(random_still(4, 0)) | {f"rot_{i}": ("float", np.zeros(4)) for i in range(4)}),
-        ["rot_0", "4 of 4 rows"],
-    ),
-}  # fmt: skip
+NO_ROTATION = {f"rot_{i}": ("float", np.zeros(4)) for i in range(4)}
+PACKED = {f"packed_{name}": ("uint", [0, 0]) for name in ["position", "rotation", "scale", "color"]}
+# A file, and what the error must name.
+BAD: list[tuple[bytes, str]] = [
+    (b"", "0 bytes"),
+    (b"\x89PNG\r\n\x1a\n" + bytes(100), "PNG"),
+    (b"plymouth\n", "plymouth"),
+    (edit(b"binary_little_endian", b"binary"), "format binary 1.0"),
+    (edit(b"format binary_little_endian 1.0\n", b""), "format"),
+    (GOOD[:200], "end_header"),
+    (edit(b"element", b"comment " + b"a" * 70000 + b"\nelement"), "end_header"),
+    (edit(b"property float z", b"floats z"), "floats z"),
+    (edit(b"property float z", b""), "line 6"),
+    (edit(b"property float z", b"property list uchar int z"), "list"),
+    (edit(b"property float z", b"property half z"), "half"),
+    (edit(b"property float z", b"property O z"), "'O'"),
+    (edit(b"property float z", b"property float y"), "line 6"),
+    (edit(b"end_header", b"element vertex 4\nend_header"), "element"),
+    (edit(b"element vertex 4\n", b""), "line 3"),
+    (edit(b"element vertex", b"element vortex"), "vertex"),
+    (edit(b"vertex 4", b"vertex -4"), "vertex -4"),
+    (edit(b"vertex 4", b"vertex 1_0"), "vertex 1_0"),
+    (edit(b"vertex 4", b"vertex " + b"9" * 5000), "count"),
+    (edit(b"vertex 4", b"vertex 100000000"), "100000000"),
+    (edit(b"vertex 4", b"vertex 999999999999999999"), "9999999"),
+    (edit(b"vertex 4", b"vertex 3"), str(len(GOOD))),
+    (GOOD[:SPLIT].replace(b"vertex 4", b"vertex 0") + b"end_header\n", "0 Gaussians"),
+    (GOOD[:-1], str(len(GOOD) - 1)),
+    (GOOD + b"\n", str(len(GOOD) + 1)),
+    (edit(b"end_header", b"element e 9\nproperty int a\nend_header"), "'e'"),
+    (edit(b"scale_2", b"scale_9"), "scale_2"),
+    (edit(b"f_rest_8", b"e_rest_8"), "f_rest_"),
+    (edit(b"f_rest_8", b"f_rest_9"), "f_rest_8"),
+    (ply_bytes(PACKED), "PlayCanvas"),
+    (with_value("f_rest_3", np.nan, (1, 3)), "f_rest_3"),
+    (with_value("x", -np.inf), "property x"),
+    (with_value("scale_1", 45.0), "scale_1"),
+    (ply_bytes(columns_of(random_still(4, 0)) | {"opacity": ("double", np.full(4, 1e300))}), "opacity"),
+    (ply_bytes(columns_of(random_still(4, 0)) | NO_ROTATION), "rot_0"),
+]
 
 
-@pytest.mark.parametrize("name", BAD)
-def test_bad_file_is_refused_in_one_sentence(tmp_path: Path, name: str) -> None:
-    data, words = BAD[name]
-    path = tmp_path / "bad.ply"
-    path.write_bytes(data)
-    tracemalloc.start()
-    try:
-        with pytest.raises(InputError) as error:
-            read_ply(path)
-        peak = tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
-    text = str(error.value)
-    assert text.startswith(f"{path}: ")
-    assert "\n" not in text
-    assert len(text) < len(str(path)) + 300
-    assert not [word for word in words if word not in text], text
-    assert peak < 2**20  # nothing is allocated on the word of a header
+@pytest.mark.parametrize("number", range(len(BAD)))
+def test_a_bad_file_is_refused(tmp_path: Path, number: int) -> None:
+    """And nothing is allocated on the word of a header."""
+    data, named = BAD[number]
+    (tmp_path / "bad.ply").write_bytes(data)
+    refused_within(tmp_path / "bad.ply", named, 2**20)
 
 
 def test_paths_that_are_no_file(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.ply")
     (tmp_path / "loop.ply").symlink_to("loop.ply")
-    for path, word in {
-        tmp_path / "missing.ply": "No such file",
-        tmp_path: "folder",
-        tmp_path / "pipe.ply": "not a regular file",
-        Path("/dev/zero"): "not a regular file",
-        tmp_path / "loop.ply": "symbolic links",
-    }.items():
-        with pytest.raises(InputError, match=word) as error:
-            read_ply(path)
-        assert str(error.value).startswith(f"{path}: ")
-
-
-def test_file_that_shrinks_while_it_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "a.ply"
-    write_ply(path, random_still(5000))
-    real = np.fromfile
-
-    def shrink(file, dtype, count):  # type: ignore[no-untyped-def]
-        os.truncate(path, 600_000)
-        return real(file, dtype, count)
-
-    monkeypatch.setattr(np, "fromfile", shrink)
-    with pytest.raises(InputError, match=r"became shorter while it was read, at row \d+ of 5000"):
-        read_ply(path)
-
-
-@pytest.mark.nightly
-@given(st.data())
-@settings(max_examples=400, deadline=None, derandomize=True)
-def test_mutated_files_are_refused_or_valid(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
-    path = tmp_path_factory.getbasetemp() / "fuzz.ply"
-    path.write_bytes(mutate(GOOD, data))
-    try:
-        still = read_ply(path)
-    except InputError as error:
-        assert str(error).startswith(f"{path}: ")  # noqa: PT017
-    else:
-        assert len(still) >= 1
-        assert all(np.isfinite(getattr(still, name)).all() for name in FIELDS)
+    for path in (tmp_path / "missing.ply", tmp_path, tmp_path / "pipe.ply", tmp_path / "loop.ply", Path("/dev/zero")):
+        refused_within(path, "", 2**20)
 
 
 def test_values_that_could_not_be_read_back_are_not_written(tmp_path: Path) -> None:
@@ -246,21 +180,11 @@ def test_values_that_could_not_be_read_back_are_not_written(tmp_path: Path) -> N
     before = path.read_bytes()
     still = random_still(3)
     still.log_scales[1, 2] = np.nan
-    with pytest.raises(InputError, match="not written, because property scale_2 is NaN or infinite in 1 of 3 rows"):
+    with pytest.raises(InputError, match="scale_2"):
         write_ply(path, still)
     with pytest.raises(InputError, match="0 Gaussians"):
         write_ply(path, random_still(0))
     assert path.read_bytes() == before
-
-
-def test_arrays_of_wrong_shape_or_type_are_refused() -> None:
-    a = random_still(3)
-    with pytest.raises(ValueError, match="quats is float32"):
-        GaussianSnapshot(a.means, a.sh, a.opacity_logits, a.log_scales, a.quats[:2])
-    with pytest.raises(ValueError, match="means is float64"):
-        GaussianSnapshot(a.means.astype(float), a.sh, a.opacity_logits, a.log_scales, a.quats)
-    with pytest.raises(ValueError, match="K of 1, 4, 9 or 16"):
-        GaussianSnapshot(a.means, a.sh[:, :5], a.opacity_logits, a.log_scales, a.quats)
 
 
 # Atomic writing: each fault is injected at one step, and the old file must be whole and alone in its folder.
@@ -273,10 +197,7 @@ def fail_with(code: int) -> Callable[..., None]:
     return fail
 
 
-@pytest.mark.parametrize(
-    ("step", "code"),
-    [("fsync", errno.ENOSPC), ("fsync", errno.EIO), ("replace", errno.EACCES), ("replace", errno.EROFS)],
-)
+@pytest.mark.parametrize(("step", "code"), [("fsync", errno.ENOSPC), ("replace", errno.EROFS)])
 def test_failed_write_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str, code: int) -> None:
     path = tmp_path / "a.ply"
     write_ply(path, random_still(2))
@@ -285,22 +206,6 @@ def test_failed_write_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.Mon
     with pytest.raises(InputError, match=f"not written \\({os.strerror(code)}\\)") as error:
         write_ply(path, random_still(3))
     assert str(path) in str(error.value)
-    monkeypatch.undo()
-    assert path.read_bytes() == before
-    assert os.listdir(tmp_path) == ["a.ply"]
-
-
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs Linux's /dev/full")
-def test_full_disk_while_writing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "a.ply"
-    write_ply(path, random_still(2))
-    before = path.read_bytes()
-    real = open
-    monkeypatch.setattr(
-        "builtins.open", lambda name, mode: real("/dev/full", "wb") if mode == "xb" else real(name, mode)
-    )
-    with pytest.raises(InputError, match="No space left on device"):
-        write_ply(path, random_still(20_000))
     monkeypatch.undo()
     assert path.read_bytes() == before
     assert os.listdir(tmp_path) == ["a.ply"]
@@ -347,39 +252,6 @@ def test_a_file_that_another_program_holds_for_moments(
     assert os.listdir(tmp_path) == ["a"]
 
 
-def test_folders_that_cannot_be_written_to(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    (tmp_path / "folder.ply").mkdir()
-    for path in [
-        tmp_path / "missing" / "a.ply",
-        tmp_path / "file" / "a.ply",
-        tmp_path / "folder.ply",
-        Path("/proc/a.ply"),
-    ]:
-        with pytest.raises(InputError, match="not written") as error:
-            write_ply(path, random_still(2))
-        assert str(error.value).startswith(f"{path}: ")
-    assert sorted(os.listdir(tmp_path)) == ["file", "folder.ply"]
-
-
-@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write to read-only folders")
-def test_read_only_folder(tmp_path: Path) -> None:
-    tmp_path.chmod(0o500)
-    with pytest.raises(InputError, match="Permission denied"):
-        write_ply(tmp_path / "a.ply", random_still(2))
-    tmp_path.chmod(0o700)
-
-
-def test_interrupted_write_keeps_the_old_file(tmp_path: Path) -> None:
-    path = tmp_path / "a"
-    path.write_bytes(b"old")
-    with pytest.raises(KeyboardInterrupt), atomic_write(path) as file:  # noqa: PT012
-        file.write(b"new")
-        raise KeyboardInterrupt
-    assert path.read_bytes() == b"old"
-    assert os.listdir(tmp_path) == ["a"]
-
-
 def test_written_file_is_forced_to_the_disk_before_it_gets_its_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -396,51 +268,3 @@ def test_written_file_is_forced_to_the_disk_before_it_gets_its_name(
     with atomic_write(tmp_path / "a") as file:
         file.write(b"12345")
     assert steps == ["fsync 5 bytes", "replace", "fsync folder"]
-
-
-def test_permissions_follow_the_umask(tmp_path: Path) -> None:
-    old = os.umask(0o027)
-    try:
-        write_ply(tmp_path / "a.ply", random_still(2))
-    finally:
-        os.umask(old)
-    assert stat.S_IMODE((tmp_path / "a.ply").stat().st_mode) == 0o640
-
-
-@pytest.mark.parametrize("step", ["os.fsync", "os.replace"])
-def test_killed_while_writing_keeps_the_old_file(tmp_path: Path, step: str) -> None:
-    path = tmp_path / "a"
-    path.write_bytes(b"old")
-    program = f"""
-import os, signal
-from lapgs_wgpu.io.atomic import atomic_write
-{step} = lambda *args: os.kill(os.getpid(), signal.SIGKILL)
-with atomic_write({str(path)!r}) as file:
-    file.write(b"new")
-"""
-    assert subprocess.run([sys.executable, "-c", program]).returncode == -9
-    assert path.read_bytes() == b"old"
-
-
-# Files of other programs.
-
-
-@pytest.mark.skipif(not REAL_FILES.is_dir(), reason="the real files are not part of the project")
-@pytest.mark.parametrize(
-    ("name", "n"),
-    [("mkkellogg_lod1_14051", 14051), ("supersplat_fruit_drops_4721", 4721), ("4dgs_coarse_iter99_2000", 2000)],
-)
-def test_reads_files_of_other_programs(tmp_path: Path, name: str, n: int) -> None:
-    still = read_ply(REAL_FILES / f"{name}.ply")
-    assert still.means.shape == (n, 3)
-    assert still.sh.shape == (n, 16, 3)
-    write_ply(tmp_path / "a.ply", still)
-    assert_same(read_ply(tmp_path / "a.ply"), still)
-    if "4dgs" in name:  # Inria's own writer: the same bytes
-        assert (tmp_path / "a.ply").read_bytes() == (REAL_FILES / f"{name}.ply").read_bytes()
-
-
-@pytest.mark.skipif(not REAL_FILES.is_dir(), reason="the real files are not part of the project")
-def test_refuses_playcanvas_compressed() -> None:
-    with pytest.raises(InputError, match="PlayCanvas's compressed layout"):
-        read_ply(REAL_FILES / "playcanvas_guitar.compressed.ply")

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import json
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from helpers.playback import open_playback
 from helpers.ply_files import columns_of, ply_bytes, random_still
+from helpers.scene_files import scene_of_outliers
 
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.config import FieldConfig, PlaneConfig
 from lapgs_wgpu.motion.fields.hash_grid_config import HashConfig
+from lapgs_wgpu.motion.playback.playback import DevicePlayback
 from lapgs_wgpu.motion.scene import Scene4D
+from lapgs_wgpu.motion.scene_file import compact_bytes, read_scene
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.run_folder import changes_since
@@ -35,6 +40,21 @@ def small_scene(kind: str, device: Device) -> Scene4D:
     config = FieldConfig(**{"kind": kind, "static": GRID, "temporal": GRID, "planes": PLANES, "width": 4} | KINDS[kind])
     points = np.random.default_rng(0).uniform(-1, 1, (3, 3))
     return Scene4D.from_points(points, np.full((3, 3), 0.5), np.full(3, 0.1), config, device=device)
+
+
+def compact_scenes(folder: Path, device: Device) -> list[bytes]:
+    """A compact file of each field that such a file can hold, and one with outliers."""
+    kinds = ("static", "grid4d", "laplacian")
+    files = [compact(small_scene(kind, device), folder / "a.ply", device) for kind in kinds]
+    return [*files, compact_bytes(scene_of_outliers(20), None)]
+
+
+def compact(scene: Scene4D, file: Path, device: Device) -> bytes:
+    """The bytes of a scene's compact file. file: its checkpoint, which is written on the way."""
+    scene.save(file, {"background": "white"})
+    playback = open_playback(file, device)
+    assert isinstance(playback, DevicePlayback)
+    return compact_bytes(read_scene(file), playback.static_features())
 
 
 def with_table(checkpoint: bytes, change: Callable[[dict[str, Any]], bytes]) -> bytes:
@@ -82,8 +102,6 @@ no_ncc = { ablate = ["ncc"], scenes = ["toys"], seeds = [0], loss.pyramid = 0.1 
 
 def with_checksums(data: bytes) -> bytes:
     """A PNG whose chunks have right checksums, so that the damage gets further in."""
-    import zlib
-
     done, at = data[:8], 8
     while at + 12 <= len(data):
         length = int.from_bytes(data[at : at + 4], "big")

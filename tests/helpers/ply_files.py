@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import struct
+import tracemalloc
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
-from hypothesis import strategies as st
+import pytest
 
+from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.checkpoint import read_checkpoint
 from lapgs_wgpu.io.ply import GaussianSnapshot
 from lapgs_wgpu.io.ply_elements import PathLike
@@ -65,18 +68,20 @@ def columns_of(still: GaussianSnapshot) -> dict[str, tuple[str, np.ndarray]]:
 
 GOOD = ply_bytes(columns_of(random_still(4, 1)))
 SPLIT = GOOD.index(b"end_header\n")
-WORDS = [
-    b"", b"0", b"-1", b"4294967296", b"1e9", b"element x 3\n", b"property uchar q\n", b"property list int int q\n",
-    b"end_header\n", b"\r\n", b"comment lapgs4d v1 safetensors 9\n", b"double", b"\x00", b"\x00\x00\x80\x7f",
-]  # fmt: skip
 
 
-def mutate(data: bytes, draw: st.DataObject) -> bytes:
-    """One to four cuts, insertions and replacements, half of them in the header's text."""
-    for _ in range(draw.draw(st.integers(1, 4))):
-        end = len(data) if draw.draw(st.booleans()) else min(len(data), SPLIT)
-        begin = draw.draw(st.integers(0, end))
-        length = draw.draw(st.sampled_from([0, 1, 2, 4, 16, 92, 10**6]))
-        new = draw.draw(st.sampled_from(WORDS) | st.binary(max_size=6))
-        data = data[:begin] + new + data[begin + length :]
-    return data
+def refused_within(path: Path, named: str, peak_limit: int) -> None:
+    """Reading a .ply or a checkpoint ends in one sentence of its path and these words, and takes no more memory."""
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError) as error:
+            read_checkpoint(path)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    text = str(error.value)
+    assert text.startswith(f"{path}: ")
+    assert "\n" not in text
+    assert len(text) < len(str(path)) + 400
+    assert named in text
+    assert peak < peak_limit
