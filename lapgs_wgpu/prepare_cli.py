@@ -22,7 +22,7 @@ extra prepare: pip install "lapgs-wgpu[prepare]".
 
   lapgs-prepare walk.mp4 --out DIR              one moving camera: a pose for each image
   lapgs-prepare a.mp4 b.mp4 c.mp4 --out DIR     several static cameras: a pose for each film; all films must start at
-                                                the same moment
+                                                the same time
   lapgs-prepare walk.mp4 --out DIR --train      the same, then train a model that suits this machine and the film
   lapgs-prepare --check DIR                     measure what a capture is worth, and what to film differently
 
@@ -68,11 +68,15 @@ def _prepare(arguments: list[str]) -> None:
         raise InputError(
             f"{run} is there already, and the training would be written to it{goes_on}; move it, or work elsewhere."
         )
-    diagnosis = _check(capture) if given.check else _convert(given, capture)
-    if given.train and not given.check and sys.platform == "darwin":
-        _train_anew(capture, given.minutes)
-    elif given.train:
+    if not given.check:
+        _convert(given, capture)
+        if given.train and sys.platform == "darwin":
+            _train_anew(capture, given.minutes)
+    diagnosis = _measure(capture)
+    if given.train:
         _train(capture, run, given.minutes, diagnosis)
+    elif not given.check:
+        print(f"{beside('lapgs-prepare')} --check {quoted(capture)} --train")
 
 
 def check_options(given: argparse.Namespace) -> None:
@@ -92,34 +96,24 @@ def check_options(given: argparse.Namespace) -> None:
         raise InputError(f"--minutes must be above 0 and at most 100000, got {given.minutes:g}.")
 
 
-def _convert(given: argparse.Namespace, out: Path) -> Diagnosis:
-    from lapgs_wgpu.prepare.capture import prepare  # after --help: numpy and Pillow take a moment
+def _convert(given: argparse.Namespace, out: Path) -> None:
+    from lapgs_wgpu.prepare.capture import prepare  # after --help: numpy and Pillow take a while
 
     films, masks = [Path(film) for film in given.films], Path(given.masks) if given.masks else None
     done = prepare(films, out, fps=given.fps, masks=masks)
-    diagnosis = _diagnosed(out)
-    for line in (*(each for each in diagnosis.measures if each.good is False), *diagnosis.dataset.warnings):
-        print(line, file=sys.stderr)
-    then = "" if given.train else f"; {beside('lapgs-prepare')} --check {quoted(out)} --train"
-    print(f"{out}: {done.images} images, {done.placed} of {done.cameras} cameras placed{then}", flush=True)
-    return diagnosis
+    print(f"{out}: {done.images} images, {done.placed} of {done.cameras} cameras placed", flush=True)
 
 
-def _check(folder: Path) -> Diagnosis:
-    diagnosis = _diagnosed(folder)
-    print(f"{folder}: {diagnosis}", flush=True)
-    return diagnosis
-
-
-def _diagnosed(folder: Path) -> Diagnosis:
-    """Measure a capture, and write the report into its folder."""
+def _measure(folder: Path) -> Diagnosis:
+    """Print what a capture is worth, and write the report into its folder."""
     from lapgs_wgpu.prepare.diagnosis import diagnose
     from lapgs_wgpu.prepare.report import REPORT, write_report
 
     diagnosis = diagnose(folder)
+    print(f"{folder}: {diagnosis}", flush=True)
     try:
         write_report(diagnosis, folder / REPORT, folder.resolve().name)
-        print(f"{folder / REPORT} shows what was found", flush=True)
+        print(f"{folder / REPORT} shows it with pictures", flush=True)
     except InputError as error:  # a training can follow all the same
         print(f"note: {error}", file=sys.stderr, flush=True)
     return diagnosis

@@ -46,6 +46,7 @@ def test_one_film(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest
     assert prepare_command([str(path), "--out", str(out)]) == 0
     said = capfd.readouterr()
     assert not re.findall(r"^[IWEF]\d{8} ", said.err, re.MULTILINE), "COLMAP's log"
+    assert said.out.count("(wanted: ") == 5
     times = json.loads((out / "times.json").read_text())
     assert COUNT - 3 <= len(times) <= COUNT + 1
     assert times == {f"{100 * i:08d}.jpg": i / 10 for i in range(len(times))}
@@ -154,11 +155,15 @@ def test_macos_trains_in_a_process_of_its_own(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "platform", "darwin")
     monkeypatch.setattr(prepare_cli, "_convert", lambda given, out: None)
-    called: list[list[str]] = []
-    monkeypatch.setattr(os, "execv", lambda program, command: called.append([program, *command]))
-    assert prepare_command(["film.mp4", "--out", "out", "--train", *minutes]) == 0
-    command = [sys.executable, "-m", "lapgs_wgpu.prepare_cli", "--check", "out", "--train", *minutes]
-    assert called == [[sys.executable, *command]]
+
+    def replaced(program: str, command: list[str]) -> None:
+        assert program == command[0] == sys.executable
+        assert command[1:] == ["-m", "lapgs_wgpu.prepare_cli", "--check", "out", "--train", *minutes]
+        raise SystemExit(7)
+
+    monkeypatch.setattr(os, "execv", replaced)
+    with pytest.raises(SystemExit, match="7"):
+        prepare_command(["film.mp4", "--out", "out", "--train", *minutes])
 
 
 # The folder

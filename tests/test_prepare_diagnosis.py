@@ -195,6 +195,7 @@ def test_photos_beside_masks_are_no_masks(tmp_path: Path) -> None:
     assert _mask(tmp_path, view) is None
 
 
+@pytest.mark.nightly
 def test_train_goes_on_to_a_scene(
     pictures, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:

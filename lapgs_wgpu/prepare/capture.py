@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,7 +18,7 @@ from lapgs_wgpu.prepare.film import Film
 from lapgs_wgpu.prepare.images import Picture, common_times, extract, extract_in_step, images_per_second
 from lapgs_wgpu.prepare.masks import MASKS, read_masks, write_masks
 from lapgs_wgpu.prepare.movers import remove_matches, solve_masked
-from lapgs_wgpu.prepare.poses import Reconstruction, all_pairs, import_pycolmap, merged, neighbouring_pairs
+from lapgs_wgpu.prepare.poses import Reconstruction, import_pycolmap, merged, neighbouring_pairs
 from lapgs_wgpu.progress import say
 
 TIMES = 8  # at which still cameras are compared
@@ -100,5 +101,5 @@ def _still_cameras(images: Path, cameras: Sequence[Sequence[Picture]], fps: floa
     groups = list(zip(*times, strict=True))  # of each camera
     source = Reconstruction(images, [name for group in groups for name in group], work, FEW_CAMERAS_LENS)
     source.find_features()
-    source.match([pair for names in times for pair in all_pairs(names)])
+    source.match([pair for names in times for pair in itertools.combinations(names, 2)])
     return merged(source, groups, work / "merged").solve()

@@ -129,13 +129,7 @@ class Film:
         streams = [s for s in file.streams.video if not int(s.disposition) & _ATTACHED_PICTURE]
         if not streams:
             raise InputError(f"{self.path} has no video stream; give the camera's recording.")
-        best = max(streams, key=lambda s: (s.width or 0) * (s.height or 0))
-        if len(streams) > 1 and not self.notes:
-            self.notes.append(
-                f"{self.path} has {len(streams)} video streams; number {streams.index(best) + 1} of them, of "
-                f"{best.width}x{best.height} pixels, is used."
-            )
-        return best
+        return max(streams, key=lambda s: (s.width or 0) * (s.height or 0))
 
 
 def _seconds(stream: Any, file: Any) -> float:

@@ -137,11 +137,6 @@ def neighbouring_pairs(names: Sequence[str]) -> list[Pair]:
     return [(names[i], names[i + k]) for k in offsets for i in range(len(names) - k)]
 
 
-def all_pairs(names: Sequence[str]) -> list[Pair]:
-    """All pairs of images."""
-    return list(itertools.combinations(names, 2))
-
-
 def import_pycolmap() -> Any:
     """The module pycolmap, which logs nothing. Raises InputError where it is not installed."""
     try:
@@ -162,8 +157,8 @@ def _chunks(items: Sequence[Any], size: int) -> Iterator[list[Any]]:
 def merged(source: Reconstruction, groups: Sequence[Sequence[str]], work: Path) -> Reconstruction:
     """One image for each group of images of a camera that stands still: it has the features of all of them.
 
-    source: has matched images of equal places in their groups, which were taken at the same moment. So what moves ties
-    the cameras together, too, and many moments average their noise.
+    source: has matched images of equal places in their groups, which were taken at the same time. So what moves ties
+    the cameras together, too, and the noise of several times is averaged.
     groups: names of images, as many for each camera. The first of each stands for the camera.
     """
     result = Reconstruction(source.images, [group[0] for group in groups], work, source.model)
