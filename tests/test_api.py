@@ -147,13 +147,13 @@ def test_a_step_that_breaks_off_did_not_begin(
 ) -> None:
     """A notebook's interrupt, too."""
 
-    def fail(self: Trainer, sample: object) -> None:
+    def fail(self: Trainer, sample: object, **share: int) -> None:
         raise error
 
     with Trainer(configure(), dataset, device) as trainer:
         trainer.step()
         before = trainer.state()
-        monkeypatch.setattr(Trainer, "_loss", fail)
+        monkeypatch.setattr(Trainer, "_descend", fail)
         with pytest.raises(error):
             trainer.step()
         assert trainer.whole

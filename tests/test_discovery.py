@@ -388,9 +388,9 @@ def test_a_field_that_knows_the_tracks_learns_slowly_also_when_resumed(
     config = configure()
     assert config.rates.mlp.start > max_field_rates(["mlp"])["mlp"]
     with Trainer(config, dataset, device) as resumed:
-        assert resumed._optimizer.highest == {}
+        assert resumed._learners.optimizer.highest == {}
         resumed.restore(started[1])
-        assert resumed._optimizer.highest == max_field_rates(["hash", "mlp"])
+        assert resumed._learners.optimizer.highest == max_field_rates(["hash", "mlp"])
 
 
 @pytest.mark.nightly

@@ -133,8 +133,11 @@ class Scene4D:
             colors: (N, 3) in [0, 1].
             scales: (N,) standard deviations, world units.
             opacity: of all Gaussians, in (0, 1).
+            field_config: as for `Scene4D`.
+            antialiased: as for `Scene4D`.
             device: None for the default adapter.
-            field_config, antialiased, seed, own_field: as for `Scene4D`.
+            seed: as for `Scene4D`.
+            own_field: as for `Scene4D`.
 
         Returns:
             The scene.

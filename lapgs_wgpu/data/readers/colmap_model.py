@@ -77,9 +77,12 @@ def read_model(folder: Path) -> ColmapModel:
     for path in files.values():
         if not path.is_file():
             raise InputError(f"{path} does not exist, but {files['cameras']} does; a sparse model needs both.")
-    cameras = (_binary_cameras if binary else _text_cameras)(files["cameras"])
-    images = (_binary_images if binary else _text_images)(files["images"])
-    points, colors = (_binary_points if binary else _text_points)(files["points3D"])
+    try:
+        cameras = (_binary_cameras if binary else _text_cameras)(files["cameras"])
+        images = (_binary_images if binary else _text_images)(files["images"])
+        points, colors = (_binary_points if binary else _text_points)(files["points3D"])
+    except OSError as error:
+        raise InputError(f"{error.filename or folder} cannot be read ({error.strerror or error}).") from error
     for image in images:
         if image.camera not in cameras:
             raise InputError(
