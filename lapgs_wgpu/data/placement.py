@@ -53,7 +53,7 @@ def place(capture: Capture, training: Sequence[Frame], cameras: Sequence[Camera]
     if cloud is not None and capture.own_footage:
         cloud = _filled(cloud, cameras)
     if cube is None or (capture.keeps_coordinates and (cube.fits or not normalize)):
-        return Placement(None, cloud, depths, warnings)
+        return Placement(None, cloud and cloud.rounded, depths, warnings)
     fit = cube.normalization
     return Placement(
         fit,
@@ -116,6 +116,6 @@ def _filled(cloud: Cloud, cameras: Sequence[Camera]) -> Cloud:
     added = points_in_view(cameras, float(near), float(far) * 1.01, missing, 0)
     _, nearest = cKDTree(points).query(added)
     return Cloud(
-        np.concatenate([cloud.points, added.astype(np.float32)]),
+        np.concatenate([cloud.points, added.astype(cloud.points.dtype)]),
         np.concatenate([cloud.colors, cloud.colors[nearest]]),
     )
