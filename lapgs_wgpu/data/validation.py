@@ -129,13 +129,11 @@ def check_focal(lens: Lens, where: str) -> None:
 def check_proportions(stored: tuple[int, int], lens: Lens, image: str, where: str) -> None:
     """Check that an image of (width, height) `stored` has the proportions that a lens states. Raises InputError."""
     if not _fits(stored, lens):
-        reason = (
-            "it lies on its side: turn it, or give the camera of the turned image"
-            if _fits(stored[::-1], lens)
-            else "these are other proportions; they do not belong together"
-        )
+        sideways = _fits(stored[::-1], lens)
+        advice = "turn it, or give the camera of the turned image" if sideways else "they do not belong together"
         raise InputError(
-            f"{image} is {size_text(stored)} pixels, but {where} states {lens.width}x{lens.height}: {reason}."
+            f"{image} is {size_text(stored)} pixels, but {where} states {lens.width}x{lens.height}, which has other "
+            f"proportions{', those of the image on its side' if sideways else ''}; {advice}."
         )
 
 
@@ -151,7 +149,8 @@ def check_cloud(cloud: Cloud, cameras: Sequence[Camera], path: Path) -> None:
     if seen < MIN_SEEN:
         raise InputError(
             f"{path}: the training cameras see {100 * seen:.0f} % of its points (at least {100 * MIN_SEEN:.0f} % are "
-            f"expected): {numbers}; it is in other coordinates than the cameras, so transform it, or remove it."
+            f"expected): {numbers}; it is in other coordinates than the cameras, or reaches far beyond what they see: "
+            "transform it, cut it to the scene, or remove it."
         )
     if len(points) > 1 and spread < MIN_SPREAD * distance:
         raise InputError(
