@@ -220,10 +220,6 @@ def other_size(folder: Path, scene: Scene) -> None:
     Image.new("RGBA", (10, 7)).save(folder / "test/r_000.png")
 
 
-def sixteen_bit(folder: Path, scene: Scene) -> None:
-    Image.fromarray(np.zeros((HEIGHT, WIDTH), dtype=np.uint16)).save(folder / "train/r_001.png")
-
-
 def cut(folder: Path, scene: Scene) -> None:
     path = folder / "train/r_001.png"
     path.write_bytes(path.read_bytes()[:-30])
@@ -280,7 +276,6 @@ BAD: dict[str, tuple[Callable[[Path, Scene], Any], list[str]]] = {
     "picture of text": (no_picture, [*PICTURE]),
     "picture cut short": (cut, [*PICTURE]),
     "picture with a wrong bit": (flip_a_bit, [*PICTURE]),
-    "picture of 16 bit": (sixteen_bit, [*PICTURE]),
     "sizes mixed": (other_size, ["test/r_000.png", "10x7", "train/r_000.png", "12x8"]),
     "time of one frame missing": (frame_without("time"), [*FRAME, "time"]),
     "time above 1": (frame_with(time=1.5), [*FRAME, "time", "1.5"]),

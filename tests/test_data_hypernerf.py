@@ -324,7 +324,6 @@ BAD: dict[str, tuple[Change, list[str]]] = {
     "image size": (json_file(CAMERA, image_size=[0, 48]), ["image_size", "got 0"]),
     "other proportions": (json_file(CAMERA, image_size=[64, 64]), ["rgb/1x", "64x48", "64x64", f"{CAMERA}.json"]),
     "sizes mixed": (picture((32, 24)), [f"{ID}.png", "32x24", "64x48"]),
-    "16 bit": (picture((64, 48), "I;16"), [f"{ID}.png"]),
     "picture of text": (text(f"rgb/1x/{ID}.png", "hello"), [f"{ID}.png"]),
     "mask absent": (
         json_file("dataset", train_ids=["left_000000"], val_ids=[ID, TEST_ID]),

@@ -393,7 +393,6 @@ BAD: dict[str, tuple[Change, list[str]]] = {
     "other proportions": (square, ["cam00", "64x64", "128x96", FILE]),
     "a number twice": (picture("cam01/images/x_001.png"), ["cam01/images"]),
     "no number": (picture("cam01/images/last.png"), ["last.png"]),
-    "16 bit": (picture("cam01/images/0000.png", mode="I;16"), ["cam01/images/0000.png"]),
     "cloud of text": (lambda folder, _: (folder / "points3D.ply").write_text("hello"), ["points3D.ply"]),
     "cloud of NaN": (cloud(np.full((5, 3), np.nan)), ["points3D.ply"]),
     "empty cloud": (cloud(np.zeros((0, 3))), ["points3D.ply"]),
