@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,10 +24,16 @@ FILLED = 0.95  # share of cells with points from which on a cloud is random: the
 
 
 class Cloud(NamedTuple):
-    """points: (N, 3) world units. colors: (N, 3) RGB in [0, 1]. Both float32."""
+    """points: (N, 3) float32 in world units; float64 in the units of files, which may lie far from their origin.
+    colors: (N, 3) float32, RGB in [0, 1]."""
 
-    points: NDArray[np.float32]
+    points: NDArray[Any]
     colors: NDArray[np.float32]
+
+    @property
+    def rounded(self) -> Cloud:
+        """The same cloud with float32 points."""
+        return Cloud(self.points.astype(np.float32), self.colors)
 
     def at_most(self, count: int, seed: int) -> Cloud:
         """Return at most `count` points: all of them, or a random subset in their order."""

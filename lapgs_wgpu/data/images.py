@@ -30,16 +30,30 @@ _ERRORS = (  # what Pillow raises; the last five for damage that it takes for va
     OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError,
     IndexError, KeyError, TypeError, struct.error, zlib.error,
 )  # fmt: skip
-_EIGHT_BIT_MODES = {"1", "L", "LA", "P", "PA", "RGB", "RGBA"}
+_MODES = {"1", "L", "LA", "P", "PA", "RGB", "RGBA", "I;16", "I"}  # the last two: gray PNG of 16 bits
+_SIGNATURES = (  # bytes, their place, and the format
+    (b"WEBP", 8, "WebP"), (b"ftypheic", 4, "HEIC"), (b"ftypmif1", 4, "HEIC"), (b"ftypavif", 4, "AVIF"),
+    (b"II*\0", 0, "TIFF"), (b"MM\0*", 0, "TIFF"), (b"GIF8", 0, "GIF"), (b"BM", 0, "BMP"),
+    (b"\x76\x2f\x31\x01", 0, "OpenEXR"), (b"\xff\x0a", 0, "JPEG XL"),
+)  # fmt: skip
+_ORIENTATION = 0x0112  # EXIF's tag
+SIDEWAYS = 5  # orientations from this one on exchange width and height
 
 LANCZOS, NEAREST = Image.Resampling.LANCZOS, Image.Resampling.NEAREST
 
 
 class ImageFile(NamedTuple):
-    """An image file whose header was checked. size: (width, height) in pixels."""
+    """An image file whose header was checked.
+
+    size: (width, height) in pixels. orientation: as EXIF states it, 1 to 8; 1 is upright. deep: whether it has 16 bits
+    per channel, of which the upper 8 are read. upright: whether `read` turns it as `orientation` says.
+    """
 
     path: Path
     size: Size
+    orientation: int = 1
+    deep: bool = False
+    upright: bool = False
 
     def __str__(self) -> str:
         return str(self.path)
@@ -47,6 +61,8 @@ class ImageFile(NamedTuple):
     def read(self, size: Size) -> Pixels:
         """Decode the image and shrink it to (width, height): see `decode`. Raises InputError."""
         image = decode(self.path)
+        if self.upright:
+            image = _turned(image, self.orientation)
         if image.shape[1::-1] != self.size:
             raise InputError(
                 f"{self.path} is {size_text(image.shape[1::-1])} pixels now and was {size_text(self.size)} when the "
@@ -54,30 +70,64 @@ class ImageFile(NamedTuple):
             )
         return shrink(image, size)
 
+    @property
+    def turned(self) -> ImageFile:
+        """The same file, read as its orientation says."""
+        size = self.size[::-1] if self.orientation >= SIDEWAYS else self.size
+        return self._replace(size=size, upright=True)
+
+
+def _turned(image: Pixels, orientation: int) -> Pixels:
+    """An image (H, W, C) as EXIF's orientation, 1 to 8, shows it."""
+    if orientation >= SIDEWAYS:
+        image = image.swapaxes(0, 1)
+    rows = -1 if orientation in (3, 4, 7, 8) else 1
+    columns = -1 if orientation in (2, 3, 6, 7) else 1
+    return np.ascontiguousarray(image[::rows, ::columns])
+
 
 def check_image(path: Path, *, whole: bool = True) -> ImageFile:
-    """Check the header of an 8-bit image. Raises InputError.
+    """Check the header of an image of 8 or 16 bits per channel. Raises InputError.
 
     whole: also read every byte (of a PNG, verify each checksum); no pixel is decoded.
     """
     try:
         with Image.open(path, formats=_FORMATS) as file:
             size, mode = file.size, file.mode
+            exif = file.format != "PNG" or "exif" in file.info  # else Pillow would decode a PNG to look for more
+            orientation = file.getexif().get(_ORIENTATION, 1) if exif else 1
+            deep = file.format == "PNG" and "16" in str(file.tile[0][3])
             if whole:
                 file.verify()
-    except _ERRORS as error:
-        reason = "neither PNG nor JPEG" if isinstance(error, Image.UnidentifiedImageError) else error
+    except Image.UnidentifiedImageError:
+        raise InputError(f"{path} {_content(path)}") from None
+    except _ERRORS as reason:
         raise InputError(f"{path} is not a readable image ({reason}); copy or render it again.") from None
-    if mode not in _EIGHT_BIT_MODES:
+    if mode not in _MODES:
         raise InputError(f"{path} has pixels of mode {mode}; save it as RGB or RGBA with 8 bits per channel.")
-    return ImageFile(path, size)
+    return ImageFile(path, size, orientation if orientation in range(1, 9) else 1, deep)
+
+
+def _content(path: Path) -> str:
+    """What a file that is neither PNG nor JPEG holds, and what to do, for errors."""
+    head = path.read_bytes()[:16]
+    for start, at, name in _SIGNATURES:
+        if head[at:].startswith(start):
+            return f"holds an image in the format {name}, whatever its name; convert it to PNG or JPEG."
+    return "is not a readable image (neither PNG nor JPEG); copy or render it again."
 
 
 def decode(path: Path) -> Pixels:
-    """Decode an 8-bit image: (H, W, 4) straight RGBA, or (H, W, 3) RGB if it has no transparency. Raises InputError."""
+    """Decode an image: (H, W, 4) straight RGBA, or (H, W, 3) RGB if it has no transparency. Raises InputError.
+
+    Of 16 bits per channel, the upper 8 are kept.
+    """
     with _decoding(path), open(path, "rb") as file:  # not the path: imageio would look into archives
         header = Image.open(file, formats=_FORMATS)
         transparent = "A" in header.getbands() or "transparency" in header.info
+        if header.mode.startswith("I"):  # Pillow clips 16 bits of gray, and takes the upper 8 of RGB
+            gray = (np.asarray(header) >> 8).astype(np.uint8)
+            return np.repeat(gray[..., None], 3, axis=2)
         file.seek(0)
         return iio.imread(file, plugin="pillow", index=0, mode="RGBA" if transparent else "RGB")
 

@@ -20,7 +20,7 @@ from lapgs_wgpu.data.placement import place
 from lapgs_wgpu.data.readers import colmap, dnerf, endonerf, hypernerf, nerfstudio, neu3d, polycam, record3d
 from lapgs_wgpu.data.split import held_out
 from lapgs_wgpu.data.timestamps import disorder, in_step, natural_key, read_times, to_unit_range
-from lapgs_wgpu.data.validation import check_cloud, check_film, check_frames, check_views
+from lapgs_wgpu.data.validation import check_cloud, check_film, check_frames, check_plausible, check_views, upright
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
@@ -61,7 +61,9 @@ def load_dataset(
     if not undistort:
         pinholes = [dataclasses.replace(frame, lens=frame.lens.idealized) for frame in capture.frames]
         capture = dataclasses.replace(capture, frames=pinholes)
-    frames, warnings = capture.frames, list(capture.warnings)
+    frames, turned = upright(capture.frames)
+    capture = dataclasses.replace(capture, frames=frames)
+    warnings = [*capture.warnings, *turned, *check_plausible(frames)]
 
     times, time_source = _times(folder, capture, warnings)
     splits = _splits(folder, frames, times)

@@ -73,20 +73,22 @@ def check_ignored(masks: Mapping[str, Path], size: Size, *, black: bool) -> list
     for path in masks.values():
         check_mask_size(path, size)
     checked = evenly(list(masks.values()), CHECKED)
-    levels = [decode(path)[..., :3].max(axis=2) for path in checked]
+    levels = [_levels(decode(path)) for path in checked]
     ignored = [(level < WHITE) == black for level in levels]
     color = f"{'black (a level below' if black else 'white (a level of at least'} {WHITE} of 255)"
-    if levels and not any(pixels.any() for pixels in ignored):
-        lowest, highest = min(level.min() for level in levels), max(level.max() for level in levels)
+    if not levels:
+        return []
+    lowest, highest = min(level.min() for level in levels), max(level.max() for level in levels)
+    if not any(pixels.any() for pixels in ignored):
         return [
             f"the masks leave out nothing: in {len(levels)} of {len(masks)} that were looked at, such as "
             f"{checked[0]}, no pixel is {color}; their levels are {lowest} to {highest}."
         ]
-    if levels and all(pixels.all() for pixels in ignored):
+    if all(pixels.all() for pixels in ignored):
         raise InputError(
             f"the masks leave out everything: in {len(levels)} of {len(masks)} that were looked at, such as "
-            f"{checked[0]}, every pixel is {color}, which does not count in the training; invert them, or leave them "
-            "out."
+            f"{checked[0]}, every pixel is {color}, which does not count in the training; their levels are {lowest} to "
+            f"{highest}: write them as 0 and 255, invert them, or leave them out."
         )
     return []
 
@@ -97,9 +99,17 @@ def read_ignored(path: Path, undistortion: Undistortion | None, stored: Size, si
     An output pixel is ignored if any of the mask's pixels that it covers is. black: whether black pixels are ignored,
     or white ones. Raises InputError.
     """
-    level = resize(decode(path)[..., :3], stored, NEAREST).max(axis=2)
-    ignored = as_pixels((level < WHITE) == black)
-    return shrink(ignored if undistortion is None else undistortion.apply(ignored), size)[..., 0] > 0
+    ignored = (_levels(decode(path)) < WHITE) == black
+    pixels = resize(as_pixels(ignored), stored, NEAREST)
+    return shrink(pixels if undistortion is None else undistortion.apply(pixels), size)[..., 0] > 0
+
+
+def _levels(mask: Pixels) -> NDArray[np.uint8]:
+    """The levels (H, W) of a mask: of its alpha if its color is the same everywhere; 0 and 1 mean 0 and 255."""
+    level = mask[..., :3].max(axis=2)
+    if mask.shape[2] == 4 and level.min() == level.max():
+        level = mask[..., 3] if mask[..., 3].min() < 255 else level
+    return level * np.uint8(255) if level.max() == 1 else level
 
 
 def as_pixels(mask: Mask) -> Pixels:

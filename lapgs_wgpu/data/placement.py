@@ -7,16 +7,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lapgs_wgpu.data.cloud import Cloud, points_in_view
+from lapgs_wgpu.data.cloud import Cloud, points_in_view, views_of
 from lapgs_wgpu.data.focus import are_parallel, focus_of
 from lapgs_wgpu.data.frames import Capture, Frame
 from lapgs_wgpu.data.normalize import BOX, Cube, Normalization, cube_in_view, cube_of_points
-from lapgs_wgpu.data.poses import AXES_HINT
+from lapgs_wgpu.data.poses import AXES_HINT, Array
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
 
 CUBE_POINTS = 4096  # random points that determine the cube of a capture without a cloud
 MIN_CLOUD_POINTS = 4096  # a smaller cloud is filled up: Gaussians multiply too slowly to fill what it leaves empty
+TOO_WIDE = 4.0  # times the cube that the cameras see around their focus: a cloud's cube beyond that is not their scene
 NEAR_FACTOR, FAR_FACTOR = 0.25, 2.0  # depths relative to the distance of the focus, for own footage without a cloud
 
 
@@ -53,7 +54,7 @@ def place(capture: Capture, training: Sequence[Frame], cameras: Sequence[Camera]
     if cloud is not None and capture.own_footage:
         cloud = _filled(cloud, cameras)
     if cube is None or (capture.keeps_coordinates and (cube.fits or not normalize)):
-        return Placement(None, cloud, depths, warnings)
+        return Placement(None, cloud and cloud.rounded, depths, warnings)
     fit = cube.normalization
     return Placement(
         fit,
@@ -93,10 +94,24 @@ def _depths(
 def _cube(capture: Capture, cameras: Sequence[Camera], depths: tuple[float, float] | None) -> Cube | None:
     """Return the cube that the capture fills, in its own coordinates; None if neither files nor cameras tell."""
     if capture.cloud is not None:
-        return cube_of_points(capture.cloud.points.astype(np.float64))
+        return _cube_of_cloud(capture.cloud.points.astype(np.float64), cameras)
     if depths is not None:
         return cube_of_points(points_in_view(cameras, *depths, CUBE_POINTS, 0))
     return cube_in_view(cameras)
+
+
+def _cube_of_cloud(points: Array, cameras: Sequence[Camera]) -> Cube:
+    """The cube of a cloud's points that at least two cameras see.
+
+    A scan may reach far beyond what the cameras look at, and be seen there, too. Then, points count that at least half
+    as many cameras see as see the point that most see.
+    """
+    seen = views_of(points, cameras)
+    twice = seen >= min(2, len(cameras))
+    cube, viewed = cube_of_points(points[twice] if twice.any() else points), cube_in_view(cameras)
+    if viewed is None or cube.half <= TOO_WIDE * viewed.half:
+        return cube
+    return cube_of_points(points[2 * seen >= seen.max()])
 
 
 def _filled(cloud: Cloud, cameras: Sequence[Camera]) -> Cloud:
@@ -116,6 +131,6 @@ def _filled(cloud: Cloud, cameras: Sequence[Camera]) -> Cloud:
     added = points_in_view(cameras, float(near), float(far) * 1.01, missing, 0)
     _, nearest = cKDTree(points).query(added)
     return Cloud(
-        np.concatenate([cloud.points, added.astype(np.float32)]),
+        np.concatenate([cloud.points, added.astype(cloud.points.dtype)]),
         np.concatenate([cloud.colors, cloud.colors[nearest]]),
     )

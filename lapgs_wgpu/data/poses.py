@@ -14,6 +14,8 @@ Array = NDArray[np.float64]
 
 # Largest deviation of R^T R from the identity: files store about seven digits; scale or shear exceeds this by far.
 ROTATION_TOLERANCE = 1e-3
+# A rotation whose error moves no camera by more than this is kept as stored, in the capture's units: float32's.
+EXACT = 1e-5
 AXES_HINT = "poses may be in OpenCV's axes where the format has OpenGL's (y up, z backward), or the other way round"
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0])  # y up, z backward -> y down, z forward
 
@@ -35,10 +37,23 @@ def check_rotation(R: Array, name: str) -> None:
 
 
 def world_to_camera(R_world_cam: Array, position: Array) -> Array:
-    """Return the (4, 4) pose of a camera at `position` (3,) whose axes are the columns of R_world_cam (3, 3)."""
+    """Return the (4, 4) pose of a camera at `position` (3,) whose axes are the columns of R_world_cam (3, 3).
+
+    An inexact rotation is replaced by the nearest one: the position follows from a pose by the rotation's inverse, and
+    its error is that of the rotation times the distance from the origin.
+    """
+    R_world_cam = nearest_rotation(R_world_cam, float(np.linalg.norm(position)))
     T_cam_world = np.eye(4)
     T_cam_world[:3, :3], T_cam_world[:3, 3] = R_world_cam.T, -R_world_cam.T @ position
     return T_cam_world
+
+
+def nearest_rotation(R: Array, reach: float) -> Array:
+    """Return the rotation nearest to R (3, 3), or R where its error times `reach`, or 1, is at most EXACT."""
+    if np.abs(R.T @ R - np.eye(3)).max() * max(reach, 1.0) <= EXACT:
+        return R
+    U, _, V = np.linalg.svd(R)
+    return np.asarray(U @ V)
 
 
 def opengl_pose(value: Any, where: str) -> Array:

@@ -5,6 +5,7 @@ A capture that cannot be trained on raises InputError; otherwise each problem is
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import groupby
@@ -14,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.data.cloud import Cloud, in_view, views_of
+from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.data.focus import spread
 from lapgs_wgpu.data.frames import Frame
-from lapgs_wgpu.data.images import check_image, gray_thumbnail, size_text
+from lapgs_wgpu.data.images import SIDEWAYS, ImageFile, check_image, decode, gray_thumbnail, size_text
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.masks import check_measured
 from lapgs_wgpu.data.poses import AXES_HINT
@@ -28,12 +30,68 @@ from lapgs_wgpu.splat.camera import Camera
 MIN_FOCAL, MAX_FOCAL = 0.05, 1000.0  # of an image's longer side: 169 and 0.06 degrees of view
 # A triangulated point was seen by cameras. If most points are not, cloud and cameras use different coordinates.
 MIN_SEEN = 0.5
+OFF_CENTER = 0.15  # of a side: intrinsics of images half or twice as large lie 0.25 or 0.5 away from the middle
+LOOKED_AT, DARK = 8, 64  # images of 16 bits that are decoded, and the level that a bright one of them reaches
 MIN_SPREAD = 1e-3  # of the cloud, relative to its distance from the cameras: a smaller one covers less than a pixel
 NAMED = 5  # images that a warning names
 STANDING = 0.01  # cameras with a spread below this, relative to their distance from the cloud, have no parallax
 FEW_POINTS = 100
 FEW_TIMES = 5  # fewer distinct times do not constrain motion
 GAP, GAP_FACTOR = 0.1, 4.0  # a gap is longer than this share of the clip, and than this multiple of the usual step
+
+
+def upright(frames: Sequence[Frame]) -> tuple[list[Frame], list[str]]:
+    """Turn images as their EXIF orientation says where only that fits their camera; return warnings where both fit."""
+    turned, unclear = [], []
+    for frame in frames:
+        image, lens = frame.image, frame.lens
+        if isinstance(image, ImageFile) and image.orientation > 1:
+            sideways = image.orientation >= SIDEWAYS
+            if sideways and not _fits(image.size, lens) and _fits(image.size[::-1], lens):
+                frame = dataclasses.replace(frame, image=image.turned)
+            elif not sideways or _fits(image.size[::-1], lens):
+                unclear.append(image)
+        turned.append(frame)
+    if not unclear:
+        return turned, []
+    return turned, [
+        f"{len(unclear)} of {len(frames)} images, such as {unclear[0]}, have an EXIF orientation "
+        f"({unclear[0].orientation}), and their size does not tell whether the poses are those of the turned images: "
+        "they are taken as they are stored; else, turn the files themselves and remove the orientation."
+    ]
+
+
+def check_plausible(frames: Sequence[Frame]) -> list[str]:
+    """Warn about principal points far from the image's middle, and about images of 16 bits that are nearly black."""
+    warnings = []
+    off = {frame.lens: frame.where for frame in reversed(frames) if _off_center(frame.lens)}
+    if off:
+        lens, where = next(reversed(off.items()))
+        warnings.append(
+            f"{where}: the principal point ({lens.cx:.5g}, {lens.cy:.5g}) is far from the middle of images of "
+            f"{lens.width}x{lens.height}, in {len(off)} cameras; unless the images were cut out of larger ones, the "
+            f"intrinsics are those of another size, such as {2 * lens.cx:.0f}x{2 * lens.cy:.0f}."
+        )
+    deep = [frame.image for frame in frames if isinstance(frame.image, ImageFile) and frame.image.deep]
+    looked_at = evenly(deep, LOOKED_AT)
+    highest = max((int(decode(image.path)[..., :3].max()) for image in looked_at), default=255)
+    if highest < DARK:
+        warnings.append(
+            f"images of 16 bits are nearly black: in {len(looked_at)} of {len(deep)}, such as {looked_at[0]}, no level "
+            f"is above {highest} of 255, so they seem to use {8 + highest.bit_length()} bits; multiply them by "
+            f"{2 ** (8 - highest.bit_length())}."
+        )
+    return warnings
+
+
+def _off_center(lens: Lens) -> bool:
+    return max(abs(lens.cx / lens.width - 0.5), abs(lens.cy / lens.height - 0.5)) > OFF_CENTER
+
+
+def _fits(size: tuple[int, int], lens: Lens) -> bool:
+    """Whether an image of (width, height) has the proportions that a lens states."""
+    # Whoever shrank the images may have rounded each side up or down.
+    return abs(size[0] * lens.height / lens.width - size[1]) <= 1.5
 
 
 def check_frames(frames: Sequence[Frame]) -> None:
@@ -70,11 +128,12 @@ def check_focal(lens: Lens, where: str) -> None:
 
 def check_proportions(stored: tuple[int, int], lens: Lens, image: str, where: str) -> None:
     """Check that an image of (width, height) `stored` has the proportions that a lens states. Raises InputError."""
-    # Whoever shrank the images may have rounded each side up or down.
-    if abs(stored[0] * lens.height / lens.width - stored[1]) > 1.5:
+    if not _fits(stored, lens):
+        sideways = _fits(stored[::-1], lens)
+        advice = "turn it, or give the camera of the turned image" if sideways else "they do not belong together"
         raise InputError(
             f"{image} is {size_text(stored)} pixels, but {where} states {lens.width}x{lens.height}, which has other "
-            "proportions; they do not belong together."
+            f"proportions{', those of the image on its side' if sideways else ''}; {advice}."
         )
 
 
@@ -90,7 +149,8 @@ def check_cloud(cloud: Cloud, cameras: Sequence[Camera], path: Path) -> None:
     if seen < MIN_SEEN:
         raise InputError(
             f"{path}: the training cameras see {100 * seen:.0f} % of its points (at least {100 * MIN_SEEN:.0f} % are "
-            f"expected): {numbers}; it is in other coordinates than the cameras, so transform it, or remove it."
+            f"expected): {numbers}; it is in other coordinates than the cameras, or reaches far beyond what they see: "
+            "transform it, cut it to the scene, or remove it."
         )
     if len(points) > 1 and spread < MIN_SPREAD * distance:
         raise InputError(

@@ -18,6 +18,7 @@ from threading import Lock
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lapgs_wgpu.data.images import LANCZOS, ImageFile, Pixels, Size, encode_png, resize, size_text
 from lapgs_wgpu.errors import InputError, pip_install
@@ -29,6 +30,10 @@ COMPRESSION = 1  # of PNG: the next levels take twice as long for a tenth of the
 LARGEST_FRAME = 8192 * 8192  # pixels; the decoder holds several frames
 WIDEST = 4.0  # width by height of a pixel, or height by width; what a header states beyond it is no such ratio
 WRITERS = min(8, os.cpu_count() or 1)  # threads that shrink and write the frames of the video that is being unpacked
+INTERLACED = (
+    "its frames are interlaced, each made of two half frames of different times, which blurs what moves into combs; "
+    "deinterlace it first (ffmpeg -vf bwdif)"
+)
 _unpacking = Lock()  # one video at a time, with all processors, which bounds memory
 
 
@@ -57,8 +62,10 @@ class Video:
             raise InputError(f"{path} is not a readable video ({error}); copy or record it again.") from None
         if first is None:
             raise InputError(f"{path} has {self.frames} frames; none is usable.")
-        self._turns = round(first.rotation / 90) % 4
-        self.size = (first.height, first.width) if self._turns % 2 else (first.width, first.height)
+        self._display = display(first)
+        self.size = self._display.size((first.width, first.height))
+        if first.interlaced_frame:
+            print(f"{path}: {INTERLACED}", file=sys.stderr, flush=True)
 
     def _check_header(self, stream: Any) -> None:
         """Raises InputError for frames that are too many, too large, or not of square pixels."""
@@ -96,7 +103,7 @@ class Video:
         except OSError as error:
             raise InputError(f"{self.path} cannot be read any more ({error.strerror}); put it back.") from None
         path = self.path.resolve()
-        state = f"{stat.st_size:x}-{stat.st_mtime_ns:x}" + (f"-turned-{self._turns}" if self._turns else "")
+        state = f"{stat.st_size:x}-{stat.st_mtime_ns:x}" + (f"-{self._display}" if any(self._display) else "")
         return cache_folder() / "frames" / _place(path.parent) / f"{path.stem}-{size[0]}x{size[1]}-{state}"
 
     def _unpack(self, folder: Path, size: Size) -> None:
@@ -118,7 +125,7 @@ class Video:
                 stream.codec_context.options = {"max_pixels": str(LARGEST_FRAME)}  # whatever the header states
                 for frame in file.decode(stream):
                     image = frame.to_ndarray(format="rgb24", interpolation=EXACT_COLORS)
-                    image = np.ascontiguousarray(np.rot90(image, self._turns))
+                    image = self._display.apply(image)
                     if image.shape[1::-1] != self.size:
                         raise InputError(
                             f"{self.path}: frame {count} has {size_text(image.shape[1::-1])} pixels, and the first has "
@@ -163,6 +170,41 @@ class VideoFrame(NamedTuple):
     def read(self, size: Size) -> Pixels:
         """Return the frame, shrunk to (width, height): see `Video.read`. Raises InputError."""
         return self.video.read(self.number, size)
+
+
+class Display(NamedTuple):
+    """How the pixels of a film are shown: mirrored (left and right exchanged) first, then turned.
+
+    turns: by 90 degrees counterclockwise, 0 to 3.
+    """
+
+    turns: int
+    mirrored: bool
+
+    def __str__(self) -> str:
+        return f"turned-{self.turns}" + ("-mirrored" if self.mirrored else "")
+
+    def size(self, coded: Size) -> Size:
+        """(width, height) as shown."""
+        return coded[::-1] if self.turns % 2 else coded
+
+    def apply(self, image: NDArray[Any]) -> NDArray[Any]:
+        """The image (H, W, ...) as shown."""
+        if self.mirrored:
+            image = image[:, ::-1]
+        return np.ascontiguousarray(np.rot90(image, self.turns))
+
+
+def display(frame: Any) -> Display:
+    """The display of a frame: of its matrix, whose rotation alone PyAV states, wrongly for mirrored ones."""
+    matrix = frame.side_data.get("DISPLAYMATRIX")
+    if matrix is None:
+        return Display(round(frame.rotation / 90) % 4, False)
+    a, b, _, c, d = np.frombuffer(matrix, np.int32)[:5] / 65536  # x' = a x + c y, y' = b x + d y; y points down
+    mirrored = bool(a * d - b * c < 0)
+    if mirrored:  # the matrix times that of the mirror, which comes first
+        a, b = -a, -b
+    return Display(round(float(np.arctan2(-b, a)) / (np.pi / 2)) % 4, mirrored)
 
 
 def cache_folder() -> Path:

@@ -12,7 +12,15 @@ from numpy.typing import NDArray
 
 from lapgs_wgpu.data.images import Pixels, Size, shrunk_size, size_text
 from lapgs_wgpu.data.thumbnails import THUMBNAIL
-from lapgs_wgpu.data.video_frames import EXACT_COLORS, LARGEST_FRAME, import_av, pixel_aspect
+from lapgs_wgpu.data.video_frames import (
+    EXACT_COLORS,
+    INTERLACED,
+    LARGEST_FRAME,
+    Display,
+    display,
+    import_av,
+    pixel_aspect,
+)
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.prepare.hdr import Transfer, to_sdr, transfer_of
 
@@ -29,7 +37,7 @@ class FilmFrame:
     gray: NDArray[np.float32]
     _frame: Any
     _size: Size  # of square pixels, not yet turned
-    _turns: int
+    _display: Display
     _transfer: Transfer | None
 
     def pixels(self, longer_side: int) -> Pixels:
@@ -40,7 +48,7 @@ class FilmFrame:
         else:
             deep = self._frame.to_ndarray(format="rgb48le", width=width, height=height, interpolation=EXACT_COLORS)
             image = to_sdr(deep, self._transfer)
-        return np.ascontiguousarray(np.rot90(image, self._turns))
+        return self._display.apply(image)
 
 
 class Film:
@@ -88,11 +96,13 @@ class Film:
                 stream.codec_context.options = {"max_pixels": str(LARGEST_FRAME)}  # whatever the header states
                 rate = float(stream.average_rate or stream.guessed_rate or rate)
                 for frame in file.decode(stream):
-                    turns = round(frame.rotation / 90) % 4
+                    shape = display(frame)
                     shown = _squared((frame.width, frame.height), self._aspect)
-                    size = shown[::-1] if turns % 2 else shown
+                    size = shape.size(shown)
                     if number == 0:
                         self.size, first = size, frame.time or 0.0
+                        if frame.interlaced_frame:
+                            self.notes.append(f"{self.path}: {INTERLACED}.")
                     elif size != self.size:
                         raise InputError(
                             f"{self.path}: frame {number} has {size_text(size)} pixels and the first has "
@@ -102,8 +112,8 @@ class Film:
                     if number and seconds <= last:  # no time stamp, or one that was there before
                         guessed, seconds = True, last + 1 / rate
                     seconds = max(seconds, 0.0)
-                    gray = _gray(frame, shown, turns)
-                    yield FilmFrame(seconds, gray, frame, shown, turns, transfer_of(frame))
+                    gray = _gray(frame, shown, shape)
+                    yield FilmFrame(seconds, gray, frame, shown, shape, transfer_of(frame))
                     number, last = number + 1, seconds
         except (av.error.FFmpegError, OSError) as error:
             if number < 2:
@@ -143,7 +153,7 @@ def _squared(coded: Size, aspect: float) -> Size:
     return max(1, round(coded[0] * aspect)), coded[1]
 
 
-def _gray(frame: Any, size: Size, turns: int) -> NDArray[np.float32]:
+def _gray(frame: Any, size: Size, shape: Display) -> NDArray[np.float32]:
     width, height = shrunk_size(size, THUMBNAIL)
     small = frame.to_ndarray(format="gray", width=width, height=height, interpolation=_FAST_BILINEAR)
-    return np.rot90(small, turns).astype(np.float32)
+    return shape.apply(small).astype(np.float32)

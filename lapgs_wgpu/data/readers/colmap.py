@@ -56,7 +56,7 @@ def _read(folder: Path, image_size: int | None) -> Capture:
         warnings.append(f"{folder / SPARSE} holds {len(models)} models ({sizes} images): {chosen.name} is taken.")
     cloud = None
     if len(model.points):
-        cloud = Cloud(model.points.astype(np.float32), (model.colors / 255).astype(np.float32))
+        cloud = Cloud(model.points, (model.colors / 255).astype(np.float32))
     else:
         warnings.append(
             f"{model.points_file} holds 0 points, so Gaussians start at random depths before the cameras; a model with "

@@ -29,7 +29,8 @@ MODELS: dict[int, tuple[str, tuple[str, ...]]] = {
 }
 OTHER_MODELS = {
     5: "OPENCV_FISHEYE", 6: "FULL_OPENCV", 7: "FOV", 8: "SIMPLE_RADIAL_FISHEYE", 9: "RADIAL_FISHEYE",
-    10: "THIN_PRISM_FISHEYE", 11: "RAD_TAN_THIN_PRISM_FISHEYE",
+    10: "THIN_PRISM_FISHEYE", 11: "RAD_TAN_THIN_PRISM_FISHEYE", 12: "SIMPLE_DIVISION", 13: "DIVISION",
+    14: "SIMPLE_FISHEYE", 15: "FISHEYE", 16: "EUCM", 17: "EQUIRECTANGULAR",
 }  # fmt: skip
 PARAMETERS = dict(MODELS.values())
 LONGEST_NAME = 4096  # bytes of an image's name
@@ -98,9 +99,13 @@ def read_model(folder: Path) -> ColmapModel:
 def _camera(where: str, model: str, width: float, height: float, values: list[float]) -> ColmapCamera:
     """Check the values of a camera. Raises InputError."""
     if model not in PARAMETERS:
+        advice = (
+            "cut pinhole views out of the panoramas"
+            if model == "EQUIRECTANGULAR"
+            else "undistort the images with colmap image_undistorter"
+        )
         raise InputError(
-            f"{where}: its model {model[:40]} is not among those that are read ({', '.join(PARAMETERS)}); undistort "
-            "the images with colmap image_undistorter."
+            f"{where}: its model {model[:40]} is not among those that are read ({', '.join(PARAMETERS)}); {advice}."
         )
     names = PARAMETERS[model]
     if len(values) != len(names):
@@ -231,7 +236,7 @@ class _Bytes:
 
 def _binary_cameras(path: Path) -> dict[int, ColmapCamera]:
     cameras, file = {}, _Bytes(path)
-    for index in range(file.count(24 + 3 * 8, "cameras")):
+    for index in range(file.count(24, "cameras")):
         identity, model, width, height = file.take("iiQQ")
         name, names = MODELS.get(model, (OTHER_MODELS.get(model, f"number {model}"), ()))
         values = list(file.take(f"{len(names)}d"))
