@@ -265,7 +265,7 @@ def picture(size: tuple[int, int]) -> Spoil:
 ALL = {f"frame_{i:04d}.png": i for i in range(1, 7)}
 BAD: dict[str, tuple[Spoil, list[str]]] = {
     "no images": (gone("images"), ["images does not exist"]),
-    "a picture absent": (gone("images/frame_0002.png"), ["frame_0002.png", "images.txt"]),
+    "pictures absent": (lambda f: [gone(f"images/frame_000{i}.png")(f) for i in (2, 3)], ["frame_0002.png", "images"]),
     "no points file": (gone("sparse/0/points3D.txt"), ["points3D.txt"]),
     "fisheye": (line("cameras.txt", "PINHOLE", "OPENCV_FISHEYE"), ["cameras.txt", "OPENCV_FISHEYE", "OPENCV"]),
     "3 parameters": (words("cameras.txt", 1, 7, ""), ["cameras.txt"]),

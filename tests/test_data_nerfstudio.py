@@ -189,7 +189,7 @@ BAD: dict[str, tuple[Callable[[dict[str, Any]], Any], list[str]]] = {
     "frames empty": (top(frames=[]), ["frames"]),
     "a frame of text": (lambda data: data["frames"].__setitem__(1, "x"), ["frame 1"]),
     "no file_path": (frame(file_path=None), ["file_path"]),
-    "file_path absent": (frame(file_path="images/x.png"), ["images/x.png"]),
+    "file_paths absent": (lambda data: [each.update(file_path="images/x.png") for each in data["frames"]], ["x.png"]),
     "file_path twice": (frame(file_path="images/frame_00001.png"), ["frame_00001.png"]),
     "no matrix": (frame(transform_matrix=None), ["transform_matrix"]),
     "matrix scaled": (frame(transform_matrix=SCALED), ["transform_matrix"]),

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import json
+import shutil
+import unicodedata
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
+import pytest
 from helpers.captures import HEIGHT, WIDTH, Blobs, cameras, write_model
 from PIL import Image
 
 from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.data.views import Dataset
+from lapgs_wgpu.errors import InputError
 
 POINTS = Blobs.random().means.double().numpy()
 
@@ -40,3 +45,58 @@ def test_images_of_a_model_without_blank_lines(tmp_path: Path) -> None:
     path = folder / "sparse/0/images.txt"
     path.write_text("\n".join(line for line in path.read_text().split("\n") if "#" in line or ".png" in line))
     assert len(times_of(load_dataset(folder))) == 12
+
+
+NAMES = {
+    "backslash": ("cam\\{:04d}.png", "cam/{:04d}.png"),
+    "two blanks": ("My  film/frame  {:04d}.png", "My  film/frame  {:04d}.png"),
+    "other blanks": ("My film/frame {:04d}.png", "My film/frame  {:04d}.png"),
+    "Unicode form": (unicodedata.normalize("NFD", "é/{:04d}.png"), unicodedata.normalize("NFC", "é/{:04d}.png")),
+    "letter case": ("CAM/{:04d}.jpg", "cam/{:04d}.JPG"),
+    "type": ("{:04d}.jpg", "{:04d}.jpeg"),
+}
+
+
+@pytest.mark.parametrize("kind", NAMES)
+def test_names_as_other_systems_write_them(kind: str, tmp_path: Path) -> None:
+    named, file = ([pattern.format(i) for i in range(12)] for pattern in NAMES[kind])
+    data = load_dataset(write(tmp_path / "toy", file, named=named))
+    assert set(times_of(data)) == set(file)
+    assert not any("left out" in warning for warning in data.warnings)
+
+
+def transforms(folder: Path, names: Sequence[str]) -> Path:
+    """The nerfstudio form of the same."""
+    flip = np.diag([1.0, -1, -1, 1])
+    frames = [
+        {"file_path": name, "transform_matrix": (np.linalg.inv(c.T_cam_world) @ flip).tolist(), "time": i / 11}
+        for i, (name, c) in enumerate(zip(names, cameras(12), strict=True))
+    ]
+    values = {"fl_x": 70, "fl_y": 70, "w": WIDTH, "h": HEIGHT, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(values))
+    shutil.rmtree(folder / "sparse")
+    return folder
+
+
+@pytest.mark.parametrize("form", ["COLMAP", "nerfstudio", "smaller", "D-NeRF"])
+def test_frames_without_an_image_are_left_out(form: str, tmp_path: Path) -> None:
+    names = [f"{i:04d}.png" for i in range(12)]
+    folder = write(tmp_path / "toy", names)
+    images = folder / "images"
+    if form != "COLMAP":
+        transforms(folder, [f"images/{name}" for name in names])
+    if form == "smaller":
+        images = images.rename(folder / "images_4")
+    if form == "D-NeRF":
+        (folder / "transforms.json").rename(folder / "transforms_train.json")
+        shutil.copyfile(folder / "transforms_train.json", folder / "transforms_test.json")
+    for name in names[2:4]:
+        (images / name).unlink()
+    data = load_dataset(folder)
+    views = data.train if form == "D-NeRF" else (*data.train, *data.test)
+    assert sorted(view.time for view in views) == pytest.approx([i / 11 for i in range(12) if i not in (2, 3)])
+    (warning, *_) = [warning for warning in data.warnings if "2 of 12 images" in warning]
+    assert "0002.png" in warning
+    (images / names[4]).unlink()
+    with pytest.raises(InputError, match=r"0002\.png does not exist.* 3 of 12 images"):
+        load_dataset(folder)

@@ -63,6 +63,7 @@ class ColmapModel(NamedTuple):
     points: Array
     colors: NDArray[np.uint8]
     cameras_file: Path
+    images_file: Path
     points_file: Path
 
 
@@ -90,7 +91,7 @@ def read_model(folder: Path) -> ColmapModel:
     bad = np.flatnonzero(~(np.abs(points) <= LARGEST_ENTRY).all(axis=1))  # true for NaN, too
     if len(bad):
         raise InputError(f"{files['points3D']}: {len(bad)} of {len(points)} points are not finite, first {bad[0]}.")
-    return ColmapModel(cameras, images, points, colors, files["cameras"], files["points3D"])
+    return ColmapModel(cameras, images, points, colors, *files.values())
 
 
 def _camera(where: str, model: str, width: float, height: float, values: list[float]) -> ColmapCamera:
