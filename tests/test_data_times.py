@@ -100,3 +100,44 @@ def test_frames_without_an_image_are_left_out(form: str, tmp_path: Path) -> None
     (images / names[4]).unlink()
     with pytest.raises(InputError, match=r"0002\.png does not exist.* 3 of 12 images"):
         load_dataset(folder)
+
+
+@pytest.mark.parametrize("pattern", ["frame{t:06d}/cam{c:02d}.png", "cam{c:02d}/frame{t:06d}.png", "t{t:04d}/{c}.png"])
+@pytest.mark.parametrize("placed", [1, 3, 8])
+def test_folders_are_cameras_or_times(pattern: str, placed: int, tmp_path: Path) -> None:
+    """Also where the model holds a few images of each still camera only."""
+    files = {pattern.format(t=t + 1, c=c): (t, c) for t in range(8) for c in range(4)}
+    named = [file for file, (t, _) in files.items() if t < placed]
+    data = load_dataset(write(tmp_path / "toy", list(files), lambda i: 3 * (i % 4), named))
+    assert times_of(data) == {file: t / 7 for file, (t, _) in files.items()}
+    assert {files[view.source.split("/images/")[-1]][1] for view in data.test} == {0}
+    assert (len(data.test), len(data.cameras)) == (8, 3)
+    assert data.summary.startswith("COLMAP, 4 still cameras, 8 times from")
+    assert data.summary.endswith(" is held out")
+
+
+STAMPS = {
+    "phone": [f"IMG_20260110_{95848 + i if i < 12 else 95900 + i - 12:06d}.png" for i in range(16)],
+    "milliseconds": [f"PXL_20260110_0958{48 + i:02d}123.png" for i in range(12)],
+    "decimals": [f"{round(i / 30, 3)}.png" for i in range(24)],
+    "Unix": [f"{1305031102.175304 + 0.5 * i:.6f}.png" for i in range(12)],
+}
+
+
+@pytest.mark.parametrize("kind", STAMPS)
+def test_times_in_names(kind: str, tmp_path: Path) -> None:
+    files = STAMPS[kind]
+    data = load_dataset(write(tmp_path / "toy", files))
+    times = times_of(data)
+    expected = np.linspace(0, 1, len(files))
+    np.testing.assert_allclose([times[file] for file in files], expected, atol=1e-3 if kind == "decimals" else 1e-6)
+    assert not any("order" in warning for warning in data.warnings)
+
+
+def test_cameras_that_end_apart_are_named(tmp_path: Path) -> None:
+    counts = {"cam0": 6, "cam1": 6, "cam2": 12}
+    files = [f"{camera}/{t:02d}.png" for camera, count in counts.items() for t in range(count)]
+    named = [f"{camera}/00.png" for camera in counts]
+    data = load_dataset(write(tmp_path / "toy", files, lambda i: 4 * i, named))
+    (warning,) = [warning for warning in data.warnings if "different times" in warning]
+    assert "cam0, cam1 at 5, cam2 at 11" in warning

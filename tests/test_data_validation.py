@@ -27,8 +27,8 @@ from PIL import Image, ImageFilter
 from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.data.cloud import Cloud
 from lapgs_wgpu.data.split import held_out
+from lapgs_wgpu.data.stamps import ImageName
 from lapgs_wgpu.data.timestamps import (
-    ImageName,
     disorder,
     frame_numbers,
     in_step,

@@ -17,7 +17,7 @@ from lapgs_wgpu.data.cloud import Cloud
 from lapgs_wgpu.data.images import ImageFile
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.normalize import Normalization
-from lapgs_wgpu.data.timestamps import ImageName
+from lapgs_wgpu.data.stamps import ImageName
 from lapgs_wgpu.data.video_frames import VideoFrame
 
 Split = Literal["train", "val", "test"]

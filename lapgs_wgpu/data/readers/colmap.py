@@ -1,7 +1,8 @@
 """Reader of COLMAP's sparse models: sparse/ or sparse/N (`colmap_model`) beside the images in images/.
 
-Each folder below images/ is a camera. If the model holds exactly one image of each of several cameras, these cameras do
-not move, and all images of a camera have the pose of the one. docs/own-data.md says how to make such a capture.
+Each folder below images/ is a camera, or a time (`stamps`). If the model places each of several cameras at one point,
+they do not move, and images of a camera that have no pose have that of its first one. docs/own-data.md says how to make
+such a capture.
 
 Models without points, and with a camera for each image, as other programs export them, are read, too.
 """
@@ -9,7 +10,8 @@ Models without points, and with a camera for each image, as other programs expor
 from __future__ import annotations
 
 import os
-from pathlib import Path, PurePosixPath
+from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -27,12 +29,14 @@ from lapgs_wgpu.data.readers.colmap_model import (
     is_model,
     read_model,
 )
-from lapgs_wgpu.data.timestamps import ImageName, natural_key
+from lapgs_wgpu.data.stamps import image_names
+from lapgs_wgpu.data.timestamps import natural_key
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.listing import is_desktop_file
 from lapgs_wgpu.splat.camera import rotation_matrix
 
 IMAGES, SPARSE = "images", "sparse"
+STILL = 0.02  # of the distance of cameras: the poses of one that stands still are apart by less
 
 
 def _matches(folder: Path) -> bool:
@@ -116,21 +120,24 @@ def _frames(
     warnings: list[str],
 ) -> list[Frame]:
     """Return the images with a pose, their own or that of their still camera. Appends a warning about those without."""
+    names = {name.file: name for name in image_names(list(files))}
     by_camera: dict[str, list[ColmapImage]] = {}
     for name, image in registered.items():
-        by_camera.setdefault(_camera_of(name), []).append(image)
-    still_cameras = len(by_camera) > 1 and all(len(own) == 1 for own in by_camera.values())
+        by_camera.setdefault(names[name].camera, []).append(image)
+    still_cameras = len(by_camera) > 1 and _stand_still(list(by_camera.values()))
     frames: list[Frame] = []
     left_out: list[str] = []
     for name, path in files.items():
-        camera = _camera_of(name)
-        posed = by_camera[camera][0] if still_cameras and camera in by_camera else registered.get(name)
+        camera = names[name].camera
+        posed = registered.get(name)
+        if posed is None and still_cameras and camera in by_camera:
+            posed = by_camera[camera][0]
         if posed is None:
             left_out.append(name)
             continue
         entry = f"{model.cameras_file}, camera {posed.camera},"
         lens, pose = _lens(model.cameras[posed.camera]), _pose(posed)
-        frames.append(Frame(check_image(path), lens, pose, entry, ImageName(name, camera)))
+        frames.append(Frame(check_image(path), lens, pose, entry, names[name]))
     if left_out:
         warnings.append(
             f"{len(left_out)} of {len(files)} images below {images} are left out, such as {left_out[0]}: "
@@ -139,9 +146,11 @@ def _frames(
     return frames
 
 
-def _camera_of(name: str) -> str:
-    """The camera that took an image: its folder below images/."""
-    return str(PurePosixPath(name).parent)
+def _stand_still(cameras: Sequence[Sequence[ColmapImage]]) -> bool:
+    """Whether the registered images of each camera were taken from one place, as exactly as COLMAP finds it."""
+    places = [np.stack([-pose[:3, :3].T @ pose[:3, 3] for pose in map(_pose, own)]) for own in cameras]
+    apart = float(np.ptp(np.concatenate(places), axis=0).max())
+    return all(float(np.ptp(own, axis=0).max()) <= STILL * apart for own in places)
 
 
 def _lens(camera: ColmapCamera) -> Lens:

@@ -19,7 +19,7 @@ from lapgs_wgpu.data.images import check_image
 from lapgs_wgpu.data.json_fields import image_path, read_json
 from lapgs_wgpu.data.poses import opengl_pose
 from lapgs_wgpu.data.readers.transforms import read_lens, timed_frames
-from lapgs_wgpu.data.timestamps import ImageName
+from lapgs_wgpu.data.stamps import ImageName
 from lapgs_wgpu.data.validation import check_frames
 from lapgs_wgpu.errors import InputError
 

@@ -18,7 +18,7 @@ from lapgs_wgpu.data.images import check_image
 from lapgs_wgpu.data.json_fields import Fields, check_inside, image_path, kind, read_json
 from lapgs_wgpu.data.poses import opengl_pose
 from lapgs_wgpu.data.readers.transforms import read_lens, timed_frames
-from lapgs_wgpu.data.timestamps import ImageName
+from lapgs_wgpu.data.stamps import ImageName, image_names
 from lapgs_wgpu.errors import InputError
 
 
@@ -52,6 +52,7 @@ def _read(folder: Path, image_size: int | None) -> Capture:
             )
         )
     names = [frame.name.file for frame in frames]
+    frames = [dataclasses.replace(frame, name=name) for frame, name in zip(frames, image_names(names), strict=True)]
     if len(set(names)) < len(names):
         twice = next(name for i, name in enumerate(names) if name in names[:i])
         raise InputError(f"{path}: {len(names)} frames name {len(set(names))} images; {twice} is there twice.")
