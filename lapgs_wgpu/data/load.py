@@ -98,7 +98,8 @@ def load_dataset(
         warnings=tuple(warnings),
         time_source=time_source,
         own_footage=capture.own_footage,
-        summary=_summary(reader.name, shots, times, time_source, splits),
+        summary=_summary(reader.name, shots, times, time_source, splits)
+        + (f"; {capture.left_out} left out" if capture.left_out else ""),
     )
 
 

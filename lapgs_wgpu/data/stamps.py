@@ -97,9 +97,10 @@ def _clock_seconds(stamp: str) -> float | None:
         return None
     *date, fraction = found.groups()
     try:
-        return datetime(*map(int, date), tzinfo=UTC).timestamp() + float(f"0.{fraction or 0}")
+        clock = datetime.strptime("".join(date), "%Y%m%d%H%M%S").replace(tzinfo=UTC)
     except ValueError:  # 20261399_000001
         return None
+    return clock.timestamp() + float(f"0.{fraction or 0}")
 
 
 def _unix_seconds(stamp: str) -> float | None:

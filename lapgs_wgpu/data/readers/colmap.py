@@ -73,6 +73,7 @@ def _read(folder: Path, image_size: int | None) -> Capture:
         cloud,
         model.points_file,
         warnings=warnings,
+        left_out=len(files) - len(frames) + len(absent),
         shares_cameras=True,
         own_footage=True,
     )

@@ -71,6 +71,7 @@ def _read(folder: Path, image_size: int | None) -> Capture:
         None if cloud is None else read_cloud(cloud),
         source=cloud or path,
         warnings=warnings,
+        left_out=len(stated_names) - len(frames),
         time_source=f"{time_field} in {path}",
         shares_cameras=True,
         own_footage=True,
