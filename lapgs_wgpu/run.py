@@ -86,6 +86,8 @@ def train(
     found += check_in_view(dataset, first_points(dataset, PROBES, config.points.box, config.seed)[0])
     if ranks.first:
         check_run_folder(out, overwrite=overwrite)
+        if dataset.summary:
+            say(f"capture: {dataset.summary}")
         for warning in (*dataset.warnings, *found):
             print(f"warning: {warning}", file=sys.stderr, flush=True)
         if dataset.normalization is not None:

@@ -12,7 +12,7 @@ from lapgs_wgpu.data import Dataset, load, load_dataset
 from lapgs_wgpu.data.frames import Capture, Frame, Reader
 from lapgs_wgpu.data.images import ImageFile, check_image, decode, encode_png
 from lapgs_wgpu.data.lens import Lens, Undistortion
-from lapgs_wgpu.data.timestamps import ImageName
+from lapgs_wgpu.data.stamps import ImageName
 from lapgs_wgpu.splat.camera import Camera
 
 COUNT = 6

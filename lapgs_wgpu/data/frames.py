@@ -17,7 +17,7 @@ from lapgs_wgpu.data.cloud import Cloud
 from lapgs_wgpu.data.images import ImageFile
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.normalize import Normalization
-from lapgs_wgpu.data.timestamps import ImageName
+from lapgs_wgpu.data.stamps import ImageName
 from lapgs_wgpu.data.video_frames import VideoFrame
 
 Split = Literal["train", "val", "test"]
@@ -64,6 +64,7 @@ class Capture:
     time_source: file and field of the times, for errors.
     time_range: times that become 0 and 1; None for the first and the last time of the frames.
     warnings: what the reader left out, one sentence each.
+    left_out: how many images, for the summary.
     moved: the transform from the files' coordinates to those of frames and cloud, if the files ask for one.
     keeps_coordinates: the files may already use the presets' coordinates (D-NeRF); they are kept if the scene fits.
     shares_cameras: frames of equal lens and pose are of one camera that stands still.
@@ -77,6 +78,7 @@ class Capture:
     time_source: str = ""
     time_range: tuple[float, float] | None = None
     warnings: Sequence[str] = ()
+    left_out: int = 0
     moved: Normalization | None = None
     keeps_coordinates: bool = False
     shares_cameras: bool = False

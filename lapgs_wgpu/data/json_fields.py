@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lapgs_wgpu.data.image_files import ImageFinder
 from lapgs_wgpu.data.images import SUFFIXES
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io import safe_json_toml
@@ -110,20 +111,23 @@ def check_inside(name: str, field: str, where: str | Path) -> None:
             )
 
 
-def image_path(entry: Fields, folder: Path) -> tuple[str, Path]:
+def image_path(entry: Fields, images: ImageFinder, absent: list[str]) -> tuple[str, Path] | None:
     """Return the file_path of a frame, and the existing file that it names; .png is appended to a name without suffix.
 
-    Raises InputError.
+    Appends a sentence to `absent`, and returns None, if no such file exists. Raises InputError.
     """
     name, named = entry.required("file_path"), f"{entry.where} names it as file_path"
     if not isinstance(name, str) or not name:
         raise InputError(f"{entry.where}: file_path must be the path of an image, got {kind(name)}.")
     check_inside(name, "file_path", entry.where)
-    for written in dict.fromkeys((name, name.replace("\\", "/"))):  # as it stands, or as Windows writes it
-        file = folder / (written if written.lower().endswith(SUFFIXES) else written + ".png")
-        if os.path.isfile(file):  # Path.is_file raises for names that are too long
-            return written, file
-    raise absent_image(folder / name if os.path.isfile(folder / name) else file, named)
+    written = name if name.lower().endswith(SUFFIXES) else name + ".png"
+    found = images.find(written)
+    if found is not None:
+        return (name if found == written else found), images.folder / found
+    if os.path.isfile(images.folder / name):
+        raise absent_image(images.folder / name, named)
+    absent.append(str(absent_image(images.folder / written, named)))
+    return None
 
 
 def absent_image(file: Path, named: str) -> InputError:

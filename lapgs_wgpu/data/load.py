@@ -57,7 +57,8 @@ def load_dataset(
     folder = Path(folder)
     if image_size is not None and image_size < 1:
         raise InputError(f"image_size must be at least 1 pixel, got {image_size}.")
-    capture = _reader(folder).read(folder, image_size)
+    reader = _reader(folder)
+    capture = reader.read(folder, image_size)
     if not undistort:
         pinholes = [dataclasses.replace(frame, lens=frame.lens.idealized) for frame in capture.frames]
         capture = dataclasses.replace(capture, frames=pinholes)
@@ -99,7 +100,24 @@ def load_dataset(
         warnings=tuple(warnings),
         time_source=time_source,
         own_footage=capture.own_footage,
+        summary=_summary(reader.name, shots, times, time_source, splits)
+        + (f"; {capture.left_out} left out" if capture.left_out else ""),
     )
+
+
+def _summary(
+    layout: str, shots: Sequence[_Shot], times: Sequence[float], time_source: str, splits: Sequence[Split]
+) -> str:
+    """Say how a capture was understood: layout, cameras, times and their source, what is held out."""
+    films = {shot.frame.name.camera for shot in shots}
+    held = [shot.frame.name.camera for shot, split in zip(shots, splits, strict=True) if split != "train"]
+    places = len({shot.camera for shot in shots})
+    still = len(shots) >= 2 * places
+    count = places if still else len(films)
+    cameras = f"{count} {'still' if still else 'moving'} camera{'s' * (count > 1)}"
+    whole = len(films) > 1 and len(set(held)) == 1 and sum(shot.frame.name.camera == held[0] for shot in shots)
+    out = f"{held[0]} is" if whole == len(held) else f"{len(held)} of {len(shots)} images are"
+    return f"{layout}, {cameras}, {len(set(times))} times from {time_source}; {out} held out"
 
 
 def _reader(folder: Path) -> Reader:

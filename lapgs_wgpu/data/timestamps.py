@@ -7,34 +7,33 @@ import re
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.data.json_fields import number, read_json
+from lapgs_wgpu.data.stamps import ImageName, clock_times
 from lapgs_wgpu.errors import InputError
 
 TIMES = "times.json"
+APART = 0.05  # of the clip: cameras that begin or end further apart may have other rates or clocks
 IN_STEP = 0.1  # of the time from an image of a camera to its next: less than films are off beside each other
-
-
-class ImageName(NamedTuple):
-    """file: relative path of an image, as in times.json. camera: the camera that took it, the name of its folder."""
-
-    file: str
-    camera: str = ""
 
 
 def read_times(names: Sequence[ImageName], folder: Path) -> tuple[list[float], str]:
     """Read the time of each image, in any unit, and name the source of the times for errors.
 
-    The source is times.json in the folder, if it exists, else the frame numbers in the names. Raises InputError.
+    The source is times.json in the folder, if it exists, else clock times, seconds or frame numbers in the names.
+    Raises InputError.
     """
     path = folder / TIMES
     if path.is_file():
         return _listed(names, path), str(path)
-    return [float(number) for number in frame_numbers(names)], f"the frame numbers in the names of {folder}"
+    whose = f"the names of folders in {folder}" if names[0].folder else f"the names of {folder}"
+    if clocks := clock_times(names):
+        times, kind = clocks
+        return times, f"the {kind} in {whose}"
+    return [float(number) for number in frame_numbers(names)], f"the frame numbers in {whose}"
 
 
 def to_unit_range(values: Sequence[float], first: float, last: float) -> list[float]:
@@ -90,7 +89,7 @@ def frame_numbers(names: Sequence[ImageName]) -> list[int]:
     for camera in dict.fromkeys(name.camera for name in names):
         mine = [i for i, name in enumerate(names) if name.camera == camera]
         files = [names[i].file for i in mine]
-        rows = [[int(digits) for digits in re.findall(r"\d+", Path(file).stem)] for file in files]
+        rows = [[int(digits) for digits in re.findall(r"\d+", names[i].stamp)] for i in mine]
         lengths = {len(row) for row in rows}
         if lengths == {0} or len(lengths) > 1:
             fewest = min(range(len(rows)), key=lambda i: len(rows[i]))
@@ -125,6 +124,8 @@ def disorder(names: Sequence[ImageName], times: Sequence[float]) -> list[str]:
     for camera in dict.fromkeys(name.camera for name in names):
         mine = [(name, time) for name, time in zip(names, times, strict=True) if name.camera == camera]
         spans[camera] = min(time for _, time in mine), max(time for _, time in mine)
+        if clock_times([name for name, _ in mine]):
+            continue  # their numbers are no frame numbers
         try:
             numbers = frame_numbers([name for name, _ in mine])
         except InputError:
@@ -137,6 +138,12 @@ def disorder(names: Sequence[ImageName], times: Sequence[float]) -> list[str]:
                 f"frames are out of order: time goes back {len(back)} times in {len(ordered)} images, first from "
                 f"{first.file} at {at:g} to {second.file} at {then:g}; check the times."
             )
+    return warnings + _ends(spans, time_step(np.unique(np.array(times, np.float64))))
+
+
+def _ends(spans: dict[str, tuple[float, float]], step: float) -> list[str]:
+    """Warn about cameras without a common time, else about those that do not begin and end together."""
+    warnings = []
     first_camera, *further = spans
     a, b = spans[first_camera]
     disjoint = [camera for camera in further if spans[camera][0] > b or spans[camera][1] < a]
@@ -147,6 +154,20 @@ def disorder(names: Sequence[ImageName], times: Sequence[float]) -> list[str]:
             f"cameras film at different times: {first_camera} from {a:g} to {b:g} and {other} from {c:g} to {d:g}; "
             "if they filmed together, number their frames from a common time on."
         )
+        return warnings
+    for word, ends in (("begin", [low for low, _ in spans.values()]), ("end", [high for _, high in spans.values()])):
+        length = max(high for _, high in spans.values()) - min(low for low, _ in spans.values())
+        if max(ends) - min(ends) > max(1.5 * step, APART * length):
+            at: dict[float, list[str]] = {}
+            for camera, end in zip(spans, ends, strict=True):
+                at.setdefault(end, []).append(camera)
+            told = ", ".join(
+                f"{', '.join(cameras[:4])}{' ...' * (len(cameras) > 4)} at {end:g}" for end, cameras in at.items()
+            )
+            warnings.append(
+                f"cameras {word} at different times: {told}; if some film more images a second, or were started apart, "
+                f"write the times in seconds into {TIMES}."
+            )
     return warnings
 
 

@@ -87,7 +87,7 @@ class Dataset:
     scale: world units per unit of length of the capture (HyperNeRF: after its scene.json), 1 if coordinates were kept.
     normalization: transform from the files' coordinates, None if they were kept. warnings: problems that do not prevent
     a training, one sentence each. time_source: field and file of the times, for errors.
-    own_footage: poses were estimated from the images.
+    own_footage: poses were estimated from the images. summary: how the capture was understood, in one line.
     """
 
     name: str
@@ -101,6 +101,7 @@ class Dataset:
     warnings: tuple[str, ...] = ()
     time_source: str = "time"
     own_footage: bool = False
+    summary: str = ""
 
     @cached_property
     def cameras(self) -> tuple[Camera, ...]:

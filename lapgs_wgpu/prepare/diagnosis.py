@@ -51,7 +51,8 @@ class Diagnosis:
     def __str__(self) -> str:
         views = (*self.dataset.train, *self.dataset.test)
         layout = f"{len(distinct_cameras(views))} cameras that stand still" if self.still else "a camera that moves"
-        lines = [f"{len(views)} images, {layout}", *map(str, self.measures)]
+        understood = [f"capture: {self.dataset.summary}"] if self.dataset.summary else []
+        lines = [f"{len(views)} images, {layout}", *understood, *map(str, self.measures)]
         return "\n".join([*lines, *(f" note  {warning}" for warning in self.dataset.warnings)])
 
 

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lapgs_wgpu.data.images import SUFFIXES
 from lapgs_wgpu.data.json_fields import LARGEST_ENTRY, LARGEST_INTRINSIC, LARGEST_SIDE
 from lapgs_wgpu.errors import InputError, shown
 
@@ -63,6 +64,7 @@ class ColmapModel(NamedTuple):
     points: Array
     colors: NDArray[np.uint8]
     cameras_file: Path
+    images_file: Path
     points_file: Path
 
 
@@ -93,7 +95,7 @@ def read_model(folder: Path) -> ColmapModel:
     bad = np.flatnonzero(~(np.abs(points) <= LARGEST_ENTRY).all(axis=1))  # true for NaN, too
     if len(bad):
         raise InputError(f"{files['points3D']}: {len(bad)} of {len(points)} points are not finite, first {bad[0]}.")
-    return ColmapModel(cameras, images, points, colors, files["cameras"], files["points3D"])
+    return ColmapModel(cameras, images, points, colors, *files.values())
 
 
 def _camera(where: str, model: str, width: float, height: float, values: list[float]) -> ColmapCamera:
@@ -136,24 +138,29 @@ def _image(name: str, camera: int, pose: Array, where: str) -> ColmapImage:
 # Text
 
 
-def _lines(path: Path, fields: str, *, skipped: bool = False) -> Iterator[tuple[str, list[str]]]:
+def _lines(path: Path, fields: str, *, images: bool = False) -> Iterator[tuple[str, list[str]]]:
     """Yield the place of each line, for errors, and its words, at least those that `fields` lists; skip comments.
 
-    skipped: whether another line, which may be empty, follows each and is left out.
+    images: each line ends with an image's name, which may have blanks. After it, a line of points, which may be empty,
+    is left out; some programs write none, and then another image follows at once.
     """
     least = fields.count(",") + 1
+    points_follow = False
     try:
         with path.open(encoding="utf-8") as file:
             lines = ((number, line) for number, line in enumerate(file, start=1) if not line.startswith("#"))
             for number, line in lines:
-                words = line.split()
+                words = line.strip().split(maxsplit=least - 1 if images else -1)
+                is_image = len(words) == least and words[-1].lower().endswith(SUFFIXES)
+                if points_follow and not is_image:
+                    points_follow = False
+                    continue
                 if not words:
                     continue
                 if len(words) < least:
                     raise InputError(f"{path}, line {number} has {len(words)} fields, and needs {least}: {fields}.")
                 yield f"{path}, line {number}", words
-                if skipped:
-                    next(lines, None)
+                points_follow = images
     except UnicodeDecodeError as error:
         raise InputError(f"{path} is not text ({error.reason}); copy it or export the model again.") from None
 
@@ -174,10 +181,10 @@ def _text_cameras(path: Path) -> dict[int, ColmapCamera]:
 
 
 def _text_images(path: Path) -> list[ColmapImage]:
-    """Two lines per image: pose and name, then its points, which may be none."""
+    """An image is a line of pose and name; a line of its points, which may be none, mostly follows."""
     images = []
-    for where, words in _lines(path, "id, QW, QX, QY, QZ, TX, TY, TZ, camera, name", skipped=True):
-        name = " ".join(words[9:])
+    for where, words in _lines(path, "id, QW, QX, QY, QZ, TX, TY, TZ, camera, name", images=True):
+        name = words[9]
         (camera,) = _numbers(words[8:9], where, int)
         images.append(_image(name, camera, np.array(_numbers(words[1:8], where)), f"{where} ({name[:80]})"))
     return images

@@ -14,11 +14,12 @@ from pathlib import Path
 
 from lapgs_wgpu.data.cloud import find_cloud, is_random, read_cloud
 from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
+from lapgs_wgpu.data.image_files import ImageFinder, check_absent
 from lapgs_wgpu.data.images import check_image
 from lapgs_wgpu.data.json_fields import image_path, read_json
 from lapgs_wgpu.data.poses import opengl_pose
 from lapgs_wgpu.data.readers.transforms import read_lens, timed_frames
-from lapgs_wgpu.data.timestamps import ImageName
+from lapgs_wgpu.data.stamps import ImageName
 from lapgs_wgpu.data.validation import check_frames
 from lapgs_wgpu.errors import InputError
 
@@ -30,10 +31,11 @@ def _matches(folder: Path) -> bool:
 
 
 def _read(folder: Path, image_size: int | None) -> Capture:
-    frames, warnings = [*_read_split(folder, "train"), *_read_split(folder, "test")], []
+    warnings: list[str] = []
+    frames = [*_read_split(folder, "train", warnings), *_read_split(folder, "test", warnings)]
     if (folder / "transforms_val.json").is_file():
         try:
-            validation = _read_split(folder, "val")
+            validation = _read_split(folder, "val", warnings)
             check_frames([frames[0], *validation])
             frames += validation
         except InputError as error:
@@ -54,16 +56,20 @@ def _read(folder: Path, image_size: int | None) -> Capture:
     )
 
 
-def _read_split(folder: Path, split: Split) -> list[Frame]:
-    """Read the frames of one transforms file."""
+def _read_split(folder: Path, split: Split, warnings: list[str]) -> list[Frame]:
+    """Read the frames of one transforms file. Appends a warning about images that do not exist."""
     path = folder / f"transforms_{split}.json"
     if not path.is_file():
         raise InputError(f"{path} does not exist; a D-NeRF scene needs transforms_train.json and transforms_test.json.")
     data = read_json(path)
     entries = timed_frames(data)
     frames: list[Frame] = []
+    images, absent = ImageFinder(folder), list[str]()
     for index, (entry, stated) in enumerate(entries):
-        file_path, file = image_path(entry, folder)
+        named = image_path(entry, images, absent)
+        if named is None:
+            continue
+        file_path, file = named
         T_cam_world = opengl_pose(entry.required("transform_matrix"), entry.where)
         time = index / max(len(entries) - 1, 1) if stated is None else stated
         if not 0 <= time <= 1:
@@ -71,6 +77,7 @@ def _read_split(folder: Path, split: Split) -> list[Frame]:
         image = check_image(file)
         lens, name = read_lens(entry, data, image.size), ImageName(file_path)
         frames.append(Frame(image, lens, T_cam_world, entry.where, name, time=time, split=split, label=f"{index:03d}"))
+    warnings += check_absent(absent, len(entries), path)
     return frames
 
 

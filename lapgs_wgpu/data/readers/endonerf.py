@@ -19,7 +19,8 @@ from lapgs_wgpu.data.frames import Capture, Frame, Reader
 from lapgs_wgpu.data.images import SUFFIXES, check_image, decode, decode_gray, size_text
 from lapgs_wgpu.data.poses import world_to_camera
 from lapgs_wgpu.data.readers.poses_bounds import POSES, read_rows
-from lapgs_wgpu.data.timestamps import ImageName, natural_key
+from lapgs_wgpu.data.stamps import ImageName
+from lapgs_wgpu.data.timestamps import natural_key
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.listing import listed
 

@@ -30,7 +30,7 @@ from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.masks import find_covisible
 from lapgs_wgpu.data.normalize import Normalization
 from lapgs_wgpu.data.poses import check_rotation, world_to_camera
-from lapgs_wgpu.data.timestamps import ImageName
+from lapgs_wgpu.data.stamps import ImageName
 from lapgs_wgpu.errors import InputError
 
 CLOUDS = ("points.npy", "points3D_downsample*.ply", "points3D.ply")  # all in the coordinates of the camera files

@@ -13,11 +13,12 @@ from pathlib import Path, PurePosixPath
 
 from lapgs_wgpu.data.cloud import read_cloud
 from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
+from lapgs_wgpu.data.image_files import ImageFinder, check_absent
 from lapgs_wgpu.data.images import check_image
 from lapgs_wgpu.data.json_fields import Fields, check_inside, image_path, kind, read_json
 from lapgs_wgpu.data.poses import opengl_pose
 from lapgs_wgpu.data.readers.transforms import read_lens, timed_frames
-from lapgs_wgpu.data.timestamps import ImageName
+from lapgs_wgpu.data.stamps import ImageName, image_names
 from lapgs_wgpu.errors import InputError
 
 
@@ -30,8 +31,13 @@ def _read(folder: Path, image_size: int | None) -> Capture:
     data = read_json(path)
     time_field = "time" if any("time" in frame for frame in data.objects("frames", "frame")) else "timestamp"
     frames = []
+    images, absent, stated_names = ImageFinder(folder), list[str](), list[str]()
     for entry, stated in timed_frames(data, time_field):
-        name_in_file, file = image_path(entry, folder)
+        named = image_path(entry, images, absent)
+        stated_names.append(str(entry.values["file_path"]))
+        if named is None:
+            continue
+        name_in_file, file = named
         image = check_image(file)
         relative = PurePosixPath(name_in_file)
         frames.append(
@@ -46,11 +52,12 @@ def _read(folder: Path, image_size: int | None) -> Capture:
             )
         )
     names = [frame.name.file for frame in frames]
+    frames = [dataclasses.replace(frame, name=name) for frame, name in zip(frames, image_names(names), strict=True)]
     if len(set(names)) < len(names):
         twice = next(name for i, name in enumerate(names) if name in names[:i])
         raise InputError(f"{path}: {len(names)} frames name {len(set(names))} images; {twice} is there twice.")
-    warnings = []
-    if splits := _splits(data, names):
+    warnings = check_absent(absent, len(stated_names), path)
+    if splits := _splits(data, [*names, *map(_posix, stated_names)]):
         left_out = [name for name in names if name not in splits]
         frames = [dataclasses.replace(frame, split=split) for frame in frames if (split := splits.get(frame.name.file))]
         if left_out:
@@ -64,6 +71,7 @@ def _read(folder: Path, image_size: int | None) -> Capture:
         None if cloud is None else read_cloud(cloud),
         source=cloud or path,
         warnings=warnings,
+        left_out=len(stated_names) - len(frames),
         time_source=f"{time_field} in {path}",
         shares_cameras=True,
         own_footage=True,
@@ -104,12 +112,15 @@ def _listed(data: Fields, field: str, names: list[str]) -> list[str]:
     listed = data.values.get(field) or []
     if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
         raise InputError(f"{data.where}: {field} must be a list of names, got {kind(listed)}.")
-    posix = {name: str(PurePosixPath(name)) for name in listed}
-    normal = [posix[name] if posix[name] in names else str(PurePosixPath(name.replace("\\", "/"))) for name in listed]
+    normal = [str(PurePosixPath(name)) if str(PurePosixPath(name)) in names else _posix(name) for name in listed]
     unknown = next((name for name in normal if name not in names), None)
     if unknown is not None:
         raise InputError(f"{data.where}: {field} names {unknown[:80]}, which is none of its {len(names)} frames.")
     return normal
+
+
+def _posix(name: str) -> str:
+    return str(PurePosixPath(name.replace("\\", "/")))
 
 
 READER = Reader("nerfstudio", "transforms.json", _matches, _read)

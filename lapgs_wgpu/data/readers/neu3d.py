@@ -20,7 +20,8 @@ from lapgs_wgpu.data.frames import Capture, Frame, ImageSource, Reader
 from lapgs_wgpu.data.images import SUFFIXES, ImageFile, check_image
 from lapgs_wgpu.data.poses import world_to_camera
 from lapgs_wgpu.data.readers.poses_bounds import POSES, PoseRow, read_rows
-from lapgs_wgpu.data.timestamps import ImageName, natural_key
+from lapgs_wgpu.data.stamps import ImageName
+from lapgs_wgpu.data.timestamps import natural_key
 from lapgs_wgpu.data.video_frames import Video, VideoFrame
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.listing import listed

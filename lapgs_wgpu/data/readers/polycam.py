@@ -15,7 +15,8 @@ from lapgs_wgpu.data.images import SUFFIXES, check_image
 from lapgs_wgpu.data.json_fields import LARGEST_INTRINSIC, absent_image, read_json
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.poses import opengl_pose
-from lapgs_wgpu.data.timestamps import ImageName, natural_key
+from lapgs_wgpu.data.stamps import ImageName
+from lapgs_wgpu.data.timestamps import natural_key
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.listing import listed
 

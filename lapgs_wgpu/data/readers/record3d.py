@@ -17,7 +17,7 @@ from lapgs_wgpu.data.images import SUFFIXES, check_image
 from lapgs_wgpu.data.json_fields import number, read_json, vector
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.poses import OPENGL_TO_OPENCV, world_to_camera
-from lapgs_wgpu.data.timestamps import ImageName
+from lapgs_wgpu.data.stamps import ImageName
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import rotation_matrix
 

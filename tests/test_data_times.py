@@ -1,0 +1,143 @@
+"""How captures of own footage are understood: layouts, names, times, and what is left out."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import unicodedata
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.captures import HEIGHT, WIDTH, Blobs, cameras, write_model
+from PIL import Image
+
+from lapgs_wgpu.data import load_dataset
+from lapgs_wgpu.data.views import Dataset
+from lapgs_wgpu.errors import InputError
+
+POINTS = Blobs.random().means.double().numpy()
+
+
+def write(
+    folder: Path, files: Sequence[str], pose: Callable[[int], int] | None = None, named: Sequence[str] = ()
+) -> Path:
+    """A COLMAP capture of text. pose: which of 12 cameras took each file. named: the model's names, if others."""
+    rng = np.random.default_rng(0)
+    for file in files:
+        (folder / "images" / file).parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(rng.integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)).save(folder / "images" / file)
+    taken = cameras(12)
+    poses = {name: taken[pose(i) if pose else i % 12] for i, name in enumerate(named or files)}
+    intrinsics = [70, WIDTH / 2, HEIGHT / 2]
+    colors = np.zeros((len(POINTS), 3), np.uint8)
+    write_model(folder / "sparse/0", "SIMPLE_PINHOLE", (WIDTH, HEIGHT), intrinsics, poses, POINTS, colors, binary=False)
+    return folder
+
+
+def times_of(data: Dataset) -> dict[str, float]:
+    return {view.source.split("/images/")[-1]: view.time for view in (*data.train, *data.test)}
+
+
+def test_images_of_a_model_without_blank_lines(tmp_path: Path) -> None:
+    folder = write(tmp_path / "toy", [f"{i:04d}.png" for i in range(12)])
+    path = folder / "sparse/0/images.txt"
+    path.write_text("\n".join(line for line in path.read_text().split("\n") if "#" in line or ".png" in line))
+    assert len(times_of(load_dataset(folder))) == 12
+
+
+NAMES = {
+    "backslash": ("cam\\{:04d}.png", "cam/{:04d}.png"),
+    "two blanks": ("My  film/frame  {:04d}.png", "My  film/frame  {:04d}.png"),
+    "other blanks": ("My film/frame {:04d}.png", "My film/frame  {:04d}.png"),
+    "Unicode form": (unicodedata.normalize("NFD", "é/{:04d}.png"), unicodedata.normalize("NFC", "é/{:04d}.png")),
+    "letter case": ("CAM/{:04d}.jpg", "cam/{:04d}.JPG"),
+    "type": ("{:04d}.jpg", "{:04d}.jpeg"),
+}
+
+
+@pytest.mark.parametrize("kind", NAMES)
+def test_names_as_other_systems_write_them(kind: str, tmp_path: Path) -> None:
+    named, file = ([pattern.format(i) for i in range(12)] for pattern in NAMES[kind])
+    data = load_dataset(write(tmp_path / "toy", file, named=named))
+    assert set(times_of(data)) == set(file)
+    assert not any("left out" in warning for warning in data.warnings)
+
+
+def transforms(folder: Path, names: Sequence[str]) -> Path:
+    """The nerfstudio form of the same."""
+    flip = np.diag([1.0, -1, -1, 1])
+    frames = [
+        {"file_path": name, "transform_matrix": (np.linalg.inv(c.T_cam_world) @ flip).tolist(), "time": i / 11}
+        for i, (name, c) in enumerate(zip(names, cameras(12), strict=True))
+    ]
+    values = {"fl_x": 70, "fl_y": 70, "w": WIDTH, "h": HEIGHT, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(values))
+    shutil.rmtree(folder / "sparse")
+    return folder
+
+
+@pytest.mark.parametrize("form", ["COLMAP", "nerfstudio", "smaller", "D-NeRF"])
+def test_frames_without_an_image_are_left_out(form: str, tmp_path: Path) -> None:
+    names = [f"{i:04d}.png" for i in range(12)]
+    folder = write(tmp_path / "toy", names)
+    images = folder / "images"
+    if form != "COLMAP":
+        transforms(folder, [f"images/{name}" for name in names])
+    if form == "smaller":
+        images = images.rename(folder / "images_4")
+    if form == "D-NeRF":
+        (folder / "transforms.json").rename(folder / "transforms_train.json")
+        shutil.copyfile(folder / "transforms_train.json", folder / "transforms_test.json")
+    for name in names[2:4]:
+        (images / name).unlink()
+    data = load_dataset(folder)
+    views = data.train if form == "D-NeRF" else (*data.train, *data.test)
+    assert sorted(view.time for view in views) == pytest.approx([i / 11 for i in range(12) if i not in (2, 3)])
+    (warning, *_) = [warning for warning in data.warnings if "2 of 12 images" in warning]
+    assert "0002.png" in warning
+    (images / names[4]).unlink()
+    with pytest.raises(InputError, match=r"0002\.png does not exist.* 3 of 12 images"):
+        load_dataset(folder)
+
+
+@pytest.mark.parametrize("pattern", ["frame{t:06d}/cam{c:02d}.png", "cam{c:02d}/frame{t:06d}.png", "t{t:04d}/{c}.png"])
+@pytest.mark.parametrize("placed", [1, 3, 8])
+def test_folders_are_cameras_or_times(pattern: str, placed: int, tmp_path: Path) -> None:
+    """Also where the model holds a few images of each still camera only."""
+    files = {pattern.format(t=t + 1, c=c): (t, c) for t in range(8) for c in range(4)}
+    named = [file for file, (t, _) in files.items() if t < placed]
+    data = load_dataset(write(tmp_path / "toy", list(files), lambda i: 3 * (i % 4), named))
+    assert times_of(data) == {file: t / 7 for file, (t, _) in files.items()}
+    assert {files[view.source.split("/images/")[-1]][1] for view in data.test} == {0}
+    assert (len(data.test), len(data.cameras)) == (8, 3)
+    assert data.summary.startswith("COLMAP, 4 still cameras, 8 times from")
+    assert data.summary.endswith(" is held out")
+
+
+STAMPS = {
+    "phone": [f"IMG_20260110_{95848 + i if i < 12 else 95900 + i - 12:06d}.png" for i in range(16)],
+    "milliseconds": [f"PXL_20260110_0958{48 + i:02d}123.png" for i in range(12)],
+    "decimals": [f"{round(i / 30, 3)}.png" for i in range(24)],
+    "Unix": [f"{1305031102.175304 + 0.5 * i:.6f}.png" for i in range(12)],
+}
+
+
+@pytest.mark.parametrize("kind", STAMPS)
+def test_times_in_names(kind: str, tmp_path: Path) -> None:
+    files = STAMPS[kind]
+    data = load_dataset(write(tmp_path / "toy", files))
+    times = times_of(data)
+    expected = np.linspace(0, 1, len(files))
+    np.testing.assert_allclose([times[file] for file in files], expected, atol=1e-3 if kind == "decimals" else 1e-6)
+    assert not any("order" in warning for warning in data.warnings)
+
+
+def test_cameras_that_end_apart_are_named(tmp_path: Path) -> None:
+    counts = {"cam0": 6, "cam1": 6, "cam2": 12}
+    files = [f"{camera}/{t:02d}.png" for camera, count in counts.items() for t in range(count)]
+    named = [f"{camera}/00.png" for camera in counts]
+    data = load_dataset(write(tmp_path / "toy", files, lambda i: 4 * i, named))
+    (warning,) = [warning for warning in data.warnings if "different times" in warning]
+    assert "cam0, cam1 at 5, cam2 at 11" in warning
