@@ -117,7 +117,6 @@ def with_value(name: str, value: float, rows: tuple[int, ...] = (2,)) -> bytes:
     return ply_bytes(columns)
 
 
-NO_ROTATION = {f"rot_{i}": ("float", np.zeros(4)) for i in range(4)}
 PACKED = {f"packed_{name}": ("uint", [0, 0]) for name in ["position", "rotation", "scale", "color"]}
 # A file, and what the error must name.
 BAD: list[tuple[bytes, str]] = [
@@ -145,17 +144,18 @@ BAD: list[tuple[bytes, str]] = [
     (edit(b"vertex 4", b"vertex 3"), str(len(GOOD))),
     (GOOD[:SPLIT].replace(b"vertex 4", b"vertex 0") + b"end_header\n", "0 Gaussians"),
     (GOOD[:-1], str(len(GOOD) - 1)),
-    (GOOD + b"\n", str(len(GOOD) + 1)),
+    (GOOD + b"\n\n", str(len(GOOD) + 2)),
     (edit(b"end_header", b"element e 9\nproperty int a\nend_header"), "'e'"),
-    (edit(b"scale_2", b"scale_9"), "scale_2"),
+    (edit(b"scale_1", b"scale_9"), "scale_1"),
+    (edit(b"property float opacity", b"property float trbf_center"), "trbf_center"),
     (edit(b"f_rest_8", b"e_rest_8"), "f_rest_"),
     (edit(b"f_rest_8", b"f_rest_9"), "f_rest_8"),
     (ply_bytes(PACKED), "PlayCanvas"),
     (with_value("f_rest_3", np.nan, (1, 3)), "f_rest_3"),
     (with_value("x", -np.inf), "property x"),
     (with_value("scale_1", 45.0), "scale_1"),
-    (ply_bytes(columns_of(random_still(4, 0)) | {"opacity": ("double", np.full(4, 1e300))}), "opacity"),
-    (ply_bytes(columns_of(random_still(4, 0)) | NO_ROTATION), "rot_0"),
+    (ply_bytes(columns_of(random_still(4, 0)) | {"f_dc_0": ("double", np.full(4, 1e300))}), "f_dc_0"),
+    (with_value("opacity", -np.inf, (0, 1, 2, 3)), "opacity"),
 ]
 
 

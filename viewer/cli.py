@@ -44,7 +44,8 @@ def _view(arguments: list[str]) -> None:
         entry = _entry(given) if job == "window" else None
         from lapgs_wgpu.viewer.loaded_scene import load_scene
 
-        scene = load_scene(Path(given.file), device.result)
+        antialiased = None if given.antialiased is None else given.antialiased == "yes"
+        scene = load_scene(Path(given.file), device.result, up=given.up, antialiased=antialiased)
     if job == "window":
         _window(given, scene, entry)
     else:
@@ -192,11 +193,12 @@ def _export(given: Any, scene: LoadedScene) -> None:
     print(f"{file}: {line}, {loss.psnr:.1f} dB PSNR against {scene.path}")
     if loss.reason:
         print(f"warning: the loss is seen: {loss.reason}.", file=sys.stderr)
-    # Our own formats say whether the scene is antialiased.
+    # Our own formats say whether the scene is antialiased, and all programs that play them know it.
     if ending not in (".lapgs", ".html") and scene.playback.at(0.0).antialiased:
+        says = "a .4dgs cannot say" if ending == ".4dgs" else "its comment 'SplatRenderMode: mip' tells few viewers"
         print(
-            "note: the scene was trained antialiased, which a file for other viewers cannot say: where they offer "
-            "antialiased drawing, turn it on; elsewhere thin places look a little thicker.",
+            f"note: the scene was trained antialiased, which {says}: where they offer antialiased drawing, turn it on; "
+            "elsewhere thin places look a little thicker.",
             file=sys.stderr,
         )
 

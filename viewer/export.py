@@ -39,8 +39,12 @@ def export_still(scene: LoadedScene, file: Path, time: float, *, overwrite: bool
     always where it is the opened file, whose motion would be lost.
     """
     check_free(scene, file, overwrite)
-    write_ply(file, scene.playback.snapshot(time))
+    _write_still(scene, file, time)
     return _loss_of_still(scene, file, time)
+
+
+def _write_still(scene: LoadedScene, file: Path, time: float) -> None:
+    write_ply(file, scene.playback.snapshot(time), antialiased=scene.playback.at(time).antialiased)
 
 
 def _loss_of_still(scene: LoadedScene, file: Path, time: float) -> Loss:
@@ -69,7 +73,7 @@ def export_frames(scene: LoadedScene, folder: Path, frames: int, *, overwrite: b
     with Progress(frames, "frames") as progress:
         for number, time in enumerate(np.linspace(0, 1, frames).tolist()):
             file = folder / f"frame_{number:0{digits}}.ply"
-            write_ply(file, scene.playback.snapshot(time))
+            _write_still(scene, file, time)
             progress.step()
     return _loss_of_still(scene, file, time)
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.initial_view import InitialView
@@ -16,7 +18,7 @@ from lapgs_wgpu.motion.scene_file import SceneFile, read_scene
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.viewer.camera import ViewCamera
 from lapgs_wgpu.viewer.clock import Clock
-from lapgs_wgpu.viewer.render_modes import BACKGROUNDS
+from lapgs_wgpu.viewer.render_modes import AHEAD, BACKGROUNDS
 
 _ELEVATION = math.radians(35)  # of the guessed camera above the middle
 _FLAT = 0.5  # of the extents along x and y: what is lower lies on the ground
@@ -46,22 +48,31 @@ class LoadedScene(NamedTuple):
         return BACKGROUNDS.get(self.playback.metadata.get("background", ""), BACKGROUNDS["black"])
 
 
-def load_scene(path: Path, device: Callable[[], Device]) -> LoadedScene:
+def load_scene(
+    path: Path, device: Callable[[], Device], *, up: str | None = None, antialiased: bool | None = None
+) -> LoadedScene:
     """Open a checkpoint, a compact scene, or any 3DGS .ply. Raises InputError.
 
-    device: is asked for when the file has been read.
+    device: is asked for when the file has been read. up: axis of AHEAD that points up, antialiased: how the Gaussians
+    are drawn; both otherwise as the file says.
     """
     file = read_scene(path)
+    if antialiased is not None:
+        file = dataclasses.replace(file, antialiased=antialiased)
     playback = playback_of(file, device())
     initial_view = InitialView.from_json(playback.metadata.get("view", ""))
-    return LoadedScene(path, playback, initial_view or guess_view(playback), file)
+    if initial_view is None:
+        initial_view = guess_view(playback, up or file.metadata.get("up"))
+    elif up is not None:
+        initial_view = guess_view(playback, up)._replace(frames=initial_view.frames)
+    return LoadedScene(path, playback, initial_view, file)
 
 
-def guess_view(playback: Playback) -> InitialView:
+def guess_view(playback: Playback, axis: str | None = None) -> InitialView:
     """Guess a view of files that name no camera: the middle of the Gaussians, from where most of them are seen.
 
-    Up is -y, as in scenes whose poses come from COLMAP; z where the Gaussians lie flat in x and y, or the file is a
-    checkpoint of D-NeRF's scenes.
+    axis: of AHEAD, up. Where it is not known, up is -y, as in scenes whose poses come from COLMAP; z where the
+    Gaussians lie flat in x and y, or move, as in D-NeRF's scenes.
     """
     means = playback.means(0.0).astype(np.float64)
     if not len(means):
@@ -70,12 +81,21 @@ def guess_view(playback: Playback) -> InitialView:
     radius = max(float(np.quantile(np.linalg.norm(means - middle, axis=1), 0.9)), 1e-3)
     extent = np.subtract(*np.quantile(means, [0.9, 0.1], axis=0))
     flat = extent[2] < _FLAT * min(extent[0], extent[1])
-    if playback.metadata:
-        up, ahead = np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0])
+    if axis in AHEAD:
+        up, ahead = direction(axis), direction(AHEAD[axis])
+    elif playback.metadata.keys() - {"antialiased", "up", "offset"}:  # of a checkpoint
+        up, ahead = direction("z"), direction("y")
     elif flat:
-        up, ahead = np.array([0.0, 0.0, 1.0]), np.array([0.0, -1.0, 0.0])  # y points down in pictures
+        up, ahead = direction("z"), direction("-y")  # y points down in pictures
     else:
-        up, ahead = np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, 1.0])
+        up, ahead = direction("-y"), direction("z")
     away = math.sin(_ELEVATION) * up - math.cos(_ELEVATION) * ahead
     camera = Camera.looking_at(middle + 3.6 * radius * away, middle, up=up.tolist(), fov_x=0.9, width=640, height=480)
     return InitialView(camera, middle, up, _FRAMES)
+
+
+def direction(axis: str) -> NDArray[np.float64]:
+    """Return the unit vector (3,) of an axis, such as "x" or "-y"."""
+    vector = np.zeros(3)
+    vector["xyz".index(axis[-1])] = -1.0 if axis.startswith("-") else 1.0
+    return vector

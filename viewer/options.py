@@ -11,7 +11,7 @@ from typing import Any
 from lapgs_wgpu.command import DEVICE_HELP, LIST_DEVICES_HELP, HelpFormatter, Parser
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.viewer.clock import LOOPS
-from lapgs_wgpu.viewer.render_modes import BACKGROUNDS, MODES
+from lapgs_wgpu.viewer.render_modes import AHEAD, BACKGROUNDS, MODES
 
 DESCRIPTION = """\
 Display a trained scene, or any 3DGS .ply file, at any time and from any viewpoint.
@@ -36,7 +36,7 @@ Without a display:
 """
 
 # What a call does -> the options that it takes beside --device and the one that chooses it.
-_PICTURE = {"time", "mode", "background", "view"}
+_PICTURE = {"time", "mode", "background", "view", "up", "antialiased"}
 _WINDOW = _PICTURE | {"time_slider", "play", "fps", "speed", "loop", "backend"}
 _TAKES = {
     "a window": _WINDOW | {"size"},
@@ -44,11 +44,11 @@ _TAKES = {
     "--list-devices": set[str](),
     "--screenshot": _PICTURE | {"size"},
     "--video": _PICTURE | {"size", "path", "fps", "seconds"},
-    "--export FILE.ply": {"time", "overwrite"},
-    "--export FILE.lapgs": {"overwrite"},
-    "--export FILE.html": {"overwrite"},
-    "--export FILE.4dgs": {"max_error", "overwrite"},
-    "--export DIR": {"frames", "overwrite"},
+    "--export FILE.ply": {"time", "antialiased", "overwrite"},
+    "--export FILE.lapgs": {"up", "antialiased", "overwrite"},
+    "--export FILE.html": {"up", "antialiased", "overwrite"},
+    "--export FILE.4dgs": {"up", "max_error", "overwrite"},
+    "--export DIR": {"frames", "antialiased", "overwrite"},
 }
 _JOBS = ("list_devices", "screenshot", "video", "export")
 
@@ -101,6 +101,10 @@ def _parse(arguments: Sequence[str]) -> Any:
     add("--background", choices=list(BACKGROUNDS), help="color behind the Gaussians [the training's, otherwise black]")
     add("--size", type=_size, metavar="WxH", help="pixels [1280x720, or of a picture that of --view or of the camera "
         "path]")
+    add("--up", choices=list(AHEAD), help="axis that points up, of a file without cameras [where the file says, "
+        "otherwise -y, or z of what lies flat]")
+    add("--antialiased", choices=("yes", "no"), help="draw as antialiased trainings do (Mip-Splatting's filter); also "
+        "of exports [what the file says]")
     add("--view", metavar="N|NAME", help="camera of the capture by name or number; test views come first [where the "
         "file says, otherwise one that shows the whole scene]")
 
@@ -134,6 +138,10 @@ def _parse(arguments: Sequence[str]) -> Any:
     add("--frames", type=_whole(1, 100_000), metavar="N", help="number of files in DIR, at times evenly from 0 to 1")
     add("--overwrite", action="store_const", const=True, help="replace an existing file, or the frame_*.ply in DIR")
     # fmt: on
+    arguments = list(arguments)
+    if "--up" in arguments[:-1]:  # "-y" alone would be an option to the parser
+        at = arguments.index("--up")
+        arguments[at : at + 2] = [f"--up={arguments[at + 1]}"]
     return parser.parse_args(arguments)
 
 

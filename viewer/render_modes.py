@@ -1,4 +1,4 @@
-"""Render modes, backgrounds and comparisons: constants that load neither torch nor wgpu."""
+"""Render modes, backgrounds, comparisons and vertical axes: constants that load neither torch nor wgpu."""
 
 from __future__ import annotations
 
@@ -15,4 +15,6 @@ MODES: dict[Mode, str] = {
     "dynamics": "norm of each Gaussian's dynamics attribute",
     "scale": "largest standard deviation of each Gaussian, world units",
 }
+# Axis that points up -> the one along which the guessed camera looks.
+AHEAD = {"x": "y", "y": "-z", "z": "y", "-x": "y", "-y": "z", "-z": "y"}
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "grey": (0.5, 0.5, 0.5)}

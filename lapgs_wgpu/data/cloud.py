@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -11,13 +12,13 @@ from numpy.typing import NDArray
 
 from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.io.ply_colors import read_colors
 from lapgs_wgpu.io.ply_elements import Floats, open_ply
 from lapgs_wgpu.splat.camera import Camera
 
 Array = NDArray[np.float64]
 
 CAMERA_SAMPLES = 64  # cameras that suffice to determine which points are seen
-COLORS = ["red", "green", "blue"]
 DENSITY, MIN_CELLS = 8, 4  # points per cell, on average; cells along an axis
 FILLED = 0.95  # share of cells with points from which on a cloud is random: the surfaces of a scene leave most empty
 
@@ -62,17 +63,22 @@ def read_cloud(path: Path) -> Cloud:
 
 
 def read_points(path: Path) -> tuple[Floats, Floats | None]:
-    """Read positions (N, 3) of a .ply file, and colors (N, 3) in [0, 1], None unless red, green and blue are bytes.
+    """Read positions (N, 3) of a .ply file, and colors (N, 3) in [0, 1], None where it has none that are known.
 
-    Values may be NaN or infinite. Raises InputError if the file is not a point cloud.
+    Positions may be NaN or infinite. Raises InputError if the file is not a point cloud.
     """
     with open_ply(path) as ply:
         vertex = ply.elements.get("vertex")
         if vertex is None or not {"x", "y", "z"} <= set(vertex.properties):
             raise InputError(f"{path}: has no element vertex with properties x, y, z, so it is no cloud of points.")
-        colored = all(vertex.properties.get(name) == np.uint8 for name in COLORS)
-        values = ply.columns(vertex, ["x", "y", "z", *(COLORS if colored else [])])
-        return values[:, :3].copy(), values[:, 3:] / np.float32(255) if colored else None
+        points, colors = ply.columns(vertex, ["x", "y", "z"]), read_colors(ply, vertex)
+        others = [name for name in vertex.properties if name not in ("x", "y", "z", "nx", "ny", "nz")]
+        if colors is None and others:
+            print(
+                f"note: {path}: no colors are known in the properties {', '.join(others[:5])}; points start gray.",
+                file=sys.stderr,
+            )
+        return points, colors
 
 
 def read_npy(path: Path) -> NDArray[np.floating]:

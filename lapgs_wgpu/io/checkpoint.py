@@ -17,6 +17,7 @@ from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.io.ply import GaussianSnapshot, ply_header, read_gaussians, vertex_rows
 from lapgs_wgpu.io.ply_elements import PathLike, PlyFile, open_ply
+from lapgs_wgpu.io.ply_foreign import read_foreign
 from lapgs_wgpu.io.safetensors_file import pack_tensors, unpack_tensors
 
 VERSION = 1
@@ -24,7 +25,8 @@ _ELEMENT = "lapgs4d"
 
 
 class Checkpoint(NamedTuple):
-    """still: Gaussians at the reference time. tensors, metadata: the motion; both empty for other 3DGS files."""
+    """still: Gaussians at the reference time. tensors, metadata: the motion. Other 3DGS files have no tensors, and as
+    metadata what `read_foreign` finds in them."""
 
     still: GaussianSnapshot
     tensors: dict[str, NDArray[Any]]
@@ -54,13 +56,15 @@ def write_checkpoint(
 
 
 def read_checkpoint(path: PathLike) -> Checkpoint:
-    """Read a checkpoint, or any 3DGS .ply file: tensors and metadata are then empty.
+    """Read a checkpoint, or any 3DGS .ply file, which has no tensors.
 
     Raises InputError when the file is neither, is damaged, or holds NaN or infinity.
     """
     with open_ply(path) as ply:
-        still = read_gaussians(ply)
-        return Checkpoint(still, *(_read_motion(ply) if _ELEMENT in ply.elements else ({}, {})))
+        if _ELEMENT in ply.elements:
+            return Checkpoint(read_gaussians(ply), *_read_motion(ply))
+        still, metadata = read_foreign(ply)
+        return Checkpoint(still, {}, metadata)
 
 
 def _read_motion(ply: PlyFile) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:

@@ -16,6 +16,7 @@ from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.io.ply_elements import Element, Floats, PathLike, PlyFile
 
 MAX_LOG_SCALE = 44.0  # exp(2 * 44) still fits in float32: the variance is finite
+ANTIALIASED = "SplatRenderMode: mip"  # comment of files whose Gaussians are drawn antialiased
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,19 +63,20 @@ def _names(rest: int) -> list[str]:
 _WRITTEN_NAMES = [*_names(0)[:3], "nx", "ny", "nz", *_names(45)[3:]]
 
 
-def write_ply(path: PathLike, still: GaussianSnapshot) -> None:
+def write_ply(path: PathLike, still: GaussianSnapshot, *, antialiased: bool = False) -> None:
     """Write Gaussians with exactly the 62 properties of 3DGS, SH padded with zeros to degree 3. Atomic.
 
-    Raises InputError when the file cannot be written or a value could not be read back.
+    antialiased: adds the comment by which Brush and others tell how the Gaussians are drawn. Raises InputError when
+    the file cannot be written or a value could not be read back.
     """
     rows = vertex_rows(still, path)
     with atomic_write(path) as file:
-        file.write(ply_header(len(still)))
+        file.write(ply_header(len(still), f"comment {ANTIALIASED}\n" if antialiased else ""))
         file.write(rows.data)
 
 
 def ply_header(count: int, trailer: str = "") -> bytes:
-    """The header for `count` Gaussians. trailer: lines of further elements."""
+    """The header for `count` Gaussians. trailer: lines of comments and further elements."""
     properties = "".join(f"property float {name}\n" for name in _WRITTEN_NAMES)
     # Some viewers expect the count on the third line.
     return f"ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{properties}{trailer}end_header\n".encode()
@@ -98,20 +100,29 @@ def vertex_rows(still: GaussianSnapshot, path: PathLike) -> Floats:
 
 
 def read_gaussians(ply: PlyFile) -> GaussianSnapshot:
-    """The Gaussians of an opened 3DGS .ply: properties in any order, SH degree 0 to 3, further scalar ones skipped.
+    """The Gaussians of an opened checkpoint: properties in any order, SH degree 0 to 3, further scalar ones skipped.
 
     Takes memory for about twice the Gaussians. Raises InputError when the file is not such a file, is damaged, or holds
     a value that cannot be rendered.
     """
+    vertex = vertex_of(ply)
+    names = gaussian_names(vertex, set(vertex.properties), ply.path)
+    return snapshot_of(ply.columns(vertex, names), names, ply.path)
+
+
+def vertex_of(ply: PlyFile) -> Element:
+    """The element that holds Gaussians. Raises InputError where there is none."""
     if "vertex" not in ply.elements:
         raise InputError(
             f"{ply.path}: has no element vertex without a list, so it holds no Gaussians; give a 3DGS .ply file"
         )
-    vertex = ply.elements["vertex"]
-    rest = _rest_count(vertex, ply.path)
-    names = _names(rest)
-    values = ply.columns(vertex, names)
-    _check_values(values, names, f"{ply.path}:")
+    return ply.elements["vertex"]
+
+
+def snapshot_of(values: Floats, names: list[str], path: PathLike) -> GaussianSnapshot:
+    """The Gaussians of columns (N, len(names)) in the order of `gaussian_names`. Raises InputError as above."""
+    _check_values(values, names, f"{path}:")
+    rest = len(names) - len(_names(0))
     end = 6 + rest  # of the colors
     sh = np.empty((len(values), 1 + rest // 3, 3), np.float32)
     sh[:, 0] = values[:, 3:6]
@@ -125,8 +136,11 @@ def read_gaussians(ply: PlyFile) -> GaussianSnapshot:
     )
 
 
-def _rest_count(vertex: Element, path: PathLike) -> int:
-    """Number of f_rest_* properties. Raises InputError unless the layout is complete and supported."""
+def gaussian_names(vertex: Element, known: set[str], path: PathLike) -> list[str]:
+    """Names of all columns that Gaussians need, in the order of 3DGS.
+
+    known: properties that the file has, or that follow from others. Raises InputError unless these are complete.
+    """
     properties = vertex.properties
     if "packed_position" in properties:
         raise InputError(
@@ -138,7 +152,8 @@ def _rest_count(vertex: Element, path: PathLike) -> int:
         raise InputError(
             f"{path}: has {rest} properties f_rest_*, where spherical harmonics of degree 0 to 3 have 0, 9, 24 or 45"
         )
-    missing = [name for name in _names(rest) if name not in properties]
+    names = _names(rest)
+    missing = [name for name in names if name not in known]
     if missing:
         more = f" and {len(missing) - 5} more" if len(missing) > 5 else ""
         raise InputError(
@@ -147,7 +162,7 @@ def _rest_count(vertex: Element, path: PathLike) -> int:
         )
     if vertex.count == 0:
         raise InputError(f"{path}: holds 0 Gaussians; at least 1 is needed")
-    return rest
+    return names
 
 
 def _check_values(values: Floats, names: list[str], where: str) -> None:

@@ -12,6 +12,7 @@ import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
@@ -54,17 +55,25 @@ class Element:
 
 
 class PlyFile(NamedTuple):
-    """An opened file. header_bytes: its header's length. elements: by name, those whose place is known."""
+    """An opened file. header_bytes: its header's length. elements: by name, those whose place is known. comments: of
+    the whole header, in their order."""
 
     file: BinaryIO
     path: PathLike
     encoding: str
     header_bytes: int
     elements: dict[str, Element]
+    comments: list[str]
 
     def columns(self, element: Element, names: list[str]) -> Floats:
         """(N, len(names)) float32: the named properties of all rows of an element. Raises InputError."""
-        values = np.empty((element.count, len(names)), np.float32)
+        return self._columns(element, names, np.empty((element.count, len(names)), np.float32))
+
+    def exact_columns(self, element: Element, names: list[str]) -> NDArray[np.float64]:
+        """As `columns`, in float64."""
+        return self._columns(element, names, np.empty((element.count, len(names)), np.float64))
+
+    def _columns(self, element: Element, names: list[str], values: NDArray[Any]) -> NDArray[Any]:
         with np.errstate(all="ignore"):  # a double beyond float32 becomes infinite, which callers report
             if self.encoding == "ascii":
                 columns = [list(element.properties).index(name) for name in names]
@@ -114,13 +123,28 @@ def open_ply(path: PathLike) -> Iterator[PlyFile]:
     try:
         mode = os.stat(path).st_mode  # before opening: a pipe would block, a device could be endless
         if stat.S_ISDIR(mode):
-            raise InputError(f"{path}: is a folder; give a .ply file, for example the checkpoint.ply in it.")
+            raise InputError(f"{path}: is a folder{_advice(Path(path))}.")
         if not stat.S_ISREG(mode):
             raise InputError(f"{path}: is not a regular file; give a .ply file.")
         with open(path, "rb") as file:
             yield _read_header(file, path)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the path.") from error
+
+
+def _advice(folder: Path) -> str:
+    """What to give in place of a folder."""
+    names = sorted(file.name for file in folder.glob("*.ply"))
+    if not names:
+        return " without a .ply file; give the .ply file itself"
+    if "checkpoint.ply" in names:
+        return "; give a .ply file, for example the checkpoint.ply in it"
+    if len(names) == 1:
+        return f"; give the file {names[0]} in it"
+    return (
+        f" of {len(names)} .ply files; a sequence of stills is not played, and one of them can be shown, for example "
+        f"{names[0]}"
+    )
 
 
 def _read_header(file: BinaryIO, path: PathLike) -> PlyFile:
@@ -138,8 +162,9 @@ def _read_header(file: BinaryIO, path: PathLike) -> PlyFile:
         )
     lines = head[: end.start()].decode(errors="replace").split("\n")[1:-1]  # comments may be in any encoding
     encoding, elements = _parse_lines(lines, path)
-    size = os.fstat(file.fileno()).st_size
-    return PlyFile(file, path, encoding, end.end(), _place(elements, encoding, end.end(), size, path))
+    comments = [" ".join(line.split()[1:]) for line in lines if line.startswith(("comment", "obj_info"))]
+    placed = _place(elements, encoding, end.end(), file, path)
+    return PlyFile(file, path, encoding, end.end(), placed, comments)
 
 
 def _parse_lines(lines: list[str], path: PathLike) -> tuple[str, dict[str, Element]]:
@@ -178,9 +203,11 @@ def _parse_lines(lines: list[str], path: PathLike) -> tuple[str, dict[str, Eleme
     return encoding, elements
 
 
-def _place(elements: dict[str, Element], encoding: str, start: int, size: int, path: PathLike) -> dict[str, Element]:
+def _place(
+    elements: dict[str, Element], encoding: str, start: int, file: BinaryIO, path: PathLike
+) -> dict[str, Element]:
     """Set the offsets of the elements before the first with lists, and return them. They must fill the file."""
-    text = encoding == "ascii"
+    text, size = encoding == "ascii", os.fstat(file.fileno()).st_size
     end, line = start, 0
     placed: dict[str, Element] = {}
     for element in elements.values():
@@ -197,7 +224,8 @@ def _place(elements: dict[str, Element], encoding: str, start: int, size: int, p
                 f"{path}: element {element.name[:40]!r} ({element.count} rows of {stride} bytes) would end at byte "
                 f"{end}, but the file has {size} bytes: it is truncated or its header is wrong."
             )
-    if end < size and not text:
+    file.seek(end)
+    if not text and file.read(3) not in (b"", b"\n", b"\r\n"):  # some programs append a line's end
         raise InputError(
             f"{path}: its header declares {end} bytes, but the file has {size}: a count is wrong or something was "
             "appended."

@@ -70,7 +70,8 @@ def read_scene(path: str | os.PathLike[str]) -> SceneFile:
             "gaussians.sh_dc": sh[:, :1],
             "gaussians.sh_rest": sh[:, 1:],
         }
-        config, degree, antialiased, timing = FieldConfig(kind="static"), still.sh_degree, False, EVEN
+        config, degree, timing = FieldConfig(kind="static"), still.sh_degree, EVEN
+        antialiased = metadata.get("antialiased") == "true"
     else:
         config, degree, antialiased, timing = _read_header(metadata, path)
     count = len(still.means)

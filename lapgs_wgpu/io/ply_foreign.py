@@ -1,0 +1,136 @@
+"""Gaussians in .ply files of other programs: what their variants mean, and what their comments say."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+
+import numpy as np
+
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.io.ply import MAX_LOG_SCALE, GaussianSnapshot, gaussian_names, snapshot_of, vertex_of
+from lapgs_wgpu.io.ply_colors import SH_C0, read_colors
+from lapgs_wgpu.io.ply_elements import Element, Floats, PathLike, PlyFile
+
+_MOTION = re.compile("(trbf|motion|omega|velocity|rot_r)_.*|t|scal(e|ing)_t|t_scale", re.IGNORECASE)
+_FLAT = float(np.log(1e-7))  # log of the smallest scale that is drawn
+_OPAQUE = 20.0  # its sigmoid is 1 in float32
+_BAD_SHARE = 0.01  # of all rows: up to it rows with NaN are left out, above it the file is damaged
+_FAR = 100.0  # distance of the scene's middle from the origin, in extents of the scene
+
+
+def read_foreign(ply: PlyFile) -> tuple[GaussianSnapshot, dict[str, str]]:
+    """The Gaussians of a 3DGS .ply of any program, and as metadata what else it says. Notes go to stderr.
+
+    Metadata: `antialiased` is "true" where a comment says so; `up`, an axis such as "z" or "-y", is the comment's
+    vertical axis; `offset` is a JSON list of 3 numbers, which were taken off the means.
+
+    Degree 0 may be given as colors, and the third scale of flat Gaussians be missing. An infinite opacity is opaque, or
+    leaves the Gaussian out; a scale of 0 is flat; a quaternion of 0 does not turn. A few rows that cannot be rendered
+    are left out. Raises InputError for all else that `snapshot_of` refuses, and for Gaussians that move.
+    """
+    vertex = vertex_of(ply)
+    _refuse_motion(vertex, ply.path)
+    values, names = _columns(ply, vertex)
+    metadata = _comments(ply)
+    offset = _take_off_offset(ply, vertex, values)
+    if offset is not None:
+        metadata["offset"] = json.dumps(offset)
+        _note(ply.path, f"lies far from the origin: {offset} is taken off all coordinates")
+    return snapshot_of(_mended(values, ply.path), names, ply.path), metadata
+
+
+def _note(path: PathLike, text: str) -> None:
+    print(f"note: {path}: {text}.", file=sys.stderr)
+
+
+def _refuse_motion(vertex: Element, path: PathLike) -> None:
+    found = [name for name in vertex.properties if _MOTION.fullmatch(name)]
+    if found:
+        more = f" and {len(found) - 5} more" if len(found) > 5 else ""
+        raise InputError(
+            f"{path}: its Gaussians move (properties {', '.join(found[:5])}{more}), as in Spacetime Gaussians, in a "
+            "way that is not played; give a .ply that its program exports at one time"
+        )
+
+
+def _columns(ply: PlyFile, vertex: Element) -> tuple[Floats, list[str]]:
+    """All columns (N, C) that Gaussians need, and their names; those that the file lacks follow from others."""
+    held = set(vertex.properties)
+    missing: dict[str, Floats | float] = {}
+    if {"scale_0", "scale_1"} <= held and "scale_2" not in held:
+        missing["scale_2"] = _FLAT
+    if not held & {"f_dc_0", "f_dc_1", "f_dc_2"} and "opacity" in held:
+        colors = read_colors(ply, vertex)
+        if colors is not None:
+            missing |= {f"f_dc_{i}": (colors[:, i] - 0.5) / np.float32(SH_C0) for i in range(3)}
+    names = gaussian_names(vertex, held | set(missing), ply.path)
+    if not missing:
+        return ply.columns(vertex, names), names
+    values = np.empty((vertex.count, len(names)), np.float32)
+    present = [name for name in names if name not in missing]
+    values[:, [names.index(name) for name in present]] = ply.columns(vertex, present)
+    for name, column in missing.items():
+        values[:, names.index(name)] = column
+    return values, names
+
+
+def _comments(ply: PlyFile) -> dict[str, str]:
+    text = "\n".join(ply.comments)
+    metadata = {}
+    if re.search(r"SplatRenderMode\s*[:=]\s*mip", text, re.IGNORECASE):
+        metadata["antialiased"] = "true"
+    axis = re.search(r"vertical[ _]axis\s*[:=]\s*\+?(-?[xyz])\b", text, re.IGNORECASE)
+    if axis:
+        metadata["up"] = axis[1].lower()
+    return metadata
+
+
+def _take_off_offset(ply: PlyFile, vertex: Element, values: Floats) -> list[float] | None:
+    """Move the means in `values` to the origin where float32 would hold few digits of them; return what is taken off.
+
+    Read in float64: in float32 such places are terraces.
+    """
+    exact = ply.exact_columns(vertex, ["x", "y", "z"])
+    with np.errstate(all="ignore"):
+        finite = exact[np.abs(exact).max(axis=1) < np.finfo(np.float32).max]
+    if not len(finite):
+        return None
+    low, middle, high = np.quantile(finite, [0.05, 0.5, 0.95], axis=0)
+    extent = float((high - low).max())
+    if not extent > 0 or np.abs(middle).max() < _FAR * extent:
+        return None
+    offset = np.round(middle, max(0, -int(np.floor(np.log10(extent)))))
+    with np.errstate(all="ignore"):
+        values[:, :3] = exact - offset
+    return [float(value) for value in offset]
+
+
+def _mended(values: Floats, path: PathLike) -> Floats:
+    """Replace in columns what is legal and cannot be rendered as it is, and leave out rows."""
+    opacities, scales, quats = values[:, -8], values[:, -7:-4], values[:, -4:]
+    invisible = opacities == -np.inf
+    opacities[opacities == np.inf] = _OPAQUE
+    scales[scales == -np.inf] = _FLAT
+    largest = np.abs(quats).max(axis=1)
+    unusual = ~((largest > 1e-12) & (largest < 1e12)) & np.isfinite(largest)
+    quats[unusual & (largest > 0)] /= largest[unusual & (largest > 0), None]
+    quats[unusual & (largest == 0)] = [1, 0, 0, 0]
+    bad = ~np.isfinite(values).all(axis=1) & ~invisible
+    bad |= (scales > MAX_LOG_SCALE).any(axis=1) & ~invisible
+    if bad.mean() > _BAD_SHARE:
+        return values  # refused as a whole
+    if bad.any():
+        _note(path, f"{bad.sum()} of {len(bad)} Gaussians hold NaN or infinite values and are left out")
+    if invisible.all():
+        raise InputError(f"{path}: no Gaussian is visible (property opacity is minus infinity in all {len(bad)} rows)")
+    kept = ~(bad | invisible)
+    shown = values if kept.all() else values[kept]
+    if (shown[:, -7:-4] > 0).all() and ((shown[:, -8] >= 0) & (shown[:, -8] <= 1)).all() and len(shown) > 1:
+        _note(
+            path,
+            "all opacities lie in 0 to 1 and all scales above 0, as after their activation; 3DGS files hold logits and "
+            "logarithms, and these are shown as such",
+        )
+    return shown
