@@ -191,8 +191,10 @@ def _parse_lines(lines: list[str], path: PathLike) -> tuple[str, dict[str, Eleme
                 last.has_lists = True
             case ["property", kind, name]:
                 if last is None or kind not in _SCALARS:
-                    what = "stands before any element" if last is None else f"has an unknown type {kind[:40]!r}"
-                    raise InputError(f"{where} {what}; the file is damaged.")
+                    what = (
+                        "stands before any element" if last is None else f"has the type {kind[:40]!r}, unknown in PLY"
+                    )
+                    raise InputError(f"{where} {what}; write the file again with another program.")
                 if name in last.properties:
                     raise InputError(f"{where} declares a property a second time; the file is damaged.")
                 last.properties[name] = np.dtype(_BYTE_ORDERS.get(encoding, "<") + _SCALARS[kind])
@@ -206,14 +208,18 @@ def _parse_lines(lines: list[str], path: PathLike) -> tuple[str, dict[str, Eleme
 def _place(
     elements: dict[str, Element], encoding: str, start: int, file: BinaryIO, path: PathLike
 ) -> dict[str, Element]:
-    """Set the offsets of the elements before the first with lists, and return them. They must fill the file."""
+    """Set the offsets of the elements and return those without lists, of a binary file before the first with lists.
+
+    They must fill the file.
+    """
     text, size = encoding == "ascii", os.fstat(file.fileno()).st_size
     end, line = start, 0
     placed: dict[str, Element] = {}
     for element in elements.values():
-        if element.has_lists:
+        if element.has_lists and not text:
             return placed
-        placed[element.name] = element
+        if not element.has_lists:
+            placed[element.name] = element
         element.offset = line if text else end
         # In text, a value takes a character and the blank or the line's end behind it.
         stride = max(2 * len(element.properties), 1) if text else element.stride

@@ -7,6 +7,7 @@ import re
 import sys
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.ply import MAX_LOG_SCALE, GaussianSnapshot, gaussian_names, snapshot_of, vertex_of
@@ -90,21 +91,28 @@ def _comments(ply: PlyFile) -> dict[str, str]:
 def _take_off_offset(ply: PlyFile, vertex: Element, values: Floats) -> list[float] | None:
     """Move the means in `values` to the origin where float32 would hold few digits of them; return what is taken off.
 
-    Read in float64: in float32 such places are terraces.
+    Such places are read again in float64: in float32 they are terraces.
     """
-    exact = ply.exact_columns(vertex, ["x", "y", "z"])
-    with np.errstate(all="ignore"):
-        finite = exact[np.abs(exact).max(axis=1) < np.finfo(np.float32).max]
-    if not len(finite):
+    middle, extent = _middle_and_extent(values[:, :3].astype(np.float64))
+    if np.abs(middle).max() <= _FAR * extent:
         return None
-    low, middle, high = np.quantile(finite, [0.05, 0.5, 0.95], axis=0)
-    extent = float((high - low).max())
-    if not extent > 0 or np.abs(middle).max() < _FAR * extent:
+    exact = ply.exact_columns(vertex, ["x", "y", "z"])
+    middle, extent = _middle_and_extent(exact)
+    if extent == 0:
         return None
     offset = np.round(middle, max(0, -int(np.floor(np.log10(extent)))))
     with np.errstate(all="ignore"):
         values[:, :3] = exact - offset
     return [float(value) for value in offset]
+
+
+def _middle_and_extent(means: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """Median (3,) of means (N, 3), and the longest side of the box around nine tenths of them; 0 of no finite ones."""
+    finite = means[np.isfinite(means).all(axis=1)]
+    if not len(finite):
+        return np.zeros(3), 0.0
+    low, middle, high = np.quantile(finite, [0.05, 0.5, 0.95], axis=0)
+    return middle, float((high - low).max())
 
 
 def _mended(values: Floats, path: PathLike) -> Floats:
