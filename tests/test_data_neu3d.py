@@ -450,7 +450,8 @@ def test_videos_have_bounds(clip: Path, monkeypatch: pytest.MonkeyPatch) -> None
     with pytest.raises(InputError, match=r"cam00\.mp4 has frames of 64x48 pixels, and at most 3,071 pixels"):
         load_dataset(clip)
     recording = video_frames.Video.__new__(video_frames.Video)
-    recording.path, recording.frames, recording.size, recording._turns = clip / "cam02.mp4", 3, (WIDTH, HEIGHT), 0
+    recording.path, recording.frames, recording.size = clip / "cam02.mp4", 3, (WIDTH, HEIGHT)
+    recording._display = video_frames.Display(0, mirrored=False)
     with pytest.raises(InputError, match=r"cam02\.mp4"):  # the decoder has the bound, too
         recording.read(0, (WIDTH, HEIGHT))
 
