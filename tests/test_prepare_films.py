@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from helpers.films import noise_pictures, turn_film, write_film
 from PIL import Image
 
+from lapgs_wgpu.data.video_frames import display
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.prepare.film import Film
 from lapgs_wgpu.prepare.hdr import Transfer, to_sdr
@@ -163,3 +167,26 @@ def test_common_times() -> None:
         assert np.ptp([picture.seconds for picture in pictures]) < 1e-6, "0, 0.2, ... are those of all three"
         assert not 0.45 < pictures[0].seconds < 0.95
     assert common_times(cameras[:2], 10, 99)[5][1].seconds == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("matrix", "shown"),
+    [
+        ((1, 0, 0, 1), lambda image: image),
+        ((-1, 0, 0, 1), np.fliplr),
+        ((1, 0, 0, -1), np.flipud),
+        ((-1, 0, 0, -1), lambda image: np.rot90(image, 2)),
+        ((0, 1, -1, 0), lambda image: np.rot90(image, -1)),
+        ((0, -1, 1, 0), np.rot90),
+        ((0, 1, 1, 0), lambda image: image.swapaxes(0, 1)),
+        ((0, -1, -1, 0), lambda image: np.rot90(image, 2).swapaxes(0, 1)),
+    ],
+)
+def test_mirrored_and_turned_films(matrix: tuple[int, ...], shown: Callable[[Any], Any]) -> None:
+    """(a, b, c, d) of a display matrix: x' = a x + c y, y' = b x + d y."""
+    a, b, c, d = matrix
+    values = np.array([a, b, 0, c, d, 0, 0, 0, 1 << 14], np.int32) << 16
+    how = display(SimpleNamespace(side_data={"DISPLAYMATRIX": values.tobytes()}))
+    image = np.arange(12).reshape(3, 4)
+    np.testing.assert_array_equal(how.apply(image), shown(image))
+    assert how.size((4, 3)) == shown(image).shape[::-1]

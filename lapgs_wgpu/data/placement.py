@@ -103,15 +103,17 @@ def _cube(capture: Capture, cameras: Sequence[Camera], depths: tuple[float, floa
 def _cube_of_cloud(points: Array, cameras: Sequence[Camera]) -> Cube:
     """The cube of a cloud's points that at least two cameras see.
 
-    A scan may reach far beyond what the cameras look at, and be seen there, too. Then, points count that at least half
-    as many cameras see as see the point that most see.
+    A scan may reach far beyond what the cameras look at, and be seen there, too. Then, points count that are near the
+    cameras' focus, and that at least half as many cameras see as see the point that most see.
     """
     seen = views_of(points, cameras)
     twice = seen >= min(2, len(cameras))
     cube, viewed = cube_of_points(points[twice] if twice.any() else points), cube_in_view(cameras)
     if viewed is None or cube.half <= TOO_WIDE * viewed.half:
         return cube
-    return cube_of_points(points[2 * seen >= seen.max()])
+    near = np.abs(points - viewed.center).max(axis=1) <= TOO_WIDE * viewed.half
+    chosen = near & (2 * seen >= seen.max(where=near, initial=0))
+    return cube_of_points(points[chosen]) if chosen.any() else cube
 
 
 def _filled(cloud: Cloud, cameras: Sequence[Camera]) -> Cloud:
