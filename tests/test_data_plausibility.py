@@ -97,17 +97,11 @@ def test_rotations_of_six_digits_leave_cameras_where_they_are() -> None:
 
 def test_coordinates_far_from_the_origin(tmp_path: Path) -> None:
     """Six digits of rotation in transforms.json, and a cloud of COLMAP."""
-    points = RNG.uniform(-0.5, 0.5, (500, 3)) + MIDDLE
-    colors = np.full((500, 3), 99, np.uint8)
     for name, offset in (("near", np.zeros(3)), ("far", UTM)):
         move = Normalization(-offset, 1.0)
         poses = {f"{i}.png": move.camera(camera) for i, camera in enumerate(CAMERAS)}
-        K = CAMERAS[0].K
-        parameters = [K[0, 0], K[1, 1], WIDTH / 2, HEIGHT / 2]
         folder = tmp_path / name
-        write_model(
-            folder / "sparse/0", "PINHOLE", (WIDTH, HEIGHT), parameters, poses, points + offset, colors, binary=True
-        )
+        write_model(folder / "sparse/0", poses, "PINHOLE", {}, binary=True, offset=offset)
         (folder / "images").mkdir()
         for image in poses:
             as_png(PICTURE, folder / "images" / image)
@@ -115,7 +109,7 @@ def test_coordinates_far_from_the_origin(tmp_path: Path) -> None:
     assert near.cloud is not None
     assert far.cloud is not None
     assert far.cloud.points.dtype == np.float32
-    np.testing.assert_allclose(far.cloud.points[:500], near.cloud.points[:500], atol=1e-6)
+    np.testing.assert_allclose(far.cloud.points[:40], near.cloud.points[:40], atol=1e-6)
     near, far = (
         load_dataset(capture(tmp_path / f"{digits}", offset=o, digits=digits)) for digits, o in ((9, 0), (6, UTM))
     )

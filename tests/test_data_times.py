@@ -10,14 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.captures import HEIGHT, WIDTH, Blobs, cameras, write_model
+from helpers.captures import HEIGHT, WIDTH, cameras, write_model
 from PIL import Image
 
 from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.errors import InputError
-
-POINTS = Blobs.random().means.double().numpy()
 
 
 def write(
@@ -30,9 +28,7 @@ def write(
         Image.fromarray(rng.integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)).save(folder / "images" / file)
     taken = cameras(12)
     poses = {name: taken[pose(i) if pose else i % 12] for i, name in enumerate(named or files)}
-    intrinsics = [70, WIDTH / 2, HEIGHT / 2]
-    colors = np.zeros((len(POINTS), 3), np.uint8)
-    write_model(folder / "sparse/0", "SIMPLE_PINHOLE", (WIDTH, HEIGHT), intrinsics, poses, POINTS, colors, binary=False)
+    write_model(folder / "sparse/0", poses, "SIMPLE_PINHOLE", {}, binary=False, points=True, each=False)
     return folder
 
 

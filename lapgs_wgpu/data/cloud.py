@@ -57,18 +57,17 @@ def read_cloud(path: Path) -> Cloud:
         points, colors = read_points(path)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
         raise InputError(f"{path} must hold at least one point of 3 numbers, an array of (N, 3), got {points.shape}.")
-    with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite, which is reported below
-        points = points.astype(np.float32)
-    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
+    points = points.astype(np.float64)  # float32 would round what lies far from the origin, before it is centered
+    bad = np.flatnonzero(~(np.abs(points) <= np.finfo(np.float32).max).all(axis=1))  # true for NaN, too
     if len(bad):
         raise InputError(
             f"{path} holds NaN or infinite coordinates in {len(bad)} of {len(points)} points, first in point {bad[0]}; "
             "remove them."
         )
-    return Cloud(points, np.full_like(points, 0.5) if colors is None else colors)
+    return Cloud(points, np.full(points.shape, 0.5, np.float32) if colors is None else colors)
 
 
-def read_points(path: Path) -> tuple[Floats, Floats | None]:
+def read_points(path: Path) -> tuple[NDArray[np.float64], Floats | None]:
     """Read positions (N, 3) of a .ply file, and colors (N, 3) in [0, 1], None where it has none that are known.
 
     Positions may be NaN or infinite. Raises InputError if the file is not a point cloud.
@@ -77,7 +76,7 @@ def read_points(path: Path) -> tuple[Floats, Floats | None]:
         vertex = ply.elements.get("vertex")
         if vertex is None or not {"x", "y", "z"} <= set(vertex.properties):
             raise InputError(f"{path}: has no element vertex with properties x, y, z, so it is no cloud of points.")
-        points, colors = ply.columns(vertex, ["x", "y", "z"]), read_colors(ply, vertex)
+        points, colors = ply.exact_columns(vertex, ["x", "y", "z"]), read_colors(ply, vertex)
         others = [name for name in vertex.properties if name not in ("x", "y", "z", "nx", "ny", "nz")]
         if colors is None and others:
             print(

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from helpers.dnerf_scene import make_scene
+from numpy.typing import NDArray
 from PIL import Image
 from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
@@ -285,10 +286,18 @@ COLMAP_MODELS = {
 
 
 def write_model(
-    folder: Path, poses: Mapping[str, Camera], model: str, lens: Lens, *, binary: bool, points: bool, each: bool
+    folder: Path,
+    poses: Mapping[str, Camera],
+    model: str,
+    lens: Lens,
+    *,
+    binary: bool,
+    points: bool = True,
+    each: bool = False,
+    offset: NDArray[np.float64] | float = 0.0,
 ) -> None:
     """A sparse model; each image sees two points, each point is seen by two images. each: a camera of its own for
-    every image, else one for all."""
+    every image, else one for all. offset: (3,), added to the points."""
     folder.mkdir(parents=True)
     number, names = COLMAP_MODELS[model]
     K = next(iter(poses.values())).K
@@ -300,7 +309,11 @@ def write_model(
         for (name, c), camera in zip(poses.items(), ids, strict=True)
     ]
     blobs = Blobs.random()
-    cloud = list(zip(blobs.means.double().tolist(), blobs.bytes_of_colors.tolist(), strict=True)) if points else []
+    cloud = (
+        list(zip((blobs.means.double().numpy() + offset).tolist(), blobs.bytes_of_colors.tolist(), strict=True))
+        if points
+        else []
+    )
     if binary:
         content = {name: struct.pack("<Q", n) for name, n in
                    (("cameras", len(set(ids))), ("images", len(rows)), ("points3D", len(cloud)))}  # fmt: skip
