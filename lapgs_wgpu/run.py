@@ -86,18 +86,18 @@ def train(
     found += check_in_view(dataset, first_points(dataset, PROBES, config.points.box, config.seed)[0])
     if ranks.first:
         check_run_folder(out, overwrite=overwrite)
-        if dataset.summary:
-            say(f"capture: {dataset.summary}")
-        for warning in (*dataset.warnings, *found):
-            print(f"warning: {warning}", file=sys.stderr, flush=True)
-        if dataset.normalization is not None:
-            say(f"normalization: {dataset.normalization}")
     keep_freed_memory()
     device = device or open_device()
     if not ranks.first:
         return _assist(start_training(config, dataset, device, ranks, parts=parts))
     with locked_folder(out):
         check_run_folder(out, overwrite=overwrite)  # again: another training may have written it meanwhile
+        if dataset.summary:
+            say(f"capture: {dataset.summary}")
+        for warning in (*dataset.warnings, *found):
+            print(f"warning: {warning}", file=sys.stderr, flush=True)
+        if dataset.normalization is not None:
+            say(f"normalization: {dataset.normalization}")
         training = start_training(config, dataset, device, ranks, parts=parts)
         start_run_folder(out, training.user_config, training.scene.device, dataset)
         if training.discovery is not None:
