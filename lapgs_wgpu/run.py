@@ -102,8 +102,7 @@ def train(
         start_run_folder(out, training.user_config, training.scene.device, dataset)
         if training.discovery is not None:
             say(f"discovery: {training.discovery}; {training.discovery_seconds:.0f} s")
-        if training.config.decoder == "device":
-            say("decoder: on the device")
+        say(f"step: {training.step_place}")
         return _run(training, out, watch, lpips)
 
 

@@ -210,11 +210,11 @@ def _dotted(table: Any, where: str, prefix: str = "") -> dict[str, Any]:
 
 
 def _holds(folder: Path, config: Config) -> bool:
-    """Whether a folder holds a run of this configuration, wherever its data are and its decoder ran."""
+    """Whether a folder holds a run of this configuration, wherever its data are and its steps were computed."""
 
     def comparable(config: Config) -> Config:
         data = dataclasses.replace(config.data, path="", masks="")
-        return dataclasses.replace(config, decoder="auto", data=data)
+        return dataclasses.replace(config, step="auto", data=data)
 
     try:
         return comparable(load_config(str(folder / "config.toml"))) == comparable(config)

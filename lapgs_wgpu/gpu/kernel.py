@@ -130,11 +130,13 @@ def _scalar(binding: Binding) -> str | None:
 class Commands:
     """A list of dispatches, submitted when the `with` block ends without an error.
 
-    profile: measures the time of each dispatch, which then gets a compute pass of its own.
+    profile: measures the time of each dispatch, which then gets a compute pass of its own. whole: submit all at once,
+    whatever `flush` asks for.
     """
 
-    def __init__(self, device: Device, profile: Profile | None = None) -> None:
+    def __init__(self, device: Device, profile: Profile | None = None, *, whole: bool = False) -> None:
         self.device = device
+        self._whole = whole
         self._profile = profile
         self._encoder = Encoder(device.wgpu_device)
         self._raising = raising("commands")
@@ -185,10 +187,14 @@ class Commands:
             source.buffer.wgpu_buffer, source.offset, target.buffer.wgpu_buffer, target.offset, source.nbytes
         )
 
+    def copy_out(self, source: DeviceArray, target: Any, offset: int) -> None:
+        """Copy an array to a wgpu buffer, `offset` bytes from its start."""
+        self._encoder.copy(source.buffer.wgpu_buffer, source.offset, target, offset, source.nbytes)
+
     def flush(self) -> None:
         """Submit what was recorded so far, where a watchdog ends long submissions, and go on. It runs even where the
         `with` block fails later."""
-        if not self.device.watchdog:
+        if self._whole or not self.device.watchdog:
             return
         with TranslatedErrors(self.device, "commands"):
             self._submit()

@@ -103,6 +103,32 @@ def _wait_for(device: Device, number: int) -> None:
         pause = min(2 * pause, _LONGEST_SLEEP)
 
 
+class Mapping:
+    """The bytes of a buffer, once the device has done what uses them, without a wait."""
+
+    def __init__(self, buffer: Any, nbytes: int) -> None:
+        self._buffer, self._nbytes, self._number = buffer, nbytes, next(_numbers)
+        info = _callback.info
+        info.userdata1 = ffi.cast("void *", self._number)
+        with raising("wgpuBufferMapAsync"):
+            lib.wgpuBufferMapAsync(buffer._internal, READ, 0, nbytes, info[0])
+
+    def poll(self, device: Device) -> bool:
+        """Whether the bytes are there."""
+        lib.wgpuDevicePoll(device.wgpu_device._internal, False, ffi.NULL)
+        return self._number in _statuses
+
+    def take(self) -> NDArray[np.uint8]:
+        """A copy of the bytes, when they are there. Raises RuntimeError where the device refused them."""
+        status = _statuses.pop(self._number)
+        if status != lib.WGPUMapAsyncStatus_Success:
+            raise RuntimeError(f"Could not map buffer ({status}).")
+        start = lib.wgpuBufferGetMappedRange(self._buffer._internal, 0, self._nbytes)
+        content = np.frombuffer(ffi.buffer(start, self._nbytes), np.uint8).copy()
+        lib.wgpuBufferUnmap(self._buffer._internal)
+        return content
+
+
 class Encoder:
     """Records commands for one submission, within `raising`."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -71,6 +71,8 @@ class Scene4D:
             (N, 15, 3); for the field laplacian and one's own also dynamics (N, D) (paper eq. 8).
         field_config: configuration of the field.
         field: the module that moves the Gaussians; None for static scenes.
+        on_access: called before the parameters or the field are given out, where a training keeps newer ones on the
+            device; else None.
         device: that renders.
         sh_degree: degree of the harmonics in use, 0 to 3.
         antialiased: how the Gaussians are drawn, see Gaussians.
@@ -101,7 +103,8 @@ class Scene4D:
             InputError: own_field is missing or superfluous for field_config.kind.
         """
         check_own(field_config, own_field)
-        self.parameters = {
+        self.on_access: Callable[[], None] | None = None
+        self._parameters = {
             name: nn.Parameter(parameters[name].detach().float().contiguous().clone())
             for name in row_shapes(field_config)
         }
@@ -110,7 +113,7 @@ class Scene4D:
         self.sh_degree = sh_degree
         self.antialiased = antialiased
         self.timing: Timing = EVEN
-        self.field: Field | None = make_field(field_config, device, seed, own_field)
+        self._field: Field | None = make_field(field_config, device, seed, own_field)
         self.metadata: dict[str, str] = {}
 
     @staticmethod
@@ -148,7 +151,21 @@ class Scene4D:
         return Scene4D(parameters, field_config, device, antialiased=antialiased, seed=seed, own_field=own_field)
 
     def __len__(self) -> int:
-        return len(self.parameters["means"])
+        return len(self._parameters["means"])
+
+    @property
+    def parameters(self) -> dict[str, nn.Parameter]:
+        """The canonical Gaussians, see above."""
+        if self.on_access is not None:
+            self.on_access()
+        return self._parameters
+
+    @property
+    def field(self) -> Field | None:
+        """The module that moves the Gaussians; None for static scenes."""
+        if self.on_access is not None:
+            self.on_access()
+        return self._field
 
     @property
     def spectrum(self) -> LaplacianMotion | None:

@@ -71,13 +71,44 @@ class Rasterizer:
 
         gradient: whether `backward` may follow.
         """
+        drawing = self._begin(gaussians, camera, background, depth=depth, gradient=gradient)
+        for band in range(drawing.plan.bands):
+            with Commands(self.device, profile) as commands:
+                drawing.lists = self._draw_band(commands, drawing, band)
+            if self._subgroup_mismatch("rasterize", drawing):
+                return self.draw(gaussians, camera, background, depth=depth, gradient=gradient, profile=profile)
+        return drawing
+
+    def record(
+        self,
+        commands: Commands,
+        gaussians: Gaussians[DeviceArray],
+        camera: Camera,
+        background: tuple[float, float, float],
+    ) -> Drawing:
+        """Record the passes that draw an image whose gradient `record_bwd` will want, among others that are submitted
+        together. `draw` and `backward` were called before, which check the driver's subgroups."""
+        drawing = self._begin(gaussians, camera, background, depth=False, gradient=True)
+        for band in range(drawing.plan.bands):
+            drawing.lists = self._draw_band(commands, drawing, band)
+        return drawing
+
+    def _begin(
+        self,
+        gaussians: Gaussians[DeviceArray],
+        camera: Camera,
+        background: tuple[float, float, float],
+        *,
+        depth: bool,
+        gradient: bool,
+    ) -> Drawing:
         self.plans.turn_to((camera.width, camera.height, gradient))
         if self.config.round_splats:
             rows, columns = self._tiles(camera)
             bands = max(self.plans.now.bands, -(-rows // max(1, MAX_BAND_TILES // columns)))
             self.plans.now = replace(self.plans.now, bands=bands)
         self._drawings += 1
-        drawing = Drawing(
+        return Drawing(
             gaussians,
             camera,
             background,
@@ -88,12 +119,6 @@ class Rasterizer:
             splats=self.pool.array("splats", (len(gaussians), SPLAT_FLOATS)),
             needed=[self.pool.array(f"needed {band}", (3,), "uint32") for band in range(self.plans.now.bands)],
         )
-        for band in range(self.plans.now.bands):
-            with Commands(self.device, profile) as commands:
-                drawing.lists = self._draw_band(commands, drawing, band)
-            if self._subgroup_mismatch("rasterize", drawing):
-                return self.draw(gaussians, camera, background, depth=depth, gradient=gradient, profile=profile)
-        return drawing
 
     def holds(self, drawing: Drawing) -> bool:
         """Return whether the arrays still hold this drawing: no other image was drawn since."""
@@ -249,36 +274,44 @@ class Rasterizer:
         """
         if not self.holds(drawing):
             raise RuntimeError("backward needs the drawing that was drawn last; its buffers now hold another image")
-        gaussians, n = drawing.gaussians, len(drawing.gaussians)
-        d_splats = self.pool.array("d_splats", (n, SPLAT_FLOATS))
-        d_means, d_scales = self.pool.array("d_means", (n, 3)), self.pool.array("d_scales", (n, 3))
-        d_quats = self.pool.array("d_quats", (n, 4))
+        d_splats = self.pool.array("d_splats", (len(drawing.gaussians), SPLAT_FLOATS))
         for band in range(drawing.plan.bands):
             with Commands(self.device, profile) as commands:
-                if band == 0:
-                    commands.clear(d_splats)
-                if drawing.plan.bands > 1:  # the lists of the other bands are gone
-                    drawing.lists = self._draw_band(commands, drawing, band)
                 self._backward_band(commands, drawing, band, d_image, d_splats)
             if self._subgroup_mismatch("rasterize_bwd", drawing):
                 return self.backward(self._drawn_again(drawing), d_image, camera=camera, profile=profile)
+        with Commands(self.device, profile) as commands:
+            return self._project_bwd(commands, drawing, d_splats, camera=camera)
+
+    def record_bwd(self, commands: Commands, drawing: Drawing, d_image: DeviceArray) -> GaussianGradients:
+        """Record the backward passes of a drawing that `record` has recorded last; d_image as for `backward`."""
+        d_splats = self.pool.array("d_splats", (len(drawing.gaussians), SPLAT_FLOATS))
+        for band in range(drawing.plan.bands):
+            self._backward_band(commands, drawing, band, d_image, d_splats)
+        return self._project_bwd(commands, drawing, d_splats, camera=False)
+
+    def _project_bwd(
+        self, commands: Commands, drawing: Drawing, d_splats: DeviceArray, *, camera: bool
+    ) -> GaussianGradients:
+        gaussians, n = drawing.gaussians, len(drawing.gaussians)
+        d_means, d_scales = self.pool.array("d_means", (n, 3)), self.pool.array("d_scales", (n, 3))
+        d_quats = self.pool.array("d_quats", (n, 4))
         d_sh = d_camera = None
         if camera:  # a row for each workgroup of camera_bwd, twice; each half begins at a multiple of 256 bytes
             d_camera = self.pool.array("d_camera", (2, (_groups(n) + 15) // 16 * 16, 4))
         arrays = gaussians.arrays() | {"frame": self._frame(drawing, 0), "d_splats": d_splats}
         arrays |= {"d_means": d_means, "d_quats": d_quats, "d_scales": d_scales}
-        with Commands(self.device, profile) as commands:
-            commands.run(Kernel.get(self.device, "project_bwd"), _groups(n), arrays)
-            if d_camera is not None:
-                commands.clear(d_camera)  # the last rows pad it
-                turned = arrays | {"d_camera": d_camera.rows(0, 1)}
-                commands.run(Kernel.get(self.device, "camera_bwd"), _groups(n), turned)
-            if gaussians.sh_degree is not None:
-                d_sh = self.pool.array("d_sh", gaussians.sh.shape)
-                self._color_bwd(commands, drawing, d_splats, d_means, d_sh)
-            if d_camera is not None:
-                shifted = {"frame": arrays["frame"], "d_means": d_means, "d_camera": d_camera.rows(1, 1)}
-                commands.run(Kernel.get(self.device, "camera_bwd", FORCE=True), _groups(n), shifted)
+        commands.run(Kernel.get(self.device, "project_bwd"), _groups(n), arrays)
+        if d_camera is not None:
+            commands.clear(d_camera)  # the last rows pad it
+            turned = arrays | {"d_camera": d_camera.rows(0, 1)}
+            commands.run(Kernel.get(self.device, "camera_bwd"), _groups(n), turned)
+        if gaussians.sh_degree is not None:
+            d_sh = self.pool.array("d_sh", gaussians.sh.shape)
+            self._color_bwd(commands, drawing, d_splats, d_means, d_sh)
+        if d_camera is not None:
+            shifted = {"frame": arrays["frame"], "d_means": d_means, "d_camera": d_camera.rows(1, 1)}
+            commands.run(Kernel.get(self.device, "camera_bwd", FORCE=True), _groups(n), shifted)
         return GaussianGradients(d_splats, d_means, d_quats, d_scales, d_sh, d_camera)
 
     def _drawn_again(self, drawing: Drawing) -> Drawing:
@@ -291,6 +324,10 @@ class Rasterizer:
     def _backward_band(
         self, commands: Commands, drawing: Drawing, band: int, d_image: DeviceArray, d_splats: DeviceArray
     ) -> None:
+        if band == 0:
+            commands.clear(d_splats)
+        if drawing.plan.bands > 1:  # the lists of the other bands are gone
+            drawing.lists = self._draw_band(commands, drawing, band)
         lists, plan = drawing.lists, drawing.plan
         records = self.pool.array("records", (plan.capacity, _RECORD_FLOATS))
         tails = (3 if drawing.depth else 2) * plan.capacity

@@ -18,7 +18,7 @@ Background = Literal["black", "white", "random"]
 BACKGROUND_LEVELS = {"black": 0.0, "white": 1.0, "random": 0.0}  # under views that are measured
 Split = Literal["plain", "adaptive"]
 Units = Literal["world", "capture"]
-DecoderPlace = Literal["auto", "torch", "device"]
+StepPlace = Literal["auto", "exchange", "resident"]
 RefineCameras = Literal["auto", "on", "off"]
 
 
@@ -275,16 +275,10 @@ class Config(Options):
         "lower the opacity of thin Gaussians by the factor by which the low-pass filter enlarges them (as in gsplat)",
         False,
     )
-    decoder: DecoderPlace = option(
-        "where the decoder of the fields grid4d and laplacian runs; auto: in torch for CPU devices, else on the device",
-        "torch",
+    step: StepPlace = option(
+        "where a training step is computed; resident: on the device from end to end, where its parameters stay; exchange: "
+        "by torch, which exchanges buffers with the device; auto: exchange on CPU devices and for what only torch can do "
+        "(fields other than static, grid4d and laplacian, one's own losses, corrected cameras and colors, --batch, several "
+        "processes), else resident",
+        "auto",
     )
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.decoder == "device" and not self.field.decodes_on_device:
-            raise ValueError(
-                "decoder device is for the fields grid4d and laplacian with field.depth 0, and for laplacian only with "
-                f"field.motion laplacian, not for {self.field.kind} with depth {self.field.depth} and motion "
-                f"{self.field.motion}"
-            )

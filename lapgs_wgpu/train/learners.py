@@ -33,6 +33,7 @@ class Learners:
 
     Attributes:
         optimizer: of the Gaussians and the field.
+        frequencies: of the motion spectrum; None where there is none.
         cameras: the corrections of the training cameras; None where they are kept.
         exposures: the corrections of the training images' colors; None where they are taken as they are.
     """
@@ -42,10 +43,10 @@ class Learners:
         self._groups = scene.field.parameter_groups() if scene.field else {}
         rates = parts.rates_of(config.rates.schedules(), scene.parameters, self._groups)
         self.optimizer = Optimizer(scene.parameters, self._groups, rates)
-        self._frequencies = None
+        self.frequencies = None
         if scene.spectrum is not None:
             limit = nyquist_frequency(dataset)
-            self._frequencies = FrequencyOptimizer(scene.spectrum, config.rates.frequencies, limit)
+            self.frequencies = FrequencyOptimizer(scene.spectrum, config.rates.frequencies, limit)
         self.exposures = Exposures(len(dataset.train), config.exposure.rate) if config.exposure.enabled else None
         self.cameras = None
         if config.cameras.refines(own_footage=dataset.own_footage):
@@ -101,7 +102,7 @@ class Learners:
         """Everything that the next step depends on, besides the scene and the gradients, by part."""
         return {
             "adam": self.optimizer.state(),
-            "frequencies": self._frequencies.state() if self._frequencies else {},
+            "frequencies": self.frequencies.state() if self.frequencies else {},
             "exposure": self.exposures.state() if self.exposures else {},
             "cameras": self.cameras.state() if self.cameras else {},
         }
@@ -109,15 +110,15 @@ class Learners:
     def restore(self, state: Mapping[str, Mapping[str, Tensor]]) -> None:
         """Go on from what `state` gave. Raises KeyError or ValueError where it is of another training."""
         self.optimizer.restore(state.get("adam", {}))
-        if self._frequencies is not None:
-            self._frequencies.restore(state["frequencies"])
+        if self.frequencies is not None:
+            self.frequencies.restore(state["frequencies"])
         if self.exposures is not None:
             self.exposures.restore(state["exposure"])
         if self.cameras is not None:
             self.cameras.restore(state["cameras"])
 
     def _refiners(self) -> Iterator[Refiner]:
-        for each in (self._frequencies, self.exposures, self.cameras):
+        for each in (self.frequencies, self.exposures, self.cameras):
             if each is not None:
                 yield each
 

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from lapgs_wgpu.motion.fields.laplacian import LaplacianMotion
@@ -17,12 +20,22 @@ ROW_MEAN_DECAY = 0.9
 ROW_EPS = 1e-15  # keeps 0 / 0 away
 
 
+class AdamState(NamedTuple):
+    """Of a parameter: how many steps have moved it, and Adam's two moments, shaped like it."""
+
+    steps: int
+    mean: Tensor
+    square: Tensor
+
+
 class Optimizer:
     """Adam over the Gaussians' parameters, one group each, and over the field's groups.
 
     gaussians: name -> parameter with a row for each Gaussian. This very mapping is changed when rows come and go.
     field: group -> parameters, such as the field's `parameter_groups()`. rates: the schedule of each name and group.
     highest: name or group -> rate that it never exceeds. The same gradients in the same order give the same bits.
+    on_access: called before the state, or the Gaussians with it, is read or changed from outside: a device may have newer
+    ones.
     """
 
     def __init__(
@@ -35,6 +48,7 @@ class Optimizer:
         self.gaussians = gaussians
         self.rates = dict(rates)
         self.highest: dict[str, float] = {}
+        self.on_access: Callable[[], None] = lambda: None
         # Fused: one pass over the memory, 2.5 times as fast as the others on the dnerf preset's hash tables.
         named = [{"params": parameters, "name": name} for name, parameters in groups.items()]
         self._adam = torch.optim.Adam(named, lr=0.0, eps=ADAM_EPS, fused=True)
@@ -51,11 +65,16 @@ class Optimizer:
         """Of those parameters that have one, by group."""
         return {name: [p.grad for p in group if p.grad is not None] for name, group in self.parameters().items()}
 
+    def rates_at(self, step: int, share: float = 1.0) -> dict[str, float]:
+        """The learning rate of each group in a step, counted from 1: a share of its schedule's."""
+        names = [group["name"] for group in self._adam.param_groups]
+        return {name: share * min(self.rates[name].at(step), self.highest.get(name, math.inf)) for name in names}
+
     def step(self, step: int, share: float = 1.0) -> None:
         """Move every parameter that has a gradient, at a share of the rates of this step (counted from 1)."""
+        rates = self.rates_at(step, share)
         for group in self._adam.param_groups:
-            name = group["name"]
-            group["lr"] = share * min(self.rates[name].at(step), self.highest.get(name, math.inf))
+            group["lr"] = rates[group["name"]]
         self._adam.step()
         # Fused Adam does not count what it writes, and a viewer knows by the count that it has to look again.
         for parameters in self.parameters().values():
@@ -65,6 +84,7 @@ class Optimizer:
 
     def edit_rows(self, keep: Tensor, added: Mapping[str, Tensor]) -> None:
         """Keep the Gaussians of a mask (N,) with their state, and append rows (M, ...) with a zero state."""
+        self.on_access()
         for name, old in self.gaussians.items():
             rows = added[name]
             zeros = torch.zeros_like(rows)
@@ -73,12 +93,14 @@ class Optimizer:
 
     def reorder(self, order: Tensor) -> None:
         """Put the Gaussians, with their state, into another order: indices (N,)."""
+        self.on_access()
         for name, old in self.gaussians.items():
             moments = {key: moment[order] for key, moment in self.moments(name).items()}
             self._replace(name, old.detach()[order], moments)
 
     def reset(self, name: str, values: Tensor) -> None:
         """Give one of the Gaussians' parameters new values (N, ...) and a zero state."""
+        self.on_access()
         self._replace(name, values, {key: torch.zeros_like(values) for key in self.moments(name)})
 
     def moments(self, name: str) -> dict[str, Tensor]:
@@ -88,6 +110,7 @@ class Optimizer:
 
     def state(self) -> dict[str, Tensor]:
         """Everything that the next step depends on, besides the parameters and their gradients."""
+        self.on_access()
         return {
             f"{group['name']}.{i}.{key}": value
             for group in self._adam.param_groups
@@ -97,6 +120,7 @@ class Optimizer:
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
         """Go on from what `state` gave, with parameters of the same shapes. Raises ValueError where they are others."""
+        self.on_access()
         for group in self._adam.param_groups:
             for i, parameter in enumerate(group["params"]):
                 prefix = f"{group['name']}.{i}."
@@ -109,6 +133,16 @@ class Optimizer:
                     raise ValueError(f"its {prefix[:-1]} holds {sorted(mine)}")
                 if mine:
                     self._adam.state[parameter] = mine
+
+    def state_of(self, parameter: Tensor) -> AdamState | None:
+        """Of a parameter; None before the first step that moves it."""
+        state = self._adam.state.get(parameter)
+        return AdamState(int(state["step"]), state["exp_avg"], state["exp_avg_sq"]) if state else None
+
+    def set_state(self, parameter: Tensor, state: AdamState) -> None:
+        """Go on with this state of a parameter."""
+        values = torch.tensor(float(state.steps)), state.mean, state.square
+        self._adam.state[parameter] = dict(zip(("step", "exp_avg", "exp_avg_sq"), values, strict=True))
 
     def _replace(self, name: str, values: Tensor, moments: Mapping[str, Tensor]) -> None:
         state = self._adam.state.pop(self.gaussians[name], {})
@@ -126,7 +160,7 @@ class FrequencyOptimizer:
     """
 
     def __init__(self, motion: LaplacianMotion, rate: Rate, limit: float) -> None:
-        self._motion, self._rate, self._limit = motion, rate, limit
+        self._motion, self.rate, self.limit = motion, rate, limit
         self._mean = torch.zeros_like(motion.frequencies)
         self._square = 0.0
         self._steps = 0
@@ -150,8 +184,8 @@ class FrequencyOptimizer:
         self._square = 0.999 * self._square + 0.001 * float(gradient.square().mean())
         mean = self._mean / (1 - 0.9**self._steps)
         size = (self._square / (1 - 0.999**self._steps)) ** 0.5
-        move = self._rate.at(step) * mean / (size + ADAM_EPS)
-        frequencies.sub_(move.clamp(-LARGEST_FREQUENCY_STEP, LARGEST_FREQUENCY_STEP)).clamp_(0.0, self._limit)
+        move = self.rate.at(step) * mean / (size + ADAM_EPS)
+        frequencies.sub_(move.clamp(-LARGEST_FREQUENCY_STEP, LARGEST_FREQUENCY_STEP)).clamp_(0.0, self.limit)
         frequencies.grad = None
 
     def state(self) -> dict[str, Tensor]:
@@ -169,6 +203,15 @@ class FrequencyOptimizer:
         if not (float(state["square"]) >= 0 and int(state["steps"]) >= 0):
             raise ValueError("its spectrum's moments are negative")
         self._mean, self._square, self._steps = state["mean"], float(state["square"]), int(state["steps"])
+
+
+    def packed(self) -> tuple[NDArray[np.float32], int]:
+        """The first moments of all frequencies and the second one, (K + 1,), and how many steps have moved them."""
+        return np.append(self._mean.numpy(), np.float32(self._square)), self._steps
+
+    def unpack(self, moments: NDArray[np.float32], steps: int) -> None:
+        """Go on from what `packed` gave."""
+        self._mean, self._square, self._steps = torch.from_numpy(moments[:-1].copy()), float(moments[-1]), steps
 
 
 class RowAdam:

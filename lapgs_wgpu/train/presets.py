@@ -42,6 +42,7 @@ ABLATIONS: dict[str, tuple[str, str, Any]] = {
 REMOVED = {
     "acceleration.frames": "it is 2",
     "data.split": "a run is measured on its test views",
+    "decoder": "it is in torch where the step is, and on the device where that is; step says which",
     "eval.snapshots": "only the last model is saved",
     "eval.views": "the validation views are measured, or 8 training views if there are none",
     "loss.dynamics_mode": "the regularization is that of the paper's equation; loss.dynamics 0 turns it off",

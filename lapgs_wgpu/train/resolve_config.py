@@ -10,6 +10,8 @@ from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.timing import MOST_TIMES
 from lapgs_wgpu.train.config import Config
+from lapgs_wgpu.train.distributed import Ranks
+from lapgs_wgpu.train.parts import Parts
 
 
 def resolve_for_dataset(config: Config, dataset: Dataset) -> Config:
@@ -45,13 +47,30 @@ def nyquist_frequency(dataset: Dataset) -> float:
     return (len(times) - 1) / 2 / float(times[-1] - times[0]) if len(times) > 1 else 0.0
 
 
-def resolve_decoder(config: Config, device: Device) -> Config:
-    """The configuration with the decoder's place, which "auto" leaves open, decided.
+def resolve_step(config: Config, dataset: Dataset, device: Device, parts: Parts, ranks: Ranks) -> Config:
+    """The configuration with the place of the step, which "auto" leaves open, decided.
 
-    It is the device where kernels for it exist, but for CPU devices: they share torch's processor, which torch makes
-    ten times more of. No trial decides, since the place changes the last bits, and near a tie two runs would differ.
+    No trial decides, since the place changes the last bits, and near a tie two runs would differ. Raises InputError
+    where it is to be resident and cannot be.
     """
-    if config.decoder != "auto":
+    reason = why_exchange(config, dataset, parts, ranks)
+    if config.step == "resident" and reason:
+        raise InputError(f"the step cannot be resident: {reason}; give --step auto.")
+    if config.step != "auto":
         return config
-    able = config.field.decodes_on_device
-    return dataclasses.replace(config, decoder="device" if able and not device.is_cpu else "torch")
+    return dataclasses.replace(config, step="exchange" if reason or device.is_cpu else "resident")
+
+
+def why_exchange(config: Config, dataset: Dataset, parts: Parts, ranks: Ranks) -> str:
+    """What of a training only torch can compute; "" where there is nothing."""
+    if config.field.kind != "static" and not config.field.decodes_on_device:
+        return f"there are no kernels for the field {config.field.kind} in this shape"
+    if parts.losses:
+        return "losses of one's own are torch's"
+    if config.cameras.refines(own_footage=dataset.own_footage):
+        return "the cameras are corrected"
+    if config.exposure.enabled:
+        return "the colors of the images are corrected"
+    if config.schedule.batch > 1:
+        return f"a step takes {config.schedule.batch} images"
+    return "" if ranks.count == 1 else f"{ranks.count} processes share a step"

@@ -14,14 +14,14 @@ from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.distributed import Ranks
 from lapgs_wgpu.train.open_dataset import open_dataset, resolve_data
 from lapgs_wgpu.train.parts import Parts
-from lapgs_wgpu.train.resolve_config import resolve_decoder, resolve_for_dataset
+from lapgs_wgpu.train.resolve_config import resolve_for_dataset, resolve_step
 
 
 class Setup(NamedTuple):
     """What a training works with.
 
     Attributes:
-        user_config: with its field and decoder decided, as config.toml holds it.
+        user_config: with its field and the place of its steps decided, as config.toml holds it.
         config: the same resolved for the data, too.
         dataset: the capture.
         device: that trains.
@@ -71,7 +71,7 @@ def set_up(
             config = dataclasses.replace(config, field=dataclasses.replace(config.field, kind="own"))
         except ValueError as error:
             raise InputError(f"{error}.") from None
-    user_config = resolve_decoder(config, device)
+    user_config = resolve_step(config, dataset, device, parts, ranks)
     resolved = resolve_for_dataset(user_config, dataset)
     if scene is not None:  # whose field does not change its shape any more
         resolved = dataclasses.replace(resolved, field=scene.field_config)

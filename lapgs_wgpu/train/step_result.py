@@ -2,31 +2,52 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import NamedTuple
 
 from lapgs_wgpu.train.nonfinite import Skipped
 
 
-class StepResult(NamedTuple):
-    """A step that is done.
+class Measured(NamedTuple):
+    """What a step measured; see StepResult."""
 
-    Attributes:
-        step: its number, counted from 1.
-        steps: the number of all steps.
-        loss: mean over the step's views.
-        psnr: mean over the step's views, dB.
-        skipped: None, or why the step changed nothing: values that were not finite.
-        terms: what each term of the loss adds to it, weight included, by name: `l1`, `ssim` (of 1 - SSIM), `pyramid`,
-            `ncc`, `smoothness`, `acceleration` and `dynamics`, as far as they were computed, and each of one's own.
-        pruned: number of Gaussians that were pruned because they contribute too little.
-    """
-
-    step: int
-    steps: int
     loss: float
     psnr: float
     skipped: Skipped | None = None
     terms: Mapping[str, float] = MappingProxyType({})
-    pruned: int = 0
+
+
+class StepResult:
+    """A step that is done, or that the device is doing: what it measures is then waited for when it is asked for.
+
+    Attributes:
+        step: its number, counted from 1.
+        steps: the number of all steps.
+        pruned: number of Gaussians that were pruned because they contribute too little.
+    """
+
+    def __init__(self, step: int, steps: int, measured: Callable[[], Measured], pruned: int = 0) -> None:
+        self.step, self.steps, self.pruned = step, steps, pruned
+        self._measured = measured
+
+    @property
+    def loss(self) -> float:
+        """Mean over the step's views."""
+        return self._measured().loss
+
+    @property
+    def psnr(self) -> float:
+        """Mean over the step's views, dB."""
+        return self._measured().psnr
+
+    @property
+    def skipped(self) -> Skipped | None:
+        """None, or why the step changed nothing: values that were not finite."""
+        return self._measured().skipped
+
+    @property
+    def terms(self) -> Mapping[str, float]:
+        """What each term of the loss adds to it, weight included, by name: `l1`, `ssim` (of 1 - SSIM), `pyramid`, `ncc`,
+        `smoothness`, `acceleration` and `dynamics`, as far as they were computed, and each of one's own."""
+        return self._measured().terms

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import math
-from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -17,7 +15,6 @@ from torch import Tensor
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.initial_view import InitialView, captured_arc
-from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.motion.timing import Timing
 from lapgs_wgpu.splat.rasterize import rasterizer_of
@@ -27,20 +24,35 @@ from lapgs_wgpu.train.densify import Statistics
 from lapgs_wgpu.train.density_control import DensityControl
 from lapgs_wgpu.train.distributed import SINGLE_PROCESS, Ranks
 from lapgs_wgpu.train.evaluate import evaluate, mean_psnr
+from lapgs_wgpu.train.exchange_step import ExchangeStep
 from lapgs_wgpu.train.ground_truth import GroundTruth
 from lapgs_wgpu.train.host_threads import step_threads, torch_threads
 from lapgs_wgpu.train.learners import Learners
-from lapgs_wgpu.train.nonfinite import SkipCounter, Skipped, cause, check_parameters, finite
-from lapgs_wgpu.train.objective import Objective, Sample, ViewResult
+from lapgs_wgpu.train.nonfinite import SkipCounter
+from lapgs_wgpu.train.objective import Objective
 from lapgs_wgpu.train.parts import Parts
+from lapgs_wgpu.train.resolve_config import why_exchange
 from lapgs_wgpu.train.setup import set_up
 from lapgs_wgpu.train.start import Start, start_from_points
-from lapgs_wgpu.train.step_result import StepResult
+from lapgs_wgpu.train.resident_step import IN_FLIGHT, ResidentStep, Task
+from lapgs_wgpu.train.step_result import Measured, StepResult
 from lapgs_wgpu.train.timing_refinement import KeptTiming, TimingRefinement
 from lapgs_wgpu.train.view_order import ViewOrder
 
 MAX_SH_DEGREE = 3
 AHEAD = 8  # images that are decoded before they are needed
+
+
+class _Past(NamedTuple):
+    """Where a step began whose samples were not yet drawn.
+
+    drawn: state of the generator. left: of the order of views. chosen: the view and its background. sh_degree: in use.
+    """
+
+    drawn: Tensor
+    left: list[int]
+    chosen: tuple[View, Tensor]
+    sh_degree: int
 
 
 class Trainer:
@@ -51,7 +63,7 @@ class Trainer:
     Attributes:
         scene: as the last step left it.
         config: the configuration, resolved for the data and the device.
-        user_config: the same before it was resolved for the data, but for the decoder's place; config.toml holds it.
+        user_config: the same before it was resolved for the data, but for the place of the steps; config.toml holds it.
         dataset: its test views are not touched by any step.
         parts: own field, losses, density control, learning rates and callbacks.
         done: number of the steps so far.
@@ -117,11 +129,8 @@ class Trainer:
         color = None if self._random_color else self._color
         self._truth = GroundTruth(scene.device, color, int(config.data.cache_gb * 1e9))
         self._order = ViewOrder(dataset.train, self._generator)
-        if isinstance(scene.field, GridField):
-            scene.field.on_device = config.decoder == "device"
         self._learners = Learners(config, dataset, self.parts, start)
         self._objective = Objective(config, scene, self.parts.losses, dataset.moments, extent)
-        self._set_field_fitted(start.field_fitted)
         self._density = DensityControl(
             config,
             scene,
@@ -145,13 +154,23 @@ class Trainer:
             )
         self._timing_steps = config.timing.corrections(config.schedule.steps) if self.timing else []
         self._skips = SkipCounter()
+        self._stepper = ExchangeStep(self._objective, self._learners, self._density, self._truth, self.ranks)
+        self._resident = None
+        self._past: dict[int, _Past] = {}
+        if config.step == "resident":
+            self._resident = ResidentStep(config, scene, self._learners, self._truth, dataset.moments)
+            self._resident.redraw = self._redraw
+            self._resident.tell = lambda measured: self._skips.note(measured.skipped)
         self._plans, camera = rasterizer_of(scene.device).plans, dataset.train[0].camera
         self._drawn = (camera.width, camera.height, True)  # the kind of images that the steps draw
         self._plans.set_bands(self._drawn, 1)
+        self._set_field_fitted(start.field_fitted)
 
     def _set_field_fitted(self, field_fitted: bool) -> None:
         """Say whether discovery has fitted the field to nearly all that moves."""
         self._objective.field_fitted = field_fitted
+        if self._resident is not None:
+            self._resident.field_fitted = field_fitted
         self._learners.limit_field_rates(field_fitted=field_fitted)
 
     @property
@@ -162,6 +181,14 @@ class Trainer:
     def exposure_of(self, view: View) -> Tensor | None:
         """The correction (3, 4) of the colors of a training view; None where they are taken as they are."""
         return self._learners.exposure(view)
+
+    @property
+    def step_place(self) -> str:
+        """Where the steps are computed, and why, in words."""
+        if self._resident is not None:
+            return "resident: on the device from end to end"
+        reason = why_exchange(self.config, self.dataset, self.parts, self.ranks) or "the device is a CPU"
+        return f"exchange: by torch, since {reason}"
 
     def close(self) -> None:
         """End what goes on beside the steps."""
@@ -180,8 +207,8 @@ class Trainer:
 
     @property
     def dead_scales(self) -> float:
-        """`Objective.dead_scales`."""
-        return self._objective.dead_scales
+        """The share of the Gaussians' scales in the last view that are at the floor, where they get no gradient."""
+        return (self._resident or self._stepper).dead_scales
 
     def evaluate(self, views: Sequence[View] | None = None) -> dict[str, Any]:
         """Measure the scene on views, the test views where None: the content of metrics.json (docs/metrics.md).
@@ -230,64 +257,89 @@ class Trainer:
         return result
 
     def _step(self) -> StepResult:
-        config, scene, ranks, step = self.config, self.scene, self.ranks, self.done + 1
+        config, step = self.config, self.done + 1
         moving = step > self.warm_up_steps
         # Every rank draws the numbers of all views, so that their random streams stay the same.
         chosen = [self._choose() for _ in range(config.schedule.batch)]
         drawn = self._generator.get_state()
-        samples = [self._objective.sample(*each, step, self._generator, moving=moving) for each in chosen]
-        mine = samples[ranks.rank :: ranks.count]
-        self._truth.prefetch([*(sample.view for sample in mine), *self._order.coming(AHEAD)])
-
-        self._learners.zero_grad()
-        seen = self._density.nothing_seen()
-        results, totals = [], Counter[str]()
-        for sample in mine:
-            result = self._descend(sample, share=len(samples))
-            seen.add(result.radii, result.d_means2d, sample.view.camera, scale=len(samples))
-            results.append(result)
-            totals.update({"loss": result.loss, "psnr": result.psnr, **result.terms})
-        if ranks.count > 1:
-            self._learners.all_reduce_gradients(ranks)
-        sums = ranks.all_reduce_sum([torch.tensor(list(totals.values()), dtype=torch.float64)])[0] / len(samples)
-        means = dict(zip(totals, sums.tolist(), strict=True))
-        loss, psnr = means.pop("loss"), means.pop("psnr")
-
-        what = self._not_finite(results, loss)
-        skipped = Skipped(step, ", ".join(sample.view.name for sample in samples), what) if what else None
         field_times = None
         if self.timing is not None and moving and step in self._timing_steps:
             field_times = self.timing.fitted(self._timing_steps.index(step))
-        self.whole = False
-        if skipped is None:
-            self._learners.step(step, min(1.0, step / self._ramp_steps) if self._ramp_steps else 1.0)
-            # After the optimizer's step, so that no gradient is lost with the rows that change.
-            if step < config.density.stop:
-                self._density.statistics.merge(self._seen_by_all(seen))
+        if self._resident is not None:
+            self._past[step] = _Past(drawn, list(self._order.left), chosen[0], self.scene.sh_degree)
+            measured: Callable[[], Measured] = self._resident.take(self._task(step))
+            self.whole = False
         else:
-            self._generator.set_state(drawn)
-            self._learners.zero_grad()
+            measured = self._exchange(step, chosen, drawn, moving=moving)
         if self.timing is not None and field_times is not None:
             self.timing.set(field_times)
         pruned = self._density.change(step, moving=moving)
         if step % config.schedule.sh_interval == 0:
-            scene.sh_degree = min(scene.sh_degree + 1, MAX_SH_DEGREE)
+            self.scene.sh_degree = min(self.scene.sh_degree + 1, MAX_SH_DEGREE)
         self.done = step
         self.whole = True
-        self._skips.note(skipped)
-        return StepResult(step, config.schedule.steps, loss, psnr, skipped, means, pruned)
+        if self._resident is None:
+            self._skips.note(measured().skipped)
+        return StepResult(step, config.schedule.steps, measured, pruned)
+
+    def _share(self, step: int) -> float:
+        """Of the learning rates of a step: they rise over the first ones."""
+        return min(1.0, step / self._ramp_steps) if self._ramp_steps else 1.0
+
+    def _exchange(
+        self, step: int, chosen: list[tuple[View, Tensor]], drawn: Tensor, *, moving: bool
+    ) -> Callable[[], Measured]:
+        """Take a step by torch."""
+
+        def began() -> None:
+            self.whole = False
+
+        samples = [self._stepper.draw(*each, step, self._generator, moving=moving) for each in chosen]
+        mine = samples[self.ranks.rank :: self.ranks.count]
+        self._truth.prefetch([*(sample.view for sample in mine), *self._order.coming(AHEAD)])
+        seen = step < self.config.density.stop
+        measured = self._stepper.take(step, samples, self._share(step), seen=seen, began=began)
+        if measured.skipped is not None:
+            self._generator.set_state(drawn)
+        return lambda: measured
+
+    def _task(self, step: int) -> Task:
+        """What a step on the device is given, its samples drawn from the generator's present state."""
+        assert self._resident is not None
+        past, optimizer, frequencies = self._past[step], self._learners.optimizer, self._learners.frequencies
+        sample = self._resident.draw(*past.chosen, step, self._generator, moving=step > self.warm_up_steps)
+        self._truth.prefetch([sample.view, *self._order.coming(AHEAD)])
+        self._resident.statistics = self._density.statistics
+        for old in [number for number in self._past if number < step - IN_FLIGHT]:
+            del self._past[old]
+        return Task(
+            step,
+            sample,
+            self.scene.timing(sample.view.time),
+            past.sh_degree,
+            optimizer.rates_at(step, self._share(step)),
+            frequencies.rate.at(step) if frequencies else 0.0,
+            seen=step < self.config.density.stop,
+        )
+
+    def _redraw(self, skipped: int, behind: list[int]) -> list[Task]:
+        """The steps behind one that was skipped, drawn anew: no random number was drawn for that one's samples."""
+        past = self._past[skipped]
+        self._generator.set_state(past.drawn)
+        self._order.left = list(past.left)
+        tasks = []
+        for step in behind:
+            chosen = self._choose()
+            self._past[step] = _Past(
+                self._generator.get_state(), list(self._order.left), chosen, self._past[step].sh_degree
+            )
+            tasks.append(self._task(step))
+        return tasks
 
     def _choose(self) -> tuple[View, Tensor]:
         """The next view, and the background (3,) that its image lies on."""
         view = self._order.next()
         return view, torch.rand(3, generator=self._generator) if self._random_color else self._color
-
-    def _descend(self, sample: Sample, *, share: int) -> ViewResult:
-        """`Objective.descend` for a view, as its camera and its colors are corrected."""
-        view = sample.view
-        truth, camera = self._truth.on_device(view), self._learners.refined_camera(view)
-        correction = self._learners.exposure(view)
-        return self._objective.descend(sample, self.done + 1, truth, camera, correction, share=share)
 
     def _as_seen(self, views: Sequence[View]) -> list[View]:
         """The views, those by cameras of the training with the corrections of these."""
@@ -303,23 +355,6 @@ class Trainer:
         image = self.scene.render(self._learners.camera(view), view.time, self._color, depth=False, timing=timing).image
         correction = self.exposure_of(view)
         return image if correction is None else image @ correction[:, :3].T + correction[:, 3]
-
-    def _seen_by_all(self, seen: Statistics) -> list[Statistics]:
-        return [Statistics(*values) for values in zip(*self.ranks.all_gather(list(vars(seen).values())), strict=True)]
-
-    def _not_finite(self, results: list[ViewResult], loss: float) -> str:
-        """What is not finite in the loss and gradients of a step, for which it is skipped; "" where all is well.
-
-        Raises NumericalError for a parameter, whose values a step cannot mend.
-        """
-        parameters, gradients = self._learners.parameters(), self._learners.gradients()
-        gradients["the places in the image"] = [result.d_means2d for result in results]
-        if not self.ranks.any_rank(not (math.isfinite(loss) and finite(parameters, gradients))):
-            return ""
-        self.whole = False
-        check_parameters(parameters)
-        self.whole = True
-        return cause([result.terms for result in results], gradients)
 
     # The state between two steps -------------------------------------------------------------------------------------
 

@@ -99,7 +99,6 @@ class DecoderPasses:
             _, features = self._activate(commands, first, count, inputs, weights)
             target = Matrix.of(outputs.rows(first, count))
             self._product(commands, f"outputs {first}", features, Matrix.of(weights["heads"]).transpose, target)
-            commands.flush()  # all blocks together may take longer than a watchdog allows
 
     def decode_bwd(
         self,
@@ -107,24 +106,31 @@ class DecoderPasses:
         inputs: Mapping[str, DeviceArray],
         weights: Mapping[str, DeviceArray],
         d_outputs: DeviceArray,
+        d_inputs: Mapping[str, DeviceArray],
         d_weights: Mapping[str, DeviceArray],
+        *,
+        add: bool = False,
     ) -> None:
-        """Record the backward pass to d_weights and to the inputs, which are overwritten by their gradients."""
+        """Record the backward pass to d_inputs, which may be the inputs' own arrays, and to d_weights.
+
+        d_weights: as `DecoderShape.weights`, and "biases" (outputs, 1) of the heads. add: to what the layers' gradients
+        hold, those of the heads excepted.
+        """
         for first, count in self._blocks(d_outputs):
             layers, features = self._activate(commands, first, count, inputs, weights)
-            d = Matrix.of(d_outputs.rows(first, count))
-            self._product.split_k(
-                commands, f"d heads {first}", d.transpose, features, d_weights["heads"], add=first > 0
-            )
+            d, more = Matrix.of(d_outputs.rows(first, count)), first > 0
+            ones = Matrix.of(inputs["beside"].rows(first, count)).from_column(self.shape.beside - 1, 1)
+            split = self._product.split_k
+            split(commands, f"d heads {first}", d.transpose, features, d_weights["heads"], add=more)
+            split(commands, f"d biases {first}", d.transpose, ones, d_weights["biases"], add=more)
             self._product(commands, f"d features {first}", d, Matrix.of(weights["heads"]), features)
             self._gate("gate_bwd", commands, first, count, d_features=features.array, layers=layers.array)
             for name, (_, channel, channels) in self.shape.inputs.items():
                 given, own = Matrix.of(inputs[name].rows(first, count)), layers.from_column(channel, channels)
-                self._product.split_k(
-                    commands, f"d weights {name} {first}", own.transpose, given, d_weights[name], add=first > 0
-                )
-                self._product(commands, f"d {name} {first}", own, Matrix.of(weights[name]), given)
-            commands.flush()  # all blocks together may take longer than a watchdog allows
+                target = Matrix.of(d_inputs[name].rows(first, count))
+                name_of_sum = f"d weights {name} {first}"
+                split(commands, name_of_sum, own.transpose, given, d_weights[name], add=add or more)
+                self._product(commands, f"d {name} {first}", own, Matrix.of(weights[name]), target)
 
     def _blocks(self, outputs: DeviceArray) -> Iterator[tuple[int, int]]:
         n = outputs.shape[0]

@@ -1,0 +1,74 @@
+"""Small results that are read some time after they were submitted, without a wait for what was submitted since."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import wgpu
+from numpy.typing import NDArray
+
+from lapgs_wgpu.errors import DeviceLostError
+from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.kernel import Commands
+from lapgs_wgpu.gpu.native import LONGEST_WAIT, Mapping
+from lapgs_wgpu.gpu.wgpu_errors import TranslatedErrors
+
+_PAUSE = 50e-6  # seconds between two looks
+
+
+class Later:
+    """Copies of some arrays, which `record` makes, and which `read` waits for once they were submitted."""
+
+    def __init__(self, ring: Ring, buffer: Any, arrays: Sequence[DeviceArray]) -> None:
+        self._ring, self._buffer, self._arrays = ring, buffer, list(arrays)
+        self._mapping: Mapping | None = None
+
+    def submitted(self) -> None:
+        """Ask for the copies, after the submission that makes them."""
+        with TranslatedErrors(self._ring.device, "what is read later"):
+            self._mapping = Mapping(self._buffer, self._ring.nbytes)
+
+    def read(self) -> list[NDArray[Any]]:
+        """The arrays' contents. Raises DeviceError where the device does not give them."""
+        assert self._mapping is not None
+        device, deadline = self._ring.device, time.monotonic() + LONGEST_WAIT
+        with TranslatedErrors(device, "what is read later"):
+            while not self._mapping.poll(device):
+                if time.monotonic() > deadline:
+                    raise DeviceLostError(f"{device.info.name} has not answered for {LONGEST_WAIT:.0f} seconds")
+                time.sleep(_PAUSE)
+            content = self._mapping.take()
+        self._ring.free.append(self._buffer)
+        found, at = [], 0
+        for array in self._arrays:
+            found.append(content[at : at + array.nbytes].view(array.dtype).reshape(array.shape))
+            at += array.nbytes
+        return found
+
+
+class Ring:
+    """Buffers of `nbytes` bytes for results that are read later, used again and again."""
+
+    def __init__(self, device: Device, nbytes: int) -> None:
+        self.device, self.nbytes = device, nbytes
+        self.free: list[Any] = []
+
+    def record(self, commands: Commands, arrays: Sequence[DeviceArray]) -> Later:
+        """Record copies of arrays, whose sizes are multiples of 4 bytes."""
+        if self.free:
+            buffer = self.free.pop()
+        else:
+            usage = wgpu.BufferUsage.MAP_READ | wgpu.BufferUsage.COPY_DST
+            with TranslatedErrors(self.device, "what is read later", self.nbytes):
+                buffer = self.device.wgpu_device.create_buffer(label="later", size=self.nbytes, usage=usage)
+        at = 0
+        for array in arrays:
+            commands.copy_out(array, buffer, at)
+            at += array.nbytes
+        if at > self.nbytes:
+            raise ValueError(f"{at} bytes are to be read later, and the buffers hold {self.nbytes}")
+        return Later(self, buffer, arrays)
+

@@ -1,0 +1,232 @@
+"""The grid fields for training on the device, without torch: from Gaussians and weights to the heads' outputs, and back.
+
+Everything stays in device arrays. Gradients are added to arrays that the caller has cleared.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.kernel import Commands, Kernel
+from lapgs_wgpu.gpu.pool import BufferPool
+from lapgs_wgpu.motion.fields.config import FieldConfig, static_grid, temporal_grids
+from lapgs_wgpu.motion.passes.decoder_passes import DecoderPasses
+from lapgs_wgpu.motion.passes.field_weights import FieldWeights
+from lapgs_wgpu.motion.passes.hash_encoder_passes import HashEncoderPasses, PointSet
+from lapgs_wgpu.motion.passes.samples import SamplePasses, Samples
+
+
+class FieldArrays(NamedTuple):
+    """What a field computes with, or the gradients of it.
+
+    Attributes:
+        geometry: (N, 12), as common/geometry.wgsl has it; its gradient is not the field's.
+        beside: (N, D + 1) dynamics attributes, then ones.
+        tables: (entries, 2) of each grid, the spatial one first.
+        weights: of `FieldWeights`.
+    """
+
+    geometry: DeviceArray
+    beside: DeviceArray
+    tables: list[DeviceArray]
+    weights: DeviceArray
+
+
+class Decoding(NamedTuple):
+    """Gaussians at a time that were decoded.
+
+    Attributes:
+        name: distinguishes it.
+        time: of the field, in [0, 1].
+        samples: those of the Gaussians; None for all, in their order.
+        points: of the encoder.
+        inputs: of the decoder.
+        weights: packed, of the decoder.
+        heads: the packed array that the weights of the heads are in.
+        outputs: (count, outputs) of the heads, without their biases; before `backward` they become their gradient.
+    """
+
+    name: str
+    time: float
+    samples: Samples | None
+    points: PointSet
+    inputs: dict[str, DeviceArray]
+    weights: dict[str, DeviceArray]
+    heads: DeviceArray
+    outputs: DeviceArray
+
+    @property
+    def biases(self) -> DeviceArray:
+        """Of the heads, as activate.wgsl binds them."""
+        return self.weights["biases"]
+
+
+class Comparison(NamedTuple):
+    """Features of sampled Gaussians, and of places and a time near them, for each group of grids. sums: (count,) squared
+    differences of each."""
+
+    points: tuple[PointSet, PointSet]
+    here: list[DeviceArray]
+    there: list[DeviceArray]
+    sums: list[DeviceArray]
+
+
+class GridFieldPasses:
+    """Records the passes of a field that `decodes_on_device`."""
+
+    def __init__(self, device: Device, config: FieldConfig) -> None:
+        self.config = config
+        self.weights = FieldWeights(device, config)
+        self.shape = self.weights.shape
+        self.pool = BufferPool(device)
+        self.samples = SamplePasses(device, self.pool)
+        grids = [[static_grid(config)], temporal_grids(config)]
+        self._encoders = [HashEncoderPasses(device, group, config.bound) for group in grids if group]
+        self._grids = [len(group) for group in grids if group]
+        self._features = [sum(grid.features for grid in group) for group in grids if group]
+        self._now, self._sampled = (DecoderPasses(device, self.shape) for _ in range(2))
+        self._device = device
+        self._layers: DeviceArray | None = None
+
+    # Forward ---------------------------------------------------------------------------------------------------------
+
+    def begin(self, commands: Commands, arrays: FieldArrays) -> None:
+        """Record what all times of a step share, before the first `decode`."""
+        self._layers = self.weights.pack_layers(commands, arrays.weights)
+
+    def decode(
+        self, commands: Commands, number: int, arrays: FieldArrays, t: float, samples: Samples | None = None
+    ) -> Decoding:
+        """Record the forward pass of all Gaussians, or of samples, at a time of the field in [0, 1].
+
+        number: distinguishes the times that are submitted together, from 0 on.
+        """
+        assert self._layers is not None
+        name, every = f"decoded {number}", samples is None
+        chosen = samples or Samples(arrays.geometry.shape[0], arrays.geometry.shape[0])
+        points = self._points(commands, number, chosen, arrays, t, every=every)
+        encodings = self._encode(commands, points, arrays.tables)
+        beside = arrays.beside
+        if samples is not None:
+            beside = self.pool.array(f"beside {number}", (samples.count, beside.shape[1]))
+            self.samples.rows(commands, f"set {number}", samples, arrays.beside, beside, back=False)
+        heads = self.weights.pack_heads(commands, arrays.weights, name, t)
+        weights = self.weights.segments(self._layers, heads)
+        inputs = dict(zip(self.shape.inputs, [beside, *encodings], strict=True))
+        outputs = self.pool.array(f"outputs {number}", (chosen.count, self.shape.outputs))
+        self._decoder(samples).decode(commands, inputs, weights, outputs)
+        return Decoding(name, t, samples, points, inputs, weights, heads, outputs)
+
+    def compare(
+        self, commands: Commands, number: int, arrays: FieldArrays, t: float, near: Samples, near_time: float
+    ) -> Comparison:
+        """Record the features of samples at a time, and of places near them at another time, and their differences.
+
+        number: as for `decode`; the next one is taken, too.
+        """
+        at_means = Samples(near.count, near.gaussians, near.first, near.seed)
+        points = (
+            self._points(commands, number, at_means, arrays, t),
+            self._points(commands, number + 1, near, arrays, near_time),
+        )
+        here, there = (self._encode(commands, each, arrays.tables) for each in points)
+        sums = []
+        kernel = Kernel.get(self._device, "smoothness")
+        for group, (a, b) in enumerate(zip(here, there, strict=True)):
+            total = self.pool.array(f"differences {group}", (near.count,))
+            uniform = self._smoothness(group, near.count, 0.0)
+            commands.dispatch(kernel, -(-near.count // 64), smoothness=uniform, here=a, there=b, sums=total)
+            sums.append(total)
+        return Comparison(points, here, there, sums)
+
+    # Backward --------------------------------------------------------------------------------------------------------
+
+    def decode_bwd(
+        self, commands: Commands, decoding: Decoding, arrays: FieldArrays, gradients: FieldArrays, *, first: bool
+    ) -> None:
+        """Record the backward pass, from the outputs, which have become their gradient.
+
+        The gradient of `beside` is written for all Gaussians, and added for samples. first: whether it is the first
+        such call of a step.
+        """
+        d_beside = gradients.beside
+        if decoding.samples is not None:
+            d_beside = self.pool.array("d_beside", decoding.inputs["beside"].shape)
+        d_layers, d_heads = self.weights.layers("gradient"), self.weights.heads("gradient")
+        d_weights = self.weights.gradient_segments(d_layers, d_heads)
+        self._decoder(decoding.samples).decode_bwd(
+            commands,
+            decoding.inputs,
+            decoding.weights,
+            decoding.outputs,
+            decoding.inputs | {"beside": d_beside},
+            d_weights,
+            add=not first,
+        )
+        if decoding.samples is not None:
+            number = decoding.points.number
+            self.samples.rows(commands, f"set {number}", decoding.samples, gradients.beside, d_beside, back=True)
+        encodings = [decoding.inputs[name] for name in self.shape.inputs if name != "beside"]
+        self._encode_bwd(commands, decoding.points, encodings, gradients.tables)
+        place = arrays.weights, gradients.weights, d_heads, decoding.name, decoding.time
+        self.weights.unpack_heads(commands, *place)
+
+    def compare_bwd(
+        self, commands: Commands, comparison: Comparison, gradients: FieldArrays, weights: list[float]
+    ) -> None:
+        """Record the backward pass of differences. weights: of the sum of each group."""
+        count = comparison.points[0].count
+        kernel = Kernel.get(self._device, "smoothness_bwd")
+        for group, (here, there) in enumerate(zip(comparison.here, comparison.there, strict=True)):
+            uniform = self._smoothness(group, count, 2 * weights[group])
+            groups = -(-count * self._features[group] // 64)
+            commands.dispatch(kernel, groups, smoothness=uniform, here=here, there=there)
+        for points, encodings in zip(comparison.points, (comparison.here, comparison.there), strict=True):
+            self._encode_bwd(commands, points, encodings, gradients.tables)
+
+    def end(self, commands: Commands, gradients: FieldArrays) -> None:
+        """Record what all times of a step share, after the last `decode_bwd`."""
+        self.weights.unpack_layers(commands, gradients.weights, self.weights.layers("gradient"))
+
+    # Parts -----------------------------------------------------------------------------------------------------------
+
+    def _decoder(self, samples: Samples | None) -> DecoderPasses:
+        """Of all Gaussians, or of samples: sets of equal size share one, and with it its buffers."""
+        return self._now if samples is None else self._sampled
+
+    def _points(
+        self,
+        commands: Commands,
+        number: int,
+        samples: Samples,
+        arrays: FieldArrays,
+        t: float,
+        *,
+        every: bool = False,
+    ) -> PointSet:
+        array = self.samples.places(commands, f"set {number}", samples, arrays.geometry, every=every)
+        return PointSet(number, array, samples.count, self.config.grid_time(t))
+
+    def _encode(self, commands: Commands, points: PointSet, tables: list[DeviceArray]) -> list[DeviceArray]:
+        found, rest = [], list(tables)
+        for group, (encoder, grids) in enumerate(zip(self._encoders, self._grids, strict=True)):
+            encoding = self.pool.array(f"encoding {points.number} {group}", (points.count, self._features[group]))
+            encoder.encode(commands, points, rest[:grids], encoding)
+            rest = rest[grids:]
+            found.append(encoding)
+        return found
+
+    def _encode_bwd(
+        self, commands: Commands, points: PointSet, d_encodings: list[DeviceArray], d_tables: list[DeviceArray]
+    ) -> None:
+        rest = list(d_tables)
+        for encoder, grids, d_encoding in zip(self._encoders, self._grids, d_encodings, strict=True):
+            encoder.add_gradient(commands, points, d_encoding, rest[:grids])
+            rest = rest[grids:]
+
+    def _smoothness(self, group: int, pairs: int, scale: float) -> DeviceArray:
+        kernel = Kernel.get(self._device, "smoothness")
+        content = kernel.uniform("Smoothness", pairs=pairs, features=self._features[group], scale=scale)
+        return self.pool.constant(f"smoothness {group} {'back' if scale else 'forth'}", content)

@@ -1,0 +1,72 @@
+"""Gaussians that a step looks at more closely, drawn on the device: one of each stretch of neighboring rows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.kernel import Commands, Kernel
+from lapgs_wgpu.gpu.pool import BufferPool
+
+
+@dataclass(frozen=True)
+class Samples:
+    """`count` of so many Gaussians, all different (common/samples.wgsl).
+
+    first: row at which the first stretch begins. seed: of 32 bits, of the places within stretches, and of offsets.
+    reach: largest offset along each axis, world units.
+    """
+
+    count: int
+    gaussians: int
+    first: int = 0
+    seed: int = 0
+    reach: float = 0.0
+
+    def uniform(self, kernel: Kernel) -> bytes:
+        """The content of the struct Samples of a kernel that has it."""
+        stretch = max(1, self.gaussians // max(1, self.count))
+        return kernel.uniform("Samples", stretch=stretch, **vars(self))
+
+
+class SamplePasses:
+    """Records the passes that collect what is sampled. name, in the calls: distinguishes samples that are submitted
+    together."""
+
+    def __init__(self, device: Device, pool: BufferPool) -> None:
+        self._device, self._pool = device, pool
+
+    def places(
+        self, commands: Commands, name: str, samples: Samples, geometry: DeviceArray, *, every: bool = False
+    ) -> DeviceArray:
+        """Points (count, 4) at the sampled Gaussians' means, with offsets where they have a reach.
+
+        geometry: (N, 12), as common/geometry.wgsl has it. every: take all Gaussians, in their order.
+        """
+        points = self._pool.array(f"points {name}", (samples.count, 4))
+        kernel = Kernel.get(self._device, "place_points", SAMPLED=not every, OFFSET=samples.reach > 0)
+        uniform = self.constant(name, samples)
+        groups = -(-samples.count // 64)
+        commands.dispatch(kernel, groups, samples=uniform, geometry=geometry, points=points)
+        return points
+
+    def rows(
+        self, commands: Commands, name: str, samples: Samples, every: DeviceArray, chosen: DeviceArray, *, back: bool
+    ) -> None:
+        """The sampled rows of an array (N, C), copied to (count, C), or with `back` added from there."""
+        columns = every.shape[1]
+        kernel = Kernel.get(self._device, "sample_rows", BACK=back)
+        commands.dispatch(
+            kernel,
+            -(-samples.count * columns // 64),
+            samples=self.constant(name, samples),
+            row=self._pool.constant(f"row {columns}", kernel.uniform("Row", columns=columns)),
+            chosen=chosen,
+            all=every,
+        )
+
+    def constant(self, name: str, samples: Samples) -> DeviceArray:
+        """The uniform of the samples."""
+        kernel = Kernel.get(self._device, "place_points")
+        return self._pool.constant(f"samples {name}", samples.uniform(kernel))

@@ -1,0 +1,296 @@
+"""What a training moves, in device arrays: values, gradients and Adam's moments; torch's tensors follow when asked.
+
+Between two looks of the host the device has the newest values. Whoever reads torch's tensors pulls them first, and the
+next step pushes what the host may have changed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lapgs_wgpu.gpu.array import DeviceArray, read_all
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.kernel import Commands, Kernel
+from lapgs_wgpu.gpu.pool import BufferPool
+from lapgs_wgpu.motion.fields.grid_field import GridField
+from lapgs_wgpu.motion.fields.laplacian import VARIANCE_FLOOR, VARIANCE_SPREAD
+from lapgs_wgpu.motion.passes.activation_passes import GEOMETRY_FLOATS, SH_FLOATS
+from lapgs_wgpu.motion.passes.field_weights import FieldWeights
+from lapgs_wgpu.motion.passes.grid_field_passes import FieldArrays
+from lapgs_wgpu.train.optimizer import LARGEST_FREQUENCY_STEP, AdamState, FrequencyOptimizer, Optimizer
+
+KINDS = ("value", "gradient", "mean", "square")
+FREQUENCIES = "motion.frequencies"
+Place = tuple[slice, slice]  # rows and columns of an array
+
+
+@dataclass
+class Block:
+    """A matrix on the device in which torch's tensors lie.
+
+    Attributes:
+        shape: (rows, columns).
+        group: of the optimizer that all values belong to; None where each tensor is a group of its own.
+        bit: that stands for its gradient where that is not finite.
+        parts: by name of a tensor its place.
+        ones: whether the last column holds ones, which no step changes.
+        moved: number of values that Adam moves; the others have an optimizer of their own.
+        moving: whether only steps with motion move them.
+        arrays: by kind.
+    """
+
+    name: str
+    shape: tuple[int, int]
+    group: str | None
+    bit: int
+    parts: dict[str, Place]
+    ones: bool = False
+    moved: int | None = None
+    moving: bool = True
+    arrays: dict[str, DeviceArray] = field(default_factory=dict)
+
+    def gather(self, tensors: Mapping[str, Tensor | None], *, value: bool) -> NDArray[np.float32]:
+        """The content for the device; tensors that are None are zeros."""
+        out = np.zeros(self.shape, np.float32)
+        for name, place in self.parts.items():
+            tensor = tensors[name]
+            if tensor is not None:
+                target = out[place]
+                target[...] = tensor.detach().numpy(force=True).reshape(target.shape)
+        if self.ones and value:
+            out[:, -1] = 1.0
+        return out
+
+    def scatter(self, content: NDArray[np.float32], tensors: Mapping[str, Tensor]) -> None:
+        """Copy the device's content into tensors."""
+        for name, place in self.parts.items():
+            tensors[name].copy_(torch.from_numpy(np.ascontiguousarray(content[place])).reshape(tensors[name].shape))
+
+
+class ResidentParameters:
+    """The Gaussians and the field of a scene, and the optimizers' state, on a device.
+
+    Attributes:
+        steps: by name of a tensor, how many steps have moved it.
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        gaussians: Mapping[str, Tensor],
+        field_module: GridField | None,
+        weights: FieldWeights | None,
+        optimizer: Optimizer,
+        frequencies: FrequencyOptimizer | None,
+    ) -> None:
+        self._device, self._pool = device, BufferPool(device)
+        self._gaussians, self._optimizer, self._frequencies = gaussians, optimizer, frequencies
+        self._field = dict(field_module.named_parameters()) if field_module is not None else {}
+        self._weights = weights
+        self.blocks: dict[str, Block] = {}
+        self.steps: dict[str, int] = {}
+        self.on_host = {"values": True, "state": True}  # what the host may have changed since it was pushed
+
+    # The host's tensors and the device's arrays ----------------------------------------------------------------------
+
+    def _tensors(self) -> dict[str, Tensor]:
+        return {**self._gaussians, **self._field}
+
+    def _layout(self) -> dict[str, Block]:
+        n, every = len(self._gaussians["means"]), slice(None)
+        columns = {"means": (0, 3), "opacity_logits": (3, 4), "quats": (4, 8), "log_scales": (8, 11)}
+        geometry = {name: (every, slice(*place)) for name, place in columns.items()}
+        colors = {"sh_dc": (every, slice(0, 3)), "sh_rest": (every, slice(3, SH_FLOATS))}
+        blocks = [
+            Block("geometry", (n, GEOMETRY_FLOATS), None, 1, geometry, moving=False),
+            Block("sh", (n, SH_FLOATS), None, 2, colors, moving=False),
+        ]
+        if self._weights is not None:
+            beside = self._weights.shape.beside
+            dynamics = {"dynamics": (every, slice(0, beside - 1))} if "dynamics" in self._gaussians else {}
+            blocks.append(Block("beside", (n, beside), None, 4, dynamics, ones=True))
+            tables = [name for name in self._field if name.endswith(".table")]
+            for bit, name in enumerate(tables):
+                shape = (self._field[name].shape[0], 2)
+                blocks.append(Block(name, shape, "hash", 8 << bit, {name: (every, every)}))
+            rows = {name: (slice(p.first, p.first + self._field[name].numel()), every) for name, p in self._weights.places.items()}
+            moved = self._weights.places[FREQUENCIES].first if FREQUENCIES in rows else None
+            blocks.append(Block("weights", (self._weights.count, 1), "mlp", 8 << len(tables), rows, moved=moved))
+        for block in blocks:
+            block.arrays = {kind: self._pool.array(f"{block.name} {kind}", block.shape) for kind in KINDS}
+        return {block.name: block for block in blocks}
+
+    def push(self) -> None:
+        """Upload what the host has had since the last step."""
+        if self.on_host["values"]:
+            self.blocks, tensors = self._layout(), self._tensors()
+            for block in self.blocks.values():
+                block.arrays["value"].write(block.gather(tensors, value=True))
+        if self.on_host["state"]:
+            state = {name: self._optimizer.state_of(tensor) for name, tensor in self._tensors().items()}
+            self.steps = {name: each.steps if each else 0 for name, each in state.items()}
+            for kind in ("mean", "square"):
+                tensors = {name: getattr(each, kind) if each else None for name, each in state.items()}
+                for block in self.blocks.values():
+                    block.arrays[kind].write(block.gather(tensors, value=False))
+            if self._frequencies is not None:
+                content, self.steps[FREQUENCIES] = self._frequencies.packed()
+                self._pool.upload("frequencies", content)
+        self.on_host = {"values": False, "state": False}
+
+    @torch.no_grad()
+    def pull_values(self) -> None:
+        """Make torch's tensors the newest ones."""
+        if self.on_host["values"]:
+            return
+        self.on_host["values"] = True
+        tensors, blocks = self._tensors(), list(self.blocks.values())
+        for block, content in zip(blocks, read_all([b.arrays["value"] for b in blocks]), strict=True):
+            block.scatter(content, tensors)
+
+    @torch.no_grad()
+    def pull_state(self) -> None:
+        """Make torch's state of the optimizers the newest one."""
+        if self.on_host["state"]:
+            return
+        self.on_host["state"] = True
+        blocks = list(self.blocks.values())
+        tensors = self._tensors()
+        both = [{name: torch.zeros_like(tensor) for name, tensor in tensors.items()} for _ in range(2)]
+        for kind, into in zip(("mean", "square"), both, strict=True):
+            for block, content in zip(blocks, read_all([b.arrays[kind] for b in blocks]), strict=True):
+                block.scatter(content, into)
+        for name, tensor in tensors.items():
+            if self.steps[name] and name != FREQUENCIES:
+                self._optimizer.set_state(tensor, AdamState(self.steps[name], both[0][name], both[1][name]))
+        if self._frequencies is not None:
+            self._frequencies.unpack(self._pool.array("frequencies", self._state_shape).read(), self.steps[FREQUENCIES])
+
+    @property
+    def _state_shape(self) -> tuple[int]:
+        assert self._weights is not None
+        return (self._weights.config.components + 1,)
+
+    def arrays(self, kind: str) -> FieldArrays:
+        """What the field computes with (kind "value"), or its gradients; the Gaussians' own for a scene without one."""
+        tables = [block.arrays[kind] for name, block in self.blocks.items() if name.endswith(".table")]
+        geometry = self.blocks["geometry"].arrays[kind]
+        if self._weights is None:
+            return FieldArrays(geometry, geometry, [], geometry)
+        return FieldArrays(geometry, self.blocks["beside"].arrays[kind], tables, self.flat_weights(kind))
+
+    def flat_weights(self, kind: str) -> DeviceArray:
+        """The field's weights as one row of numbers."""
+        array = self.blocks["weights"].arrays[kind]
+        return DeviceArray(array.buffer, (array.shape[0],), array.dtype, array.offset)
+
+    # Passes ----------------------------------------------------------------------------------------------------------
+
+    def _moved(self, *, moving: bool) -> Iterator[Block]:
+        return (block for block in self.blocks.values() if moving or not block.moving)
+
+    def clear_gradients(self, commands: Commands, *, moving: bool) -> None:
+        """Record zeros for the gradients that are added to."""
+        for block in self._moved(moving=moving):
+            if block.name not in ("sh", "beside"):
+                commands.clear(block.arrays["gradient"])
+
+    def record_check(self, commands: Commands, bad: DeviceArray, *, moving: bool) -> None:
+        """Record the search for gradients that are not finite."""
+        kernel = Kernel.get(self._device, "check_finite")
+        for block in self._moved(moving=moving):
+            gradient = block.arrays["gradient"]
+            content = kernel.uniform("Check", count=gradient.size, bit=block.bit)
+            uniform = self._pool.constant(f"check {block.name}", content)
+            commands.dispatch(kernel, -(-gradient.size // 1024), check=uniform, values=gradient, bad=bad)
+
+    def count_step(self, *, moving: bool) -> None:
+        """A step that moves the parameters is about to be recorded."""
+        for block in self._moved(moving=moving):
+            for name in block.parts:
+                self.steps[name] += 1
+
+    def record_adam(
+        self, commands: Commands, guard: DeviceArray, rates: Mapping[str, float], frequency_rate: float, *, moving: bool
+    ) -> None:
+        """Record a step of the optimizers. rates: of the optimizer's groups."""
+        table: list[tuple[float, float]] = []
+        first: dict[str, int] = {}
+        for block in self._moved(moving=moving):
+            first[block.name] = len(table)
+            columns = block.shape[1] if block.group is None else 1
+            rows = [(0.0, 0.0)] * columns
+            for name, (_, place) in block.parts.items():
+                if name == FREQUENCIES:
+                    continue
+                rate, factor = _corrected(rates[block.group or name], self.steps[name])
+                for column in range(columns)[place]:
+                    rows[column] = rate, factor
+            table += rows
+        uploaded = self._pool.upload("rates", np.array(table, np.float32))
+        kernel = Kernel.get(self._device, "adam")
+        for block in self._moved(moving=moving):
+            count = block.arrays["value"].size if block.moved is None else block.moved
+            columns = block.shape[1] if block.group is None else 1
+            content = kernel.uniform("Adam", count=count, columns=columns, first=first[block.name])
+            commands.dispatch(
+                kernel,
+                -(-count // 256),
+                adam=self._pool.constant(f"adam {block.name} {moving}", content),
+                guard=guard,
+                rates=uploaded,
+                gradients=block.arrays["gradient"],
+                values=block.arrays["value"],
+                means=block.arrays["mean"],
+                squares=block.arrays["square"],
+            )
+        if moving and self._frequencies is not None:
+            self._record_frequencies(commands, guard, frequency_rate)
+
+    def _record_frequencies(self, commands: Commands, guard: DeviceArray, rate: float) -> None:
+        assert self._weights is not None and self._frequencies is not None
+        kernel, places = Kernel.get(self._device, "adam_frequencies"), self._weights.places
+        corrected, factor = _corrected(rate, self.steps[FREQUENCIES])
+        content = kernel.uniform(
+            "Frequencies",
+            width=self._weights.config.width,
+            components=self._weights.config.components,
+            alpha=places["motion.alpha"].first,
+            beta=places["motion.beta"].first,
+            frequencies=places[FREQUENCIES].first,
+            rate=corrected,
+            square_factor=factor,
+            limit=self._frequencies.limit,
+            largest=LARGEST_FREQUENCY_STEP,
+            floor=VARIANCE_FLOOR,
+            spread=VARIANCE_SPREAD,
+        )
+        commands.dispatch(
+            kernel,
+            1,
+            spectrum=self._pool.constant("frequencies uniform", content),
+            guard=guard,
+            d_weights=self.flat_weights("gradient"),
+            weights=self.flat_weights("value"),
+            state=self._pool.array("frequencies", self._state_shape),
+        )
+
+    def gradients(self) -> dict[str, list[Tensor]]:
+        """Of each tensor, read back; for the text of an error."""
+        tensors = {name: torch.zeros_like(tensor) for name, tensor in self._tensors().items()}
+        for block in self.blocks.values():
+            block.scatter(block.arrays["gradient"].read(), tensors)
+        return {name: [tensor] for name, tensor in tensors.items()}
+
+
+def _corrected(rate: float, steps: int) -> tuple[float, float]:
+    """A rate of Adam and the factor of the root of its second moment, with both moments' bias corrected."""
+    return rate / (1 - 0.9**steps), (1 - 0.999**steps) ** -0.5
+
+
