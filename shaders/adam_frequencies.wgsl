@@ -20,7 +20,7 @@ const EPSILON = 1e-15;
 
 @group(0) @binding(0) var<uniform> spectrum: Frequencies;
 @group(0) @binding(1) var<storage, read> guard: u32;
-@group(0) @binding(2) var<storage, read> d_weights: array<f32>;
+@group(0) @binding(2) var<storage, read_write> d_weights: array<f32>;
 @group(0) @binding(3) var<storage, read_write> weights: array<f32>;
 @group(0) @binding(4) var<storage, read_write> state: array<f32>;   // (components + 1,): means; the second moment
 
@@ -55,6 +55,9 @@ fn main(@builtin(local_invocation_index) lane: u32) {
     let square = 0.999 * state[spectrum.components] + 0.001 * mean_square;
     let mean = 0.9 * state[k] + 0.1 * gradient;
     workgroupBarrier();
+    if (lane < spectrum.components) {
+        d_weights[spectrum.frequencies + k] = 0.0;
+    }
     if (guard != 0u || lane >= spectrum.components) {
         return;
     }

@@ -1,10 +1,10 @@
-// Adds gradients in 64-bit fixed point to those in floats.
+// Adds gradients in 64-bit fixed point to those in floats, and leaves zeros for the next ones.
 #import common/fixed_scale
 #import common/hashgrid
 #import common/index
 
 @group(0) @binding(0) var<uniform> grid: Grid;
-@group(0) @binding(1) var<storage, read> d_fixed: array<vec2<u32>>;
+@group(0) @binding(1) var<storage, read_write> d_fixed: array<vec2<u32>>;
 @group(0) @binding(2) var<storage, read_write> d_features: array<f32>;
 @group(0) @binding(3) var<storage, read> largest: u32;   // as hashgrid_bwd has it
 
@@ -19,6 +19,7 @@ fn main(
         return;
     }
     var word = d_fixed[i];
+    d_fixed[i] = vec2(0u);
     let negative = (word.y & 0x80000000u) != 0u;
     if (negative) {
         word = vec2(~word.x + 1u, ~word.y + select(0u, 1u, word.x == 0u));

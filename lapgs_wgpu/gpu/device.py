@@ -148,6 +148,7 @@ class Device:
         command buffer (gfx-rs/wgpu#9531), so there the host polls.
     watchdog: whether the driver ends a submission that takes seconds, as on Windows and macOS (all but CPU devices).
     mappable: whether buffers can be mapped without a staging copy (CPU devices).
+    generation: number of buffers that pools have made: what was recorded before the last one may use a freed one.
     allocated_bytes: of all buffers at present, without staging buffers and textures.
     max_loop_turns: number of iterations, of all loops of an invocation together, after which the driver ends it; None
         for no limit.
@@ -187,6 +188,7 @@ class Device:
         self.max_loop_turns = SOFTWARE_LOOP_TURNS if self.is_cpu else None
         self.kernel_cache: dict[Any, Any] = {}
         self.allocated_bytes = 0
+        self.generation = 0
 
     @property
     def max_binding(self) -> int:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from types import TracebackType
 from typing import Any
 
@@ -16,6 +17,7 @@ from lapgs_wgpu.gpu.buffer import Buffer
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.native import Encoder, raising
 from lapgs_wgpu.gpu.profile import Profile
+from lapgs_wgpu.gpu.recording import Recording
 from lapgs_wgpu.gpu.shader import Binding, Defines, ShaderError, compose, enabled, pack, reflect
 from lapgs_wgpu.gpu.wgpu_errors import TranslatedErrors, is_lost
 
@@ -134,8 +136,15 @@ class Commands:
     whatever `flush` asks for.
     """
 
-    def __init__(self, device: Device, profile: Profile | None = None, *, whole: bool = False) -> None:
+    def __init__(
+        self,
+        device: Device,
+        profile: Profile | None = None,
+        *,
+        whole: bool = False,
+    ) -> None:
         self.device = device
+        self._recording: Recording | None = None
         self._whole = whole
         self._profile = profile
         self._encoder = Encoder(device.wgpu_device)
@@ -164,6 +173,7 @@ class Commands:
         group = kernel.bind(arrays, textures)
         self._encoder.begin_pass(None if self._profile is None else self._profile.record(kernel.name))
         self._encoder.dispatch(kernel.pipeline, group, *groups)
+        self._record("dispatch", (kernel.pipeline, group), *groups)
         for name in kernel.written:
             arrays[name].buffer.version += 1
 
@@ -176,7 +186,9 @@ class Commands:
         if array.nbytes == 0:
             return
         array.buffer.version += 1
-        self._encoder.clear(array.buffer.wgpu_buffer, array.offset, (array.nbytes + 3) & ~3)
+        place = array.offset, (array.nbytes + 3) & ~3
+        self._encoder.clear(array.buffer.wgpu_buffer, *place)
+        self._record("clear", (array.buffer.wgpu_buffer,), *place)
 
     def copy(self, source: DeviceArray, target: DeviceArray) -> None:
         """Copy an array to another of the same size in bytes."""
@@ -186,10 +198,36 @@ class Commands:
         self._encoder.copy(
             source.buffer.wgpu_buffer, source.offset, target.buffer.wgpu_buffer, target.offset, source.nbytes
         )
+        if self._recording is not None:
+            raise ValueError("copies are not recorded")
 
     def copy_out(self, source: DeviceArray, target: Any, offset: int) -> None:
         """Copy an array to a wgpu buffer, `offset` bytes from its start."""
         self._encoder.copy(source.buffer.wgpu_buffer, source.offset, target, offset, source.nbytes)
+
+    def varying(self, write: Callable[[], DeviceArray]) -> DeviceArray:
+        """A uniform whose content differs from one replay to the next: `write` writes it, and is called before each."""
+        if self._recording is not None:
+            self._recording.writers.append(write)
+        return write()
+
+    @contextmanager
+    def taken_down(self, recording: Recording | None) -> Iterator[None]:
+        """Take down in a recording what is done within, for `replay`."""
+        self._recording = recording
+        yield
+        self._recording = None
+
+    def _record(self, kind: str, objects: tuple[Any, ...], *numbers: int) -> None:
+        if self._recording is not None:
+            self._recording.kept.append(objects)
+            self._recording.commands.append((kind, *(each._internal for each in objects), *numbers))
+
+    def replay(self, recording: Recording) -> None:
+        """Do what was recorded, after its varying uniforms were written."""
+        for write in recording.writers:
+            write()
+        self._encoder.replay(recording.commands)
 
     def flush(self) -> None:
         """Submit what was recorded so far, where a watchdog ends long submissions, and go on. It runs even where the

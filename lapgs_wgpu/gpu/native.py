@@ -162,6 +162,22 @@ class Encoder:
         lib.wgpuComputePassEncoderSetBindGroup(self._pass, 0, bind_group._internal, 0, ffi.NULL)
         lib.wgpuComputePassEncoderDispatchWorkgroups(self._pass, columns, rows, 1)
 
+    def replay(self, commands: list[tuple[Any, ...]]) -> None:
+        """Do what a Recording holds."""
+        pipeline_of, group_of = lib.wgpuComputePassEncoderSetPipeline, lib.wgpuComputePassEncoderSetBindGroup
+        run, nothing = lib.wgpuComputePassEncoderDispatchWorkgroups, ffi.NULL
+        for kind, *values in commands:
+            if kind == "clear":
+                self.end_pass()
+                lib.wgpuCommandEncoderClearBuffer(self._encoder, *values)
+                continue
+            if self._pass is None:
+                self.begin_pass()
+            pipeline, group, columns, rows = values
+            pipeline_of(self._pass, pipeline)
+            group_of(self._pass, 0, group, 0, nothing)
+            run(self._pass, columns, rows, 1)
+
     def clear(self, buffer: Any, offset: int, nbytes: int) -> None:
         """Set bytes of a buffer to zero."""
         self.end_pass()

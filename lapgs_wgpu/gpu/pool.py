@@ -29,6 +29,7 @@ class BufferPool:
         buffer = self._buffers.get(name)
         nbytes = math.prod(shape) * np.dtype(dtype).itemsize
         if buffer is None or buffer.nbytes < nbytes:
+            self.device.generation += 1
             buffer = self._buffers[name] = Buffer(self.device, nbytes, name)
         return DeviceArray(buffer, shape, dtype)
 

@@ -19,7 +19,7 @@ from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.gpu.profile import Profile
 from lapgs_wgpu.gpu.radix_sort import RadixSort
 from lapgs_wgpu.gpu.scan import Scan
-from lapgs_wgpu.splat.buffer_plan import BufferPlans, roomy
+from lapgs_wgpu.splat.buffer_plan import BufferPlan, BufferPlans, roomy
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.drawing import Drawing, GaussianGradients, TileLists
 from lapgs_wgpu.splat.gaussians import Gaussians
@@ -120,6 +120,11 @@ class Rasterizer:
             needed=[self.pool.array(f"needed {band}", (3,), "uint32") for band in range(self.plans.now.bands)],
         )
 
+    def plan_of(self, camera: Camera) -> BufferPlan:
+        """The plan by which `record` draws this camera's image next."""
+        self.plans.turn_to((camera.width, camera.height, True))
+        return self.plans.now
+
     def holds(self, drawing: Drawing) -> bool:
         """Return whether the arrays still hold this drawing: no other image was drawn since."""
         return drawing.number == self._drawings
@@ -156,7 +161,8 @@ class Rasterizer:
     def _draw_band(self, commands: Commands, drawing: Drawing, band: int) -> TileLists:
         device, pool, config, gaussians = self.device, self.pool, self.config, drawing.gaussians
         n, capacity, tiles = len(gaussians), drawing.plan.capacity, self._band_tiles(drawing, band)
-        frame, needed, visible = self._frame(drawing, band), drawing.needed[band], pool.array("visible", (1,), "uint32")
+        frame = commands.varying(lambda: self._frame(drawing, band))
+        needed, visible = drawing.needed[band], pool.array("visible", (1,), "uint32")
         tile_counts, ids, keys, offsets = (
             pool.array(name, (n,), "uint32") for name in ("tile counts", "ids", "depth keys", "offsets")
         )

@@ -99,6 +99,11 @@ class ImageLoss:
         commands.dispatch_grid(kernel, grid, picture=frame.picture, pixels=pixels, d_image=d_image, **extra)
         return LossArrays(terms, d_image)
 
+    def held(self, truth: DeviceArray) -> DeviceArray:
+        """Where a ground truth (H, W) is copied to, so that all of a training go through one buffer, and with it through
+        one texture and one bind group."""
+        return self.pool.array("truth", truth.shape, "uint32")
+
     def kernel(self, name: str, **defines: int) -> Kernel:
         return Kernel.get(self.device, name, LANES=self._lanes, **defines)
 
@@ -170,9 +175,9 @@ class _Frame:
 
     def pixels(self, image: DeviceArray, truth: DeviceArray) -> DeviceArray:
         pool = self.owner.pool
-        # A copy, so that all pictures of a training go through one buffer (and one texture, and one bind group).
-        held = pool.array("truth", truth.shape, "uint32")
-        self.commands.copy(truth, held)
+        held = self.owner.held(truth)
+        if held.buffer is not truth.buffer:
+            self.commands.copy(truth, held)
         pixels = pool.array("pixels", (self.places, 4), "uint32")
         self.commands.dispatch_grid(
             self.owner.kernel("loss_pixels"),

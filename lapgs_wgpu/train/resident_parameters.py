@@ -6,7 +6,7 @@ next step pushes what the host may have changed.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -25,6 +25,7 @@ from lapgs_wgpu.motion.passes.field_weights import FieldWeights
 from lapgs_wgpu.motion.passes.grid_field_passes import FieldArrays
 from lapgs_wgpu.train.optimizer import LARGEST_FREQUENCY_STEP, AdamState, FrequencyOptimizer, Optimizer
 
+_MOST_RATES = 512  # columns with a rate of their own
 KINDS = ("value", "gradient", "mean", "square")
 FREQUENCIES = "motion.frequencies"
 Place = tuple[slice, slice]  # rows and columns of an array
@@ -54,6 +55,11 @@ class Block:
     moved: int | None = None
     moving: bool = True
     arrays: dict[str, DeviceArray] = field(default_factory=dict)
+
+    @property
+    def rate_columns(self) -> int:
+        """Number of columns with a rate of their own."""
+        return self.shape[1] if self.group is None else 1
 
     def gather(self, tensors: Mapping[str, Tensor | None], *, value: bool) -> NDArray[np.float32]:
         """The content for the device; tensors that are None are zeros."""
@@ -195,11 +201,10 @@ class ResidentParameters:
     def _moved(self, *, moving: bool) -> Iterator[Block]:
         return (block for block in self.blocks.values() if moving or not block.moving)
 
-    def clear_gradients(self, commands: Commands, *, moving: bool) -> None:
-        """Record zeros for the gradients that are added to."""
-        for block in self._moved(moving=moving):
-            if block.name not in ("sh", "beside"):
-                commands.clear(block.arrays["gradient"])
+    def clear_gradients(self, commands: Commands) -> None:
+        """Record zeros for the gradients, which each step of Adam leaves."""
+        for block in self.blocks.values():
+            commands.clear(block.arrays["gradient"])
 
     def record_check(self, commands: Commands, bad: DeviceArray, *, moving: bool) -> None:
         """Record the search for gradients that are not finite."""
@@ -216,35 +221,36 @@ class ResidentParameters:
             for name in block.parts:
                 self.steps[name] += 1
 
-    def record_adam(
-        self, commands: Commands, guard: DeviceArray, rates: Mapping[str, float], frequency_rate: float, *, moving: bool
-    ) -> None:
-        """Record a step of the optimizers. rates: of the optimizer's groups."""
+    def write_rates(self, rates: Mapping[str, float], *, moving: bool) -> None:
+        """Upload the learning rates of a step. rates: of the optimizer's groups."""
         table: list[tuple[float, float]] = []
-        first: dict[str, int] = {}
         for block in self._moved(moving=moving):
-            first[block.name] = len(table)
-            columns = block.shape[1] if block.group is None else 1
+            columns = block.rate_columns
             rows = [(0.0, 0.0)] * columns
             for name, (_, place) in block.parts.items():
-                if name == FREQUENCIES:
-                    continue
-                rate, factor = _corrected(rates[block.group or name], self.steps[name])
-                for column in range(columns)[place]:
-                    rows[column] = rate, factor
+                if name != FREQUENCIES:
+                    rows[place if columns > 1 else slice(None)] = [
+                        _corrected(rates[block.group or name], self.steps[name])
+                    ] * len(range(columns)[place])
             table += rows
-        uploaded = self._pool.upload("rates", np.array(table, np.float32))
-        kernel = Kernel.get(self._device, "adam")
+        self._pool.array("rates", (_MOST_RATES, 2)).rows(0, len(table)).write(np.array(table, np.float32))
+
+    def record_adam(
+        self, commands: Commands, guard: DeviceArray, frequency_rate: Callable[[], float], *, moving: bool
+    ) -> None:
+        """Record a step of the optimizers, by the rates that were written."""
+        kernel, first = Kernel.get(self._device, "adam"), 0
+        rates = self._pool.array("rates", (_MOST_RATES, 2))
         for block in self._moved(moving=moving):
             count = block.arrays["value"].size if block.moved is None else block.moved
-            columns = block.shape[1] if block.group is None else 1
-            content = kernel.uniform("Adam", count=count, columns=columns, first=first[block.name])
+            content = kernel.uniform("Adam", count=count, columns=block.rate_columns, first=first)
+            first += block.rate_columns
             commands.dispatch(
                 kernel,
                 -(-count // 256),
-                adam=self._pool.constant(f"adam {block.name} {moving}", content),
+                adam=self._pool.constant(f"adam {block.name}", content),
                 guard=guard,
-                rates=uploaded,
+                rates=rates,
                 gradients=block.arrays["gradient"],
                 values=block.arrays["value"],
                 means=block.arrays["mean"],
@@ -253,28 +259,32 @@ class ResidentParameters:
         if moving and self._frequencies is not None:
             self._record_frequencies(commands, guard, frequency_rate)
 
-    def _record_frequencies(self, commands: Commands, guard: DeviceArray, rate: float) -> None:
+    def _record_frequencies(self, commands: Commands, guard: DeviceArray, rate: Callable[[], float]) -> None:
         assert self._weights is not None and self._frequencies is not None
         kernel, places = Kernel.get(self._device, "adam_frequencies"), self._weights.places
-        corrected, factor = _corrected(rate, self.steps[FREQUENCIES])
-        content = kernel.uniform(
-            "Frequencies",
-            width=self._weights.config.width,
-            components=self._weights.config.components,
-            alpha=places["motion.alpha"].first,
-            beta=places["motion.beta"].first,
-            frequencies=places[FREQUENCIES].first,
-            rate=corrected,
-            square_factor=factor,
-            limit=self._frequencies.limit,
-            largest=LARGEST_FREQUENCY_STEP,
-            floor=VARIANCE_FLOOR,
-            spread=VARIANCE_SPREAD,
-        )
+
+        def write() -> DeviceArray:
+            corrected, factor = _corrected(rate(), self.steps[FREQUENCIES])
+            content = kernel.uniform(
+                "Frequencies",
+                width=self._weights.config.width,
+                components=self._weights.config.components,
+                alpha=places["motion.alpha"].first,
+                beta=places["motion.beta"].first,
+                frequencies=places[FREQUENCIES].first,
+                rate=corrected,
+                square_factor=factor,
+                limit=self._frequencies.limit,
+                largest=LARGEST_FREQUENCY_STEP,
+                floor=VARIANCE_FLOOR,
+                spread=VARIANCE_SPREAD,
+            )
+            return self._pool.constant("frequencies uniform", content)
+
         commands.dispatch(
             kernel,
             1,
-            spectrum=self._pool.constant("frequencies uniform", content),
+            spectrum=commands.varying(write),
             guard=guard,
             d_weights=self.flat_weights("gradient"),
             weights=self.flat_weights("value"),

@@ -12,7 +12,7 @@ import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -21,9 +21,11 @@ from torch import Tensor
 
 from lapgs_wgpu.data.views import View
 from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.later import Later, Ring
 from lapgs_wgpu.gpu.pool import BufferPool
+from lapgs_wgpu.gpu.recording import Recording
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.passes.activation_passes import ActivationPasses, Line
 from lapgs_wgpu.motion.passes.grid_field_passes import Comparison, Decoding, FieldArrays, GridFieldPasses
@@ -98,6 +100,18 @@ class _Flying(NamedTuple):
     result: Pending
 
 
+class _Recorded(NamedTuple):
+    """The passes of a step. told: what is read of it later."""
+
+    recording: Recording | None
+    drawing: Drawing
+    told: list[DeviceArray]
+
+    def holds(self, device: Device) -> bool:
+        """Whether it can be replayed."""
+        return self.recording is not None and self.recording.generation == device.generation
+
+
 class Pending:
     """What a step will have told."""
 
@@ -142,6 +156,7 @@ class ResidentStep:
         self._pool = BufferPool(device)
         self._ring = Ring(device, _RING_BYTES)
         self._flying: deque[_Flying] = deque()
+        self._recordings: dict[tuple[Any, ...], _Recorded] = {}
         self._checked = False
         self._statistics_on_host = True
         self.statistics: Statistics | None = None
@@ -244,8 +259,10 @@ class ResidentStep:
             return
         # Not finite. The gradients are gone that were: this step alone once more, behind the closed guard.
         self._word("guard").write(np.array([flying.task.step], np.uint32))
-        self._told(self._submit(flying.task, flying.result))
+        self._told(self._submit(flying.task, flying.result, judged=True))
         gradients = self.parameters.gradients()
+        with Commands(self._device) as commands:
+            self.parameters.clear_gradients(commands)
         self.parameters.steps = dict(flying.task.counts)
         self.parameters.pull_values()
         check_parameters(self._learners.parameters())
@@ -311,35 +328,66 @@ class ResidentStep:
 
     # The passes of a step --------------------------------------------------------------------------------------------
 
-    def _submit(self, task: Task, result: Pending) -> _Flying:
-        sample, device = task.sample, self._device
-        values, gradients = self.parameters.arrays("value"), self.parameters.arrays("gradient")
-        truth = self._truth.on_device(sample.view)
+    def _submit(self, task: Task, result: Pending, *, judged: bool = False) -> _Flying:
+        """Submit a step. judged: only up to its gradients, which stay."""
+        self._task = task
+        truth = self._truth.on_device(task.sample.view)
         self._check_driver(task)
         task.counts = dict(self.parameters.steps)
-        self.parameters.count_step(moving=sample.moving)
+        self.parameters.count_step(moving=task.sample.moving)
+        self.parameters.write_rates(task.rates, moving=task.sample.moving)
+        held = self._losses.held(truth)
+        with Commands(self._device, whole=True) as commands:
+            commands.copy(truth, held)
+            step = self._recorded(commands, task, held, judged=judged)
+            later = self._ring.record(commands, step.told)
+        later.submitted()
+        return _Flying(task, step.drawing, later, result)
+
+    def _recorded(self, commands: Commands, task: Task, truth: DeviceArray, *, judged: bool) -> _Recorded:
+        """Record a step's passes, or replay those of one of the same shape."""
+        camera, plan = task.sample.view.camera, self._rasterizer.plan_of(task.sample.view.camera)
+        shape = (
+            *(task.sample.moving, task.sample.near is None, task.sample.even is None, task.sh_degree, task.seen),
+            *(task.sample.background, camera.width, camera.height, plan, judged),
+        )
+        found = self._recordings.get(shape)
+        if found is not None and found.recording is not None and found.holds(self._device):
+            found.drawing.camera = camera
+            commands.replay(found.recording)
+            return found
+        # Textures follow their buffers by copies that no recording has.
+        recording = None if self._device.textures else Recording(self._device.generation)
+        with commands.taken_down(recording):
+            step = self._record(commands, task, truth, recording, judged=judged)
+        if recording is not None:
+            recording.generation = self._device.generation
+            of_today = {key: each for key, each in self._recordings.items() if each.holds(self._device)}
+            self._recordings = of_today | {shape: step}
+        return step
+
+    def _record(
+        self, commands: Commands, task: Task, truth: DeviceArray, recording: Recording | None, *, judged: bool
+    ) -> _Recorded:
+        sample = task.sample
+        values, gradients = self.parameters.arrays("value"), self.parameters.arrays("gradient")
         guard, bad, dead = (self._word(name) for name in ("guard", "bad", "dead"))
         totals = self._pool.array("totals", (len(_TOTALS),))
-        with Commands(device, whole=True) as commands:
-            for array in (bad, dead, totals):
-                commands.clear(array)
-            self.parameters.clear_gradients(commands, moving=sample.moving)
-            decoding, comparison, line = self._decode(commands, task, values)
-            drawn = self._activate(commands, task, decoding, dead)
-            drawing = self._rasterizer.record(commands, drawn, sample.view.camera, sample.background)
-            terms, d_image = self._losses.record(
-                commands, drawing.image, truth, sample.background, self._weights(task), gradient=True
-            )
-            assert d_image is not None
-            by_drawn = self._rasterizer.record_bwd(commands, drawing, d_image)
-            self._activate_bwd(commands, drawn, by_drawn, decoding, line, totals)
-            if self._field is not None and decoding is not None:
-                self._decode_bwd(commands, values, gradients, decoding, comparison, line, totals)
-            self._record_end(commands, task, drawing, by_drawn, terms)
-            told = [guard, bad, dead, terms, totals, *drawing.needed]
-            later = self._ring.record(commands, told)
-        later.submitted()
-        return _Flying(task, drawing, later, result)
+        for array in (bad, dead, totals):
+            commands.clear(array)
+        decoding, comparison, line = self._decode(commands, task, values)
+        drawn = self._activate(commands, task, decoding, dead)
+        drawing = self._rasterizer.record(commands, drawn, sample.view.camera, sample.background)
+        terms, d_image = self._losses.record(
+            commands, drawing.image, truth, sample.background, self._weights(task), gradient=True
+        )
+        assert d_image is not None
+        by_drawn = self._rasterizer.record_bwd(commands, drawing, d_image)
+        self._activate_bwd(commands, drawn, by_drawn, decoding, line, totals)
+        if self._field is not None and decoding is not None:
+            self._decode_bwd(commands, values, gradients, decoding, comparison, line, totals)
+        self._record_end(commands, task, drawing, by_drawn, terms, judged=judged)
+        return _Recorded(recording, drawing, [guard, bad, dead, terms, totals, *drawing.needed])
 
     def _check_driver(self, task: Task) -> None:
         """Draw an image and its gradient once the ordinary way, which checks the driver's subgroups."""
@@ -364,16 +412,29 @@ class ResidentStep:
         if field is None or not sample.moving:
             return None, None, None
         field.begin(commands, values)
-        decoding, comparison, line = field.decode(commands, 0, values, task.time), None, None
+        decoding, comparison, line = field.decode(commands, 0, values, self._time), None, None
         if sample.near is not None:
-            comparison = field.compare(commands, 1, values, task.time, sample.near, sample.near_time)
+            near_time = self._of_sample("near_time")
+            comparison = field.compare(commands, 1, values, self._time, self._of_sample("near"), near_time)
         if sample.even is not None:
-            before, after = sample.even_times
-            both = (field.decode(commands, 3 + i, values, t, sample.even) for i, t in enumerate(sample.even_times))
-            config = self._config.acceleration
+            even, config = self._of_sample("even"), self._config.acceleration
+            before = field.decode(commands, 3, values, lambda: self._task.sample.even_times[0], even)
+            after = field.decode(commands, 4, values, lambda: self._task.sample.even_times[1], even)
             scale = config.weight * config.interval / sample.even.count
-            line = Line(sample.even, *both, (task.time - before) / (after - before), scale)
+            line = Line(even, before, after, self._even_share, scale)
         return decoding, comparison, line
+
+    # What varies from step to step: recorded passes ask for it anew.
+
+    def _time(self) -> float:
+        return self._task.time
+
+    def _of_sample(self, name: str) -> Callable[[], Any]:
+        return lambda: getattr(self._task.sample, name)
+
+    def _even_share(self) -> float:
+        before, after = self._task.sample.even_times
+        return (self._task.time - before) / (after - before)
 
     def _activate(
         self, commands: Commands, task: Task, decoding: Decoding | None, dead: DeviceArray
@@ -459,7 +520,14 @@ class ResidentStep:
         self._total(commands, arrays["losses"], "dynamics", 1.0, totals)
 
     def _record_end(
-        self, commands: Commands, task: Task, drawing: Drawing, by_drawn: GaussianGradients, terms: DeviceArray
+        self,
+        commands: Commands,
+        task: Task,
+        drawing: Drawing,
+        by_drawn: GaussianGradients,
+        terms: DeviceArray,
+        *,
+        judged: bool,
     ) -> None:
         device, moving = self._device, task.sample.moving
         guard, bad = self._word("guard"), self._word("bad")
@@ -469,12 +537,17 @@ class ResidentStep:
         commands.dispatch(check, 1, check=self._pool.constant("check terms", content), values=terms, bad=bad)
         close = Kernel.get(device, "close_guard")
         plan = drawing.plan
-        content = close.uniform(
-            "Guarded", step=task.step, capacity=plan.capacity, rounds=int(bool(self._rasterizer.config.round_splats))
-        )
-        guarded = self._pool.constant("guarded", content)
+        rounds = int(bool(self._rasterizer.config.round_splats))
+
+        def guarded_step() -> DeviceArray:
+            content = close.uniform("Guarded", step=self._task.step, capacity=plan.capacity, rounds=rounds)
+            return self._pool.constant("guarded", content)
+
+        guarded = commands.varying(guarded_step)
         for needed in drawing.needed:
             commands.dispatch(close, 1, guarded=guarded, needed=needed, bad=bad, guard=guard)
+        if judged:
+            return
         if task.seen:
             kernel, camera = Kernel.get(device, "accumulate_statistics"), task.sample.view.camera
             content = kernel.uniform("Seen", half_size=(camera.width / 2, camera.height / 2), gaussians=self.count)
@@ -487,7 +560,7 @@ class ResidentStep:
                 d_splats=by_drawn.splats,
                 statistics=self._seen(),
             )
-        self.parameters.record_adam(commands, guard, task.rates, task.frequency_rate, moving=moving)
+        self.parameters.record_adam(commands, guard, lambda: self._task.frequency_rate, moving=moving)
 
 
 def _draw_rows(count: int, generator: torch.Generator) -> tuple[int, int]:

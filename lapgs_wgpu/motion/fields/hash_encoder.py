@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -117,7 +118,7 @@ class HashEncoder:
         for number, (points, time) in enumerate(places):
             padded = _host(torch.nn.functional.pad(points.detach().float(), (0, 1)))
             uploaded = self._pool.upload(f"points {number}", padded)
-            self._held.points.append(PointSet(number, uploaded, len(points), time))
+            self._held.points.append(PointSet(number, uploaded, len(points), partial(float, time)))
             shapes = [(len(points), features) for features in self.features]
             self._held.encodings.append(
                 [self._pool.array(f"encoding {number} {group}", shape) for group, shape in enumerate(shapes)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 from lapgs_wgpu.gpu.array import DeviceArray
@@ -10,7 +11,7 @@ from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.motion.fields.config import GEOMETRY, FieldConfig
 from lapgs_wgpu.motion.passes.grid_field_passes import Decoding
-from lapgs_wgpu.motion.passes.samples import SamplePasses, Samples
+from lapgs_wgpu.motion.passes.samples import SamplePasses, Sampling
 from lapgs_wgpu.splat.drawing import GaussianGradients
 from lapgs_wgpu.splat.gaussians import Gaussians
 
@@ -22,16 +23,16 @@ class Line(NamedTuple):
     """Samples before and after the time of a step, which should lie on a line.
 
     Attributes:
-        samples: of the Gaussians.
+        sampling: gives the samples of the Gaussians.
         before, after: they at these times.
-        share: of the way from the one to the other.
+        share: gives that of the way from the one to the other.
         scale: of the gradient: the loss's weight, divided by the number of samples.
     """
 
-    samples: Samples
+    sampling: Sampling
     before: Decoding
     after: Decoding
-    share: float
+    share: Callable[[], float]
     scale: float
 
 
@@ -111,7 +112,7 @@ class ActivationPasses:
         self, commands: Commands, line: Line, geometry: DeviceArray, drawn: Gaussians[DeviceArray]
     ) -> DeviceArray:
         """Record the acceleration loss of each sample, without its weight: (count,)."""
-        values = self.pool.array("accelerations", (line.samples.count,))
+        values = self.pool.array("accelerations", (line.before.points.count,))
         kernel = Kernel.get(self._device, "acceleration")
         self._line(commands, kernel, line, geometry, drawn, values=values)
         return values
@@ -139,14 +140,16 @@ class ActivationPasses:
         drawn: Gaussians[DeviceArray],
         **more: DeviceArray,
     ) -> None:
-        content = kernel.uniform(
-            "Acceleration", outputs=self._outputs, mirror=self._mirror, share=line.share, scale=line.scale
-        )
+        def write() -> DeviceArray:
+            given = {"outputs": self._outputs, "mirror": self._mirror}
+            content = kernel.uniform("Acceleration", **given, share=line.share(), scale=line.scale)
+            return self.pool.constant("acceleration", content)
+
         commands.dispatch(
             kernel,
-            -(-line.samples.count // 64),
-            samples=self._samples.constant("line", line.samples),
-            acceleration=self.pool.constant("acceleration", content),
+            -(-line.before.points.count // 64),
+            samples=self._samples.constant(commands, "line", line.sampling),
+            acceleration=commands.varying(write),
             biases_before=line.before.biases,
             biases_after=line.after.biases,
             geometry=geometry,

@@ -7,6 +7,7 @@ does the same in motion/fields/grid_field.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +25,9 @@ _NONE = 0xFFFFFFFF  # pack_weights.wgsl
 _ALIGNED = 64  # floats; a multiple of 256 bytes, at which a binding may begin
 _BIASES = 20  # floats of the heads' biases, as activate.wgsl binds them
 _HEADS = sum(GEOMETRY)
+
+
+Time = Callable[[], float]  # gives that of the step that is taken, in [0, 1]
 
 
 class Segment(NamedTuple):
@@ -153,8 +157,8 @@ class FieldWeights:
         """Record that the gradients of packed layers are added to those of the weights."""
         self._pack(commands, self._layers, d_weights, d_packed, back=True)
 
-    def pack_heads(self, commands: Commands, weights: DeviceArray, name: str, t: float) -> DeviceArray:
-        """Record the packing of the heads at a time in [0, 1], with the motion folded in; the packed ones.
+    def pack_heads(self, commands: Commands, weights: DeviceArray, name: str, t: Time) -> DeviceArray:
+        """Record the packing of the heads at a time, with the motion folded in; the packed ones.
 
         name: distinguishes the times that are submitted together.
         """
@@ -162,7 +166,7 @@ class FieldWeights:
         self._pack(commands, self._heads, weights, packed)
         if self.shape.motion:
             series = self._pool.array(f"series {name}", (self.config.width,))
-            spectrum = self._spectrum(name, t)
+            spectrum = commands.varying(lambda: self._spectrum(name, t()))
             commands.dispatch(
                 Kernel.get(self._device, "spectrum"),
                 -(-self.config.width // 64),
@@ -182,7 +186,7 @@ class FieldWeights:
         return packed
 
     def unpack_heads(
-        self, commands: Commands, weights: DeviceArray, d_weights: DeviceArray, d_packed: DeviceArray, name: str, t: float
+        self, commands: Commands, weights: DeviceArray, d_weights: DeviceArray, d_packed: DeviceArray, name: str, t: Time
     ) -> None:
         """Record that the gradients of heads that `pack_heads` packed are added to those of the weights."""
         self._pack(commands, self._heads, d_weights, d_packed, back=True)
@@ -190,7 +194,7 @@ class FieldWeights:
             return
         series = self._pool.array(f"series {name}", (self.config.width,))
         d_series = self._pool.array("d_series", (self.config.width,))
-        arrays = {"spectrum": self._spectrum(name, t), "weights": weights, "d_weights": d_weights}
+        arrays = {"spectrum": self._spectrum(name, t()), "weights": weights, "d_weights": d_weights}
         both = {f"d_{name}": segment.of(d_packed) for name, segment in self._heads.segments.items()}
         fold = Kernel.get(self._device, "fold_motion_bwd")
         commands.dispatch(fold, self.config.width, **arrays, series=series, d_series=d_series, **both)

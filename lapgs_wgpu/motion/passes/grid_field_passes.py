@@ -5,6 +5,8 @@ Everything stays in device arrays. Gradients are added to arrays that the caller
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 from lapgs_wgpu.gpu.array import DeviceArray
@@ -13,9 +15,9 @@ from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.motion.fields.config import FieldConfig, static_grid, temporal_grids
 from lapgs_wgpu.motion.passes.decoder_passes import DecoderPasses
-from lapgs_wgpu.motion.passes.field_weights import FieldWeights
+from lapgs_wgpu.motion.passes.field_weights import FieldWeights, Time
 from lapgs_wgpu.motion.passes.hash_encoder_passes import HashEncoderPasses, PointSet
-from lapgs_wgpu.motion.passes.samples import SamplePasses, Samples
+from lapgs_wgpu.motion.passes.samples import SamplePasses, Samples, Sampling
 
 
 class FieldArrays(NamedTuple):
@@ -39,8 +41,8 @@ class Decoding(NamedTuple):
 
     Attributes:
         name: distinguishes it.
-        time: of the field, in [0, 1].
-        samples: those of the Gaussians; None for all, in their order.
+        time: gives that of the field, in [0, 1].
+        sampling: gives those of the Gaussians; None for all, in their order.
         points: of the encoder.
         inputs: of the decoder.
         weights: packed, of the decoder.
@@ -49,8 +51,8 @@ class Decoding(NamedTuple):
     """
 
     name: str
-    time: float
-    samples: Samples | None
+    time: Time
+    sampling: Sampling | None
     points: PointSet
     inputs: dict[str, DeviceArray]
     weights: dict[str, DeviceArray]
@@ -97,47 +99,51 @@ class GridFieldPasses:
         self._layers = self.weights.pack_layers(commands, arrays.weights)
 
     def decode(
-        self, commands: Commands, number: int, arrays: FieldArrays, t: float, samples: Samples | None = None
+        self, commands: Commands, number: int, arrays: FieldArrays, t: Time, sampling: Sampling | None = None
     ) -> Decoding:
-        """Record the forward pass of all Gaussians, or of samples, at a time of the field in [0, 1].
+        """Record the forward pass of all Gaussians, or of samples, at a time of the field.
 
         number: distinguishes the times that are submitted together, from 0 on.
         """
         assert self._layers is not None
-        name, every = f"decoded {number}", samples is None
-        chosen = samples or Samples(arrays.geometry.shape[0], arrays.geometry.shape[0])
+        name, every = f"decoded {number}", sampling is None
+        count = arrays.geometry.shape[0]
+        chosen = sampling or partial(Samples, count, count)
         points = self._points(commands, number, chosen, arrays, t, every=every)
         encodings = self._encode(commands, points, arrays.tables)
         beside = arrays.beside
-        if samples is not None:
-            beside = self.pool.array(f"beside {number}", (samples.count, beside.shape[1]))
-            self.samples.rows(commands, f"set {number}", samples, arrays.beside, beside, back=False)
+        if sampling is not None:
+            beside = self.pool.array(f"beside {number}", (points.count, beside.shape[1]))
+            self.samples.rows(commands, f"set {number}", sampling, arrays.beside, beside, back=False)
         heads = self.weights.pack_heads(commands, arrays.weights, name, t)
         weights = self.weights.segments(self._layers, heads)
         inputs = dict(zip(self.shape.inputs, [beside, *encodings], strict=True))
-        outputs = self.pool.array(f"outputs {number}", (chosen.count, self.shape.outputs))
-        self._decoder(samples).decode(commands, inputs, weights, outputs)
-        return Decoding(name, t, samples, points, inputs, weights, heads, outputs)
+        outputs = self.pool.array(f"outputs {number}", (points.count, self.shape.outputs))
+        self._decoder(sampling).decode(commands, inputs, weights, outputs)
+        return Decoding(name, t, sampling, points, inputs, weights, heads, outputs)
 
     def compare(
-        self, commands: Commands, number: int, arrays: FieldArrays, t: float, near: Samples, near_time: float
+        self, commands: Commands, number: int, arrays: FieldArrays, t: Time, near: Sampling, near_time: Time
     ) -> Comparison:
         """Record the features of samples at a time, and of places near them at another time, and their differences.
 
         number: as for `decode`; the next one is taken, too.
         """
-        at_means = Samples(near.count, near.gaussians, near.first, near.seed)
+        def at_means() -> Samples:
+            return replace(near(), reach=0.0)
+
         points = (
             self._points(commands, number, at_means, arrays, t),
             self._points(commands, number + 1, near, arrays, near_time),
         )
         here, there = (self._encode(commands, each, arrays.tables) for each in points)
+        count = points[0].count
         sums = []
         kernel = Kernel.get(self._device, "smoothness")
         for group, (a, b) in enumerate(zip(here, there, strict=True)):
-            total = self.pool.array(f"differences {group}", (near.count,))
-            uniform = self._smoothness(group, near.count, 0.0)
-            commands.dispatch(kernel, -(-near.count // 64), smoothness=uniform, here=a, there=b, sums=total)
+            total = self.pool.array(f"differences {group}", (count,))
+            uniform = self._smoothness(group, count, 0.0)
+            commands.dispatch(kernel, -(-count // 64), smoothness=uniform, here=a, there=b, sums=total)
             sums.append(total)
         return Comparison(points, here, there, sums)
 
@@ -152,11 +158,11 @@ class GridFieldPasses:
         such call of a step.
         """
         d_beside = gradients.beside
-        if decoding.samples is not None:
+        if decoding.sampling is not None:
             d_beside = self.pool.array("d_beside", decoding.inputs["beside"].shape)
         d_layers, d_heads = self.weights.layers("gradient"), self.weights.heads("gradient")
         d_weights = self.weights.gradient_segments(d_layers, d_heads)
-        self._decoder(decoding.samples).decode_bwd(
+        self._decoder(decoding.sampling).decode_bwd(
             commands,
             decoding.inputs,
             decoding.weights,
@@ -165,9 +171,9 @@ class GridFieldPasses:
             d_weights,
             add=not first,
         )
-        if decoding.samples is not None:
+        if decoding.sampling is not None:
             number = decoding.points.number
-            self.samples.rows(commands, f"set {number}", decoding.samples, gradients.beside, d_beside, back=True)
+            self.samples.rows(commands, f"set {number}", decoding.sampling, gradients.beside, d_beside, back=True)
         encodings = [decoding.inputs[name] for name in self.shape.inputs if name != "beside"]
         self._encode_bwd(commands, decoding.points, encodings, gradients.tables)
         place = arrays.weights, gradients.weights, d_heads, decoding.name, decoding.time
@@ -192,22 +198,22 @@ class GridFieldPasses:
 
     # Parts -----------------------------------------------------------------------------------------------------------
 
-    def _decoder(self, samples: Samples | None) -> DecoderPasses:
+    def _decoder(self, sampling: Sampling | None) -> DecoderPasses:
         """Of all Gaussians, or of samples: sets of equal size share one, and with it its buffers."""
-        return self._now if samples is None else self._sampled
+        return self._now if sampling is None else self._sampled
 
     def _points(
         self,
         commands: Commands,
         number: int,
-        samples: Samples,
+        sampling: Sampling,
         arrays: FieldArrays,
-        t: float,
+        t: Time,
         *,
         every: bool = False,
     ) -> PointSet:
-        array = self.samples.places(commands, f"set {number}", samples, arrays.geometry, every=every)
-        return PointSet(number, array, samples.count, self.config.grid_time(t))
+        array = self.samples.places(commands, f"set {number}", sampling, arrays.geometry, every=every)
+        return PointSet(number, array, array.shape[0], lambda: self.config.grid_time(t()))
 
     def _encode(self, commands: Commands, points: PointSet, tables: list[DeviceArray]) -> list[DeviceArray]:
         found, rest = [], list(tables)

@@ -7,7 +7,8 @@ looking up two planes for each point.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from functools import partial
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,13 +29,13 @@ class PointSet:
     """Points at one time.
 
     number: distinguishes the sets that are submitted together. array: (N, 4) world units. count: number of points to
-    encode. time: in [0, 1].
+    encode. time: gives the one in [0, 1].
     """
 
     number: int
     array: DeviceArray
     count: int
-    time: float
+    time: Callable[[], float]
 
 
 @dataclass(frozen=True)
@@ -116,13 +117,13 @@ class HashEncoderPasses:
             points=count,
             all_points=points.count,
             all_levels=self._row // 2,
-            time=points.time if self._timed else 0.0,
+            time=points.time() if self._timed else 0.0,
             bound=self.bound,
         )
         return self.pool.constant(f"grid {points.number} from {first} by {most}", content)
 
     def _blocks(
-        self, points: PointSet, encoding: DeviceArray, most: int | None = None
+        self, commands: Commands, points: PointSet, encoding: DeviceArray, most: int | None = None
     ) -> Iterator[tuple[int, int, DeviceArray]]:
         """Yield first point, number of points and uniform of each dispatch: at most `most` points, whose rows fit in a
         binding."""
@@ -131,14 +132,16 @@ class HashEncoderPasses:
         size = self.device.max_binding // max(row, 1) // _ALIGNED * _ALIGNED
         size = size if most is None else min(size, most)
         counts = ((first, min(size, n - first)) for first in range(0, n, size))
-        return ((first, count, self._uniform(points, first, count, size)) for first, count in counts)
+        for first, count in counts:
+            write = partial(self._uniform, points, first, count, size)
+            yield first, count, commands.varying(write) if self._timed else write()
 
     def encode(self, commands: Commands, points: PointSet, tables: list[DeviceArray], encoding: DeviceArray) -> None:
         """Encode points; outside the box [-bound, bound]^3 features are zero.
 
         tables: (entries, 2) of each grid. encoding: (N, row) float32, N = points.count.
         """
-        blocks = list(self._blocks(points, encoding))
+        blocks = list(self._blocks(commands, points, encoding))
         slices = self.pool.array("slices", (self._slice_entries, 2))
         for number, cut in self._cuts.items():
             kernel = Kernel.get(self.device, "hashgrid_slice", **self._long_lanes)
@@ -163,11 +166,9 @@ class HashEncoderPasses:
                 (levels, self.pool.array(f"d_fixed {levels.name}", (2 * target.size,), "uint32"))
                 for levels, target in floats
             ]
-            for _, fixed in sums:
-                commands.clear(fixed)
 
         largest = {} if self.lane_levels else {"largest": self._largest(commands, points, d_encoding)}
-        for first, count, grid in self._blocks(points, d_encoding, self._most_points):
+        for first, count, grid in self._blocks(commands, points, d_encoding, self._most_points):
             arrays = {"points": points.array.rows(first, count), "d_encoding": d_encoding.rows(first, count)}
             arrays |= {"grid": grid, **largest}
             for levels, target in sums:
@@ -191,7 +192,7 @@ class HashEncoderPasses:
         largest = self.pool.array(f"largest {points.number}", (1,), "uint32")
         commands.clear(largest)
         kernel = Kernel.get(self.device, "hashgrid_largest")
-        for first, count, grid in self._blocks(points, d_encoding):
+        for first, count, grid in self._blocks(commands, points, d_encoding):
             gradient = d_encoding.rows(first, count)
             commands.dispatch(kernel, -(-count * self._row // 4096), grid=grid, d_encoding=gradient, largest=largest)
         return largest

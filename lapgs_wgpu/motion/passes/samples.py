@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from lapgs_wgpu.gpu.array import DeviceArray
@@ -30,6 +31,9 @@ class Samples:
         return kernel.uniform("Samples", stretch=stretch, **vars(self))
 
 
+Sampling = Callable[[], Samples]  # gives the samples of the step that is taken, whose number is the same in each
+
+
 class SamplePasses:
     """Records the passes that collect what is sampled. name, in the calls: distinguishes samples that are submitted
     together."""
@@ -38,35 +42,36 @@ class SamplePasses:
         self._device, self._pool = device, pool
 
     def places(
-        self, commands: Commands, name: str, samples: Samples, geometry: DeviceArray, *, every: bool = False
+        self, commands: Commands, name: str, sampling: Sampling, geometry: DeviceArray, *, every: bool = False
     ) -> DeviceArray:
         """Points (count, 4) at the sampled Gaussians' means, with offsets where they have a reach.
 
         geometry: (N, 12), as common/geometry.wgsl has it. every: take all Gaussians, in their order.
         """
+        samples = sampling()
         points = self._pool.array(f"points {name}", (samples.count, 4))
         kernel = Kernel.get(self._device, "place_points", SAMPLED=not every, OFFSET=samples.reach > 0)
-        uniform = self.constant(name, samples)
+        uniform = self.constant(commands, name, sampling)
         groups = -(-samples.count // 64)
         commands.dispatch(kernel, groups, samples=uniform, geometry=geometry, points=points)
         return points
 
     def rows(
-        self, commands: Commands, name: str, samples: Samples, every: DeviceArray, chosen: DeviceArray, *, back: bool
+        self, commands: Commands, name: str, sampling: Sampling, every: DeviceArray, chosen: DeviceArray, *, back: bool
     ) -> None:
         """The sampled rows of an array (N, C), copied to (count, C), or with `back` added from there."""
         columns = every.shape[1]
         kernel = Kernel.get(self._device, "sample_rows", BACK=back)
         commands.dispatch(
             kernel,
-            -(-samples.count * columns // 64),
-            samples=self.constant(name, samples),
+            -(-chosen.size // 64),
+            samples=self.constant(commands, name, sampling),
             row=self._pool.constant(f"row {columns}", kernel.uniform("Row", columns=columns)),
             chosen=chosen,
             all=every,
         )
 
-    def constant(self, name: str, samples: Samples) -> DeviceArray:
+    def constant(self, commands: Commands, name: str, sampling: Sampling) -> DeviceArray:
         """The uniform of the samples."""
         kernel = Kernel.get(self._device, "place_points")
-        return self._pool.constant(f"samples {name}", samples.uniform(kernel))
+        return commands.varying(lambda: self._pool.constant(f"samples {name}", sampling().uniform(kernel)))

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -130,7 +131,7 @@ class GridFieldPlayback:
         table = DeviceArray.upload(self._device, "static table", entries)  # not in the pool, since it is needed once
         with Commands(self._device) as commands:
             for number, block in enumerate(self._blocks):
-                encoder.encode(commands, PointSet(number, block.points, block.count, 0.0), [table], block.still)
+                encoder.encode(commands, PointSet(number, block.points, block.count, float), [table], block.still)
 
     def static_features(self) -> Floats:
         """Return the spatial features H_s, (N, F): the static grid's at the canonical means."""
@@ -195,7 +196,7 @@ class GridFieldPlayback:
         names |= {"colors": "sh"} if color else {}
         with Commands(self._device) as commands:
             for number, block in enumerate(self._blocks):
-                points = PointSet(number, block.points, block.count, self._config.grid_time(t))
+                points = PointSet(number, block.points, block.count, partial(self._config.grid_time, t))
                 self._temporal.encode(commands, points, self._tables, block.moving)
                 uniform = self._pool.constant(
                     f"deform {number}",

@@ -1,0 +1,109 @@
+"""What a step costs its host: the real loop in the shapes that graphics cards get, on a card that takes no time at all.
+
+Every dispatch has no workgroups. What is left is what the host does, and what the driver takes to be told.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+from unittest import mock
+
+from measure import Timing, recording, summary
+from wgpu import GPUQueue
+
+from lapgs_wgpu import Trainer
+from lapgs_wgpu.data import load_dataset
+from lapgs_wgpu.data.synthetic import write_synthetic
+from lapgs_wgpu.gpu.device import Device, _adapters
+from lapgs_wgpu.gpu.kernel import Commands
+from lapgs_wgpu.gpu.native import Encoder
+from lapgs_wgpu.train.presets import load_config
+
+CASES = {  # Gaussians and longer side of the images, pixels
+    "tiny": (10_000, 200),
+    "dnerf-400": (25_000, 400),
+    "dnerf": (50_000, 800),
+}
+WARM_UP, VIEWS = 6, 4
+
+
+@dataclass(frozen=True)
+class HostReport:
+    """Of a step in which everything moves, in the mean but for its milliseconds: dispatches; submissions; waits for
+    mapped buffers; bytes up and down."""
+
+    gaussians: int
+    size: int
+    step: Timing
+    dispatches: float
+    submissions: float
+    waits: float
+    up: float
+    down: float
+
+
+def null_device() -> Device:
+    """The first adapter, taken for a graphics card."""
+    info, adapter = _adapters()[0]
+    return Device(adapter, replace(info, kind="discrete"))
+
+
+@contextmanager
+def no_time() -> Iterator[None]:
+    """Every dispatch has no workgroups."""
+    dispatch, record = Encoder.dispatch, Commands._record
+
+    def nothing(self: Encoder, pipeline: object, group: object, columns: int, rows: int) -> None:
+        dispatch(self, pipeline, group, 0, rows)
+
+    def nothing_again(self: Commands, kind: str, objects: tuple[Any, ...], *numbers: int) -> None:
+        record(self, kind, objects, *((0, 1) if kind == "dispatch" else numbers))
+
+    with mock.patch.object(Encoder, "dispatch", nothing), mock.patch.object(Commands, "_record", nothing_again):
+        yield
+
+
+def bench_host(device: Device, preset: str, repeat: int, step: str = "auto") -> HostReport:
+    """Steps of a training by a preset, on the built-in scene; discovery and density control are left out."""
+    count, size = CASES[preset]
+    keys = {"points.count": str(count), "schedule.warm_up": "0", "discovery.enabled": "false", "step": step}
+    keys |= {"density.start": "1000000", "density.stop": "1000001", "data.size": "0", "timing.refine": "false"}
+    config = load_config(preset, keys)
+    submit, submissions = GPUQueue.submit, [0]
+
+    def counted(self: GPUQueue, buffers: list[object]) -> None:
+        submissions[0] += 1
+        submit(self, buffers)
+
+    with TemporaryDirectory() as folder, no_time(), mock.patch.object(GPUQueue, "submit", counted):
+        dataset = load_dataset(write_synthetic(Path(folder), size=size, train_views=VIEWS, test_views=1))
+        with Trainer(config, dataset, device) as trainer:
+            for _ in range(WARM_UP):
+                trainer.step()
+            marks = [time.perf_counter()]
+            for _ in range(repeat):
+                trainer.step()
+                marks.append(time.perf_counter())
+            before = submissions[0]
+            with recording() as events:
+                for _ in range(repeat):
+                    trainer.step()
+            submitted = submissions[0] - before
+    gaps = [1e3 * (b - a) for a, b in zip(marks, marks[1:], strict=False)]
+    kinds = {kind: [event for event in events if event.kind == kind] for kind in ("dispatch", "read", "write")}
+    return HostReport(
+        count,
+        size,
+        summary(gaps),
+        len(kinds["dispatch"]) / repeat,
+        submitted / repeat,
+        len(kinds["read"]) / repeat,
+        sum(event.nbytes for event in kinds["write"]) / repeat,
+        sum(event.nbytes for event in kinds["read"]) / repeat,
+    )
