@@ -39,10 +39,16 @@ class Progress:
         """`done` steps are done. text: makes the line, by default the count and the time left at the mean rate."""
         self._done = done
         now, on_terminal = time.perf_counter(), self._stream.isatty()
-        if done == self._total or now - self._shown >= (TERMINAL_SECONDS if on_terminal else FILE_SECONDS):
+        if done == self._total or self.due:
             self._shown = now
             line = text() if text else self._line(now)
             self._write(in_place(line) if on_terminal else f"{line}\n")
+
+    @property
+    def due(self) -> bool:
+        """Whether it is time to show the line again."""
+        seconds = TERMINAL_SECONDS if self._stream.isatty() else FILE_SECONDS
+        return time.perf_counter() - self._shown >= seconds
 
     def note(self, text: str) -> None:
         """Print a line of its own."""

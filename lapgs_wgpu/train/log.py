@@ -49,6 +49,7 @@ class Log:
         self._path = path
         self._file, so_far = _continued(path, done)
         self._recent: deque[StepResult] = deque(maxlen=INTERVAL)
+        self._fresh: list[StepResult] = []  # that were not yet asked what they tell
         self.listeners: list[Callable[[dict[str, Any]], None]] = []
         self._began = time.perf_counter()
         self._start = self._began - (so_far or before)
@@ -71,17 +72,16 @@ class Log:
 
     def after_step(self, trainer: Trainer, result: StepResult, /) -> None:
         """Take in a step that is done; the loss of one that was skipped does not count. A callback of `Trainer`."""
-        if result.skipped is not None:
-            self.tell(str(result.skipped))
         self.step(result, len(trainer.scene), lambda: _now(trainer))
 
     def step(self, result: StepResult, gaussians: int, now: Callable[[], dict[str, Any]] = dict) -> None:
         """Take in a step that is done. now: further entries of a line, asked only where a line is written."""
         step, last = result.step, result.step == self._steps
-        if math.isfinite(result.loss) and math.isfinite(result.psnr):
-            self._recent.append(result)
+        self._fresh.append(result)
         self._times.append(time.perf_counter())
         self._pruned += result.pruned
+        if step % INTERVAL == 0 or last or self._progress.due:
+            self._take_in()
         if not self._recent:
             return
         if step % INTERVAL == 0 or last:
@@ -90,6 +90,15 @@ class Log:
         if last and self._pruned:
             self.tell(f"pruned {self._pruned} Gaussians that hardly showed in any image (density.min_contribution)")
         self._progress.at(step, lambda: self._progress_line(step, gaussians))
+
+    def _take_in(self) -> None:
+        """Ask the last steps what they tell, which waits for those that the device is still doing."""
+        for result in self._fresh:
+            if result.skipped is not None:
+                self.tell(str(result.skipped))
+            if math.isfinite(result.loss) and math.isfinite(result.psnr):
+                self._recent.append(result)
+        self._fresh.clear()
 
     def _steps_per_second(self) -> float:
         """Of the last steps. The first one, which compiles kernels, counts only while it is alone."""
@@ -165,9 +174,7 @@ def _continued(path: Path, done: int) -> tuple[BinaryIO, float]:
 
 def _now(trainer: Trainer) -> dict[str, Any]:
     """Of the scene after a step: the share of dead scales, the motion's spectrum where there is one, and memory."""
-    values = {}
-    if (motion := trainer.scene.spectrum) is not None:
-        values = {"frequencies": motion.frequencies.detach(), "amplitudes": motion.amplitudes()}
+    values = trainer.spectrum()
     spectrum = {name: [round(value, 6) for value in tensor.tolist()] for name, tensor in values.items()}
     memory = {"host_bytes": resident_bytes(), "device_bytes": trainer.scene.device.allocated_bytes}
     return {

@@ -6,6 +6,7 @@ next step pushes what the host may have changed.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 
@@ -21,7 +22,7 @@ from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.fields.laplacian import VARIANCE_FLOOR, VARIANCE_SPREAD
 from lapgs_wgpu.motion.passes.activation_passes import GEOMETRY_FLOATS, SH_FLOATS
-from lapgs_wgpu.motion.passes.field_weights import FieldWeights
+from lapgs_wgpu.motion.passes.field_weights import FieldWeights, Segment
 from lapgs_wgpu.motion.passes.grid_field_passes import FieldArrays
 from lapgs_wgpu.train.optimizer import LARGEST_FREQUENCY_STEP, AdamState, FrequencyOptimizer, Optimizer
 
@@ -178,6 +179,17 @@ class ResidentParameters:
         if self._frequencies is not None:
             self._frequencies.unpack(self._pool.array("frequencies", self._state_shape).read(), self.steps[FREQUENCIES])
 
+    def spectrum(self) -> dict[str, Tensor]:
+        """The motion's frequencies (K,) and amplitudes (K,), the newest ones."""
+        if self.on_host["values"]:
+            tensors = {name: self._field[f"motion.{name}"].detach() for name in ("frequencies", "alpha", "beta")}
+        else:
+            assert self._weights is not None
+            flat, places = torch.from_numpy(self.flat_weights("value").read()), self._weights.places
+            tensors = {name: _view(flat, places[f"motion.{name}"]) for name in ("frequencies", "alpha", "beta")}
+        power = (tensors["alpha"].square() + tensors["beta"].square()).mean(dim=1)
+        return {"frequencies": tensors["frequencies"], "amplitudes": power.sqrt()}
+
     @property
     def _state_shape(self) -> tuple[int]:
         assert self._weights is not None
@@ -297,6 +309,11 @@ class ResidentParameters:
         for block in self.blocks.values():
             block.scatter(block.arrays["gradient"].read(), tensors)
         return {name: [tensor] for name, tensor in tensors.items()}
+
+
+def _view(flat: Tensor, place: Segment) -> Tensor:
+    """A parameter among a field's weights."""
+    return flat[place.first : place.first + math.prod(place.shape)].reshape(place.shape)
 
 
 def _corrected(rate: float, steps: int) -> tuple[float, float]:

@@ -184,9 +184,22 @@ class ResidentStep:
         self.to_host()
         self.parameters.pull_state()
 
+    @torch.no_grad()
+    def spectrum(self) -> dict[str, Tensor]:
+        """The motion's frequencies and amplitudes after all steps, without the rest of the parameters."""
+        if self._field is None or self._learners.frequencies is None:
+            return {}
+        self.settle()
+        return self.parameters.spectrum()
+
     def settle(self) -> None:
         """Wait for all steps."""
         while self._flying:
+            self._settle_first()
+
+    def make_room(self) -> None:
+        """Wait until one more step may be in flight. Nothing may have been drawn for it yet."""
+        while len(self._flying) >= IN_FLIGHT:
             self._settle_first()
 
     def draw(
@@ -218,9 +231,7 @@ class ResidentStep:
         return len(self._scene)
 
     def take(self, task: Task) -> Pending:
-        """Submit a step; what it will have told."""
-        while len(self._flying) >= IN_FLIGHT:
-            self._settle_first()
+        """Submit a step, after `make_room`; what it will have told."""
         self._push()
         flying = self._submit(task, Pending(self._settle_first))
         self._flying.append(flying)

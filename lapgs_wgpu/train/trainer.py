@@ -210,6 +210,13 @@ class Trainer:
         """The share of the Gaussians' scales in the last view that are at the floor, where they get no gradient."""
         return (self._resident or self._stepper).dead_scales
 
+    def spectrum(self) -> dict[str, Tensor]:
+        """The motion's frequencies (K,), cycles over the clip, and amplitudes (K,); nothing for a field without one."""
+        if self._resident is not None:
+            return self._resident.spectrum()
+        motion = self.scene.spectrum
+        return {} if motion is None else {"frequencies": motion.frequencies.detach(), "amplitudes": motion.amplitudes()}
+
     def evaluate(self, views: Sequence[View] | None = None) -> dict[str, Any]:
         """Measure the scene on views, the test views where None: the content of metrics.json (docs/metrics.md).
         Training views are seen by their corrected cameras."""
@@ -243,6 +250,8 @@ class Trainer:
         control's state stay as they were; what the schedule plans for this step is done. Raises NumericalError where
         too many are skipped, or where a parameter is not finite, and DeviceError.
         """
+        if self._resident is not None:
+            self._resident.make_room()  # which may take steps again, and draw for them
         random, order = self._generator.get_state(), list(self._order.left)
         try:
             with torch_threads(self._threads):

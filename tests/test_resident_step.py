@@ -1,0 +1,177 @@
+"""The step that stays on the device, against the one by torch; and what it does where something goes wrong."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from helpers import sampled_rows
+from helpers.scenes import relative
+from helpers.training import configure
+from torch import Tensor
+
+from lapgs_wgpu.data import Dataset
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.motion.fields.deformation import Nearby, TimeSamples
+from lapgs_wgpu.train.config import Config
+from lapgs_wgpu.train.objective import Sample
+from lapgs_wgpu.train.resident_step import Pending, ResidentSample, Task
+from lapgs_wgpu.train.trainer import Trainer
+
+pytestmark = pytest.mark.kernels
+SMALL = {"points__count": "150", "acceleration__interval": "1", "schedule__warm_up": "0"}
+KINDS = {
+    "laplacian": {},
+    "opacity, too": {"field__appearance": "color+opacity"},
+    "mirrored scales": {"field__negative_scales": "mirror"},
+    "no appearance": {"field__appearance": "none"},
+    "no dynamics": {"field__dynamics": "0"},
+    "no temporal grids": {"field__temporal_hash": "false"},
+}
+
+
+def started(config: Config, dataset: Dataset, device: Device, step: str) -> Trainer:
+    return Trainer(dataclasses.replace(config, step=step), dataset, device)
+
+
+def disturb(trainer: Trainer) -> None:
+    """Give every parameter a value that everything depends on; the same in each call."""
+    generator = torch.Generator().manual_seed(7)
+    scene = trainer.scene
+    with torch.no_grad():
+        for name, tensor in sorted(scene.parameters.items()):
+            tensor += 0.2 * torch.randn(tensor.shape, generator=generator)
+            if name == "log_scales":
+                tensor[:5] = -20.0  # below the floor
+        if scene.field is not None:
+            for _, tensor in sorted(scene.field.named_parameters()):
+                tensor += 0.2 * torch.randn(tensor.shape, generator=generator)
+            scene.field.heads.weight *= 0.3
+    scene.sh_degree = 2
+
+
+def by_resident(trainer: Trainer, task: Task) -> dict[str, Tensor]:
+    step = trainer._resident
+    step._push()
+    step._told(step._submit(task, Pending(step.settle), judged=True))
+    return {name: tensors[0] for name, tensors in step.parameters.gradients().items()}
+
+
+def by_torch(trainer: Trainer, sample: ResidentSample) -> dict[str, Tensor]:
+    nearby = times = None
+    smooth = trainer.config.smoothness
+    if sample.near is not None:
+        chosen, offsets = sampled_rows.rows(sample.near), sampled_rows.offsets(sample.near)
+        nearby = Nearby(chosen, offsets, sample.near_time, smooth.static, smooth.temporal)
+    if sample.even is not None:
+        times = TimeSamples(sampled_rows.rows(sample.even), sample.even_times)
+    given = Sample(sample.view, torch.tensor(sample.background), sample.moving, nearby, times)
+    trainer._stepper._descend(given, 4, share=1)
+    scene = trainer.scene
+    named = {**scene.parameters, **(dict(scene.field.named_parameters()) if scene.field else {})}
+    return {name: torch.zeros_like(p) if p.grad is None else p.grad for name, p in named.items()}
+
+
+@pytest.mark.parametrize("kind", [*KINDS, "grid4d", "static", "warm-up"])
+def test_gradients_are_those_of_torch(device: Device, dataset: Dataset, kind: str) -> None:
+    method = kind if kind in ("grid4d", "static") else "laplacian"
+    config = configure(method, **SMALL, **KINDS.get(kind, {}))
+    moving = kind not in ("static", "warm-up")
+    trainers = [started(config, dataset, device, step) for step in ("resident", "exchange")]
+    for trainer in trainers:
+        disturb(trainer)
+    resident = trainers[0]._resident
+    view = dataset.train[3]
+    sample = resident.draw(view, torch.zeros(3), 4, torch.Generator().manual_seed(3), moving=moving)
+    assert (sample.near is not None) == (sample.even is not None) == moving
+    rates = trainers[0]._learners.optimizer.rates_at(4)
+    task = Task(4, sample, trainers[0].scene.timing(view.time), 2, rates, 1e-3, seen=True)
+    mine, expected = by_resident(trainers[0], task), by_torch(trainers[1], sample)
+    assert mine.keys() == expected.keys()
+    for name, exact in expected.items():
+        if exact.abs().max() == 0:
+            assert mine[name].abs().max() == 0, name
+        else:
+            assert relative(mine[name], exact) < 2e-5, name
+
+
+@pytest.mark.parametrize("method", ["laplacian", "static"])
+def test_steps_are_those_of_torch(device: Device, dataset: Dataset, data: Path, method: str) -> None:
+    """Without what each draws by itself, over steps with and without motion, density control and a rising degree."""
+    config = configure(
+        method, data__path=str(data), points__count="150", smoothness__share="0", acceleration__weight="0"
+    )
+    trainers = [started(config, dataset, device, step) for step in ("resident", "exchange")]
+    results = [[trainer.step() for _ in range(20)] for trainer in trainers]
+    for mine, other in zip(*results, strict=True):
+        assert mine.loss == pytest.approx(other.loss, rel=5e-2 if mine.step > 10 else 1e-4), mine.step
+        assert mine.terms.keys() == other.terms.keys()
+    counts = [len(trainer.scene) for trainer in trainers]
+    assert counts[0] == pytest.approx(counts[1], rel=0.1)
+
+
+def test_a_resumed_training_and_one_that_was_looked_at_end_with_the_same_bytes(
+    device: Device, dataset: Dataset, data: Path
+) -> None:
+    config = configure(data__path=str(data))
+    straight, watched = (started(config, dataset, device, "resident") for _ in range(2))
+    for _ in straight:
+        pass
+    for number in range(17):
+        watched.step()
+        if number % 5 == 2:
+            watched.scene.at(0.3)
+    resumed = started(config, dataset, device, "resident")
+    resumed.restore(watched.state())
+    for _ in resumed:
+        pass
+    state, again = straight.state(), resumed.state()
+    assert state.keys() == again.keys()
+    assert [name for name in state if not np.array_equal(state[name], again[name])] == []
+
+
+def test_steps_in_flight_behind_an_overflow_are_taken_again(device: Device, dataset: Dataset, data: Path) -> None:
+    """The same bytes as with buffers that sufficed from the start."""
+    config = configure(data__path=str(data), schedule__steps="12")
+    states = []
+    for capacity in (None, 64):
+        trainer = started(config, dataset, device, "resident")
+        for number in range(12):
+            if capacity is not None and number in (3, 8):
+                trainer._resident.settle()
+                plans = trainer._resident._rasterizer.plans
+                plans.now = dataclasses.replace(plans.now, capacity=capacity)
+            trainer.step()
+        states.append(trainer.state())
+    assert [name for name in states[0] if not np.array_equal(states[0][name], states[1][name])] == []
+
+
+def test_a_step_that_is_not_finite_is_skipped_and_named(device: Device, dataset: Dataset, data: Path) -> None:
+    """With two steps in flight behind it, which are drawn anew: the same bytes as if none had been."""
+    config = configure(data__path=str(data), schedule__steps="12", schedule__warm_up="2")
+    states, told = [], []
+    for waits in (False, True):
+        trainer = started(config, dataset, device, "resident")
+        color, results = trainer._color, []
+        for number in range(1, 13):
+            trainer._color = torch.full((3,), torch.nan) if number == 7 else color
+            results.append(trainer.step())
+            if waits:
+                trainer._resident.settle()
+        trainer._color = color
+        states.append(trainer.state())
+        told.append([result.skipped for result in results])
+    for skipped in told:
+        assert [each.step for each in skipped if each] == [7]
+        assert "the loss term l1 is nan" in skipped[6].what
+        assert "gradient of means" in skipped[6].what
+    assert [name for name in states[0] if not np.array_equal(states[0][name], states[1][name])] == []
+
+
+def test_what_only_torch_computes_is_refused_by_name(device: Device, dataset: Dataset) -> None:
+    with pytest.raises(InputError, match="hexplane"):
+        started(configure("hexplane"), dataset, device, "resident")
