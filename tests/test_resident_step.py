@@ -96,7 +96,7 @@ def test_gradients_are_those_of_torch(device: Device, dataset: Dataset, kind: st
         if exact.abs().max() == 0:
             assert mine[name].abs().max() == 0, name
         else:
-            assert relative(mine[name], exact) < 2e-5, name
+            assert relative(mine[name], exact) < 3e-5, name
 
 
 @pytest.mark.parametrize("method", ["laplacian", "static"])
@@ -132,6 +132,25 @@ def test_a_resumed_training_and_one_that_was_looked_at_end_with_the_same_bytes(
     state, again = straight.state(), resumed.state()
     assert state.keys() == again.keys()
     assert [name for name in state if not np.array_equal(state[name], again[name])] == []
+
+
+def test_what_was_recorded_is_right_when_gaussians_go(device: Device, dataset: Dataset, data: Path) -> None:
+    """The same bytes as if every step were recorded anew, where fewer Gaussians need no new buffers."""
+    config = configure(data__path=str(data), density__start="1000", density__stop="1001", schedule__warm_up="2")
+    states = []
+    for anew in (False, True):
+        trainer = started(config, dataset, device, "resident")
+        for number in range(14):
+            if number in (6, 10):
+                rows = {name: row[:0] for name, row in trainer.scene.parameters.items()}
+                keep = torch.arange(len(trainer.scene)) % 3 > 0
+                trainer._density.statistics = trainer._density.statistics.of(keep)
+                trainer._learners.optimizer.edit_rows(keep, rows)
+            if anew:
+                trainer._resident._recordings.clear()
+            trainer.step()
+        states.append(trainer.state())
+    assert [name for name in states[0] if not np.array_equal(states[0][name], states[1][name])] == []
 
 
 def test_steps_in_flight_behind_an_overflow_are_taken_again(device: Device, dataset: Dataset, data: Path) -> None:

@@ -360,7 +360,7 @@ class ResidentStep:
         camera, plan = task.sample.view.camera, self._rasterizer.plan_of(task.sample.view.camera)
         shape = (
             *(task.sample.moving, task.sample.near is None, task.sample.even is None, task.sh_degree, task.seen),
-            *(task.sample.background, camera.width, camera.height, plan, judged),
+            *(task.sample.background, camera.width, camera.height, plan, judged, self.count),
         )
         found = self._recordings.get(shape)
         if found is not None and found.recording is not None and found.holds(self._device):
