@@ -22,9 +22,8 @@ from typing import Any
 
 import torch
 from ceilings import describe
-from crossings import BUSES, Crossing, bench_crossings
-from decoder import DecoderReport, bench_decoder
 from encoder import EncoderReport, bench_encoder
+from host import CASES, HostReport, bench_host, null_device
 from losses import LossReport, bench_losses
 from measure import Timing, Traffic
 from passes import Meter, PassTimes
@@ -38,7 +37,7 @@ from lapgs_wgpu.gpu.probe_subgroup import subgroup_size
 from lapgs_wgpu.train.presets import load_config
 from viewer import bench_viewer, print_viewer
 
-PARTS = ("raster", "encoder", "decoder", "losses", "step", "shares", "bytes", "viewer")
+PARTS = ("raster", "encoder", "losses", "step", "shares", "host", "steps", "viewer")
 
 
 def options() -> argparse.ArgumentParser:
@@ -50,7 +49,7 @@ def options() -> argparse.ArgumentParser:
         default=FIXED_SET,
         metavar="SCENE@WxH",
         help="what is drawn: a ball of so many Gaussians, or the checkpoint.ply of a training, and the size of the "
-        "image; the first one also decides the sizes in encoder, decoder, losses, shares and bytes; the viewer "
+        "image; the first one also decides the sizes in encoder, losses and shares; the viewer "
         "shows checkpoints instead of its own balls, if there are any "
         f"[{_names(FIXED_SET)}]",
     )
@@ -58,7 +57,7 @@ def options() -> argparse.ArgumentParser:
     parser.add_argument(
         "--preset",
         default="dnerf",
-        help="configuration of the field in encoder and decoder, and of the step in shares and bytes [dnerf]",
+        help="configuration of the field in encoder, and of the step in shares [dnerf]",
     )
     parser.add_argument("--repeat", type=int, default=15, metavar="R", help="timed runs of each [15]")
     parser.add_argument("--device", metavar="NAME", help="adapter: a part of its name, or its kind")
@@ -100,10 +99,6 @@ def run(options: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
         means = first.make()[0]["means"]
         results["encoder"] = bench_encoder(device, load_config(options.preset).field, means, meter, repeat)
         print_encoder(results["encoder"])
-    if "decoder" in options.parts:
-        means = first.make()[0]["means"]
-        results["decoder"] = bench_decoder(device, load_config(options.preset).field, means, repeat)
-        print_decoder(results["decoder"], options.preset)
     if "losses" in options.parts:
         results["losses"] = bench_losses(device, first.height, meter, repeat)
         print_losses(results["losses"])
@@ -114,12 +109,14 @@ def run(options: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
         steps = max(1, repeat // 2)
         results["shares"] = bench_shares(device, options.preset, steps, first.gaussians, first.height)
         print_shares(results["shares"], first, options.preset)
-    if "bytes" in options.parts:
-        results["bytes"] = {}
-        for decoder in ("torch", "device"):
-            crossings = bench_crossings(device, options.preset, first.gaussians, first.height, decoder)
-            print_crossings(crossings, f"{_title(first, options.preset)}, decoder: {decoder}")
-            results["bytes"][decoder] = crossings
+    for part in ("host", "steps"):
+        if part in options.parts:
+            results[part] = {}
+            for preset in CASES:
+                null = part == "host"
+                report = bench_host(null_device() if null else device, preset, 2 * repeat, null=null)
+                print_host(report, preset, null=null)
+                results[part][preset] = report
     if "viewer" in options.parts:
         trained = [scene for scene in options.scenes if isinstance(scene, TrainedScene)]
         results["viewer"] = bench_viewer(device, repeat, trained=trained)
@@ -223,14 +220,6 @@ def print_encoder(report: EncoderReport) -> None:
     print(f"  {ratio:.1f} times as fast as the reference; gradients differ by {report.largest_difference:.1e} at most")
 
 
-def print_decoder(report: DecoderReport, preset: str) -> None:
-    print_header(f"encoder and decoder, forward + backward: {report.gaussians:,} Gaussians, preset {preset}")
-    print_row("decoder in torch", report.torch)
-    print_row("decoder on the device", report.device)
-    ratio = report.torch.median / report.device.median
-    print(f"  {ratio:.2f} times as fast on the device; gradients differ by {report.largest_difference:.1e} at most")
-
-
 def print_losses(report: LossReport) -> None:
     print_header(f"image losses, forward + backward: L1, SSIM, pyramid and NCC, {report.size}x{report.size}")
     print_passes(report.passes)
@@ -247,14 +236,14 @@ def print_shares(shares: dict[str, Timing], scene: SceneSize | TrainedScene, pre
         print(f"  {name:46s}{time.median:8.2f}  {time.median / shares['step'].median:4.0%}")
 
 
-def print_crossings(crossings: dict[str, Crossing], title: str) -> None:
-    """A row a purpose: megabytes in each direction, and milliseconds at the speeds of buses."""
-    print(f"\n{title}: what crosses over")
-    buses = "".join(f"{f'ms, {speed} GB/s':>13s}" for speed in BUSES)
-    print(f"  {'':50s}{'MB up':>8s}{'MB down':>9s}{buses}")
-    for name, one in crossings.items():
-        times = "".join(f"{one.milliseconds(speed):13.3f}" for speed in BUSES)
-        print(f"  {name:50s}{one.up / 1e6:8.2f}{one.down / 1e6:9.2f}{times}")
+def print_host(report: HostReport, preset: str, *, null: bool) -> None:
+    on = "a card that takes no time" if null else "this device"
+    print_header(f"a step of {preset} on {on}: {report.gaussians:,} Gaussians at {report.size}x{report.size}")
+    print_row("from one to the next", report.step)
+    print(
+        f"{report.submissions:.1f} submissions, {report.waits:.1f} waits, "
+        f"{report.up / 1e6:.3f} MB up, {report.down / 1e6:.3f} MB down"
+    )
 
 
 def _title(scene: SceneSize | TrainedScene, preset: str) -> str:

@@ -7,7 +7,8 @@
 #   SMALL=1 benchmarks/gpu.sh OUT DATA             at sizes for Mesa's software driver, which shows that the script works
 #
 # kernels   the kernel tests on this driver
-# passes    the passes of rasteriser, encoder, decoder (in torch and on the device), losses and a whole step: OUT/passes.json
+# resident  whether the step that stays on the device is right on this driver, and what it takes, in two minutes
+# passes    the passes of rasteriser, encoder, losses and a whole step: OUT/passes.json
 # gsplat    the same splats drawn by gsplat's kernels, where CUDA and gsplat are installed: OUT/gsplat.json
 # train     the three scenes at 800x800 by the whole schedule of dnerf, grid4d and laplacian: OUT/table. HOURS=H stops it
 #           in time, with saved state; the same call goes on
@@ -23,7 +24,7 @@ if [ -n "${SMALL:-}" ]; then
   table=$out/small.toml
   sed 's/^\[common\]/&\nschedule.steps = 30\npoints.count = 500\ndata.size = 48\ndiscovery.enabled = false/' benchmarks/gpu.toml > "$table"
 else
-  scenes=(50k@400x400 100k@800x800 500k@800x800) repeat=15 parts=(raster encoder decoder losses step) tests=(tests)
+  scenes=(50k@400x400 100k@800x800 500k@800x800) repeat=15 parts=(raster encoder losses step) tests=(tests)
   table=benchmarks/gpu.toml
 fi
 
@@ -32,6 +33,10 @@ kernels() { $python -m pytest -m kernels "${tests[@]}"; }
 passes() {
   $python -c 'from lapgs_wgpu.command import print_devices; print_devices()' &&
     $python benchmarks --scenes "${scenes[@]}" --parts "${parts[@]}" --repeat "$repeat" --json "$out/passes.json"
+}
+
+resident() {
+  $python -m pytest -q tests/test_resident_step.py && $python benchmarks --parts steps host --repeat 30
 }
 
 gsplat() {
@@ -48,7 +53,7 @@ train() { $limit $python -c 'import sys; from lapgs_wgpu.table_cli import table_
   "$table" --data "$data" --out "$out/table"; }
 
 failed=0
-for stage in "${@:-kernels passes gsplat train}"; do
+for stage in "${@:-resident kernels passes gsplat train}"; do
   for name in $stage; do
     start=$SECONDS
     "$name" > "$out/$name.log" 2>&1

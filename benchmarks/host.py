@@ -6,6 +6,7 @@ on the card as it is stands beside it.
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
@@ -36,13 +37,12 @@ WARM_UP, VIEWS = 6, 4
 
 @dataclass(frozen=True)
 class HostReport:
-    """Of a step in which everything moves, in the mean but for its milliseconds: dispatches; submissions; waits for
-    mapped buffers; bytes up and down."""
+    """Of a step in which everything moves, in the mean but for its milliseconds: submissions; waits for what was just
+    submitted; bytes up and down."""
 
     gaussians: int
     size: int
     step: Timing
-    dispatches: float
     submissions: float
     waits: float
     up: float
@@ -82,7 +82,11 @@ def bench_host(device: Device, preset: str, repeat: int, step: str = "auto", *, 
         submissions[0] += 1
         submit(self, buffers)
 
-    with TemporaryDirectory() as folder, no_time() if null else nullcontext(), mock.patch.object(GPUQueue, "submit", counted):
+    with (
+        TemporaryDirectory() as folder,
+        no_time() if null else nullcontext(),
+        mock.patch.object(GPUQueue, "submit", counted),
+    ):
         dataset = load_dataset(write_synthetic(Path(folder), size=size, train_views=VIEWS, test_views=1))
         with Trainer(config, dataset, device) as trainer:
             for _ in range(WARM_UP):
@@ -98,13 +102,12 @@ def bench_host(device: Device, preset: str, repeat: int, step: str = "auto", *, 
                 for _ in range(repeat):
                     trainer.step()
             submitted = submissions[0] - before
-    gaps = [1e3 * (b - a) for a, b in zip(marks, marks[1:], strict=False)]
-    kinds = {kind: [event for event in events if event.kind == kind] for kind in ("dispatch", "read", "write")}
+    gaps = [1e3 * (b - a) for a, b in itertools.pairwise(marks)]
+    kinds = {kind: [event for event in events if event.kind == kind] for kind in ("read", "write")}
     return HostReport(
         count,
         size,
         summary(gaps),
-        len(kinds["dispatch"]) / repeat,
         submitted / repeat,
         len(kinds["read"]) / repeat,
         sum(event.nbytes for event in kinds["write"]) / repeat,

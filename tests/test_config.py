@@ -152,11 +152,6 @@ def test_presets_correct_times_after_density_control(preset: str) -> None:
         ('base = "dnerf"\n[loss]\nssim = nan', "loss.ssim must lie between 0 and 2147483647, got nan"),
         ('base = "dnerf"\n[field.static]\nbase = [1, 2]', "field.static.base must be 3 numbers, got [1, 2]"),
         ('base = "dnerf"\n[data]\nbackground = "blak"', "must be black or white or random, got 'blak'"),
-        (
-            'base = "dnerf"\ndecoder = "device"\n[field]\ndepth = 1',
-            "decoder device is for the fields grid4d and laplacian with field.depth 0, and for laplacian only with "
-            "field.motion laplacian, not for laplacian with depth 1 and motion laplacian",
-        ),
         ("[data]\nsize = 1", 'start the file with base = "dnerf"'),
         ("base = 3", "base must be the name of a preset, got 3"),
         ('base = "nerf"', "there is no preset 'nerf'; did you mean dnerf?"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import Any, NamedTuple
 
@@ -11,23 +12,22 @@ import torch
 from helpers.scenes import Scene, oblique_camera, random_scene
 from helpers.scenes import step as torch_step
 from helpers.stages import watch
+from helpers.training import configure
 from wgpu.backends.wgpu_native import GPUBuffer, GPUQueue
 
+from lapgs_wgpu.data import Dataset
 from lapgs_wgpu.gpu import array as array_module
 from lapgs_wgpu.gpu import buffer as buffer_module
 from lapgs_wgpu.gpu import native
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.radix_sort import FEW_OWNERS, runs
-from lapgs_wgpu.motion.fields.config import FieldConfig
-from lapgs_wgpu.motion.fields.deformation import Nearby
-from lapgs_wgpu.motion.fields.grid_field import GridField
-from lapgs_wgpu.motion.fields.hash_grid_config import HashConfig
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterize import rasterizer_of
 from lapgs_wgpu.train.config import LossWeights
 from lapgs_wgpu.train.fused_loss import image_loss_of, render_loss
 from lapgs_wgpu.train.ground_truth import upload_rgba
+from lapgs_wgpu.train.trainer import Trainer
 
 pytestmark = pytest.mark.kernels
 
@@ -160,27 +160,25 @@ def test_rasterize_reads_back_twice(device: Device, scene: Scene, events: list[E
     assert read <= totals(events)["read"] <= read + 256
 
 
-def test_a_decoder_on_the_device_keeps_its_features_there(device: Device, events: list[Event]) -> None:
-    """A step of the field exchanges tables, points, what stands beside the features, weights and outputs, once each."""
-    grid = HashConfig(4, (4, 4, 4), (16, 16, 8))
-    config = FieldConfig(static=grid, temporal=grid, width=32, dynamics=3)
-    field = GridField(config, device, seed=0)
-    field.on_device = True
-    means, dynamics, pairs = torch.rand(COUNT, 3), torch.zeros(COUNT, 3, requires_grad=True), 50
-    nearby = Nearby(torch.arange(pairs), torch.zeros(pairs, 3), 0.5, 1.0, 1.0)
-    for counted in (False, True):  # buffers are made in the first
+@pytest.mark.parametrize("method", ["laplacian", "static"])
+def test_a_resident_step_is_one_submission_and_waits_for_nothing(
+    device: Device, dataset: Dataset, events: list[Event], monkeypatch: pytest.MonkeyPatch, method: str
+) -> None:
+    """Nor does it move more than a few kilobytes between host and device."""
+    submitted, submit = [], GPUQueue.submit
+    monkeypatch.setattr(GPUQueue, "submit", lambda self, buffers: submitted.append(1) or submit(self, buffers))
+    config = dataclasses.replace(configure(method, schedule__warm_up="0", density__start="100"), step="resident")
+    with Trainer(config, dataset, device) as trainer:
+        for _ in range(len(dataset.train) + 1):  # in which the images cross, too
+            trainer.step()
+        trainer._resident.settle()
         events.clear()
-        move = field(means, 0.4, dynamics, nearby)
-        assert not counted or waits(events) == 1
-        (move.translation.square().sum() + move.smoothness).backward()
-    assert waits(events) == 2
-    tables = sum(grid.table.nbytes for grid in field.grids)
-    beside, outputs = 4 * 4 * COUNT, 4 * 17 * COUNT
-    weights = 4 * (96 * 4 + 64 * 8 + 32 * 24 + 17 * 64)
-    written = tables + 16 * (COUNT + 2 * pairs) + beside + weights + outputs
-    read = outputs + 4 * 2 * pairs + beside + weights + tables
-    assert written <= totals(events)["write"] <= written + 4096
-    assert read <= totals(events)["read"] <= read + 256
+        submitted.clear()
+        for _ in range(2):
+            trainer.step()
+        assert len(submitted) == 2
+        assert waits(events) == 0
+        assert totals(events)["write"] < 2 * 8192
 
 
 def test_nothing_grows_in_steady_state(

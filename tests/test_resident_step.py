@@ -19,7 +19,8 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.deformation import Nearby, TimeSamples
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.objective import Sample
-from lapgs_wgpu.train.resident_step import Pending, ResidentSample, Task
+from lapgs_wgpu.train.resident_passes import ResidentSample, Task
+from lapgs_wgpu.train.resident_step import Pending
 from lapgs_wgpu.train.trainer import Trainer
 
 pytestmark = pytest.mark.kernels
@@ -147,7 +148,7 @@ def test_what_was_recorded_is_right_when_gaussians_go(device: Device, dataset: D
                 trainer._density.statistics = trainer._density.statistics.of(keep)
                 trainer._learners.optimizer.edit_rows(keep, rows)
             if anew:
-                trainer._resident._recordings.clear()
+                trainer._resident._passes._recordings.clear()
             trainer.step()
         states.append(trainer.state())
     assert [name for name in states[0] if not np.array_equal(states[0][name], states[1][name])] == []
@@ -162,7 +163,7 @@ def test_steps_in_flight_behind_an_overflow_are_taken_again(device: Device, data
         for number in range(12):
             if capacity is not None and number in (3, 8):
                 trainer._resident.settle()
-                plans = trainer._resident._rasterizer.plans
+                plans = trainer._resident._passes.rasterizer.plans
                 plans.now = dataclasses.replace(plans.now, capacity=capacity)
             trainer.step()
         states.append(trainer.state())

@@ -26,11 +26,13 @@ from lapgs_wgpu.motion.scene import Scene4D, load
 from lapgs_wgpu.run import train
 from lapgs_wgpu.train import objective
 from lapgs_wgpu.train.config import LossWeights
+from lapgs_wgpu.train.distributed import SINGLE_PROCESS
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
 from lapgs_wgpu.train.initial_points import initial_points
 from lapgs_wgpu.train.log import Log
+from lapgs_wgpu.train.parts import Parts
 from lapgs_wgpu.train.presets import load_config
-from lapgs_wgpu.train.resolve_config import resolve_decoder, resolve_for_dataset
+from lapgs_wgpu.train.resolve_config import resolve_for_dataset, resolve_step
 from lapgs_wgpu.train.step_result import StepResult
 
 
@@ -62,7 +64,7 @@ def test_a_run_is_whole(trained_run: Path, data: Path, dataset: Dataset) -> None
     }  # fmt: skip
     assert resolve_for_dataset(configure(), dataset).field.components == 4  # of 8 times
     assert load_config(str(trained_run / "config.toml")) == dataclasses.replace(
-        configure(data__path=str(data)), decoder="torch"
+        configure(data__path=str(data)), step="exchange"
     )
     record = (trained_run / "config.toml").read_text().split("[record]")[1]
     assert all(f"\n{key} = " in record for key in ("lapgs_wgpu", "torch", "adapter", "driver"))
@@ -183,10 +185,10 @@ def test_a_training_repeats_to_the_last_byte(
 
 
 @pytest.mark.nightly
-def test_the_decoder_on_the_device_trains_as_well_and_repeats(
+def test_the_resident_step_trains_as_well_and_repeats(
     trained_run: Path, dataset: Dataset, device: Device, tmp_path: Path
 ) -> None:
-    config = configure(decoder="device")
+    config = dataclasses.replace(configure(), step="resident")
     for name in ("first", "again"):
         train(config, dataset, tmp_path / name, device=device)
     assert load_config(str(tmp_path / "first/config.toml")) == config
@@ -198,30 +200,24 @@ def test_the_decoder_on_the_device_trains_as_well_and_repeats(
 @pytest.mark.parametrize(
     ("given", "is_cpu", "place"),
     [
-        ({}, True, "torch"),
-        ({}, False, "device"),
-        ({"method": "grid4d"}, False, "device"),
-        ({"method": "static"}, False, "torch"),
-        ({"method": "hexplane"}, False, "torch"),
-        ({"field__depth": "1"}, False, "torch"),
-        ({"decoder": "torch"}, False, "torch"),
-        ({"decoder": "device"}, True, "device"),
+        ({}, True, "exchange"),
+        ({}, False, "resident"),
+        ({"method": "grid4d"}, False, "resident"),
+        ({"method": "static"}, False, "resident"),
+        ({"method": "hexplane"}, False, "exchange"),
+        ({"field__depth": "1"}, False, "exchange"),
+        ({"schedule__batch": "2"}, False, "exchange"),
+        ({"cameras__refine": "on"}, False, "exchange"),
+        ({"step": "exchange"}, False, "exchange"),
+        ({"step": "resident"}, True, "resident"),
     ],
 )
-def test_where_the_decoder_works_follows_from_the_device(
-    given: dict[str, str], is_cpu: bool, place: str, device: Device, monkeypatch: pytest.MonkeyPatch
+def test_where_the_step_is_computed(
+    given: dict[str, str], is_cpu: bool, place: str, dataset: Dataset, device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(device, "is_cpu", is_cpu)
     config = configure(**given)
-    assert resolve_decoder(config, device) == dataclasses.replace(config, decoder=place)
-
-
-def test_the_place_of_the_decoder_is_recorded(
-    dataset: Dataset, device: Device, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setattr(device, "is_cpu", False)
-    train(configure(schedule__steps="1"), dataset, tmp_path / "gpu", device=device)
-    assert load_config(str(tmp_path / "gpu/config.toml")).decoder == "device"
+    assert resolve_step(config, dataset, device, Parts(), SINGLE_PROCESS) == dataclasses.replace(config, step=place)
 
 
 def test_nothing_moves_during_the_warm_up(dataset: Dataset, device: Device, tmp_path: Path) -> None:

@@ -71,4 +71,3 @@ class Ring:
         if at > self.nbytes:
             raise ValueError(f"{at} bytes are to be read later, and the buffers hold {self.nbytes}")
         return Later(self, buffer, arrays)
-

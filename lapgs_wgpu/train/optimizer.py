@@ -204,7 +204,6 @@ class FrequencyOptimizer:
             raise ValueError("its spectrum's moments are negative")
         self._mean, self._square, self._steps = state["mean"], float(state["square"]), int(state["steps"])
 
-
     def packed(self) -> tuple[NDArray[np.float32], int]:
         """The first moments of all frequencies and the second one, (K + 1,), and how many steps have moved them."""
         return np.append(self._mean.numpy(), np.float32(self._square)), self._steps

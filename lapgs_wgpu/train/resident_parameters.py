@@ -126,7 +126,10 @@ class ResidentParameters:
             for bit, name in enumerate(tables):
                 shape = (self._field[name].shape[0], 2)
                 blocks.append(Block(name, shape, "hash", 8 << bit, {name: (every, every)}))
-            rows = {name: (slice(p.first, p.first + self._field[name].numel()), every) for name, p in self._weights.places.items()}
+            rows = {
+                name: (slice(p.first, p.first + self._field[name].numel()), every)
+                for name, p in self._weights.places.items()
+            }
             moved = self._weights.places[FREQUENCIES].first if FREQUENCIES in rows else None
             blocks.append(Block("weights", (self._weights.count, 1), "mlp", 8 << len(tables), rows, moved=moved))
         for block in blocks:
@@ -272,7 +275,8 @@ class ResidentParameters:
             self._record_frequencies(commands, guard, frequency_rate)
 
     def _record_frequencies(self, commands: Commands, guard: DeviceArray, rate: Callable[[], float]) -> None:
-        assert self._weights is not None and self._frequencies is not None
+        assert self._weights is not None
+        assert self._frequencies is not None
         kernel, places = Kernel.get(self._device, "adam_frequencies"), self._weights.places
 
         def write() -> DeviceArray:
@@ -319,5 +323,3 @@ def _view(flat: Tensor, place: Segment) -> Tensor:
 def _corrected(rate: float, steps: int) -> tuple[float, float]:
     """A rate of Adam and the factor of the root of its second moment, with both moments' bias corrected."""
     return rate / (1 - 0.9**steps), (1 - 0.999**steps) ** -0.5
-
-

@@ -31,10 +31,11 @@ from lapgs_wgpu.train.learners import Learners
 from lapgs_wgpu.train.nonfinite import SkipCounter
 from lapgs_wgpu.train.objective import Objective
 from lapgs_wgpu.train.parts import Parts
+from lapgs_wgpu.train.resident_passes import Task
+from lapgs_wgpu.train.resident_step import IN_FLIGHT, ResidentStep
 from lapgs_wgpu.train.resolve_config import why_exchange
 from lapgs_wgpu.train.setup import set_up
 from lapgs_wgpu.train.start import Start, start_from_points
-from lapgs_wgpu.train.resident_step import IN_FLIGHT, ResidentStep, Task
 from lapgs_wgpu.train.step_result import Measured, StepResult
 from lapgs_wgpu.train.timing_refinement import KeptTiming, TimingRefinement
 from lapgs_wgpu.train.view_order import ViewOrder

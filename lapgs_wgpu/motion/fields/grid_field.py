@@ -11,13 +11,11 @@ from torch.utils.checkpoint import checkpoint
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.config import GEOMETRY, TEMPORAL_AXES, FieldConfig
 from lapgs_wgpu.motion.fields.deformation import Deformation, Nearby, TimeSamples
-from lapgs_wgpu.motion.fields.device_decoder import Decoder
 from lapgs_wgpu.motion.fields.hash_encoder import HashEncoder, HashGrid
 from lapgs_wgpu.motion.fields.laplacian import LaplacianMotion, TimeMotion
 from lapgs_wgpu.motion.fields.layers import linear, zero_head
 from lapgs_wgpu.motion.fields.parameter_shapes import parameter_shapes
 from lapgs_wgpu.motion.fields.torch_decoder import KEPT, DecoderWeights, decode
-from lapgs_wgpu.motion.passes.decoder_passes import decoder_shape
 
 _BLOCK = 1 << 13  # Gaussians per block decoded by hidden layers
 
@@ -29,8 +27,7 @@ class GridField(nn.Module):
     motion before the heads (eq. 6), and has an appearance head for changes of brightness. With all of these at zero it
     equals grid4d.
 
-    on_device: compute the decoder by kernels if gradients are needed; the configuration must be one that
-    `decodes_on_device`. Otherwise, and without gradients, torch computes it.
+    Torch computes the decoder; a training step that stays on the device has motion/passes/grid_field_passes instead.
     """
 
     def __init__(self, config: FieldConfig, device: Device, seed: int) -> None:
@@ -64,8 +61,6 @@ class GridField(nn.Module):
         elif ours:
             self.motion = TimeMotion(static, width, generator)
         self.appearance = zero_head(shapes["appearance.weight"]) if config.appearance_size else None
-        self.on_device = False
-        self._decoder = Decoder(device, self._encoder, decoder_shape(config))
 
     @property
     def grids(self) -> list[HashGrid]:
@@ -90,8 +85,7 @@ class GridField(nn.Module):
 
         All are encoded together, which takes much less time than one after another.
         """
-        evaluate = self._on_device if self.on_device and torch.is_grad_enabled() else self._in_torch
-        now, *others, sq_distances = evaluate(means, t, dynamics, nearby, time_samples)
+        now, *others, sq_distances = self._outputs(means, t, dynamics, nearby, time_samples)
         smoothness = _smoothness(sq_distances, nearby) if nearby is not None else None
         return [self._deformation(now)._replace(smoothness=smoothness), *map(self._deformation, others)]
 
@@ -108,7 +102,7 @@ class GridField(nn.Module):
             look[:, 3] if look is not None and look.shape[1] > 3 else None,
         )
 
-    def _in_torch(
+    def _outputs(
         self, means: Tensor, t: float, dynamics: Tensor | None, nearby: Nearby | None, time_samples: TimeSamples | None
     ) -> list[Tensor]:
         """Return outputs of the geometry heads (N, 14) and, in further columns, of the appearance head.
@@ -154,39 +148,6 @@ class GridField(nn.Module):
         if self.appearance is not None:
             outputs.append(self.appearance(*gated))
         return torch.cat(outputs, dim=1) * self._head_factors()
-
-    def _on_device(
-        self, means: Tensor, t: float, dynamics: Tensor | None, nearby: Nearby | None, time_samples: TimeSamples | None
-    ) -> list[Tensor]:
-        """Return the same as `_in_torch`, computed on the device, without transferring features or their gradients."""
-        others = []
-        if time_samples is not None:
-            their_means, their_dynamics = time_samples.chosen(means, dynamics)
-            others = [self._on_device(their_means, time, their_dynamics, None, None)[0] for time in time_samples.times]
-        time = self.config.grid_time(t)
-        compared = None
-        if nearby is not None:
-            near = means[nearby.rows]
-            compared = (near, time), (near + nearby.offsets, self.config.grid_time(nearby.time))
-        size = self.config.dynamics_size
-        given = means.new_zeros(len(means), size) if dynamics is None or not size else dynamics
-        beside = torch.cat([given, means.new_ones(len(means), 1)], dim=1)
-        w = self._weights(t)
-        placed = [(w.spatial, w.spatial_bias)]
-        heads = w.heads
-        if w.inner is not None and w.inner_bias is not None and w.motion_heads is not None:
-            placed.append((w.inner, w.inner_bias))
-            heads = torch.cat([heads, w.motion_heads], dim=1)
-        of_place = [nn.functional.pad(bias[:, None], (size, 0)) for _, bias in placed]
-        of_time = torch.cat([self.temporal.weight[:, :size], w.temporal_bias[:, None]], dim=1)
-        weights = {
-            "beside": torch.cat([*of_place, of_time]),
-            "static": torch.cat([weight for weight, _ in placed]),
-            "temporal": self.temporal.weight[:, size:],
-            "heads": heads,
-        }
-        outputs, sq_distances = self._decoder((means, time), beside, weights, compared)
-        return [outputs + w.heads_bias, *others, sq_distances]
 
     def _weights(self, t: float) -> DecoderWeights:
         """Return the decoder's weights at a time.

@@ -186,7 +186,13 @@ class FieldWeights:
         return packed
 
     def unpack_heads(
-        self, commands: Commands, weights: DeviceArray, d_weights: DeviceArray, d_packed: DeviceArray, name: str, t: Time
+        self,
+        commands: Commands,
+        weights: DeviceArray,
+        d_weights: DeviceArray,
+        d_packed: DeviceArray,
+        name: str,
+        t: Time,
     ) -> None:
         """Record that the gradients of heads that `pack_heads` packed are added to those of the weights."""
         self._pack(commands, self._heads, d_weights, d_packed, back=True)

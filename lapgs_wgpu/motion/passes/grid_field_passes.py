@@ -129,6 +129,7 @@ class GridFieldPasses:
 
         number: as for `decode`; the next one is taken, too.
         """
+
         def at_means() -> Samples:
             return replace(near(), reach=0.0)
 

@@ -7,9 +7,9 @@ looking up two planes for each point.
 from __future__ import annotations
 
 import os
-from functools import partial
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,0 +1,196 @@
+"""The passes of the resident step that no gradient test covers, each against torch in float64."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from helpers import sampled_rows
+from helpers.matrices import on_device, random, read
+from torch import Tensor, nn
+
+from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.kernel import Commands, Kernel
+from lapgs_wgpu.gpu.pool import BufferPool
+from lapgs_wgpu.motion.fields.dynamics import dynamics_loss
+from lapgs_wgpu.motion.fields.laplacian import VARIANCE_FLOOR, VARIANCE_SPREAD, LaplacianMotion
+from lapgs_wgpu.motion.passes.samples import SamplePasses, Samples
+from lapgs_wgpu.splat.splat_layout import MEAN, RADIUS, SPLAT_FLOATS
+from lapgs_wgpu.train.densify import Statistics
+from lapgs_wgpu.train.learning_rate import Rate
+from lapgs_wgpu.train.optimizer import ADAM_EPS, LARGEST_FREQUENCY_STEP, FrequencyOptimizer
+
+pytestmark = pytest.mark.kernels
+OPEN, CLOSED = 0, 7
+
+
+def word(device: Device, value: int) -> DeviceArray:
+    return DeviceArray.upload(device, "word", np.array([value], np.uint32))
+
+
+def uniform(device: Device, kernel: Kernel, struct: str, **values: object) -> DeviceArray:
+    return DeviceArray.upload(device, struct, np.frombuffer(kernel.uniform(struct, **values), np.uint8))
+
+
+@pytest.mark.parametrize("guard", [OPEN, CLOSED])
+@pytest.mark.parametrize(("rows", "columns"), [(1, 1), (301, 3)])
+def test_adam(device: Device, rows: int, columns: int, guard: int) -> None:
+    """Steps with a rate for each column, as torch.optim.Adam takes them; behind a closed guard nothing moves."""
+    rates, values = [10.0**-k for k in range(columns)], random(rows, columns)
+    exact = [nn.Parameter(values[:, k].double()) for k in range(columns)]
+    adam = torch.optim.Adam([{"params": [p], "lr": rate} for p, rate in zip(exact, rates, strict=True)], eps=ADAM_EPS)
+    kernel = Kernel.get(device, "adam")
+    arrays = [on_device(device, each) for each in (values, torch.zeros_like(values), torch.zeros_like(values))]
+    given = uniform(device, kernel, "Adam", count=rows * columns, columns=columns, first=1)
+    for step in range(1, 4):
+        gradient = random(rows, columns, seed=step) * 10.0 ** -(3 * step)
+        d = on_device(device, gradient)
+        table = [(0.0, 0.0), *((rate / (1 - 0.9**step), (1 - 0.999**step) ** -0.5) for rate in rates)]
+        with Commands(device) as commands:
+            commands.dispatch(
+                kernel, -(-rows * columns // 256), adam=given, guard=word(device, guard),
+                rates=on_device(device, torch.tensor(table)), gradients=d, values=arrays[0], means=arrays[1],
+                squares=arrays[2],
+            )  # fmt: skip
+        for k, p in enumerate(exact):
+            p.grad = gradient[:, k].double()
+        adam.step()
+        assert not read(d).any()
+    expected = torch.stack([p.detach() for p in exact], dim=1) if guard == OPEN else values.double()
+    torch.testing.assert_close(read(arrays[0]).double(), expected, rtol=1e-5, atol=1e-6)
+
+
+def test_adam_of_the_frequencies(device: Device) -> None:
+    width, components, rate, limit = 20, 5, 3e-2, 3.5
+    motion = LaplacianMotion(4, width, components, torch.Generator().manual_seed(0))
+    optimizer = FrequencyOptimizer(motion, Rate(rate, rate, 1), limit)
+    flat = torch.cat([motion.alpha.detach().flatten(), motion.beta.detach().flatten(), motion.frequencies.detach()])
+    kernel, first = Kernel.get(device, "adam_frequencies"), 2 * width * components
+    weights, state = on_device(device, flat), on_device(device, torch.zeros(components + 1))
+    for step in range(1, 6):
+        gradient = random(components, seed=step)
+        motion.frequencies.grad = gradient.clone()
+        optimizer.step(step)
+        given = uniform(
+            device, kernel, "Frequencies", width=width, components=components, alpha=0, beta=width * components,
+            frequencies=first, rate=rate / (1 - 0.9**step), square_factor=(1 - 0.999**step) ** -0.5, limit=limit,
+            largest=LARGEST_FREQUENCY_STEP, floor=VARIANCE_FLOOR, spread=VARIANCE_SPREAD,
+        )  # fmt: skip
+        d = on_device(device, torch.cat([torch.zeros(first), gradient]))
+        with Commands(device) as commands:
+            commands.dispatch(
+                kernel, 1, spectrum=given, guard=word(device, OPEN), d_weights=d, weights=weights, state=state
+            )
+        assert not read(d).any()
+    torch.testing.assert_close(read(weights)[first:], motion.frequencies.detach(), rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(read(weights)[:first], flat[:first])
+    torch.testing.assert_close(read(state), torch.from_numpy(optimizer.packed()[0]), rtol=1e-4, atol=1e-7)
+
+
+@pytest.mark.parametrize(("count", "columns"), [(1, 3), (700, 20), (65, 1)])
+def test_the_dynamics_loss(device: Device, count: int, columns: int) -> None:
+    rows, weight = random(count, columns + 1), 0.3
+    exact = rows[:, :columns].double().requires_grad_()
+    loss = weight * dynamics_loss(exact)
+    loss.backward()
+    pool = BufferPool(device)
+    arrays = {
+        "rows": on_device(device, rows), "d_rows": on_device(device, torch.zeros(count, columns + 1)),
+        "sums": pool.array("sums", (64, 256)), "distances": pool.array("distances", (count,)),
+        **{name: pool.array(name, (64,)) for name in ("distance_sums", "square_sums", "losses")},
+    }  # fmt: skip
+    for name in ("dynamics_mean", "dynamics_distances", "dynamics_deviation", "dynamics_bwd"):
+        kernel = Kernel.get(device, name, GROUPS=64)
+        sizes = {"gaussians": count, "columns": columns, "stride": columns + 1, "weight": weight}
+        arrays["dynamics"] = uniform(device, kernel, "Dynamics", **sizes)
+        with Commands(device) as commands:
+            commands.run(kernel, 64, arrays)
+    totals, total = on_device(device, torch.zeros(3)), Kernel.get(device, "sum_values")
+    with Commands(device) as commands:
+        given = uniform(device, total, "Values", count=64, place=1, factor=2.0)
+        commands.dispatch(total, 1, sum=given, values=arrays["losses"], totals=totals)
+    torch.testing.assert_close(
+        read(totals).double(), torch.tensor([0.0, 2 * loss.item(), 0.0]).double(), rtol=1e-5, atol=1e-7
+    )
+    gradient = torch.zeros(count, columns + 1, dtype=torch.float64)
+    gradient[:, :columns] = exact.grad
+    torch.testing.assert_close(read(arrays["d_rows"]).double(), gradient, rtol=1e-4, atol=1e-7)
+
+
+@pytest.mark.parametrize("guard", [OPEN, CLOSED])
+def test_statistics_of_density_control(device: Device, guard: int) -> None:
+    count, camera = 150, SimpleNamespace(width=30, height=20)
+    splats, d_splats, before = (
+        random(count, SPLAT_FLOATS),
+        random(count, SPLAT_FLOATS, seed=1),
+        random(count, 4, seed=2).abs(),
+    )
+    splats[:, RADIUS] = torch.where(torch.arange(count) % 3 == 0, 0.0, 9 * splats[:, RADIUS].abs())
+    expected = Statistics(*(column.clone() for column in before[:, :3].T))
+    if guard == OPEN:
+        expected.add(splats[:, RADIUS].int(), d_splats[:, MEAN], camera)
+    kernel, known = Kernel.get(device, "accumulate_statistics"), on_device(device, before)
+    given = uniform(device, kernel, "Seen", half_size=(15.0, 10.0), gaussians=count)
+    with Commands(device) as commands:
+        commands.dispatch(
+            kernel, 3, seen=given, guard=word(device, guard), splats=on_device(device, splats),
+            d_splats=on_device(device, d_splats), statistics=known,
+        )  # fmt: skip
+    for found, wanted in zip(read(known).T, vars(expected).values(), strict=False):
+        kept = splats[:, RADIUS] >= 1  # a radius below a pixel is none to torch, which has whole numbers
+        torch.testing.assert_close(found[kept], wanted[kept], rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize(("bad", "capacity", "needed", "closed"), [(0, 10, 10, 0), (4, 10, 3, 5), (0, 10, 11, 5)])
+def test_the_guard_closes(device: Device, bad: int, capacity: int, needed: int, closed: int) -> None:
+    kernel, guard, flags = Kernel.get(device, "close_guard"), word(device, 0), word(device, bad)
+    counts = DeviceArray.upload(device, "needed", np.array([needed, 0, 0], np.uint32))
+    for step in (5, 6):  # the first one that is bad stays
+        given = uniform(device, kernel, "Guarded", step=step, capacity=capacity, rounds=0)
+        with Commands(device) as commands:
+            commands.dispatch(kernel, 1, guarded=given, needed=counts, bad=flags, guard=guard)
+    assert guard.read()[0] == closed
+    assert bool(flags.read()[0] >> 31) == (needed > capacity)
+
+
+@pytest.mark.parametrize("value", [0.0, 1e18, -3.0, np.inf, -np.inf, np.nan, 3e19])
+@pytest.mark.parametrize("place", [0, 1500, 2999])
+def test_values_that_are_not_finite_are_found(device: Device, value: float, place: int) -> None:
+    values = random(3000)
+    values[place] = value
+    kernel, bad = Kernel.get(device, "check_finite"), word(device, 2)
+    given = uniform(device, kernel, "Check", count=3000, bit=8)
+    with Commands(device) as commands:
+        commands.dispatch(kernel, 3, check=given, values=on_device(device, values), bad=bad)
+    assert bad.read()[0] == (2 if abs(value) < 1e19 else 10)
+
+
+@pytest.mark.parametrize(("count", "gaussians"), [(1, 1), (7, 100), (100, 100), (33, 70)])
+def test_samples_are_different_rows_and_places_near_them(device: Device, count: int, gaussians: int) -> None:
+    samples = Samples(count, gaussians, 5 % gaussians, 1234567, 0.25)
+    rows = sampled_rows.rows(samples)
+    assert len(set(rows.tolist())) == count
+    geometry, pool = random(gaussians, 12), BufferPool(device)
+    passes, every = SamplePasses(device, pool), on_device(device, geometry)
+    with Commands(device) as commands:
+        points = passes.places(commands, "near", lambda: samples, every)
+        chosen = pool.array("chosen", (count, 12))
+        passes.rows(commands, "near", lambda: samples, every, chosen, back=False)
+    near = geometry[rows, :3] + sampled_rows.offsets(samples)
+    torch.testing.assert_close(read(points), nn.functional.pad(near, (0, 1)), rtol=0, atol=1e-6)
+    assert torch.equal(read(chosen), geometry[rows])
+    with Commands(device) as commands:
+        passes.rows(commands, "near", lambda: samples, every, chosen, back=True)
+    twice = geometry.clone()
+    twice[rows] *= 2
+    assert torch.equal(read(every), twice)
+
+
+def test_offsets_fill_their_cube() -> None:
+    offsets: Tensor = sampled_rows.offsets(Samples(2000, 2000, 0, 42, 1.0))
+    assert offsets.abs().max() <= 1
+    assert offsets.mean(dim=0).abs().max() < 0.06
+    assert (offsets.std(dim=0) - 3**-0.5).abs().max() < 0.03
