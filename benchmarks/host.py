@@ -1,7 +1,7 @@
-"""What a step costs its host: the real loop in the shapes that graphics cards get, on a card that takes no time at all.
+"""What a step costs its host: the real loop in the shapes that graphics cards get, on a card that takes no time.
 
-Every dispatch has no workgroups. What is left is what the host does, and what the driver takes to be told. The same loop
-on the card as it is stands beside it.
+Every dispatch has no workgroups. What is left is what the host does, and what the driver takes to be told. The same
+loop on the card as it is stands beside it.
 """
 
 from __future__ import annotations

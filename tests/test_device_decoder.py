@@ -1,4 +1,4 @@
-"""The passes of the decoder on the device, and of the smoothness loss, against torch. test_resident_step has the whole."""
+"""The passes of the decoder on the device, and of the smoothness loss, against torch (the whole: test_resident_step)."""
 
 from __future__ import annotations
 

@@ -276,9 +276,9 @@ class Config(Options):
         False,
     )
     step: StepPlace = option(
-        "where a training step is computed; resident: on the device from end to end, where its parameters stay; exchange: "
-        "by torch, which exchanges buffers with the device; auto: exchange on CPU devices and for what only torch can do "
-        "(fields other than static, grid4d and laplacian, one's own losses, corrected cameras and colors, --batch, several "
-        "processes), else resident",
+        "where a training step is computed; resident: on the device from end to end, where its parameters stay; "
+        "exchange: by torch, which exchanges buffers with the device; auto: exchange on CPU devices and for what only "
+        "torch computes (fields other than static, grid4d and laplacian, corrected cameras and colors, --batch), else "
+        "resident",
         "auto",
     )

@@ -100,8 +100,7 @@ class ImageLoss:
         return LossArrays(terms, d_image)
 
     def held(self, truth: DeviceArray) -> DeviceArray:
-        """Where a ground truth (H, W) is copied to, so that all of a training go through one buffer, and with it through
-        one texture and one bind group."""
+        """Where a ground truth (H, W) is copied to: all of a training go through one buffer, texture and bind group."""
         return self.pool.array("truth", truth.shape, "uint32")
 
     def kernel(self, name: str, **defines: int) -> Kernel:

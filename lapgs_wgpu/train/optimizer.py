@@ -34,8 +34,8 @@ class Optimizer:
     gaussians: name -> parameter with a row for each Gaussian. This very mapping is changed when rows come and go.
     field: group -> parameters, such as the field's `parameter_groups()`. rates: the schedule of each name and group.
     highest: name or group -> rate that it never exceeds. The same gradients in the same order give the same bits.
-    on_access: called before the state, or the Gaussians with it, is read or changed from outside: a device may have newer
-    ones.
+    on_access: called before the state, or the Gaussians with it, is read or changed from outside: a device may have
+    newer ones.
     """
 
     def __init__(

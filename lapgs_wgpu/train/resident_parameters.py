@@ -146,9 +146,9 @@ class ResidentParameters:
             state = {name: self._optimizer.state_of(tensor) for name, tensor in self._tensors().items()}
             self.steps = {name: each.steps if each else 0 for name, each in state.items()}
             for kind in ("mean", "square"):
-                tensors = {name: getattr(each, kind) if each else None for name, each in state.items()}
+                moments = {name: getattr(each, kind) if each else None for name, each in state.items()}
                 for block in self.blocks.values():
-                    block.arrays[kind].write(block.gather(tensors, value=False))
+                    block.arrays[kind].write(block.gather(moments, value=False))
             if self._frequencies is not None:
                 content, self.steps[FREQUENCIES] = self._frequencies.packed()
                 self._pool.upload("frequencies", content)
@@ -278,19 +278,20 @@ class ResidentParameters:
         assert self._weights is not None
         assert self._frequencies is not None
         kernel, places = Kernel.get(self._device, "adam_frequencies"), self._weights.places
+        config, limit = self._weights.config, self._frequencies.limit
 
         def write() -> DeviceArray:
             corrected, factor = _corrected(rate(), self.steps[FREQUENCIES])
             content = kernel.uniform(
                 "Frequencies",
-                width=self._weights.config.width,
-                components=self._weights.config.components,
+                width=config.width,
+                components=config.components,
                 alpha=places["motion.alpha"].first,
                 beta=places["motion.beta"].first,
                 frequencies=places[FREQUENCIES].first,
                 rate=corrected,
                 square_factor=factor,
-                limit=self._frequencies.limit,
+                limit=limit,
                 largest=LARGEST_FREQUENCY_STEP,
                 floor=VARIANCE_FLOOR,
                 spread=VARIANCE_SPREAD,

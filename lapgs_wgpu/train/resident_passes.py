@@ -21,7 +21,7 @@ from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.drawing import Drawing, GaussianGradients
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterize import rasterizer_of
-from lapgs_wgpu.train.config import Config
+from lapgs_wgpu.train.config import Config, LossWeights
 from lapgs_wgpu.train.fused_loss import image_loss_of
 from lapgs_wgpu.train.image_loss import TERMS
 from lapgs_wgpu.train.learners import Learners
@@ -111,6 +111,10 @@ class ResidentPasses:
         """Whether there is a field."""
         return self._field is not None
 
+    def weights(self, task: Task) -> LossWeights:
+        """Of the image losses of a step."""
+        return self._config.loss.weights(warm=task.sample.moving)
+
     def seen(self) -> DeviceArray:
         """Density control's statistics, (N, 4)."""
         return self._pool.array("statistics", (len(self._scene), 4))
@@ -179,7 +183,7 @@ class ResidentPasses:
         drawn = self._activate(commands, task, decoding, dead)
         drawing = self.rasterizer.record(commands, drawn, sample.view.camera, sample.background)
         terms, d_image = self._losses.record(
-            commands, drawing.image, truth, sample.background, self._weights(task), gradient=True
+            commands, drawing.image, truth, sample.background, self.weights(task), gradient=True
         )
         assert d_image is not None
         by_drawn = self.rasterizer.record_bwd(commands, drawing, d_image)

@@ -138,15 +138,14 @@ class ResidentStep:
         if not moving or not self._passes.moves or step <= config.smoothness.start:
             return sample
         smooth, even = config.smoothness, config.acceleration
-        near = round(smooth.share * count)
-        if near and (smooth.static or smooth.temporal):
-            chosen = Samples(near, count, *_draw_rows(count, generator), smooth.reach)
+        near_count, even_count = round(smooth.share * count), round(even.share * count)
+        if near_count and (smooth.static or smooth.temporal):
+            near = Samples(near_count, count, *_draw_rows(count, generator), smooth.reach)
             shift = smooth.time_reach * (2 * float(torch.rand((), generator=generator)) - 1)
-            sample = dataclasses.replace(sample, near=chosen, near_time=min(max(t + shift, 0.0), 1.0))
-        chosen = round(even.share * count)
+            sample = dataclasses.replace(sample, near=near, near_time=min(max(t + shift, 0.0), 1.0))
         left_out = self.field_fitted or step % even.interval or not even.weight or self._time_count < 3
-        if chosen and not left_out:
-            samples = Samples(chosen, count, *_draw_rows(count, generator))
+        if even_count and not left_out:
+            samples = Samples(even_count, count, *_draw_rows(count, generator))
             reach = LARGEST_DISTANCE / (self._time_count - 1) * (1 + float(torch.rand((), generator=generator))) / 2
             sample = dataclasses.replace(sample, even=samples, even_times=(max(t - reach, 0.0), min(t + reach, 1.0)))
         return sample

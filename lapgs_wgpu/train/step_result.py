@@ -48,6 +48,6 @@ class StepResult:
 
     @property
     def terms(self) -> Mapping[str, float]:
-        """What each term of the loss adds to it, weight included, by name: `l1`, `ssim` (of 1 - SSIM), `pyramid`, `ncc`,
-        `smoothness`, `acceleration` and `dynamics`, as far as they were computed, and each of one's own."""
+        """What each term of the loss adds to it, weight included, by name: `l1`, `ssim` (of 1 - SSIM), `pyramid`,
+        `ncc`, `smoothness`, `acceleration` and `dynamics`, as far as they were computed, and each of one's own."""
         return self._measured().terms

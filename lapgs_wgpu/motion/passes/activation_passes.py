@@ -37,7 +37,8 @@ class Line(NamedTuple):
 
 
 class ActivationPasses:
-    """Records the passes on one device. geometry: (N, 12) and sh (N, 48), as they are trained (common/geometry.wgsl)."""
+    """Records the passes on one device. geometry: (N, 12) and sh (N, 48), as they are trained, see
+    common/geometry.wgsl."""
 
     def __init__(self, device: Device, config: FieldConfig) -> None:
         self._device, self._config = device, config

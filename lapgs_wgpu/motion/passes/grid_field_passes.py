@@ -1,4 +1,4 @@
-"""The grid fields for training on the device, without torch: from Gaussians and weights to the heads' outputs, and back.
+"""The grid fields for training on the device, without torch: from Gaussians and weights to the heads' outputs and back.
 
 Everything stays in device arrays. Gradients are added to arrays that the caller has cleared.
 """
@@ -66,8 +66,8 @@ class Decoding(NamedTuple):
 
 
 class Comparison(NamedTuple):
-    """Features of sampled Gaussians, and of places and a time near them, for each group of grids. sums: (count,) squared
-    differences of each."""
+    """Features of sampled Gaussians, and of places and a time near them, for each group of grids. sums: (count,)
+    squared differences of each."""
 
     points: tuple[PointSet, PointSet]
     here: list[DeviceArray]
