@@ -1,10 +1,9 @@
-"""Frames: in full at rest, whatever was drawn while something moved; files and devices that fail."""
+"""Frames: in full at rest, whatever was drawn while something moved; devices that fail."""
 
 from __future__ import annotations
 
 import asyncio
 import importlib
-import re
 import signal
 from collections.abc import Callable, Coroutine, Iterator
 from contextlib import suppress
@@ -16,7 +15,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.playback import open_playback
-from helpers.still_scenes import CAMERA, KINDS
+from helpers.still_scenes import CAMERA
 from helpers.trained_scenes import GRID4D, OURS, trained
 
 from lapgs_wgpu.errors import DeviceLostError, NumericalError
@@ -32,7 +31,7 @@ pytestmark = pytest.mark.kernels
 
 
 def planes(frame: Frame) -> np.ndarray:
-    return frame.layout.planes.read().view(np.uint32)[:4]
+    return frame.image.planes.read().view(np.uint32)[:4]
 
 
 @pytest.mark.parametrize("mode", ["motion", "scale"])
@@ -81,54 +80,6 @@ def test_the_window_rests_in_full(device: Device, tmp_path: Path, monkeypatch: p
     now[0] += 5
     canvas.draw()
     assert app.viewport.frame is rests
-
-
-TROUBLE = {
-    "no file": "scene.txt",
-    "a buffer": "12000 bytes, .* 8192",
-    "a binding": "one binding, .* 8192",
-    "memory": "out of memory",
-}
-
-
-@pytest.mark.triangles
-@pytest.mark.parametrize("what", TROUBLE)
-def test_a_file_that_cannot_be_shown_leaves_the_scene_as_it_is(
-    device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
-) -> None:
-    trained(device, GRID4D, 100).save(tmp_path / "small.ply")
-    trained(device, KINDS["mlp"], 1000).save(tmp_path / "large.ply")  # whose buffers are made when it is drawn
-    canvas, app, now = app_by_the_clock(tmp_path / "small.ply", device, monkeypatch)
-    app.state.clock.seek(0.3)
-    canvas.draw()
-    before = vars(app.state) | vars(app.viewport) | {"message": None}
-    assert app.viewport.frame is not None
-    shown = planes(app.viewport.frame)
-
-    def give_out(*_: object) -> None:
-        raise MemoryError
-
-    large = tmp_path / ("scene.txt" if what == "no file" else "large.ply")
-    with monkeypatch.context() as patched:
-        if what == "a buffer":
-            patched.setitem(device.limits, "max-buffer-size", 8192)
-        elif what == "a binding":
-            patched.setitem(device.limits, "max-storage-buffer-binding-size", 8192)
-        elif what == "memory":
-            patched.setattr("lapgs_wgpu.viewer.loaded_scene.playback_of", give_out)
-        app.open(large)
-    assert app.state.message is not None
-    assert re.search(TROUBLE[what], app.state.message)
-    assert str(large) in app.state.message
-    assert vars(app.state) | vars(app.viewport) | {"message": None} == before
-    now[0] += 5
-    canvas.draw()
-    assert app.viewport.frame is before["frame"]
-    np.testing.assert_array_equal(planes(app.viewport.frame), shown)
-    app.open(tmp_path / "large.ply")
-    assert (app.state.scene.playback.count, app.state.clock.time, app.state.message) == (1000, 0.0, None)
-    canvas.draw()
-    assert app.viewport.frame is not before["frame"]
 
 
 @pytest.mark.triangles

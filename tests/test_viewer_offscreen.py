@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -24,14 +23,11 @@ from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.rasterize import rasterize
 from lapgs_wgpu.train.evaluate import to_8_bit
 from lapgs_wgpu.viewer import offscreen as offscreen_module
+from lapgs_wgpu.viewer.capture_views import capture_views
 from lapgs_wgpu.viewer.cli import view_command
-from lapgs_wgpu.viewer.ground_truth import open_ground_truth
-from lapgs_wgpu.viewer.loaded_scene import load_scene
 from lapgs_wgpu.viewer.offscreen import framed
 from lapgs_wgpu.viewer.path import CameraPath, KeyFrame, Pose
 from lapgs_wgpu.viewer.path_file import PathFile, write_path
-from lapgs_wgpu.viewer.view_state import ViewState
-from lapgs_wgpu.viewer.viewport import Viewport
 
 pytestmark = pytest.mark.triangles
 kernels = pytest.mark.kernels
@@ -340,35 +336,10 @@ def test_the_capture_opens_as_the_training_opened_it(
 ) -> None:
     opened: list[dict[str, object]] = []
     monkeypatch.setattr(
-        "lapgs_wgpu.data.load_dataset", lambda path, **given: opened.append(given) or SimpleNamespace(test=(), train=())
+        "lapgs_wgpu.data.load_dataset",
+        lambda path, **given: opened.append(given) or SimpleNamespace(test=("a",), train=("b",)),
     )
     (tmp_path / "config.toml").write_text(f'[data]\npath = "{tmp_path}"\nsize = 200\n{line}\n')
-    assert open_ground_truth(tmp_path / "checkpoint.ply", {}) is not None
+    scene = SimpleNamespace(path=tmp_path / "checkpoint.ply", playback=SimpleNamespace(metadata={}))
+    assert capture_views(scene) == ("a", "b")  # type: ignore[arg-type]
     assert opened == [{"image_size": 200, "normalize": True, "undistort": expected}]
-
-
-def test_an_image_that_cannot_be_read_ends_the_comparison(run: Path, device: Device, tmp_path: Path) -> None:
-    offscreen = pytest.importorskip("rendercanvas.offscreen")
-    shutil.copytree(run, tmp_path / "run")
-    (tmp_path / "run" / "config.toml").write_text(f'[data]\npath = "{tmp_path / "run" / "toys"}"\nsize = 0\n')
-    state = ViewState(load_scene(tmp_path / "run" / "checkpoint.ply", lambda: device))
-    canvas = offscreen.RenderCanvas(size=(64, 48), pixel_ratio=1)
-    viewport = Viewport(canvas, state)
-    state.next_compare()
-    assert state.comparing() != "off"
-    for image in (tmp_path / "run" / "toys" / "test").glob("*.png"):
-        image.write_bytes(image.read_bytes()[:60])
-
-    def draw() -> None:
-        viewport.draw(50.0)
-        viewport.present()
-
-    canvas.request_draw(draw)
-    canvas.draw()
-    assert state.compare == "off"
-    assert state.message is not None
-    assert "cannot be decoded as an image" in state.message
-    shown = canvas.draw()
-    state.message = None
-    np.testing.assert_array_equal(shown, canvas.draw())
-    assert state.message is None

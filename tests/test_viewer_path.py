@@ -20,7 +20,7 @@ from lapgs_wgpu.motion.fields.hash_grid_config import HashConfig
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.viewer.camera import ViewCamera
 from lapgs_wgpu.viewer.path import CameraPath, KeyFrame, Pose
-from lapgs_wgpu.viewer.path_editor import PathEditor, path_file_of
+from lapgs_wgpu.viewer.path_editor import PathEditor
 from lapgs_wgpu.viewer.path_file import PathFile, read_path, write_path
 
 
@@ -93,18 +93,8 @@ def test_fields_of_view_stay_within_those_of_the_keys() -> None:
 # Files
 
 
-def test_round_trip(tmp_path: Path) -> None:
-    held = PathFile(CameraPath(keys()), (640, 360), 24.0)
-    write_path(tmp_path / "a.json", held)
-    back = read_path(tmp_path / "a.json")
-    assert (back.size, back.fps) == ((640, 360), 24.0)
-    for a, b in zip(back.path.keys, held.path.keys, strict=True):
-        assert (a.second, a.time) == (pytest.approx(b.second), pytest.approx(b.time))
-        assert_near(a.pose, b.pose)
-
-
-def test_what_is_written_is_nerfstudios(tmp_path: Path) -> None:
-    """Every key that nerfstudio's render command and viewer read, in its axes and units."""
+def test_what_is_written_is_nerfstudios_and_read_back(tmp_path: Path) -> None:
+    """Every key that nerfstudio's render command reads, in its axes and units."""
     camera = ViewCamera([0, 0, 5], [0, 0, 0], [0, 1, 0], math.radians(50))  # looks along -z, as OpenGL's cameras do
     pose = Pose(camera.position, camera.rotation, camera.fov_y)
     path = CameraPath([KeyFrame(0, 0.25, pose), KeyFrame(2, 0.75, pose._replace(position=np.array([1.0, 0, 5])))])
@@ -112,17 +102,19 @@ def test_what_is_written_is_nerfstudios(tmp_path: Path) -> None:
     values = json.loads((tmp_path / "a.json").read_text())
     assert values["camera_type"] == "perspective"
     assert (values["render_width"], values["render_height"]) == (640, 360)
-    assert (values["fps"], values["seconds"], values["is_cycle"]) == (10.0, 2.0, False)
-    assert len(values["camera_path"]) == 20
+    assert (values["fps"], values["seconds"]) == (10.0, 2.0)
+    assert len(values["camera_path"]) == 21
     frame = values["camera_path"][10]
     np.testing.assert_allclose(frame["camera_to_world"], [1, 0, 0, 0.5, 0, 1, 0, 0, 0, 0, 1, 5, 0, 0, 0, 1], atol=1e-12)
     assert frame["fov"] == pytest.approx(50)
     assert frame["aspect"] == pytest.approx(640 / 360)
     assert frame["render_time"] == pytest.approx(0.5)
-    key = values["keyframes"][1]
-    np.testing.assert_allclose(key["matrix"], [1, 0, 0, 1, 0, 1, 0, 0, 0, 0, 1, 5, 0, 0, 0, 1], atol=1e-12)
-    assert (key["override_transition_enabled"], key["override_transition_sec"]) == (True, 2.0)
-    assert (key["override_time_enabled"], key["render_time"]) == (True, 0.75)
+    back = read_path(tmp_path / "a.json")
+    assert (back.size, back.fps, back.path.seconds) == ((640, 360), 10.0, 2.0)
+    for second in np.linspace(0, 2, 21).tolist():
+        (a, t), (b, u) = back.path.at(second), path.at(second)
+        assert t == pytest.approx(u)
+        assert_near(a, b)
 
 
 def read(tmp_path: Path, values: Any) -> PathFile:
@@ -130,42 +122,22 @@ def read(tmp_path: Path, values: Any) -> PathFile:
     return read_path(tmp_path / "a.json")
 
 
-def test_nerfstudios_key_frames(tmp_path: Path) -> None:
+def test_nerfstudios_frames(tmp_path: Path) -> None:
     held = read(tmp_path, nerfstudio())
-    assert [key.second for key in held.path.keys] == [0.0, 2.0, 2.5]
-    assert [key.time for key in held.path.keys] == pytest.approx([0.0, 0.8, 1.0])  # the clip once along the path
+    assert [key.second for key in held.path.keys] == pytest.approx([0.0, 1 / 30])
+    assert [key.time for key in held.path.keys] == [0.0, 1.0]  # the clip once along the path
     first = held.path.keys[0].pose
     np.testing.assert_allclose(first.rotation, np.diag([1, -1, -1]), atol=1e-12)
     assert first.fov_y == pytest.approx(math.radians(60))
     np.testing.assert_allclose(held.path.keys[1].pose.position, [3, 0, 0])
-
-
-def test_a_closed_path_comes_back(tmp_path: Path) -> None:
-    held = read(tmp_path, nerfstudio(is_cycle=True))
-    assert [key.second for key in held.path.keys] == [0.0, 2.0, 2.5, 4.5]
-    assert_near(held.path.keys[-1].pose, held.path.keys[0].pose)
-
-
-def test_frames_serve_where_there_are_no_key_frames(tmp_path: Path) -> None:
-    """Files of other programs have none; those of nerfstudio's first viewer hold them as texts."""
-    for given in ([], [{"matrix": json.dumps(IDENTITY), "fov": 50, "properties": "[]"}]):
-        held = read(tmp_path, nerfstudio(keyframes=given))
-        assert [key.second for key in held.path.keys] == pytest.approx([0.0, 1 / 30])
-    rows = [{"camera_to_world": IDENTITY, "fov": 50, "time": t} for t in (0.5, 0.75, 0.25)]
+    rows = [{"camera_to_world": IDENTITY, "fov": 50, name: t} for name, t in (("time", 0.5), ("render_time", 0.25))]
     held = read(tmp_path, {"camera_path": rows, "render_width": 64, "render_height": 48})
-    assert [key.time for key in held.path.keys] == [0.5, 0.75, 0.25]
-
-
-def test_times_are_read_from_the_key_frames(tmp_path: Path) -> None:
-    values = nerfstudio()
-    for key, time in zip(values["keyframes"], (0.5, 0.25, 1.0), strict=True):
-        key["render_time"] = time
-    assert [key.time for key in read(tmp_path, values).path.keys] == [0.5, 0.25, 1.0]
+    assert [key.time for key in held.path.keys] == [0.5, 0.25]
 
 
 def changed(key: str, value: Any) -> dict[str, Any]:
     values = nerfstudio()
-    values["keyframes"][1][key] = value
+    values["camera_path"][1][key] = value
     return values
 
 
@@ -174,22 +146,13 @@ BAD: dict[str, tuple[Any, str]] = {
     "fisheye": (nerfstudio(camera_type="fisheye"), "camera_type"),
     "no width": (nerfstudio(render_width=None), "render_width"),
     "endless": (nerfstudio(fps=float("inf")), "fps"),
-    "nothing": (nerfstudio(keyframes=[], camera_path=[]), "camera_path"),
-    "a frame of no object": (nerfstudio(keyframes=[], camera_path=[1]), "camera_path"),
-    "12 numbers": (changed("matrix", IDENTITY[:12]), r"keyframes\[1\]: matrix"),
-    "sheared": (changed("matrix", [1, 1, *IDENTITY[2:]]), r"keyframes\[1\]: matrix"),
-    "mirrored": (changed("matrix", [-1, *IDENTITY[1:]]), r"keyframes\[1\]: matrix"),
-    "fov of 180": (changed("fov", 180), r"keyframes\[1\]: fov"),
-    "time of 2": (changed("render_time", 2), r"keyframes\[1\]: render_time"),
-    "a step back": (
-        nerfstudio(
-            keyframes=[
-                {"matrix": IDENTITY, "fov": 50, "override_transition_enabled": True, "override_transition_sec": wait}
-                for wait in (0, -1)
-            ]
-        ),
-        r"keyframes\[1\]: override_transition_sec",
-    ),
+    "nothing": (nerfstudio(camera_path=[]), "camera_path"),
+    "a frame of no object": (nerfstudio(camera_path=[1]), "frame 0"),
+    "12 numbers": (changed("camera_to_world", IDENTITY[:12]), "frame 1: camera_to_world"),
+    "sheared": (changed("camera_to_world", [1, 1, *IDENTITY[2:]]), "frame 1: camera_to_world"),
+    "mirrored": (changed("camera_to_world", [-1, *IDENTITY[1:]]), "frame 1: camera_to_world"),
+    "fov of 180": (changed("fov", 180), "frame 1: fov"),
+    "time of 2": (changed("render_time", 2), "frame 1: render_time"),
 }
 
 
@@ -222,44 +185,13 @@ def edited() -> PathEditor:
     return editor
 
 
-def seconds(editor: PathEditor) -> list[float]:
-    return [round(key.second, 6) for key in editor.keys]
-
-
-def test_key_frames_are_added_at_the_end() -> None:
+def test_key_frames_are_added_and_dropped_at_the_end() -> None:
     editor = edited()
-    assert seconds(editor) == [0.0, 2.0, 4.0]
-    assert editor.chosen == 2
+    assert [key.second for key in editor.keys] == [0.0, 2.0, 4.0]
     assert editor.keys[1].pose.position.tolist() == [1, 0, 5]
     assert editor.keys[1].time == 0.1
-
-
-def test_moving_a_key_frame() -> None:
-    editor = edited()
-    editor.move(1.0)
-    assert seconds(editor) == [0.0, 1.0, 2.0]
-    assert editor.chosen == 1
-    assert editor.keys[1].time == 0.2
-    editor.move(2.0)  # where another one is: a little beyond
-    assert seconds(editor) == [0.0, 2.0, 2.05]
-    assert editor.chosen == 2
-    editor.move(-1.0)  # becomes the first, at second 0
-    assert seconds(editor) == [0.0, 1.0, 3.0]
-    assert editor.chosen == 0
-
-
-def test_replacing_and_deleting() -> None:
-    editor = edited()
-    editor.chosen = 1
-    editor.replace(camera(9).pose, 0.9)
-    assert (editor.keys[1].second, editor.keys[1].time, editor.keys[1].pose.position[0]) == (2.0, 0.9, 9)
-    editor.chosen = 0
-    editor.delete()
-    assert seconds(editor) == [0.0, 2.0]
-    editor.delete()
-    editor.delete()
-    assert editor.keys == []
-    assert editor.chosen is None
+    editor.undo()
+    assert [key.second for key in editor.keys] == [0.0, 2.0]
 
 
 def test_the_preview_shows_the_path_at_that_moment() -> None:
@@ -274,26 +206,6 @@ def test_the_preview_shows_the_path_at_that_moment() -> None:
     assert shown is not None
     assert_near(shown[0], editor.keys[-1].pose)
     assert editor.preview(105.1) is None
-
-
-def test_saving_and_loading(tmp_path: Path) -> None:
-    file = path_file_of(tmp_path / "checkpoint.ply")
-    assert file == tmp_path / "checkpoint.camera_path.json"
-    editor, other = edited(), PathEditor()
-    editor.save(file, (640, 360), 25.0)
-    other.load(file)
-    assert seconds(other) == seconds(editor)
-    assert_near(other.keys[2].pose, editor.keys[2].pose)
-    file.write_text("{}")
-    with pytest.raises(InputError):
-        other.load(file)
-    assert seconds(other) == seconds(editor)
-    with pytest.raises(InputError, match="another path"):
-        edited().save(file, (640, 360), 25.0)
-    assert file.read_text() == "{}"
-    editor.save(file, (640, 360), 25.0)  # its own
-    other.load(file)
-    other.save(file, (640, 360), 24.0)
 
 
 @pytest.mark.kernels

@@ -86,15 +86,15 @@ def _window(given: Any, scene: LoadedScene, entry: Entry | None) -> None:
 
 def _start(given: Any, state: ViewState) -> None:
     """Set the state as the options say. Raises InputError where the scene lacks the mode or the view."""
-    from lapgs_wgpu.viewer.offscreen import check_mode, find_view
+    from lapgs_wgpu.viewer.capture_views import find_view
+    from lapgs_wgpu.viewer.offscreen import check_mode
 
     if given.mode is not None:
         check_mode(state.scene, state.renderer, given.mode)
         state.mode = given.mode
     if given.view is not None:
         name = find_view(state.scene, given.view).name
-        assert state.ground_truth is not None
-        state.stand_at([view.name for view in state.ground_truth.views].index(name))
+        state.stand_at([view.name for view in state.views].index(name))
     state.background = BACKGROUNDS.get(given.background, state.background)
     state.show_transport = bool(given.time_slider or state.show_transport)
     clock = state.clock
@@ -111,7 +111,8 @@ def _renderer(given: Any, scene: LoadedScene) -> OffscreenRenderer:
 
 
 def _screenshot(given: Any, scene: LoadedScene) -> None:
-    from lapgs_wgpu.viewer.offscreen import find_view, framed, write_png
+    from lapgs_wgpu.viewer.capture_views import find_view
+    from lapgs_wgpu.viewer.offscreen import framed, write_png
 
     file = _named(given.screenshot, ".png", "--screenshot")
     time = given.time or 0.0
@@ -128,7 +129,8 @@ def _screenshot(given: Any, scene: LoadedScene) -> None:
 def _video(given: Any, scene: LoadedScene) -> None:
     from lapgs_wgpu.viewer import video
     from lapgs_wgpu.viewer.camera import ViewCamera
-    from lapgs_wgpu.viewer.offscreen import find_view, framed
+    from lapgs_wgpu.viewer.capture_views import find_view
+    from lapgs_wgpu.viewer.offscreen import framed
     from lapgs_wgpu.viewer.path_file import read_path
 
     file = _named(given.video, ".mp4", "--video")

@@ -16,7 +16,7 @@ from lapgs_wgpu.motion.playback.playback import Playback
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterizer import Rasterizer
-from lapgs_wgpu.viewer.present import ImageLayout
+from lapgs_wgpu.viewer.present import DrawnImage
 from lapgs_wgpu.viewer.render_modes import MODES, Mode
 
 _TIMES = 9  # of the clip, at which the Gaussians' places are compared
@@ -33,11 +33,10 @@ class FrameRequest(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Frame:
-    """A drawn frame. layout: for the presenter, at the origin in its own size. seconds: until all passes were done.
-    splats: how many touched the picture."""
+    """A drawn frame. seconds: until all passes were done. splats: how many touched the image."""
 
     request: FrameRequest
-    layout: ImageLayout
+    image: DrawnImage
     seconds: float
     splats: int
 
@@ -91,14 +90,13 @@ class FrameRenderer:
         if mode == "depth":
             low, high = self._depth_range(drawing.image)
         shows = {"rgb": "color", "alpha": "alpha", "depth": "depth"}.get(mode, "value")
-        size = (camera.width, camera.height)
-        layout = ImageLayout(drawing.image, size, (0, 0), size, request.background, shows, low, high)
-        return Frame(request, layout, time.perf_counter() - start, int(visible[0]))
+        image = DrawnImage(drawing.image, (camera.width, camera.height), request.background, shows, low, high)
+        return Frame(request, image, time.perf_counter() - start, int(visible[0]))
 
     def depth_at(self, frame: Frame, column: int, row: int) -> float | None:
         """Measure the depth along the camera's axis at a pixel, world units; None where it shows next to nothing."""
         drawn = self.draw(frame.request._replace(mode="depth"))
-        planes = drawn.layout.planes.read()
+        planes = drawn.image.planes.read()
         alpha = 1.0 - float(planes[3, row, column])
         return float(planes[4, row, column]) / alpha if alpha > 0.1 else None
 

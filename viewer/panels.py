@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 from imgui_bundle import imgui
 from wgpu.utils.imgui import ImguiRenderer
 
-from lapgs_wgpu.viewer.file_browser import FileBrowser
 from lapgs_wgpu.viewer.key_bindings import KEYS, MOUSE
 from lapgs_wgpu.viewer.path_panel import draw_path
 from lapgs_wgpu.viewer.present import HEAT
-from lapgs_wgpu.viewer.render_modes import BACKGROUNDS, COMPARES, MODES
+from lapgs_wgpu.viewer.render_modes import BACKGROUNDS, MODES
 from lapgs_wgpu.viewer.time_slider import draw_time_slider
 from lapgs_wgpu.viewer.training_control import TrainingControl
 from lapgs_wgpu.viewer.view_state import ViewState
@@ -26,7 +23,6 @@ _GAP = 8.0
 _BAR_HEIGHT = 62.0  # of the time slider
 _SIDE = 230.0  # width of the panel at the left
 _ACCENT = (0.95, 0.60, 0.25, 1.0)
-_COMPARE_NAMES = ("no comparison", "side by side", "split", "error, 4 times")
 
 
 class _Renderer(ImguiRenderer):
@@ -45,15 +41,13 @@ class _Renderer(ImguiRenderer):
 
 
 class Panels:
-    """Draws the GUI of a ViewState onto the viewport's canvas. open_file: shows another file."""
+    """Draws the GUI of a ViewState onto the viewport's canvas."""
 
-    def __init__(self, state: ViewState, viewport: Viewport, open_file: Callable[[Path], None]) -> None:
+    def __init__(self, state: ViewState, viewport: Viewport) -> None:
         self.state, self.viewport = state, viewport
         self._covered: list[tuple[float, float, float, float]] = []
         self._renderer = _Renderer(viewport.device.wgpu_device, viewport.canvas, viewport.format)
         self._renderer.set_gui(self._draw)
-        path = state.scene.path
-        self._files = FileBrowser(path.resolve().parent if path else Path.cwd(), open_file)
         imgui.get_io().set_ini_filename("")
         imgui.get_io().config_flags &= ~imgui.ConfigFlags_.nav_enable_keyboard  # the keys are the viewer's
         _style()
@@ -103,17 +97,13 @@ class Panels:
         state.mode = choice("mode", state.mode, state.renderer.modes())
         tip(MODES[state.mode])
         frame = self.viewport.frame
-        if frame is not None and frame.layout.shows in ("depth", "value"):
-            _legend(frame.layout.low, frame.layout.high)
+        if frame is not None and frame.image.shows in ("depth", "value"):
+            _legend(frame.image.low, frame.image.high)
         state.background = choice("ground", state.background, list(BACKGROUNDS.values()), list(BACKGROUNDS))
         tip("background")
         if button("Reset"):
             state.reset_camera()
         tip("camera back to where it started (R)")
-        imgui.same_line()
-        if button("Open", enabled=state.training is None):  # there would be no way back to the training
-            self._files.toggle()
-        tip("another .ply or .lapgs file")
         imgui.same_line()
         if button("Help"):
             state.show_help = not state.show_help
@@ -122,10 +112,11 @@ class Panels:
             imgui.text_colored(_ACCENT, "flying: W A S D Q E, V ends")
         if state.training is not None:
             self._training(state.training)
-        if state.ground_truth is not None:
-            self._capture()
+        if state.views:
+            chosen = choice("camera", state.view, range(len(state.views)), [view.name for view in state.views])
+            if chosen is not None and chosen != state.view:
+                state.stand_at(chosen)
         draw_path(state, self.viewport)
-        self._files.draw()
         self._end()
 
     def _training(self, training: TrainingControl) -> None:
@@ -140,21 +131,6 @@ class Panels:
         if button("Step"):
             training.step()
         tip("one step of the optimizer, then pause")
-
-    def _capture(self) -> None:
-        state = self.state
-        assert state.ground_truth is not None
-        imgui.separator_text("Capture")
-        views = state.ground_truth.views
-        chosen = choice("camera", state.view, range(len(views)), [view.name for view in views])
-        compare = choice("##compare", state.compare, COMPARES, _COMPARE_NAMES, width=-1)
-        if compare != state.compare and state.view is None:
-            chosen = 0
-        state.compare = compare
-        if chosen is not None and chosen != state.view:
-            state.stand_at(chosen)
-        if state.compare != "off" and state.comparing() == "off":
-            imgui.text_wrapped("The capture has no picture of this camera and time; N goes to the next that it has.")
 
     # Texts over the picture ------------------------------------------------------------------------------------------
 

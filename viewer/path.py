@@ -41,11 +41,10 @@ class KeyFrame(NamedTuple):
 
 
 class CameraPath:
-    """A path through its key-frames, at least one, in the order of their seconds; the first is at second 0.
+    """A path through its key-frames, at least one, by ascending seconds; the first is at second 0.
 
     Positions, rotations (as quaternions, the shortest way) and fields of view follow cubic curves without jumps of
     velocity, and rest between two equal key-frames. Times in the clip are linear from key-frame to key-frame.
-    Raises ValueError where two key-frames are at the same second.
     """
 
     def __init__(self, keys: Iterable[KeyFrame]) -> None:
@@ -53,14 +52,11 @@ class CameraPath:
         from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
         from scipy.spatial.transform import Rotation
 
-        ordered = sorted(keys, key=lambda key: key.second)
-        self.keys = tuple(key._replace(second=key.second - ordered[0].second) for key in ordered)
+        self.keys = tuple(keys)
         self._curve = None
         if len(self.keys) < 2:
             return
         seconds = np.array([key.second for key in self.keys])
-        if not (np.diff(seconds) > 0).all():
-            raise ValueError("two key-frames of a camera path are at the same second")
         positions, turns, fovs = zip(*(key.pose for key in self.keys), strict=True)
         quats = Rotation.from_matrix(np.stack(turns)).as_quat()
         for before, after in itertools.pairwise(quats):

@@ -1,12 +1,10 @@
-"""Render modes, backgrounds, comparisons and vertical axes: constants that load neither torch nor wgpu."""
+"""Render modes, backgrounds and vertical axes: constants that load neither torch nor wgpu."""
 
 from __future__ import annotations
 
 from typing import Literal
 
 Mode = Literal["rgb", "depth", "alpha", "motion", "dynamics", "scale"]
-Compare = Literal["off", "side", "split", "error"]
-COMPARES: tuple[Compare, ...] = ("off", "side", "split", "error")
 MODES: dict[Mode, str] = {
     "rgb": "colors",
     "depth": "depth along the camera axis, world units",

@@ -58,7 +58,7 @@ PASSES: dict[str, tuple[str, Defines]] = {
 }  # fmt: skip
 _FIELD = ("hashgrid_slice", "hashgrid SLICED", "hashgrid")  # beside one of deform
 _CHOSEN = ("color", "rasterize", "deform")  # one of each
-_DESKTOP_ACTIONS = ("next_mode", "next_view", "next_compare", "add_key_frame", "toggle_pause", "step_training")
+_DESKTOP_ACTIONS = ("next_mode", "next_view", "add_key_frame", "toggle_pause", "step_training")
 
 
 def player_data() -> dict[str, Any]:

@@ -27,25 +27,11 @@ SHIFTED = [1, 0, 0, 3, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
 def nerfstudio(**changes: Any) -> dict[str, Any]:
     """A path as nerfstudio's viewer saves it, without times."""
     values: dict[str, Any] = {
-        "default_fov": 75.0,
-        "default_transition_sec": 2.0,
-        "keyframes": [
-            {
-                "matrix": matrix,
-                "fov": 60.0,
-                "aspect": 1.78,
-                "override_transition_enabled": i == 2,
-                "override_transition_sec": 0.5 if i == 2 else None,
-            }
-            for i, matrix in enumerate([IDENTITY, SHIFTED, IDENTITY])
-        ],
         "camera_type": "perspective",
         "render_height": 1080,
         "render_width": 1920,
         "fps": 30.0,
         "seconds": 2.5,
-        "is_cycle": False,
-        "smoothness_value": 0.0,
         "camera_path": [{"camera_to_world": m, "fov": 60.0, "aspect": 1.78} for m in (IDENTITY, SHIFTED)],
     }
     return values | changes
