@@ -6,7 +6,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from types import FrameType
@@ -25,7 +25,6 @@ from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.progress import Progress, say
 from lapgs_wgpu.stop_signals import on_stop_signals
 from lapgs_wgpu.train.config import Config, DataConfig
-from lapgs_wgpu.train.distributed import SINGLE_PROCESS, Ranks
 from lapgs_wgpu.train.evaluate import evaluate, write_metrics
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.lpips import Lpips
@@ -63,19 +62,17 @@ def train(
     device: Device | None = None,
     overwrite: bool = False,
     watch: Watch | None = None,
-    ranks: Ranks = SINGLE_PROCESS,
     parts: Parts | None = None,
     lpips: Lpips | None = None,
 ) -> Scene4D:
     """Train on a dataset, evaluate on its test views, and leave config.toml, log.jsonl, metrics.json, checkpoint.ply
     and eval/ in the folder `out`, which must be new or empty, or hold an earlier run when `overwrite` is set.
 
-    device: the default adapter where None. ranks: this process among those that train together; only the first one
-    writes. parts: what Python gives the training (docs/api.md). lpips: of the evaluation. The same configuration,
-    pictures, adapter and driver give the same checkpoint to the last byte, watched or not, interrupted and resumed or
-    not. Raises InputError before anything is written where the input is not usable, and KeyboardInterrupt after Ctrl-C
-    or SIGTERM, when checkpoint and state of the last whole step have been written. DeviceError, NumericalError and
-    whatever else ends a step go on to the caller when that state has been written.
+    device: the default adapter where None. parts: what Python gives the training (docs/api.md). lpips: of the
+    evaluation. The same configuration, pictures, adapter and driver give the same checkpoint to the last byte, watched
+    or not, interrupted and resumed or not. Raises InputError before anything is written where the input is not usable,
+    and KeyboardInterrupt after Ctrl-C or SIGTERM, when checkpoint and state of the last whole step have been written.
+    DeviceError, NumericalError and whatever else ends a step go on to the caller when that state has been written.
     """
     out = Path(out)
     if not dataset.test:
@@ -84,12 +81,9 @@ def train(
     if config.eval.tensorboard:
         check_tensorboard()
     found += check_in_view(dataset, first_points(dataset, PROBES, config.points.box, config.seed)[0])
-    if ranks.first:
-        check_run_folder(out, overwrite=overwrite)
+    check_run_folder(out, overwrite=overwrite)
     keep_freed_memory()
     device = device or open_device()
-    if not ranks.first:
-        return _assist(start_training(config, dataset, device, ranks, parts=parts))
     with locked_folder(out):
         check_run_folder(out, overwrite=overwrite)  # again: another training may have written it meanwhile
         if dataset.summary:
@@ -98,7 +92,7 @@ def train(
             print(f"warning: {warning}", file=sys.stderr, flush=True)
         if dataset.normalization is not None:
             say(f"normalization: {dataset.normalization}")
-        training = start_training(config, dataset, device, ranks, parts=parts)
+        training = start_training(config, dataset, device, parts=parts)
         start_run_folder(out, training.user_config, training.scene.device, dataset)
         if training.discovery is not None:
             say(f"discovery: {training.discovery}; {training.discovery_seconds:.0f} s")
@@ -114,7 +108,6 @@ def resume(
     *,
     device: Device | None = None,
     watch: Watch | None = None,
-    ranks: Ranks = SINGLE_PROCESS,
     parts: Parts | None = None,
     lpips: Lpips | None = None,
 ) -> Scene4D:
@@ -125,25 +118,24 @@ def resume(
         raise InputError(f"{out} is finished: there is nothing to resume.")
     keep_freed_memory()
     device = device or open_device()
-    with locked_folder(out) if ranks.first else nullcontext():
+    with locked_folder(out):
         state = load_state(out)
         if state is None and (out / "checkpoint.ply").exists():
             raise InputError(
                 f"{out} holds a checkpoint, but no state to go on from ({STATE}); copy that file, too, or train anew."
             )
-        if ranks.first:
-            note_paths(out, config)
+        note_paths(out, config)
         if state is None:
-            training = start_training(config, dataset, device, ranks, parts=parts)
+            training = start_training(config, dataset, device, parts=parts)
         else:
-            training = Trainer(config, dataset, device, ranks, parts=parts)
+            training = Trainer(config, dataset, device, parts=parts)
             try:
                 check_state(state, views=len(dataset.train), steps=config.schedule.steps)
                 training.restore(state)
             except (IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
                 reason = f"{type(error).__name__}: {error}".splitlines()[0]
                 raise InputError(f"{out}: its state and its config.toml do not belong together ({reason}).") from error
-        return _run(training, out, watch, lpips) if ranks.first else _assist(training)
+        return _run(training, out, watch, lpips)
 
 
 def _outside(scene: Scene4D) -> str:
@@ -159,16 +151,6 @@ def _outside(scene: Scene4D) -> str:
         "cannot tell one from another and moves all alike; where something moves there, or a background trembles, "
         "raise field.bound."
     )
-
-
-def _assist(training: Trainer) -> Scene4D:
-    """Take the steps of a process that is not the first: nothing is written."""
-    with _interruptible() as interrupted:
-        for _ in _steps(training, None, interrupted):
-            pass
-    if training.done < training.config.schedule.steps:
-        raise KeyboardInterrupt(f"stopped after step {training.done}.")
-    return training.scene
 
 
 def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None) -> Scene4D:
@@ -237,11 +219,11 @@ def _save_now_and_then(out: Path, training: Trainer, result: StepResult) -> None
         save_state(out, training.state())
 
 
-def _steps(training: Trainer, out: Path | None, interrupted: threading.Event) -> Iterator[StepResult]:
-    """Take the steps that are left, until `interrupted` is set in any process. An error saves the state in `out`."""
-    ranks, last = training.ranks, training.config.schedule.steps
+def _steps(training: Trainer, out: Path, interrupted: threading.Event) -> Iterator[StepResult]:
+    """Take the steps that are left, until `interrupted` is set. An error saves the state in `out`."""
+    last = training.config.schedule.steps
     try:
-        while training.done < last and not ranks.any_rank(interrupted.is_set()):
+        while training.done < last and not interrupted.is_set():
             yield training.step()
     except (DeviceError, NumericalError, MemoryError) as error:
         kind = MemoryError if not isinstance(error, DeviceError | NumericalError) else type(error)  # numpy has its own
@@ -253,10 +235,8 @@ def _steps(training: Trainer, out: Path | None, interrupted: threading.Event) ->
         training.close()
 
 
-def _saved(training: Trainer, out: Path | None) -> str:
+def _saved(training: Trainer, out: Path) -> str:
     """Save the state of a training that cannot go on, if it has one worth saving; what a user should know of it."""
-    if out is None:
-        return ""
     if training.whole and training.done:
         try:
             save_state(out, training.state())

@@ -53,7 +53,7 @@ def scene(run: Path, device: Device) -> Scene4D:
 
 @pytest.fixture(autouse=True)
 def one_device(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(device_module, "open_device", lambda name=None, **_: device)
+    monkeypatch.setattr(device_module, "open_device", lambda name=None: device)
 
 
 def view(*words: object) -> None:

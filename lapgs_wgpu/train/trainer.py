@@ -25,7 +25,6 @@ from lapgs_wgpu.train.camera_refinement import CameraRefinement
 from lapgs_wgpu.train.config import BACKGROUND_LEVELS, Config
 from lapgs_wgpu.train.densify import Statistics
 from lapgs_wgpu.train.density_control import DensityControl
-from lapgs_wgpu.train.distributed import SINGLE_PROCESS, Ranks
 from lapgs_wgpu.train.evaluate import evaluate, mean_psnr
 from lapgs_wgpu.train.ground_truth import GroundTruth
 from lapgs_wgpu.train.host_threads import step_threads, torch_threads
@@ -60,7 +59,6 @@ class Trainer:
         discovery: what motion discovery found, a sentence; None where it was left out.
         discovery_seconds: that it took; 0 where it was left out.
         timing: the corrections of the training images' times; None where they are kept.
-        ranks: this process among those that train together.
         whole: False while a step is partly applied, and after an error in that part of it.
     """
 
@@ -69,7 +67,6 @@ class Trainer:
         config: Config,
         dataset: Dataset | None = None,
         device: Device | None = None,
-        ranks: Ranks = SINGLE_PROCESS,
         *,
         scene: Scene4D | None = None,
         start: Start | None = None,
@@ -83,7 +80,6 @@ class Trainer:
             config: as `load_config` gives it.
             dataset: None for the one that config.data names; a built-in scene is then written into the folder runs.
             device: None for the default adapter.
-            ranks: this process among those that train together. The first one's start replaces those of the others.
             scene: to start from, and to move from the first step on. Its field keeps its shape, whatever config.field
                 says.
             start: what motion discovery found.
@@ -93,20 +89,18 @@ class Trainer:
             InputError: the configuration, the data, the scene and the parts do not fit each other.
         """
         self.parts = parts or Parts()
-        self.user_config, self.config, self.dataset, device = set_up(config, dataset, device, self.parts, ranks, scene)
+        self.user_config, self.config, self.dataset, device = set_up(config, dataset, device, self.parts, scene)
         if scene is not None:
             start = Start(scene, ramp_steps=config.schedule.warm_up)
         elif start is None:
             start = start_from_points(self.config, self.dataset, device, self.parts.field)
-        self.ranks, self.callbacks = ranks, list(self.parts.callbacks)
+        self.callbacks = list(self.parts.callbacks)
         self.done = 0
         self.scene, self.discovery, self.discovery_seconds = start.scene, start.summary, start.seconds
         self.warm_up_steps, self._ramp_steps = start.warm_up_steps, start.ramp_steps
         self._threads = step_threads(self.config.field, device)
         self._generator = torch.Generator().manual_seed(config.seed)
         self._prepare(start)
-        if ranks.count > 1:
-            self.restore(ranks.of_first(self.state()))
         self.whole = True
 
     def _prepare(self, start: Start) -> None:
@@ -131,7 +125,6 @@ class Trainer:
             self._learners.camera,
             extent,
             self._generator,
-            self.ranks,
         )
         self.timing = None
         if config.timing.refine and scene.field is not None and len(dataset.times) > 2:
@@ -141,7 +134,6 @@ class Trainer:
                 lambda view: self._truth.on_host(view, self._color),
                 self._picture,
                 dataset.time_gap,
-                self.ranks,
             )
         self._timing_steps = config.timing.corrections(config.schedule.steps) if self.timing else []
         self._skips = SkipCounter()
@@ -230,27 +222,22 @@ class Trainer:
         return result
 
     def _step(self) -> StepResult:
-        config, scene, ranks, step = self.config, self.scene, self.ranks, self.done + 1
+        config, scene, step = self.config, self.scene, self.done + 1
         moving = step > self.warm_up_steps
-        # Every rank draws the numbers of all views, so that their random streams stay the same.
         chosen = [self._choose() for _ in range(config.schedule.batch)]
         drawn = self._generator.get_state()
         samples = [self._objective.sample(*each, step, self._generator, moving=moving) for each in chosen]
-        mine = samples[ranks.rank :: ranks.count]
-        self._truth.prefetch([*(sample.view for sample in mine), *self._order.coming(AHEAD)])
+        self._truth.prefetch([*(sample.view for sample in samples), *self._order.coming(AHEAD)])
 
         self._learners.zero_grad()
         seen = self._density.nothing_seen()
         results, totals = [], Counter[str]()
-        for sample in mine:
+        for sample in samples:
             result = self._descend(sample, share=len(samples))
             seen.add(result.radii, result.d_means2d, sample.view.camera, scale=len(samples))
             results.append(result)
             totals.update({"loss": result.loss, "psnr": result.psnr, **result.terms})
-        if ranks.count > 1:
-            self._learners.all_reduce_gradients(ranks)
-        sums = ranks.all_reduce_sum([torch.tensor(list(totals.values()), dtype=torch.float64)])[0] / len(samples)
-        means = dict(zip(totals, sums.tolist(), strict=True))
+        means = {name: total / len(samples) for name, total in totals.items()}
         loss, psnr = means.pop("loss"), means.pop("psnr")
 
         what = self._not_finite(results, loss)
@@ -263,7 +250,7 @@ class Trainer:
             self._learners.step(step, min(1.0, step / self._ramp_steps) if self._ramp_steps else 1.0)
             # After the optimizer's step, so that no gradient is lost with the rows that change.
             if step < config.density.stop:
-                self._density.statistics.merge(self._seen_by_all(seen))
+                self._density.statistics.merge(seen)
         else:
             self._generator.set_state(drawn)
             self._learners.zero_grad()
@@ -304,9 +291,6 @@ class Trainer:
         correction = self.exposure_of(view)
         return image if correction is None else image @ correction[:, :3].T + correction[:, 3]
 
-    def _seen_by_all(self, seen: Statistics) -> list[Statistics]:
-        return [Statistics(*values) for values in zip(*self.ranks.all_gather(list(vars(seen).values())), strict=True)]
-
     def _not_finite(self, results: list[ViewResult], loss: float) -> str:
         """What is not finite in the loss and gradients of a step, for which it is skipped; "" where all is well.
 
@@ -314,7 +298,7 @@ class Trainer:
         """
         parameters, gradients = self._learners.parameters(), self._learners.gradients()
         gradients["the places in the image"] = [result.d_means2d for result in results]
-        if not self.ranks.any_rank(not (math.isfinite(loss) and finite(parameters, gradients))):
+        if math.isfinite(loss) and finite(parameters, gradients):
             return ""
         self.whole = False
         check_parameters(parameters)
