@@ -42,7 +42,6 @@ from lapgs_wgpu.train.run_folder import (
     start_run_folder,
 )
 from lapgs_wgpu.train.step_result import StepResult
-from lapgs_wgpu.train.tensorboard import TensorBoard, check_tensorboard
 from lapgs_wgpu.train.trainer import Trainer
 
 PROBES = 2048  # points of the scene that say whether a camera sees it
@@ -78,8 +77,6 @@ def train(
     if not dataset.test:
         raise InputError(f"{dataset.name} has no test view, by which a run is measured; add images to the capture.")
     found = check_times(dataset, moving=config.field.kind != "static")
-    if config.eval.tensorboard:
-        check_tensorboard()
     found += check_in_view(dataset, first_points(dataset, PROBES, config.points.box, config.seed)[0])
     check_run_folder(out, overwrite=overwrite)
     keep_freed_memory()
@@ -160,8 +157,6 @@ def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None)
     with log, _interruptible() as interrupted:
         if training.discovery is not None:
             log.discovered(training.discovery)
-        if config.eval.tensorboard:
-            log.listeners.append(TensorBoard(out / "tensorboard", done=training.done))
         training.callbacks.append(log.after_step)
         if config.eval.interval:
             training.callbacks.append(partial(_log_psnr, log))

@@ -57,7 +57,7 @@ class FrameRenderer:
         self.playback = playback
         self._rasterizer = Rasterizer(playback.device)
         self._pool = BufferPool(playback.device)
-        self._values: dict[tuple[Mode, float], tuple[DeviceArray, float, float]] = {}
+        self._values: dict[Mode, tuple[DeviceArray, float]] = {}
 
     def forget(self) -> None:
         """Drop what was measured of the scene, because it has changed."""
@@ -76,10 +76,10 @@ class FrameRenderer:
         camera, mode = request.camera, request.mode
         low, high, background = 0.0, 1.0, request.background
         # Before the Gaussians: measuring may take them to other times.
-        value = self._value(mode, request.time) if mode in ("motion", "dynamics", "scale") else None
+        value = self._value(mode) if mode in ("motion", "dynamics") else None
         gaussians = self.playback.at(request.time)
         if value is not None:
-            colors, low, high = value
+            colors, high = value
             gaussians = dataclasses.replace(gaussians, sh=colors)
             background = (0.0, 0.0, 0.0)
         while True:
@@ -108,26 +108,19 @@ class FrameRenderer:
         low, high = np.percentile(depth[seen] / (1.0 - rest[seen]), [1, 99])
         return float(low), float(high)
 
-    def _value(self, mode: Mode, t: float) -> tuple[DeviceArray, float, float]:
-        """Return a value of each Gaussian as its color (N, 3), and the values at the ends of the scale."""
-        key = (mode, t if mode == "scale" else 0.0)
-        held = self._values.get(key)
-        if held is None:
-            value = self._measure(mode, t)
+    def _value(self, mode: Mode) -> tuple[DeviceArray, float]:
+        """Return a value of each Gaussian as its color (N, 3), and the value at the end of the scale."""
+        if mode not in self._values:
+            value = self._motion() if mode == "motion" else self._dynamics()
             array = self._pool.upload(mode, np.repeat(value[:, None], 3, axis=1))
-            low = float(np.percentile(value, 2)) if mode == "scale" and len(value) else 0.0
-            high = float(np.percentile(value, 98)) if len(value) else 1.0
-            self._values = {other: entry for other, entry in self._values.items() if other[0] != mode}
-            held = self._values[key] = (array, low, max(high, 1e-9))
-        return held
+            self._values[mode] = array, max(float(np.percentile(value, 98)) if len(value) else 1.0, 1e-9)
+        return self._values[mode]
 
-    def _measure(self, mode: Mode, t: float) -> NDArray[np.float32]:
-        if mode == "dynamics":
-            attributes = self.playback.dynamics()
-            assert attributes is not None
-            return np.linalg.norm(attributes, axis=1).astype(np.float32)
-        if mode == "scale":
-            scales = self.playback.at(t).scales.read()
-            return scales.max(axis=1, initial=0.0)
+    def _dynamics(self) -> NDArray[np.float32]:
+        attributes = self.playback.dynamics()
+        assert attributes is not None
+        return np.linalg.norm(attributes, axis=1).astype(np.float32)
+
+    def _motion(self) -> NDArray[np.float32]:
         places = np.stack([self.playback.means(t) for t in np.linspace(0, 1, _TIMES)])
         return np.linalg.norm(places - places.mean(axis=0), axis=2).max(axis=0).astype(np.float32)

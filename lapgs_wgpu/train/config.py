@@ -249,7 +249,6 @@ class EvalConfig(Options):
         0,
         at_least=0,
     )
-    tensorboard: bool = option("also write the figures of log.jsonl for TensorBoard (extra tensorboard)", False)
 
 
 @dataclass(frozen=True)

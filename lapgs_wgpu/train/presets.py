@@ -43,6 +43,7 @@ REMOVED = {
     "acceleration.frames": "it is 2",
     "data.split": "a run is measured on its test views",
     "eval.snapshots": "only the last model is saved",
+    "eval.tensorboard": "log.jsonl has the figures",
     "eval.views": "the validation views are measured, or 8 training views if there are none",
     "loss.dynamics_mode": "the regularization is that of the paper's equation; loss.dynamics 0 turns it off",
     "points.opacity": "it is 0.1",
