@@ -158,5 +158,5 @@ def _open_data(config: Config, parent: Path, *, normalize: bool = True) -> tuple
     return config, open_dataset(config, normalize=normalize)
 
 
-if __name__ == "__main__":  # lapgs-table starts its runs this way
+if __name__ == "__main__":
     sys.exit(train_command())
