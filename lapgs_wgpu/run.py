@@ -248,8 +248,7 @@ def _moved(report: dict[str, Any]) -> str:
     turn, shift = report["rotation_degrees"], report["shift_percent"]
     return (
         f"the training cameras were corrected by {turn['median']:.2f} degrees and {shift['median']:.2f} % of their "
-        f"extent (medians; at most {turn['largest']:.2f} and {shift['largest']:.2f} %), their focal length by "
-        f"{report['focal_percent']:+.2f} %."
+        f"extent (medians; at most {turn['largest']:.2f} and {shift['largest']:.2f} %)."
     )
 
 

@@ -41,6 +41,7 @@ ABLATIONS: dict[str, tuple[str, str, Any]] = {
 # Keys of earlier versions, and what holds now. In a .toml file they are ignored, with a note.
 REMOVED = {
     "acceleration.frames": "it is 2",
+    "cameras.focal": "focal lengths are taken as they are",
     "data.split": "a run is measured on its test views",
     "eval.snapshots": "only the last model is saved",
     "eval.tensorboard": "log.jsonl has the figures",
