@@ -6,10 +6,8 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 from lapgs_wgpu.data.initial_gaussians import first_points
@@ -23,7 +21,7 @@ from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.progress import Progress, say
-from lapgs_wgpu.stop_signals import on_stop_signals
+from lapgs_wgpu.stop_signals import stop_requests
 from lapgs_wgpu.train.config import Config, DataConfig
 from lapgs_wgpu.train.evaluate import evaluate, write_metrics
 from lapgs_wgpu.train.log import Log
@@ -154,7 +152,7 @@ def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None)
     """The steps that are left, with all that a run folder receives."""
     config, scene = training.config, training.scene
     log = Log(out / "log.jsonl", config.schedule.steps, done=training.done, before=training.discovery_seconds)
-    with log, _interruptible() as interrupted:
+    with log, stop_requests() as interrupted:
         if training.discovery is not None:
             log.discovered(training.discovery)
         training.callbacks.append(log.after_step)
@@ -175,11 +173,10 @@ def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None)
             log.tell(outside)
         if training.cameras is not None:
             measured["cameras"] = training.cameras.report()
-            log.tell(_moved(measured["cameras"]))
+            log.tell(training.cameras.summary())
         if training.timing is not None:
-            retimed = measured["image_times"] = training.timing.report()
-            if retimed["frames_most"] > 0:
-                log.tell(_retimed(retimed))
+            measured["image_times"] = training.timing.report()
+            log.tell(training.timing.summary())
 
     return_freed_memory()
     save_state(out, training.state())
@@ -243,23 +240,6 @@ def _saved(training: Trainer, out: Path) -> str:
     return "; nothing was saved yet."
 
 
-def _moved(report: dict[str, Any]) -> str:
-    """How far the cameras went, in a sentence."""
-    turn, shift = report["rotation_degrees"], report["shift_percent"]
-    return (
-        f"the training cameras were corrected by {turn['median']:.2f} degrees and {shift['median']:.2f} % of their "
-        f"extent (medians; at most {turn['largest']:.2f} and {shift['largest']:.2f} %)."
-    )
-
-
-def _retimed(report: dict[str, float]) -> str:
-    """How far the times went, in a sentence."""
-    return (
-        f"the times of the training images were corrected by {report['frames']:.2f} of the distance of two images "
-        f"(root mean square; at most {report['frames_most']:.2f})."
-    )
-
-
 def evaluate_run(
     out: Path,
     scene: Scene4D,
@@ -290,19 +270,3 @@ def evaluate_run(
     metrics["training"] = training
     write_metrics(out, metrics)
     return metrics
-
-
-@contextmanager
-def _interruptible() -> Iterator[threading.Event]:
-    """An event that Ctrl-C and its like set, instead of an exception in the middle of a step; a second one is one."""
-    interrupted = threading.Event()
-    asked = set[int]()
-
-    def note(number: int, frame: FrameType | None) -> None:
-        if number in asked:
-            raise KeyboardInterrupt
-        asked.add(number)
-        interrupted.set()
-
-    with on_stop_signals(note):
-        yield interrupted

@@ -200,6 +200,15 @@ class CameraRefinement:
             ],
         }
 
+    def summary(self) -> str:
+        """How far the cameras went, in a sentence."""
+        report = self.report()
+        turn, shift = report["rotation_degrees"], report["shift_percent"]
+        return (
+            f"the training cameras were corrected by {turn['median']:.2f} degrees and {shift['median']:.2f} % of their "
+            f"extent (medians; at most {turn['largest']:.2f} and {shift['largest']:.2f} %)."
+        )
+
     def state(self) -> dict[str, Tensor]:
         """Everything that the next step depends on, besides the gradient."""
         return {"learnt": self._learnt, "settled": self._settled, **self._descent.state()}

@@ -92,6 +92,14 @@ class TimingRefinement:
         differences = np.abs(self._field_times - self._times) / self._gap
         return {"frames": float(np.sqrt(np.mean(differences**2))), "frames_most": float(differences.max())}
 
+    def summary(self) -> str:
+        """How far the times went, in a sentence."""
+        report = self.report()
+        return (
+            f"the times of the training images were corrected by {report['frames']:.2f} of the distance of two images "
+            f"(root mean square; at most {report['frames_most']:.2f})."
+        )
+
     def state(self) -> dict[str, Tensor]:
         """Everything that the next step depends on."""
         return {"moments": torch.from_numpy(self._field_times)}
