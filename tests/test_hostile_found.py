@@ -34,7 +34,6 @@ from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.run_folder import STATE, load_state, save_state, start_run_folder
 from lapgs_wgpu.train.step_result import StepResult
 from lapgs_wgpu.train.trainer import Trainer
-from lapgs_wgpu.viewer.path_file import read_path
 
 TABLE = "__metadata__"
 
@@ -152,8 +151,8 @@ def test_pipes_and_devices_do_not_hang(tmp_path: Path) -> None:
     (tmp_path / "zero.json").symlink_to("/dev/zero")
     (tmp_path / "zero.toml").symlink_to("/dev/zero")
     actions: list[Callable[[], Any]] = [
-        lambda: read_path(tmp_path / "a.json"),
-        lambda: read_path(tmp_path / "zero.json"),
+        lambda: read_json(tmp_path / "a.json"),
+        lambda: read_json(tmp_path / "zero.json"),
         lambda: read_spec(tmp_path / "a.toml"),
         lambda: read_toml(tmp_path / "zero.toml"),
         lambda: load_state(tmp_path),

@@ -49,9 +49,6 @@ class App:
         self._drawn_at, self._running = now, state.clock.playing or self.controls.flying
         state.clock.advance(passed)
         self.controls.fly(passed)
-        previewed = state.path.preview(now)  # of this very moment, however long the last frame took
-        if previewed is not None:
-            state.stand_on(*previewed)
         self.viewport.draw(now)
         self.viewport.present()
         if self._gui is None:
@@ -61,7 +58,7 @@ class App:
         else:
             self._gui.render()
             self._gui_draws -= 1
-        if state.clock.playing or self.controls.flying or self._gui_draws > 0 or previewed is not None:
+        if state.clock.playing or self.controls.flying or self._gui_draws > 0:
             self.canvas.request_draw()
         elif not self.viewport.at_rest:
             self.loop.call_later(SETTLED, self.canvas.request_draw)

@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lapgs_wgpu.data.poses import world_to_camera
 from lapgs_wgpu.splat.camera import Camera
-from lapgs_wgpu.viewer.path import Pose
 
 Vector = NDArray[np.float64]
 _STEEPEST = math.radians(89)  # of the line of sight, up or down: beyond it the picture would turn over
@@ -49,17 +49,6 @@ class ViewCamera:
         self.focus = self.position + distance * self.rotation[2]
         self.fov_y = 2 * math.atan(0.5 * camera.height / camera.K[1, 1])
 
-    @property
-    def pose(self) -> Pose:
-        """Position, rotation and field of view."""
-        return Pose(self.position.copy(), self.rotation.copy(), self.fov_y)
-
-    def stand(self, pose: Pose) -> None:
-        """Move to a pose. The distance to the focus, which lies straight ahead, does not change."""
-        distance = self.distance
-        self.position, self.rotation, self.fov_y = pose.position.copy(), pose.rotation.copy(), pose.fov_y
-        self.focus = self.position + distance * self.rotation[2]
-
     def reset(self) -> None:
         """Go back to where the camera started."""
         self.position, self.focus, self.rotation, self.fov_y = self._start
@@ -96,7 +85,9 @@ class ViewCamera:
 
     def camera(self, width: int, height: int) -> Camera:
         """Make the rasterizer's camera for a picture of this size."""
-        return self.pose.camera(width, height)
+        f = 0.5 * height / math.tan(0.5 * self.fov_y)
+        K = np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]])
+        return Camera(K, world_to_camera(self.rotation.T, self.position), width, height)
 
     def _shift(self, by: Vector) -> None:
         self.position, self.focus = self.position + by, self.focus + by

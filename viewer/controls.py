@@ -82,7 +82,6 @@ class Controls:
         self.pointer = (event["x"], event["y"])
         if self._covered(*self.pointer):
             return
-        state.path.started = None  # a drag ends the preview
         if event["button"] != 1 or "Shift" in event["modifiers"]:
             self._dragging = "pan"
         else:

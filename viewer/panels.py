@@ -1,4 +1,4 @@
-"""The GUI over the image (Dear ImGui): the view's panel, overlay, message, help."""
+"""The GUI over the image (Dear ImGui): the view's panel, overlay, help."""
 
 from __future__ import annotations
 
@@ -8,14 +8,13 @@ from imgui_bundle import imgui
 from wgpu.utils.imgui import ImguiRenderer
 
 from lapgs_wgpu.viewer.key_bindings import KEYS, MOUSE
-from lapgs_wgpu.viewer.path_panel import draw_path
 from lapgs_wgpu.viewer.present import HEAT
 from lapgs_wgpu.viewer.render_modes import BACKGROUNDS, MODES
 from lapgs_wgpu.viewer.time_slider import draw_time_slider
 from lapgs_wgpu.viewer.training_control import TrainingControl
 from lapgs_wgpu.viewer.view_state import ViewState
 from lapgs_wgpu.viewer.viewport import Viewport
-from lapgs_wgpu.viewer.widgets import button, choice, printable, tip
+from lapgs_wgpu.viewer.widgets import button, choice, tip
 
 _FIXED = imgui.WindowFlags_.no_move | imgui.WindowFlags_.no_resize | imgui.WindowFlags_.no_saved_settings
 _BAR = _FIXED | imgui.WindowFlags_.no_title_bar | imgui.WindowFlags_.no_scrollbar
@@ -84,8 +83,6 @@ class Panels:
             imgui.begin("transport", None, _BAR)
             draw_time_slider(state)
             self._end()
-        if state.message:
-            self._message(state.message)
 
     # The panel at the left -------------------------------------------------------------------------------------------
 
@@ -116,7 +113,6 @@ class Panels:
             chosen = choice("camera", state.view, range(len(state.views)), [view.name for view in state.views])
             if chosen is not None and chosen != state.view:
                 state.stand_at(chosen)
-        draw_path(state, self.viewport)
         self._end()
 
     def _training(self, training: TrainingControl) -> None:
@@ -150,17 +146,6 @@ class Panels:
             f"{camera.width}x{camera.height}" + (f" ({100 * viewport.scale:.0f} %)" if viewport.scale < 1 else "")
         )
         imgui.text(viewport.device.info.name[:34])
-        self._end()
-
-    def _message(self, message: str) -> None:
-        state = self.state
-        width, _ = self.viewport.canvas.get_logical_size()
-        imgui.set_next_window_pos((0.5 * width, _GAP), imgui.Cond_.always, (0.5, 0.0))
-        imgui.set_next_window_size((min(420.0, width - 2 * _GAP), 0))
-        imgui.begin("message", None, _BAR)
-        imgui.text_wrapped(printable(message))
-        if imgui.button("OK"):
-            state.message = None
         self._end()
 
     def _help(self) -> None:

@@ -9,8 +9,6 @@ from lapgs_wgpu.viewer.capture_views import capture_views
 from lapgs_wgpu.viewer.clock import LOOPS, SPEEDS
 from lapgs_wgpu.viewer.frame import FrameRenderer
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene
-from lapgs_wgpu.viewer.path import Pose
-from lapgs_wgpu.viewer.path_editor import PathEditor
 from lapgs_wgpu.viewer.render_modes import BACKGROUNDS, Mode
 from lapgs_wgpu.viewer.training_control import TrainingControl
 
@@ -22,24 +20,21 @@ class ViewState:
     """Panels read and set the attributes; keys call the methods and turn the flags (viewer/key_bindings). Knows no
     window and no GUI.
 
-    view: number of the capture's camera that was chosen last, or None. message: one sentence for the user, or None.
-    training: the training under way; None where a file is shown.
+    view: number of the capture's camera that was chosen last, or None. training: the training under way; None where a
+    file is shown.
     """
 
     def __init__(self, scene: LoadedScene) -> None:
         self.mode: Mode = "rgb"
         self.show_panels = self.show_overlay = True
         self.show_help = False
-        self.show_path = False  # opens the panel's section at the next draw
         self.flying = False
         self.training: TrainingControl | None = None
         self.scene, self.renderer = scene, FrameRenderer(scene.playback)
         self.camera, self.clock = scene.camera(), scene.clock()
-        self.path = PathEditor()
         self.background = scene.background
         self.show_transport = scene.playback.moves
         self.view: int | None = None
-        self.message: str | None = None if scene.playback.moves else "no motion data in this file"
 
     @cached_property
     def views(self) -> tuple[View, ...]:
@@ -52,12 +47,6 @@ class ViewState:
         self.camera.stand_at(self.views[view].camera)
         self.clock.playing = False
         self.clock.seek(self.views[view].time)
-
-    def stand_on(self, pose: Pose, time: float) -> None:
-        """Go to a pose of a camera path and to a time."""
-        self.camera.stand(pose)
-        self.clock.playing = False
-        self.clock.seek(time)
 
     # Actions of keys (viewer/key_bindings), which also turn the flags ------------------------------------------------
 
@@ -106,10 +95,6 @@ class ViewState:
     def step_training(self) -> None:
         if self.training is not None:
             self.training.step()
-
-    def add_key_frame(self) -> None:
-        self.path.add(self.camera.pose, self.clock.time)
-        self.show_path = True
 
 
 def _next(choices: Any, present: Any) -> Any:
