@@ -18,7 +18,7 @@ from helpers.training import configure
 from scipy.spatial.transform import Rotation
 
 from lapgs_wgpu.data import Dataset
-from lapgs_wgpu.discovery.start import start_training
+from lapgs_wgpu.discovery.start_training import start_training
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.run import resume, train

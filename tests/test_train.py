@@ -27,10 +27,10 @@ from lapgs_wgpu.run import train
 from lapgs_wgpu.train import objective
 from lapgs_wgpu.train.config import LossWeights
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
-from lapgs_wgpu.train.initial_points import initial_points
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.resolve_config import resolve_decoder, resolve_for_dataset
+from lapgs_wgpu.train.start import initial_points
 from lapgs_wgpu.train.step_result import StepResult
 
 

@@ -28,12 +28,12 @@ from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train.camera_refinement import rotation_vector
 from lapgs_wgpu.train.config import BACKGROUND_LEVELS
 from lapgs_wgpu.train.environment import environment
-from lapgs_wgpu.train.image_metrics import MS_SSIM_SMALLEST, SSIM_WINDOW, masked_ssim, ms_ssim, psnr, ssim
+from lapgs_wgpu.train.image_metrics import MS_SSIM_SMALLEST, ms_ssim, psnr, ssim
 from lapgs_wgpu.train.lpips import SMALLEST, Lpips
 from lapgs_wgpu.train.view_alignment import aligned_view
 
 ERROR_GAIN = 4  # of the error pictures
-MEASURES = ("psnr", "ssim", "ms_ssim", "lpips", "lpips_unscaled", "masked_psnr", "masked_ssim")
+MEASURES = ("psnr", "ssim", "ms_ssim", "lpips", "lpips_unscaled", "masked_psnr")
 NOT_AVAILABLE = "not available"
 ALIGNED = "test-time alignment: the camera of each test view was fitted to its image, the scene fixed"
 
@@ -55,7 +55,7 @@ def evaluate(
     are no weights for it.
     Each measure is one of an image, then the mean over the images (of PSNR of the dB): psnr over all channels; ssim,
     that of the loss; ms_ssim; lpips on inputs in [-1, 1], and lpips_unscaled on inputs in [0, 1], as 3DGS's code
-    reports it; masked_psnr and masked_ssim, of the pixels of the view's mask. "not available" stands for what cannot be
+    reports it; masked_psnr, of the pixels of the view's mask. "not available" stands for what cannot be
     measured: pictures too small, no weights, no masks.
     camera_unit: extent of the cameras, world units, where training cameras were refined. `aligned` then holds the
     measures once more, after test-time alignment (`view_alignment`), labelled as such; the others stay without it.
@@ -150,9 +150,6 @@ def _measures(
         "lpips": perceptual(image, truth) if perceptual else NOT_AVAILABLE,
         "lpips_unscaled": perceptual(image, truth, unscaled=True) if perceptual else NOT_AVAILABLE,
         "masked_psnr": psnr(image[mask], truth[mask]) if mask is not None else NOT_AVAILABLE,
-        "masked_ssim": (
-            float(masked_ssim(image, truth, mask)) if mask is not None and side >= SSIM_WINDOW else NOT_AVAILABLE
-        ),
     }
 
 
