@@ -256,7 +256,6 @@ def evaluate_run(
     if folder.is_symlink():
         raise InputError(f"{folder} is a link, and images are written into the run's own folder only; remove it.")
     folder.mkdir(exist_ok=True)
-    unit = dataset.extent if "cameras" in training else None  # they were refined
     with Progress(len(dataset.test), "test views measured") as progress:
         metrics = evaluate(
             scene,
@@ -264,7 +263,6 @@ def evaluate_run(
             data.background,
             folder,
             lpips=lpips,
-            camera_unit=unit,
             progress=progress,
         )
     metrics["training"] = training

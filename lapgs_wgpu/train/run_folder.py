@@ -108,10 +108,9 @@ def result_text(run: Path) -> str:
     """What metrics.json of a finished run says, in a line."""
     metrics = json.loads((run / "metrics.json").read_text())
     width, height = metrics["size"]
-    aligned = f" ({metrics['aligned']['psnr']:.2f} dB after test-time alignment)" if "aligned" in metrics else ""
     return (
         f"{run}: {metrics['psnr']:.2f} dB PSNR, {metrics['ssim']:.4f} SSIM on {len(metrics['views'])} test views of "
-        f"{width}x{height}{aligned}, {metrics['gaussians']} Gaussians"
+        f"{width}x{height}, {metrics['gaussians']} Gaussians"
     )
 
 
