@@ -27,10 +27,9 @@ from lapgs_wgpu.train.host_threads import step_threads
 from lapgs_wgpu.train.presets import write_toml
 
 STATE = "state.safetensors"
-OLD_STATE = "state.before.safetensors"  # that earlier versions wrote, too
 RUN_FILES = (
     "config.toml", "log.jsonl", "metrics.json", "metrics.csv", "checkpoint.ply", "eval", "tensorboard",
-    STATE, OLD_STATE,
+    STATE,
 )  # fmt: skip
 
 State = Mapping[str, NDArray[Any]]
@@ -166,6 +165,6 @@ def check_state(state: State, *, views: int, steps: int) -> None:
 
 def drop_states(out: Path) -> None:
     """Remove the state of a training that is finished, and temporary files of killed processes."""
-    for path in (out / STATE, out / OLD_STATE, *out.glob(".*.tmp")):
+    for path in (out / STATE, *out.glob(".*.tmp")):
         with suppress(OSError):
             path.unlink(missing_ok=True)
