@@ -15,12 +15,11 @@ from PIL import Image, ImageFilter
 from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.data.cloud import Cloud
 from lapgs_wgpu.data.split import held_out
-from lapgs_wgpu.data.stamps import ImageName
+from lapgs_wgpu.data.stamps import ImageName, natural_key
 from lapgs_wgpu.data.timestamps import (
     disorder,
     frame_numbers,
     in_step,
-    natural_key,
 )
 from lapgs_wgpu.data.validation import check_film, check_in_view, check_times, check_views
 from lapgs_wgpu.data.views import Dataset, View

@@ -17,6 +17,7 @@ from lapgs_wgpu.data.cloud import Cloud
 from lapgs_wgpu.data.images import ImageFile
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.normalize import Normalization
+from lapgs_wgpu.data.poses import place_of
 from lapgs_wgpu.data.stamps import ImageName
 from lapgs_wgpu.data.video_frames import VideoFrame
 
@@ -33,6 +34,7 @@ class Frame:
     T_cam_world: (4, 4) pose, OpenCV axes, the capture's coordinates.
     where: the description of camera and lens: file and entry, for errors.
     name: file name and camera, for rules on own footage.
+    states_size: whether the files state the size or the center of the lens; else they are those of the image.
     time: in any unit; None if the files state none. Either all frames of a capture have a time, or none.
     split: None to apply the rule for own footage (`split.held_out`), for all frames of a capture or for none.
     label: suffix of the view's name; None to number the views.
@@ -52,6 +54,12 @@ class Frame:
     depths: tuple[float, float] | None = None
     mask: Path | None = None
     black: Path | None = None
+    states_size: bool = True
+
+    @property
+    def place(self) -> NDArray[np.float64]:
+        """(3,) the place of the camera."""
+        return place_of(self.T_cam_world)
 
 
 @dataclass(frozen=True, eq=False)

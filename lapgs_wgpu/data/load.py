@@ -7,26 +7,27 @@ file in `readers` and a line in READERS.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import NamedTuple
 
 from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
 from lapgs_wgpu.data.images import Pixels, Size, shrink, shrunk_size
 from lapgs_wgpu.data.lens import Lens, Undistortion
-from lapgs_wgpu.data.masks import Mask, check_ignored, find_masks, read_ignored, read_measured
+from lapgs_wgpu.data.masks import Mask, MaskKind, check_masks, find_masks, read_mask
 from lapgs_wgpu.data.placement import place
-from lapgs_wgpu.data.readers import colmap, dnerf, endonerf, hypernerf, nerfstudio, neu3d, polycam, record3d
+from lapgs_wgpu.data.readers import apps, colmap, hypernerf, poses_bounds, transforms
 from lapgs_wgpu.data.split import held_out
-from lapgs_wgpu.data.timestamps import disorder, in_step, natural_key, read_times, to_unit_range
+from lapgs_wgpu.data.stamps import natural_key
+from lapgs_wgpu.data.timestamps import as_one_camera, by_camera, disorder, in_step, read_times, to_unit_range
 from lapgs_wgpu.data.validation import check_cloud, check_film, check_frames, check_plausible, check_views, upright
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
 
 READERS: tuple[Reader, ...] = tuple(
-    module.READER for module in (dnerf, hypernerf, neu3d, nerfstudio, colmap, record3d, polycam, endonerf)
+    reader for module in (transforms, hypernerf, poses_bounds, colmap, apps) for reader in module.READERS
 )
 
 
@@ -62,30 +63,55 @@ def load_dataset(
     if not undistort:
         pinholes = [dataclasses.replace(frame, lens=frame.lens.idealized) for frame in capture.frames]
         capture = dataclasses.replace(capture, frames=pinholes)
-    frames, turned = upright(capture.frames)
+    frames, warnings = upright(capture.frames)
     capture = dataclasses.replace(capture, frames=frames)
-    warnings = [*capture.warnings, *turned, *check_plausible(frames)]
+    warnings = [*capture.warnings, *warnings, *check_plausible(frames)]
 
     times, time_source = _times(folder, capture, warnings)
+    if capture.own_footage:
+        names = as_one_camera([frame.name for frame in frames], times, [frame.place for frame in frames])
+        frames = [dataclasses.replace(frame, name=name) for frame, name in zip(frames, names, strict=True)]
+        capture = dataclasses.replace(capture, frames=frames)
     splits = _splits(folder, frames, times)
     check_frames(frames)
     shots = _undistort(capture, shrunk_size(frames[0].image.size, image_size))
     training = [shot for shot, split in zip(shots, splits, strict=True) if split == "train"]
     training_cameras = list(dict.fromkeys(shot.camera for shot in training))
-    warnings += _check_cloud(capture, shots, training_cameras)
+    if capture.cloud is not None:
+        if capture.own_footage:
+            cameras, files = [shot.camera for shot in shots], [shot.frame.name.file for shot in shots]
+            warnings += check_views(capture.cloud, cameras, files, capture.source)
+        cloud = check_cloud(capture.cloud, training_cameras, capture.source, warnings)
+        capture = dataclasses.replace(capture, cloud=cloud)
     placement = place(capture, [shot.frame for shot in training], training_cameras, normalize=normalize)
     warnings += placement.warnings
     order = _film_order(frames, times, warnings) if capture.own_footage else range(len(frames))
-    ignored = _ignored(None if masks is None else Path(masks), frames, splits, warnings)
+    ignored, kind = _ignored(masks, frames, splits)
+    warnings += check_masks(ignored, frames[0].image.size, kind)
+    measured = {frame.name.file: frame.mask for frame in frames if frame.mask is not None}
+    check_masks(measured, frames[0].image.size, "measured")
 
     fit = placement.normalization
-    cameras = dict.fromkeys(shot.camera for shot in shots)
-    placed = {camera: camera if fit is None else fit.camera(camera) for camera in cameras}
+    whole = fit if fit is None or capture.moved is None else capture.moved.then(fit)
+    distinct = dict.fromkeys(shot.camera for shot in shots)
+    placed = {camera: camera if fit is None else fit.camera(camera) for camera in distinct}
 
     def views(split: Split) -> tuple[View, ...]:
         chosen = [i for i in order if splits[i] == split]
-        return tuple(
-            _view(split, n, shots[i], placed[shots[i].camera], times[i], ignored) for n, i in enumerate(chosen)
+        return tuple(_view(split, n, i) for n, i in enumerate(chosen))
+
+    def _view(split: Split, number: int, i: int) -> View:
+        """Make the view of a frame. number: within its split, for its name."""
+        shot, frame = shots[i], frames[i]
+        mask = ignored.get(frame.name.file) if split == "train" else None
+        return View(
+            name=f"{split}_{frame.label or f'{number:05d}'}",
+            camera=placed[shot.camera],
+            time=times[i],
+            source=str(frame.image),
+            pixels=shot.pixels,
+            mask=None if frame.mask is None else partial(shot.mask, frame.mask, "measured"),
+            ignored=None if mask is None else partial(shot.mask, mask, kind),
         )
 
     return Dataset(
@@ -95,29 +121,40 @@ def load_dataset(
         val=views("val"),
         cloud=placement.cloud,
         depths=placement.depths,
-        normalization=fit if fit is None or capture.moved is None else capture.moved.then(fit),
+        normalization=whole,
         scale=1.0 if fit is None else fit.scale,
         warnings=tuple(warnings),
         time_source=time_source,
         own_footage=capture.own_footage,
-        summary=_summary(reader.name, shots, times, time_source, splits)
-        + (f"; {capture.left_out} left out" if capture.left_out else ""),
+        summary=_summary(reader.name, capture, shots, times, time_source, splits, whole and whole.scale),
     )
 
 
 def _summary(
-    layout: str, shots: Sequence[_Shot], times: Sequence[float], time_source: str, splits: Sequence[Split]
+    layout: str,
+    capture: Capture,
+    shots: Sequence[_Shot],
+    times: Sequence[float],
+    time_source: str,
+    splits: Sequence[Split],
+    scale: float | None,
 ) -> str:
-    """Say how a capture was understood: layout, cameras, times and their source, what is held out."""
-    films = {shot.frame.name.camera for shot in shots}
-    held = [shot.frame.name.camera for shot, split in zip(shots, splits, strict=True) if split != "train"]
-    places = len({shot.camera for shot in shots})
+    """Say how a capture was understood: layout, cameras, times and their source, what is held out, scale, and what was
+    left out."""
+    films = by_camera([frame.name for frame in capture.frames])
+    folders = {PurePath(frame.name.file).parent for frame in capture.frames}
+    held = {frame.name.camera for frame, split in zip(capture.frames, splits, strict=True) if split != "train"}
+    count, places = len(splits) - splits.count("train"), len({shot.camera for shot in shots})
     still = len(shots) >= 2 * places
-    count = places if still else len(films)
-    cameras = f"{count} {'still' if still else 'moving'} camera{'s' * (count > 1)}"
-    whole = len(films) > 1 and len(set(held)) == 1 and sum(shot.frame.name.camera == held[0] for shot in shots)
-    out = f"{held[0]} is" if whole == len(held) else f"{len(held)} of {len(shots)} images are"
-    return f"{layout}, {cameras}, {len(set(times))} times from {time_source}; {out} held out"
+    number = places if still else len(films)
+    cameras = f"{number} {'still' if still else 'moving'} camera{'s' * (number > 1)}"
+    if len(films) == 1 < len(folders) and not still:
+        cameras += f" in {len(folders)} folders, one after the other" * capture.own_footage
+    whole = len(films) > 1 and len(held) == 1 and len(films[next(iter(held))]) == count
+    out = f"{next(iter(held))} is" if whole else f"{count} of {len(shots)} images are"
+    told = f"{layout}, {cameras}, {len(set(times))} times from {time_source}; {out} held out"
+    told += "; coordinates are kept" if scale is None else f"; 1 unit of the files becomes {scale:.4g}"
+    return told + (f"; {capture.left_out} left out" if capture.left_out else "")
 
 
 def _reader(folder: Path) -> Reader:
@@ -145,7 +182,7 @@ def _times(folder: Path, capture: Capture, warnings: list[str]) -> tuple[list[fl
     names = [frame.name for frame in capture.frames]
     times, source = [frame.time for frame in capture.frames if frame.time is not None], capture.time_source
     if not times:
-        times, source = read_times(names, folder)
+        times, source = read_times(names, folder, warnings)
     if capture.own_footage:
         warnings += disorder(names, times)
         times = in_step(names, times)
@@ -184,13 +221,9 @@ class _Shot(NamedTuple):
             return image.read(self.size)
         return shrink(self.undistortion.apply(image.read(image.size)), self.size)
 
-    def measured(self, mask: Path) -> Mask:
-        """Decode, undistort and shrink a test mask. Raises InputError."""
-        return read_measured(mask, self.undistortion, self.frame.image.size, self.size)
-
-    def ignored(self, mask: Path, *, black: bool) -> Mask:
-        """Decode, undistort and shrink a training mask. Raises InputError."""
-        return read_ignored(mask, self.undistortion, self.frame.image.size, self.size, black=black)
+    def mask(self, file: Path, kind: MaskKind) -> Mask:
+        """Decode, undistort and shrink a mask. Raises InputError."""
+        return read_mask(file, kind, self.undistortion, self.frame.image.size, self.size)
 
 
 def _undistort(capture: Capture, size: Size) -> list[_Shot]:
@@ -216,58 +249,21 @@ def _undistort(capture: Capture, size: Size) -> list[_Shot]:
     return shots
 
 
-def _check_cloud(capture: Capture, shots: Sequence[_Shot], training: Sequence[Camera]) -> list[str]:
-    """Check a cloud against the cameras: return warnings, or raise InputError."""
-    if capture.cloud is None:
-        return []
-    warnings = []
-    if capture.own_footage:
-        cameras, names = [shot.camera for shot in shots], [shot.frame.name.file for shot in shots]
-        warnings = check_views(capture.cloud, cameras, names, capture.source)
-    check_cloud(capture.cloud, training, capture.source)
-    return warnings
-
-
 def _film_order(frames: Sequence[Frame], times: Sequence[float], warnings: list[str]) -> list[int]:
     """Return the frames by camera, then time. Appends warnings about blurred and repeated images of each camera."""
-    films: dict[str, list[int]] = {}
-    for i in sorted(range(len(frames)), key=lambda i: (times[i], natural_key(frames[i].name.file))):
-        films.setdefault(frames[i].name.camera, []).append(i)
-    for film in films.values():
+    order = []
+    for mine in by_camera([frame.name for frame in frames]).values():
+        film = sorted(mine, key=lambda i: (times[i], natural_key(frames[i].name.file)))
         warnings += check_film([Path(str(frames[i].image)) for i in film])
-    return [i for camera in sorted(films, key=natural_key) for i in films[camera]]
-
-
-class _IgnoredMasks(NamedTuple):
-    """Masks of training images by the images' names. black: whether black pixels are ignored, or white ones."""
-
-    paths: Mapping[str, Path]
-    black: bool
+        order += film
+    return order
 
 
 def _ignored(
-    folder: Path | None, frames: Sequence[Frame], splits: Sequence[Split], warnings: list[str]
-) -> _IgnoredMasks:
-    """Find and check the masks in the user's folder, or else those that the capture names. Appends warnings."""
+    folder: str | Path | None, frames: Sequence[Frame], splits: Sequence[Split]
+) -> tuple[dict[str, Path], MaskKind]:
+    """Find the masks of training images, by the images' names: the user's, or else those that the capture names."""
     if folder is None:
-        paths = {frame.name.file: frame.black for frame in frames if frame.black is not None}
-    else:
-        names = [frame.name.file for frame, split in zip(frames, splits, strict=True) if split == "train"]
-        paths = find_masks(folder, names, "each training image, named as the image")
-    warnings += check_ignored(paths, frames[0].image.size, black=folder is None)
-    return _IgnoredMasks(paths, folder is None)
-
-
-def _view(split: Split, number: int, shot: _Shot, camera: Camera, time: float, ignored: _IgnoredMasks) -> View:
-    """Make the view of a frame. number: within its split, for its name. camera: in the world's coordinates."""
-    frame = shot.frame
-    path = ignored.paths.get(frame.name.file) if split == "train" else None
-    return View(
-        name=f"{split}_{frame.label or f'{number:05d}'}",
-        camera=camera,
-        time=time,
-        source=str(frame.image),
-        pixels=shot.pixels,
-        mask=None if frame.mask is None else partial(shot.measured, frame.mask),
-        ignored=None if path is None else partial(shot.ignored, path, black=ignored.black),
-    )
+        return {frame.name.file: frame.black for frame in frames if frame.black is not None}, "black"
+    names = [frame.name.file for frame, split in zip(frames, splits, strict=True) if split == "train"]
+    return find_masks(Path(folder), names, "each training image, named as the image"), "white"

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from lapgs_wgpu.data.stamps import ImageName
-from lapgs_wgpu.data.timestamps import natural_key
+from lapgs_wgpu.data.stamps import ImageName, natural_key
 from lapgs_wgpu.errors import InputError
 
 EVERY = 8  # one of so many times is tested: the fifth, the thirteenth, ...

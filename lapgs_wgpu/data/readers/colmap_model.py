@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 
 from lapgs_wgpu.data.images import SUFFIXES
 from lapgs_wgpu.data.json_fields import LARGEST_ENTRY, LARGEST_INTRINSIC, LARGEST_SIDE
+from lapgs_wgpu.data.poses import unit_quaternion
 from lapgs_wgpu.errors import InputError, shown
+from lapgs_wgpu.splat.camera import rotation_matrix
 
 Array = NDArray[np.float64]
 
@@ -46,13 +48,12 @@ class ColmapCamera(NamedTuple):
 
 
 class ColmapImage(NamedTuple):
-    """A registered image. name: of its file, relative to the folder of images. quaternion: (4,) wxyz and
-    translation: (3,) from world to camera, OpenCV's axes. where: file and entry, for errors."""
+    """A registered image. name: of its file, relative to the folder of images. T_cam_world: (4, 4) pose, OpenCV's
+    axes. where: file and entry, for errors."""
 
     name: str
     camera: int
-    quaternion: Array
-    translation: Array
+    T_cam_world: Array
     where: str
 
 
@@ -129,10 +130,9 @@ def _image(name: str, camera: int, pose: Array, where: str) -> ColmapImage:
     bad = ~(np.abs(pose) <= LARGEST_ENTRY)  # true for NaN, too
     if bad.any():
         raise InputError(f"{where}: its pose holds {pose[bad][0]:g}; at most {LARGEST_ENTRY:g} is allowed.")
-    length = float(np.linalg.norm(pose[:4]))
-    if abs(length - 1) > 1e-3:
-        raise InputError(f"{where}: its quaternion has length {length:g}, must be 1; export the model again.")
-    return ColmapImage(name, camera, pose[:4] / length, pose[4:], where)
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = rotation_matrix(unit_quaternion(pose[:4], where)), pose[4:]
+    return ColmapImage(name, camera, T, where)
 
 
 # Text
