@@ -45,7 +45,8 @@ class App:
     def open(self, path: Path) -> None:
         """Show another file. If it cannot be read or is too large: keep the present scene, and show a message."""
         try:
-            scene = load_scene(path, lambda: self.viewport.device)
+            asked = self.state.scene
+            scene = load_scene(path, lambda: self.viewport.device, up=asked.up, antialiased=asked.antialiased)
             renderer = FrameRenderer(scene.playback)
             width, height = self.canvas.get_physical_size()
             # Some buffers are allocated only when a frame is drawn.

@@ -39,6 +39,7 @@ class ViewState:
         self.camera, self.clock = scene.camera(), scene.clock()
         self.path = PathEditor()
         self.background = scene.background
+        self.antialiased = scene.playback.at(0.0).antialiased
         self.show_transport = scene.playback.moves
         self._ground_truth: GroundTruth | None = None
         self._ground_truth_sought = False

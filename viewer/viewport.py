@@ -63,7 +63,8 @@ class Viewport:
         """Draw the scene where something changed: at a lower resolution while it changes, in full once
         nothing has changed for SETTLED seconds. now: seconds of `time.perf_counter`."""
         state, full = self.state, self._full_camera()
-        key = (*_camera_key(full), state.clock.time, state.mode, state.background, state.renderer)
+        shown = state.clock.time, state.mode, state.background, state.antialiased
+        key = (*_camera_key(full), *shown, state.renderer)
         changed = key != self._drawn
         if changed:
             moving = bool(self._drawn) and self._drawn[-1] is state.renderer  # not the first frame of a scene
@@ -78,7 +79,7 @@ class Viewport:
         camera = full
         if self.scale < 1:
             camera = full.resized(max(1, round(self.scale * full.width)), max(1, round(self.scale * full.height)))
-        self.frame = state.renderer.draw(FrameRequest(camera, state.clock.time, state.mode, state.background))
+        self.frame = state.renderer.draw(FrameRequest(camera, *shown))
         self._drawn, self.stale = key, False
         self._times.append(time.perf_counter())
         if moving:

@@ -19,7 +19,7 @@ from lapgs_wgpu.data.masks import Mask, MaskKind, check_masks, find_masks, read_
 from lapgs_wgpu.data.placement import place
 from lapgs_wgpu.data.readers import apps, colmap, hypernerf, poses_bounds, transforms
 from lapgs_wgpu.data.split import held_out
-from lapgs_wgpu.data.stamps import natural_key
+from lapgs_wgpu.data.stamps import ImageName, natural_key
 from lapgs_wgpu.data.timestamps import as_one_camera, by_camera, disorder, in_step, read_times, to_unit_range
 from lapgs_wgpu.data.validation import check_cloud, check_film, check_frames, check_plausible, check_views, upright
 from lapgs_wgpu.data.views import Dataset, View
@@ -67,11 +67,9 @@ def load_dataset(
     capture = dataclasses.replace(capture, frames=frames)
     warnings = [*capture.warnings, *warnings, *check_plausible(frames)]
 
-    times, time_source = _times(folder, capture, warnings)
-    if capture.own_footage:
-        names = as_one_camera([frame.name for frame in frames], times, [frame.place for frame in frames])
-        frames = [dataclasses.replace(frame, name=name) for frame, name in zip(frames, names, strict=True)]
-        capture = dataclasses.replace(capture, frames=frames)
+    names, times, time_source = _times(folder, capture, warnings)
+    frames = [dataclasses.replace(frame, name=name) for frame, name in zip(frames, names, strict=True)]
+    capture = dataclasses.replace(capture, frames=frames)
     splits = _splits(folder, frames, times)
     check_frames(frames)
     shots = _undistort(capture, shrunk_size(frames[0].image.size, image_size))
@@ -177,16 +175,17 @@ def _reader(folder: Path) -> Reader:
     raise InputError(f"{folder} is no scene in a known format: expected {expected}{inside}.")
 
 
-def _times(folder: Path, capture: Capture, warnings: list[str]) -> tuple[list[float], str]:
-    """Return the times of all frames in [0, 1], and their source. Appends warnings about own footage."""
+def _times(folder: Path, capture: Capture, warnings: list[str]) -> tuple[list[ImageName], list[float], str]:
+    """Return names, times in [0, 1] and the source of the times. Appends warnings about own footage."""
     names = [frame.name for frame in capture.frames]
     times, source = [frame.time for frame in capture.frames if frame.time is not None], capture.time_source
     if not times:
         times, source = read_times(names, folder, warnings)
     if capture.own_footage:
+        names = as_one_camera(names, times, [frame.place for frame in capture.frames])
         warnings += disorder(names, times)
         times = in_step(names, times)
-    return to_unit_range(times, *(capture.time_range or (min(times), max(times)))), source
+    return names, to_unit_range(times, *(capture.time_range or (min(times), max(times)))), source
 
 
 def _splits(folder: Path, frames: Sequence[Frame], times: Sequence[float]) -> list[Split]:

@@ -55,29 +55,27 @@ def image_names(files: Sequence[str], places: Mapping[str, NDArray[np.float64]])
     The words in the names decide; where they do not, whether cameras stand still in one of the two readings alone; else
     there are more times than cameras. places: (3,) of the cameras of some of the files.
     """
-    paths = [PurePosixPath(file) for file in files]
-    cameras = [ImageName(file, str(path.parent)) for file, path in zip(files, paths, strict=True)]
-    level = _varying_folder([path.parts[:-1] for path in paths])
-    if level is None:
+    parts = [(*(path := PurePosixPath(file)).parts[:-1], path.stem) for file in files]
+    cameras = [ImageName(file, str(PurePosixPath(file).parent)) for file in files]
+    same_depth = len(set(map(len, parts))) == 1
+    varying = [level for level, names in enumerate(zip(*parts, strict=same_depth)) if len(set(names)) > 1]
+    stem = len(parts[0]) - 1
+    if not same_depth or len(varying) not in (1, 2) or varying[0] == stem:
         return cameras
-    times = [
-        ImageName(file, str(PurePosixPath(*path.parts[level + 1 :]).with_suffix("")), path.parts[level])
-        for file, path in zip(files, paths, strict=True)
-    ]
-    decided = _folders_are_times([name.folder for name in times], [path.stem for path in paths])
+    outer, inner = varying[0], (*varying, stem)[1]
+
+    def timed(level: int) -> list[ImageName]:
+        """Take the folders of a level as times, and all others as cameras."""
+        others = ["/".join(each[:level] + each[level + 1 :]) for each in parts]
+        return [ImageName(*name) for name in zip(files, others, (each[level] for each in parts), strict=True)]
+
+    readings = timed(outer), cameras if inner == stem else timed(inner)
+    decided = _folders_are_times([each[outer] for each in parts], [each[inner] for each in parts])
     if decided is None:
-        still = [stand_still(_places_of_each(names, places)) for names in (times, cameras)]
-        fewer = len({name.camera for name in times}) < len({name.camera for name in cameras})
+        still = [stand_still(_places_of_each(names, places)) for names in readings]
+        fewer = len({name.camera for name in readings[0]}) < len({name.camera for name in readings[1]})
         decided = still[0] if still[0] != still[1] else fewer
-    return times if decided else cameras
-
-
-def _varying_folder(parents: Sequence[tuple[str, ...]]) -> int | None:
-    """The only level at which the folders of images differ; None if there is none, or more than one."""
-    if len({len(parts) for parts in parents}) != 1:
-        return None
-    varying = [level for level, parts in enumerate(zip(*parents, strict=True)) if len(set(parts)) > 1]
-    return varying[0] if len(varying) == 1 else None
+    return readings[0] if decided else readings[1]
 
 
 def _folders_are_times(folders: Sequence[str], stems: Sequence[str]) -> bool | None:

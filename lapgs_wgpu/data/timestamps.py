@@ -157,10 +157,10 @@ def _at_one_rate(names: Sequence[ImageName], numbers: Sequence[int], warnings: l
         return [float(number) for number in numbers]
     rates = {camera: len(span) // least for camera, span in spans.items()}
     warnings += _ends({camera: (float(span[0]), float(span[-1])) for camera, span in spans.items()}, 1.0)
-    faster = [f"{camera} {rate} times" for camera, rate in rates.items() if rate > 1]
+    faster = [f"{camera} has {rate} times as many images" for camera, rate in rates.items() if rate > 1]
     warnings.append(
-        f"{', '.join(faster)} as many images as the other cameras, and is taken to film as many times as fast, over "
-        f"the same time; if it filmed longer, write the times in seconds into {TIMES}."
+        f"cameras have other rates: {', '.join(faster)} as the slowest, and is taken to film as many times as fast, "
+        f"over the same time; if it filmed longer, write the times in seconds into {TIMES}."
     )
     return [first + (number - first) / rates[name.camera] for name, number in zip(names, numbers, strict=True)]
 

@@ -1,7 +1,7 @@
 """PLY files: the elements that a header declares, and their values in any of the three encodings.
 
 Files are untrusted: the header's length is limited, and declared sizes are compared with the file size before any
-allocation. Elements with lists, such as the faces of a mesh, may be declared; neither they nor what follows is read.
+allocation. Elements with lists, such as the faces of a mesh, are passed over.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import re
 import stat
+import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -29,16 +30,16 @@ _BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": 
 _SCALARS = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
     "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
-    "float32": "f4", "float64": "f8",
+    "float32": "f4", "float64": "f8", "half": "f2", "float16": "f2",
 }  # fmt: skip
 
 
 @dataclass
 class Element:
-    """An element: `count` rows of scalar `properties`.
+    """An element: `count` rows of scalar `properties` and of `lists`, of which a row holds a length and as many values.
 
     offset: byte of the file at which it begins; line after the header in a text file. comments: those below its line.
-    has_lists: whether it declares lists, too, so that its size is unknown.
+    order: its scalars' bytes and its lists' types, in the order of a row.
     """
 
     name: str
@@ -46,7 +47,12 @@ class Element:
     properties: dict[str, np.dtype[Any]] = field(default_factory=dict)
     comments: list[str] = field(default_factory=list)
     offset: int = 0
-    has_lists: bool = False
+    order: list[int | tuple[str, int]] = field(default_factory=list)
+
+    @property
+    def has_lists(self) -> bool:
+        """Whether a row's size is not known."""
+        return any(isinstance(part, tuple) for part in self.order)
 
     @property
     def stride(self) -> int:
@@ -187,8 +193,9 @@ def _parse_lines(lines: list[str], path: PathLike) -> tuple[str, dict[str, Eleme
                 if not re.fullmatch("[0-9]{1,18}", count):
                     raise InputError(f"{where} does not declare a count from 0 to 10^18 - 1; the file is damaged.")
                 last = elements[name] = Element(name, int(count))
-            case ["property", "list", *_] if last is not None:
-                last.has_lists = True
+            case ["property", "list", length, kind, _] if last is not None and {length, kind} <= _SCALARS.keys():
+                code = _BYTE_ORDERS.get(encoding, "<") + np.dtype(_SCALARS[length]).char
+                last.order.append((code, np.dtype(_SCALARS[kind]).itemsize))
             case ["property", kind, name]:
                 if last is None or kind not in _SCALARS:
                     what = (
@@ -198,6 +205,7 @@ def _parse_lines(lines: list[str], path: PathLike) -> tuple[str, dict[str, Eleme
                 if name in last.properties:
                     raise InputError(f"{where} declares a property a second time; the file is damaged.")
                 last.properties[name] = np.dtype(_BYTE_ORDERS.get(encoding, "<") + _SCALARS[kind])
+                last.order.append(last.properties[name].itemsize)
             case _:
                 raise InputError(f"{where} is not a line of a PLY header; the file is damaged.")
     if not encoding:
@@ -208,16 +216,17 @@ def _parse_lines(lines: list[str], path: PathLike) -> tuple[str, dict[str, Eleme
 def _place(
     elements: dict[str, Element], encoding: str, start: int, file: BinaryIO, path: PathLike
 ) -> dict[str, Element]:
-    """Set the offsets of the elements and return those without lists, of a binary file before the first with lists.
-
-    They must fill the file.
-    """
+    """Set the offsets of the elements and return those without lists. They must fill the file."""
     text, size = encoding == "ascii", os.fstat(file.fileno()).st_size
     end, line = start, 0
+    rest = {element.name for element in elements.values() if not element.has_lists}
     placed: dict[str, Element] = {}
     for element in elements.values():
         if element.has_lists and not text:
-            return placed
+            if rest == placed.keys():
+                return placed
+            end = _end_of_lists(element, end, file, path)
+            continue
         if not element.has_lists:
             placed[element.name] = element
         element.offset = line if text else end
@@ -237,3 +246,28 @@ def _place(
             "appended."
         )
     return placed
+
+
+def _end_of_lists(element: Element, start: int, file: BinaryIO, path: PathLike) -> int:
+    """The byte of a binary file at which an element with lists ends, which begins at `start`."""
+    file.seek(0)
+    data, at = file.read(), start
+    try:
+        for _ in range(element.count):
+            for part in element.order:
+                if isinstance(part, tuple):
+                    code, size = part
+                    (length,) = struct.unpack_from(code, data, at)
+                    at += struct.calcsize(code) + int(length) * size
+                else:
+                    at += part
+            if not start < at <= len(data):
+                break
+    except (struct.error, ValueError, OverflowError):  # a length that is no whole number
+        at = -1
+    if not start <= at <= len(data):
+        raise InputError(
+            f"{path}: element {element.name[:40]!r} ({element.count} rows with lists) does not end within the "
+            f"{len(data)} bytes of the file: it is truncated or its header is wrong."
+        )
+    return at
