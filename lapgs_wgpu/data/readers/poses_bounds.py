@@ -19,7 +19,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,22 +52,13 @@ MOVING = (
     "capture are down, right and backward, so convert it to COLMAP's or nerfstudio's format"
 )
 Array = NDArray[np.float64]
+LLFF = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])  # from down, right and backward to right, down and forward
 
 
-class PoseRow(NamedTuple):
-    """One row. R: (3, 3) rotation, columns as stored. position: (3,). depths: nearest and furthest. where: file and
-    row, for errors."""
+def _read_rows(path: Path, names: Sequence[str], what: str, axes: Array) -> list[dict[str, Any]]:
+    """Read what a row tells of a frame, as arguments of `Frame`, for each of the names, in their order.
 
-    lens: Lens
-    R: Array
-    position: Array
-    depths: tuple[float, float]
-    where: str
-
-
-def _read_rows(path: Path, names: Sequence[str], what: str) -> list[PoseRow]:
-    """Read a row for each of the names, in their order. names: at least one, of `what`, such as "images".
-
+    names: at least one, of `what`, such as "images". axes: (3, 3), from the columns of R to right, down and forward.
     Raises InputError: the file is not readable, has another number of rows, or one of them is no camera.
     """
     rows = read_npy(path).astype(np.float64)
@@ -81,11 +72,10 @@ def _read_rows(path: Path, names: Sequence[str], what: str) -> list[PoseRow]:
             f"{path} holds {len(rows)} poses, but there are {len(names)} {what}, {names[0]} to {names[-1]}; each of "
             "them needs a row, in this order."
         )
-    return [_row(row, f"{path}, row {i} ({name})") for i, (row, name) in enumerate(zip(rows, names, strict=True))]
+    return [_row(row, f"{path}, row {i} ({name})", axes) for i, (row, name) in enumerate(zip(rows, names, strict=True))]
 
 
-def _row(row: Array, where: str) -> PoseRow:
-    """Check a row (17,). Raises InputError."""
+def _row(row: Array, where: str, axes: Array) -> dict[str, Any]:
     bad = ~(np.abs(row) <= LARGEST_ENTRY)  # true for NaN, too
     if bad.any():
         column = int(np.argmax(bad))
@@ -99,8 +89,12 @@ def _row(row: Array, where: str) -> PoseRow:
     if not 0 < near < far:
         raise InputError(f"{where}: the depth bounds must be 0 < near < far, got {near:g} and {far:g}.")
     check_rotation(pose[:, :3], f"{where}: the pose")
-    lens = Lens(round(width), round(height), focal, focal, width / 2, height / 2)
-    return PoseRow(lens, pose[:, :3], pose[:, 3], (float(near), float(far)), where)
+    return {
+        "lens": Lens(round(width), round(height), focal, focal, width / 2, height / 2),
+        "T_cam_world": world_to_camera(pose[:, :3] @ axes, pose[:, 3]),
+        "where": where,
+        "depths": (float(near), float(far)),
+    }
 
 
 # Neu3D
@@ -109,7 +103,7 @@ def _row(row: Array, where: str) -> PoseRow:
 def _read_neu3d(folder: Path, image_size: int | None) -> Capture:
     path = folder / POSES
     recordings = _recordings(folder)
-    rows = _read_rows(path, [recording.name for recording in recordings], "recordings")
+    rows = _read_rows(path, [recording.name for recording in recordings], "recordings", LLFF)
     names = [recording.stem for recording in recordings]
     warnings = []
     if names != sorted(names):
@@ -130,14 +124,11 @@ def _read_neu3d(folder: Path, image_size: int | None) -> Capture:
     frames = [
         Frame(
             image,
-            row.lens,
-            _llff_pose(row),
-            row.where,
-            ImageName(f"{recording.stem}/{_file_name(image, index)}", recording.stem),
+            name=ImageName(f"{recording.stem}/{_file_name(image, index)}", recording.stem),
             time=index,
             split="test" if recording is first else "train",
             label=f"{recording.stem}_{index:05d}",
-            depths=row.depths,
+            **row,
         )
         for (recording, images), row in zip(recordings.items(), rows, strict=True)
         for index, image in enumerate(images)
@@ -154,12 +145,6 @@ def _read_neu3d(folder: Path, image_size: int | None) -> Capture:
     )
 
 
-def _llff_pose(row: PoseRow) -> Array:
-    """Return the (4, 4) pose in OpenCV's axes of a row in LLFF's."""
-    down, right, back = row.R.T
-    return world_to_camera(np.stack([right, down, -back], axis=1), row.position)
-
-
 def _recordings(folder: Path) -> dict[Path, list[ImageSource]]:
     """Return the frames of each camera, by its number. Images take precedence over a video of the same camera."""
     videos = {child.stem: child for child in sorted(folder.iterdir()) if child.suffix.lower() == ".mp4"}
@@ -171,39 +156,28 @@ def _recordings(folder: Path) -> dict[Path, list[ImageSource]]:
             "at least 2 are needed: one for testing, one for training."
         )
     paths = sorted(recordings.values(), key=lambda path: natural_key(path.stem))
-    return {path: _numbered(path / IMAGES) if path.is_dir() else _video(path) for path in paths}
+    return {path: _of_folder(path / IMAGES) if path.is_dir() else _of_video(path) for path in paths}
 
 
-def _file_name(image: ImageSource, index: int) -> str:
+def _file_name(image: ImageSource, index: int = 0) -> str:
     """The name of an image; of a film's frame, its number from 0 on, which masks are named by."""
     return image.path.name if isinstance(image, ImageFile) else f"{index}.png"
 
 
-def _video(path: Path) -> list[ImageSource]:
+def _of_video(path: Path) -> list[ImageSource]:
     video = Video(path)
     return [VideoFrame(video, index) for index in range(video.frames)]
 
 
-def _numbered(folder: Path) -> list[ImageSource]:
-    """Return the images of a folder in the order of their numbers: 2.png comes before 10.png."""
-    numbered: dict[int, Path] = {}
-    for file in _images(folder):
-        digits = re.findall(r"\d+", file.stem)
-        if not digits or int(digits[-1]) in numbered:
-            why = f"has the number {int(digits[-1])}, as another has" if digits else "has no number"
-            raise InputError(
-                f"{file} {why}; frames are put in order by the last number in their names: rename or remove it."
-            )
-        numbered[int(digits[-1])] = file
-    return [check_image(numbered[number], whole=False) for number in sorted(numbered)]  # whole, they may be gigabytes
+def _of_folder(folder: Path, *, whole: bool = False) -> list[ImageSource]:
+    """Return the images of a folder, by number. whole: of `check_image`; whole, those of a rig may be gigabytes.
 
-
-def _images(folder: Path) -> list[Path]:
-    """Return the images of a folder, by number. Raises InputError if there is none."""
+    Raises InputError if there is none.
+    """
     files = sorted((f for f in listed(folder) if f.suffix.lower() in SUFFIXES), key=lambda f: natural_key(f.name))
     if not files:
         raise InputError(f"{folder} holds no images (.png or .jpg); extract the camera's frames into it.")
-    return files
+    return [check_image(file, whole=whole) for file in files]
 
 
 # EndoNeRF
@@ -211,20 +185,18 @@ def _images(folder: Path) -> list[Path]:
 
 def _read_endonerf(folder: Path, image_size: int | None) -> Capture:
     path = folder / POSES
-    images = [check_image(file) for file in _images(folder / IMAGES)]
-    rows = _read_rows(path, [image.path.name for image in images], "images")
+    images = _of_folder(folder / IMAGES, whole=True)
+    names = [_file_name(image) for image in images]
+    rows = _read_rows(path, names, "images", np.eye(3))
     frames = [
         Frame(
             image,
-            row.lens,
-            world_to_camera(row.R, row.position),  # right, down and forward are OpenCV's axes
-            row.where,
-            ImageName(image.path.name),
+            name=ImageName(name),
             time=index,
             split="test" if index % EVERY == FIRST else "train",
-            depths=row.depths,
+            **row,
         )
-        for index, (row, image) in enumerate(zip(rows, images, strict=True))
+        for index, (image, name, row) in enumerate(zip(images, names, rows, strict=True))
     ]
     cloud = _depth_cloud(folder, frames) if (folder / DEPTH).is_dir() else None
     depth = f"depths are those of {folder / DEPTH}" if cloud is not None else "depths are a guess between the bounds"
@@ -241,7 +213,7 @@ def _read_endonerf(folder: Path, image_size: int | None) -> Capture:
 
 def _depth_cloud(folder: Path, frames: list[Frame]) -> Cloud:
     """Make points at the depths of some of the maps, in their images' colors. Raises InputError."""
-    maps = _images(folder / DEPTH)
+    maps = [Path(str(image)) for image in _of_folder(folder / DEPTH)]
     if len(maps) != len(frames):
         raise InputError(
             f"{folder / DEPTH} holds {len(maps)} depth maps for {len(frames)} images; each image needs one, or remove "
