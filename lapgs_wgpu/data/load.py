@@ -183,7 +183,7 @@ def _times(folder: Path, capture: Capture, warnings: list[str]) -> tuple[list[Im
         times, source = read_times(names, folder, warnings)
     if capture.own_footage:
         names = as_one_camera(names, times, [frame.place for frame in capture.frames])
-        warnings += disorder(names, times)
+        warnings += disorder(names, times, numbered=source.startswith("the frame numbers"))
         times = in_step(names, times)
     return names, to_unit_range(times, *(capture.time_range or (min(times), max(times)))), source
 
@@ -195,7 +195,7 @@ def _splits(folder: Path, frames: Sequence[Frame], times: Sequence[float]) -> li
         tested = held_out([frame.name for frame in frames], times)
         splits = ["test" if i in tested else "train" for i in range(len(frames))]
     if "train" not in splits:
-        raise InputError(f"{folder}: all {len(frames)} images are held out for testing; none is left to train on.")
+        raise InputError(f"{folder}: all {len(frames)} images are held out; name fewer in its lists of test images.")
     return splits
 
 

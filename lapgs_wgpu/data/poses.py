@@ -34,7 +34,7 @@ def check_rotation(R: Array, name: str) -> None:
             f"{ROTATION_TOLERANCE:g} is allowed), its axes have lengths {axes}; remove scale and shear."
         )
     if np.linalg.det(R) < 0:
-        raise InputError(f"{name} is left-handed (determinant -1, must be 1); flip one of its axes.")
+        raise InputError(f"{name} is left-handed (determinant -1, must be 1); its axes are not those of the format.")
 
 
 def unit_quaternion(quaternion: Array, where: str) -> Array:
@@ -81,7 +81,8 @@ def opengl_pose(value: Any, where: str) -> Array:
         raise InputError(f"{name} must be 4 rows of 4 numbers (the last, 0 0 0 1, may be missing), got {kind(value)}.")
     T = np.stack([vector(row, 4, "transform_matrix", where) for row in [*value, [0, 0, 0, 1]][:4]])
     if np.abs(T[3] - [0, 0, 0, 1]).max() > ROTATION_TOLERANCE:
-        raise InputError(f"{name} must end with the row 0 0 0 1, got {' '.join(f'{x:g}' for x in T[3])}.")
+        got = " ".join(f"{x:g}" for x in T[3])
+        raise InputError(f"{name} must end with the row 0 0 0 1, got {got}; the position stands at the right.")
     R, position = T[:3, :3], T[:3, 3]
     check_rotation(R, name)
     return world_to_camera(R @ OPENGL_TO_OPENCV, position)

@@ -156,7 +156,7 @@ def _at_one_rate(names: Sequence[ImageName], numbers: Sequence[int], warnings: l
     ):
         return [float(number) for number in numbers]
     rates = {camera: len(span) // least for camera, span in spans.items()}
-    warnings += _ends({camera: (float(span[0]), float(span[-1])) for camera, span in spans.items()}, 1.0)
+    warnings += _ends({camera: (float(span[0]), float(span[-1])) for camera, span in spans.items()}, 1.0, "")
     faster = [f"{camera} has {rate} times as many images" for camera, rate in rates.items() if rate > 1]
     warnings.append(
         f"cameras have other rates: {', '.join(faster)} as the slowest, and is taken to film as many times as fast, "
@@ -165,8 +165,11 @@ def _at_one_rate(names: Sequence[ImageName], numbers: Sequence[int], warnings: l
     return [first + (number - first) / rates[name.camera] for name, number in zip(names, numbers, strict=True)]
 
 
-def disorder(names: Sequence[ImageName], times: Sequence[float]) -> list[str]:
-    """Warn about cameras whose times decrease with the frame number, and about cameras without a common time."""
+def disorder(names: Sequence[ImageName], times: Sequence[float], *, numbered: bool) -> list[str]:
+    """Warn about cameras whose times decrease with the frame number, and about cameras without a common time.
+
+    numbered: whether the times are frame numbers.
+    """
     warnings = []
     spans: dict[str, tuple[float, float]] = {}
     for camera, mine in by_camera(names).items():
@@ -185,12 +188,13 @@ def disorder(names: Sequence[ImageName], times: Sequence[float]) -> list[str]:
             warnings.append(
                 f"frames are out of order: time goes back {len(back)} times in {len(ordered)} images, first from "
                 f"{names[first].file} at {times[first]:g} to "
-                f"{names[second].file} at {times[second]:g}; check the times."
+                f"{names[second].file} at {times[second]:g}; correct the times, or the numbers."
             )
-    return warnings + _ends(spans, time_step(np.unique(np.array(times, np.float64))))
+    advice = f"; if some film more images a second, or were started apart, write the times in seconds into {TIMES}"
+    return warnings + _ends(spans, time_step(np.unique(np.array(times, np.float64))), advice if numbered else "")
 
 
-def _ends(spans: dict[str, tuple[float, float]], step: float) -> list[str]:
+def _ends(spans: dict[str, tuple[float, float]], step: float, advice: str) -> list[str]:
     """Warn about cameras without a common time, else about those that do not begin and end together."""
     warnings = []
     first_camera, *further = spans
@@ -201,7 +205,7 @@ def _ends(spans: dict[str, tuple[float, float]], step: float) -> list[str]:
         c, d = spans[other]
         return [
             f"cameras film at different times: {first_camera} from {a:g} to {b:g} and {other} from {c:g} to {d:g}; "
-            "if they filmed together, number their frames from a common time on."
+            "if they filmed together, give their times, or numbers, from a common moment on."
         ]
     for word, ends in (("begin", [low for low, _ in spans.values()]), ("end", [high for _, high in spans.values()])):
         length = max(high for _, high in spans.values()) - min(low for low, _ in spans.values())
@@ -212,10 +216,7 @@ def _ends(spans: dict[str, tuple[float, float]], step: float) -> list[str]:
             told = ", ".join(
                 f"{', '.join(cameras[:4])}{' ...' * (len(cameras) > 4)} at {end:g}" for end, cameras in at.items()
             )
-            warnings.append(
-                f"cameras {word} at different times: {told}; if some film more images a second, or were started apart, "
-                f"write the times in seconds into {TIMES}."
-            )
+            warnings.append(f"cameras {word} at different times: {told}{advice}.")
     return warnings
 
 

@@ -102,7 +102,7 @@ def check_frames(frames: Sequence[Frame]) -> None:
         if frame.image.size != first.size:
             raise InputError(
                 f"{frame.image} is {size_text(frame.image.size)} pixels and {first} is {size_text(first.size)}; all "
-                "images must have one size."
+                "images must have one size: crop or leave out those that differ."
             )
         if frame.lens not in checked:
             checked.add(frame.lens)
@@ -117,7 +117,7 @@ def check_focal(lens: Lens, where: str) -> None:
         if not MIN_FOCAL * longer <= focal <= MAX_FOCAL * longer:
             raise InputError(
                 f"{where}: a focal length of {focal:.4g} pixels does not fit images of {lens.width}x{lens.height}; it "
-                f"must be {MIN_FOCAL:g} to {MAX_FOCAL:g} times the longer side."
+                f"must be {MIN_FOCAL:g} to {MAX_FOCAL:g} times the longer side, in pixels of that size."
             )
 
 
@@ -125,7 +125,7 @@ def check_proportions(stored: tuple[int, int], lens: Lens, image: str, where: st
     """Check that an image of (width, height) `stored` has the proportions that a lens states. Raises InputError."""
     if not _fits(stored, lens):
         sideways = _fits(stored[::-1], lens)
-        advice = "turn it, or give the camera of the turned image" if sideways else "they do not belong together"
+        advice = "turn it, or give the camera of the turned image" if sideways else "give the camera of this image"
         raise InputError(
             f"{image} is {size_text(stored)} pixels, but {where} states {lens.width}x{lens.height}, which has other "
             f"proportions{', those of the image on its side' if sideways else ''}; {advice}."

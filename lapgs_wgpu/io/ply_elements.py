@@ -71,29 +71,17 @@ class PlyFile(NamedTuple):
     elements: dict[str, Element]
     comments: list[str]
 
-    def columns(self, element: Element, names: list[str]) -> Floats:
-        """(N, len(names)) float32: the named properties of all rows of an element. Raises InputError."""
-        return self._columns(element, names, np.empty((element.count, len(names)), np.float32))
-
-    def exact_columns(self, element: Element, names: list[str]) -> NDArray[np.float64]:
-        """As `columns`, in float64."""
-        return self._columns(element, names, np.empty((element.count, len(names)), np.float64))
-
-    def _columns(self, element: Element, names: list[str], values: NDArray[Any]) -> NDArray[Any]:
+    def columns(self, element: Element, names: list[str], dtype: type = np.float32) -> NDArray[Any]:
+        """(N, len(names)): the named properties of all rows of an element. Raises InputError."""
+        values = np.empty((element.count, len(names)), dtype)
+        read = self._text_rows if self.encoding == "ascii" else self._binary_rows
         with np.errstate(all="ignore"):  # a double beyond float32 becomes infinite, which callers report
-            if self.encoding == "ascii":
-                columns = [list(element.properties).index(name) for name in names]
-                for index, row in enumerate(self._text_rows(element)):
-                    values[index] = row[columns]
-            else:
-                start = 0
-                for rows in self._binary_blocks(element, names):
-                    for column, name in enumerate(names):
-                        values[start : start + len(rows), column] = rows[name]
-                    start += len(rows)
+            for start, rows in read(element, names):
+                for column, name in enumerate(names):
+                    values[start : start + len(rows), column] = rows[name]
         return values
 
-    def _binary_blocks(self, element: Element, names: list[str]) -> Iterator[NDArray[Any]]:
+    def _binary_rows(self, element: Element, names: list[str]) -> Iterator[tuple[int, NDArray[Any]]]:
         layout = np.dtype(list(element.properties.items()))[names]
         size = max(1, _BLOCK_BYTES // element.stride)
         self.file.seek(element.offset)
@@ -103,9 +91,9 @@ class PlyFile(NamedTuple):
                 raise InputError(
                     f"{self.path}: became shorter while it was read, at row {start + len(rows)} of {element.count}."
                 )
-            yield rows
+            yield start, rows
 
-    def _text_rows(self, element: Element) -> Iterator[NDArray[np.float64]]:
+    def _text_rows(self, element: Element, names: list[str]) -> Iterator[tuple[int, NDArray[Any]]]:
         self.file.seek(self.header_bytes)
         lines = self.file.read().decode(errors="replace").splitlines()[element.offset :][: element.count]
         if len(lines) < element.count:
@@ -113,14 +101,17 @@ class PlyFile(NamedTuple):
                 f"{self.path}: declares {element.count} rows of {element.name}, but {len(lines)} lines follow; it is "
                 "truncated."
             )
+        layout = np.dtype([(name, np.float64) for name in element.properties])
+        table = np.empty((element.count, len(layout)))
         for number, line in enumerate(lines):
             try:
-                yield np.array(line.split(), dtype=np.float64).reshape(len(element.properties))
+                table[number] = np.array(line.split(), np.float64).reshape(len(layout))
             except ValueError:
                 raise InputError(
-                    f"{self.path}: row {number} of {element.name}, {line[:80]!r}, does not hold "
-                    f"{len(element.properties)} numbers; the file is damaged."
+                    f"{self.path}: row {number} of {element.name}, {line[:80]!r}, does not hold {len(layout)} numbers; "
+                    "the file is damaged."
                 ) from None
+        yield 0, table.view(layout)[:, 0]
 
 
 @contextmanager
@@ -143,14 +134,9 @@ def _advice(folder: Path) -> str:
     names = sorted(file.name for file in folder.glob("*.ply"))
     if not names:
         return " without a .ply file; give the .ply file itself"
-    if "checkpoint.ply" in names:
-        return "; give a .ply file, for example the checkpoint.ply in it"
-    if len(names) == 1:
-        return f"; give the file {names[0]} in it"
-    return (
-        f" of {len(names)} .ply files; a sequence of stills is not played, and one of them can be shown, for example "
-        f"{names[0]}"
-    )
+    if "checkpoint.ply" in names or len(names) == 1:
+        return f"; give the file {'checkpoint.ply' if 'checkpoint.ply' in names else names[0]} in it"
+    return f" of {len(names)} .ply files; a sequence of stills is not played: give one of them, such as {names[0]}"
 
 
 def _read_header(file: BinaryIO, path: PathLike) -> PlyFile:
@@ -158,8 +144,12 @@ def _read_header(file: BinaryIO, path: PathLike) -> PlyFile:
     if head[:64].lstrip().lower().startswith(b"<!doctype html"):
         raise InputError(f"{path}: is a web page, and this is not a browser; give the checkpoint that it was made of.")
     if re.match(rb"ply\r?\n", head) is None:
-        what = f"begins with {head[:8]!r}" if head else "is empty (0 bytes)"
-        raise InputError(f"{path}: {what}, where a PLY file begins with the line 'ply'; give a 3DGS .ply file.")
+        if not head:
+            raise InputError(f"{path}: is empty (0 bytes); copy or write it again.")
+        raise InputError(
+            f"{path}: begins with {head[:8]!r}, where a PLY file begins with the line 'ply'; convert it to .ply, for "
+            "example with SuperSplat or splat-transform."
+        )
     end = re.search(rb"^end_header\r?\n", head, re.MULTILINE)
     if end is None:
         raise InputError(

@@ -37,7 +37,7 @@ def _read(folder: Path, image_size: int | None) -> Capture:
     models = {path: read_model(path) for path in _models(folder)}
     chosen, model = max(models.items(), key=lambda item: len(item[1].images))  # the first of equal ones
     if not model.images:
-        raise InputError(f"{chosen} holds no image with a pose; COLMAP could not register any: make it anew.")
+        raise InputError(f"{chosen} holds no image with a pose; let COLMAP register the images again.")
     files = _image_files(images)
     registered, warnings = _registered(model, images, files)
     frames = _frames(model, registered, images, files, warnings)

@@ -80,7 +80,7 @@ def read_model(folder: Path) -> ColmapModel:
     files = {name: folder / f"{name}.{'bin' if binary else 'txt'}" for name in ("cameras", "images", "points3D")}
     for path in files.values():
         if not path.is_file():
-            raise InputError(f"{path} does not exist, but {files['cameras']} does; a sparse model needs both.")
+            raise InputError(f"{path} does not exist, but {files['cameras']} does; copy it, too.")
     try:
         cameras = (_binary_cameras if binary else _text_cameras)(files["cameras"])
         images = (_binary_images if binary else _text_images)(files["images"])
@@ -95,7 +95,9 @@ def read_model(folder: Path) -> ColmapModel:
             )
     bad = np.flatnonzero(~(np.abs(points) <= LARGEST_ENTRY).all(axis=1))  # true for NaN, too
     if len(bad):
-        raise InputError(f"{files['points3D']}: {len(bad)} of {len(points)} points are not finite, first {bad[0]}.")
+        raise InputError(
+            f"{files['points3D']}: {len(bad)} of {len(points)} points are not finite, first {bad[0]}; remove them."
+        )
     return ColmapModel(cameras, images, points, colors, *files.values())
 
 
@@ -206,7 +208,9 @@ class _Bytes:
         self.path, self.at, self.data = path, 0, path.read_bytes()
 
     def damaged(self, problem: str) -> InputError:
-        return InputError(f"{self.path} {problem}; it is damaged, so copy it again.")
+        return InputError(
+            f"{self.path} {problem}; it is damaged, or of another version: copy it, or export it as text."
+        )
 
     def take(self, form: str) -> tuple[Any, ...]:
         """Return the next values, by struct's names for their types."""

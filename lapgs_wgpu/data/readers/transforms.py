@@ -95,7 +95,9 @@ def _read_lens(frame: Fields, shared: Fields, image: ImageFile) -> tuple[Lens, b
     else:
         angle = source("camera_angle_x")
         if "camera_angle_x" not in angle:
-            raise InputError(f"{frame.where} and {shared.where} have neither the field fl_x nor camera_angle_x.")
+            raise InputError(
+                f"{frame.where} and {shared.where} have neither fl_x nor camera_angle_x; give one of the two."
+            )
         fov_x = angle.number("camera_angle_x")
         if not 1e-6 < fov_x < math.pi:
             raise InputError(f"{angle.where}: camera_angle_x must be radians between 0 and pi, got {fov_x:g}.")
@@ -216,7 +218,10 @@ def _read_split(folder: Path, split: Split, warnings: list[str]) -> list[Frame]:
     """Read the frames of one transforms file. Appends a warning about images that do not exist."""
     path, files = folder / f"transforms_{split}.json", CaptureFiles(folder)
     if not path.is_file():
-        raise InputError(f"{path} does not exist; a D-NeRF scene needs transforms_train.json and transforms_test.json.")
+        raise InputError(
+            f"{path} does not exist, which a D-NeRF scene needs; if there is one file alone, name it transforms.json, "
+            "and every eighth image is held out."
+        )
     read = _read_frames(read_json(path), files, "time")
     frames = []
     for index, frame in enumerate(read):
