@@ -18,9 +18,8 @@ from lapgs_wgpu.data.capture_files import CaptureFiles
 from lapgs_wgpu.data.cloud import Cloud
 from lapgs_wgpu.data.frames import Capture, Frame, Reader
 from lapgs_wgpu.data.images import SUFFIXES, check_image
-from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.poses import place_of
-from lapgs_wgpu.data.readers.colmap_model import ColmapCamera, ColmapImage, ColmapModel, is_model, read_model
+from lapgs_wgpu.data.readers.colmap_model import ColmapImage, ColmapModel, is_model, read_model
 from lapgs_wgpu.data.stamps import image_names, natural_key, stand_still
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.listing import is_desktop_file
@@ -121,7 +120,7 @@ def _frames(
             continue
         where = f"{model.cameras_file}, camera {posed.camera},"
         frames.append(
-            Frame(check_image(images / name.file), _lens(model.cameras[posed.camera]), posed.T_cam_world, where, name)
+            Frame(check_image(images / name.file), model.cameras[posed.camera], posed.T_cam_world, where, name)
         )
     if left_out:
         warnings.append(
@@ -129,13 +128,6 @@ def _frames(
             f"{model.images_file} holds no pose for them."
         )
     return frames
-
-
-def _lens(camera: ColmapCamera) -> Lens:
-    p = camera.parameters
-    fx, fy = p.get("fx", p.get("f", 0.0)), p.get("fy", p.get("f", 0.0))
-    radial, tangential = (p.get("k1", 0.0), p.get("k2", 0.0), 0.0), (p.get("p1", 0.0), p.get("p2", 0.0))
-    return Lens(camera.width, camera.height, fx, fy, p["cx"], p["cy"], radial=radial, tangential=tangential)
 
 
 READERS = (Reader("COLMAP", "sparse/0/cameras.bin or .txt beside images/", lambda f: bool(_models(f)), _read),)

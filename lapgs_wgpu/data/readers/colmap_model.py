@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from lapgs_wgpu.data.images import SUFFIXES
 from lapgs_wgpu.data.json_fields import LARGEST_ENTRY, LARGEST_INTRINSIC, LARGEST_SIDE
+from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.poses import unit_quaternion
 from lapgs_wgpu.errors import InputError, shown
 from lapgs_wgpu.splat.camera import rotation_matrix
@@ -39,14 +40,6 @@ PARAMETERS = dict(MODELS.values())
 LONGEST_NAME = 4096  # bytes of an image's name
 
 
-class ColmapCamera(NamedTuple):
-    """width, height in pixels; parameters by COLMAP's names for them (MODELS)."""
-
-    width: int
-    height: int
-    parameters: dict[str, float]
-
-
 class ColmapImage(NamedTuple):
     """A registered image. name: of its file, relative to the folder of images. T_cam_world: (4, 4) pose, OpenCV's
     axes. where: file and entry, for errors."""
@@ -60,7 +53,7 @@ class ColmapImage(NamedTuple):
 class ColmapModel(NamedTuple):
     """cameras: by id. images: in file order. points: (N, 3), colors: (N, 3) uint8."""
 
-    cameras: dict[int, ColmapCamera]
+    cameras: dict[int, Lens]
     images: list[ColmapImage]
     points: Array
     colors: NDArray[np.uint8]
@@ -101,14 +94,11 @@ def read_model(folder: Path) -> ColmapModel:
     return ColmapModel(cameras, images, points, colors, *files.values())
 
 
-def _camera(where: str, model: str, width: float, height: float, values: list[float]) -> ColmapCamera:
+def _camera(where: str, model: str, width: float, height: float, values: list[float]) -> Lens:
     """Check the values of a camera. Raises InputError."""
     if model not in PARAMETERS:
-        advice = (
-            "cut pinhole views out of the panoramas"
-            if model == "EQUIRECTANGULAR"
-            else "undistort the images with colmap image_undistorter"
-        )
+        cut = model == "EQUIRECTANGULAR"
+        advice = "cut pinhole views out of it" if cut else "undistort the images with colmap image_undistorter"
         raise InputError(
             f"{where}: its model {model[:40]} is not among those that are read ({', '.join(PARAMETERS)}); {advice}."
         )
@@ -124,7 +114,10 @@ def _camera(where: str, model: str, width: float, height: float, values: list[fl
     for name, value in zip(names, values, strict=True):
         if not abs(value) <= LARGEST_INTRINSIC or (name[0] == "f" and value <= 0):  # true for NaN, too
             raise InputError(f"{where}: {name} is {value:g}, which no camera has.")
-    return ColmapCamera(int(width), int(height), dict(zip(names, values, strict=True)))
+    p = dict(zip(names, values, strict=True))
+    fx, fy = p.get("fx", p.get("f", 0.0)), p.get("fy", p.get("f", 0.0))
+    radial, tangential = (p.get("k1", 0.0), p.get("k2", 0.0), 0.0), (p.get("p1", 0.0), p.get("p2", 0.0))
+    return Lens(int(width), int(height), fx, fy, p["cx"], p["cy"], radial=radial, tangential=tangential)
 
 
 def _image(name: str, camera: int, pose: Array, where: str) -> ColmapImage:
@@ -174,7 +167,7 @@ def _numbers(words: list[str], where: str, kind: Callable[[str], Any] = float) -
         raise InputError(f"{where}: {str(error)[:80]}; export the model again.") from None
 
 
-def _text_cameras(path: Path) -> dict[int, ColmapCamera]:
+def _text_cameras(path: Path) -> dict[int, Lens]:
     cameras = {}
     for where, words in _lines(path, "id, model, width, height"):
         identity, width, height = _numbers([words[0], *words[2:4]], where, int)
@@ -245,7 +238,7 @@ class _Bytes:
             raise self.damaged(f"declares {self.at} bytes, but has {len(self.data)}")
 
 
-def _binary_cameras(path: Path) -> dict[int, ColmapCamera]:
+def _binary_cameras(path: Path) -> dict[int, Lens]:
     cameras, file = {}, _Bytes(path)
     for index in range(file.count(24, "cameras")):
         identity, model, width, height = file.take("iiQQ")
