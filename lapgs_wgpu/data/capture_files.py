@@ -30,7 +30,7 @@ class CaptureFiles:
         """Return the path of an existing file relative to the folder, with slashes; None if there is none.
 
         The name may differ from the file's in slashes, number of blanks, Unicode form, letter case, .jpeg for .jpg, and
-        images_4 for images. The file whose name is the same goes before others.
+        images_4 for images, or begin with the folder's. The file whose name is the same goes before others.
         """
         if os.path.isfile(self.folder / name):  # Path.is_file raises for names that are too long
             return PurePosixPath(name).as_posix()
@@ -42,6 +42,8 @@ class CaptureFiles:
             found = part if os.path.exists(at / part) else entries.get(_folded(part))
             if found is None and (images := _SMALLER.sub(r"\1", _folded(part))) == "images":
                 found = next((entries[key] for key in sorted(entries) if _SMALLER.sub(r"\1", key) == images), None)
+            if found is None and at == self.folder and _folded(part) == _folded(at.name):
+                found = "."  # the name begins with the folder's own
             if found is None:
                 return None
             at = at / found

@@ -146,6 +146,8 @@ def _summary(
     still = len(shots) >= 2 * places
     number = places if still else len(films)
     cameras = f"{number} {'still' if still else 'moving'} camera{'s' * (number > 1)}"
+    if len(films) > 1 and not still:
+        cameras += " that film at the same time"
     if len(films) == 1 < len(folders) and not still:
         cameras += f" in {len(folders)} folders, one after the other" * capture.own_footage
     whole = len(films) > 1 and len(held) == 1 and len(films[next(iter(held))]) == count

@@ -123,6 +123,11 @@ def frame_numbers(names: Sequence[ImageName]) -> list[int]:
                 f"{other if rows[most] else 'it has no numbers'}; write the times into {TIMES}, or number the frames."
             )
         varying = [column for column in range(len(rows[0])) if len({row[column] for row in rows}) > 1]
+        if len(varying) > 1:  # a counter beside a clock of seconds, which repeats itself
+            ordered = sorted(rows, key=lambda row: [row[column] for column in reversed(varying)])
+            once = [column for column in varying if len({row[column] for row in rows}) == len(rows)]
+            if len(once) == 1 and all(a[c] <= b[c] for a, b in pairwise(ordered) for c in varying):
+                varying = once
         if len(varying) > 1:
             raise InputError(
                 f"{files[0]} and {files[-1]} differ in {len(varying)} numbers, so the frame number is ambiguous; write "
@@ -191,7 +196,8 @@ def disorder(names: Sequence[ImageName], times: Sequence[float], *, numbered: bo
                 f"{names[second].file} at {times[second]:g}; correct the times, or the numbers."
             )
     advice = f"; if some film more images a second, or were started apart, write the times in seconds into {TIMES}"
-    return warnings + _ends(spans, time_step(np.unique(np.array(times, np.float64))), advice if numbered else "")
+    slowest = max(time_step(np.unique([times[i] for i in mine])) for mine in by_camera(names).values())
+    return warnings + _ends(spans, slowest, advice if numbered else "")
 
 
 def _ends(spans: dict[str, tuple[float, float]], step: float, advice: str) -> list[str]:

@@ -98,7 +98,9 @@ def _camera(where: str, model: str, width: float, height: float, values: list[fl
     """Check the values of a camera. Raises InputError."""
     if model not in PARAMETERS:
         cut = model == "EQUIRECTANGULAR"
-        advice = "cut pinhole views out of it" if cut else "undistort the images with colmap image_undistorter"
+        advice = (
+            "cut pinhole views out of the panoramas" if cut else "undistort the images with colmap image_undistorter"
+        )
         raise InputError(
             f"{where}: its model {model[:40]} is not among those that are read ({', '.join(PARAMETERS)}); {advice}."
         )
