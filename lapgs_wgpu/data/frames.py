@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from lapgs_wgpu.data.cloud import Cloud
 from lapgs_wgpu.data.images import ImageFile
 from lapgs_wgpu.data.lens import Lens
+from lapgs_wgpu.data.masks import MaskKind
 from lapgs_wgpu.data.normalize import Normalization
 from lapgs_wgpu.data.poses import place_of
 from lapgs_wgpu.data.stamps import ImageName
@@ -39,8 +40,7 @@ class Frame:
     split: None to apply the rule for own footage (`split.held_out`), for all frames of a capture or for none.
     label: suffix of the view's name; None to number the views.
     depths: nearest and furthest depth, the capture's units.
-    mask: image of the pixels that the masked metrics measure, of any size; white is measured.
-    black: image of the pixels that the training leaves out, of any size; black is left out.
+    mask: image, of any size, of what the training leaves out or the masked metrics measure, as mask_kind says.
     """
 
     image: ImageSource
@@ -53,7 +53,7 @@ class Frame:
     label: str | None = None
     depths: tuple[float, float] | None = None
     mask: Path | None = None
-    black: Path | None = None
+    mask_kind: MaskKind = "measured"
     states_size: bool = True
 
     @property

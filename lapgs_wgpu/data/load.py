@@ -8,18 +8,17 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path, PurePath
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
 from lapgs_wgpu.data.images import Pixels, Size, shrink, shrunk_size
 from lapgs_wgpu.data.lens import Lens, Undistortion
-from lapgs_wgpu.data.masks import Mask, MaskKind, check_masks, find_masks, read_mask
+from lapgs_wgpu.data.masks import MASKED, Mask, MaskKind, check_masks, find_masks, read_mask
 from lapgs_wgpu.data.placement import place
 from lapgs_wgpu.data.readers import apps, colmap, hypernerf, poses_bounds, transforms
 from lapgs_wgpu.data.split import held_out
-from lapgs_wgpu.data.stamps import ImageName, natural_key
+from lapgs_wgpu.data.stamps import natural_key
 from lapgs_wgpu.data.timestamps import as_one_camera, by_camera, disorder, in_step, read_times, to_unit_range
 from lapgs_wgpu.data.validation import check_cloud, check_film, check_frames, check_plausible, check_views, upright
 from lapgs_wgpu.data.views import Dataset, View
@@ -60,57 +59,40 @@ def load_dataset(
         raise InputError(f"image_size must be at least 1 pixel, got {image_size}.")
     reader = _reader(folder)
     capture = reader.read(folder, image_size)
+    frames = list(capture.frames)
     if not undistort:
-        pinholes = [dataclasses.replace(frame, lens=frame.lens.idealized) for frame in capture.frames]
-        capture = dataclasses.replace(capture, frames=pinholes)
-    frames, warnings = upright(capture.frames)
-    capture = dataclasses.replace(capture, frames=frames)
+        frames = [dataclasses.replace(frame, lens=frame.lens.idealized) for frame in frames]
+    frames, warnings = upright(frames)
     warnings = [*capture.warnings, *warnings, *check_plausible(frames)]
-
-    names, times, time_source = _times(folder, capture, warnings)
-    frames = [dataclasses.replace(frame, name=name) for frame, name in zip(frames, names, strict=True)]
-    capture = dataclasses.replace(capture, frames=frames)
-    splits = _splits(folder, frames, times)
+    frames, time_source = _timed(folder, dataclasses.replace(capture, frames=frames), warnings)
     check_frames(frames)
+    if masks is not None:
+        frames = _masked(Path(masks), frames)
+    warnings += _check_masks(frames)
+
+    capture = dataclasses.replace(capture, frames=frames)
     shots = _undistort(capture, shrunk_size(frames[0].image.size, image_size))
-    training = [shot for shot, split in zip(shots, splits, strict=True) if split == "train"]
+    training = [shot for shot in shots if shot.frame.split == "train"]
     training_cameras = list(dict.fromkeys(shot.camera for shot in training))
     if capture.cloud is not None:
         if capture.own_footage:
-            cameras, files = [shot.camera for shot in shots], [shot.frame.name.file for shot in shots]
+            cameras, files = [shot.camera for shot in shots], [frame.name.file for frame in frames]
             warnings += check_views(capture.cloud, cameras, files, capture.source)
         cloud = check_cloud(capture.cloud, training_cameras, capture.source, warnings)
         capture = dataclasses.replace(capture, cloud=cloud)
     placement = place(capture, [shot.frame for shot in training], training_cameras, normalize=normalize)
     warnings += placement.warnings
-    order = _film_order(frames, times, warnings) if capture.own_footage else range(len(frames))
-    ignored, kind = _ignored(masks, frames, splits)
-    warnings += check_masks(ignored, frames[0].image.size, kind)
-    measured = {frame.name.file: frame.mask for frame in frames if frame.mask is not None}
-    check_masks(measured, frames[0].image.size, "measured")
+    summary = _summary(reader.name, capture, shots, time_source)
+    if capture.own_footage:
+        shots = _by_film(shots, warnings)
 
     fit = placement.normalization
     whole = fit if fit is None or capture.moved is None else capture.moved.then(fit)
-    distinct = dict.fromkeys(shot.camera for shot in shots)
-    placed = {camera: camera if fit is None else fit.camera(camera) for camera in distinct}
+    placed = {camera: camera if fit is None else fit.camera(camera) for camera in {shot.camera for shot in shots}}
 
     def views(split: Split) -> tuple[View, ...]:
-        chosen = [i for i in order if splits[i] == split]
-        return tuple(_view(split, n, i) for n, i in enumerate(chosen))
-
-    def _view(split: Split, number: int, i: int) -> View:
-        """Make the view of a frame. number: within its split, for its name."""
-        shot, frame = shots[i], frames[i]
-        mask = ignored.get(frame.name.file) if split == "train" else None
-        return View(
-            name=f"{split}_{frame.label or f'{number:05d}'}",
-            camera=placed[shot.camera],
-            time=times[i],
-            source=str(frame.image),
-            pixels=shot.pixels,
-            mask=None if frame.mask is None else partial(shot.mask, frame.mask, "measured"),
-            ignored=None if mask is None else partial(shot.mask, mask, kind),
-        )
+        chosen = [shot for shot in shots if shot.frame.split == split]
+        return tuple(shot.view(number, placed[shot.camera]) for number, shot in enumerate(chosen))
 
     return Dataset(
         folder.resolve().name,
@@ -124,37 +106,29 @@ def load_dataset(
         warnings=tuple(warnings),
         time_source=time_source,
         own_footage=capture.own_footage,
-        summary=_summary(reader.name, capture, shots, times, time_source, splits, whole and whole.scale),
+        summary=summary
+        + ("; coordinates are kept" if whole is None else f"; 1 unit of the files becomes {whole.scale:.4g}")
+        + (f"; {capture.left_out} left out" if capture.left_out else ""),
     )
 
 
-def _summary(
-    layout: str,
-    capture: Capture,
-    shots: Sequence[_Shot],
-    times: Sequence[float],
-    time_source: str,
-    splits: Sequence[Split],
-    scale: float | None,
-) -> str:
-    """Say how a capture was understood: layout, cameras, times and their source, what is held out, scale, and what was
-    left out."""
+def _summary(layout: str, capture: Capture, shots: Sequence[_Shot], time_source: str) -> str:
+    """Say how a capture was understood: layout, cameras, times and their source, what is held out."""
     films = by_camera([frame.name for frame in capture.frames])
-    folders = {PurePath(frame.name.file).parent for frame in capture.frames}
-    held = {frame.name.camera for frame, split in zip(capture.frames, splits, strict=True) if split != "train"}
-    count, places = len(splits) - splits.count("train"), len({shot.camera for shot in shots})
+    folders = len({PurePath(frame.name.file).parent for frame in capture.frames})
+    held = [frame.name.camera for frame in capture.frames if frame.split != "train"]
+    places = len({shot.camera for shot in shots})
     still = len(shots) >= 2 * places
     number = places if still else len(films)
     cameras = f"{number} {'still' if still else 'moving'} camera{'s' * (number > 1)}"
-    if len(films) > 1 and not still:
+    if not still and capture.own_footage and len(films) > 1:
         cameras += " that film at the same time"
-    if len(films) == 1 < len(folders) and not still:
-        cameras += f" in {len(folders)} folders, one after the other" * capture.own_footage
-    whole = len(films) > 1 and len(held) == 1 and len(films[next(iter(held))]) == count
-    out = f"{next(iter(held))} is" if whole else f"{count} of {len(shots)} images are"
-    told = f"{layout}, {cameras}, {len(set(times))} times from {time_source}; {out} held out"
-    told += "; coordinates are kept" if scale is None else f"; 1 unit of the files becomes {scale:.4g}"
-    return told + (f"; {capture.left_out} left out" if capture.left_out else "")
+    elif not still and capture.own_footage and folders > 1:
+        cameras += f" in {folders} folders, one after the other"
+    whole = len(films) > 1 and len(set(held)) == 1 and len(films[held[0]]) == len(held)
+    out = f"{held[0]} is" if whole else f"{len(held)} of {len(shots)} images are"
+    times = len({frame.time for frame in capture.frames})
+    return f"{layout}, {cameras}, {times} times from {time_source}; {out} held out"
 
 
 def _reader(folder: Path) -> Reader:
@@ -177,8 +151,11 @@ def _reader(folder: Path) -> Reader:
     raise InputError(f"{folder} is no scene in a known format: expected {expected}{inside}.")
 
 
-def _times(folder: Path, capture: Capture, warnings: list[str]) -> tuple[list[ImageName], list[float], str]:
-    """Return names, times in [0, 1] and the source of the times. Appends warnings about own footage."""
+def _timed(folder: Path, capture: Capture, warnings: list[str]) -> tuple[list[Frame], str]:
+    """Give the frames their times in [0, 1] and, by the rule for own footage, splits where the files state none.
+
+    Returns them, and the source of the times. Appends warnings about own footage. Raises InputError.
+    """
     names = [frame.name for frame in capture.frames]
     times, source = [frame.time for frame in capture.frames if frame.time is not None], capture.time_source
     if not times:
@@ -187,18 +164,34 @@ def _times(folder: Path, capture: Capture, warnings: list[str]) -> tuple[list[Im
         names = as_one_camera(names, times, [frame.place for frame in capture.frames])
         warnings += disorder(names, times, numbered=source.startswith("the frame numbers"))
         times = in_step(names, times)
-    return names, to_unit_range(times, *(capture.time_range or (min(times), max(times)))), source
-
-
-def _splits(folder: Path, frames: Sequence[Frame], times: Sequence[float]) -> list[Split]:
-    """Return the split of each frame, as the files state it, or by the rule for own footage. Raises InputError."""
-    splits: list[Split] = [frame.split for frame in frames if frame.split is not None]
+    times = to_unit_range(times, *(capture.time_range or (min(times), max(times))))
+    splits: list[Split] = [frame.split for frame in capture.frames if frame.split is not None]
     if not splits:
-        tested = held_out([frame.name for frame in frames], times)
-        splits = ["test" if i in tested else "train" for i in range(len(frames))]
+        tested = held_out(names, times)
+        splits = ["test" if i in tested else "train" for i in range(len(names))]
     if "train" not in splits:
-        raise InputError(f"{folder}: all {len(frames)} images are held out; name fewer in its lists of test images.")
-    return splits
+        raise InputError(f"{folder}: all {len(names)} images are held out; name fewer in its lists of test images.")
+    found = zip(capture.frames, names, times, splits, strict=True)
+    return [dataclasses.replace(f, name=name, time=time, split=split) for f, name, time, split in found], source
+
+
+def _masked(folder: Path, frames: Sequence[Frame]) -> list[Frame]:
+    """Give training frames the masks in the user's folder, in place of those that the capture names."""
+    names = [frame.name.file for frame in frames if frame.split == "train"]
+    masks = find_masks(folder, names, "each training image, named as the image")
+    return [
+        dataclasses.replace(frame, mask=masks[frame.name.file], mask_kind="white") if frame.split == "train" else frame
+        for frame in frames
+    ]
+
+
+def _check_masks(frames: Sequence[Frame]) -> list[str]:
+    warnings = []
+    for kind in get_args(MaskKind):
+        of_kind = [frame for frame in frames if frame.mask_kind == kind and frame.split == MASKED[kind]]
+        masks = {frame.name.file: frame.mask for frame in of_kind if frame.mask is not None}
+        warnings += check_masks(masks, frames[0].image.size, kind)
+    return warnings
 
 
 class _Shot(NamedTuple):
@@ -222,9 +215,25 @@ class _Shot(NamedTuple):
             return image.read(self.size)
         return shrink(self.undistortion.apply(image.read(image.size)), self.size)
 
-    def mask(self, file: Path, kind: MaskKind) -> Mask:
-        """Decode, undistort and shrink a mask. Raises InputError."""
-        return read_mask(file, kind, self.undistortion, self.frame.image.size, self.size)
+    def mask(self) -> Mask:
+        """Decode, undistort and shrink the mask. Raises InputError."""
+        assert self.frame.mask is not None
+        return read_mask(self.frame.mask, self.frame.mask_kind, self.undistortion, self.frame.image.size, self.size)
+
+    def view(self, number: int, camera: Camera) -> View:
+        """Make the view. number: within its split, for its name. camera: in the world's coordinates."""
+        frame = self.frame
+        assert frame.time is not None
+        mask = self.mask if frame.mask is not None and frame.split == MASKED[frame.mask_kind] else None
+        return View(
+            name=f"{frame.split}_{frame.label or f'{number:05d}'}",
+            camera=camera,
+            time=frame.time,
+            source=str(frame.image),
+            pixels=self.pixels,
+            mask=mask if frame.split == "test" else None,
+            ignored=mask if frame.split == "train" else None,
+        )
 
 
 def _undistort(capture: Capture, size: Size) -> list[_Shot]:
@@ -250,21 +259,11 @@ def _undistort(capture: Capture, size: Size) -> list[_Shot]:
     return shots
 
 
-def _film_order(frames: Sequence[Frame], times: Sequence[float], warnings: list[str]) -> list[int]:
-    """Return the frames by camera, then time. Appends warnings about blurred and repeated images of each camera."""
-    order = []
-    for mine in by_camera([frame.name for frame in frames]).values():
-        film = sorted(mine, key=lambda i: (times[i], natural_key(frames[i].name.file)))
-        warnings += check_film([Path(str(frames[i].image)) for i in film])
-        order += film
-    return order
-
-
-def _ignored(
-    folder: str | Path | None, frames: Sequence[Frame], splits: Sequence[Split]
-) -> tuple[dict[str, Path], MaskKind]:
-    """Find the masks of training images, by the images' names: the user's, or else those that the capture names."""
-    if folder is None:
-        return {frame.name.file: frame.black for frame in frames if frame.black is not None}, "black"
-    names = [frame.name.file for frame, split in zip(frames, splits, strict=True) if split == "train"]
-    return find_masks(Path(folder), names, "each training image, named as the image"), "white"
+def _by_film(shots: Sequence[_Shot], warnings: list[str]) -> list[_Shot]:
+    """Return the shots by camera, then time. Appends warnings about blurred and repeated images of each camera."""
+    ordered = []
+    for mine in by_camera([shot.frame.name for shot in shots]).values():
+        film = sorted((shots[i] for i in mine), key=lambda shot: (shot.frame.time, natural_key(shot.frame.name.file)))
+        warnings += check_film([Path(str(shot.frame.image)) for shot in film])
+        ordered += film
+    return ordered

@@ -22,6 +22,7 @@ from lapgs_wgpu.errors import InputError
 
 Mask = NDArray[np.bool_]
 MaskKind = Literal["white", "black", "measured"]  # white or black pixels are ignored in training; white ones measured
+MASKED = {"white": "train", "black": "train", "measured": "test"}  # the split whose masks are of this kind
 
 WHITE = 128  # level from which on a pixel is set
 MEASURED = 255  # level of a pixel that the masked metrics measure: what mixes with others does not count
@@ -35,26 +36,48 @@ def check_mask_folder(folder: Path, what: str) -> None:
 
 
 def find_masks(folder: Path, names: Iterable[str], what: str) -> dict[str, Path]:
-    """Find the masks of images by their names: NAME.png or NAME.jpg.png (COLMAP's way) below a folder.
+    """Find the masks of all images by their names: NAME.png or NAME.jpg.png (COLMAP's way) below a folder.
 
-    Names may differ from the files' as images' may (`CaptureFiles.find`). what: the images and how masks are named, for
-    errors. Raises InputError: no such folder, or a mask is missing.
+    what: the images and how masks are named, for errors. Raises InputError: no such folder, or a mask is missing.
     """
     check_mask_folder(folder, what)
-    files = CaptureFiles(folder)
-    masks, missing = {}, []
-    for name in names:
-        found = files.find(str(PurePosixPath(name).with_suffix(".png"))) or files.find(f"{name}.png")
-        if found is None:
-            missing.append(name)
-        else:
-            masks[name] = folder / found
+    masks, missing = _found(folder, names)
     if missing:
         raise InputError(
             f"{folder} lacks {len(missing)} of {len(missing) + len(masks)} masks, such as that of {missing[0]}; add a "
             f"PNG for {what}."
         )
     return masks
+
+
+def find_covisible(folders: Sequence[Path], names: Sequence[str]) -> dict[str, Path]:
+    """Find the masks of all these test images in the first folder that holds any; {} if none does.
+
+    Raises InputError if a folder holds only some of them.
+    """
+    for folder in folders:
+        masks, missing = _found(folder, names)
+        if masks and missing:
+            raise InputError(
+                f"{folder / missing[0]}.png does not exist, but {len(masks)} of {len(names)} test images have a mask "
+                f"there; add it, or remove {folder}."
+            )
+        if masks:
+            return masks
+    return {}
+
+
+def _found(folder: Path, names: Iterable[str]) -> tuple[dict[str, Path], list[str]]:
+    """The masks below a folder by image, and the images without. Names may differ as in `CaptureFiles.find`."""
+    files = CaptureFiles(folder)
+    masks, missing = dict[str, Path](), list[str]()
+    for name in names:
+        found = files.find(f"{name}.png") or files.find(str(PurePosixPath(name).with_suffix(".png")))
+        if found is None:
+            missing.append(name)
+        else:
+            masks[name] = folder / found
+    return masks, missing
 
 
 def check_mask_size(path: Path, size: Size) -> None:
@@ -126,22 +149,3 @@ def _levels(mask: Pixels) -> NDArray[np.uint8]:
 def as_pixels(mask: Mask) -> Pixels:
     """(H, W, 3) white where a mask (H, W) is set, black elsewhere."""
     return np.repeat(np.where(mask, 255, 0).astype(np.uint8)[..., None], 3, axis=2)
-
-
-def find_covisible(folders: Sequence[Path], names: Sequence[str]) -> dict[str, Path]:
-    """Find the masks NAME.png of all these test images in the first folder that holds any; {} if none does.
-
-    Raises InputError if a folder holds only some of them.
-    """
-    for folder in folders:
-        files = CaptureFiles(folder)
-        found = {name: file for name in names if (file := files.find(f"{name}.png"))}
-        if found and len(found) < len(names):
-            missing = next(name for name in names if name not in found)
-            raise InputError(
-                f"{folder / missing}.png does not exist, but {len(found)} of {len(names)} test images have a mask "
-                f"there; add it, or remove {folder}."
-            )
-        if found:
-            return {name: folder / file for name, file in found.items()}
-    return {}

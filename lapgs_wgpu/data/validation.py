@@ -18,7 +18,7 @@ from lapgs_wgpu.data.cloud import Cloud, in_view, views_of
 from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.data.focus import spread
 from lapgs_wgpu.data.frames import Frame
-from lapgs_wgpu.data.images import ImageFile, decode, gray_thumbnail, size_text
+from lapgs_wgpu.data.images import ImageFile, Size, decode, gray_thumbnail, size_text
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.placement import near_focus
 from lapgs_wgpu.data.poses import AXES_HINT
@@ -88,7 +88,7 @@ def _off_center(lens: Lens) -> bool:
     return max(abs(lens.cx / lens.width - 0.5), abs(lens.cy / lens.height - 0.5)) > OFF_CENTER
 
 
-def _fits(size: tuple[int, int], lens: Lens) -> bool:
+def _fits(size: Size, lens: Lens) -> bool:
     """Whether an image of (width, height) has the proportions that a lens states."""
     # Whoever shrank the images may have rounded each side up or down.
     return abs(size[0] * lens.height / lens.width - size[1]) <= 1.5
@@ -106,29 +106,24 @@ def check_frames(frames: Sequence[Frame]) -> None:
             )
         if frame.lens not in checked:
             checked.add(frame.lens)
-            check_focal(frame.lens, frame.where)
-            check_proportions(first.size, frame.lens, str(frame.image), frame.where)
+            _check_lens(frame.lens, first.size, str(frame.image), frame.where)
 
 
-def check_focal(lens: Lens, where: str) -> None:
-    """Check that both focal lengths are plausible. Raises InputError, whose message begins with `where`."""
-    longer = max(lens.width, lens.height)
+def _check_lens(lens: Lens, size: Size, image: str, where: str) -> None:
+    """Check that focal lengths are plausible, and that an image of (width, height) has the lens's proportions."""
+    stated, longer = f"{lens.width}x{lens.height}", max(lens.width, lens.height)
     for focal in (lens.fx, lens.fy):
         if not MIN_FOCAL * longer <= focal <= MAX_FOCAL * longer:
             raise InputError(
-                f"{where}: a focal length of {focal:.4g} pixels does not fit images of {lens.width}x{lens.height}; it "
-                f"must be {MIN_FOCAL:g} to {MAX_FOCAL:g} times the longer side, in pixels of that size."
+                f"{where}: a focal length of {focal:.4g} pixels does not fit images of {stated}; it must be "
+                f"{MIN_FOCAL:g} to {MAX_FOCAL:g} times the longer side, in pixels of that size."
             )
-
-
-def check_proportions(stored: tuple[int, int], lens: Lens, image: str, where: str) -> None:
-    """Check that an image of (width, height) `stored` has the proportions that a lens states. Raises InputError."""
-    if not _fits(stored, lens):
-        sideways = _fits(stored[::-1], lens)
+    if not _fits(size, lens):
+        sideways = _fits(size[::-1], lens)
         advice = "turn it, or give the camera of the turned image" if sideways else "give the camera of this image"
         raise InputError(
-            f"{image} is {size_text(stored)} pixels, but {where} states {lens.width}x{lens.height}, which has other "
-            f"proportions{', those of the image on its side' if sideways else ''}; {advice}."
+            f"{image} is {size_text(size)} pixels, but {where} states {stated}, which has other proportions"
+            f"{', those of the image on its side' if sideways else ''}; {advice}."
         )
 
 

@@ -121,7 +121,7 @@ def _read_nerfstudio(folder: Path, image_size: int | None) -> Capture:
     read = _read_frames(data, files, time)
     warnings = files.left_out(len(entries), path)
     frames = [
-        dataclasses.replace(frame, black=files.optional(entry, "mask_path"))
+        dataclasses.replace(frame, mask=files.optional(entry, "mask_path"), mask_kind="black")
         for frame, entry in zip(read, entries, strict=True)
         if frame is not None
     ]
