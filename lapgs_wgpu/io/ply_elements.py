@@ -73,7 +73,7 @@ class PlyFile(NamedTuple):
 
     def columns(self, element: Element, names: list[str], dtype: type = np.float32) -> NDArray[Any]:
         """(N, len(names)): the named properties of all rows of an element. Raises InputError."""
-        values = np.empty((element.count, len(names)), dtype)
+        values: NDArray[Any] = np.empty((element.count, len(names)), dtype)
         read = self._text_rows if self.encoding == "ascii" else self._binary_rows
         with np.errstate(all="ignore"):  # a double beyond float32 becomes infinite, which callers report
             for start, rows in read(element, names):
@@ -101,17 +101,17 @@ class PlyFile(NamedTuple):
                 f"{self.path}: declares {element.count} rows of {element.name}, but {len(lines)} lines follow; it is "
                 "truncated."
             )
-        layout = np.dtype([(name, np.float64) for name in element.properties])
-        table = np.empty((element.count, len(layout)))
+        width = len(element.properties)
+        table = np.empty((element.count, width))
         for number, line in enumerate(lines):
             try:
-                table[number] = np.array(line.split(), np.float64).reshape(len(layout))
+                table[number] = np.array(line.split(), np.float64).reshape(width)
             except ValueError:
                 raise InputError(
-                    f"{self.path}: row {number} of {element.name}, {line[:80]!r}, does not hold {len(layout)} numbers; "
+                    f"{self.path}: row {number} of {element.name}, {line[:80]!r}, does not hold {width} numbers; "
                     "the file is damaged."
                 ) from None
-        yield 0, table.view(layout)[:, 0]
+        yield 0, table.view(np.dtype([(name, np.float64) for name in element.properties]))[:, 0]
 
 
 @contextmanager
