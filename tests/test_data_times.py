@@ -53,6 +53,8 @@ NAMES = {
     "other blanks": ("My film/frame {:04d}.png", "My film/frame  {:04d}.png"),
     "Unicode form": (unicodedata.normalize("NFD", "é/{:04d}.png"), unicodedata.normalize("NFC", "é/{:04d}.png")),
     "letter case": ("CAM/{:04d}.jpg", "cam/{:04d}.JPG"),
+    "absolute": ("C:\\walk\\Images\\{:04d}.png", "{:04d}.png"),
+    "the folder's own name": ("images/{:04d}.png", "{:04d}.png"),
     "type": ("{:04d}.jpg", "{:04d}.jpeg"),
 }
 

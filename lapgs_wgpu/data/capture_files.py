@@ -30,20 +30,25 @@ class CaptureFiles:
         """Return the path of an existing file relative to the folder, with slashes; None if there is none.
 
         The name may differ from the file's in slashes, number of blanks, Unicode form, letter case, .jpeg for .jpg, and
-        images_4 for images, or begin with the folder's. The file whose name is the same goes before others.
+        images_4 for images, and may be absolute or begin with the folder's own. The file whose name is the same goes
+        before others.
         """
-        if os.path.isfile(self.folder / name):  # Path.is_file raises for names that are too long
-            return PurePosixPath(name).as_posix()
+        path = os.path.relpath(self.folder / name, self.folder)
+        if os.path.isfile(self.folder / name) and not path.startswith(".."):  # Path.is_file raises for long names
+            return path.replace(os.sep, "/")
+        parts = [part for part in name.replace("\\", "/").split("/") if part not in ("", ".")]
+        if ".." in parts:
+            return None
+        own = [i for i, part in enumerate(parts[:-1], start=1) if _folded(part) == _folded(self.folder.name)]
+        return self._walk(parts) or (self._walk(parts[own[-1] :]) if own else None)
+
+    def _walk(self, parts: list[str]) -> str | None:
         at = self.folder
-        for part in name.replace("\\", "/").split("/"):
-            if part in ("", "."):
-                continue
+        for part in parts:
             entries = self._folded_entries(at)
             found = part if os.path.exists(at / part) else entries.get(_folded(part))
             if found is None and (images := _SMALLER.sub(r"\1", _folded(part))) == "images":
                 found = next((entries[key] for key in sorted(entries) if _SMALLER.sub(r"\1", key) == images), None)
-            if found is None and at == self.folder and _folded(part) == _folded(at.name):
-                found = "."  # the name begins with the folder's own
             if found is None:
                 return None
             at = at / found
