@@ -62,9 +62,15 @@ class View:
 
     def load_mask(self) -> NDArray[np.bool_] | None:
         """Decode the mask: (H, W) bool, at least one pixel set; None without a mask. Raises InputError."""
-        mask = None if self.mask is None else self.mask()
-        if mask is not None and not mask.any():
-            raise InputError(f"{self.source}: its mask leaves nothing to measure; make it again, or remove it.")
+        if self.mask is None:
+            return None
+        mask = self.mask()
+        size = (self.camera.height, self.camera.width)
+        if mask.dtype != np.bool_ or mask.shape != size or not mask.any():
+            raise InputError(
+                f"{self.source}: expected a mask of {size[1]}x{size[0]} pixels, at least one of them set, got an array "
+                f"of {mask.shape} {mask.dtype} with {np.count_nonzero(mask)} set; make the mask again, or remove it."
+            )
         return mask
 
     def load_ignored(self) -> NDArray[np.bool_] | None:
