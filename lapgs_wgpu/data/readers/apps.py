@@ -136,11 +136,6 @@ def _read_polycam(folder: Path, image_size: int | None) -> Capture:
 
 
 READERS = (
-    Reader(
-        "Record3D", "metadata.json beside rgb/0.jpg", lambda folder: _record3d_layout(folder) is not None,
-        _read_record3d,
-    ),
-    Reader(
-        "Polycam", "keyframes/cameras/*.json", lambda folder: _subfolder(folder, "cameras").is_dir(), _read_polycam
-    ),
-)  # fmt: skip
+    Reader("Record3D", "metadata.json beside rgb/0.jpg", lambda f: _record3d_layout(f) is not None, _read_record3d),
+    Reader("Polycam", "keyframes/cameras/*.json", lambda f: _subfolder(f, "cameras").is_dir(), _read_polycam),
+)

@@ -172,11 +172,5 @@ def _names(data: Fields, field: str) -> list[str]:
     return names
 
 
-READERS = (
-    Reader(
-        "HyperNeRF",
-        "dataset.json beside camera/ and rgb/",
-        lambda folder: (folder / "dataset.json").is_file(),
-        _read,
-    ),
-)
+FILES = "dataset.json beside camera/ and rgb/"
+READERS = (Reader("HyperNeRF", FILES, lambda folder: (folder / "dataset.json").is_file(), _read),)
