@@ -60,6 +60,28 @@ def app_by_the_clock(file: Path, device: Device, monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.mark.triangles
+def test_antialiased_is_switched_and_kept_for_other_files(
+    tmp_path: Path, device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By a key, and as the options asked for files that are opened later; so is the axis that points up."""
+    trained(device, GRID4D, 50).save(tmp_path / "a.ply")
+    canvas, app, now = app_by_the_clock(tmp_path / "a.ply", device, monkeypatch)
+    pictures = []
+    for antialiased in (False, True):
+        assert app.state.antialiased == antialiased
+        canvas.draw()
+        now[0] += 1
+        canvas.draw()
+        pictures.append(planes(app.viewport.frame))
+        app.controls._on_key_down({"key": "X", "modifiers": []})
+    assert np.abs(pictures[0] - pictures[1]).max() > 0
+    app.state.scene = app.state.scene._replace(up="x", antialiased=True)
+    app.open(tmp_path / "a.ply")
+    assert app.state.scene.initial_view.up.tolist() == [1, 0, 0]
+    assert app.state.antialiased
+
+
+@pytest.mark.triangles
 def test_the_window_rests_in_full(device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     trained(device, GRID4D, 100).save(tmp_path / "scene.ply")
     canvas, app, now = app_by_the_clock(tmp_path / "scene.ply", device, monkeypatch)

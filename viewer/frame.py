@@ -23,12 +23,13 @@ _TIMES = 9  # of the clip, at which the Gaussians' places are compared
 
 
 class FrameRequest(NamedTuple):
-    """What to draw: equal requests give equal frames."""
+    """What to draw: equal requests give equal frames. antialiased: None for as the scene says."""
 
     camera: Camera
     time: float
     mode: Mode
     background: tuple[float, float, float]
+    antialiased: bool | None = None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -78,6 +79,8 @@ class FrameRenderer:
         # Before the Gaussians: measuring may take them to other times.
         value = self._value(mode) if mode in ("motion", "dynamics") else None
         gaussians = self.playback.at(request.time)
+        if request.antialiased is not None:
+            gaussians = dataclasses.replace(gaussians, antialiased=request.antialiased)
         if value is not None:
             colors, high = value
             gaussians = dataclasses.replace(gaussians, sh=colors)

@@ -28,6 +28,7 @@ KEYS = (
     KeyBinding("l", "L", "next_loop", "at the end: loop, bounce or stop"),
     KeyBinding("m", "M", "next_mode", "what is shown: colors, depth, coverage, motion, dynamics"),
     KeyBinding("b", "B", "next_background", "background: black, white or grey"),
+    KeyBinding("x", "X", "antialiased", "antialiased or not (Mip-Splatting's filter)"),
     KeyBinding("f", "F", "focus", "turn about what lies under the pointer (a double click does the same)"),
     KeyBinding("r", "R", "reset_camera", "camera back to where it started"),
     KeyBinding("v", "V", "flying", "fly: W A S D move, Q E down and up, Shift fast, Alt slow"),

@@ -98,6 +98,8 @@ class Panels:
             _legend(frame.image.low, frame.image.high)
         state.background = choice("ground", state.background, list(BACKGROUNDS.values()), list(BACKGROUNDS))
         tip("background")
+        _, state.antialiased = imgui.checkbox("antialiased", state.antialiased)
+        tip("Mip-Splatting's filter, as antialiased trainings draw (X)")
         if button("Reset"):
             state.reset_camera()
         tip("camera back to where it started (R)")

@@ -61,7 +61,8 @@ class Viewport:
         nothing has changed for SETTLED seconds. now: seconds of `time.perf_counter`."""
         state, (width, height) = self.state, self.canvas.get_physical_size()
         full = state.camera.camera(max(1, width), max(1, height))
-        key = (*_camera_key(full), state.clock.time, state.mode, state.background)
+        shown = state.clock.time, state.mode, state.background, state.antialiased
+        key = (*_camera_key(full), *shown)
         moving = bool(self._drawn) and key != self._drawn  # not the first frame
         if key != self._drawn:
             self.moved_at = now
@@ -73,7 +74,7 @@ class Viewport:
         camera = full
         if self.scale < 1:
             camera = full.resized(max(1, round(self.scale * full.width)), max(1, round(self.scale * full.height)))
-        self.frame = state.renderer.draw(FrameRequest(camera, state.clock.time, state.mode, state.background))
+        self.frame = state.renderer.draw(FrameRequest(camera, *shown))
         self._drawn, self.stale = key, False
         self._times.append(time.perf_counter())
         if moving:
