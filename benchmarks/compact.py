@@ -23,7 +23,7 @@ from lapgs_wgpu.viewer.view_state import ViewState
 def mean_psnr(path: Path, run: Path) -> float:
     """PSNR of the scene in a file on the test views of a run's capture, dB."""
     scene = load_scene(path, open_device)
-    capture = ViewState(load_scene(run / "checkpoint.ply", open_device)).capture
+    capture = ViewState(load_scene(run / "checkpoint.ply", open_device)).ground_truth
     if capture is None:
         raise SystemExit(f"{run}: its capture is not here")
     draw = OffscreenRenderer(scene)

@@ -17,7 +17,6 @@ if typing.TYPE_CHECKING:
     from lapgs_wgpu.data import Dataset
     from lapgs_wgpu.run import Watch
     from lapgs_wgpu.train.config import Config
-    from lapgs_wgpu.train.distributed import Ranks
     from lapgs_wgpu.train.lpips import Lpips
 
 EVAL_KEYS = ("data.path", "data.background", "data.cache_gb")  # keys that can be given with --eval
@@ -36,7 +35,6 @@ def _train(arguments: list[str]) -> None:
     options = parse_options(arguments)
     from lapgs_wgpu.gpu.device import open_device  # what follows needs torch, which takes seconds to import
     from lapgs_wgpu.run import train
-    from lapgs_wgpu.train.distributed import join_ranks
     from lapgs_wgpu.train.run_folder import check_run_folder, result_text
 
     overrides = {key: options[key] for key in config_keys() if key in options}
@@ -44,16 +42,14 @@ def _train(arguments: list[str]) -> None:
         _evaluate(Path(options["eval"]), options, overrides)
         return
     lpips = _lpips(options)
-    ranks = join_ranks()
     watch = None
     if options["view"]:
         from lapgs_wgpu.viewer import live
 
-        if ranks.first:
-            live.check_window()  # before anything is written or replaced
+        live.check_window()  # before anything is written or replaced
         watch = live.watch
     if options["resume"]:
-        _resume(Path(options["resume"]), options, overrides, watch, ranks, lpips)
+        _resume(Path(options["resume"]), options, overrides, watch, lpips)
         return
     if options["preset"] is None:
         raise InputError("name a preset, such as tiny, and the data to train on; lapgs-train --help says more.")
@@ -62,13 +58,11 @@ def _train(arguments: list[str]) -> None:
     scene = Path(config.data.path).resolve().name or "scene"
     out = Path(options["out"] or f"runs/{scene}-{Path(options['preset']).stem}")
     overwrite = options["overwrite"]
-    if ranks.first:
-        check_run_folder(out, overwrite=overwrite)
-    device = open_device(options["device"], number=ranks.local_rank)
-    config, dataset = _open_data(config, out.parent, ranks)
-    train(config, dataset, out, device=device, overwrite=overwrite, watch=watch, ranks=ranks, lpips=lpips)
-    if ranks.first:
-        say(result_text(out))
+    check_run_folder(out, overwrite=overwrite)
+    device = open_device(options["device"])
+    config, dataset = _open_data(config, out.parent)
+    train(config, dataset, out, device=device, overwrite=overwrite, watch=watch, lpips=lpips)
+    say(result_text(out))
 
 
 def _resume(
@@ -76,7 +70,6 @@ def _resume(
     options: dict[str, typing.Any],
     overrides: dict[str, typing.Any],
     watch: Watch | None,
-    ranks: Ranks,
     lpips: Lpips | None,
 ) -> None:
     from lapgs_wgpu.gpu.device import open_device
@@ -85,15 +78,14 @@ def _resume(
 
     _check_alone("resume", options, [key for key in overrides if key not in RESUME_KEYS], allowed=("view",))
     config = _config_of(run, overrides, "--resume needs the folder of a run")
-    device = open_device(options["device"], number=ranks.local_rank)
-    config, dataset = _open_data(config, run.parent, ranks)
+    device = open_device(options["device"])
+    config, dataset = _open_data(config, run.parent)
     if "data.path" in overrides:
         check_same_data(run, config.data.path, dataset)
-    for what, before, now in changes_since(run, config, device, dataset) if ranks.first else ():
+    for what, before, now in changes_since(run, config, device, dataset):
         print(f"lapgs-train: {what} was {before} when {run} began and is {now}: bits may differ.", file=sys.stderr)
-    resume(config, dataset, run, device=device, watch=watch, ranks=ranks, lpips=lpips)
-    if ranks.first:
-        say(result_text(run))
+    resume(config, dataset, run, device=device, watch=watch, lpips=lpips)
+    say(result_text(run))
 
 
 def _evaluate(run: Path, options: dict[str, typing.Any], overrides: dict[str, typing.Any]) -> None:
@@ -101,7 +93,6 @@ def _evaluate(run: Path, options: dict[str, typing.Any], overrides: dict[str, ty
     from lapgs_wgpu.io.safe_json_toml import read_json
     from lapgs_wgpu.motion.scene import load
     from lapgs_wgpu.run import evaluate_run
-    from lapgs_wgpu.train.distributed import SINGLE_PROCESS
     from lapgs_wgpu.train.run_folder import check_same_data, result_text
 
     _check_alone("eval", options, [key for key in overrides if key not in EVAL_KEYS])
@@ -112,7 +103,7 @@ def _evaluate(run: Path, options: dict[str, typing.Any], overrides: dict[str, ty
     config = _config_of(run, overrides, "--eval needs the folder of a finished run")
     device = open_device(options["device"])
     scene = load(run / "checkpoint.ply", device)
-    config, dataset = _open_data(config, run.parent, SINGLE_PROCESS, normalize="placement" in scene.metadata)
+    config, dataset = _open_data(config, run.parent, normalize="placement" in scene.metadata)
     if "data.path" in overrides:
         check_same_data(run, config.data.path, dataset)
     try:
@@ -158,18 +149,14 @@ def _config_of(run: Path, overrides: dict[str, typing.Any], advice: str) -> Conf
     return config
 
 
-def _open_data(config: Config, parent: Path, ranks: Ranks, *, normalize: bool = True) -> tuple[Config, Dataset]:
-    """The dataset, and the configuration with its folder. parent: folder for the built-in scene, which the
-    first of several processes writes. normalize: of `load_dataset`."""
+def _open_data(config: Config, parent: Path, *, normalize: bool = True) -> tuple[Config, Dataset]:
+    """The dataset, and the configuration with its folder. parent: folder for the built-in scene. normalize: of
+    `load_dataset`."""
     from lapgs_wgpu.train.open_dataset import open_dataset, resolve_data
 
-    if not ranks.first:
-        ranks.barrier()  # waits for the first process, which writes the scene
     config = resolve_data(config, parent)
-    if ranks.first:
-        ranks.barrier()
     return config, open_dataset(config, normalize=normalize)
 
 
-if __name__ == "__main__":  # lapgs-table starts its runs this way
+if __name__ == "__main__":
     sys.exit(train_command())

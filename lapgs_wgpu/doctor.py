@@ -1,32 +1,29 @@
-"""The self-test of lapgs-doctor: kernels of a training against closed forms.
+"""The self-test of lapgs-doctor: a known image and its gradient, against float64.
 
-lapgs-doctor runs this module in a process of its own (`python -m lapgs_wgpu.doctor [DEVICE]`), since a driver may crash
-or hang. It prints a Markdown line a check.
+It prints a Markdown line a check, whose name comes before it runs: a driver may crash or hang.
 """
 
 from __future__ import annotations
 
-import sys
+import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from torch import Tensor
 
-from lapgs_wgpu.command import guarded
 from lapgs_wgpu.gpu.device import Device, open_device
 from lapgs_wgpu.gpu.probe_subgroup import subgroup_size
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.constants import CONSTANTS
 from lapgs_wgpu.splat.rasterize import Rendering, rasterize, rasterizer_of
+from lapgs_wgpu.splat.rotation import rotation_matrices
 
 COUNT = 40  # Gaussians
 FOCAL, WIDTH, HEIGHT = 64.0, 70, 50  # pixels
-BACKGROUND = np.array([0.2, 0.1, 0.6])
-
-Floats = NDArray[np.float64]
+BACKGROUND = torch.tensor([0.2, 0.1, 0.6], dtype=torch.float64)
 
 
 class Check(NamedTuple):
@@ -37,119 +34,87 @@ class Check(NamedTuple):
     allowed: float
 
 
-class StackedGaussians:
-    """Axis-aligned Gaussians on the optical axis, in no order of depth.
+def stacked_gaussians() -> dict[str, Tensor]:
+    """Arguments of `rasterize` by name, float64: Gaussians on the optical axis, in no order of depth."""
+    rng = np.random.default_rng(0)
+    depths = rng.permutation(np.linspace(3.0, 6.0, COUNT))
+    arrays = {
+        "means": np.stack([np.zeros(COUNT), np.zeros(COUNT), depths], axis=1),
+        "quats": np.tile([1.0, 0.0, 0.0, 0.0], (COUNT, 1)),
+        "scales": rng.uniform(0.1, 0.5, (COUNT, 3)),
+        "opacities": rng.uniform(0.05, 0.2, COUNT),  # so low that no pixel is finished before the last Gaussian
+        "colors": rng.uniform(0, 1, (COUNT, 3)),
+    }
+    return {name: torch.tensor(array, requires_grad=True) for name, array in arrays.items()}
 
-    Their projections are axis-aligned ellipses around the middle of the image, so image and gradients have closed
-    forms, and only a correct sort puts them in order. N Gaussians, images (H, W).
-    """
 
-    def __init__(self) -> None:
-        rng = np.random.default_rng(0)
-        self.depths = rng.permutation(np.linspace(3.0, 6.0, COUNT))
-        self.scales = rng.uniform(0.1, 0.5, (COUNT, 3))
-        self.opacities = rng.uniform(0.05, 0.2, COUNT)  # so low that no pixel is finished before the last Gaussian
-        self.colors = rng.uniform(0, 1, (COUNT, 3))
+def pixel_alphas(gaussians: Mapping[str, Tensor]) -> Tensor:
+    """(N, H, W) opacity of each Gaussian at each pixel. Exact to first order in the distance from the axis, which is
+    enough for gradients on it."""
+    means, magnification = gaussians["means"], FOCAL / gaussians["means"][:, 2]
+    axes = rotation_matrices(gaussians["quats"])[:, :2] * (magnification[:, None] * gaussians["scales"])[:, None]
+    inverse = torch.linalg.inv(axes @ axes.mT + CONSTANTS["DILATION"] * torch.eye(2, dtype=torch.float64))
+    x = torch.arange(WIDTH) + 0.5 - WIDTH / 2 - (magnification * means[:, 0])[:, None, None]
+    y = torch.arange(HEIGHT)[:, None] + 0.5 - HEIGHT / 2 - (magnification * means[:, 1])[:, None, None]
+    a, b, c = (inverse[:, i, j, None, None] for i, j in ((0, 0), (0, 1), (1, 1)))
+    return gaussians["opacities"][:, None, None] * torch.exp(-0.5 * (a * x**2 + 2 * b * x * y + c * y**2))
 
-        self.x = np.arange(WIDTH)[None] + 0.5 - WIDTH / 2
-        self.y = np.arange(HEIGHT)[:, None] + 0.5 - HEIGHT / 2
-        self.magnification = FOCAL / self.depths
-        self.variances = (self.magnification[:, None] * self.scales[:, :2]) ** 2 + CONSTANTS["DILATION"]  # (N, 2), px^2
-        xx, yy = self.variances.T[:, :, None, None]
-        alphas = self.opacities[:, None, None] * np.exp(-0.5 * (self.x**2 / xx + self.y**2 / yy))
-        self.alphas = np.where(alphas >= CONSTANTS["ALPHA_MIN"], alphas, 0.0)  # (N, H, W)
 
-        self.behind = np.zeros((COUNT, HEIGHT, WIDTH, 3))  # colors behind each Gaussian
-        self.image = np.broadcast_to(BACKGROUND, (HEIGHT, WIDTH, 3))
-        for i in np.argsort(-self.depths):
-            self.behind[i] = self.image
-            alpha = self.alphas[i, ..., None]
-            self.image = alpha * self.colors[i] + (1 - alpha) * self.image
-        self.transmittance = np.zeros_like(self.alphas)  # of all that is in front of each Gaussian
-        left = np.ones((HEIGHT, WIDTH))
-        for i in np.argsort(self.depths):
-            self.transmittance[i] = left
-            left = left * (1 - self.alphas[i])
-        self.depth = np.einsum("nhw,n->hw", self.transmittance * self.alphas, self.depths)
+def known_image(gaussians: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+    """Colors (H, W, 3) and depths (H, W) of stacked Gaussians, differentiable: only a correct sort gives the same."""
+    depths, alphas = gaussians["means"][:, 2], pixel_alphas(gaussians)
+    alphas = torch.where(alphas >= CONSTANTS["ALPHA_MIN"], alphas, 0.0)
+    image, depth = torch.zeros(HEIGHT, WIDTH, 3, dtype=torch.float64), torch.zeros(HEIGHT, WIDTH, dtype=torch.float64)
+    transmittance = torch.ones(HEIGHT, WIDTH, dtype=torch.float64)
+    for i in depths.argsort():
+        weight = transmittance * alphas[i]
+        image, depth = image + weight[..., None] * gaussians["colors"][i], depth + weight * depths[i]
+        transmittance = transmittance - weight
+    return image + transmittance[..., None] * BACKGROUND, depth
 
-    def gradients(self, weights: Floats) -> dict[str, Floats]:
-        """Gradients of sum(weights * image), weights (H, W, 3), by the arguments of `rasterize`.
 
-        Of the quaternions (w, x, y, z), z alone: (N, 1).
-        """
-        xx, yy = self.variances.T
-        sx, sy, _ = self.scales.T
-        m2 = self.magnification**2
-        color_change = np.einsum("nhwc,hwc->nhw", self.colors[:, None, None] - self.behind, weights)
-        by_exponent = color_change * self.transmittance * self.alphas  # (N, H, W)
-
-        def moment(plane: Floats) -> Floats:
-            return np.einsum("nhw,hw->n", by_exponent, plane)
-
-        by_xx = 0.5 * moment(np.broadcast_to(self.x**2, (HEIGHT, WIDTH))) / xx**2
-        by_yy = 0.5 * moment(np.broadcast_to(self.y**2, (HEIGHT, WIDTH))) / yy**2
-        by_xy = moment(self.x * self.y) / (xx * yy)
-        mean_x = self.magnification * moment(np.broadcast_to(self.x, (HEIGHT, WIDTH))) / xx
-        mean_y = self.magnification * moment(np.broadcast_to(self.y, (HEIGHT, WIDTH))) / yy
-        mean_z = -2 * m2 / self.depths * (by_xx * sx**2 + by_yy * sy**2)
-        return {
-            "means": np.stack([mean_x, mean_y, mean_z], axis=1),
-            "quats": (2 * m2 * (sx**2 - sy**2) * by_xy)[:, None],
-            "scales": 2 * m2[:, None] * np.stack([by_xx * sx, by_yy * sy, np.zeros(COUNT)], axis=1),
-            "opacities": by_exponent.sum(axis=(1, 2)) / self.opacities,
-            "colors": np.einsum("nhw,hwc->nc", self.transmittance * self.alphas, weights),
-        }
-
-    def draw(self, device: Device) -> tuple[dict[str, torch.Tensor], Rendering]:
-        """The arguments of `rasterize`, which require gradients, and what it returned."""
-        arguments = {
-            "means": np.stack([np.zeros(COUNT), np.zeros(COUNT), self.depths], axis=1),
-            "quats": np.tile([1.0, 0.0, 0.0, 0.0], (COUNT, 1)),
-            "scales": self.scales,
-            "opacities": self.opacities,
-            "colors": self.colors,
-        }
-        tensors = {name: torch.tensor(a, dtype=torch.float32, requires_grad=True) for name, a in arguments.items()}
-        K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
-        camera = Camera(K, np.eye(4), WIDTH, HEIGHT)
-        background = torch.tensor(BACKGROUND, dtype=torch.float32)
-        gaussians: dict[str, Any] = dict(tensors)  # arguments of rasterize by name
-        return tensors, rasterize(**gaussians, camera=camera, background=background, device=device)
+def draw(device: Device) -> tuple[dict[str, Tensor], Rendering]:
+    """The stacked Gaussians in float32, which require gradients, and their rendering."""
+    tensors = {name: value.detach().float().requires_grad_() for name, value in stacked_gaussians().items()}
+    K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+    gaussians: dict[str, Any] = dict(tensors)  # arguments of rasterize by name
+    camera = Camera(K, np.eye(4), WIDTH, HEIGHT)
+    return tensors, rasterize(**gaussians, camera=camera, background=BACKGROUND.float(), device=device)
 
 
 def image(device: Device) -> float:
-    """Colors and depths of stacked Gaussians. The error of depths is relative to the largest."""
-    gaussians = StackedGaussians()
-    _, rendering = gaussians.draw(device)
-    return max(relative_error(rendering.image, gaussians.image), relative_error(rendering.depth, gaussians.depth))
+    """The error of colors and depths, that of depths relative to the largest."""
+    expected, depth = known_image(stacked_gaussians())
+    _, rendering = draw(device)
+    return max(relative_error(rendering.image, expected), relative_error(rendering.depth, depth))
 
 
 def image_gradient(device: Device) -> float:
-    """The gradients of that image, each error relative to the largest gradient of its kind."""
-    gaussians = StackedGaussians()
-    weights = np.random.default_rng(0).standard_normal((HEIGHT, WIDTH, 3))
-    tensors, rendering = gaussians.draw(device)
-    (rendering.image * torch.tensor(weights, dtype=torch.float32)).sum().backward()
-    errors = []
-    for name, gradient in gaussians.gradients(weights).items():
-        computed = tensors[name].grad
-        assert computed is not None
-        errors.append(relative_error(computed[:, 3:] if name == "quats" else computed, gradient))
-    return max(errors)
+    """The error of the image's gradients, each relative to the largest of its kind."""
+    weights = torch.randn(HEIGHT, WIDTH, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    gaussians, (tensors, rendering) = stacked_gaussians(), draw(device)
+    (rendering.image * weights.float()).sum().backward()
+    (known_image(gaussians)[0] * weights).sum().backward()
+    return max(relative_error(_gradient(tensors[name]), _gradient(gaussians[name])) for name in gaussians)
 
 
-def relative_error(computed: torch.Tensor, expected: Floats) -> float:
+def _gradient(tensor: Tensor) -> Tensor:
+    assert tensor.grad is not None
+    return tensor.grad
+
+
+def relative_error(computed: Tensor, expected: Tensor) -> float:
     """The largest difference relative to the largest expected value; infinite where a computed value is not finite."""
-    error = float(np.abs(computed.detach().double().numpy() - expected).max() / np.abs(expected).max())
-    return error if np.isfinite(error) else float("inf")
+    error = float((computed.detach().double() - expected.detach()).abs().max() / expected.detach().abs().max())
+    return error if math.isfinite(error) else math.inf
 
 
 CHECKS = (Check("image", image, 1e-5), Check("gradient of the image", image_gradient, 1e-4))
 
 
-def self_test(arguments: list[str]) -> int:
-    """Run the checks on the adapter that `arguments` may name. Returns 1 if one failed. Raises NoAdapterError."""
-    device = open_device(*arguments)
+def self_test(name: str | None) -> int:
+    """Run the checks on an adapter (`open_device`). Returns 1 if one failed. Raises NoAdapterError."""
+    device = open_device(name)
     print(f"### Self-test on {device.info.name} ({device.info.backend})\n", flush=True)
     failed = 0
     for check in CHECKS:
@@ -174,7 +139,3 @@ def self_test(arguments: list[str]) -> int:
         flush=True,
     )
     return 1 if failed else 0
-
-
-if __name__ == "__main__":
-    sys.exit(guarded("lapgs-doctor", self_test, sys.argv[1:]))

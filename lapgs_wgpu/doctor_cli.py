@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 import platform
-import subprocess
 import sys
 from collections.abc import Sequence
 from importlib import metadata
@@ -31,8 +30,6 @@ VARIABLES = (
     "LAPGS_DEVICE", "VK_DRIVER_FILES", "VK_ICD_FILENAMES", "WGPU_BACKEND_TYPE", "LP_NUM_THREADS",
     "LP_NATIVE_VECTOR_WIDTH", "OMP_NUM_THREADS", "MESA_VK_DEVICE_SELECT", "DRI_PRIME",
 )  # fmt: skip
-LONGEST_SELF_TEST = 120.0  # seconds
-CODES_OF_COMMANDS = range(6)  # of lapgs_wgpu.command; a crash has another one
 
 
 def doctor_command(arguments: Sequence[str] | None = None) -> int:
@@ -50,7 +47,9 @@ def options() -> Parser:
 def _doctor(arguments: list[str]) -> int:
     given = options().parse_args(arguments)
     print("\n".join(["## lapgs-doctor", "", *system_lines(), "", *adapter_lines(), ""]), flush=True)
-    return run_self_test(given.device)
+    from lapgs_wgpu.doctor import self_test  # needs torch; the report so far is out, should a driver crash or hang
+
+    return self_test(given.device)
 
 
 def system_lines() -> list[str]:
@@ -78,21 +77,6 @@ def adapter_lines() -> list[str]:
         for name, (offered, needed) in adapter.too_small.items():
             lines.append(f"  - **cannot be used**: {name} is {offered}, {needed} is needed")
     return lines
-
-
-def run_self_test(device: str | None) -> int:
-    """Run the self-test in a process of its own, which a driver may crash or hang. Returns the exit code."""
-    command = [sys.executable, "-m", "lapgs_wgpu.doctor", *([device] if device is not None else [])]
-    try:
-        code = subprocess.run(command, timeout=LONGEST_SELF_TEST).returncode
-    except subprocess.TimeoutExpired:
-        print(f"\n\n**The self-test did not end within {LONGEST_SELF_TEST:.0f} s.**")
-        return 1
-    if code in CODES_OF_COMMANDS:
-        return code
-    # Windows' codes of crashes are known in this form, such as 0xc0000005.
-    print(f"\n\n**The self-test crashed with code {f'{code:#x}' if code > 0xFFFF else code}.**")
-    return 1
 
 
 def _version(package: str) -> str:

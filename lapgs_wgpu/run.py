@@ -6,16 +6,14 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 from lapgs_wgpu.data.initial_gaussians import first_points
 from lapgs_wgpu.data.validation import check_in_view, check_times
 from lapgs_wgpu.data.views import Dataset, spread_views
-from lapgs_wgpu.discovery.start import start_training
+from lapgs_wgpu.discovery.start_training import start_training
 from lapgs_wgpu.errors import DeviceError, InputError, NumericalError, quoted
 from lapgs_wgpu.gpu.device import Device, open_device
 from lapgs_wgpu.io.folder_lock import locked_folder
@@ -23,9 +21,8 @@ from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.progress import Progress, say
-from lapgs_wgpu.stop_signals import on_stop_signals
+from lapgs_wgpu.stop_signals import stop_requests
 from lapgs_wgpu.train.config import Config, DataConfig
-from lapgs_wgpu.train.distributed import SINGLE_PROCESS, Ranks
 from lapgs_wgpu.train.evaluate import evaluate, write_metrics
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.lpips import Lpips
@@ -43,7 +40,6 @@ from lapgs_wgpu.train.run_folder import (
     start_run_folder,
 )
 from lapgs_wgpu.train.step_result import StepResult
-from lapgs_wgpu.train.tensorboard import TensorBoard, check_tensorboard
 from lapgs_wgpu.train.trainer import Trainer
 
 PROBES = 2048  # points of the scene that say whether a camera sees it
@@ -63,33 +59,26 @@ def train(
     device: Device | None = None,
     overwrite: bool = False,
     watch: Watch | None = None,
-    ranks: Ranks = SINGLE_PROCESS,
     parts: Parts | None = None,
     lpips: Lpips | None = None,
 ) -> Scene4D:
     """Train on a dataset, evaluate on its test views, and leave config.toml, log.jsonl, metrics.json, checkpoint.ply
     and eval/ in the folder `out`, which must be new or empty, or hold an earlier run when `overwrite` is set.
 
-    device: the default adapter where None. ranks: this process among those that train together; only the first one
-    writes. parts: what Python gives the training (docs/api.md). lpips: of the evaluation. The same configuration,
-    pictures, adapter and driver give the same checkpoint to the last byte, watched or not, interrupted and resumed or
-    not. Raises InputError before anything is written where the input is not usable, and KeyboardInterrupt after Ctrl-C
-    or SIGTERM, when checkpoint and state of the last whole step have been written. DeviceError, NumericalError and
-    whatever else ends a step go on to the caller when that state has been written.
+    device: the default adapter where None. parts: what Python gives the training (docs/api.md). lpips: of the
+    evaluation. The same configuration, pictures, adapter and driver give the same checkpoint to the last byte, watched
+    or not, interrupted and resumed or not. Raises InputError before anything is written where the input is not usable,
+    and KeyboardInterrupt after Ctrl-C or SIGTERM, when checkpoint and state of the last whole step have been written.
+    DeviceError, NumericalError and whatever else ends a step go on to the caller when that state has been written.
     """
     out = Path(out)
     if not dataset.test:
         raise InputError(f"{dataset.name} has no test view, by which a run is measured; add images to the capture.")
     found = check_times(dataset, moving=config.field.kind != "static")
-    if config.eval.tensorboard:
-        check_tensorboard()
     found += check_in_view(dataset, first_points(dataset, PROBES, config.points.box, config.seed)[0])
-    if ranks.first:
-        check_run_folder(out, overwrite=overwrite)
+    check_run_folder(out, overwrite=overwrite)
     keep_freed_memory()
     device = device or open_device()
-    if not ranks.first:
-        return _assist(start_training(config, dataset, device, ranks, parts=parts))
     with locked_folder(out):
         check_run_folder(out, overwrite=overwrite)  # again: another training may have written it meanwhile
         if dataset.summary:
@@ -98,7 +87,7 @@ def train(
             print(f"warning: {warning}", file=sys.stderr, flush=True)
         if dataset.normalization is not None:
             say(f"normalization: {dataset.normalization}")
-        training = start_training(config, dataset, device, ranks, parts=parts)
+        training = start_training(config, dataset, device, parts=parts)
         start_run_folder(out, training.user_config, training.scene.device, dataset)
         if training.discovery is not None:
             say(f"discovery: {training.discovery}; {training.discovery_seconds:.0f} s")
@@ -113,7 +102,6 @@ def resume(
     *,
     device: Device | None = None,
     watch: Watch | None = None,
-    ranks: Ranks = SINGLE_PROCESS,
     parts: Parts | None = None,
     lpips: Lpips | None = None,
 ) -> Scene4D:
@@ -124,25 +112,24 @@ def resume(
         raise InputError(f"{out} is finished: there is nothing to resume.")
     keep_freed_memory()
     device = device or open_device()
-    with locked_folder(out) if ranks.first else nullcontext():
+    with locked_folder(out):
         state = load_state(out)
         if state is None and (out / "checkpoint.ply").exists():
             raise InputError(
                 f"{out} holds a checkpoint, but no state to go on from ({STATE}); copy that file, too, or train anew."
             )
-        if ranks.first:
-            note_paths(out, config)
+        note_paths(out, config)
         if state is None:
-            training = start_training(config, dataset, device, ranks, parts=parts)
+            training = start_training(config, dataset, device, parts=parts)
         else:
-            training = Trainer(config, dataset, device, ranks, parts=parts)
+            training = Trainer(config, dataset, device, parts=parts)
             try:
                 check_state(state, views=len(dataset.train), steps=config.schedule.steps)
                 training.restore(state)
             except (IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
                 reason = f"{type(error).__name__}: {error}".splitlines()[0]
                 raise InputError(f"{out}: its state and its config.toml do not belong together ({reason}).") from error
-        return _run(training, out, watch, lpips) if ranks.first else _assist(training)
+        return _run(training, out, watch, lpips)
 
 
 def _outside(scene: Scene4D) -> str:
@@ -160,25 +147,13 @@ def _outside(scene: Scene4D) -> str:
     )
 
 
-def _assist(training: Trainer) -> Scene4D:
-    """Take the steps of a process that is not the first: nothing is written."""
-    with _interruptible() as interrupted:
-        for _ in _steps(training, None, interrupted):
-            pass
-    if training.done < training.config.schedule.steps:
-        raise KeyboardInterrupt(f"stopped after step {training.done}.")
-    return training.scene
-
-
 def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None) -> Scene4D:
     """The steps that are left, with all that a run folder receives."""
     config, scene = training.config, training.scene
     log = Log(out / "log.jsonl", config.schedule.steps, done=training.done, before=training.discovery_seconds)
-    with log, _interruptible() as interrupted:
+    with log, stop_requests() as interrupted:
         if training.discovery is not None:
             log.discovered(training.discovery)
-        if config.eval.tensorboard:
-            log.listeners.append(TensorBoard(out / "tensorboard", done=training.done))
         training.callbacks.append(log.after_step)
         if config.eval.interval:
             training.callbacks.append(partial(_log_psnr, log))
@@ -197,11 +172,10 @@ def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None)
             log.tell(outside)
         if training.cameras is not None:
             measured["cameras"] = training.cameras.report()
-            log.tell(_moved(measured["cameras"]))
+            log.tell(training.cameras.summary())
         if training.timing is not None:
-            retimed = measured["image_times"] = training.timing.report()
-            if retimed["frames_most"] > 0:
-                log.tell(_retimed(retimed))
+            measured["image_times"] = training.timing.report()
+            log.tell(training.timing.summary())
 
     return_freed_memory()
     save_state(out, training.state())
@@ -236,11 +210,11 @@ def _save_now_and_then(out: Path, training: Trainer, result: StepResult) -> None
         save_state(out, training.state())
 
 
-def _steps(training: Trainer, out: Path | None, interrupted: threading.Event) -> Iterator[StepResult]:
-    """Take the steps that are left, until `interrupted` is set in any process. An error saves the state in `out`."""
-    ranks, last = training.ranks, training.config.schedule.steps
+def _steps(training: Trainer, out: Path, interrupted: threading.Event) -> Iterator[StepResult]:
+    """Take the steps that are left, until `interrupted` is set. An error saves the state in `out`."""
+    last = training.config.schedule.steps
     try:
-        while training.done < last and not ranks.any_rank(interrupted.is_set()):
+        while training.done < last and not interrupted.is_set():
             yield training.step()
     except (DeviceError, NumericalError, MemoryError) as error:
         kind = MemoryError if not isinstance(error, DeviceError | NumericalError) else type(error)  # numpy has its own
@@ -252,10 +226,8 @@ def _steps(training: Trainer, out: Path | None, interrupted: threading.Event) ->
         training.close()
 
 
-def _saved(training: Trainer, out: Path | None) -> str:
+def _saved(training: Trainer, out: Path) -> str:
     """Save the state of a training that cannot go on, if it has one worth saving; what a user should know of it."""
-    if out is None:
-        return ""
     if training.whole and training.done:
         try:
             save_state(out, training.state())
@@ -265,24 +237,6 @@ def _saved(training: Trainer, out: Path | None) -> str:
     if (out / STATE).exists():
         return f"; lapgs-train --resume {quoted(out)} goes on from the state that was saved last."
     return "; nothing was saved yet."
-
-
-def _moved(report: dict[str, Any]) -> str:
-    """How far the cameras went, in a sentence."""
-    turn, shift = report["rotation_degrees"], report["shift_percent"]
-    return (
-        f"the training cameras were corrected by {turn['median']:.2f} degrees and {shift['median']:.2f} % of their "
-        f"extent (medians; at most {turn['largest']:.2f} and {shift['largest']:.2f} %), their focal length by "
-        f"{report['focal_percent']:+.2f} %."
-    )
-
-
-def _retimed(report: dict[str, float]) -> str:
-    """How far the times went, in a sentence."""
-    return (
-        f"the times of the training images were corrected by {report['frames']:.2f} of the distance of two images "
-        f"(root mean square; at most {report['frames_most']:.2f})."
-    )
 
 
 def evaluate_run(
@@ -301,7 +255,6 @@ def evaluate_run(
     if folder.is_symlink():
         raise InputError(f"{folder} is a link, and images are written into the run's own folder only; remove it.")
     folder.mkdir(exist_ok=True)
-    unit = dataset.extent if "cameras" in training else None  # they were refined
     with Progress(len(dataset.test), "test views measured") as progress:
         metrics = evaluate(
             scene,
@@ -309,25 +262,8 @@ def evaluate_run(
             data.background,
             folder,
             lpips=lpips,
-            camera_unit=unit,
             progress=progress,
         )
     metrics["training"] = training
     write_metrics(out, metrics)
     return metrics
-
-
-@contextmanager
-def _interruptible() -> Iterator[threading.Event]:
-    """An event that Ctrl-C and its like set, instead of an exception in the middle of a step; a second one is one."""
-    interrupted = threading.Event()
-    asked = set[int]()
-
-    def note(number: int, frame: FrameType | None) -> None:
-        if number in asked:
-            raise KeyboardInterrupt
-        asked.add(number)
-        interrupted.set()
-
-    with on_stop_signals(note):
-        yield interrupted

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Callable, Iterator
+import threading
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
 
@@ -11,18 +12,21 @@ _NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")  # Ctrl-C, kill, a terminal
 
 
 @contextmanager
-def on_stop_signals(handler: Callable[[int, FrameType | None], object]) -> Iterator[None]:
-    """Call `handler` for them until the block ends; the signals' own handlers then come back.
+def stop_requests() -> Iterator[threading.Event]:
+    """An event that these signals set until the block ends, instead of an exception in the middle of a step.
 
-    SIGHUP stays ignored where it is (as by nohup), and counts once: a shell repeats what the system has sent. Outside
-    the main thread, which alone may listen to signals, nothing happens.
+    The second one of a kind raises KeyboardInterrupt, but for SIGHUP: a shell repeats what the system has sent. Where
+    SIGHUP is ignored (as by nohup) it stays so. Outside the main thread, which alone may listen to signals, nothing
+    happens.
     """
     hangup = getattr(signal, "SIGHUP", None)
+    requested, seen = threading.Event(), set[int]()
 
     def take(number: int, frame: FrameType | None) -> None:
-        if number == hangup:
-            signal.signal(number, signal.SIG_IGN)
-        handler(number, frame)
+        if number in seen and number != hangup:
+            raise KeyboardInterrupt
+        seen.add(number)
+        requested.set()
 
     before = {}
     with suppress(ValueError):
@@ -30,7 +34,7 @@ def on_stop_signals(handler: Callable[[int, FrameType | None], object]) -> Itera
             if number != hangup or signal.getsignal(number) != signal.SIG_IGN:
                 before[number] = signal.signal(number, take)
     try:
-        yield
+        yield requested
     finally:
         for number, own in before.items():
             signal.signal(number, own)

@@ -1,7 +1,6 @@
 """Tables of many runs: a preset on several scenes, by rows (methods, or changed keys) and seeds.
 
-Each run is a `lapgs-train` in a process of its own, so that a run that crashes ends no other, and device memory is free
-for the next one. A run whose folder holds its results is skipped, and an interrupted one is resumed.
+A run whose folder holds its results is skipped, and an interrupted one is resumed.
 """
 
 from __future__ import annotations
@@ -9,31 +8,27 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
-import subprocess
 import sys
-import tempfile
-import threading
 from collections.abc import Sequence
+from contextlib import redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import mean, stdev
 from typing import Any
 
-from lapgs_wgpu.command import INTERRUPTED
-from lapgs_wgpu.data.synthetic import write_synthetic
-from lapgs_wgpu.errors import InputError, shown
+from lapgs_wgpu.errors import DeviceError, InputError, NumericalError, shown
+from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.io.dataclass_table import Options, build_dataclass, checked, option
 from lapgs_wgpu.io.safe_json_toml import read_json, read_toml
-from lapgs_wgpu.stop_signals import on_stop_signals
+from lapgs_wgpu.run import resume, train
 from lapgs_wgpu.train.config import Config
-from lapgs_wgpu.train.open_dataset import SYNTHETIC
-from lapgs_wgpu.train.presets import load_config, write_toml
+from lapgs_wgpu.train.lpips import Lpips
+from lapgs_wgpu.train.open_dataset import SYNTHETIC, open_dataset, resolve_data
+from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.run_folder import has_state
 
-_NAME = re.compile(
-    r"\w[\w .+=-]*", re.ASCII
-)  # of a scene or a row: the name of a folder, and a cell of a Markdown table
+_NAME = re.compile(r"\w[\w .+=-]*", re.ASCII)  # of a scene or a row: of a folder, and a cell of a Markdown table
 # Columns of the printed table: entry of a result, heading, format.
 _COLUMNS = (
     ("psnr", "PSNR", ".2f"), ("ssim", "SSIM", ".4f"), ("lpips", "LPIPS", ".4f"), ("gaussians", "Gaussians", ",.0f"),
@@ -100,7 +95,7 @@ def read_spec(path: Path) -> list[Run]:
 
 
 def make_table(
-    runs: Sequence[Run], data: Path, out: Path, *, device: str | None = None, lpips: Path | None = None
+    runs: Sequence[Run], data: Path, out: Path, *, device: Device | None = None, lpips: Lpips | None = None
 ) -> list[Run]:
     """Train the runs that are not finished, and write `out`/results.json anew after each.
 
@@ -108,8 +103,8 @@ def make_table(
         runs: of `read_spec`.
         data: the folder in which the scenes' folders are.
         out: of the table; a run's own folder is `out`/SCENE/ROW/seedN.
-        device: adapter of the trainings, as for `lapgs-train --device`.
-        lpips: file of LPIPS's weights.
+        device: None for the default adapter.
+        lpips: of the evaluation.
 
     Returns:
         The runs that failed, each of which has told why on stderr.
@@ -126,13 +121,11 @@ def make_table(
         if read_result(out, run) is not None:
             continue
         print(f"run {number} of {len(runs)}: {run}", file=sys.stderr)
-        scene = write_synthetic(out / SYNTHETIC) if run.folder == SYNTHETIC else data / run.folder
-        more = [f"--device={device}"] if device else []
-        more += [f"--lpips-weights={lpips.resolve()}"] if lpips else []
-        code = _train(run, [f"--data={scene.resolve()}", *more], run_folder(out, run))
-        if code == INTERRUPTED:
-            raise KeyboardInterrupt(f"stopped in run {number} of {len(runs)}; the same command goes on.")
-        if code:
+        try:
+            with redirect_stdout(sys.stderr):  # stdout gets the table alone
+                _train(run, data, out, device, lpips)
+        except (InputError, DeviceError, NumericalError, MemoryError, OSError) as error:
+            print(f"{run}: {str(error) or 'out of memory'}", file=sys.stderr)
             failed.append(run)
         results = [result for each in runs if (result := read_result(out, each)) is not None]
         out.mkdir(parents=True, exist_ok=True)
@@ -222,24 +215,14 @@ def _holds(folder: Path, config: Config) -> bool:
         return False
 
 
-def _train(run: Run, options: list[str], folder: Path) -> int:
-    """Run lapgs-train, or resume it; it tells on stderr. Returns its exit code; INTERRUPTED after a signal."""
-    with tempfile.TemporaryDirectory() as work:
-        preset = Path(work) / "config.toml"
-        preset.write_text(write_toml(dataclasses.asdict(run.config)), encoding="utf-8")
-        how = [str(preset), f"--out={folder.resolve()}", "--overwrite"]
-        if has_state(folder) and _holds(folder, run.config):
-            how = [f"--resume={folder.resolve()}"]
-        command = [sys.executable, "-m", "lapgs_wgpu.cli", *how, *options]
-        stopped = threading.Event()
-        with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
-
-            def stop(number: int, frame: object) -> None:
-                """The training saves its state. On Windows Ctrl-C has reached it, and `terminate` would kill it."""
-                stopped.set()
-                if sys.platform != "win32":
-                    process.terminate()
-
-            with on_stop_signals(stop):
-                code = process.wait()
-        return INTERRUPTED if stopped.is_set() else code
+def _train(run: Run, data: Path, out: Path, device: Device | None, lpips: Lpips | None) -> None:
+    """Train a run, or resume it."""
+    folder = run_folder(out, run)
+    path = SYNTHETIC if run.folder == SYNTHETIC else str(data / run.folder)
+    config = dataclasses.replace(run.config, data=dataclasses.replace(run.config.data, path=path))
+    config = resolve_data(config, out)
+    dataset = open_dataset(config)
+    if has_state(folder) and _holds(folder, run.config):
+        resume(config, dataset, folder, device=device, lpips=lpips)
+    else:
+        train(config, dataset, folder, device=device, overwrite=True, lpips=lpips)

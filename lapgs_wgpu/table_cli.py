@@ -46,11 +46,8 @@ def _table(arguments: list[str]) -> int:
     runs, out = read_spec(Path(given.spec)), Path(given.out)
     if out.exists() and not out.is_dir():
         raise InputError(f"{out} is a file; name a folder for the table with --out.")
-    lpips = Path(given.lpips_weights) if given.lpips_weights else None
-    if lpips is not None:
-        Lpips(lpips)  # reports a mistake before the first training
-    open_device(given.device)  # likewise
-    failed = make_table(runs, Path(given.data), out, device=given.device, lpips=lpips)
+    lpips = Lpips(Path(given.lpips_weights)) if given.lpips_weights else None
+    failed = make_table(runs, Path(given.data), out, device=open_device(given.device), lpips=lpips)
     print(markdown([result for run in runs if (result := read_result(out, run)) is not None]))
     for run in failed:
         print(f"lapgs-table: {run} failed.", file=sys.stderr)

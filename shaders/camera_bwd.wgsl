@@ -1,6 +1,6 @@
 // Sums over a workgroup's Gaussians what moves all of them alike, which is what moves the camera the other way round.
-// Before color_bwd: the gradients of a rotation of all Gaussians about the camera's centre (the colors do not change
-// with it), and of the logarithm of the focal length. With FORCE, after color_bwd: of a shift of all Gaussians.
+// Before color_bwd: the gradient of a rotation of all Gaussians about the camera's centre (the colors do not change with
+// it). With FORCE, after color_bwd: of a shift of all Gaussians.
 #import common/frame
 #import common/index
 #import common/splat
@@ -10,13 +10,11 @@
 #ifndef FORCE
 #table 2 means: f32
 #table 3 quats: vec4<f32>
-#table 4 scales: f32
-#table 5 d_splats: vec4<f32>
-#table 6 d_quats: vec4<f32>
-#table 7 d_scales: f32
+#table 4 d_splats: vec4<f32>
+#table 5 d_quats: vec4<f32>
 #endif
-// (workgroups,): rotation about the world's axes, log focal length; with FORCE shift, 0
-@group(0) @binding(8) var<storage, read_write> d_camera: array<vec4<f32>>;
+// (workgroups,): rotation about the world's axes, 0; with FORCE shift, 0
+@group(0) @binding(6) var<storage, read_write> d_camera: array<vec4<f32>>;
 
 var<workgroup> sums: array<vec4<f32>, 64>;
 
@@ -34,12 +32,7 @@ fn gradient(i: u32) -> vec4<f32> {
     let q = quats_at(i);
     let d_q = d_quats_at(i);
     let turn = 0.5 * (q.x * d_q.yzw - q.yzw * d_q.x + cross(q.yzw, d_q.yzw));
-    // A longer focal length enlarges the image about its principal point: means, and the Gaussians' axes.
-    let scale = vec3(scales_at(3u * i), scales_at(3u * i + 1u), scales_at(3u * i + 2u));
-    let d_scale = vec3(d_scales_at(3u * i), d_scales_at(3u * i + 1u), d_scales_at(3u * i + 2u));
-    let camera = (frame.view * vec4(mean, 1.0)).xyz;
-    let offset = frame.focal * camera.xy / camera.z;
-    return vec4(cross(arm, d_mean) + turn, dot(d_splats_at(i * SPLAT_STRIDE).xy, offset) + dot(d_scale, scale));
+    return vec4(cross(arm, d_mean) + turn, 0.0);
 #endif
 }
 

@@ -38,7 +38,6 @@ from lapgs_wgpu.gpu.kernel import Commands
 from lapgs_wgpu.io.checkpoint import read_checkpoint
 from lapgs_wgpu.motion.fields.own_field import OwnField
 from lapgs_wgpu.motion.timing import Timing
-from lapgs_wgpu.run import train
 from lapgs_wgpu.splat.rotation import rotate, rotation_matrices
 from lapgs_wgpu.train.config import LossWeights
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
@@ -47,7 +46,6 @@ from lapgs_wgpu.train.learning_rate import Rate
 from lapgs_wgpu.train.loss_terms import LossTerm, torch_loss
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.run_folder import load_state, save_state
-from lapgs_wgpu.train.tensorboard import scalars
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
@@ -616,27 +614,3 @@ def test_the_wgsl_of_the_page_is_the_mean_squared_error(device: Device, tmp_path
 def test_the_page_names_all_that_is_public() -> None:
     training = set(lapgs_wgpu.__all__) - {"Camera", "Gaussians", "Rendering", "rasterize"}
     assert all(f"`{name}" in PAGE for name in training), training
-
-
-def test_tensorboard_gets_the_figures_of_the_log(dataset: Dataset, device: Device, tmp_path: Path) -> None:
-    pytest.importorskip("tensorboard")
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
-    train(configure(eval__tensorboard="true", eval__interval="36"), dataset, tmp_path / "run", device=device)
-    events = EventAccumulator(str(tmp_path / "run/tensorboard"))
-    events.Reload()
-    for text in (tmp_path / "run/log.jsonl").read_text().splitlines():
-        line = {name: value for name, value in json.loads(text).items() if name != "timing"}
-        for name, value in scalars(line):
-            (found,) = (each for each in events.Scalars(name) if each.step == STEPS)
-            assert found.value == pytest.approx(value, rel=1e-5)
-    assert {"loss", "terms/ssim", "val_psnr", "memory/host_bytes", "dead_scales"} <= set(events.Tags()["scalars"])
-
-
-def test_without_tensorboard_a_run_that_asks_for_it_does_not_start(
-    dataset: Dataset, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "torch.utils.tensorboard", None)
-    with pytest.raises(InputError, match=r'pip install "lapgs-wgpu\[tensorboard\]"'):
-        train(configure(eval__tensorboard="true"), dataset, tmp_path / "run", device=device)
-    assert not (tmp_path / "run").exists()

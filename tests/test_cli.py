@@ -204,7 +204,7 @@ def test_a_damaged_scene_starts_no_run(scene: Path, tmp_path: Path, capsys: pyte
 def test_without_any_adapter_the_exit_code_is_3(
     scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def none(name: str | None = None, *, number: int = 0) -> None:
+    def none(name: str | None = None) -> None:
         raise NoAdapterError("no adapter was found on this machine")
 
     monkeypatch.setattr(device_module, "open_device", none)

@@ -14,12 +14,10 @@ from helpers.scene_files import moving_scene
 
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train import density_control, trainer
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.densify import published_rule
 from lapgs_wgpu.train.density_control import contributions
-from lapgs_wgpu.train.distributed import Ranks
 from lapgs_wgpu.train.optimizer import Optimizer
 from lapgs_wgpu.train.presets import load_config
 
@@ -68,29 +66,6 @@ def test_pruning_keeps_the_largest_whatever_they_contribute(device: Device, monk
     assert control.change(4, moving=True) == pruned
     assert torch.equal(scene.parameters["means"], kept)
     assert len(control.statistics.views) == 3
-
-
-def test_processes_share_the_views_by_which_they_prune(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    config, scene, shown = pruning_config(min_contribution=0.5), moving_scene(device), views(5)
-    seen: list[View] = []
-    mine, others = torch.zeros(2, len(scene))
-    mine[3], others[5] = 1.0, 1.0
-
-    def noted(scene: Scene4D, views: list[View], *, moving: bool) -> torch.Tensor:
-        seen.extend(views)
-        return mine
-
-    monkeypatch.setattr(density_control, "contributions", noted)
-    monkeypatch.setattr(density_control, "LEAST_KEPT", 1)
-    monkeypatch.setattr(Ranks, "all_gather", lambda self, tensors: [[tensor, others] for tensor in tensors])
-    optimizer = Optimizer(scene.parameters, {}, config.rates.schedules())
-    control = density_control.DensityControl(
-        config, scene, optimizer, published_rule, shown, lambda view: view.camera, 1.0, torch.Generator(), Ranks(1, 2)
-    )
-    kept = scene.parameters["means"].detach()[[3, 5]]
-    control.change(4, moving=True)
-    assert [view.name for view in seen] == [view.name for view in shown[1::2]]
-    assert torch.equal(scene.parameters["means"], kept)
 
 
 def test_training_prunes_what_hardly_shows(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -127,6 +127,32 @@ def test_a_scan_of_the_whole_building(tmp_path: Path) -> None:
     assert data.scale == pytest.approx(BOX / 0.5, rel=0.05)
 
 
+def test_a_scan_that_cameras_hardly_see(tmp_path: Path) -> None:
+    """A fifth of its points is the scene; the others are left out."""
+    scene = RNG.uniform(-0.5, 0.5, (1000, 3)) + MIDDLE
+    write_points(tmp_path / "scan.ply", np.concatenate([scene, RNG.uniform([50, 50, 200], [90, 90, 300], (4000, 3))]))
+    capture(tmp_path / "scan", ply_file_path="scan.ply")
+    (tmp_path / "scan.ply").rename(tmp_path / "scan/scan.ply")
+    data = load_dataset(tmp_path / "scan")
+    assert data.cloud is not None
+    assert data.normalization is not None
+    np.testing.assert_allclose(data.cloud.points[:1000], data.normalization.points(scene), atol=1e-4)
+    assert told(data, "% of its points: of 5000")
+    assert data.scale == pytest.approx(BOX / 0.5, rel=0.05)
+
+
+def test_orientation_where_no_size_is_stated(tmp_path: Path) -> None:
+    """The principal point tells it; the angle of view alone does not."""
+    missing = {"w": None, "h": None}
+    turned = load_dataset(capture(tmp_path / "turned", sideways, **missing))
+    np.testing.assert_array_equal(turned.train[0].load(), PICTURE)
+    stored = load_dataset(capture(tmp_path / "stored", sideways, cx=HEIGHT / 2, cy=WIDTH / 2, **missing))
+    assert stored.train[0].load().shape == (WIDTH, HEIGHT, 3)
+    assert not any(told(data, "EXIF") for data in (turned, stored))
+    unclear = load_dataset(capture(tmp_path / "unclear", sideways, cx=None, cy=None, **missing))
+    assert told(unclear, "EXIF")
+
+
 def test_orientation_of_exif(tmp_path: Path) -> None:
     """The picture is 64x48, and its file 48x64."""
     turned = load_dataset(capture(tmp_path / "turned", sideways))

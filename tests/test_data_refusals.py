@@ -205,7 +205,8 @@ ARKIT: list[Case] = [(put(FILE, "frames", 1, "timestamp", GONE), "frame timestam
 ID, TEST_ID = "left_000001", "left_000004"
 CAMERA, MASK = f"camera/{ID}.json", f"covisible/1x/val/{TEST_ID}.png"
 NERFIES: list[Case] = [
-    *((gone(name), name) for name in ("scene.json", "metadata.json", CAMERA, "rgb", f"rgb/1x/{ID}.png")),
+    *((gone(name), name) for name in ("scene.json", "metadata.json", CAMERA, "rgb")),
+    (gone(f"rgb/1x/{ID}.png", "rgb/1x/left_000002.png"), f"rgb/1x/{ID}.png dataset.json"),
     (put("dataset.json", "ids", GONE), "dataset.json ids"),
     (put("dataset.json", "ids", ["../../x"]), "dataset.json ids ../../x"),
     (put("dataset.json", "ids", ["a", "a"]), "dataset.json"),
@@ -276,8 +277,7 @@ NEU3D: list[Case] = [
     (gone("cam02/images/0001.png"), "cam02 cam00"),
     (image("cam02/images/0002.png", (32, 24)), "cam02/images/0002.png 32x24 64x48"),
     (square, f"cam00 64x64 128x96 {POSES}"),
-    (image("cam01/images/x_001.png", (WIDTH, HEIGHT)), "cam01/images"),
-    (image("cam01/images/last.png", (WIDTH, HEIGHT)), "last.png"),
+    (image("cam01/images/x_001.png", (WIDTH, HEIGHT)), "cam01 cam00"),
     (cloud(Blobs.random().means.numpy() + np.array([50, 0, 0])), "points3D.ply"),
 ]
 
@@ -289,7 +289,7 @@ RECORD3D: list[Case] = [
     (put("metadata.json", "w", GONE), "w"),
 ]
 POLYCAM: list[Case] = [
-    (gone("keyframes/images/9900000.jpg"), "9900000.jpg 9900000.json"),
+    (gone("keyframes/images/9900000.jpg", "keyframes/images/10025000.jpg"), "9900000 9900000.json"),
     (put("keyframes/corrected_cameras/*.json", "fx", GONE), "fx"),
     (put("keyframes/corrected_cameras/*.json", "t_00", 3.0), "rotation"),
     (gone(*(f"keyframes/corrected_cameras/{9_900_000 + 125_000 * i}.json" for i in range(6))), "camera"),

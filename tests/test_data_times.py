@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import unicodedata
 from collections.abc import Callable, Sequence
@@ -10,12 +11,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.captures import HEIGHT, WIDTH, cameras, write_model
+from helpers.captures import HEIGHT, WIDTH, cameras, write_model, write_nerfies, write_points, write_polycam
 from PIL import Image
 
 from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.gpu.device import Device
+
+MIDDLE = np.array([0.3, -0.2, 0.5])  # what the cameras look at
 
 
 def write(
@@ -49,6 +53,8 @@ NAMES = {
     "other blanks": ("My film/frame {:04d}.png", "My film/frame  {:04d}.png"),
     "Unicode form": (unicodedata.normalize("NFD", "é/{:04d}.png"), unicodedata.normalize("NFC", "é/{:04d}.png")),
     "letter case": ("CAM/{:04d}.jpg", "cam/{:04d}.JPG"),
+    "absolute": ("C:\\walk\\Images\\{:04d}.png", "{:04d}.png"),
+    "the folder's own name": ("images/{:04d}.png", "{:04d}.png"),
     "type": ("{:04d}.jpg", "{:04d}.jpeg"),
 }
 
@@ -72,6 +78,41 @@ def transforms(folder: Path, names: Sequence[str]) -> Path:
     (folder / "transforms.json").write_text(json.dumps(values))
     shutil.rmtree(folder / "sparse")
     return folder
+
+
+@pytest.mark.parametrize("named", ["no suffix", "three rows", "masks", "cloud"])
+def test_transforms_as_other_programs_write_them(named: str, tmp_path: Path) -> None:
+    """JPEGs without their suffix, poses of three rows; masks and cloud under names with other case and slashes."""
+    names = [f"images/{i:04d}.jpg" for i in range(12)]
+    folder = transforms(write(tmp_path / "toy", [f"{i:04d}.jpg" for i in range(12)]), names)
+    data = json.loads((folder / "transforms.json").read_text())
+    for i, frame in enumerate(data["frames"]):
+        if named == "no suffix":
+            frame["file_path"] = f"images/{i:04d}"
+        if named == "three rows":
+            frame["transform_matrix"].pop()
+        if named == "masks":
+            frame["mask_path"] = f"Masks\\{i:04d}.PNG"
+    if named == "cloud":
+        data["ply_file_path"] = "Points.PLY"
+        write_points(folder / "points.ply", np.random.default_rng(0).normal(0, 0.1, (200, 3)) + MIDDLE)
+    (folder / "transforms.json").write_text(json.dumps(data))
+    (folder / "masks").mkdir()
+    mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    mask[:5] = 0
+    for i in range(12):
+        Image.fromarray(mask).save(folder / f"masks/{i:04d}.png")
+    found = load_dataset(folder)
+    assert len(times_of(found)) == 12
+    assert (found.cloud is not None) == (named == "cloud")
+    if named == "masks":
+        np.testing.assert_array_equal(found.train[0].load_ignored(), mask == 0)
+    (folder / "Mine").mkdir()
+    for file in (folder / "masks").rename(folder / "Mine/Images").iterdir():
+        file.rename(file.with_name(f"{file.stem}.PNG"))
+    if named == "no suffix":
+        view = load_dataset(folder, masks=folder / "Mine").train[0]
+        np.testing.assert_array_equal(view.load_ignored(), mask == 255)
 
 
 @pytest.mark.parametrize("form", ["COLMAP", "nerfstudio", "smaller", "D-NeRF"])
@@ -98,7 +139,32 @@ def test_frames_without_an_image_are_left_out(form: str, tmp_path: Path) -> None
         load_dataset(folder)
 
 
-@pytest.mark.parametrize("pattern", ["frame{t:06d}/cam{c:02d}.png", "cam{c:02d}/frame{t:06d}.png", "t{t:04d}/{c}.png"])
+@pytest.mark.parametrize("named", ["HyperNeRF", "Polycam"])
+def test_frames_of_apps_without_an_image_are_left_out(named: str, device: Device, tmp_path: Path) -> None:
+    if named == "HyperNeRF":
+        folder, file = write_nerfies(tmp_path / "toy", device), "rgb/1x/left_000001.png"
+    else:
+        folder, file = write_polycam(tmp_path / "toy", device), "keyframes/images/10025000.jpg"
+    count = len(times_of(load_dataset(folder)))
+    (folder / file).unlink()
+    data = load_dataset(folder)
+    assert len(times_of(data)) == count - 1
+    assert any(f"1 of {count} images" in warning for warning in data.warnings)
+    assert data.summary.endswith("; 1 left out")
+
+
+@pytest.mark.parametrize(
+    "pattern",
+    [
+        "frame{t:06d}/cam{c:02d}.png",
+        "cam{c:02d}/frame{t:06d}.png",
+        "t{t:04d}/{c}.png",
+        "{t:04d}/{c:02d}.png",
+        "{c:02d}/{t:04d}.png",
+        "{t:04d}/cam_{c}_x.png",
+        "{t:03d}/{c}/image.png",
+    ],
+)
 @pytest.mark.parametrize("placed", [1, 3, 8])
 def test_folders_are_cameras_or_times(pattern: str, placed: int, tmp_path: Path) -> None:
     """Also where the model holds a few images of each still camera only."""
@@ -109,7 +175,7 @@ def test_folders_are_cameras_or_times(pattern: str, placed: int, tmp_path: Path)
     assert {files[view.source.split("/images/")[-1]][1] for view in data.test} == {0}
     assert (len(data.test), len(data.cameras)) == (8, 3)
     assert data.summary.startswith("COLMAP, 4 still cameras, 8 times from")
-    assert data.summary.endswith(" is held out")
+    assert " is held out; 1 unit of the files becomes " in data.summary
 
 
 STAMPS = {
@@ -130,10 +196,53 @@ def test_times_in_names(kind: str, tmp_path: Path) -> None:
     assert not any("order" in warning for warning in data.warnings)
 
 
-def test_cameras_that_end_apart_are_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize("start", ["235855", "095855", "09-58-55", "IMG_09.58.55"])
+def test_times_of_day_without_a_date(start: str, tmp_path: Path) -> None:
+    """Every two seconds, past a minute, an hour or midnight."""
+    h, m, s = (int(digits) for digits in re.findall(r"\d\d", start))
+    seconds = [(3600 * h + 60 * m + s + 10 * i) % 86400 for i in range(12)]
+    stamps = [f"{t // 3600:02d}{t // 60 % 60:02d}{t % 60:02d}" for t in seconds]
+    separator = next((each for each in "-." if each in start), "")
+    before = "IMG_" if start.startswith("I") else ""
+    files = [before + separator.join(re.findall("..", stamp)) + ".png" for stamp in stamps]
+    data = load_dataset(write(tmp_path / "toy", files))
+    times = times_of(data)
+    np.testing.assert_allclose([times[file] for file in files], np.linspace(0, 1, 12), atol=1e-9)
+    assert "12 times from the clock times" in data.summary
+
+
+def test_six_digits_of_a_counter_are_no_times_of_day(tmp_path: Path) -> None:
+    files = [f"{50 * i:06d}.png" for i in range(12)]  # 000050, 000100, 000150: as times of day, too
+    data = load_dataset(write(tmp_path / "toy", files))
+    assert "from the frame numbers" in data.summary
+
+
+@pytest.mark.parametrize("names", [["part1/{:03d}.png", "part2/{:03d}.png"], ["clip/{:03d}.png", "more/{:03d}.png"]])
+def test_folders_that_follow_one_another_are_of_one_camera(names: list[str], tmp_path: Path) -> None:
+    files = [names[i // 8].format(i) for i in range(16)]
+    data = load_dataset(write(tmp_path / "toy", files))
+    assert times_of(data) == {file: i / 15 for i, file in enumerate(files)}
+    assert "1 moving camera in 2 folders, one after the other, 16 times" in data.summary
+    assert [view.time for view in data.test] == pytest.approx([4 / 15, 12 / 15])
+    assert not any("different times" in warning for warning in data.warnings)
+
+
+def test_a_rate_that_is_a_multiple(tmp_path: Path) -> None:
+    """cam2 has 12 images, the others 6."""
     counts = {"cam0": 6, "cam1": 6, "cam2": 12}
+    files = [f"{camera}/{t:02d}.png" for camera, count in counts.items() for t in range(count)]
+    data = load_dataset(write(tmp_path / "toy", files, lambda i: 4 * i, [f"{camera}/00.png" for camera in counts]))
+    times = times_of(data)
+    assert times["cam1/03.png"] == times["cam2/06.png"]
+    assert times["cam2/11.png"] == 1
+    assert any("cam2 has 2 times" in warning for warning in data.warnings)
+    assert "different times" in " ".join(data.warnings)
+
+
+def test_cameras_that_end_apart_are_named(tmp_path: Path) -> None:
+    counts = {"cam0": 6, "cam1": 6, "cam2": 11}
     files = [f"{camera}/{t:02d}.png" for camera, count in counts.items() for t in range(count)]
     named = [f"{camera}/00.png" for camera in counts]
     data = load_dataset(write(tmp_path / "toy", files, lambda i: 4 * i, named))
     (warning,) = [warning for warning in data.warnings if "different times" in warning]
-    assert "cam0, cam1 at 5, cam2 at 11" in warning
+    assert "cam0, cam1 at 5, cam2 at 10" in warning

@@ -15,12 +15,11 @@ from PIL import Image, ImageFilter
 from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.data.cloud import Cloud
 from lapgs_wgpu.data.split import held_out
-from lapgs_wgpu.data.stamps import ImageName
+from lapgs_wgpu.data.stamps import ImageName, natural_key
 from lapgs_wgpu.data.timestamps import (
     disorder,
     frame_numbers,
     in_step,
-    natural_key,
 )
 from lapgs_wgpu.data.validation import check_film, check_in_view, check_times, check_views
 from lapgs_wgpu.data.views import Dataset, View
@@ -122,12 +121,12 @@ def test_cameras_that_look_away_for_a_while(device: Device, tmp_path: Path, caps
 def test_frames_out_of_order() -> None:
     images = [ImageName(f"frame_{i:03d}.jpg", ".") for i in range(10)]
     times = [float(i) for i in range(10)]
-    assert disorder(images, times) == []
+    assert disorder(images, times, numbered=True) == []
     times[4], times[5] = times[5], times[4]
-    (warning,) = disorder(images, times)
+    (warning,) = disorder(images, times, numbered=True)
     assert "frame_004.jpg at 5 to frame_005.jpg at 4" in warning
     images = [ImageName(f"cam{c}/{i + 10 * c:03d}.jpg", f"cam{c}") for c in range(2) for i in range(5)]
-    (warning,) = disorder(images, [float(n) for n in frame_numbers(images)])
+    (warning,) = disorder(images, [float(n) for n in frame_numbers(images)], numbered=True)
     assert "cam0 from 0 to 4" in warning, "no time in common"
 
 

@@ -28,17 +28,10 @@ def opened(monkeypatch: pytest.MonkeyPatch) -> Any:
     monkeypatch.setattr(module, "_adapters", lambda: found)
     monkeypatch.setattr(module, "Device", lambda adapter, info: info)
     monkeypatch.delenv("LAPGS_DEVICE", raising=False)
-    return lambda name=None, number=0: module._open_device.__wrapped__(name or os.environ.get("LAPGS_DEVICE"), number)
+    return lambda name=None: module._open_device.__wrapped__(name or os.environ.get("LAPGS_DEVICE"))
 
 
 # Which adapter
-
-
-def test_processes_share_out_the_adapters_of_the_best_kind(opened: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    two = dataclasses.replace(DISCRETE, name="second")
-    monkeypatch.setattr(module, "_adapters", lambda: [(DISCRETE, None), (two, None), (SOFTWARE, None)])
-    assert [opened(None, number) for number in range(4)] == [DISCRETE, two, DISCRETE, two]
-    assert [opened("cpu", number) for number in range(2)] == [SOFTWARE, SOFTWARE]
 
 
 def test_the_best_adapter_is_the_default(opened: Any) -> None:
@@ -81,7 +74,7 @@ def test_no_adapter_at_all_says_what_to_install(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(module, "_adapters", list)
     for name in (None, "cpu"):
         with pytest.raises(NoAdapterError, match=r"no Vulkan, Metal or D3D12 adapter .* mesa-vulkan-drivers"):
-            module._open_device.__wrapped__(name, 0)
+            module._open_device.__wrapped__(name)
 
 
 def test_d3d12_is_used_where_its_newer_compiler_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -94,7 +87,7 @@ def test_d3d12_is_used_where_its_newer_compiler_is_there(monkeypatch: pytest.Mon
     monkeypatch.setattr(module, "_adapters", list)
     monkeypatch.setattr(module, "_options", lambda: without)
     with pytest.raises(NoAdapterError, match=r"D3D12 adapters need dxcompiler\.dll .* in a folder of PATH$"):
-        module._open_device.__wrapped__(None, 0)
+        module._open_device.__wrapped__(None)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the Vulkan loader's variables mean nothing here")

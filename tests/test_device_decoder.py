@@ -1,4 +1,4 @@
-"""The passes of the decoder on the device, and of the smoothness loss, against torch (the whole: test_resident_step)."""
+"""The passes of the decoder on the device and of the smoothness loss, against torch."""
 
 from __future__ import annotations
 

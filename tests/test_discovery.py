@@ -18,7 +18,7 @@ from lapgs_wgpu.discovery.acceptance import explained_share, rows_with, tracks_i
 from lapgs_wgpu.discovery.discover import RAMP_STEPS, discover
 from lapgs_wgpu.discovery.field_fit import fit_field
 from lapgs_wgpu.discovery.residual import Residual, moving_pixels
-from lapgs_wgpu.discovery.start import start_training
+from lapgs_wgpu.discovery.start_training import start_training
 from lapgs_wgpu.discovery.static_fit import static_fit
 from lapgs_wgpu.discovery.surface_points import PointClouds, Points, surface_points
 from lapgs_wgpu.discovery.tracks import Tracks, find_tracks

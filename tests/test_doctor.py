@@ -1,4 +1,4 @@
-"""lapgs-doctor: its checks pass, each sees a broken kernel, and the report gets written whatever a driver does."""
+"""lapgs-doctor: its checks pass, each sees a broken kernel, and the report gets written."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
+import torch
 
 from lapgs_wgpu import doctor, doctor_cli
-from lapgs_wgpu.doctor import CHECKS, Check, StackedGaussians
+from lapgs_wgpu.doctor import CHECKS, Check, pixel_alphas, stacked_gaussians
 from lapgs_wgpu.gpu import shader
 from lapgs_wgpu.gpu.device import Device, adapter_details
 from lapgs_wgpu.splat import rasterize
@@ -51,11 +51,10 @@ def test_checks_see_broken_kernels(
 
 def test_rounding_decides_nothing_in_the_known_image() -> None:
     """Neither whether a pixel is reached, nor whether it is finished."""
-    gaussians = StackedGaussians()
-    xx, yy = gaussians.variances.T[:, :, None, None]
-    alphas = gaussians.opacities[:, None, None] * np.exp(-0.5 * (gaussians.x**2 / xx + gaussians.y**2 / yy))
-    assert np.abs(alphas / CONSTANTS["ALPHA_MIN"] - 1).min() > 1e-6
-    assert np.prod(1 - gaussians.alphas, axis=0).min() > 10 * CONSTANTS["TRANSMITTANCE_MIN"]
+    alphas = pixel_alphas(stacked_gaussians()).detach()
+    assert (alphas / CONSTANTS["ALPHA_MIN"] - 1).abs().min() > 1e-6
+    drawn = torch.where(alphas >= CONSTANTS["ALPHA_MIN"], alphas, 0.0)
+    assert (1 - drawn).prod(dim=0).min() > 10 * CONSTANTS["TRANSMITTANCE_MIN"]
 
 
 def run_doctor(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
@@ -90,31 +89,16 @@ def test_an_unknown_adapter_is_exit_code_2() -> None:
     assert "'no such card'" in done.stderr
 
 
-@pytest.mark.parametrize(
-    ("program", "told"),
-    [("import os; os.abort()", "code -6"), ("import time; time.sleep(600)", "within 3 s")],
-    ids=["crash", "hang"],
-)
-def test_a_crash_and_a_hang_are_reported(
-    program: str, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "torch.py").write_text(program)
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    monkeypatch.setattr(doctor_cli, "LONGEST_SELF_TEST", 3.0)
-    assert doctor_cli.run_self_test(None) == 1
-    assert told in capfd.readouterr().out
-
-
 def test_a_failed_check_fails_the_report(
     device: Device, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def refused(_: Device) -> float:
         raise ValueError("no\nshader")
 
-    monkeypatch.setattr(doctor, "open_device", lambda: device)
+    monkeypatch.setattr(doctor, "open_device", lambda name: device)
     checks = (Check("exact", lambda _: 0.0, 0), Check("inexact", lambda _: 0.5, 1e-5), Check("refused", refused, 0))
     monkeypatch.setattr(doctor, "CHECKS", checks)
-    assert doctor.self_test([]) == 1
+    assert doctor.self_test(None) == 1
     said = capsys.readouterr().out
     assert "- exact: ok" in said
     assert "- inexact: **FAILED**, error 0.5" in said

@@ -34,7 +34,7 @@ ERRORS = list(FAILING)
 
 @pytest.fixture(autouse=True)
 def one_device(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(device_module, "open_device", lambda name=None, **_: device)
+    monkeypatch.setattr(device_module, "open_device", lambda name=None: device)
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +64,7 @@ class Whole(NamedTuple):
 def whole(preset: Path, device: Device, tmp_path_factory: pytest.TempPathFactory) -> Whole:
     out = tmp_path_factory.mktemp("whole") / "run"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(device_module, "open_device", lambda name=None, **_: device)
+        patch.setattr(device_module, "open_device", lambda name=None: device)
         disk = Disk(out)
         disk.install(patch)
         assert cli.train_command([str(preset), "--out", str(out)]) == 0

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.camera_paths import nerfstudio
 from helpers.damaged_files import (
     FOREIGN,
     KINDS,
@@ -52,7 +51,6 @@ from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.run_folder import STATE, check_state, load_state, save_state
 from lapgs_wgpu.train.trainer import Trainer
-from lapgs_wgpu.viewer.path_file import read_path
 
 pytestmark = pytest.mark.nightly
 
@@ -195,19 +193,6 @@ def test_states(
 
 
 # JSON and TOML
-
-
-@fuzzed(300)
-@given(tree_edits, byte_edits([b"[", b"{", b'"', b",", b":"], least=0), st.booleans(), st.booleans())
-def test_camera_paths(folder: Path, changes: TreeEdits, edits: ByteEdits, cycle: bool, old: bool) -> None:
-    tree = nerfstudio(is_cycle=cycle, **({"keyframes": []} if old else {}))
-    (folder / "a.json").write_bytes(edit_bytes(json_text(edit_tree(tree, changes)), edits[:1]))
-    held = refused_or(lambda: read_path(folder / "a.json"))
-    if held is not None:
-        for second in np.linspace(0, held.path.seconds, 5).tolist():
-            pose, time = held.path.at(second)
-            assert 0 <= time <= 1
-            assert np.isfinite(pose.camera(*held.size).T_cam_world).all()
 
 
 @fuzzed()

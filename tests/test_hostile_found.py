@@ -34,8 +34,6 @@ from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.run_folder import STATE, load_state, save_state, start_run_folder
 from lapgs_wgpu.train.step_result import StepResult
 from lapgs_wgpu.train.trainer import Trainer
-from lapgs_wgpu.viewer.ground_truth import open_ground_truth
-from lapgs_wgpu.viewer.path_file import read_path
 
 TABLE = "__metadata__"
 
@@ -119,8 +117,6 @@ def test_found_in_states(device: Device, tmp_path: Path) -> None:
 def test_found_in_a_run_folder(tmp_path: Path) -> None:
     (tmp_path / "config.toml").write_text('record = "x"\n')
     assert changes_since_without_device(tmp_path) == []
-    (tmp_path / "config.toml").write_text(f'[data]\npath = "{tmp_path}"\nsize = inf\n')
-    assert open_ground_truth(tmp_path / "checkpoint.ply", {}) is None
 
 
 def test_nothing_is_written_through_a_link(tmp_path: Path) -> None:
@@ -155,8 +151,8 @@ def test_pipes_and_devices_do_not_hang(tmp_path: Path) -> None:
     (tmp_path / "zero.json").symlink_to("/dev/zero")
     (tmp_path / "zero.toml").symlink_to("/dev/zero")
     actions: list[Callable[[], Any]] = [
-        lambda: read_path(tmp_path / "a.json"),
-        lambda: read_path(tmp_path / "zero.json"),
+        lambda: read_json(tmp_path / "a.json"),
+        lambda: read_json(tmp_path / "zero.json"),
         lambda: read_spec(tmp_path / "a.toml"),
         lambda: read_toml(tmp_path / "zero.toml"),
         lambda: load_state(tmp_path),

@@ -59,7 +59,7 @@ ALLOWED = {
         "train_options",
         "viewer",
     },
-    "table": {"errors", "command", "stop_signals", "data", "io", "train"},
+    "table": {"errors", "gpu", "io", "train", "run"},
     "table_cli": {"errors", "command", "gpu", "table", "train"},
 }
 FOLDERS = {"": PACKAGE, "viewer": Path(lapgs_wgpu.viewer.__file__).parent}  # where the parts lie on the disk

@@ -130,7 +130,7 @@ BAD: list[tuple[bytes, str]] = [
     (edit(b"property float z", b"floats z"), "floats z"),
     (edit(b"property float z", b""), "line 6"),
     (edit(b"property float z", b"property list uchar int z"), "list"),
-    (edit(b"property float z", b"property half z"), "half"),
+    (edit(b"property float z", b"property quarter z"), "quarter"),
     (edit(b"property float z", b"property O z"), "'O'"),
     (edit(b"property float z", b"property float y"), "line 6"),
     (edit(b"end_header", b"element vertex 4\nend_header"), "element"),

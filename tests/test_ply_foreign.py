@@ -82,7 +82,7 @@ def test_a_line_end_behind_the_rows_and_any_encoding_of_comments(tmp_path: Path)
 def test_gaussians_that_move_are_refused(tmp_path: Path) -> None:
     columns = columns_of(random_still(3, 0)) | {"trbf_center": ("float", np.zeros(3)), "omega_0": ("float", [0, 0, 0])}
     (tmp_path / "a.ply").write_bytes(ply_bytes(columns))
-    with pytest.raises(InputError, match="trbf_center, omega_0"):
+    with pytest.raises(InputError, match="trbf_center, omega_0, 2 in all"):
         read_ply(tmp_path / "a.ply")
 
 
@@ -176,3 +176,36 @@ def test_a_cloud_whose_colors_are_not_known(tmp_path: Path, capsys: pytest.Captu
     (tmp_path / "a.ply").write_bytes(ply_bytes(columns))
     assert read_points(tmp_path / "a.ply")[1] is None
     assert "intensity" in capsys.readouterr().err
+
+
+def test_half_precision(tmp_path: Path) -> None:
+    still = random_still(N, 0)
+    columns = columns_of(still)
+    rows = np.stack([values for _, values in columns.values()], axis=1).astype("<f2")
+    head = ply_bytes(columns).partition(b"end_header\n")[0].replace(b"property float", b"property half")
+    (tmp_path / "a.ply").write_bytes(head + b"end_header\n" + rows.tobytes())
+    np.testing.assert_array_equal(read_ply(tmp_path / "a.ply").means, still.means.astype(np.float16))
+
+
+def test_faces_before_the_vertices(tmp_path: Path) -> None:
+    """Triangles and quads, and a file that ends among them."""
+    points = np.random.default_rng(0).normal(size=(7, 3)).astype("<f4")
+    faces = b"".join(bytes([n]) + bytes(4 * n) + bytes(4) for n in (3, 4, 3))
+    head = "ply\nformat binary_little_endian 1.0\nelement face 3\nproperty list uchar int vertex_indices\n"
+    head += "property float quality\nelement vertex 7\n" + "".join(f"property float {a}\n" for a in "xyz")
+    data = head.encode() + b"end_header\n" + faces
+    (tmp_path / "a.ply").write_bytes(data + points.tobytes())
+    np.testing.assert_array_equal(read_points(tmp_path / "a.ply")[0], points)
+    (tmp_path / "a.ply").write_bytes(data[:-9])
+    with pytest.raises(InputError, match="'face'"):
+        read_points(tmp_path / "a.ply")
+
+
+def test_values_after_their_activation_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    columns = columns_of(random_still(N, 0))
+    assert read_ply(changed(tmp_path, {})) is not None
+    assert "activation" not in capsys.readouterr().err
+    columns |= {name: ("float", np.full(N, 0.5)) for name in ("opacity", "scale_0", "scale_1", "scale_2")}
+    (tmp_path / "b.ply").write_bytes(ply_bytes(columns))
+    read_ply(tmp_path / "b.ply")
+    assert "activation" in capsys.readouterr().err

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import subprocess
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from lapgs_wgpu import command, table, table_cli
+from lapgs_wgpu.data import Dataset
 from lapgs_wgpu.data.synthetic import write_synthetic
+from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.presets import load_config, write_toml
 from lapgs_wgpu.train.run_folder import STATE
 
@@ -112,12 +112,12 @@ def trained(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Instead of training, leaves a run folder with made-up figures, and notes here which run it was."""
     done: list[str] = []
 
-    def train(run: table.Run, options: Sequence[str], folder: Path) -> int:
+    def train(run: table.Run, data: Path, out: Path, *_: object) -> None:
         done.append(str(run))
+        folder = table.run_folder(out, run)
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "config.toml").write_text(write_toml(dataclasses.asdict(run.config)))
         (folder / "metrics.json").write_text(json.dumps(metrics(run.seed, run.config.schedule.steps)))
-        return 0
 
     monkeypatch.setattr(table, "_train", train)
     return done
@@ -154,23 +154,17 @@ def test_finished_runs_are_skipped_others_trained_again(
 def test_an_interrupted_table_goes_on(
     spec: Path, data: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    commands: list[list[str]] = []
+    called: list[tuple[str, str, Path]] = []
 
-    class Process:
-        def __init__(self, command: list[str], **_: object) -> None:
-            commands.append(command)
+    def interrupted(how: str) -> Any:
+        def call(config: Config, dataset: Dataset, folder: Path, **_: object) -> None:
+            called.append((how, config.data.path, folder))
+            raise KeyboardInterrupt("stopped after step 1 of 3.")
 
-        def __enter__(self) -> Process:
-            return self
+        return call
 
-        def __exit__(self, *_: object) -> None: ...
-
-        def terminate(self) -> None: ...
-
-        def wait(self) -> int:
-            return command.INTERRUPTED
-
-    monkeypatch.setattr(subprocess, "Popen", Process)
+    monkeypatch.setattr(table, "train", interrupted("train"))
+    monkeypatch.setattr(table, "resume", interrupted("resume"))
     assert make(spec, data) == command.INTERRUPTED
     assert "run 1 of 5" in capsys.readouterr().err
     folder = spec.parent / "out" / "toys" / "static" / "seed3"
@@ -178,15 +172,11 @@ def test_an_interrupted_table_goes_on(
     (folder / STATE).write_bytes(b"state")
     (folder / "config.toml").write_text(write_toml(dataclasses.asdict(table.read_spec(spec)[0].config)))
     assert make(spec, data) == command.INTERRUPTED
-    assert f"--out={folder}" in commands[0]
-    assert f"--resume={folder}" in commands[1]
-    assert f"--data={data / 'toys'}" in commands[1]
+    assert called == [(how, str(data / "toys"), folder) for how in ("train", "resume")]
 
 
 @pytest.mark.nightly
-def test_runs_are_trained_in_processes_and_a_failed_one_stops_no_other(
-    data: Path, spec: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_that_fails_stops_no_other(data: Path, spec: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Two real runs, of which the first finds a file where its folder should be."""
     out = spec.parent / "out"
     out.mkdir()
@@ -195,7 +185,7 @@ def test_runs_are_trained_in_processes_and_a_failed_one_stops_no_other(
     spec.write_text(f'{text}[scenes]\nfirst = "toys"\nsecond = "toys"\n[rows]\nstatic = {{ method = "static" }}\n')
     assert make(spec, data) == 1
     shown = capsys.readouterr()
-    assert "first, static, seed 3 failed" in shown.err
+    assert "first, static, seed 3: " in shown.err
     assert "| second | static | 1 |" in shown.out
     measured = json.loads((out / "second/static/seed3/metrics.json").read_text())
     (only,) = json.loads((out / "results.json").read_text())

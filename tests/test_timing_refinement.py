@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -25,7 +24,6 @@ from lapgs_wgpu.motion.fields.deformation import Deformation
 from lapgs_wgpu.motion.scene import Scene4D, load
 from lapgs_wgpu.motion.timing import EVEN, Timing
 from lapgs_wgpu.run import resume, train
-from lapgs_wgpu.train.distributed import SINGLE_PROCESS, Ranks
 from lapgs_wgpu.train.ground_truth import GroundTruth, HostImage
 from lapgs_wgpu.train.timing_refinement import FARTHEST, TimingRefinement, running_median
 from lapgs_wgpu.train.trainer import Trainer
@@ -62,9 +60,7 @@ def views_at(times: Sequence[float]) -> list[View]:
     ]
 
 
-def refinement(
-    scene: Scene4D, truth: Callable[[View], Tensor], times: Sequence[float] = TIMES, ranks: Ranks = SINGLE_PROCESS
-) -> TimingRefinement:
+def refinement(scene: Scene4D, truth: Callable[[View], Tensor], times: Sequence[float] = TIMES) -> TimingRefinement:
     def picture(view: View, timing: Timing) -> Tensor:
         return scene.render(view.camera, view.time, timing=timing).image
 
@@ -72,7 +68,7 @@ def refinement(
         pixels = truth(view)
         return HostImage(pixels, pixels.isnan()[..., :1])
 
-    return TimingRefinement(scene, views_at(times), image, picture, time_step(np.asarray(times)), ranks)
+    return TimingRefinement(scene, views_at(times), image, picture, time_step(np.asarray(times)))
 
 
 def refine(scene: Scene4D, truth: Callable[[View], Tensor]) -> None:
@@ -135,26 +131,6 @@ def test_moments_rise_and_stay_near_their_times(device: Device) -> None:
         found.set(found.fitted(number))
     assert (np.diff(scene.timing.moments) >= 0).all()
     assert np.abs(scene.timing.moments - TIMES).max() <= FARTHEST * 0.1 + 1e-12
-
-
-class Alone(Ranks):
-    """A rank that hears of no other, and keeps what it says."""
-
-    said: ClassVar[list[Tensor]] = []
-
-    def all_reduce_sum(self, tensors: Sequence[Tensor]) -> list[Tensor]:
-        self.said.extend(tensors)
-        return list(tensors)
-
-
-def test_ranks_share_the_images(device: Device) -> None:
-    for ranks in (Alone(0, 1), Alone(0, 2), Alone(1, 2)):
-        scene = moving(device)
-        refinement(scene, film(scene), ranks=ranks).fitted(0)
-    whole, even, odd = Alone.said
-    assert not even[1::2].any()
-    assert not odd[::2].any()
-    assert torch.equal(even + odd, whole)
 
 
 def test_the_running_median_has_as_many_after_as_before() -> None:

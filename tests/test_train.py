@@ -26,13 +26,12 @@ from lapgs_wgpu.motion.scene import Scene4D, load
 from lapgs_wgpu.run import train
 from lapgs_wgpu.train import objective
 from lapgs_wgpu.train.config import LossWeights
-from lapgs_wgpu.train.distributed import SINGLE_PROCESS
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
-from lapgs_wgpu.train.initial_points import initial_points
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.parts import Parts
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.resolve_config import resolve_for_dataset, resolve_step
+from lapgs_wgpu.train.start import initial_points
 from lapgs_wgpu.train.step_result import StepResult
 
 
@@ -217,7 +216,7 @@ def test_where_the_step_is_computed(
 ) -> None:
     monkeypatch.setattr(device, "is_cpu", is_cpu)
     config = configure(**given)
-    assert resolve_step(config, dataset, device, Parts(), SINGLE_PROCESS) == dataclasses.replace(config, step=place)
+    assert resolve_step(config, dataset, device, Parts()) == dataclasses.replace(config, step=place)
 
 
 def test_nothing_moves_during_the_warm_up(dataset: Dataset, device: Device, tmp_path: Path) -> None:

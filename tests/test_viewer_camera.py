@@ -1,4 +1,4 @@
-"""The viewer's camera: what mouse moves leave as it was, and exact snapping to a capture's camera."""
+"""The viewer's camera: what mouse moves leave as it was, and standing at a capture's camera."""
 
 from __future__ import annotations
 
@@ -104,33 +104,11 @@ def captured() -> Camera:
     return Camera(camera.K * np.array([[1.0, 1, 1.1], [1, 1.15, 0.93], [1, 1, 1]]), camera.T_cam_world, 60, 40)
 
 
-def test_snapping_is_exact(view: ViewCamera) -> None:
-    wanted = captured()
-    view.snap(wanted)
-    got = view.camera(60, 40)
-    assert np.array_equal(got.K, wanted.K)
-    assert np.array_equal(got.T_cam_world, wanted.T_cam_world)
-    assert ahead(view)
-    larger = view.camera(300, 120)  # the capture's aspect, as large as fits
-    assert (larger.width, larger.height) == (180, 120)
-    assert np.allclose(larger.K, wanted.resized(180, 120).K)
-
-
-@pytest.mark.parametrize("move", ["orbit", "look", "pan", "zoom", "fly", "focus_on", "stand", "reset"])
-def test_any_move_leaves_the_exact_camera(view: ViewCamera, move: str) -> None:
-    arguments = {"zoom": (0.9,), "fly": (0, 0, 1), "focus_on": ([0, 0, 0],), "reset": ()}
-    arguments["stand"] = (view.pose,)
-    view.snap(captured())
-    getattr(view, move)(*arguments.get(move, (0.1, 0.1)))
-    assert view.exact is None
-    assert (view.camera(300, 120).width, view.camera(300, 120).height) == (300, 120)
-
-
 def test_reset_returns_to_the_start(view: ViewCamera) -> None:
     before = view.camera(64, 48)
     view.orbit(0.3, 0.2)
     view.pan(0.1, 0.1)
-    view.snap(captured())
+    view.stand_at(captured())
     view.reset()
     after = view.camera(64, 48)
     assert np.array_equal(after.K, before.K)

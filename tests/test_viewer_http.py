@@ -29,7 +29,6 @@ from lapgs_wgpu.viewer.frame import FrameRenderer, FrameRequest
 from lapgs_wgpu.viewer.loaded_scene import load_scene
 from lapgs_wgpu.viewer.present import Offscreen
 from lapgs_wgpu.viewer.remote import guarded, open_entry
-from lapgs_wgpu.viewer.viewport import MARGIN
 
 TOKEN = "a-token_of-22-letters"
 SIZE = (480, 320)
@@ -187,7 +186,7 @@ def expected(scene: Path, device: Device, size: tuple[int, int], time: float) ->
     """What the desktop draws where the viewer begins."""
     opened = load_scene(scene, lambda: device)
     request = FrameRequest(opened.camera().camera(*size), time, "rgb", opened.background)
-    return Offscreen(device)(size, [FrameRenderer(opened.playback).draw(request).layout], MARGIN).astype(np.int16)
+    return Offscreen(device)(size, FrameRenderer(opened.playback).draw(request).image).astype(np.int16)
 
 
 def apart(a: NDArray[np.int16], b: NDArray[np.int16]) -> float:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -24,14 +23,9 @@ from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.rasterize import rasterize
 from lapgs_wgpu.train.evaluate import to_8_bit
 from lapgs_wgpu.viewer import offscreen as offscreen_module
+from lapgs_wgpu.viewer.capture_views import capture_views
 from lapgs_wgpu.viewer.cli import view_command
-from lapgs_wgpu.viewer.ground_truth import open_ground_truth
-from lapgs_wgpu.viewer.loaded_scene import load_scene
 from lapgs_wgpu.viewer.offscreen import framed
-from lapgs_wgpu.viewer.path import CameraPath, KeyFrame, Pose
-from lapgs_wgpu.viewer.path_file import PathFile, write_path
-from lapgs_wgpu.viewer.view_state import ViewState
-from lapgs_wgpu.viewer.viewport import Viewport
 
 pytestmark = pytest.mark.triangles
 kernels = pytest.mark.kernels
@@ -57,7 +51,7 @@ def scene(run: Path, device: Device) -> Scene4D:
 
 @pytest.fixture(autouse=True)
 def one_device(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(device_module, "open_device", lambda name=None, **_: device)
+    monkeypatch.setattr(device_module, "open_device", lambda name=None: device)
 
 
 def view(*words: object) -> None:
@@ -101,7 +95,7 @@ def test_time_background_and_size_of_a_view(run: Path, scene: Scene4D, tmp_path:
 
 
 @kernels
-@pytest.mark.parametrize("mode", ["depth", "alpha", "motion", "dynamics", "scale"])
+@pytest.mark.parametrize("mode", ["depth", "alpha", "motion", "dynamics"])
 def test_every_mode_gives_a_picture(mode: str, run: Path, tmp_path: Path) -> None:
     view(run / "checkpoint.ply", "--screenshot", tmp_path / "a.png", "--mode", mode, "--size", "40x30")
     got = picture(tmp_path / "a.png")
@@ -175,22 +169,6 @@ def test_where_cameras_stand_on_one_side_a_turn_swings_between_them() -> None:
     places = np.stack([camera.position for camera, _ in orbit_views(start, (8, 6), 4, None, arc)])
     for place, degrees in zip(places, (0, -20, 0, 40), strict=True):
         np.testing.assert_allclose(place, standing(degrees).position, atol=1e-6)
-
-
-@kernels
-def test_a_video_along_a_camera_path(run: Path, scene: Scene4D, tmp_path: Path) -> None:
-    def pose(x: float) -> Pose:
-        camera = Camera.looking_at([x, -3, 1], [0, 0, 0], up=[0, 0, 1], fov_x=0.8, width=4, height=3)
-        return Pose(camera.position, camera.T_cam_world[:3, :3], 0.7)
-
-    path = CameraPath([KeyFrame(0, 0.2, pose(-1)), KeyFrame(0.5, 0.6, pose(1)), KeyFrame(1.0, 0.1, pose(2))])
-    write_path(tmp_path / "p.json", PathFile(path, (48, 36), 4.0))
-    view(run / "checkpoint.ply", "--video", tmp_path / "a.mp4", "--path", tmp_path / "p.json")
-    got = frames_of(tmp_path / "a.mp4")
-    assert got.shape == (4, 36, 48, 3)
-    for frame, second in zip(got, np.linspace(0, 1, 4), strict=True):
-        stand, time = path.at(float(second))
-        assert distance(frame, expected_picture(scene, stand.camera(48, 36), time)) < 4.5
 
 
 def test_ctrl_c_leaves_no_file(
@@ -308,7 +286,7 @@ MISTAKES = {
     "no size": (["CHECKPOINT", "--screenshot", "a.png", "--size", "8"], "WIDTHxHEIGHT"),
     "a jpeg": (["CHECKPOINT", "--screenshot", "a.jpg"], "ends with .png"),
     "a folder without frames": (["CHECKPOINT", "--export", "a"], "--frames"),
-    "an unknown path": (["CHECKPOINT", "--video", "a.mp4", "--path", "spiral"], "expected time, view, both"),
+    "an unknown path": (["CHECKPOINT", "--video", "a.mp4", "--path", "spiral"], "--path"),
     "an unknown view": (["CHECKPOINT", "--screenshot", "a.png", "--view", "99"], "--view 99"),
     "too long": (["CHECKPOINT", "--video", "a.mp4", "--fps", "1000", "--seconds", "86400"], "are 86400000 frames"),
     "a missing folder": (["CHECKPOINT", "--screenshot", "no/a.png", "--size", "8x8"], "no/a.png"),
@@ -340,35 +318,10 @@ def test_the_capture_opens_as_the_training_opened_it(
 ) -> None:
     opened: list[dict[str, object]] = []
     monkeypatch.setattr(
-        "lapgs_wgpu.data.load_dataset", lambda path, **given: opened.append(given) or SimpleNamespace(test=(), train=())
+        "lapgs_wgpu.data.load_dataset",
+        lambda path, **given: opened.append(given) or SimpleNamespace(test=("a",), train=("b",)),
     )
     (tmp_path / "config.toml").write_text(f'[data]\npath = "{tmp_path}"\nsize = 200\n{line}\n')
-    assert open_ground_truth(tmp_path / "checkpoint.ply", {}) is not None
+    scene = SimpleNamespace(path=tmp_path / "checkpoint.ply", playback=SimpleNamespace(metadata={}))
+    assert capture_views(scene) == ("a", "b")  # type: ignore[arg-type]
     assert opened == [{"image_size": 200, "normalize": True, "undistort": expected}]
-
-
-def test_an_image_that_cannot_be_read_ends_the_comparison(run: Path, device: Device, tmp_path: Path) -> None:
-    offscreen = pytest.importorskip("rendercanvas.offscreen")
-    shutil.copytree(run, tmp_path / "run")
-    (tmp_path / "run" / "config.toml").write_text(f'[data]\npath = "{tmp_path / "run" / "toys"}"\nsize = 0\n')
-    state = ViewState(load_scene(tmp_path / "run" / "checkpoint.ply", lambda: device))
-    canvas = offscreen.RenderCanvas(size=(64, 48), pixel_ratio=1)
-    viewport = Viewport(canvas, state)
-    state.next_compare()
-    assert state.comparing() != "off"
-    for image in (tmp_path / "run" / "toys" / "test").glob("*.png"):
-        image.write_bytes(image.read_bytes()[:60])
-
-    def draw() -> None:
-        viewport.draw(50.0)
-        viewport.present()
-
-    canvas.request_draw(draw)
-    canvas.draw()
-    assert state.compare == "off"
-    assert state.message is not None
-    assert "cannot be decoded as an image" in state.message
-    shown = canvas.draw()
-    state.message = None
-    np.testing.assert_array_equal(shown, canvas.draw())
-    assert state.message is None

@@ -179,6 +179,9 @@ def test_an_antialiased_scene_of_uneven_timing(window: Browser, folder: Path, de
         call(window, "setTime", time)
         assert same(window, Desktop(made, device), time)
         assert not same(window, without, time)
+    for antialiased in (False, True):  # the key that switches it
+        window.key("x")
+        assert same(window, Desktop(made, device), time) == antialiased
 
 
 # Input

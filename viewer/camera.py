@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lapgs_wgpu.data.poses import world_to_camera
 from lapgs_wgpu.splat.camera import Camera
-from lapgs_wgpu.viewer.path import Pose
 
 Vector = NDArray[np.float64]
 _STEEPEST = math.radians(89)  # of the line of sight, up or down: beyond it the picture would turn over
@@ -18,7 +18,6 @@ class ViewCamera:
     """A camera that turns about a focus. World frame and units are the scene's; camera axes are OpenCV's.
 
     position (3,), focus (3,), up (3,) of unit length; fov_y: vertical field of view in radians.
-    exact: the camera of a data set at which this one stands, with its own centre and aspect, until it is moved.
     """
 
     def __init__(self, position: ArrayLike, focus: ArrayLike, up: ArrayLike, fov_y: float) -> None:
@@ -27,16 +26,14 @@ class ViewCamera:
         self.up: Vector = _unit(np.asarray(up, np.float64))
         self.fov_y = fov_y
         self.rotation = self._level(self.focus - self.position)
-        self.exact: Camera | None = None
-        self._start = (self.position, self.focus, self.rotation, self.fov_y, self.exact)
+        self._start = (self.position, self.focus, self.rotation, self.fov_y)
 
     @staticmethod
     def of(camera: Camera, focus: ArrayLike, up: ArrayLike) -> ViewCamera:
         """Make a camera that starts where another one stands; the focus is moved onto its line of sight."""
         made = ViewCamera(camera.position, focus, up, 2 * math.atan(0.5 * camera.height / camera.K[1, 1]))
-        made.snap(camera)
-        made.exact = None  # so that the picture fills the window, whatever its aspect
-        made._start = (made.position, made.focus, made.rotation, made.fov_y, made.exact)
+        made.stand_at(camera)
+        made._start = (made.position, made.focus, made.rotation, made.fov_y)
         return made
 
     @property
@@ -44,29 +41,17 @@ class ViewCamera:
         """Distance from the position to the focus, world units."""
         return float(np.linalg.norm(self.focus - self.position))
 
-    def snap(self, camera: Camera) -> None:
-        """Stand exactly where `camera` stands."""
+    def stand_at(self, camera: Camera) -> None:
+        """Stand where a camera stands, with its vertical field of view; the picture fills the window."""
         distance = max(float((self.focus - camera.position) @ camera.T_cam_world[2, :3]), 1e-3 * self.distance, 1e-6)
         self.rotation = camera.T_cam_world[:3, :3].copy()
         self.position = camera.position
         self.focus = self.position + distance * self.rotation[2]
         self.fov_y = 2 * math.atan(0.5 * camera.height / camera.K[1, 1])
-        self.exact = camera
-
-    @property
-    def pose(self) -> Pose:
-        """Position, rotation and field of view."""
-        return Pose(self.position.copy(), self.rotation.copy(), self.fov_y)
-
-    def stand(self, pose: Pose) -> None:
-        """Move to a pose. The distance to the focus, which lies straight ahead, does not change."""
-        distance = self.distance
-        self.position, self.rotation, self.fov_y = pose.position.copy(), pose.rotation.copy(), pose.fov_y
-        self.focus, self.exact = self.position + distance * self.rotation[2], None
 
     def reset(self) -> None:
         """Go back to where the camera started."""
-        self.position, self.focus, self.rotation, self.fov_y, self.exact = self._start
+        self.position, self.focus, self.rotation, self.fov_y = self._start
 
     def orbit(self, right: float, down: float) -> None:
         """Turn about the focus, as if the scene were dragged; radians."""
@@ -88,7 +73,6 @@ class ViewCamera:
     def zoom(self, factor: float) -> None:
         """Multiply the distance to the focus."""
         self.position = self.focus + factor * (self.position - self.focus)
-        self.exact = None
 
     def fly(self, right: float, down: float, forward: float) -> None:
         """Move by these lengths, world units, along the camera's axes."""
@@ -98,18 +82,15 @@ class ViewCamera:
         """Turn about another point from now on, which moves to the middle of the picture."""
         self.focus = np.asarray(point, np.float64)
         self.rotation = self._level(self.focus - self.position)
-        self.exact = None
 
     def camera(self, width: int, height: int) -> Camera:
-        """Make the rasterizer's camera for a picture of this size. At an exact camera the picture keeps that one's
-        aspect, and is as large as fits."""
-        if self.exact is not None:
-            scale = min(width / self.exact.width, height / self.exact.height)
-            return self.exact.resized(max(1, round(scale * self.exact.width)), max(1, round(scale * self.exact.height)))
-        return self.pose.camera(width, height)
+        """Make the rasterizer's camera for a picture of this size."""
+        f = 0.5 * height / math.tan(0.5 * self.fov_y)
+        K = np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]])
+        return Camera(K, world_to_camera(self.rotation.T, self.position), width, height)
 
     def _shift(self, by: Vector) -> None:
-        self.position, self.focus, self.exact = self.position + by, self.focus + by, None
+        self.position, self.focus = self.position + by, self.focus + by
 
     def _turn(self, right: float, down: float) -> None:
         """Turn the line of sight: about `up` so that the scene goes to the right, and about the horizontal axis. The
@@ -120,7 +101,6 @@ class ViewCamera:
         pitch = math.asin(float(np.clip(turned[2] @ self.up, -1, 1)))
         new = float(np.clip(pitch - down, -_STEEPEST, _STEEPEST))
         self.rotation = turned @ _about(across, pitch - new)
-        self.exact = None
 
     def _level(self, forward: Vector) -> NDArray[np.float64]:
         """(3, 3) rotation from world to camera of a line of sight, the horizon level."""

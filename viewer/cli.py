@@ -86,15 +86,15 @@ def _window(given: Any, scene: LoadedScene, entry: Entry | None) -> None:
 
 def _start(given: Any, state: ViewState) -> None:
     """Set the state as the options say. Raises InputError where the scene lacks the mode or the view."""
-    from lapgs_wgpu.viewer.offscreen import check_mode, find_view
+    from lapgs_wgpu.viewer.capture_views import find_view
+    from lapgs_wgpu.viewer.offscreen import check_mode
 
     if given.mode is not None:
         check_mode(state.scene, state.renderer, given.mode)
         state.mode = given.mode
     if given.view is not None:
         name = find_view(state.scene, given.view).name
-        assert state.ground_truth is not None
-        state.stand_at([view.name for view in state.ground_truth.views].index(name))
+        state.stand_at([view.name for view in state.views].index(name))
     state.background = BACKGROUNDS.get(given.background, state.background)
     state.show_transport = bool(given.time_slider or state.show_transport)
     clock = state.clock
@@ -111,7 +111,8 @@ def _renderer(given: Any, scene: LoadedScene) -> OffscreenRenderer:
 
 
 def _screenshot(given: Any, scene: LoadedScene) -> None:
-    from lapgs_wgpu.viewer.offscreen import find_view, framed, write_png
+    from lapgs_wgpu.viewer.capture_views import find_view
+    from lapgs_wgpu.viewer.offscreen import framed, write_png
 
     file = _named(given.screenshot, ".png", "--screenshot")
     time = given.time or 0.0
@@ -128,35 +129,24 @@ def _screenshot(given: Any, scene: LoadedScene) -> None:
 def _video(given: Any, scene: LoadedScene) -> None:
     from lapgs_wgpu.viewer import video
     from lapgs_wgpu.viewer.camera import ViewCamera
-    from lapgs_wgpu.viewer.offscreen import find_view, framed
-    from lapgs_wgpu.viewer.path_file import read_path
+    from lapgs_wgpu.viewer.capture_views import find_view
+    from lapgs_wgpu.viewer.offscreen import framed
 
     file = _named(given.video, ".mp4", "--video")
     path = given.path or ("time" if scene.playback.moves else "view")
-    if path not in video.PATHS and not path.endswith(".json"):
-        raise InputError(f"--path {path}: expected time, view, both, or the .json file of a camera path.")
     if path != "view" and given.time is not None:
         raise InputError(f"--time has no use with --path {path}, along which time passes.")
-    held = None if path in video.PATHS else read_path(Path(path))
-    if held is not None and given.view is not None:
-        raise InputError("--view has no use with a camera path, which says where the camera is.")
     view = find_view(scene, given.view) if given.view is not None else None
 
-    fps, seconds = given.fps or 30.0, 6.0
-    wanted = (view.camera.width, view.camera.height) if view else _SIZE
-    if held is not None:
-        fps, seconds, wanted = given.fps or held.fps, held.path.seconds, held.size
-    elif path != "view":
-        seconds = scene.clock().frames / fps
-    wanted = given.size or wanted
+    fps = given.fps or 30.0
+    seconds = 6.0 if path == "view" else scene.clock().frames / fps
+    wanted = given.size or ((view.camera.width, view.camera.height) if view else _SIZE)
     size = video.even(wanted)
     if size != wanted:
         print(f"note: mp4 needs even sizes: {_by(wanted)} becomes {_by(size)}", file=sys.stderr)
     frames = video.count_frames(given.seconds or seconds, fps)
 
-    if held is not None:
-        cameras = video.path_views(held.path, size, frames)
-    elif path == "time":
+    if path == "time":
         camera = framed(view.camera, *size) if view else scene.camera().camera(*size)
         cameras = video.clip_views(camera, frames)
     else:

@@ -16,7 +16,6 @@ LOOK = 0.4 * ORBIT  # about the camera itself, where a turn moves more of the pi
 ZOOM = 0.0015  # of the distance's logarithm a pixel of the wheel
 FLY_REACH = 0.6  # of the distance to the focus a second
 _SPEEDS = {"Shift": 4.0, "Alt": 0.25}  # of a flight, while the key is held
-_GRIP = 0.01  # of the width: how near to the split it can be dragged
 
 
 class Controls:
@@ -83,11 +82,7 @@ class Controls:
         self.pointer = (event["x"], event["y"])
         if self._covered(*self.pointer):
             return
-        state.path.started = None  # a drag ends the preview
-        point = self.viewport.on_image(*self.pointer)
-        if state.comparing() == "split" and point is not None and abs(point[0] - state.split) < _GRIP:
-            self._dragging = "split"
-        elif event["button"] != 1 or "Shift" in event["modifiers"]:
+        if event["button"] != 1 or "Shift" in event["modifiers"]:
             self._dragging = "pan"
         else:
             self._dragging = "look" if state.flying else "orbit"
@@ -103,9 +98,6 @@ class Controls:
         elif self._dragging == "pan":
             height = self.viewport.canvas.get_logical_size()[1]
             state.camera.pan(right / height, down / height)
-        elif self._dragging == "split":
-            point = self.viewport.on_image(x, y)
-            state.split = point[0] if point is not None else state.split
 
     def _on_pointer_up(self, event: dict[str, Any]) -> None:
         self._dragging = None

@@ -16,28 +16,28 @@ from lapgs_wgpu.motion.playback.playback import Playback
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterizer import Rasterizer
-from lapgs_wgpu.viewer.present import ImageLayout
+from lapgs_wgpu.viewer.present import DrawnImage
 from lapgs_wgpu.viewer.render_modes import MODES, Mode
 
 _TIMES = 9  # of the clip, at which the Gaussians' places are compared
 
 
 class FrameRequest(NamedTuple):
-    """What to draw: equal requests give equal frames."""
+    """What to draw: equal requests give equal frames. antialiased: None for as the scene says."""
 
     camera: Camera
     time: float
     mode: Mode
     background: tuple[float, float, float]
+    antialiased: bool | None = None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Frame:
-    """A drawn frame. layout: for the presenter, at the origin in its own size. seconds: until all passes were done.
-    splats: how many touched the picture."""
+    """A drawn frame. seconds: until all passes were done. splats: how many touched the image."""
 
     request: FrameRequest
-    layout: ImageLayout
+    image: DrawnImage
     seconds: float
     splats: int
 
@@ -58,7 +58,7 @@ class FrameRenderer:
         self.playback = playback
         self._rasterizer = Rasterizer(playback.device)
         self._pool = BufferPool(playback.device)
-        self._values: dict[tuple[Mode, float], tuple[DeviceArray, float, float]] = {}
+        self._values: dict[Mode, tuple[DeviceArray, float]] = {}
 
     def forget(self) -> None:
         """Drop what was measured of the scene, because it has changed."""
@@ -77,10 +77,12 @@ class FrameRenderer:
         camera, mode = request.camera, request.mode
         low, high, background = 0.0, 1.0, request.background
         # Before the Gaussians: measuring may take them to other times.
-        value = self._value(mode, request.time) if mode in ("motion", "dynamics", "scale") else None
+        value = self._value(mode) if mode in ("motion", "dynamics") else None
         gaussians = self.playback.at(request.time)
+        if request.antialiased is not None:
+            gaussians = dataclasses.replace(gaussians, antialiased=request.antialiased)
         if value is not None:
-            colors, low, high = value
+            colors, high = value
             gaussians = dataclasses.replace(gaussians, sh=colors)
             background = (0.0, 0.0, 0.0)
         while True:
@@ -91,14 +93,13 @@ class FrameRenderer:
         if mode == "depth":
             low, high = self._depth_range(drawing.image)
         shows = {"rgb": "color", "alpha": "alpha", "depth": "depth"}.get(mode, "value")
-        size = (camera.width, camera.height)
-        layout = ImageLayout(drawing.image, size, (0, 0), size, request.background, shows, low, high)
-        return Frame(request, layout, time.perf_counter() - start, int(visible[0]))
+        image = DrawnImage(drawing.image, (camera.width, camera.height), request.background, shows, low, high)
+        return Frame(request, image, time.perf_counter() - start, int(visible[0]))
 
     def depth_at(self, frame: Frame, column: int, row: int) -> float | None:
         """Measure the depth along the camera's axis at a pixel, world units; None where it shows next to nothing."""
         drawn = self.draw(frame.request._replace(mode="depth"))
-        planes = drawn.layout.planes.read()
+        planes = drawn.image.planes.read()
         alpha = 1.0 - float(planes[3, row, column])
         return float(planes[4, row, column]) / alpha if alpha > 0.1 else None
 
@@ -110,26 +111,19 @@ class FrameRenderer:
         low, high = np.percentile(depth[seen] / (1.0 - rest[seen]), [1, 99])
         return float(low), float(high)
 
-    def _value(self, mode: Mode, t: float) -> tuple[DeviceArray, float, float]:
-        """Return a value of each Gaussian as its color (N, 3), and the values at the ends of the scale."""
-        key = (mode, t if mode == "scale" else 0.0)
-        held = self._values.get(key)
-        if held is None:
-            value = self._measure(mode, t)
+    def _value(self, mode: Mode) -> tuple[DeviceArray, float]:
+        """Return a value of each Gaussian as its color (N, 3), and the value at the end of the scale."""
+        if mode not in self._values:
+            value = self._motion() if mode == "motion" else self._dynamics()
             array = self._pool.upload(mode, np.repeat(value[:, None], 3, axis=1))
-            low = float(np.percentile(value, 2)) if mode == "scale" and len(value) else 0.0
-            high = float(np.percentile(value, 98)) if len(value) else 1.0
-            self._values = {other: entry for other, entry in self._values.items() if other[0] != mode}
-            held = self._values[key] = (array, low, max(high, 1e-9))
-        return held
+            self._values[mode] = array, max(float(np.percentile(value, 98)) if len(value) else 1.0, 1e-9)
+        return self._values[mode]
 
-    def _measure(self, mode: Mode, t: float) -> NDArray[np.float32]:
-        if mode == "dynamics":
-            attributes = self.playback.dynamics()
-            assert attributes is not None
-            return np.linalg.norm(attributes, axis=1).astype(np.float32)
-        if mode == "scale":
-            scales = self.playback.at(t).scales.read()
-            return scales.max(axis=1, initial=0.0)
+    def _dynamics(self) -> NDArray[np.float32]:
+        attributes = self.playback.dynamics()
+        assert attributes is not None
+        return np.linalg.norm(attributes, axis=1).astype(np.float32)
+
+    def _motion(self) -> NDArray[np.float32]:
         places = np.stack([self.playback.means(t) for t in np.linspace(0, 1, _TIMES)])
         return np.linalg.norm(places - places.mean(axis=0), axis=2).max(axis=0).astype(np.float32)

@@ -27,12 +27,14 @@ _FRAMES = 150  # of a clip whose file does not say how many it has
 
 class LoadedScene(NamedTuple):
     """path: where it came from, None for a training under way. initial_view: camera, focus, up and frames to
-    begin with. file: its content, None for a training."""
+    begin with. file: its content, None for a training. up, antialiased: asked for by the user (`load_scene`)."""
 
     path: Path | None
     playback: Playback
     initial_view: InitialView
     file: SceneFile | None = None
+    up: str | None = None
+    antialiased: bool | None = None
 
     def camera(self) -> ViewCamera:
         """Make a camera where the viewer begins."""
@@ -65,7 +67,7 @@ def load_scene(
         initial_view = guess_view(playback, up or file.metadata.get("up"))
     elif up is not None:
         initial_view = guess_view(playback, up)._replace(frames=initial_view.frames)
-    return LoadedScene(path, playback, initial_view, file)
+    return LoadedScene(path, playback, initial_view, file, up, antialiased)
 
 
 def guess_view(playback: Playback, axis: str | None = None) -> InitialView:

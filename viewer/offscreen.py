@@ -7,13 +7,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.data import View
 from lapgs_wgpu.data.images import encode_png
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.viewer.frame import FrameRenderer, FrameRequest
-from lapgs_wgpu.viewer.ground_truth import open_ground_truth
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene
 from lapgs_wgpu.viewer.present import Offscreen
 from lapgs_wgpu.viewer.render_modes import Mode
@@ -34,29 +32,13 @@ class OffscreenRenderer:
     def __call__(self, camera: Camera, time: float) -> NDArray[np.uint8]:
         """Draw what the camera sees at a time in [0, 1]: (height, width, 3) uint8."""
         frame = self._renderer.draw(FrameRequest(camera, time, self._mode, self._background))
-        return self._offscreen((camera.width, camera.height), [frame.layout], self._background)
+        return self._offscreen((camera.width, camera.height), frame.image)
 
 
 def check_mode(scene: LoadedScene, renderer: FrameRenderer, mode: Mode) -> None:
     """Raises InputError where the scene has nothing to show in this mode."""
     if mode not in renderer.modes():
         raise InputError(f"{scene.path}: has nothing to show in mode {mode}; it has {', '.join(renderer.modes())}.")
-
-
-def find_view(scene: LoadedScene, wanted: str) -> View:
-    """The view of the capture beside the file with this number (the held-out ones come first) or name. Raises
-    InputError."""
-    capture = open_ground_truth(scene.path, scene.playback.metadata) if scene.path else None
-    if capture is None:
-        raise InputError(
-            f"--view {wanted}: {scene.path} stands beside no config.toml that names a capture which is here."
-        )
-    names = [view.name for view in capture.views]
-    if wanted in names:
-        return capture.views[names.index(wanted)]
-    if wanted.isdecimal() and int(wanted[:9]) < len(names):
-        return capture.views[int(wanted[:9])]
-    raise InputError(f"--view {wanted}: the capture has views 0 to {len(names) - 1}, named {names[0]} to {names[-1]}.")
 
 
 def framed(camera: Camera, width: int, height: int) -> Camera:

@@ -25,7 +25,6 @@ Without a display:
   lapgs-view CHECKPOINT.ply --screenshot a.png --view test_000 --mode depth
   lapgs-view CHECKPOINT.ply --video a.mp4                             the clip once; an orbit if the scene is static
   lapgs-view CHECKPOINT.ply --video a.mp4 --path both --seconds 10    one orbit while the clip plays
-  lapgs-view CHECKPOINT.ply --video a.mp4 --path CAMERAS.json         along a camera path (nerfstudio's format)
   lapgs-view CHECKPOINT.ply --export still.ply --time 0.5             static .ply for other splat viewers
   lapgs-view CHECKPOINT.ply --export frames --frames 60               sequence of static .ply files for SuperSplat
   lapgs-view CHECKPOINT.ply --export scene.html                       web page that plays the scene on the visitor's GPU
@@ -99,8 +98,7 @@ def _parse(arguments: Sequence[str]) -> Any:
         "not for videos in which the clip plays [0, or the time of --view]")
     add("--mode", choices=list(MODES), help="; ".join(f"{mode}: {about}" for mode, about in MODES.items()) + " [rgb]")
     add("--background", choices=list(BACKGROUNDS), help="color behind the Gaussians [the training's, otherwise black]")
-    add("--size", type=_size, metavar="WxH", help="pixels [1280x720, or of a picture that of --view or of the camera "
-        "path]")
+    add("--size", type=_size, metavar="WxH", help="pixels [1280x720, or of a picture that of --view]")
     add("--up", choices=list(AHEAD), help="axis that points up, of a file without cameras [where the file says, "
         "otherwise -y, or z of what lies flat]")
     add("--antialiased", choices=("yes", "no"), help="draw as antialiased trainings do (Mip-Splatting's filter); also "
@@ -111,8 +109,7 @@ def _parse(arguments: Sequence[str]) -> Any:
     add = parser.add_argument_group("window").add_argument
     add("--time-slider", action="store_const", const=True, help="show the time slider [shown if the scene moves]")
     add("--play", action="store_const", const=True, help="start playing at once [paused]")
-    add("--fps", type=_number(0.1, 1000.0), metavar="F", help="frames a second at speed 1 and of --video "
-        "[30, or that of the camera path]")
+    add("--fps", type=_number(0.1, 1000.0), metavar="F", help="frames a second at speed 1 and of --video [30]")
     add("--speed", type=_number(0.01, 100.0), metavar="X", help="playback speed, a factor [1]")
     add("--loop", choices=list(LOOPS), help="at the end of the clip: start again, play backwards, or stop [loop]")
     add("--backend", choices=("glfw", "http"), help="glfw: desktop window; http: web server for a browser (pip install "
@@ -123,11 +120,11 @@ def _parse(arguments: Sequence[str]) -> Any:
     add = parser.add_argument_group("screenshot and video (no window); existing files are replaced").add_argument
     add("--screenshot", metavar="FILE.png", help="render one image")
     add("--video", metavar="FILE.mp4", help="render a video (H.264; pip install 'lapgs-wgpu[video]')")
-    add("--path", metavar="time|view|both|CAMERAS.json", help="of --video; time: static camera while the clip plays; "
+    add("--path", choices=("time", "view", "both"), help="of --video; time: static camera while the clip plays; "
         "view: one orbit at --time, to and fro where the capture has cameras on one side only; both: the same while "
-        "the clip plays; CAMERAS.json: camera path in nerfstudio's format [time, or view if the scene does not move]")
-    add("--seconds", type=_number(0.001, 86400.0), metavar="S", help="length of --video [that of the clip or of the "
-        "camera path; 6 for view]")
+        "the clip plays [time, or view if the scene does not move]")
+    add("--seconds", type=_number(0.001, 86400.0), metavar="S", help="length of --video [that of the clip; 6 for "
+        "view]")
 
     add = parser.add_argument_group("export (no window)").add_argument
     add("--export", metavar="FILE.ply|.lapgs|.html|.4dgs|DIR", help=".ply: static 3DGS file at --time; "

@@ -1,24 +1,20 @@
-"""The GUI over the image (Dear ImGui): the view's panel, overlay, message, help."""
+"""The GUI over the image (Dear ImGui): the view's panel, overlay, help."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 from imgui_bundle import imgui
 from wgpu.utils.imgui import ImguiRenderer
 
-from lapgs_wgpu.viewer.file_browser import FileBrowser
 from lapgs_wgpu.viewer.key_bindings import KEYS, MOUSE
-from lapgs_wgpu.viewer.path_panel import draw_path
 from lapgs_wgpu.viewer.present import HEAT
-from lapgs_wgpu.viewer.render_modes import BACKGROUNDS, COMPARES, MODES
+from lapgs_wgpu.viewer.render_modes import BACKGROUNDS, MODES
 from lapgs_wgpu.viewer.time_slider import draw_time_slider
 from lapgs_wgpu.viewer.training_control import TrainingControl
 from lapgs_wgpu.viewer.view_state import ViewState
 from lapgs_wgpu.viewer.viewport import Viewport
-from lapgs_wgpu.viewer.widgets import button, choice, printable, tip
+from lapgs_wgpu.viewer.widgets import button, choice, tip
 
 _FIXED = imgui.WindowFlags_.no_move | imgui.WindowFlags_.no_resize | imgui.WindowFlags_.no_saved_settings
 _BAR = _FIXED | imgui.WindowFlags_.no_title_bar | imgui.WindowFlags_.no_scrollbar
@@ -26,7 +22,6 @@ _GAP = 8.0
 _BAR_HEIGHT = 62.0  # of the time slider
 _SIDE = 230.0  # width of the panel at the left
 _ACCENT = (0.95, 0.60, 0.25, 1.0)
-_COMPARE_NAMES = ("no comparison", "side by side", "split", "error, 4 times")
 
 
 class _Renderer(ImguiRenderer):
@@ -45,15 +40,13 @@ class _Renderer(ImguiRenderer):
 
 
 class Panels:
-    """Draws the GUI of a ViewState onto the viewport's canvas. open_file: shows another file."""
+    """Draws the GUI of a ViewState onto the viewport's canvas."""
 
-    def __init__(self, state: ViewState, viewport: Viewport, open_file: Callable[[Path], None]) -> None:
+    def __init__(self, state: ViewState, viewport: Viewport) -> None:
         self.state, self.viewport = state, viewport
         self._covered: list[tuple[float, float, float, float]] = []
         self._renderer = _Renderer(viewport.device.wgpu_device, viewport.canvas, viewport.format)
         self._renderer.set_gui(self._draw)
-        path = state.scene.path
-        self._files = FileBrowser(path.resolve().parent if path else Path.cwd(), open_file)
         imgui.get_io().set_ini_filename("")
         imgui.get_io().config_flags &= ~imgui.ConfigFlags_.nav_enable_keyboard  # the keys are the viewer's
         _style()
@@ -90,8 +83,6 @@ class Panels:
             imgui.begin("transport", None, _BAR)
             draw_time_slider(state)
             self._end()
-        if state.message:
-            self._message(state.message)
 
     # The panel at the left -------------------------------------------------------------------------------------------
 
@@ -103,17 +94,15 @@ class Panels:
         state.mode = choice("mode", state.mode, state.renderer.modes())
         tip(MODES[state.mode])
         frame = self.viewport.frame
-        if frame is not None and frame.layout.shows in ("depth", "value"):
-            _legend(frame.layout.low, frame.layout.high)
+        if frame is not None and frame.image.shows in ("depth", "value"):
+            _legend(frame.image.low, frame.image.high)
         state.background = choice("ground", state.background, list(BACKGROUNDS.values()), list(BACKGROUNDS))
         tip("background")
+        _, state.antialiased = imgui.checkbox("antialiased", state.antialiased)
+        tip("Mip-Splatting's filter, as antialiased trainings draw (X)")
         if button("Reset"):
             state.reset_camera()
         tip("camera back to where it started (R)")
-        imgui.same_line()
-        if button("Open", enabled=state.training is None):  # there would be no way back to the training
-            self._files.toggle()
-        tip("another .ply or .lapgs file")
         imgui.same_line()
         if button("Help"):
             state.show_help = not state.show_help
@@ -122,10 +111,10 @@ class Panels:
             imgui.text_colored(_ACCENT, "flying: W A S D Q E, V ends")
         if state.training is not None:
             self._training(state.training)
-        if state.ground_truth is not None:
-            self._capture()
-        draw_path(state, self.viewport)
-        self._files.draw()
+        if state.views:
+            chosen = choice("camera", state.view, range(len(state.views)), [view.name for view in state.views])
+            if chosen is not None and chosen != state.view:
+                state.stand_at(chosen)
         self._end()
 
     def _training(self, training: TrainingControl) -> None:
@@ -140,21 +129,6 @@ class Panels:
         if button("Step"):
             training.step()
         tip("one step of the optimizer, then pause")
-
-    def _capture(self) -> None:
-        state = self.state
-        assert state.ground_truth is not None
-        imgui.separator_text("Capture")
-        views = state.ground_truth.views
-        chosen = choice("camera", state.view, range(len(views)), [view.name for view in views])
-        compare = choice("##compare", state.compare, COMPARES, _COMPARE_NAMES, width=-1)
-        if compare != state.compare and state.view is None:
-            chosen = 0
-        state.compare = compare
-        if chosen is not None and chosen != state.view:
-            state.stand_at(chosen)
-        if state.compare != "off" and state.comparing() == "off":
-            imgui.text_wrapped("The capture has no picture of this camera and time; N goes to the next that it has.")
 
     # Texts over the picture ------------------------------------------------------------------------------------------
 
@@ -174,17 +148,6 @@ class Panels:
             f"{camera.width}x{camera.height}" + (f" ({100 * viewport.scale:.0f} %)" if viewport.scale < 1 else "")
         )
         imgui.text(viewport.device.info.name[:34])
-        self._end()
-
-    def _message(self, message: str) -> None:
-        state = self.state
-        width, _ = self.viewport.canvas.get_logical_size()
-        imgui.set_next_window_pos((0.5 * width, _GAP), imgui.Cond_.always, (0.5, 0.0))
-        imgui.set_next_window_size((min(420.0, width - 2 * _GAP), 0))
-        imgui.begin("message", None, _BAR)
-        imgui.text_wrapped(printable(message))
-        if imgui.button("OK"):
-            state.message = None
         self._end()
 
     def _help(self) -> None:

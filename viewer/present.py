@@ -26,40 +26,31 @@ VALUES = ("color", "alpha", "depth", "value")  # what a pixel shows; the order i
 OFFSCREEN_FORMAT = "rgba8unorm"
 
 
-class ImageLayout(NamedTuple):
-    """A picture and where it stands on the target.
+class DrawnImage(NamedTuple):
+    """An image and how its values are shown.
 
-    planes: as the rasterizer draws them, (4 or 5, height, width). origin, size: in pixels of the target.
+    planes: as the rasterizer draws them, (4 or 5, height, width). size: (width, height).
     shows: one of VALUES; low, high: the values at the ends of the scale, for depth and value.
-    truth: (height, width) uint32 on the device, red in the lowest byte, of truth_size; shown left of `truth_until`
-    (a share of the width), or, with error_gain, its absolute difference times this.
     """
 
     planes: DeviceArray
-    picture: tuple[int, int]
-    origin: tuple[int, int]
     size: tuple[int, int]
     background: tuple[float, float, float]
     shows: str = "color"
     low: float = 0.0
     high: float = 1.0
-    truth: DeviceArray | None = None
-    truth_size: tuple[int, int] = (0, 0)
-    truth_until: float = 0.0
-    error_gain: float = 0.0
 
 
 class Presenter:
-    """Draws pictures onto textures of one format of one device."""
+    """Draws images onto textures of one format of one device."""
 
     def __init__(self, device: Device, target_format: str) -> None:
         self.device = device
         self._pool = BufferPool(device)
-        self._no_truth = self._pool.array("no truth", (1, 4), "uint32")
         self._source = compose("present", {})
         native = device.wgpu_device
         module = native.create_shader_module(label="present", code=self._source)
-        kinds = ("uniform", "read-only-storage", "read-only-storage")
+        kinds = ("uniform", "read-only-storage")
         self._layout = native.create_bind_group_layout(
             entries=[
                 {"binding": i, "visibility": wgpu.ShaderStage.FRAGMENT, "buffer": {"type": kind}}
@@ -74,39 +65,28 @@ class Presenter:
             primitive={"topology": "triangle-list"},
         )
 
-    def __call__(self, target: Any, pictures: list[ImageLayout], margin: tuple[float, float, float]) -> None:
-        """Submit: `target`, a texture view, filled with the margin's color and then with the pictures."""
-        uniforms = [self._uniform(i, layout) for i, layout in enumerate(pictures)]
-        native = self.device.wgpu_device
-        encoder = native.create_command_encoder()
-        attachment = {"view": target, "load_op": "clear", "store_op": "store", "clear_value": (*margin, 1)}
-        render = encoder.begin_render_pass(color_attachments=[attachment])
-        render.set_pipeline(self._pipeline)
-        for uniform, layout in zip(uniforms, pictures, strict=True):
-            bound = (uniform, layout.planes, layout.truth or self._no_truth)
-            entries = [{"binding": i, "resource": array.resource} for i, array in enumerate(bound)]
-            render.set_bind_group(0, native.create_bind_group(layout=self._layout, entries=entries))
-            render.set_viewport(*layout.origin, *layout.size, 0, 1)
-            render.set_scissor_rect(*layout.origin, *layout.size)
-            render.draw(3)
-        render.end()
-        self.device.queue.submit([encoder.finish()])
-
-    def _uniform(self, number: int, layout: ImageLayout) -> DeviceArray:
+    def __call__(self, target: Any, size: tuple[int, int], image: DrawnImage) -> None:
+        """Submit: the image on all of `target`, a texture view of (width, height)."""
         values: dict[str, object] = {f"heat{i}": (*color, 1.0) for i, color in enumerate(HEAT)}
         values |= {
-            "background": (*layout.background, 1.0),
-            "origin": layout.origin,
-            "size": layout.size,
-            "picture": layout.picture,
-            "truth": layout.truth_size,
-            "value": VALUES.index(layout.shows),
-            "low": layout.low,
-            "high": layout.high,
-            "truth_until": layout.truth_until,
-            "error_gain": layout.error_gain,
+            "background": (*image.background, 1.0),
+            "size": size,
+            "picture": image.size,
+            "value": VALUES.index(image.shows),
+            "low": image.low,
+            "high": image.high,
         }
-        return self._pool.constant(f"picture {number}", pack(self._source, "Present", values))
+        uniform = self._pool.constant("present", pack(self._source, "Present", values))
+        entries = [{"binding": i, "resource": array.resource} for i, array in enumerate((uniform, image.planes))]
+        native = self.device.wgpu_device
+        encoder = native.create_command_encoder()
+        attachment = {"view": target, "load_op": "clear", "store_op": "store"}
+        render = encoder.begin_render_pass(color_attachments=[attachment])
+        render.set_pipeline(self._pipeline)
+        render.set_bind_group(0, native.create_bind_group(layout=self._layout, entries=entries))
+        render.draw(3)
+        render.end()
+        self.device.queue.submit([encoder.finish()])
 
 
 class Offscreen:
@@ -117,15 +97,13 @@ class Offscreen:
         self._texture: Any = None
         self._device = device
 
-    def __call__(
-        self, size: tuple[int, int], pictures: list[ImageLayout], margin: tuple[float, float, float]
-    ) -> NDArray[np.uint8]:
-        """Draw the pictures on a target of (width, height); returns (height, width, 3) uint8."""
+    def __call__(self, size: tuple[int, int], image: DrawnImage) -> NDArray[np.uint8]:
+        """Draw an image on a target of (width, height); returns (height, width, 3) uint8."""
         native = self._device.wgpu_device
         if self._texture is None or self._texture.size[:2] != size:
             usage = wgpu.TextureUsage.RENDER_ATTACHMENT | wgpu.TextureUsage.COPY_SRC
             self._texture = native.create_texture(size=(*size, 1), format=OFFSCREEN_FORMAT, usage=usage)
-        self._presenter(self._texture.create_view(), pictures, margin)
+        self._presenter(self._texture.create_view(), size, image)
         width, height = size
         pitch = (4 * width + 255) // 256 * 256
         data = self._device.queue.read_texture(

@@ -1,19 +1,16 @@
-"""Render modes, backgrounds, comparisons and vertical axes: constants that load neither torch nor wgpu."""
+"""Render modes, backgrounds and vertical axes: constants that load neither torch nor wgpu."""
 
 from __future__ import annotations
 
 from typing import Literal
 
-Mode = Literal["rgb", "depth", "alpha", "motion", "dynamics", "scale"]
-Compare = Literal["off", "side", "split", "error"]
-COMPARES: tuple[Compare, ...] = ("off", "side", "split", "error")
+Mode = Literal["rgb", "depth", "alpha", "motion", "dynamics"]
 MODES: dict[Mode, str] = {
     "rgb": "colors",
     "depth": "depth along the camera axis, world units",
     "alpha": "opacity of the image",
     "motion": "largest distance of each Gaussian from its mean position over the clip, world units",
     "dynamics": "norm of each Gaussian's dynamics attribute",
-    "scale": "largest standard deviation of each Gaussian, world units",
 }
 # Axis that points up -> the one along which the guessed camera looks.
 AHEAD = {"x": "y", "y": "-z", "z": "y", "-x": "y", "-y": "z", "-z": "y"}

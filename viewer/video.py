@@ -15,10 +15,8 @@ from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.progress import Progress
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.viewer.camera import ViewCamera
-from lapgs_wgpu.viewer.path import CameraPath
 
 TimedCamera = tuple[Camera, float]  # a camera and a time in the clip
-PATHS = ("time", "view", "both")
 _QUALITY = "18"  # H.264's crf: hardly distinguishable from the rendered images
 _MOST_FRAMES = 1_000_000
 
@@ -58,13 +56,6 @@ def _turned(share: float, arc: tuple[float, float] | None) -> float:
         return 2 * math.pi * share
     wave = math.sin(2 * math.pi * share)
     return math.radians(wave * (arc[0] if wave > 0 else arc[1]))
-
-
-def path_views(path: CameraPath, size: tuple[int, int], frames: int) -> Iterator[TimedCamera]:
-    """Follow a camera path from its first to its last key-frame."""
-    for second in np.linspace(0, path.seconds, frames).tolist():
-        pose, time = path.at(second)
-        yield pose.camera(*size), time
 
 
 def even(size: tuple[int, int]) -> tuple[int, int]:

@@ -1,4 +1,4 @@
-"""The canvas's frames: drawn where something changed, at the resolution that keeps up, and laid out on the canvas."""
+"""The canvas's frames: drawn where something changed, at the resolution that keeps up."""
 
 from __future__ import annotations
 
@@ -7,17 +7,14 @@ import time
 from collections import deque
 from typing import Any
 
-from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.viewer.frame import Frame, FrameRequest
-from lapgs_wgpu.viewer.present import ImageLayout, Presenter
+from lapgs_wgpu.viewer.present import Presenter
 from lapgs_wgpu.viewer.view_state import ViewState
 
 SETTLED = 0.2  # seconds without a change after which the full resolution is drawn
-MARGIN = (0.11, 0.11, 0.12)  # color around an image that does not fill the canvas
 TARGET_SECONDS = 1 / 12  # for a frame while something moves; where it takes longer, the resolution falls
 SMALLEST_SCALE = 0.25  # least resolution, share of the canvas's width and height
-_ERROR_GAIN = 4.0
 
 
 class Viewport:
@@ -38,7 +35,7 @@ class Viewport:
         self._presenter = Presenter(self.device, self.format)
         self.frame: Frame | None = None
         self.scale = self._moving_scale = 1.0
-        self._drawn: tuple[Any, ...] = ()  # all that the frame depends on, with the renderer at the end
+        self._drawn: tuple[Any, ...] = ()  # all that the frame depends on
         self.stale = False
         self.moved_at = time.perf_counter()
         self._times: deque[float] = deque(maxlen=30)
@@ -62,23 +59,22 @@ class Viewport:
     def draw(self, now: float) -> None:
         """Draw the scene where something changed: at a lower resolution while it changes, in full once
         nothing has changed for SETTLED seconds. now: seconds of `time.perf_counter`."""
-        state, full = self.state, self._full_camera()
-        key = (*_camera_key(full), state.clock.time, state.mode, state.background, state.renderer)
-        changed = key != self._drawn
-        if changed:
-            moving = bool(self._drawn) and self._drawn[-1] is state.renderer  # not the first frame of a scene
+        state, (width, height) = self.state, self.canvas.get_physical_size()
+        full = state.camera.camera(max(1, width), max(1, height))
+        shown = state.clock.time, state.mode, state.background, state.antialiased
+        key = (*_camera_key(full), *shown)
+        moving = bool(self._drawn) and key != self._drawn  # not the first frame
+        if key != self._drawn:
             self.moved_at = now
         elif not self.stale and (self.at_rest or now - self.moved_at < SETTLED):
             return
-        else:
-            moving = False
         if state.training is not None:
             state.renderer.forget()
         self.scale = self._moving_scale if moving else 1.0
         camera = full
         if self.scale < 1:
             camera = full.resized(max(1, round(self.scale * full.width)), max(1, round(self.scale * full.height)))
-        self.frame = state.renderer.draw(FrameRequest(camera, state.clock.time, state.mode, state.background))
+        self.frame = state.renderer.draw(FrameRequest(camera, *shown))
         self._drawn, self.stale = key, False
         self._times.append(time.perf_counter())
         if moving:
@@ -87,65 +83,18 @@ class Viewport:
             self._moving_scale = min(max(math.floor(16 * ideal) / 16, SMALLEST_SCALE), 1.0)
 
     def present(self) -> None:
-        """Copy the frame, with the ground truth where the two are compared, to the canvas's texture."""
-        target = self._context.get_current_texture()
-        self._presenter(target.create_view(), self._layouts(*target.size[:2]), MARGIN)
-
-    def _full_camera(self) -> Camera:
-        """Make the camera at full resolution: the canvas's, or that of the image that is subtracted."""
-        comparing, camera = self.state.comparing(), self.state.camera
-        if comparing == "error" and camera.exact is not None:
-            return camera.exact
-        width, height = self.canvas.get_physical_size()
-        return camera.camera(max(1, width // 2 if comparing == "side" else width), max(1, height))
-
-    def _layouts(self, width: int, height: int) -> list[ImageLayout]:
-        """Lay the frame out on a canvas of this size, pixels."""
+        """Draw the frame on the canvas's texture."""
         assert self.frame is not None
-        layout = self.frame.layout._replace(**self._truth())
-        compare = self.state.comparing()
-        columns = width // 2 if compare == "side" else width
-        if compare == "side":
-            right = _fit(layout._replace(truth_until=0.0), columns, height, columns)
-            return [_fit(layout._replace(truth_until=1.0), columns, height, 0), right]
-        if compare == "split":
-            layout = layout._replace(truth_until=self.state.split)
-        elif compare == "error":
-            layout = layout._replace(error_gain=_ERROR_GAIN)
-        return [_fit(layout, columns, height, 0)]
-
-    def _truth(self) -> dict[str, Any]:
-        """What `ImageLayout` has to know of the image that is compared with, if any. One that cannot be read ends the
-        comparison, with a message."""
-        state = self.state
-        if state.comparing() == "off" or state.ground_truth is None or state.view is None:
-            return {}
-        try:
-            return state.ground_truth.truth(state.view, state.background, self.device)
-        except InputError as error:
-            state.compare, state.message = "off", str(error)
-            self.canvas.request_draw()
-            return {}
-
-    def on_image(self, x: float, y: float) -> tuple[float, float] | None:
-        """A point of the canvas (logical pixels) as shares of the image's width and height; None beside the image. Of
-        two images the right one counts."""
-        if self.frame is None:
-            return None
-        layout = self._layouts(*self.canvas.get_physical_size())[-1]
-        ratio = self.canvas.get_pixel_ratio()
-        across, down = (
-            (at * ratio - start) / length for at, start, length in zip((x, y), layout.origin, layout.size, strict=True)
-        )
-        return (across, down) if 0 <= across < 1 and 0 <= down < 1 else None
+        target = self._context.get_current_texture()
+        self._presenter(target.create_view(), target.size[:2], self.frame.image)
 
     def focus(self, x: float, y: float) -> None:
         """Move the camera's focus to the surface under a point of the canvas, logical pixels."""
-        point = self.on_image(x, y)
-        if point is None or self.frame is None:
+        across, down = (at / length for at, length in zip((x, y), self.canvas.get_logical_size(), strict=True))
+        if self.frame is None or not (0 <= across < 1 and 0 <= down < 1):
             return
         camera = self.frame.request.camera
-        column, row = int(point[0] * camera.width), int(point[1] * camera.height)
+        column, row = int(across * camera.width), int(down * camera.height)
         depth = self.state.renderer.depth_at(self.frame, column, row)
         self._drawn = ()  # the frame's buffers hold the depth now
         if depth is not None:
@@ -156,15 +105,3 @@ class Viewport:
 
 def _camera_key(camera: Camera) -> tuple[bytes, bytes, int, int]:
     return camera.K.tobytes(), camera.T_cam_world.tobytes(), camera.width, camera.height
-
-
-def _fit(layout: ImageLayout, width: int, height: int, left: int) -> ImageLayout:
-    """Center the image, as large as fits, between columns left and left + width."""
-    columns, rows = layout.picture
-    scale = min(width / columns, height / rows)
-    # An image drawn for this canvas at a lower resolution fills it again, whatever rounding did to its size.
-    across, down = (
-        most if abs(scale * n - most) <= max(1.0, scale) else max(1, round(scale * n))
-        for n, most in ((columns, width), (rows, height))
-    )
-    return layout._replace(origin=(left + (width - across) // 2, (height - down) // 2), size=(across, down))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from typing import TypeVar
 
@@ -31,8 +30,3 @@ def tip(text: str) -> None:
     """Show a text while the pointer rests on the last item."""
     if imgui.is_item_hovered(imgui.HoveredFlags_.allow_when_disabled):
         imgui.set_tooltip(text)
-
-
-def printable(text: str) -> str:
-    """Make a text valid UTF-8: names of files may not be, which ends Dear ImGui's frame with an error."""
-    return os.fsencode(text).decode("utf-8", "replace")

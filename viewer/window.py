@@ -6,11 +6,10 @@ import os
 import sys
 import warnings
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 from lapgs_wgpu.errors import InputError, pip_install
-from lapgs_wgpu.viewer.app import App, window_title
+from lapgs_wgpu.viewer.app import App
 from lapgs_wgpu.viewer.gui_library import check_imgui
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene
 from lapgs_wgpu.viewer.view_state import ViewState
@@ -38,7 +37,7 @@ def run_window(scene: LoadedScene, size: tuple[int, int], start: Callable[[ViewS
     size: of the picture, logical pixels. start: puts the state of the view as the window begins. Raises InputError as
     `start` does, and DeviceError where the device is lost or full.
     """
-    canvas, loop = make_canvas(window_title(scene.path), size, lambda path: app.open(path))
+    canvas, loop = make_canvas(f"{scene.path} - lapgs-view", size)
     app = App(canvas, loop, scene)
     start(app.state)
     loop.run()
@@ -46,11 +45,8 @@ def run_window(scene: LoadedScene, size: tuple[int, int], start: Callable[[ViewS
         raise app.failed
 
 
-def make_canvas(title: str, size: tuple[int, int], drop: Callable[[Path], None] | None = None) -> tuple[Any, Any]:
-    """Make a window that draws on request, and its event loop. drop: called with a file dropped on it."""
-    from rendercanvas.glfw import RenderCanvas, glfw, loop
+def make_canvas(title: str, size: tuple[int, int]) -> tuple[Any, Any]:
+    """Make a window that draws on request, and its event loop."""
+    from rendercanvas.glfw import RenderCanvas, loop
 
-    canvas = RenderCanvas(title=title, size=size, update_mode="ondemand", max_fps=60)
-    if drop is not None:
-        glfw.set_drop_callback(canvas._window, lambda window, paths: drop(Path(paths[0])))
-    return canvas, loop
+    return RenderCanvas(title=title, size=size, update_mode="ondemand", max_fps=60), loop

@@ -76,7 +76,7 @@ def read_points(path: Path) -> tuple[NDArray[np.float64], Floats | None]:
         vertex = ply.elements.get("vertex")
         if vertex is None or not {"x", "y", "z"} <= set(vertex.properties):
             raise InputError(f"{path}: has no element vertex with properties x, y, z, so it is no cloud of points.")
-        points, colors = ply.exact_columns(vertex, ["x", "y", "z"]), read_colors(ply, vertex)
+        points, colors = ply.columns(vertex, ["x", "y", "z"], np.float64), read_colors(ply, vertex)
         others = [name for name in vertex.properties if name not in ("x", "y", "z", "nx", "ny", "nz")]
         if colors is None and others:
             print(

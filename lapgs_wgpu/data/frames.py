@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 from lapgs_wgpu.data.cloud import Cloud
 from lapgs_wgpu.data.images import ImageFile
 from lapgs_wgpu.data.lens import Lens
+from lapgs_wgpu.data.masks import MaskKind
 from lapgs_wgpu.data.normalize import Normalization
+from lapgs_wgpu.data.poses import place_of
 from lapgs_wgpu.data.stamps import ImageName
 from lapgs_wgpu.data.video_frames import VideoFrame
 
@@ -33,12 +35,12 @@ class Frame:
     T_cam_world: (4, 4) pose, OpenCV axes, the capture's coordinates.
     where: the description of camera and lens: file and entry, for errors.
     name: file name and camera, for rules on own footage.
+    states_size: whether the files state the size or the center of the lens; else they are those of the image.
     time: in any unit; None if the files state none. Either all frames of a capture have a time, or none.
     split: None to apply the rule for own footage (`split.held_out`), for all frames of a capture or for none.
     label: suffix of the view's name; None to number the views.
     depths: nearest and furthest depth, the capture's units.
-    mask: image of the pixels that the masked metrics measure, of any size; white is measured.
-    black: image of the pixels that the training leaves out, of any size; black is left out.
+    mask: image, of any size, of what the training leaves out or the masked metrics measure, as mask_kind says.
     """
 
     image: ImageSource
@@ -51,7 +53,13 @@ class Frame:
     label: str | None = None
     depths: tuple[float, float] | None = None
     mask: Path | None = None
-    black: Path | None = None
+    mask_kind: MaskKind = "measured"
+    states_size: bool = True
+
+    @property
+    def place(self) -> NDArray[np.float64]:
+        """(3,) the place of the camera."""
+        return place_of(self.T_cam_world)
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import sys
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath, PureWindowsPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.data.image_files import ImageFinder
-from lapgs_wgpu.data.images import SUFFIXES
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io import safe_json_toml
 
@@ -96,45 +93,6 @@ def vector(value: Any, length: int, name: str, where: str | Path) -> NDArray[np.
     if not isinstance(value, list) or len(value) != length:
         raise InputError(f"{where}: {name} must be a list of {length} numbers, got {kind(value)}.")
     return np.array([number(entry, name, where, -LARGEST_ENTRY, LARGEST_ENTRY) for entry in value])
-
-
-def check_inside(name: str, field: str, where: str | Path) -> None:
-    """Raise InputError if the path in a field leaves the capture's folder, on any system.
-
-    Symbolic links are allowed: the owner of the folder created them.
-    """
-    for system in (PurePosixPath, PureWindowsPath):
-        if system(name).anchor or ".." in system(os.path.normpath(name)).parts:
-            raise InputError(
-                f"{where}: {field} {kind(name)} leads out of the scene's folder; put the file, or a link to it, into "
-                "the folder."
-            )
-
-
-def image_path(entry: Fields, images: ImageFinder, absent: list[str]) -> tuple[str, Path] | None:
-    """Return the file_path of a frame, and the existing file that it names; .png is appended to a name without suffix.
-
-    Appends a sentence to `absent`, and returns None, if no such file exists. Raises InputError.
-    """
-    name, named = entry.required("file_path"), f"{entry.where} names it as file_path"
-    if not isinstance(name, str) or not name:
-        raise InputError(f"{entry.where}: file_path must be the path of an image, got {kind(name)}.")
-    check_inside(name, "file_path", entry.where)
-    written = name if name.lower().endswith(SUFFIXES) else name + ".png"
-    found = images.find(written)
-    if found is not None:
-        return (name if found == written else found), images.folder / found
-    if os.path.isfile(images.folder / name):
-        raise absent_image(images.folder / name, named)
-    absent.append(str(absent_image(images.folder / written, named)))
-    return None
-
-
-def absent_image(file: Path, named: str) -> InputError:
-    """The error for a file that is missing or no image. named: what names it."""
-    if os.path.isfile(file):
-        return InputError(f"{file} is neither PNG nor JPEG, but {named}; convert it.")
-    return InputError(f"{file} does not exist, but {named}.")
 
 
 def kind(value: Any) -> str:

@@ -7,26 +7,26 @@ file in `readers` and a line in READERS.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
-from functools import partial
-from pathlib import Path
-from typing import NamedTuple
+from collections.abc import Sequence
+from pathlib import Path, PurePath
+from typing import NamedTuple, get_args
 
 from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
 from lapgs_wgpu.data.images import Pixels, Size, shrink, shrunk_size
 from lapgs_wgpu.data.lens import Lens, Undistortion
-from lapgs_wgpu.data.masks import Mask, check_ignored, find_masks, read_ignored, read_measured
+from lapgs_wgpu.data.masks import MASKED, Mask, MaskKind, check_masks, find_masks, read_mask
 from lapgs_wgpu.data.placement import place
-from lapgs_wgpu.data.readers import colmap, dnerf, endonerf, hypernerf, nerfstudio, neu3d, polycam, record3d
+from lapgs_wgpu.data.readers import apps, colmap, hypernerf, poses_bounds, transforms
 from lapgs_wgpu.data.split import held_out
-from lapgs_wgpu.data.timestamps import disorder, in_step, natural_key, read_times, to_unit_range
+from lapgs_wgpu.data.stamps import natural_key
+from lapgs_wgpu.data.timestamps import as_one_camera, by_camera, disorder, in_step, read_times, to_unit_range
 from lapgs_wgpu.data.validation import check_cloud, check_film, check_frames, check_plausible, check_views, upright
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
 
 READERS: tuple[Reader, ...] = tuple(
-    module.READER for module in (dnerf, hypernerf, neu3d, nerfstudio, colmap, record3d, polycam, endonerf)
+    reader for module in (transforms, hypernerf, poses_bounds, colmap, apps) for reader in module.READERS
 )
 
 
@@ -59,34 +59,40 @@ def load_dataset(
         raise InputError(f"image_size must be at least 1 pixel, got {image_size}.")
     reader = _reader(folder)
     capture = reader.read(folder, image_size)
+    frames = list(capture.frames)
     if not undistort:
-        pinholes = [dataclasses.replace(frame, lens=frame.lens.idealized) for frame in capture.frames]
-        capture = dataclasses.replace(capture, frames=pinholes)
-    frames, turned = upright(capture.frames)
-    capture = dataclasses.replace(capture, frames=frames)
-    warnings = [*capture.warnings, *turned, *check_plausible(frames)]
-
-    times, time_source = _times(folder, capture, warnings)
-    splits = _splits(folder, frames, times)
+        frames = [dataclasses.replace(frame, lens=frame.lens.idealized) for frame in frames]
+    frames, warnings = upright(frames)
+    warnings = [*capture.warnings, *warnings, *check_plausible(frames)]
+    frames, time_source = _timed(folder, dataclasses.replace(capture, frames=frames), warnings)
     check_frames(frames)
+    if masks is not None:
+        frames = _masked(Path(masks), frames)
+    warnings += _check_masks(frames)
+
+    capture = dataclasses.replace(capture, frames=frames)
     shots = _undistort(capture, shrunk_size(frames[0].image.size, image_size))
-    training = [shot for shot, split in zip(shots, splits, strict=True) if split == "train"]
+    training = [shot for shot in shots if shot.frame.split == "train"]
     training_cameras = list(dict.fromkeys(shot.camera for shot in training))
-    warnings += _check_cloud(capture, shots, training_cameras)
+    if capture.cloud is not None:
+        if capture.own_footage:
+            cameras, files = [shot.camera for shot in shots], [frame.name.file for frame in frames]
+            warnings += check_views(capture.cloud, cameras, files, capture.source)
+        cloud = check_cloud(capture.cloud, training_cameras, capture.source, warnings)
+        capture = dataclasses.replace(capture, cloud=cloud)
     placement = place(capture, [shot.frame for shot in training], training_cameras, normalize=normalize)
     warnings += placement.warnings
-    order = _film_order(frames, times, warnings) if capture.own_footage else range(len(frames))
-    ignored = _ignored(None if masks is None else Path(masks), frames, splits, warnings)
+    summary = _summary(reader.name, capture, shots, time_source)
+    if capture.own_footage:
+        shots = _by_film(shots, warnings)
 
     fit = placement.normalization
-    cameras = dict.fromkeys(shot.camera for shot in shots)
-    placed = {camera: camera if fit is None else fit.camera(camera) for camera in cameras}
+    whole = fit if fit is None or capture.moved is None else capture.moved.then(fit)
+    placed = {camera: camera if fit is None else fit.camera(camera) for camera in {shot.camera for shot in shots}}
 
     def views(split: Split) -> tuple[View, ...]:
-        chosen = [i for i in order if splits[i] == split]
-        return tuple(
-            _view(split, n, shots[i], placed[shots[i].camera], times[i], ignored) for n, i in enumerate(chosen)
-        )
+        chosen = [shot for shot in shots if shot.frame.split == split]
+        return tuple(shot.view(number, placed[shot.camera]) for number, shot in enumerate(chosen))
 
     return Dataset(
         folder.resolve().name,
@@ -95,29 +101,34 @@ def load_dataset(
         val=views("val"),
         cloud=placement.cloud,
         depths=placement.depths,
-        normalization=fit if fit is None or capture.moved is None else capture.moved.then(fit),
+        normalization=whole,
         scale=1.0 if fit is None else fit.scale,
         warnings=tuple(warnings),
         time_source=time_source,
         own_footage=capture.own_footage,
-        summary=_summary(reader.name, shots, times, time_source, splits)
+        summary=summary
+        + ("; coordinates are kept" if whole is None else f"; 1 unit of the files becomes {whole.scale:.4g}")
         + (f"; {capture.left_out} left out" if capture.left_out else ""),
     )
 
 
-def _summary(
-    layout: str, shots: Sequence[_Shot], times: Sequence[float], time_source: str, splits: Sequence[Split]
-) -> str:
+def _summary(layout: str, capture: Capture, shots: Sequence[_Shot], time_source: str) -> str:
     """Say how a capture was understood: layout, cameras, times and their source, what is held out."""
-    films = {shot.frame.name.camera for shot in shots}
-    held = [shot.frame.name.camera for shot, split in zip(shots, splits, strict=True) if split != "train"]
+    films = by_camera([frame.name for frame in capture.frames])
+    folders = len({PurePath(frame.name.file).parent for frame in capture.frames})
+    held = [frame.name.camera for frame in capture.frames if frame.split != "train"]
     places = len({shot.camera for shot in shots})
     still = len(shots) >= 2 * places
-    count = places if still else len(films)
-    cameras = f"{count} {'still' if still else 'moving'} camera{'s' * (count > 1)}"
-    whole = len(films) > 1 and len(set(held)) == 1 and sum(shot.frame.name.camera == held[0] for shot in shots)
-    out = f"{held[0]} is" if whole == len(held) else f"{len(held)} of {len(shots)} images are"
-    return f"{layout}, {cameras}, {len(set(times))} times from {time_source}; {out} held out"
+    number = places if still else len(films)
+    cameras = f"{number} {'still' if still else 'moving'} camera{'s' * (number > 1)}"
+    if not still and capture.own_footage and len(films) > 1:
+        cameras += " that film at the same time"
+    elif not still and capture.own_footage and folders > 1:
+        cameras += f" in {folders} folders, one after the other"
+    whole = len(films) > 1 and len(set(held)) == 1 and len(films[held[0]]) == len(held)
+    out = f"{held[0]} is" if whole else f"{len(held)} of {len(shots)} images are"
+    times = len({frame.time for frame in capture.frames})
+    return f"{layout}, {cameras}, {times} times from {time_source}; {out} held out"
 
 
 def _reader(folder: Path) -> Reader:
@@ -140,27 +151,47 @@ def _reader(folder: Path) -> Reader:
     raise InputError(f"{folder} is no scene in a known format: expected {expected}{inside}.")
 
 
-def _times(folder: Path, capture: Capture, warnings: list[str]) -> tuple[list[float], str]:
-    """Return the times of all frames in [0, 1], and their source. Appends warnings about own footage."""
+def _timed(folder: Path, capture: Capture, warnings: list[str]) -> tuple[list[Frame], str]:
+    """Give the frames their times in [0, 1] and, by the rule for own footage, splits where the files state none.
+
+    Returns them, and the source of the times. Appends warnings about own footage. Raises InputError.
+    """
     names = [frame.name for frame in capture.frames]
     times, source = [frame.time for frame in capture.frames if frame.time is not None], capture.time_source
     if not times:
-        times, source = read_times(names, folder)
+        times, source = read_times(names, folder, warnings)
     if capture.own_footage:
-        warnings += disorder(names, times)
+        names = as_one_camera(names, times, [frame.place for frame in capture.frames])
+        warnings += disorder(names, times, numbered=source.startswith("the frame numbers"))
         times = in_step(names, times)
-    return to_unit_range(times, *(capture.time_range or (min(times), max(times)))), source
-
-
-def _splits(folder: Path, frames: Sequence[Frame], times: Sequence[float]) -> list[Split]:
-    """Return the split of each frame, as the files state it, or by the rule for own footage. Raises InputError."""
-    splits: list[Split] = [frame.split for frame in frames if frame.split is not None]
+    times = to_unit_range(times, *(capture.time_range or (min(times), max(times))))
+    splits: list[Split] = [frame.split for frame in capture.frames if frame.split is not None]
     if not splits:
-        tested = held_out([frame.name for frame in frames], times)
-        splits = ["test" if i in tested else "train" for i in range(len(frames))]
+        tested = held_out(names, times)
+        splits = ["test" if i in tested else "train" for i in range(len(names))]
     if "train" not in splits:
-        raise InputError(f"{folder}: all {len(frames)} images are held out for testing; none is left to train on.")
-    return splits
+        raise InputError(f"{folder}: all {len(names)} images are held out; name fewer in its lists of test images.")
+    found = zip(capture.frames, names, times, splits, strict=True)
+    return [dataclasses.replace(f, name=name, time=time, split=split) for f, name, time, split in found], source
+
+
+def _masked(folder: Path, frames: Sequence[Frame]) -> list[Frame]:
+    """Give training frames the masks in the user's folder, in place of those that the capture names."""
+    names = [frame.name.file for frame in frames if frame.split == "train"]
+    masks = find_masks(folder, names, "each training image, named as the image")
+    return [
+        dataclasses.replace(frame, mask=masks[frame.name.file], mask_kind="white") if frame.split == "train" else frame
+        for frame in frames
+    ]
+
+
+def _check_masks(frames: Sequence[Frame]) -> list[str]:
+    warnings = []
+    for kind in get_args(MaskKind):
+        of_kind = [frame for frame in frames if frame.mask_kind == kind and frame.split == MASKED[kind]]
+        masks = {frame.name.file: frame.mask for frame in of_kind if frame.mask is not None}
+        warnings += check_masks(masks, frames[0].image.size, kind)
+    return warnings
 
 
 class _Shot(NamedTuple):
@@ -184,13 +215,25 @@ class _Shot(NamedTuple):
             return image.read(self.size)
         return shrink(self.undistortion.apply(image.read(image.size)), self.size)
 
-    def measured(self, mask: Path) -> Mask:
-        """Decode, undistort and shrink a test mask. Raises InputError."""
-        return read_measured(mask, self.undistortion, self.frame.image.size, self.size)
+    def mask(self) -> Mask:
+        """Decode, undistort and shrink the mask. Raises InputError."""
+        assert self.frame.mask is not None
+        return read_mask(self.frame.mask, self.frame.mask_kind, self.undistortion, self.frame.image.size, self.size)
 
-    def ignored(self, mask: Path, *, black: bool) -> Mask:
-        """Decode, undistort and shrink a training mask. Raises InputError."""
-        return read_ignored(mask, self.undistortion, self.frame.image.size, self.size, black=black)
+    def view(self, number: int, camera: Camera) -> View:
+        """Make the view. number: within its split, for its name. camera: in the world's coordinates."""
+        frame = self.frame
+        assert frame.time is not None
+        mask = self.mask if frame.mask is not None and frame.split == MASKED[frame.mask_kind] else None
+        return View(
+            name=f"{frame.split}_{frame.label or f'{number:05d}'}",
+            camera=camera,
+            time=frame.time,
+            source=str(frame.image),
+            pixels=self.pixels,
+            mask=mask if frame.split == "test" else None,
+            ignored=mask if frame.split == "train" else None,
+        )
 
 
 def _undistort(capture: Capture, size: Size) -> list[_Shot]:
@@ -216,58 +259,11 @@ def _undistort(capture: Capture, size: Size) -> list[_Shot]:
     return shots
 
 
-def _check_cloud(capture: Capture, shots: Sequence[_Shot], training: Sequence[Camera]) -> list[str]:
-    """Check a cloud against the cameras: return warnings, or raise InputError."""
-    if capture.cloud is None:
-        return []
-    warnings = []
-    if capture.own_footage:
-        cameras, names = [shot.camera for shot in shots], [shot.frame.name.file for shot in shots]
-        warnings = check_views(capture.cloud, cameras, names, capture.source)
-    check_cloud(capture.cloud, training, capture.source)
-    return warnings
-
-
-def _film_order(frames: Sequence[Frame], times: Sequence[float], warnings: list[str]) -> list[int]:
-    """Return the frames by camera, then time. Appends warnings about blurred and repeated images of each camera."""
-    films: dict[str, list[int]] = {}
-    for i in sorted(range(len(frames)), key=lambda i: (times[i], natural_key(frames[i].name.file))):
-        films.setdefault(frames[i].name.camera, []).append(i)
-    for film in films.values():
-        warnings += check_film([Path(str(frames[i].image)) for i in film])
-    return [i for camera in sorted(films, key=natural_key) for i in films[camera]]
-
-
-class _IgnoredMasks(NamedTuple):
-    """Masks of training images by the images' names. black: whether black pixels are ignored, or white ones."""
-
-    paths: Mapping[str, Path]
-    black: bool
-
-
-def _ignored(
-    folder: Path | None, frames: Sequence[Frame], splits: Sequence[Split], warnings: list[str]
-) -> _IgnoredMasks:
-    """Find and check the masks in the user's folder, or else those that the capture names. Appends warnings."""
-    if folder is None:
-        paths = {frame.name.file: frame.black for frame in frames if frame.black is not None}
-    else:
-        names = [frame.name.file for frame, split in zip(frames, splits, strict=True) if split == "train"]
-        paths = find_masks(folder, names, "each training image, named as the image")
-    warnings += check_ignored(paths, frames[0].image.size, black=folder is None)
-    return _IgnoredMasks(paths, folder is None)
-
-
-def _view(split: Split, number: int, shot: _Shot, camera: Camera, time: float, ignored: _IgnoredMasks) -> View:
-    """Make the view of a frame. number: within its split, for its name. camera: in the world's coordinates."""
-    frame = shot.frame
-    path = ignored.paths.get(frame.name.file) if split == "train" else None
-    return View(
-        name=f"{split}_{frame.label or f'{number:05d}'}",
-        camera=camera,
-        time=time,
-        source=str(frame.image),
-        pixels=shot.pixels,
-        mask=None if frame.mask is None else partial(shot.measured, frame.mask),
-        ignored=None if path is None else partial(shot.ignored, path, black=ignored.black),
-    )
+def _by_film(shots: Sequence[_Shot], warnings: list[str]) -> list[_Shot]:
+    """Return the shots by camera, then time. Appends warnings about blurred and repeated images of each camera."""
+    ordered = []
+    for mine in by_camera([shot.frame.name for shot in shots]).values():
+        film = sorted((shots[i] for i in mine), key=lambda shot: (shot.frame.time, natural_key(shot.frame.name.file)))
+        warnings += check_film([Path(str(shot.frame.image)) for shot in film])
+        ordered += film
+    return ordered

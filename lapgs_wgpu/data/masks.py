@@ -9,16 +9,20 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lapgs_wgpu.data.capture_files import CaptureFiles
 from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.data.images import NEAREST, Pixels, Size, check_image, decode, resize, shrink, size_text
 from lapgs_wgpu.data.lens import Undistortion
 from lapgs_wgpu.errors import InputError
 
 Mask = NDArray[np.bool_]
+MaskKind = Literal["white", "black", "measured"]  # white or black pixels are ignored in training; white ones measured
+MASKED = {"white": "train", "black": "train", "measured": "test"}  # the split whose masks are of this kind
 
 WHITE = 128  # level from which on a pixel is set
 MEASURED = 255  # level of a pixel that the masked metrics measure: what mixes with others does not count
@@ -32,26 +36,48 @@ def check_mask_folder(folder: Path, what: str) -> None:
 
 
 def find_masks(folder: Path, names: Iterable[str], what: str) -> dict[str, Path]:
-    """Find the masks of images by their names: NAME.png or NAME.jpg.png (COLMAP's way) below a folder.
+    """Find the masks of all images by their names: NAME.png or NAME.jpg.png (COLMAP's way) below a folder.
 
     what: the images and how masks are named, for errors. Raises InputError: no such folder, or a mask is missing.
     """
     check_mask_folder(folder, what)
-    masks = {}
-    missing = []
-    for name in names:
-        paths = folder / PurePosixPath(name).with_suffix(".png"), folder / f"{name}.png"
-        path = next((path for path in paths if path.is_file()), None)
-        if path is None:
-            missing.append(name)
-        else:
-            masks[name] = path
+    masks, missing = _found(folder, names)
     if missing:
         raise InputError(
             f"{folder} lacks {len(missing)} of {len(missing) + len(masks)} masks, such as that of {missing[0]}; add a "
             f"PNG for {what}."
         )
     return masks
+
+
+def find_covisible(folders: Sequence[Path], names: Sequence[str]) -> dict[str, Path]:
+    """Find the masks of all these test images in the first folder that holds any; {} if none does.
+
+    Raises InputError if a folder holds only some of them.
+    """
+    for folder in folders:
+        masks, missing = _found(folder, names)
+        if masks and missing:
+            raise InputError(
+                f"{folder / missing[0]}.png does not exist, but {len(masks)} of {len(names)} test images have a mask "
+                f"there; add it, or remove {folder}."
+            )
+        if masks:
+            return masks
+    return {}
+
+
+def _found(folder: Path, names: Iterable[str]) -> tuple[dict[str, Path], list[str]]:
+    """The masks below a folder by image, and the images without. Names may differ as in `CaptureFiles.find`."""
+    files = CaptureFiles(folder)
+    masks, missing = dict[str, Path](), list[str]()
+    for name in names:
+        found = files.find(f"{name}.png") or files.find(str(PurePosixPath(name).with_suffix(".png")))
+        if found is None:
+            missing.append(name)
+        else:
+            masks[name] = folder / found
+    return masks, missing
 
 
 def check_mask_size(path: Path, size: Size) -> None:
@@ -64,44 +90,52 @@ def check_mask_size(path: Path, size: Size) -> None:
         )
 
 
-def check_ignored(masks: Mapping[str, Path], size: Size, *, black: bool) -> list[str]:
-    """Check the proportions of training masks for images of (width, height) `size`, and decode some of them.
+def check_masks(masks: Mapping[str, Path], size: Size, kind: MaskKind) -> list[str]:
+    """Check the proportions of masks for images of (width, height) `size`, and decode some of those of training images.
 
-    masks: by image. black: as in `read_ignored`. Warns if nothing is ignored in those decoded. Raises InputError for
-    other proportions, or if everything is.
+    masks: by image. Returns a warning if these take out nothing. Raises InputError for other proportions, or if they
+    take out everything.
     """
     for path in masks.values():
         check_mask_size(path, size)
-    checked = evenly(list(masks.values()), CHECKED)
+    checked = list(masks.values()) if kind == "measured" else evenly(list(masks.values()), CHECKED)
     levels = [_levels(decode(path)) for path in checked]
-    ignored = [(level < WHITE) == black for level in levels]
-    color = f"{'black (a level below' if black else 'white (a level of at least'} {WHITE} of 255)"
-    if not levels:
+    out = [_taken_out(level, kind) for level in levels]
+    if kind == "measured":
+        empty = next((path for path, pixels in zip(checked, out, strict=True) if pixels.all()), None)
+        if empty is not None:
+            raise InputError(
+                f"{empty} has no white pixel ({MEASURED}), which leaves nothing to measure; make it again, or remove "
+                "the masks of all test images."
+            )
         return []
-    lowest, highest = min(level.min() for level in levels), max(level.max() for level in levels)
-    if not any(pixels.any() for pixels in ignored):
-        return [
-            f"the masks leave out nothing: in {len(levels)} of {len(masks)} that were looked at, such as "
-            f"{checked[0]}, no pixel is {color}; their levels are {lowest} to {highest}."
-        ]
-    if all(pixels.all() for pixels in ignored):
-        raise InputError(
-            f"the masks leave out everything: in {len(levels)} of {len(masks)} that were looked at, such as "
-            f"{checked[0]}, every pixel is {color}, which does not count in the training; their levels are {lowest} to "
-            f"{highest}: write them as 0 and 255, invert them, or leave them out."
-        )
-    return []
+    if not levels or (any(pixels.any() for pixels in out) and not all(pixels.all() for pixels in out)):
+        return []
+    looked_at = f"in {len(levels)} of {len(masks)} that were looked at, such as {checked[0]}"
+    color = f"{'black (a level below' if kind == 'black' else 'white (a level of at least'} {WHITE} of 255)"
+    range_ = f"their levels are {min(level.min() for level in levels)} to {max(level.max() for level in levels)}"
+    if not any(pixels.any() for pixels in out):
+        return [f"the masks leave out nothing: {looked_at}, no pixel is {color}; {range_}."]
+    raise InputError(
+        f"the masks leave out everything: {looked_at}, every pixel is {color}, which does not count in the training; "
+        f"{range_}: write them as 0 and 255, invert them, or leave them out."
+    )
 
 
-def read_ignored(path: Path, undistortion: Undistortion | None, stored: Size, size: Size, *, black: bool) -> Mask:
-    """Decode a training mask (H, W) of an image of (width, height) `stored` that is undistorted and shrunk to `size`.
+def read_mask(path: Path, kind: MaskKind, undistortion: Undistortion | None, stored: Size, size: Size) -> Mask:
+    """Decode the mask (H, W) of an image of (width, height) `stored` that is undistorted and shrunk to `size`.
 
-    An output pixel is ignored if any of the mask's pixels that it covers is. black: whether black pixels are ignored,
-    or white ones. Raises InputError.
+    The mask is first resized to `stored` by nearest neighbours. A pixel in which several mix is ignored if any of them
+    is, and measured if all of them are. Raises InputError.
     """
-    ignored = (_levels(decode(path)) < WHITE) == black
-    pixels = resize(as_pixels(ignored), stored, NEAREST)
-    return shrink(pixels if undistortion is None else undistortion.apply(pixels), size)[..., 0] > 0
+    pixels = resize(as_pixels(_taken_out(_levels(decode(path)), kind)), stored, NEAREST)
+    out = shrink(pixels if undistortion is None else undistortion.apply(pixels), size)[..., 0] > 0
+    return ~out if kind == "measured" else out
+
+
+def _taken_out(levels: NDArray[np.uint8], kind: MaskKind) -> Mask:
+    """The pixels (H, W) that a mask of these levels takes out of training or measures."""
+    return levels < MEASURED if kind == "measured" else (levels < WHITE) == (kind == "black")
 
 
 def _levels(mask: Pixels) -> NDArray[np.uint8]:
@@ -115,40 +149,3 @@ def _levels(mask: Pixels) -> NDArray[np.uint8]:
 def as_pixels(mask: Mask) -> Pixels:
     """(H, W, 3) white where a mask (H, W) is set, black elsewhere."""
     return np.repeat(np.where(mask, 255, 0).astype(np.uint8)[..., None], 3, axis=2)
-
-
-def find_covisible(folders: Sequence[Path], names: Sequence[str]) -> dict[str, Path]:
-    """Find the masks NAME.png of all these test images in the first folder that holds any; {} if none does.
-
-    Raises InputError if a folder holds only some of them.
-    """
-    for folder in folders:
-        masks = {name: folder / f"{name}.png" for name in names}
-        missing = [path for path in masks.values() if not path.is_file()]
-        if not missing:
-            return masks
-        if len(missing) < len(masks):
-            raise InputError(
-                f"{missing[0]} does not exist, but {len(masks) - len(missing)} of {len(masks)} test images have a "
-                f"mask there; add it, or remove {folder}."
-            )
-    return {}
-
-
-def check_measured(path: Path) -> None:
-    """Check that a test mask has a white pixel. Raises InputError."""
-    if decode(path)[..., 0].max() < MEASURED:
-        raise InputError(
-            f"{path} has no white pixel ({MEASURED}), which leaves nothing to measure; make it again, or remove the "
-            "masks of all test images."
-        )
-
-
-def read_measured(path: Path, undistortion: Undistortion | None, stored: Size, size: Size) -> Mask:
-    """Decode the test mask of an image of (width, height) `stored` that is undistorted and shrunk to `size`: (H, W).
-
-    The mask is first resized to `stored` by nearest neighbours. Where undistorting and shrinking mix pixels, all must
-    be white. Raises InputError.
-    """
-    mask = resize(decode(path)[..., :3], stored, NEAREST)
-    return shrink(mask if undistortion is None else undistortion.apply(mask), size)[..., 0] == MEASURED

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lapgs_wgpu.data.cloud import Cloud, points_in_view, views_of
 from lapgs_wgpu.data.focus import are_parallel, focus_of
@@ -101,19 +102,25 @@ def _cube(capture: Capture, cameras: Sequence[Camera], depths: tuple[float, floa
 
 
 def _cube_of_cloud(points: Array, cameras: Sequence[Camera]) -> Cube:
-    """The cube of a cloud's points that at least two cameras see.
-
-    A scan may reach far beyond what the cameras look at, and be seen there, too. Then, points count that are near the
-    cameras' focus, and that at least half as many cameras see as see the point that most see.
-    """
-    seen = views_of(points, cameras)
-    twice = seen >= min(2, len(cameras))
+    """The cube of a cloud's points that at least two cameras see; of a scan that reaches far beyond what the cameras
+    look at, and is seen there, too, that of the points near their focus."""
+    twice = views_of(points, cameras) >= min(2, len(cameras))
     cube, viewed = cube_of_points(points[twice] if twice.any() else points), cube_in_view(cameras)
     if viewed is None or cube.half <= TOO_WIDE * viewed.half:
         return cube
+    near = near_focus(points, cameras)
+    return cube_of_points(points[near]) if near.any() else cube
+
+
+def near_focus(points: Array, cameras: Sequence[Camera]) -> NDArray[np.bool_]:
+    """(N,) which points (N, 3) are near the cameras' focus, and seen by half as many cameras as that most see or more;
+    none where the cameras have no focus."""
+    viewed = cube_in_view(cameras)
+    if viewed is None:
+        return np.zeros(len(points), bool)
     near = np.abs(points - viewed.center).max(axis=1) <= TOO_WIDE * viewed.half
-    chosen = near & (2 * seen >= seen.max(where=near, initial=0))
-    return cube_of_points(points[chosen]) if chosen.any() else cube
+    seen = views_of(points, cameras)
+    return near & (2 * seen >= max(seen.max(where=near, initial=0), 1))
 
 
 def _filled(cloud: Cloud, cameras: Sequence[Camera]) -> Cloud:

@@ -14,6 +14,7 @@ Array = NDArray[np.float64]
 
 # Largest deviation of R^T R from the identity: files store about seven digits; scale or shear exceeds this by far.
 ROTATION_TOLERANCE = 1e-3
+UNIT = 1e-2  # largest deviation of a quaternion's length from 1
 # A rotation whose error moves no camera by more than this is kept as stored, in the capture's units: float32's.
 EXACT = 1e-5
 AXES_HINT = "poses may be in OpenCV's axes where the format has OpenGL's (y up, z backward), or the other way round"
@@ -33,7 +34,20 @@ def check_rotation(R: Array, name: str) -> None:
             f"{ROTATION_TOLERANCE:g} is allowed), its axes have lengths {axes}; remove scale and shear."
         )
     if np.linalg.det(R) < 0:
-        raise InputError(f"{name} is left-handed (determinant -1, must be 1); flip one of its axes.")
+        raise InputError(f"{name} is left-handed (determinant -1, must be 1); its axes are not those of the format.")
+
+
+def unit_quaternion(quaternion: Array, where: str) -> Array:
+    """Return a quaternion (4,) of length 1. Raises InputError where it is far from that."""
+    length = float(np.linalg.norm(quaternion))
+    if abs(length - 1) > UNIT:
+        raise InputError(f"{where}: its quaternion has length {length:g}, must be 1; export the poses again.")
+    return quaternion / length
+
+
+def place_of(T_cam_world: Array) -> Array:
+    """(3,) the place of a camera of pose (4, 4)."""
+    return -T_cam_world[:3, :3].T @ T_cam_world[:3, 3]
 
 
 def world_to_camera(R_world_cam: Array, position: Array) -> Array:
@@ -63,11 +77,12 @@ def opengl_pose(value: Any, where: str) -> Array:
     the matrix is a rigid motion.
     """
     name = f"{where}: transform_matrix"
-    if not isinstance(value, list) or len(value) != 4:
-        raise InputError(f"{name} must be 4 rows of 4 numbers, got {kind(value)}.")
-    T = np.stack([vector(row, 4, "transform_matrix", where) for row in value])
+    if not isinstance(value, list) or len(value) not in (3, 4):
+        raise InputError(f"{name} must be 4 rows of 4 numbers (the last, 0 0 0 1, may be missing), got {kind(value)}.")
+    T = np.stack([vector(row, 4, "transform_matrix", where) for row in [*value, [0, 0, 0, 1]][:4]])
     if np.abs(T[3] - [0, 0, 0, 1]).max() > ROTATION_TOLERANCE:
-        raise InputError(f"{name} must end with the row 0 0 0 1, got {' '.join(f'{x:g}' for x in T[3])}.")
+        got = " ".join(f"{x:g}" for x in T[3])
+        raise InputError(f"{name} must end with the row 0 0 0 1, got {got}; the position stands at the right.")
     R, position = T[:3, :3], T[:3, 3]
     check_rotation(R, name)
     return world_to_camera(R @ OPENGL_TO_OPENCV, position)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from lapgs_wgpu.data.stamps import ImageName
-from lapgs_wgpu.data.timestamps import natural_key
+from lapgs_wgpu.data.stamps import ImageName, natural_key
 from lapgs_wgpu.errors import InputError
 
 EVERY = 8  # one of so many times is tested: the fifth, the thirteenth, ...
@@ -22,16 +21,13 @@ def held_out(names: Sequence[ImageName], times: Sequence[float]) -> set[int]:
     cameras = sorted({name.camera for name in names}, key=natural_key)
     if len(cameras) >= CAMERAS:
         return {i for i, name in enumerate(names) if name.camera == cameras[0]}
-    # If all times are equal, each image counts as a time of its own.
-    distinct = sorted(set(times)) if len(set(times)) > 1 else []
-    if distinct:
-        tested = set(distinct[FIRST::EVERY])
-        chosen = {i for i, time in enumerate(times) if time in tested}
-    else:
-        chosen = set(range(len(names))[FIRST::EVERY])
+    distinct = sorted(set(times))
+    moments = times if len(distinct) > 1 else range(len(names))  # of equal times, each image counts as one of its own
+    tested = set(sorted(set(moments))[FIRST::EVERY])
+    chosen = {i for i, moment in enumerate(moments) if moment in tested}
     if not chosen:
         raise InputError(
-            f"{len(names)} images at {max(len(distinct), 1)} times are too few: every eighth time from the fifth on is "
-            "held out for testing, so at least 5 are needed, or 3 cameras, of which the first is held out."
+            f"{len(names)} images at {len(distinct)} times are too few: every eighth time from the fifth on is held "
+            "out for testing, so at least 5 are needed, or 3 cameras, of which the first is held out."
         )
     return chosen

@@ -4,19 +4,25 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import PurePosixPath
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 # Words before the number in the name of a folder or file.
 TIME_WORDS = {"frame", "fr", "time", "timestep", "timestamp", "ts", "t", "step", "moment", "sec"}
 CAMERA_WORDS = {"cam", "camera", "c", "view", "kinect", "device"}
-_CLOCK = re.compile(  # 20260110_095848, 2026-01-10 at 09.58.48; digits after that are a fraction of a second
-    r"(?<!\d)((?:19|20)\d\d)[-_.]?(\d\d)[-_.]?(\d\d)\D{0,4}(\d\d)[-_.:]?(\d\d)[-_.:]?(\d\d)(?:[-_.]?(\d{3}|\d{6}))?(?!\d)"
+STILL = 0.02  # of the distance of cameras: the places of one that stands still are apart by less
+_CLOCK = re.compile(  # 20260110_095848, 2026-01-10 at 09.58.48, 09-58-48; digits after that are a fraction of a second
+    r"(?<!\d)(?:((?:19|20)\d\d)[-_.]?(\d\d)[-_.]?(\d\d)\D{0,4})?(\d\d)[-_.:]?(\d\d)[-_.:]?(\d\d)"
+    r"(?:[-_.]?(\d{3}|\d{6}))?(?!\d)"
 )
 _UNIX = re.compile(r"(?<!\d)(1\d{9})[-_.](\d{3,9})(?!\d)")
 _DECIMAL = re.compile(r"(?<![\w.])\d+(?:\.(\d+))?(?![\w.])|(?<=[_-])\d+(?:\.(\d+))?(?![\w.])")
+_DAY = 86400.0  # seconds
 
 
 class ImageName(NamedTuple):
@@ -33,40 +39,58 @@ class ImageName(NamedTuple):
         return self.folder or PurePosixPath(self.file).stem
 
 
-def image_names(files: Sequence[str]) -> list[ImageName]:
+def natural_key(name: str) -> tuple[tuple[int, int | str], ...]:
+    """Sort key that puts cam2 before cam10."""
+    parts = re.split(r"(\d+)", name)
+    return tuple((0, int(part)) if part.isdecimal() else (1, part) for part in parts)
+
+
+# Cameras
+
+
+def image_names(files: Sequence[str], places: Mapping[str, NDArray[np.float64]]) -> list[ImageName]:
     """Tell cameras from times in relative paths: each folder is a camera (cam00/0001.png), or each is a time
-    (frame000001/cam00.png), by the words in the names."""
-    paths = [PurePosixPath(file) for file in files]
-    level = _varying_folder([path.parts[:-1] for path in paths])
-    if level is None or not _folders_are_times([path.parts[level] for path in paths], paths):
-        return [ImageName(file, str(path.parent)) for file, path in zip(files, paths, strict=True)]
-    named = []
-    for file, path in zip(files, paths, strict=True):
-        rest = PurePosixPath(*path.parts[level + 1 :]).with_suffix("")
-        named.append(ImageName(file, str(rest), path.parts[level]))
-    return named
+    (frame000001/cam00.png).
+
+    The words in the names decide; where they do not, whether cameras stand still in one of the two readings alone; else
+    there are more times than cameras. places: (3,) of the cameras of some of the files.
+    """
+    parts = [(*(path := PurePosixPath(file)).parts[:-1], path.stem) for file in files]
+    cameras = [ImageName(file, str(PurePosixPath(file).parent)) for file in files]
+    same_depth = len(set(map(len, parts))) == 1
+    varying = [level for level, names in enumerate(zip(*parts, strict=same_depth)) if len(set(names)) > 1]
+    stem = len(parts[0]) - 1
+    if not same_depth or len(varying) not in (1, 2) or varying[0] == stem:
+        return cameras
+    outer, inner = varying[0], (*varying, stem)[1]
+
+    def timed(level: int) -> list[ImageName]:
+        """Take the folders of a level as times, and all others as cameras."""
+        others = ["/".join(each[:level] + each[level + 1 :]) for each in parts]
+        return [ImageName(*name) for name in zip(files, others, (each[level] for each in parts), strict=True)]
+
+    readings = timed(outer), cameras if inner == stem else timed(inner)
+    decided = _folders_are_times([each[outer] for each in parts], [each[inner] for each in parts])
+    if decided is None:
+        still = [stand_still(_places_of_each(names, places)) for names in readings]
+        fewer = len({name.camera for name in readings[0]}) < len({name.camera for name in readings[1]})
+        decided = still[0] if still[0] != still[1] else fewer
+    return readings[0] if decided else readings[1]
 
 
-def _varying_folder(parents: Sequence[tuple[str, ...]]) -> int | None:
-    """The only level at which the folders of images differ; None if there is none, or more than one."""
-    if len({len(parts) for parts in parents}) != 1:
-        return None
-    varying = [level for level, parts in enumerate(zip(*parents, strict=True)) if len(set(parts)) > 1]
-    return varying[0] if len(varying) == 1 else None
-
-
-def _folders_are_times(folders: Sequence[str], paths: Sequence[PurePosixPath]) -> bool:
-    words, stems = {_word(folder) for folder in folders}, [path.stem for path in paths]
-    images = Counter(stems)
+def _folders_are_times(folders: Sequence[str], stems: Sequence[str]) -> bool | None:
+    """Whether folders are times, or cameras, by their names and the files'; None where these do not say."""
+    words, images = {_word(folder) for folder in folders}, Counter(stems)
     if len(words) != 1 or max(images.values()) < 2 or not all(re.search(r"\d", folder) for folder in folders):
         return False
-    (word,) = words
-    files = {_word(stem) for stem in stems}
+    (word,), files = words, {_word(stem) for stem in stems}
+    if word in CAMERA_WORDS or files & TIME_WORDS:
+        return False
+    if word in TIME_WORDS or not any(re.search(r"\d", stem) for stem in stems):
+        return True
     if len(images) == 1:  # a folder for each image
-        return word in TIME_WORDS or (word == "" and not re.search(r"\d", stems[0]))
-    if word in TIME_WORDS:
-        return not files & TIME_WORDS
-    return word == "" and files <= CAMERA_WORDS
+        return False
+    return True if word == "" and files <= CAMERA_WORDS else None
 
 
 def _word(name: str) -> str:
@@ -74,26 +98,53 @@ def _word(name: str) -> str:
     return re.sub(r"[\W\d_]", "", re.sub(r"\d+\D*$", "", name)).lower()
 
 
+def _places_of_each(
+    names: Iterable[ImageName], places: Mapping[str, NDArray[np.float64]]
+) -> list[list[NDArray[np.float64]]]:
+    """Group the known places by camera."""
+    groups: dict[str, list[NDArray[np.float64]]] = {}
+    for name in names:
+        if name.file in places:
+            groups.setdefault(name.camera, []).append(places[name.file])
+    return list(groups.values())
+
+
+def stand_still(cameras: Sequence[Sequence[NDArray[np.float64]]]) -> bool:
+    """Whether the places (3,) of each of several cameras are one, as exactly as structure from motion finds it."""
+    if len(cameras) < 2:
+        return False
+    apart = float(np.ptp(np.concatenate(cameras), axis=0).max())
+    return all(float(np.ptp(own, axis=0).max()) <= STILL * apart for own in cameras)
+
+
+# Times
+
+
 def clock_times(names: Sequence[ImageName]) -> tuple[list[float], str] | None:
     """Return the times in seconds that all names state, and what they are; None if these are no clock times, Unix
     times or decimals, or if two images of a camera have the same.
     """
     stamps = [name.stamp for name in names]
-    for read, kind in ((_clock_seconds, "clock times"), (_unix_seconds, "Unix times")):
-        read_times = [read(stamp) for stamp in stamps]
-        seconds = [value for value in read_times if value is not None]
-        if len(seconds) == len(names) and _differ(names, seconds):
+    readings = (
+        (_of_each(stamps, _date), "clock times"),
+        (_of_each(stamps, _unix_seconds), "Unix times"),
+        (_times_of_day(names), "clock times (HHMMSS)"),
+        (_decimals(stamps), "seconds"),
+    )
+    for seconds, kind in readings:
+        if seconds and len({(name.camera, time) for name, time in zip(names, seconds, strict=True)}) == len(names) > 1:
             return seconds, kind
-    decimals = _decimals(stamps)
-    return (decimals, "seconds") if decimals and _differ(names, decimals) else None
+    return None
 
 
-def _differ(names: Sequence[ImageName], times: Sequence[float]) -> bool:
-    return len({(name.camera, time) for name, time in zip(names, times, strict=True)}) == len(names) > 1
+def _of_each(stamps: Sequence[str], read: Callable[[str], float | None]) -> list[float] | None:
+    seconds = [value for value in map(read, stamps) if value is not None]
+    return seconds if len(seconds) == len(stamps) else None
 
 
-def _clock_seconds(stamp: str) -> float | None:
-    if not (found := _CLOCK.search(stamp)):
+def _date(stamp: str) -> float | None:
+    """Seconds of a date and a time of day."""
+    if not (found := _CLOCK.search(stamp)) or found[1] is None:
         return None
     *date, fraction = found.groups()
     try:
@@ -101,6 +152,32 @@ def _clock_seconds(stamp: str) -> float | None:
     except ValueError:  # 20261399_000001
         return None
     return clock.timestamp() + float(f"0.{fraction or 0}")
+
+
+def _times_of_day(names: Sequence[ImageName]) -> list[float] | None:
+    """Seconds of HHMMSS without a date, also past midnight; None unless all are possible times of day, alike in all
+    else that the names of a camera hold, and more even as times than as numbers, which jump by 40 each minute."""
+    found = [_CLOCK.search(name.stamp) for name in names]
+    matches = [match for match in found if match and match[1] is None]
+    if len(matches) < len(names):
+        return None
+    around = {(name.camera, _CLOCK.sub("", name.stamp, count=1)) for name in names}
+    parts = np.array([[float(match[part]) for part in (4, 5, 6)] for match in matches])
+    if len(around) > len({name.camera for name in names}) or (parts >= [24, 60, 60]).any():
+        return None
+    times = parts @ [3600, 60, 1] + [float(f"0.{match[7] or 0}") for match in matches]
+    ordered = np.sort(times)
+    pause = int(np.argmax(np.diff(ordered, append=ordered[-1])))
+    if pause + 1 < len(ordered) and ordered[pause + 1] - ordered[pause] > _DAY / 2:
+        times = np.where(times <= ordered[pause], times + _DAY, times)
+    numbers = np.array([float(re.sub(r"\D", "", match[0])) for match in matches])
+    return times.tolist() if _unevenness(times) < _unevenness(numbers) else None
+
+
+def _unevenness(values: NDArray[np.float64]) -> float:
+    """The largest step between ascending values, in usual ones."""
+    steps = np.diff(np.unique(values))
+    return float(steps.max() / np.median(steps)) if len(steps) else 0.0
 
 
 def _unix_seconds(stamp: str) -> float | None:

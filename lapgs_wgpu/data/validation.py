@@ -18,9 +18,9 @@ from lapgs_wgpu.data.cloud import Cloud, in_view, views_of
 from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.data.focus import spread
 from lapgs_wgpu.data.frames import Frame
-from lapgs_wgpu.data.images import SIDEWAYS, ImageFile, check_image, decode, gray_thumbnail, size_text
+from lapgs_wgpu.data.images import ImageFile, Size, decode, gray_thumbnail, size_text
 from lapgs_wgpu.data.lens import Lens
-from lapgs_wgpu.data.masks import check_measured
+from lapgs_wgpu.data.placement import near_focus
 from lapgs_wgpu.data.poses import AXES_HINT
 from lapgs_wgpu.data.thumbnails import BLURRED, EQUAL, THUMBNAIL, blurred, repeats, sharpness, sharpness_around
 from lapgs_wgpu.data.views import Dataset
@@ -44,20 +44,20 @@ def upright(frames: Sequence[Frame]) -> tuple[list[Frame], list[str]]:
     """Turn images as their EXIF orientation says where only that fits their camera; return warnings where both fit."""
     turned, unclear = [], []
     for frame in frames:
-        image, lens = frame.image, frame.lens
+        image = frame.image
         if isinstance(image, ImageFile) and image.orientation > 1:
-            sideways = image.orientation >= SIDEWAYS
-            if sideways and not _fits(image.size, lens) and _fits(image.size[::-1], lens):
+            stored, shown = (_fits(size, frame.lens) for size in (image.size, image.turned.size))
+            if shown and not stored:
                 frame = dataclasses.replace(frame, image=image.turned)
-            elif not sideways or _fits(image.size[::-1], lens):
+            elif shown == stored or not frame.states_size:
                 unclear.append(image)
         turned.append(frame)
     if not unclear:
         return turned, []
     return turned, [
         f"{len(unclear)} of {len(frames)} images, such as {unclear[0]}, have an EXIF orientation "
-        f"({unclear[0].orientation}), and their size does not tell whether the poses are those of the turned images: "
-        "they are taken as they are stored; else, turn the files themselves and remove the orientation."
+        f"({unclear[0].orientation}), and no size or principal point tells whether the poses are those of the turned "
+        "images: they are taken as they are stored; else, turn the files themselves and remove the orientation."
     ]
 
 
@@ -88,74 +88,72 @@ def _off_center(lens: Lens) -> bool:
     return max(abs(lens.cx / lens.width - 0.5), abs(lens.cy / lens.height - 0.5)) > OFF_CENTER
 
 
-def _fits(size: tuple[int, int], lens: Lens) -> bool:
+def _fits(size: Size, lens: Lens) -> bool:
     """Whether an image of (width, height) has the proportions that a lens states."""
     # Whoever shrank the images may have rounded each side up or down.
     return abs(size[0] * lens.height / lens.width - size[1]) <= 1.5
 
 
 def check_frames(frames: Sequence[Frame]) -> None:
-    """Check that all images have one size, which fits their cameras, and the same of masks. Raises InputError."""
-    checked: set[tuple[Lens, Path | None]] = set()
+    """Check that all images have one size, which fits their cameras. Raises InputError."""
+    checked: set[Lens] = set()
     first = frames[0].image
     for frame in frames:
         if frame.image.size != first.size:
             raise InputError(
                 f"{frame.image} is {size_text(frame.image.size)} pixels and {first} is {size_text(first.size)}; all "
-                "images must have one size."
+                "images must have one size: crop or leave out those that differ."
             )
-        key = frame.lens, frame.mask
-        if key in checked:
-            continue
-        checked.add(key)
-        check_focal(frame.lens, frame.where)
-        check_proportions(first.size, frame.lens, str(frame.image), frame.where)
-        if frame.mask is not None:
-            check_proportions(check_image(frame.mask).size, frame.lens, str(frame.mask), frame.where)
-            check_measured(frame.mask)
+        if frame.lens not in checked:
+            checked.add(frame.lens)
+            _check_lens(frame.lens, first.size, str(frame.image), frame.where)
 
 
-def check_focal(lens: Lens, where: str) -> None:
-    """Check that both focal lengths are plausible. Raises InputError, whose message begins with `where`."""
-    longer = max(lens.width, lens.height)
+def _check_lens(lens: Lens, size: Size, image: str, where: str) -> None:
+    """Check that focal lengths are plausible, and that an image of (width, height) has the lens's proportions."""
+    stated, longer = f"{lens.width}x{lens.height}", max(lens.width, lens.height)
     for focal in (lens.fx, lens.fy):
         if not MIN_FOCAL * longer <= focal <= MAX_FOCAL * longer:
             raise InputError(
-                f"{where}: a focal length of {focal:.4g} pixels does not fit images of {lens.width}x{lens.height}; it "
-                f"must be {MIN_FOCAL:g} to {MAX_FOCAL:g} times the longer side."
+                f"{where}: a focal length of {focal:.4g} pixels does not fit images of {stated}; it must be "
+                f"{MIN_FOCAL:g} to {MAX_FOCAL:g} times the longer side, in pixels of that size."
             )
-
-
-def check_proportions(stored: tuple[int, int], lens: Lens, image: str, where: str) -> None:
-    """Check that an image of (width, height) `stored` has the proportions that a lens states. Raises InputError."""
-    if not _fits(stored, lens):
-        sideways = _fits(stored[::-1], lens)
-        advice = "turn it, or give the camera of the turned image" if sideways else "they do not belong together"
+    if not _fits(size, lens):
+        sideways = _fits(size[::-1], lens)
+        advice = "turn it, or give the camera of the turned image" if sideways else "give the camera of this image"
         raise InputError(
-            f"{image} is {size_text(stored)} pixels, but {where} states {lens.width}x{lens.height}, which has other "
-            f"proportions{', those of the image on its side' if sideways else ''}; {advice}."
+            f"{image} is {size_text(size)} pixels, but {where} states {stated}, which has other proportions"
+            f"{', those of the image on its side' if sideways else ''}; {advice}."
         )
 
 
-def check_cloud(cloud: Cloud, cameras: Sequence[Camera], path: Path) -> None:
-    """Check that a cloud and the training cameras use the same coordinates and scale. Raises InputError."""
+def check_cloud(cloud: Cloud, cameras: Sequence[Camera], path: Path, warnings: list[str]) -> Cloud:
+    """Check that a cloud and the training cameras use the same coordinates and scale, and return it.
+
+    Of a scan that reaches far beyond what the cameras see, only the points that they see are returned, with a warning.
+    Raises InputError.
+    """
     points = cloud.points.astype(np.float64)
     centres = np.stack([camera.position for camera in cameras])
     middle = np.median(points, axis=0)
     spread = float(np.percentile(np.linalg.norm(points - middle, axis=1), 90))
     distance = float(np.median(np.linalg.norm(centres - middle, axis=1)))
-    seen = float((views_of(points, cameras) > 0).mean())
+    seen = views_of(points, cameras) > 0
     numbers = f"the cloud has a radius of {spread:.3g}, and the cameras stand {distance:.3g} away from it"
-    if seen < MIN_SEEN:
-        raise InputError(
-            f"{path}: the training cameras see {100 * seen:.0f} % of its points (at least {100 * MIN_SEEN:.0f} % are "
-            f"expected): {numbers}; it is in other coordinates than the cameras, or reaches far beyond what they see: "
-            "transform it, cut it to the scene, or remove it."
-        )
+    if seen.mean() < MIN_SEEN:
+        told = f"{path}: the training cameras see {100 * seen.mean():.0f} % of its points"
+        if near_focus(points, cameras).sum() < FEW_POINTS:
+            raise InputError(
+                f"{told} (at least {100 * MIN_SEEN:.0f} % are expected), and hardly any where they look: {numbers}; it "
+                "is in other coordinates than the cameras: transform it to theirs, or remove it."
+            )
+        warnings.append(f"{told}: of {len(points)}, {len(points) - seen.sum()} are left out.")
+        return Cloud(cloud.points[seen], cloud.colors[seen])
     if len(points) > 1 and spread < MIN_SPREAD * distance:
         raise InputError(
             f"{path} is a speck: {numbers}; it has another scale than the cameras, so scale it to theirs or remove it."
         )
+    return cloud
 
 
 def check_times(dataset: Dataset, *, moving: bool) -> list[str]:

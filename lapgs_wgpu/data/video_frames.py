@@ -61,7 +61,7 @@ class Video:
         except (av.error.FFmpegError, OSError) as error:
             raise InputError(f"{path} is not a readable video ({error}); copy or record it again.") from None
         if first is None:
-            raise InputError(f"{path} has {self.frames} frames; none is usable.")
+            raise InputError(f"{path} has {self.frames} frames that can be decoded; copy or record it again.")
         self._display = display(first)
         self.size = self._display.size((first.width, first.height))
         if first.interlaced_frame:
@@ -129,7 +129,7 @@ class Video:
                     if image.shape[1::-1] != self.size:
                         raise InputError(
                             f"{self.path}: frame {count} has {size_text(image.shape[1::-1])} pixels, and the first has "
-                            f"{size_text(self.size)}; record it with one size."
+                            f"{size_text(self.size)}; convert it to one size."
                         )
                     if len(written) == 2 * WRITERS:  # the decoder is ahead of the writers: bound the frames in memory
                         written.popleft().result()

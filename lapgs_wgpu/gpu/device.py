@@ -200,13 +200,12 @@ def _matches(info: DeviceInfo, wanted: str) -> bool:
     return wanted.lower() in (info.kind, info.backend.lower()) or wanted.lower() in info.name.lower()
 
 
-def open_device(name: str | None = None, *, number: int = 0) -> Device:
+def open_device(name: str | None = None) -> Device:
     """Open an adapter. Equal arguments give the same Device.
 
     Args:
         name: part of the adapter's name, or its kind (cpu, integrated, discrete). None: the environment variable
             LAPGS_DEVICE, otherwise the best adapter.
-        number: index among the adapters that match and are of the best one's kind, modulo their number.
 
     Returns:
         The opened adapter.
@@ -214,11 +213,11 @@ def open_device(name: str | None = None, *, number: int = 0) -> Device:
     Raises:
         NoAdapterError: no adapter, or none that matches.
     """
-    return _open_device(name or os.environ.get("LAPGS_DEVICE") or None, number)
+    return _open_device(name or os.environ.get("LAPGS_DEVICE") or None)
 
 
 @functools.cache
-def _open_device(name: str | None, number: int) -> Device:
+def _open_device(name: str | None) -> Device:
     adapters = _adapters()
     if not adapters:
         hint = INSTALL_HINT if "DX12" in _options()["backends"] else INSTALL_HINT + _WITHOUT_DXC
@@ -227,6 +226,5 @@ def _open_device(name: str | None, number: int) -> Device:
     if not chosen:
         there = ", ".join(f"{info.name!r} ({info.kind})" for info, _ in adapters)
         raise NoAdapterError(f"no adapter matches --device {name!r}; this machine has: {there}")
-    alike = [pair for pair in chosen if pair[0].kind == chosen[0][0].kind]
-    info, adapter = alike[number % len(alike)]
+    info, adapter = chosen[0]
     return Device(adapter, info)

@@ -150,7 +150,8 @@ def gaussian_names(vertex: Element, known: set[str], path: PathLike) -> list[str
     rest = sum(name.startswith("f_rest_") for name in properties)
     if rest not in (0, 9, 24, 45):
         raise InputError(
-            f"{path}: has {rest} properties f_rest_*, where spherical harmonics of degree 0 to 3 have 0, 9, 24 or 45"
+            f"{path}: has {rest} properties f_rest_*, where spherical harmonics of degree 0 to 3 have 0, 9, 24 or 45; "
+            "export it with one of these degrees"
         )
     names = _names(rest)
     missing = [name for name in names if name not in known]
@@ -158,7 +159,8 @@ def gaussian_names(vertex: Element, known: set[str], path: PathLike) -> list[str
         more = f" and {len(missing) - 5} more" if len(missing) > 5 else ""
         raise InputError(
             f"{path}: its element vertex lacks the property {', '.join(missing[:5])}{more} "
-            f"({len(properties)} properties found): it is not a 3DGS .ply file"
+            f"({len(properties)} properties found), so it holds no Gaussians; a cloud of points is not shown, "
+            "and a training may start at it"
         )
     if vertex.count == 0:
         raise InputError(f"{path}: holds 0 Gaussians; at least 1 is needed")

@@ -1,7 +1,7 @@
 """PLY files: the elements that a header declares, and their values in any of the three encodings.
 
 Files are untrusted: the header's length is limited, and declared sizes are compared with the file size before any
-allocation. Elements with lists, such as the faces of a mesh, may be declared; neither they nor what follows is read.
+allocation. Elements with lists, such as the faces of a mesh, are passed over.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import re
 import stat
+import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -29,16 +30,16 @@ _BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": 
 _SCALARS = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
     "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
-    "float32": "f4", "float64": "f8",
+    "float32": "f4", "float64": "f8", "half": "f2", "float16": "f2",
 }  # fmt: skip
 
 
 @dataclass
 class Element:
-    """An element: `count` rows of scalar `properties`.
+    """An element: `count` rows of scalar `properties` and of `lists`, of which a row holds a length and as many values.
 
     offset: byte of the file at which it begins; line after the header in a text file. comments: those below its line.
-    has_lists: whether it declares lists, too, so that its size is unknown.
+    order: its scalars' bytes and its lists' types, in the order of a row.
     """
 
     name: str
@@ -46,7 +47,12 @@ class Element:
     properties: dict[str, np.dtype[Any]] = field(default_factory=dict)
     comments: list[str] = field(default_factory=list)
     offset: int = 0
-    has_lists: bool = False
+    order: list[int | tuple[str, int]] = field(default_factory=list)
+
+    @property
+    def has_lists(self) -> bool:
+        """Whether a row's size is not known."""
+        return any(isinstance(part, tuple) for part in self.order)
 
     @property
     def stride(self) -> int:
@@ -65,29 +71,17 @@ class PlyFile(NamedTuple):
     elements: dict[str, Element]
     comments: list[str]
 
-    def columns(self, element: Element, names: list[str]) -> Floats:
-        """(N, len(names)) float32: the named properties of all rows of an element. Raises InputError."""
-        return self._columns(element, names, np.empty((element.count, len(names)), np.float32))
-
-    def exact_columns(self, element: Element, names: list[str]) -> NDArray[np.float64]:
-        """As `columns`, in float64."""
-        return self._columns(element, names, np.empty((element.count, len(names)), np.float64))
-
-    def _columns(self, element: Element, names: list[str], values: NDArray[Any]) -> NDArray[Any]:
+    def columns(self, element: Element, names: list[str], dtype: type = np.float32) -> NDArray[Any]:
+        """(N, len(names)): the named properties of all rows of an element. Raises InputError."""
+        values: NDArray[Any] = np.empty((element.count, len(names)), dtype)
+        read = self._text_rows if self.encoding == "ascii" else self._binary_rows
         with np.errstate(all="ignore"):  # a double beyond float32 becomes infinite, which callers report
-            if self.encoding == "ascii":
-                columns = [list(element.properties).index(name) for name in names]
-                for index, row in enumerate(self._text_rows(element)):
-                    values[index] = row[columns]
-            else:
-                start = 0
-                for rows in self._binary_blocks(element, names):
-                    for column, name in enumerate(names):
-                        values[start : start + len(rows), column] = rows[name]
-                    start += len(rows)
+            for start, rows in read(element, names):
+                for column, name in enumerate(names):
+                    values[start : start + len(rows), column] = rows[name]
         return values
 
-    def _binary_blocks(self, element: Element, names: list[str]) -> Iterator[NDArray[Any]]:
+    def _binary_rows(self, element: Element, names: list[str]) -> Iterator[tuple[int, NDArray[Any]]]:
         layout = np.dtype(list(element.properties.items()))[names]
         size = max(1, _BLOCK_BYTES // element.stride)
         self.file.seek(element.offset)
@@ -97,9 +91,9 @@ class PlyFile(NamedTuple):
                 raise InputError(
                     f"{self.path}: became shorter while it was read, at row {start + len(rows)} of {element.count}."
                 )
-            yield rows
+            yield start, rows
 
-    def _text_rows(self, element: Element) -> Iterator[NDArray[np.float64]]:
+    def _text_rows(self, element: Element, names: list[str]) -> Iterator[tuple[int, NDArray[Any]]]:
         self.file.seek(self.header_bytes)
         lines = self.file.read().decode(errors="replace").splitlines()[element.offset :][: element.count]
         if len(lines) < element.count:
@@ -107,14 +101,17 @@ class PlyFile(NamedTuple):
                 f"{self.path}: declares {element.count} rows of {element.name}, but {len(lines)} lines follow; it is "
                 "truncated."
             )
+        width = len(element.properties)
+        table = np.empty((element.count, width))
         for number, line in enumerate(lines):
             try:
-                yield np.array(line.split(), dtype=np.float64).reshape(len(element.properties))
+                table[number] = np.array(line.split(), np.float64).reshape(width)
             except ValueError:
                 raise InputError(
-                    f"{self.path}: row {number} of {element.name}, {line[:80]!r}, does not hold "
-                    f"{len(element.properties)} numbers; the file is damaged."
+                    f"{self.path}: row {number} of {element.name}, {line[:80]!r}, does not hold {width} numbers; "
+                    "the file is damaged."
                 ) from None
+        yield 0, table.view(np.dtype([(name, np.float64) for name in element.properties]))[:, 0]
 
 
 @contextmanager
@@ -137,14 +134,9 @@ def _advice(folder: Path) -> str:
     names = sorted(file.name for file in folder.glob("*.ply"))
     if not names:
         return " without a .ply file; give the .ply file itself"
-    if "checkpoint.ply" in names:
-        return "; give a .ply file, for example the checkpoint.ply in it"
-    if len(names) == 1:
-        return f"; give the file {names[0]} in it"
-    return (
-        f" of {len(names)} .ply files; a sequence of stills is not played, and one of them can be shown, for example "
-        f"{names[0]}"
-    )
+    if "checkpoint.ply" in names or len(names) == 1:
+        return f"; give the file {'checkpoint.ply' if 'checkpoint.ply' in names else names[0]} in it"
+    return f" of {len(names)} .ply files; a sequence of stills is not played: give one of them, such as {names[0]}"
 
 
 def _read_header(file: BinaryIO, path: PathLike) -> PlyFile:
@@ -152,8 +144,12 @@ def _read_header(file: BinaryIO, path: PathLike) -> PlyFile:
     if head[:64].lstrip().lower().startswith(b"<!doctype html"):
         raise InputError(f"{path}: is a web page, and this is not a browser; give the checkpoint that it was made of.")
     if re.match(rb"ply\r?\n", head) is None:
-        what = f"begins with {head[:8]!r}" if head else "is empty (0 bytes)"
-        raise InputError(f"{path}: {what}, where a PLY file begins with the line 'ply'; give a 3DGS .ply file.")
+        if not head:
+            raise InputError(f"{path}: is empty (0 bytes); copy or write it again.")
+        raise InputError(
+            f"{path}: begins with {head[:8]!r}, where a PLY file begins with the line 'ply'; convert it to .ply, for "
+            "example with SuperSplat or splat-transform."
+        )
     end = re.search(rb"^end_header\r?\n", head, re.MULTILINE)
     if end is None:
         raise InputError(
@@ -187,8 +183,9 @@ def _parse_lines(lines: list[str], path: PathLike) -> tuple[str, dict[str, Eleme
                 if not re.fullmatch("[0-9]{1,18}", count):
                     raise InputError(f"{where} does not declare a count from 0 to 10^18 - 1; the file is damaged.")
                 last = elements[name] = Element(name, int(count))
-            case ["property", "list", *_] if last is not None:
-                last.has_lists = True
+            case ["property", "list", length, kind, _] if last is not None and {length, kind} <= _SCALARS.keys():
+                code = _BYTE_ORDERS.get(encoding, "<") + np.dtype(_SCALARS[length]).char
+                last.order.append((code, np.dtype(_SCALARS[kind]).itemsize))
             case ["property", kind, name]:
                 if last is None or kind not in _SCALARS:
                     what = (
@@ -198,6 +195,7 @@ def _parse_lines(lines: list[str], path: PathLike) -> tuple[str, dict[str, Eleme
                 if name in last.properties:
                     raise InputError(f"{where} declares a property a second time; the file is damaged.")
                 last.properties[name] = np.dtype(_BYTE_ORDERS.get(encoding, "<") + _SCALARS[kind])
+                last.order.append(last.properties[name].itemsize)
             case _:
                 raise InputError(f"{where} is not a line of a PLY header; the file is damaged.")
     if not encoding:
@@ -208,16 +206,17 @@ def _parse_lines(lines: list[str], path: PathLike) -> tuple[str, dict[str, Eleme
 def _place(
     elements: dict[str, Element], encoding: str, start: int, file: BinaryIO, path: PathLike
 ) -> dict[str, Element]:
-    """Set the offsets of the elements and return those without lists, of a binary file before the first with lists.
-
-    They must fill the file.
-    """
+    """Set the offsets of the elements and return those without lists. They must fill the file."""
     text, size = encoding == "ascii", os.fstat(file.fileno()).st_size
     end, line = start, 0
+    rest = {element.name for element in elements.values() if not element.has_lists}
     placed: dict[str, Element] = {}
     for element in elements.values():
         if element.has_lists and not text:
-            return placed
+            if rest == placed.keys():
+                return placed
+            end = _end_of_lists(element, end, file, path)
+            continue
         if not element.has_lists:
             placed[element.name] = element
         element.offset = line if text else end
@@ -237,3 +236,28 @@ def _place(
             "appended."
         )
     return placed
+
+
+def _end_of_lists(element: Element, start: int, file: BinaryIO, path: PathLike) -> int:
+    """The byte of a binary file at which an element with lists ends, which begins at `start`."""
+    file.seek(0)
+    data, at = file.read(), start
+    try:
+        for _ in range(element.count):
+            for part in element.order:
+                if isinstance(part, tuple):
+                    code, size = part
+                    (length,) = struct.unpack_from(code, data, at)
+                    at += struct.calcsize(code) + int(length) * size
+                else:
+                    at += part
+            if not start < at <= len(data):
+                break
+    except (struct.error, ValueError, OverflowError):  # a length that is no whole number
+        at = -1
+    if not start <= at <= len(data):
+        raise InputError(
+            f"{path}: element {element.name[:40]!r} ({element.count} rows with lists) does not end within the "
+            f"{len(data)} bytes of the file: it is truncated or its header is wrong."
+        )
+    return at

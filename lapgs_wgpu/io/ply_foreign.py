@@ -32,9 +32,30 @@ def read_foreign(ply: PlyFile) -> tuple[GaussianSnapshot, dict[str, str]]:
     are left out. Raises InputError for all else that `snapshot_of` refuses, and for Gaussians that move.
     """
     vertex = vertex_of(ply)
-    _refuse_motion(vertex, ply.path)
-    values, names = _columns(ply, vertex)
-    metadata = _comments(ply)
+    moving = [name for name in vertex.properties if _MOTION.fullmatch(name)]
+    if moving:
+        raise InputError(
+            f"{ply.path}: its Gaussians move (properties {', '.join(moving[:5])}, {len(moving)} in all), as in "
+            "Spacetime Gaussians, in a way that is not played; give a .ply that its program exports at one time"
+        )
+    held, missing = set(vertex.properties), dict[str, Floats | float]()
+    if {"scale_0", "scale_1"} <= held and "scale_2" not in held:
+        missing["scale_2"] = _FLAT
+    if not held & {"f_dc_0", "f_dc_1", "f_dc_2"} and "opacity" in held:
+        colors = read_colors(ply, vertex)
+        if colors is not None:
+            missing |= {f"f_dc_{i}": (colors[:, i] - 0.5) / np.float32(SH_C0) for i in range(3)}
+    names = gaussian_names(vertex, held | set(missing), ply.path)
+    values = ply.columns(vertex, [name for name in names if name not in missing])
+    for index, name in enumerate(names):
+        if name in missing:
+            values = np.insert(values, index, missing[name], axis=1)
+    metadata, text = {}, "\n".join(ply.comments)
+    if re.search(r"SplatRenderMode\s*[:=]\s*mip", text, re.IGNORECASE):
+        metadata["antialiased"] = "true"
+    axis = re.search(r"vertical[ _]axis\s*[:=]\s*\+?(-?[xyz])\b", text, re.IGNORECASE)
+    if axis:
+        metadata["up"] = axis[1].lower()
     offset = _take_off_offset(ply, vertex, values)
     if offset is not None:
         metadata["offset"] = json.dumps(offset)
@@ -46,48 +67,6 @@ def _note(path: PathLike, text: str) -> None:
     print(f"note: {path}: {text}.", file=sys.stderr)
 
 
-def _refuse_motion(vertex: Element, path: PathLike) -> None:
-    found = [name for name in vertex.properties if _MOTION.fullmatch(name)]
-    if found:
-        more = f" and {len(found) - 5} more" if len(found) > 5 else ""
-        raise InputError(
-            f"{path}: its Gaussians move (properties {', '.join(found[:5])}{more}), as in Spacetime Gaussians, in a "
-            "way that is not played; give a .ply that its program exports at one time"
-        )
-
-
-def _columns(ply: PlyFile, vertex: Element) -> tuple[Floats, list[str]]:
-    """All columns (N, C) that Gaussians need, and their names; those that the file lacks follow from others."""
-    held = set(vertex.properties)
-    missing: dict[str, Floats | float] = {}
-    if {"scale_0", "scale_1"} <= held and "scale_2" not in held:
-        missing["scale_2"] = _FLAT
-    if not held & {"f_dc_0", "f_dc_1", "f_dc_2"} and "opacity" in held:
-        colors = read_colors(ply, vertex)
-        if colors is not None:
-            missing |= {f"f_dc_{i}": (colors[:, i] - 0.5) / np.float32(SH_C0) for i in range(3)}
-    names = gaussian_names(vertex, held | set(missing), ply.path)
-    if not missing:
-        return ply.columns(vertex, names), names
-    values = np.empty((vertex.count, len(names)), np.float32)
-    present = [name for name in names if name not in missing]
-    values[:, [names.index(name) for name in present]] = ply.columns(vertex, present)
-    for name, column in missing.items():
-        values[:, names.index(name)] = column
-    return values, names
-
-
-def _comments(ply: PlyFile) -> dict[str, str]:
-    text = "\n".join(ply.comments)
-    metadata = {}
-    if re.search(r"SplatRenderMode\s*[:=]\s*mip", text, re.IGNORECASE):
-        metadata["antialiased"] = "true"
-    axis = re.search(r"vertical[ _]axis\s*[:=]\s*\+?(-?[xyz])\b", text, re.IGNORECASE)
-    if axis:
-        metadata["up"] = axis[1].lower()
-    return metadata
-
-
 def _take_off_offset(ply: PlyFile, vertex: Element, values: Floats) -> list[float] | None:
     """Move the means in `values` to the origin where float32 would hold few digits of them; return what is taken off.
 
@@ -96,7 +75,7 @@ def _take_off_offset(ply: PlyFile, vertex: Element, values: Floats) -> list[floa
     middle, extent = _middle_and_extent(values[:, :3].astype(np.float64))
     if np.abs(middle).max() <= _FAR * extent:
         return None
-    exact = ply.exact_columns(vertex, ["x", "y", "z"])
+    exact = ply.columns(vertex, ["x", "y", "z"], np.float64)
     middle, extent = _middle_and_extent(exact)
     if extent == 0:
         return None

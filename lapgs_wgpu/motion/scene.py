@@ -135,12 +135,9 @@ class Scene4D:
             points: (N, 3) means, world units.
             colors: (N, 3) in [0, 1].
             scales: (N,) standard deviations, world units.
+            field_config, antialiased, seed, own_field: as for `Scene4D`.
             opacity: of all Gaussians, in (0, 1).
-            field_config: as for `Scene4D`.
-            antialiased: as for `Scene4D`.
             device: None for the default adapter.
-            seed: as for `Scene4D`.
-            own_field: as for `Scene4D`.
 
         Returns:
             The scene.

@@ -83,15 +83,14 @@ class CameraGradient(NamedTuple):
     """Gradients with respect to a camera.
 
     rotation: (3,) by a small rotation of the camera about its own center, a vector along the world's axes, radians.
-    position: (3,) by the center, world units. log_focal: by the logarithm of both focal lengths.
+    position: (3,) by the center, world units.
     """
 
     rotation: NDArray[np.float64]
     position: NDArray[np.float64]
-    log_focal: float
 
 
 def camera_gradient(sums: NDArray[np.float32]) -> CameraGradient:
     """Return the gradient by the camera from the content of `GaussianGradients.camera`."""
     turn, shift = sums.sum(axis=1, dtype=np.float64)
-    return CameraGradient(-turn[:3], -shift[:3], float(turn[3]))
+    return CameraGradient(-turn[:3], -shift[:3])

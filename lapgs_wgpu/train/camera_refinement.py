@@ -1,4 +1,4 @@
-"""Cameras corrected while training: of each training camera its rotation and its place, of all together the zoom.
+"""Cameras corrected while training: of each training camera its rotation and its place.
 
 Poses of own footage come from structure from motion and are a little off, which a training answers with blur. The
 gradient is that of the rasterizer's backward pass (`camera_bwd`); the steps move each image alike (`CameraDescent`).
@@ -22,13 +22,12 @@ from torch import Tensor, nn
 
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train.config import CamerasConfig
-from lapgs_wgpu.train.optimizer import RowAdam, restore_rows
+from lapgs_wgpu.train.optimizer import restore_rows
 
 MEAN_DECAY = 0.5  # of a camera's momentum: it is seen a few dozen times
 SQUARE_DECAY = 0.98  # of the second moment, which all cameras share
 MOST_POINTS = 2000  # of the scene that the image motion is measured at
 NEAREST = 0.05  # depth relative to the median of the points, below which a point does not count
-ZOOM_DECAY = 0.99  # of Adam's second moment
 Array = NDArray[np.float64]
 
 
@@ -107,23 +106,16 @@ class CameraDescent:
 
 
 class RefinedCamera(NamedTuple):
-    """A corrected camera; and `change` (7,), zeros whose gradient is that by a further change of it: a rotation about
-    its center along the world's axes, radians; a shift in units of the cameras' extent; the logarithm of the zoom. None
-    where the camera is kept."""
+    """A corrected camera; and `change` (6,), zeros whose gradient is that by a further change of it: a rotation about
+    its center along the world's axes, radians; a shift in units of the cameras' extent. None where the camera is
+    kept."""
 
     camera: Camera
     change: Tensor | None
 
 
-class Corrections(NamedTuple):
-    """What cameras were corrected by, as far as it is known.
-
-    of_cameras: by the number of a camera, (6,) rotation vector and shift, world units. zoom: logarithm of the factor of
-    all focal lengths.
-    """
-
-    of_cameras: Mapping[int, Array]
-    zoom: float
+# By the number of a camera, as far as it is known: (6,) rotation vector and shift, world units.
+Corrections = Mapping[int, Array]
 
 
 class CameraRefinement:
@@ -150,17 +142,14 @@ class CameraRefinement:
         self._cameras, self._extent, self._config, self._points = list(cameras), extent, config, points
         self._numbers = {camera: number for number, camera in enumerate(self._cameras)}
         count = len(self._cameras)
-        self.values = nn.Parameter(torch.zeros(count, 7))  # zeros that get the gradient
+        self.values = nn.Parameter(torch.zeros(count, 6))  # zeros that get the gradient
         self._learnt = torch.zeros(count, 6, dtype=torch.float64)  # rotation vectors, shifts
-        self._zoom = torch.zeros(1, dtype=torch.float64)
         self._descent = CameraDescent(count)
-        self._zoom_adam = RowAdam((1, 1), ZOOM_DECAY)
         self._common = torch.from_numpy(_common_motions(self._cameras, extent))
         self._settled = torch.zeros(1)
         if before is not None:
             self._settled += 1
-            self._zoom += before.zoom
-            for number, correction in before.of_cameras.items():
+            for number, correction in before.items():
                 self._learnt[number] = torch.from_numpy(correction * _units(1 / extent))
 
     def refined(self, camera: Camera) -> RefinedCamera:
@@ -170,14 +159,12 @@ class CameraRefinement:
 
     def camera(self, number: int) -> Camera:
         """The corrected form of a camera, by its number."""
-        return changed_camera(
-            self._cameras[number], self._learnt[number].numpy() * _units(self._extent), float(self._zoom)
-        )
+        return changed_camera(self._cameras[number], self._learnt[number].numpy() * _units(self._extent))
 
     def corrections_of(self, cameras: Mapping[int, Camera]) -> Corrections:
         """What the cameras (the same objects) are corrected by, under the given numbers."""
         learnt = self._learnt.numpy() * _units(self._extent)
-        return Corrections({n: learnt[self._numbers[c]] for n, c in cameras.items()}, float(self._zoom))
+        return {number: learnt[self._numbers[camera]] for number, camera in cameras.items()}
 
     @torch.no_grad()
     def step(self, step: int) -> None:
@@ -192,54 +179,54 @@ class CameraRefinement:
         rows, points = gradient.any(dim=1).nonzero()[:, 0].tolist(), self._points()
         for row in rows:
             whiten = whitening(image_motion(self.camera(row), points, self._extent), damping)
-            change = self._descent.change(row, gradient[row, :6].double().numpy(), whiten, rate)
+            change = self._descent.change(row, gradient[row].double().numpy(), whiten, rate)
             before = rotation_of(self._learnt[row, :3].numpy())
             self._learnt[row, :3] = torch.from_numpy(rotation_vector(rotation_of(change[:3]) @ before))
             self._learnt[row, 3:] += torch.from_numpy(change[3:])
-        if config.focal and rows:
-            _, move = self._zoom_adam.descend(gradient[rows, 6].mean()[None, None], rate)
-            self._zoom -= move.sum() * len(rows) / len(self._cameras)  # each camera has its share
         self._learnt[rows] *= 1 - rate * config.pull
-        self._zoom *= 1 - rate * config.pull
         flat = self._learnt.view(-1)
         flat -= self._common @ (self._common.T @ flat)
 
     def report(self) -> dict[str, Any]:
-        """How far the cameras went: degrees, per cent of their extent, per cent of the focal length."""
+        """How far the cameras went: degrees, and per cent of their extent."""
         turns = np.degrees(self._learnt[:, :3].norm(dim=1).numpy())
         shifts = 100 * self._learnt[:, 3:].norm(dim=1).numpy()
         return {
             "rotation_degrees": _summary(turns),
             "shift_percent": _summary(shifts),
-            "focal_percent": 100 * float(np.expm1(float(self._zoom))),
             "cameras": [
                 {"rotation_degrees": round(float(turn), 4), "shift_percent": round(float(shift), 4)}
                 for turn, shift in zip(turns, shifts, strict=True)
             ],
         }
 
+    def summary(self) -> str:
+        """How far the cameras went, in a sentence."""
+        report = self.report()
+        turn, shift = report["rotation_degrees"], report["shift_percent"]
+        return (
+            f"the training cameras were corrected by {turn['median']:.2f} degrees and {shift['median']:.2f} % of their "
+            f"extent (medians; at most {turn['largest']:.2f} and {shift['largest']:.2f} %)."
+        )
+
     def state(self) -> dict[str, Tensor]:
         """Everything that the next step depends on, besides the gradient."""
-        zoom = {f"zoom_{name}": value for name, value in self._zoom_adam.state().items()}
-        mine = {"learnt": self._learnt, "zoom": self._zoom, "settled": self._settled}
-        return {**mine, **zoom, **self._descent.state()}
+        return {"learnt": self._learnt, "settled": self._settled, **self._descent.state()}
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
         """Go on from what `state` gave. Raises ValueError where it is of other cameras."""
         restore_rows(self.state(), state, "camera")
 
 
-def changed_camera(camera: Camera, change: Array, zoom: float = 0.0) -> Camera:
+def changed_camera(camera: Camera, change: Array) -> Camera:
     """A camera after a rotation about its center and a shift.
 
-    change: (6,) rotation vector along the world's axes, radians, and shift, world units. zoom: logarithm of the factor
-    of the focal lengths.
+    change: (6,) rotation vector along the world's axes, radians, and shift, world units.
     """
-    T, K = camera.T_cam_world.copy(), camera.K.copy()
+    T = camera.T_cam_world.copy()
     T[:3, :3] = T[:3, :3] @ rotation_of(change[:3]).T
     T[:3, 3] = -T[:3, :3] @ (camera.position + change[3:])
-    K[:2, :2] *= np.exp(zoom)
-    return Camera(K, T, camera.width, camera.height)
+    return Camera(camera.K, T, camera.width, camera.height)
 
 
 def rotation_of(vector: Array) -> Array:

@@ -214,7 +214,6 @@ class CamerasConfig(Options):
     )
     rate: Rate = option("camera corrections, radians of image motion per step", Rate(4e-3, 2e-4, 3_000))
     pull: float = option("weight decay of the corrections, relative to the learning rate", 0.1, at_least=0)
-    focal: bool = option("also correct the focal length: one factor for all training cameras", True)
     start: int = option("first step that corrects cameras", 300, at_least=1)
 
     def refines(self, *, own_footage: bool) -> bool:
@@ -249,7 +248,6 @@ class EvalConfig(Options):
         0,
         at_least=0,
     )
-    tensorboard: bool = option("also write the figures of log.jsonl for TensorBoard (extra tensorboard)", False)
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ are looked at, and dynamics by the adaptive split; whatever else a Gaussian carr
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -57,12 +57,11 @@ class Statistics:
         self.views += visible
         self.radii = torch.maximum(self.radii, radii.to(self.radii.dtype))
 
-    def merge(self, others: Iterable[Statistics]) -> None:
-        """Take in what others have seen of the same Gaussians, in this order."""
-        for other in others:
-            self.gradients += other.gradients
-            self.views += other.views
-            self.radii = torch.maximum(self.radii, other.radii)
+    def merge(self, other: Statistics) -> None:
+        """Take in what another has seen of the same Gaussians."""
+        self.gradients += other.gradients
+        self.views += other.views
+        self.radii = torch.maximum(self.radii, other.radii)
 
     def of(self, keep: Tensor) -> Statistics:
         """The statistics of the Gaussians of a mask (N,)."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Callable, Sequence
 
 import torch
@@ -25,7 +24,6 @@ from lapgs_wgpu.train.densify import (
     largest,
     reset_opacities,
 )
-from lapgs_wgpu.train.distributed import SINGLE_PROCESS, Ranks
 from lapgs_wgpu.train.optimizer import Optimizer
 
 MOST_VIEWS = 50  # by which Gaussians are pruned
@@ -47,13 +45,12 @@ class DensityControl:
         camera_of: Callable[[View], Camera],
         extent: float,
         generator: torch.Generator,
-        ranks: Ranks = SINGLE_PROCESS,
     ) -> None:
-        """views: of the training. camera_of: a view's camera as it is drawn. ranks: which share the work."""
+        """views: of the training. camera_of: a view's camera as it is drawn."""
         self._config, self._last = config.density, config.schedule.steps
         self._scene, self._optimizer, self._rule = scene, optimizer, rule
         self._views, self._camera_of = spread_views(views, MOST_VIEWS), camera_of
-        self._extent, self._generator, self._ranks = extent, generator, ranks
+        self._extent, self._generator = extent, generator
         self.statistics = self.nothing_seen()
 
     def nothing_seen(self) -> Statistics:
@@ -91,10 +88,8 @@ class DensityControl:
 
     def _prune_hidden(self, moving: bool) -> int:
         """Prune the Gaussians that contribute too little to all images; how many."""
-        mine = self._views[self._ranks.rank :: self._ranks.count]
-        views = [dataclasses.replace(view, camera=self._camera_of(view)) for view in mine]
+        views = [dataclasses.replace(view, camera=self._camera_of(view)) for view in self._views]
         most = contributions(self._scene, views, moving=moving)
-        most = functools.reduce(torch.maximum, self._ranks.all_gather([most])[0])
         keep = (most >= self._config.min_contribution) | largest(most, LEAST_KEPT)
         if not keep.all():
             self._optimizer.edit_rows(keep, {name: row[:0] for name, row in self._scene.parameters.items()})

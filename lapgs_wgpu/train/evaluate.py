@@ -24,18 +24,14 @@ from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.progress import Progress
-from lapgs_wgpu.splat.camera import Camera
-from lapgs_wgpu.train.camera_refinement import rotation_vector
 from lapgs_wgpu.train.config import BACKGROUND_LEVELS
 from lapgs_wgpu.train.environment import environment
-from lapgs_wgpu.train.image_metrics import MS_SSIM_SMALLEST, SSIM_WINDOW, masked_ssim, ms_ssim, psnr, ssim
+from lapgs_wgpu.train.image_metrics import MS_SSIM_SMALLEST, ms_ssim, psnr, ssim
 from lapgs_wgpu.train.lpips import SMALLEST, Lpips
-from lapgs_wgpu.train.view_alignment import aligned_view
 
 ERROR_GAIN = 4  # of the error pictures
-MEASURES = ("psnr", "ssim", "ms_ssim", "lpips", "lpips_unscaled", "masked_psnr", "masked_ssim")
+MEASURES = ("psnr", "ssim", "ms_ssim", "lpips", "lpips_unscaled", "masked_psnr")
 NOT_AVAILABLE = "not available"
-ALIGNED = "test-time alignment: the camera of each test view was fitted to its image, the scene fixed"
 
 
 def evaluate(
@@ -45,7 +41,6 @@ def evaluate(
     folder: Path | None = None,
     *,
     lpips: Lpips | None = None,
-    camera_unit: float | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Render every view and compare: the content of metrics.json.
@@ -55,24 +50,20 @@ def evaluate(
     are no weights for it.
     Each measure is one of an image, then the mean over the images (of PSNR of the dB): psnr over all channels; ssim,
     that of the loss; ms_ssim; lpips on inputs in [-1, 1], and lpips_unscaled on inputs in [0, 1], as 3DGS's code
-    reports it; masked_psnr and masked_ssim, of the pixels of the view's mask. "not available" stands for what cannot be
+    reports it; masked_psnr, of the pixels of the view's mask. "not available" stands for what cannot be
     measured: pictures too small, no weights, no masks.
-    camera_unit: extent of the cameras, world units, where training cameras were refined. `aligned` then holds the
-    measures once more, after test-time alignment (`view_alignment`), labelled as such; the others stay without it.
     progress: takes a step for each view.
     Raises InputError where there are no views, or a picture or a mask cannot be read.
     """
     _check_any(views)
     start = time.perf_counter()
     color = torch.full((3,), BACKGROUND_LEVELS[background])
-    rows, aligned = [], []
+    rows = []
     for view in views:
         truth, image = _on(color, view), _render(scene, view, color)
         row: dict[str, Any] = {"view": view.name, "time": view.time}
         row |= _measures(_unit(image), _unit(truth), view.load_mask(), lpips)
         rows.append(row)
-        if camera_unit is not None:
-            aligned.append(_aligned_row(scene, view, truth, color, camera_unit, lpips))
         if folder is not None:
             with atomic_write(folder / f"{view.name}.png") as file:
                 file.write(encode_png(side_by_side(truth, image)))
@@ -80,7 +71,6 @@ def evaluate(
             progress.step()
     return {
         **{name: _mean([row[name] for row in rows]) for name in MEASURES},
-        **({"aligned": _aligned(aligned)} if aligned else {}),
         "gaussians": len(scene),
         "field": scene.field_config.kind,
         "size": [views[0].camera.width, views[0].camera.height],
@@ -88,30 +78,6 @@ def evaluate(
         "views": rows,
         "seconds": round(time.perf_counter() - start, 3),
         "environment": environment(scene.device),
-    }
-
-
-def _aligned_row(
-    scene: Scene4D, view: View, truth: NDArray[np.uint8], color: Tensor, unit: float, lpips: Lpips | None
-) -> dict[str, Any]:
-    """The measures of a view after test-time alignment, and how far it moved the camera."""
-    near = aligned_view(scene, view, color, unit)
-    measures = _measures(_unit(_render(scene, near, color)), _unit(truth), view.load_mask(), lpips)
-    return {"view": view.name} | measures | _apart(view.camera, near.camera, unit)
-
-
-def _aligned(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """The means over the views after test-time alignment, and each view."""
-    names = (*MEASURES, "rotation_degrees", "shift_percent")
-    return {"protocol": ALIGNED} | {name: _mean([row[name] for row in rows]) for name in names} | {"views": rows}
-
-
-def _apart(given: Camera, fitted: Camera, unit: float) -> dict[str, float]:
-    """How far the alignment moved a camera: degrees, and per cent of the cameras' extent."""
-    turn = rotation_vector(fitted.T_cam_world[:3, :3].T @ given.T_cam_world[:3, :3])
-    return {
-        "rotation_degrees": float(np.degrees(np.linalg.norm(turn))),
-        "shift_percent": 100 * float(np.linalg.norm(fitted.position - given.position)) / unit,
     }
 
 
@@ -150,9 +116,6 @@ def _measures(
         "lpips": perceptual(image, truth) if perceptual else NOT_AVAILABLE,
         "lpips_unscaled": perceptual(image, truth, unscaled=True) if perceptual else NOT_AVAILABLE,
         "masked_psnr": psnr(image[mask], truth[mask]) if mask is not None else NOT_AVAILABLE,
-        "masked_ssim": (
-            float(masked_ssim(image, truth, mask)) if mask is not None and side >= SSIM_WINDOW else NOT_AVAILABLE
-        ),
     }
 
 

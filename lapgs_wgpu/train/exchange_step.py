@@ -11,9 +11,7 @@ import torch
 from torch import Tensor
 
 from lapgs_wgpu.data.views import View
-from lapgs_wgpu.train.densify import Statistics
 from lapgs_wgpu.train.density_control import DensityControl
-from lapgs_wgpu.train.distributed import Ranks
 from lapgs_wgpu.train.ground_truth import GroundTruth
 from lapgs_wgpu.train.learners import Learners
 from lapgs_wgpu.train.nonfinite import Skipped, cause, check_parameters, finite
@@ -29,14 +27,11 @@ class ExchangeStep:
         learners: that are moved.
         density: whose statistics take the views in.
         truth: of the views.
-        ranks: this process among those that share the views.
     """
 
-    def __init__(
-        self, objective: Objective, learners: Learners, density: DensityControl, truth: GroundTruth, ranks: Ranks
-    ) -> None:
+    def __init__(self, objective: Objective, learners: Learners, density: DensityControl, truth: GroundTruth) -> None:
         self._objective, self._learners, self._density = objective, learners, density
-        self._truth, self._ranks = truth, ranks
+        self._truth = truth
 
     @property
     def dead_scales(self) -> float:
@@ -54,7 +49,7 @@ class ExchangeStep:
 
         Args:
             step: counted from 1.
-            samples: of all views, which the ranks share.
+            samples: of its views.
             share: of the learning rates.
             seen: whether density control takes the views in.
             began: called before anything changes, and after the last error that leaves all as it was.
@@ -62,19 +57,15 @@ class ExchangeStep:
         Raises:
             NumericalError: a parameter is not finite.
         """
-        ranks, mine = self._ranks, samples[self._ranks.rank :: self._ranks.count]
         self._learners.zero_grad()
         statistics = self._density.nothing_seen()
         results, totals = [], Counter[str]()
-        for sample in mine:
+        for sample in samples:
             result = self._descend(sample, step, share=len(samples))
             statistics.add(result.radii, result.d_means2d, sample.view.camera, scale=len(samples))
             results.append(result)
             totals.update({"loss": result.loss, "psnr": result.psnr, **result.terms})
-        if ranks.count > 1:
-            self._learners.all_reduce_gradients(ranks)
-        sums = ranks.all_reduce_sum([torch.tensor(list(totals.values()), dtype=torch.float64)])[0] / len(samples)
-        means = dict(zip(totals, sums.tolist(), strict=True))
+        means = {name: total / len(samples) for name, total in totals.items()}
         loss, psnr = means.pop("loss"), means.pop("psnr")
         what = self._not_finite(results, loss, began)
         skipped = Skipped(step, ", ".join(sample.view.name for sample in samples), what) if what else None
@@ -83,7 +74,7 @@ class ExchangeStep:
             self._learners.step(step, share)
             # After the optimizer's step, so that no gradient is lost with the rows that change.
             if seen:
-                self._density.statistics.merge(self._seen_by_all(statistics))
+                self._density.statistics.merge(statistics)
         else:
             self._learners.zero_grad()
         return Measured(loss, psnr, skipped, means)
@@ -95,9 +86,6 @@ class ExchangeStep:
         correction = self._learners.exposure(view)
         return self._objective.descend(sample, step, truth, camera, correction, share=share)
 
-    def _seen_by_all(self, seen: Statistics) -> list[Statistics]:
-        return [Statistics(*values) for values in zip(*self._ranks.all_gather(list(vars(seen).values())), strict=True)]
-
     def _not_finite(self, results: list[ViewResult], loss: float, began: Callable[[], None]) -> str:
         """What is not finite in the loss and gradients of a step, for which it is skipped; "" where all is well.
 
@@ -105,7 +93,7 @@ class ExchangeStep:
         """
         parameters, gradients = self._learners.parameters(), self._learners.gradients()
         gradients["the places in the image"] = [result.d_means2d for result in results]
-        if not self._ranks.any_rank(not (math.isfinite(loss) and finite(parameters, gradients))):
+        if math.isfinite(loss) and finite(parameters, gradients):
             return ""
         try:
             check_parameters(parameters)

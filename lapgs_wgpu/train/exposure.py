@@ -19,9 +19,10 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.train.learning_rate import Rate
-from lapgs_wgpu.train.optimizer import RowAdam, restore_rows
+from lapgs_wgpu.train.optimizer import restore_rows
 
-SQUARE_DECAY = 0.999  # Adam's
+MEAN_DECAY, SQUARE_DECAY = 0.9, 0.999  # Adam's
+EPS = 1e-15  # keeps 0 / 0 away
 
 
 def without_exposure(image: NDArray[np.float32], correction: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -71,8 +72,8 @@ class ExposurePasses:
 class Exposures:
     """The corrections of all training pictures, (V, 3, 4), the identity at first, and how they learn.
 
-    Colors that all corrections share belong to the scene, which is measured without any: the mean of all stays the
-    identity.
+    Adam, whose state of a picture stands still while that one has no gradient. Colors that all corrections share belong
+    to the scene, which is measured without any: the mean of all stays the identity.
     """
 
     name = "exposures"
@@ -81,21 +82,28 @@ class Exposures:
         self._identity = torch.eye(3, 4)
         self._rate = rate
         self.values = nn.Parameter(self._identity.repeat(count, 1, 1))
-        self._adam = RowAdam((count, 3, 4), SQUARE_DECAY)
+        self._mean, self._square = torch.zeros(2, count, 3, 4).unbind()
+        self._steps = torch.zeros(count, 1, 1)
 
     @torch.no_grad()
     def step(self, step: int) -> None:
         """Move the corrections that have a gradient, at the rate of this step (counted from 1), and forget it."""
         if self.values.grad is None:
             return
-        rows, move = self._adam.descend(self.values.grad, self._rate.at(step))
-        self.values[rows] -= move
+        rows = self.values.grad.flatten(1).any(dim=1).nonzero()[:, 0]
+        gradient = self.values.grad[rows]
+        self._steps[rows] += 1
+        self._mean[rows] = MEAN_DECAY * self._mean[rows] + (1 - MEAN_DECAY) * gradient
+        self._square[rows] = SQUARE_DECAY * self._square[rows] + (1 - SQUARE_DECAY) * gradient.square()
+        mean = self._mean[rows] / (1 - MEAN_DECAY ** self._steps[rows])
+        size = (self._square[rows] / (1 - SQUARE_DECAY ** self._steps[rows])).sqrt()
+        self.values[rows] -= self._rate.at(step) * mean / (size + EPS)
         self.values.sub_(self.values.mean(dim=0) - self._identity)
         self.values.grad = None
 
     def state(self) -> dict[str, Tensor]:
         """Everything that the next step depends on, besides the gradient."""
-        return {"values": self.values, **self._adam.state()}
+        return {"values": self.values, "mean": self._mean, "square": self._square, "steps": self._steps}
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
         """Go on from what `state` gave. Raises ValueError where it is of other pictures."""

@@ -90,8 +90,8 @@ def render_loss(
         device: that computes.
         correction: (3, 4) of the image's colors before they are compared (train/exposure); None for none.
         own: further terms of the image, with their weights.
-        camera_change: (7,) zeros, which get the gradient by a small change of the camera: rotation, shift in units of
-            `camera_unit`, log of the focal lengths (splat.drawing.CameraGradient); None for none.
+        camera_change: (6,) zeros, which get the gradient by a small change of the camera: rotation, shift in units of
+            `camera_unit` (splat.drawing.CameraGradient); None for none.
         camera_unit: world units.
     """
     tensors = (
@@ -170,7 +170,7 @@ class _FusedLoss(torch.autograd.Function):
             by_camera = None
             if change is not None:
                 by = camera_gradient(rows[-1])
-                by_camera = change.new_tensor([*by.rotation, *(unit * by.position), by.log_focal])
+                by_camera = change.new_tensor([*by.rotation, *(unit * by.position)])
             ctx.gradients = (*by_gaussians, by_correction, by_camera, d_means2d)
         computed = torch.from_numpy(np.append(values.astype(np.float64), [own_values[t.name] for t, _ in own]))
         radii, centres = radii_and_centres(splats, probe.device)

@@ -60,23 +60,6 @@ def ms_ssim(image: Tensor, target: Tensor) -> Tensor:
     return product.mean()
 
 
-def masked_ssim(image: Tensor, target: Tensor, mask: Tensor) -> Tensor:
-    """Mean structural similarity of two (H, W, C) images of at least 11 pixels a side, where a mask (H, W), bool, is
-    set, as DyCheck (Gao et al. 2022) computes it.
-
-    The window is that of `ssim`, in partial convolutions, so that no other pixel has any influence. Windows lie wholly
-    inside the image; variances are at least 0, and covariances at most their geometric mean. The mean is over all
-    windows, and one without a pixel of the mask counts as 1.
-    """
-    a, b = image.permute(2, 0, 1), target.permute(2, 0, 1)
-    mean_a, mean_b, aa, bb, ab = _partial_blur(torch.cat([a, b, a * a, b * b, a * b]), mask).chunk(5)
-    variance_a, variance_b = (aa - mean_a * mean_a).clamp(min=0), (bb - mean_b * mean_b).clamp(min=0)
-    bound = (variance_a * variance_b).sqrt()
-    covariance = (ab - mean_a * mean_b).clamp(-bound, bound)
-    luminance = (2 * mean_a * mean_b + SSIM_C1) / (mean_a * mean_a + mean_b * mean_b + SSIM_C1)
-    return (luminance * (2 * covariance + SSIM_C2) / (variance_a + variance_b + SSIM_C2)).mean()
-
-
 def psnr(image: Tensor, target: Tensor) -> float:
     """Peak signal-to-noise ratio in dB over all pixels and channels, at most 100 dB."""
     squares = (image - target).square().flatten()  # one order of summation, whatever the strides
@@ -96,22 +79,6 @@ def _blur(planes: Tensor) -> Tensor:
     rows = window.view(1, 1, 1, -1).expand(count, 1, 1, -1)
     down = functional.conv2d(planes[None], columns, padding=(margin, 0), groups=count)
     return functional.conv2d(down, rows, padding=(0, margin), groups=count)[0]
-
-
-def _partial_blur(planes: Tensor, mask: Tensor) -> Tensor:
-    """(P, H - 10, W - 10): (P, H, W) planes under the Gaussian window by partial convolutions (Liu et al. 2018).
-
-    Along rows, then columns: a weighted sum over the taps that the mask (H, W) has, times 11 / their number
-    (whatever their weights); what has any tap is the mask of the second pass, and 0 stands for the rest.
-    """
-    present = mask.to(planes.dtype)[None, None]
-    planes = planes[:, None]
-    for shape in ((1, 1, 1, -1), (1, 1, -1, 1)):
-        window = _window(planes.dtype, planes.device).view(shape)
-        taps = functional.conv2d(present, torch.ones_like(window))
-        planes = functional.conv2d(planes * present, window) * SSIM_WINDOW / taps.clamp(min=1)
-        present = (taps > 0).to(planes.dtype)
-    return planes[:, 0]
 
 
 @functools.cache

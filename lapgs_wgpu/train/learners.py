@@ -11,7 +11,6 @@ from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train.camera_refinement import CameraRefinement, RefinedCamera, ScenePoints, scene_points
 from lapgs_wgpu.train.config import Config
-from lapgs_wgpu.train.distributed import Ranks
 from lapgs_wgpu.train.exposure import Exposures
 from lapgs_wgpu.train.nonfinite import Tensors
 from lapgs_wgpu.train.optimizer import FrequencyOptimizer, Optimizer
@@ -85,12 +84,6 @@ class Learners:
         self.optimizer.zero_grad()
         for each in self._refiners():
             each.values.grad = None
-
-    def all_reduce_gradients(self, ranks: Ranks) -> None:
-        """Make every rank's gradients the sums over the ranks."""
-        mine = [gradient for group in self.gradients().values() for gradient in group]
-        for gradient, total in zip(mine, ranks.all_reduce_sum(mine), strict=True):
-            gradient.copy_(total)
 
     def step(self, step: int, share: float) -> None:
         """Move all that has a gradient, the Gaussians and the field at a share of the rates of this step."""

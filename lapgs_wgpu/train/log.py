@@ -36,9 +36,6 @@ class Log:
         done: number of steps that are done.
         before: seconds that the training took before its first step.
         terminal: stderr where None.
-
-    Attributes:
-        listeners: called with each line.
     """
 
     def __init__(
@@ -50,7 +47,6 @@ class Log:
         self._file, so_far = _continued(path, done)
         self._recent: deque[StepResult] = deque(maxlen=INTERVAL)
         self._fresh: list[StepResult] = []  # that were not yet asked what they tell
-        self.listeners: list[Callable[[dict[str, Any]], None]] = []
         self._began = time.perf_counter()
         self._start = self._began - (so_far or before)
         self._times: deque[float] = deque(maxlen=INTERVAL + 1)  # at which steps ended
@@ -141,8 +137,6 @@ class Log:
         self.tell(f"step {step}: {psnr:.2f} dB on the {shown} views")
 
     def _write(self, line: dict[str, Any]) -> None:
-        for listener in self.listeners:
-            listener(line)
         try:
             self._file.write((json.dumps(line) + "\n").encode())
         except OSError as error:

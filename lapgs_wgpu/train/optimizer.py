@@ -16,8 +16,6 @@ from lapgs_wgpu.train.learning_rate import Rate
 
 ADAM_EPS = 1e-15  # 3DGS's: gradients of single Gaussians are tiny
 LARGEST_FREQUENCY_STEP = 0.02  # cycles over the clip
-ROW_MEAN_DECAY = 0.9
-ROW_EPS = 1e-15  # keeps 0 / 0 away
 
 
 class AdamState(NamedTuple):
@@ -213,40 +211,9 @@ class FrequencyOptimizer:
         self._mean, self._square, self._steps = torch.from_numpy(moments[:-1].copy()), float(moments[-1]), steps
 
 
-class RowAdam:
-    """Adam for values of which a step moves a few rows, such as those of the images that it was trained on.
-
-    The state of a row stands still while the row has no gradient.
-
-    Args:
-        shape: of the values, rows first.
-        square_decay: of the second moment.
-    """
-
-    def __init__(self, shape: tuple[int, ...], square_decay: float) -> None:
-        self._square_decay = square_decay
-        self._mean, self._square = torch.zeros(shape), torch.zeros(shape)
-        self._steps = torch.zeros(shape[0], *[1] * (len(shape) - 1))
-
-    def descend(self, gradient: Tensor, rate: float) -> tuple[Tensor, Tensor]:
-        """The rows (R,) that have a gradient, and what to subtract from them (R, ...) at this learning rate."""
-        rows = gradient.flatten(1).any(dim=1).nonzero()[:, 0]
-        gradient, decay = gradient[rows], self._square_decay
-        self._steps[rows] += 1
-        self._mean[rows] = ROW_MEAN_DECAY * self._mean[rows] + (1 - ROW_MEAN_DECAY) * gradient
-        self._square[rows] = decay * self._square[rows] + (1 - decay) * gradient.square()
-        mean = self._mean[rows] / (1 - ROW_MEAN_DECAY ** self._steps[rows])
-        size = (self._square[rows] / (1 - decay ** self._steps[rows])).sqrt()
-        return rows, rate * mean / (size + ROW_EPS)
-
-    def state(self) -> dict[str, Tensor]:
-        """Everything that the next step depends on, besides the gradient."""
-        return {"mean": self._mean, "square": self._square, "steps": self._steps}
-
-
 @torch.no_grad()
 def restore_rows(mine: Mapping[str, Tensor], state: Mapping[str, Tensor], of: str) -> None:
-    """Copy a state that was stored into the tensors that are in use, those of a `RowAdam` among them.
+    """Copy a state that was stored into the tensors that are in use, a `square` and `steps` of Adam among them.
 
     of: what the values are, for the text of a ValueError, which is raised where the state is of another training.
     """

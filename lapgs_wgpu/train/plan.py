@@ -13,12 +13,11 @@ from typing import Any, NamedTuple
 from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.errors import DeviceMemoryError, InputError
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.progress import duration
 from lapgs_wgpu.train.config import Config
-from lapgs_wgpu.train.initial_points import initial_points
 from lapgs_wgpu.train.open_dataset import open_dataset
 from lapgs_wgpu.train.presets import load_config
+from lapgs_wgpu.train.start import start_from_points
 from lapgs_wgpu.train.trainer import Trainer
 
 LARGE = {"one moving camera": "hypernerf", "static cameras": "neu3d", "cameras all around": "dnerf"}
@@ -52,10 +51,8 @@ def camera_layout(dataset: Dataset) -> str:
 def step_seconds(config: Config, dataset: Dataset, device: Device) -> float:
     """Time some steps of a training with `points.count` moving Gaussians: the mean, seconds. Writes nothing. Raises
     InputError and DeviceError."""
-    points, colors, scales = initial_points(config.points, dataset, config.seed)
-    scene = Scene4D.from_points(points, colors, scales, config.field, antialiased=config.antialiased, device=device)
     taken = []
-    with Trainer(config, dataset, device, scene=scene) as trainer:
+    with Trainer(config, dataset, device, scene=start_from_points(config, dataset, device).scene) as trainer:
         for _ in range(UNTIMED_STEPS + TIMED_STEPS):
             start = time.perf_counter()
             trainer.step()

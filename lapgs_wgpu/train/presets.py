@@ -41,9 +41,11 @@ ABLATIONS: dict[str, tuple[str, str, Any]] = {
 # Keys of earlier versions, and what holds now. In a .toml file they are ignored, with a note.
 REMOVED = {
     "acceleration.frames": "it is 2",
+    "cameras.focal": "focal lengths are taken as they are",
     "data.split": "a run is measured on its test views",
     "decoder": "it is in torch where the step is, and on the device where that is; step says which",
     "eval.snapshots": "only the last model is saved",
+    "eval.tensorboard": "log.jsonl has the figures",
     "eval.views": "the validation views are measured, or 8 training views if there are none",
     "loss.dynamics_mode": "the regularization is that of the paper's equation; loss.dynamics 0 turns it off",
     "points.opacity": "it is 0.1",

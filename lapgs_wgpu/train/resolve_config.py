@@ -10,7 +10,6 @@ from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.timing import MOST_TIMES
 from lapgs_wgpu.train.config import Config
-from lapgs_wgpu.train.distributed import Ranks
 from lapgs_wgpu.train.parts import Parts
 
 
@@ -47,13 +46,13 @@ def nyquist_frequency(dataset: Dataset) -> float:
     return (len(times) - 1) / 2 / float(times[-1] - times[0]) if len(times) > 1 else 0.0
 
 
-def resolve_step(config: Config, dataset: Dataset, device: Device, parts: Parts, ranks: Ranks) -> Config:
+def resolve_step(config: Config, dataset: Dataset, device: Device, parts: Parts) -> Config:
     """The configuration with the place of the step, which "auto" leaves open, decided.
 
     No trial decides, since the place changes the last bits, and near a tie two runs would differ. Raises InputError
     where it is to be resident and cannot be.
     """
-    reason = why_exchange(config, dataset, parts, ranks)
+    reason = why_exchange(config, dataset, parts)
     if config.step == "resident" and reason:
         raise InputError(f"the step cannot be resident: {reason}; give --step auto.")
     if config.step != "auto":
@@ -61,7 +60,7 @@ def resolve_step(config: Config, dataset: Dataset, device: Device, parts: Parts,
     return dataclasses.replace(config, step="exchange" if reason or device.is_cpu else "resident")
 
 
-def why_exchange(config: Config, dataset: Dataset, parts: Parts, ranks: Ranks) -> str:
+def why_exchange(config: Config, dataset: Dataset, parts: Parts) -> str:
     """What of a training only torch can compute; "" where there is nothing."""
     if config.field.kind != "static" and not config.field.decodes_on_device:
         return f"there are no kernels for the field {config.field.kind} in this shape"
@@ -73,4 +72,4 @@ def why_exchange(config: Config, dataset: Dataset, parts: Parts, ranks: Ranks) -
         return "the colors of the images are corrected"
     if config.schedule.batch > 1:
         return f"a step takes {config.schedule.batch} images"
-    return "" if ranks.count == 1 else f"{ranks.count} processes share a step"
+    return ""

@@ -27,10 +27,9 @@ from lapgs_wgpu.train.host_threads import step_threads
 from lapgs_wgpu.train.presets import write_toml
 
 STATE = "state.safetensors"
-OLD_STATE = "state.before.safetensors"  # that earlier versions wrote, too
 RUN_FILES = (
     "config.toml", "log.jsonl", "metrics.json", "metrics.csv", "checkpoint.ply", "eval", "tensorboard",
-    STATE, OLD_STATE,
+    STATE,
 )  # fmt: skip
 
 State = Mapping[str, NDArray[Any]]
@@ -108,10 +107,9 @@ def result_text(run: Path) -> str:
     """What metrics.json of a finished run says, in a line."""
     metrics = json.loads((run / "metrics.json").read_text())
     width, height = metrics["size"]
-    aligned = f" ({metrics['aligned']['psnr']:.2f} dB after test-time alignment)" if "aligned" in metrics else ""
     return (
         f"{run}: {metrics['psnr']:.2f} dB PSNR, {metrics['ssim']:.4f} SSIM on {len(metrics['views'])} test views of "
-        f"{width}x{height}{aligned}, {metrics['gaussians']} Gaussians"
+        f"{width}x{height}, {metrics['gaussians']} Gaussians"
     )
 
 
@@ -167,6 +165,6 @@ def check_state(state: State, *, views: int, steps: int) -> None:
 
 def drop_states(out: Path) -> None:
     """Remove the state of a training that is finished, and temporary files of killed processes."""
-    for path in (out / STATE, out / OLD_STATE, *out.glob(".*.tmp")):
+    for path in (out / STATE, *out.glob(".*.tmp")):
         with suppress(OSError):
             path.unlink(missing_ok=True)

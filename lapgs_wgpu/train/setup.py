@@ -11,7 +11,6 @@ from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device, open_device
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.config import Config
-from lapgs_wgpu.train.distributed import Ranks
 from lapgs_wgpu.train.open_dataset import open_dataset, resolve_data
 from lapgs_wgpu.train.parts import Parts
 from lapgs_wgpu.train.resolve_config import resolve_for_dataset, resolve_step
@@ -38,7 +37,6 @@ def set_up(
     dataset: Dataset | None,
     device: Device | None,
     parts: Parts,
-    ranks: Ranks,
     scene: Scene4D | None = None,
 ) -> Setup:
     """Check the arguments of a `Trainer`, open what they leave out, and resolve the configuration.
@@ -48,11 +46,6 @@ def set_up(
     for name, kind, value in (("config", Config, config), ("dataset", Dataset | None, dataset)):
         if not isinstance(value, kind):
             raise InputError(f"Trainer takes as {name} what load_{name} gives, got a {type(value).__name__}.")
-    if config.schedule.batch % ranks.count:
-        raise InputError(
-            f"{ranks.count} processes cannot share {config.schedule.batch} views a step evenly; give --batch "
-            f"{ranks.count}, or a multiple of it."
-        )
     if scene is not None and parts.field is not None:
         raise InputError("the scene to start from keeps its own field; leave out Parts(field=...).")
     if scene is not None and scene.antialiased != config.antialiased:
@@ -71,7 +64,7 @@ def set_up(
             config = dataclasses.replace(config, field=dataclasses.replace(config.field, kind="own"))
         except ValueError as error:
             raise InputError(f"{error}.") from None
-    user_config = resolve_step(config, dataset, device, parts, ranks)
+    user_config = resolve_step(config, dataset, device, parts)
     resolved = resolve_for_dataset(user_config, dataset)
     if scene is not None:  # whose field does not change its shape any more
         resolved = dataclasses.replace(resolved, field=scene.field_config)

@@ -5,15 +5,21 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+import numpy as np
+import torch
+from numpy.typing import NDArray
 from torch import nn
 
+from lapgs_wgpu.data.initial_gaussians import first_points, initial_scales, limit_optical_depth
+from lapgs_wgpu.data.plane_sweep import still_surface
 from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.scene import Scene4D
+from lapgs_wgpu.splat.morton import morton_order
 from lapgs_wgpu.train.camera_refinement import Corrections
-from lapgs_wgpu.train.config import Config
-from lapgs_wgpu.train.initial_points import INITIAL_OPACITY, initial_points
+from lapgs_wgpu.train.config import Config, PointsConfig
 
+INITIAL_OPACITY = 0.1
 # Learning rates at which a field keeps what discovery fitted; at higher ones Adam's noise undoes the fit.
 MAX_HASH_RATE, MAX_MLP_RATE = 5e-3, 1e-3
 
@@ -64,6 +70,27 @@ def start_from_points(config: Config, dataset: Dataset, device: Device, own_fiel
         own_field=own_field,
     )
     return Start(scene, warm_up_steps=config.schedule.warm_up)
+
+
+def initial_points(
+    config: PointsConfig, dataset: Dataset, seed: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """The first Gaussians, along a Morton curve: points (N, 3), colors (N, 3) and scales (N,).
+
+    Without a cloud, the cameras of a rig tell where what stands still is (data/plane_sweep): as large a share of the
+    points as of the pixels lies there. The others, and those of other captures, lie as data/initial_gaussians says.
+    """
+    points, colors = first_points(dataset, config.count, config.box, seed)
+    if dataset.cloud is None and (surface := still_surface(dataset)) is not None:
+        known = min(round(surface.share * len(points)), len(surface.points))
+        chosen = np.random.default_rng(seed).choice(len(surface.points), known, replace=False)
+        points[:known], colors[:known] = surface.points[chosen], surface.colors[chosen]
+    scales = initial_scales(points)
+    # Published figures of D-NeRF start from a fog, which the empty background there soon lifts.
+    if dataset.cloud is not None or dataset.depths is not None:
+        scales = limit_optical_depth(points, scales, INITIAL_OPACITY, dataset.cameras)
+    order = morton_order(torch.from_numpy(points)).numpy()
+    return points[order], colors[order], scales[order]
 
 
 def max_field_rates(groups: Iterable[str]) -> dict[str, float]:

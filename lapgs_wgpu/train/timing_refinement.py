@@ -19,7 +19,6 @@ from torch import Tensor
 from lapgs_wgpu.data.views import View
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.motion.timing import EVEN, Timing, checked_timing
-from lapgs_wgpu.train.distributed import Ranks
 from lapgs_wgpu.train.ground_truth import HostImage
 
 # Distances in time are in gaps between images (the usual one).
@@ -38,7 +37,6 @@ class TimingRefinement:
         truth: the image of a view.
         picture: the scene's picture (H, W, 3) of a view under a timing, which is compared with it.
         gap: the usual distance in time of two images of a camera.
-        ranks: which share the work.
     """
 
     def __init__(
@@ -48,9 +46,8 @@ class TimingRefinement:
         truth: Callable[[View], HostImage],
         picture: Callable[[View, Timing], Tensor],
         gap: float,
-        ranks: Ranks,
     ) -> None:
-        self._scene, self._truth, self._picture, self._gap, self._ranks = scene, truth, picture, gap, ranks
+        self._scene, self._truth, self._picture, self._gap = scene, truth, picture, gap
         self._times = np.unique([view.time for view in views])
         self._views = [[view for view in views if view.time == t] for t in self._times.tolist()]
         self._field_times = np.array([scene.timing(t) for t in self._times.tolist()])
@@ -60,11 +57,11 @@ class TimingRefinement:
 
         The same bits on every run of one adapter and driver. Raises InputError where an image cannot be read.
         """
-        mine = torch.zeros(len(self._times), 2, dtype=torch.float64)
-        for row in range(len(mine))[self._ranks.rank :: self._ranks.count]:
-            views = self._views[row]
-            mine[row] = torch.tensor(self._fit(views[number % len(views)], float(self._field_times[row])))
-        shifts, gains = self._ranks.all_reduce_sum([mine])[0].numpy().T
+        fits = [
+            self._fit(views[number % len(views)], now)
+            for views, now in zip(self._views, self._field_times.tolist(), strict=True)
+        ]
+        shifts, gains = np.array(fits).T
         shifts = shifts - running_median(shifts, AROUND)
         shifts[shifts**2 * gains < LEAST_GAIN] = 0.0
         moved = self._field_times + self._gap * shifts.clip(-LARGEST_SHIFT, LARGEST_SHIFT)
@@ -94,6 +91,14 @@ class TimingRefinement:
         """Differences of field times from image times: root mean square and largest, in gaps between images."""
         differences = np.abs(self._field_times - self._times) / self._gap
         return {"frames": float(np.sqrt(np.mean(differences**2))), "frames_most": float(differences.max())}
+
+    def summary(self) -> str:
+        """How far the times went, in a sentence."""
+        report = self.report()
+        return (
+            f"the times of the training images were corrected by {report['frames']:.2f} of the distance of two images "
+            f"(root mean square; at most {report['frames_most']:.2f})."
+        )
 
     def state(self) -> dict[str, Tensor]:
         """Everything that the next step depends on."""

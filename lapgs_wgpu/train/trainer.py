@@ -22,7 +22,6 @@ from lapgs_wgpu.train.camera_refinement import CameraRefinement
 from lapgs_wgpu.train.config import BACKGROUND_LEVELS, Config
 from lapgs_wgpu.train.densify import Statistics
 from lapgs_wgpu.train.density_control import DensityControl
-from lapgs_wgpu.train.distributed import SINGLE_PROCESS, Ranks
 from lapgs_wgpu.train.evaluate import evaluate, mean_psnr
 from lapgs_wgpu.train.exchange_step import ExchangeStep
 from lapgs_wgpu.train.ground_truth import GroundTruth
@@ -73,7 +72,6 @@ class Trainer:
         discovery: what motion discovery found, a sentence; None where it was left out.
         discovery_seconds: that it took; 0 where it was left out.
         timing: the corrections of the training images' times; None where they are kept.
-        ranks: this process among those that train together.
         whole: False while a step is partly applied, and after an error in that part of it.
     """
 
@@ -82,7 +80,6 @@ class Trainer:
         config: Config,
         dataset: Dataset | None = None,
         device: Device | None = None,
-        ranks: Ranks = SINGLE_PROCESS,
         *,
         scene: Scene4D | None = None,
         start: Start | None = None,
@@ -96,7 +93,6 @@ class Trainer:
             config: as `load_config` gives it.
             dataset: None for the one that config.data names; a built-in scene is then written into the folder runs.
             device: None for the default adapter.
-            ranks: this process among those that train together. The first one's start replaces those of the others.
             scene: to start from, and to move from the first step on. Its field keeps its shape, whatever config.field
                 says.
             start: what motion discovery found.
@@ -106,20 +102,18 @@ class Trainer:
             InputError: the configuration, the data, the scene and the parts do not fit each other.
         """
         self.parts = parts or Parts()
-        self.user_config, self.config, self.dataset, device = set_up(config, dataset, device, self.parts, ranks, scene)
+        self.user_config, self.config, self.dataset, device = set_up(config, dataset, device, self.parts, scene)
         if scene is not None:
             start = Start(scene, ramp_steps=config.schedule.warm_up)
         elif start is None:
             start = start_from_points(self.config, self.dataset, device, self.parts.field)
-        self.ranks, self.callbacks = ranks, list(self.parts.callbacks)
+        self.callbacks = list(self.parts.callbacks)
         self.done = 0
         self.scene, self.discovery, self.discovery_seconds = start.scene, start.summary, start.seconds
         self.warm_up_steps, self._ramp_steps = start.warm_up_steps, start.ramp_steps
         self._threads = step_threads(self.config.field, device)
         self._generator = torch.Generator().manual_seed(config.seed)
         self._prepare(start)
-        if ranks.count > 1:
-            self.restore(ranks.of_first(self.state()))
         self.whole = True
 
     def _prepare(self, start: Start) -> None:
@@ -141,7 +135,6 @@ class Trainer:
             self._learners.camera,
             extent,
             self._generator,
-            self.ranks,
         )
         self.timing = None
         if config.timing.refine and scene.field is not None and len(dataset.times) > 2:
@@ -151,11 +144,10 @@ class Trainer:
                 lambda view: self._truth.on_host(view, self._color),
                 self._picture,
                 dataset.time_gap,
-                self.ranks,
             )
         self._timing_steps = config.timing.corrections(config.schedule.steps) if self.timing else []
         self._skips = SkipCounter()
-        self._stepper = ExchangeStep(self._objective, self._learners, self._density, self._truth, self.ranks)
+        self._stepper = ExchangeStep(self._objective, self._learners, self._density, self._truth)
         self._resident = None
         self._past: dict[int, _Past] = {}
         if config.step == "resident":
@@ -188,7 +180,7 @@ class Trainer:
         """Where the steps are computed, and why, in words."""
         if self._resident is not None:
             return "resident: on the device from end to end"
-        reason = why_exchange(self.config, self.dataset, self.parts, self.ranks) or "the device is a CPU"
+        reason = why_exchange(self.config, self.dataset, self.parts) or "the device is a CPU"
         return f"exchange: by torch, since {reason}"
 
     def close(self) -> None:
@@ -269,7 +261,6 @@ class Trainer:
     def _step(self) -> StepResult:
         config, step = self.config, self.done + 1
         moving = step > self.warm_up_steps
-        # Every rank draws the numbers of all views, so that their random streams stay the same.
         chosen = [self._choose() for _ in range(config.schedule.batch)]
         drawn = self._generator.get_state()
         field_times = None
@@ -305,8 +296,7 @@ class Trainer:
             self.whole = False
 
         samples = [self._stepper.draw(*each, step, self._generator, moving=moving) for each in chosen]
-        mine = samples[self.ranks.rank :: self.ranks.count]
-        self._truth.prefetch([*(sample.view for sample in mine), *self._order.coming(AHEAD)])
+        self._truth.prefetch([*(sample.view for sample in samples), *self._order.coming(AHEAD)])
         seen = step < self.config.density.stop
         measured = self._stepper.take(step, samples, self._share(step), seen=seen, began=began)
         if measured.skipped is not None:

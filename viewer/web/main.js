@@ -104,7 +104,8 @@ async function prepare(gpu, scene, data, former, progress) {
     const trained = scene.metadata.background; // on it
     const background = data.backgrounds[Object.hasOwn(data.backgrounds, trained) ? trained : "black"];
     delete scene.gaussians; // the device has them now
-    const state = former ?? { camera: new ViewCamera(first), clock, background, fresh: true };
+    const { antialiased } = scene;
+    const state = former ?? { camera: new ViewCamera(first), clock, background, antialiased, fresh: true };
     return reopen => start(gpu, { scene, playback, rasterizer }, state, data, reopen);
 }
 
@@ -138,6 +139,7 @@ function start(gpu, { scene, playback, rasterizer }, state, data, reopen) {
         faster: () => clock.faster(),
         next_loop: () => clock.nextLoop(),
         next_background: () => setBackground(after(Object.values(data.backgrounds), state.background)),
+        antialiased: () => (state.antialiased = !state.antialiased),
         focus: (x, y) => viewport.focus(x, y).catch(fail),
         reset_camera: () => camera.reset(),
         flying: () => (controls.flying = !controls.flying),

@@ -15,7 +15,6 @@ export class Presenter {
             vertex: { module, entryPoint: "vertex" },
             fragment: { module, entryPoint: "fragment", targets: [{ format }] },
         });
-        this.none = this.pool.array("no ground truth", 16);
     }
 
     present({ image, camera }) {
@@ -24,10 +23,9 @@ export class Presenter {
         const black = [0, 0, 0, 1];
         const present = this.pool.uniform("present", { uniforms: shader.uniforms }, "present", {
             heat0: black, heat1: black, heat2: black, heat3: black, heat4: black, heat5: black, background: black,
-            origin: [0, 0], size, picture: [camera.width, camera.height], truth: [0, 0], value: 0, low: 0, high: 1,
-            truth_until: 0, error_gain: 0,
+            size, picture: [camera.width, camera.height], value: 0, low: 0, high: 1,
         });
-        const arrays = { present, image, ground_truth: this.none };
+        const arrays = { present, image };
         const entries = Object.entries(shader.bindings).map(([name, [binding]]) => ({ binding, resource: resource(arrays[name]) }));
         const encoder = gpu.device.createCommandEncoder();
         const view = this.context.getCurrentTexture().createView();

@@ -12,7 +12,7 @@ export function canvasSize(width, height, density, { maxTextureDimension2D, maxS
 }
 
 export class Viewport {
-    // state: {camera, clock, background}. numbers: settled and target seconds, smallest scale. signal: ends it.
+    // state: {camera, clock, background, antialiased}. numbers: settled and target seconds, smallest scale. signal: ends it.
     constructor(canvas, state, { playback, rasterizer, presenter, numbers, signal }) {
         Object.assign(this, { canvas, state, playback, rasterizer, presenter, signal, ...numbers });
         // frame: on show. scale: of it; 1 is the full resolution. time: of it, in the clip. seconds: that it took. drawn: all
@@ -28,8 +28,8 @@ export class Viewport {
     get readable() { return this.state.clock.playing ? !this.busy && this.drawn !== "" : this.atRest; }
 
     key() {
-        const { camera: { position, rotation, fovY }, clock, background } = this.state;
-        return [position, rotation, fovY, clock.time, background, this.canvas.width, this.canvas.height].join();
+        const { camera: { position, rotation, fovY }, clock, background, antialiased } = this.state;
+        return [position, rotation, fovY, clock.time, background, antialiased, this.canvas.width, this.canvas.height].join();
     }
 
     // Draw where something changed; whether it did. now: milliseconds of performance.now().
@@ -62,7 +62,7 @@ export class Viewport {
     async drawWhole(scale, depth = false) {
         const { canvas, state, rasterizer } = this;
         const [width, height] = [canvas.width, canvas.height].map(size => Math.max(1, Math.round(scale * size)));
-        const gaussians = this.playback.at(state.clock.time);
+        const gaussians = { ...this.playback.at(state.clock.time), antialiased: state.antialiased };
         const camera = state.camera.camera(canvas.width, canvas.height);
         const image = { ...camera, width, height, focal: scaled(camera.focal, canvas, width, height),
             center: scaled(camera.center, canvas, width, height) };

@@ -16,7 +16,10 @@ from numpy.typing import NDArray
 
 from lapgs_wgpu.data.images import SUFFIXES
 from lapgs_wgpu.data.json_fields import LARGEST_ENTRY, LARGEST_INTRINSIC, LARGEST_SIDE
+from lapgs_wgpu.data.lens import Lens
+from lapgs_wgpu.data.poses import unit_quaternion
 from lapgs_wgpu.errors import InputError, shown
+from lapgs_wgpu.splat.camera import rotation_matrix
 
 Array = NDArray[np.float64]
 
@@ -37,29 +40,20 @@ PARAMETERS = dict(MODELS.values())
 LONGEST_NAME = 4096  # bytes of an image's name
 
 
-class ColmapCamera(NamedTuple):
-    """width, height in pixels; parameters by COLMAP's names for them (MODELS)."""
-
-    width: int
-    height: int
-    parameters: dict[str, float]
-
-
 class ColmapImage(NamedTuple):
-    """A registered image. name: of its file, relative to the folder of images. quaternion: (4,) wxyz and
-    translation: (3,) from world to camera, OpenCV's axes. where: file and entry, for errors."""
+    """A registered image. name: of its file, relative to the folder of images. T_cam_world: (4, 4) pose, OpenCV's
+    axes. where: file and entry, for errors."""
 
     name: str
     camera: int
-    quaternion: Array
-    translation: Array
+    T_cam_world: Array
     where: str
 
 
 class ColmapModel(NamedTuple):
     """cameras: by id. images: in file order. points: (N, 3), colors: (N, 3) uint8."""
 
-    cameras: dict[int, ColmapCamera]
+    cameras: dict[int, Lens]
     images: list[ColmapImage]
     points: Array
     colors: NDArray[np.uint8]
@@ -79,7 +73,7 @@ def read_model(folder: Path) -> ColmapModel:
     files = {name: folder / f"{name}.{'bin' if binary else 'txt'}" for name in ("cameras", "images", "points3D")}
     for path in files.values():
         if not path.is_file():
-            raise InputError(f"{path} does not exist, but {files['cameras']} does; a sparse model needs both.")
+            raise InputError(f"{path} does not exist, but {files['cameras']} does; copy it, too.")
     try:
         cameras = (_binary_cameras if binary else _text_cameras)(files["cameras"])
         images = (_binary_images if binary else _text_images)(files["images"])
@@ -94,17 +88,18 @@ def read_model(folder: Path) -> ColmapModel:
             )
     bad = np.flatnonzero(~(np.abs(points) <= LARGEST_ENTRY).all(axis=1))  # true for NaN, too
     if len(bad):
-        raise InputError(f"{files['points3D']}: {len(bad)} of {len(points)} points are not finite, first {bad[0]}.")
+        raise InputError(
+            f"{files['points3D']}: {len(bad)} of {len(points)} points are not finite, first {bad[0]}; remove them."
+        )
     return ColmapModel(cameras, images, points, colors, *files.values())
 
 
-def _camera(where: str, model: str, width: float, height: float, values: list[float]) -> ColmapCamera:
+def _camera(where: str, model: str, width: float, height: float, values: list[float]) -> Lens:
     """Check the values of a camera. Raises InputError."""
     if model not in PARAMETERS:
+        cut = model == "EQUIRECTANGULAR"
         advice = (
-            "cut pinhole views out of the panoramas"
-            if model == "EQUIRECTANGULAR"
-            else "undistort the images with colmap image_undistorter"
+            "cut pinhole views out of the panoramas" if cut else "undistort the images with colmap image_undistorter"
         )
         raise InputError(
             f"{where}: its model {model[:40]} is not among those that are read ({', '.join(PARAMETERS)}); {advice}."
@@ -121,7 +116,10 @@ def _camera(where: str, model: str, width: float, height: float, values: list[fl
     for name, value in zip(names, values, strict=True):
         if not abs(value) <= LARGEST_INTRINSIC or (name[0] == "f" and value <= 0):  # true for NaN, too
             raise InputError(f"{where}: {name} is {value:g}, which no camera has.")
-    return ColmapCamera(int(width), int(height), dict(zip(names, values, strict=True)))
+    p = dict(zip(names, values, strict=True))
+    fx, fy = p.get("fx", p.get("f", 0.0)), p.get("fy", p.get("f", 0.0))
+    radial, tangential = (p.get("k1", 0.0), p.get("k2", 0.0), 0.0), (p.get("p1", 0.0), p.get("p2", 0.0))
+    return Lens(int(width), int(height), fx, fy, p["cx"], p["cy"], radial=radial, tangential=tangential)
 
 
 def _image(name: str, camera: int, pose: Array, where: str) -> ColmapImage:
@@ -129,10 +127,9 @@ def _image(name: str, camera: int, pose: Array, where: str) -> ColmapImage:
     bad = ~(np.abs(pose) <= LARGEST_ENTRY)  # true for NaN, too
     if bad.any():
         raise InputError(f"{where}: its pose holds {pose[bad][0]:g}; at most {LARGEST_ENTRY:g} is allowed.")
-    length = float(np.linalg.norm(pose[:4]))
-    if abs(length - 1) > 1e-3:
-        raise InputError(f"{where}: its quaternion has length {length:g}, must be 1; export the model again.")
-    return ColmapImage(name, camera, pose[:4] / length, pose[4:], where)
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = rotation_matrix(unit_quaternion(pose[:4], where)), pose[4:]
+    return ColmapImage(name, camera, T, where)
 
 
 # Text
@@ -172,7 +169,7 @@ def _numbers(words: list[str], where: str, kind: Callable[[str], Any] = float) -
         raise InputError(f"{where}: {str(error)[:80]}; export the model again.") from None
 
 
-def _text_cameras(path: Path) -> dict[int, ColmapCamera]:
+def _text_cameras(path: Path) -> dict[int, Lens]:
     cameras = {}
     for where, words in _lines(path, "id, model, width, height"):
         identity, width, height = _numbers([words[0], *words[2:4]], where, int)
@@ -206,7 +203,9 @@ class _Bytes:
         self.path, self.at, self.data = path, 0, path.read_bytes()
 
     def damaged(self, problem: str) -> InputError:
-        return InputError(f"{self.path} {problem}; it is damaged, so copy it again.")
+        return InputError(
+            f"{self.path} {problem}; it is damaged, or of another version: copy it, or export it as text."
+        )
 
     def take(self, form: str) -> tuple[Any, ...]:
         """Return the next values, by struct's names for their types."""
@@ -241,7 +240,7 @@ class _Bytes:
             raise self.damaged(f"declares {self.at} bytes, but has {len(self.data)}")
 
 
-def _binary_cameras(path: Path) -> dict[int, ColmapCamera]:
+def _binary_cameras(path: Path) -> dict[int, Lens]:
     cameras, file = {}, _Bytes(path)
     for index in range(file.count(24, "cameras")):
         identity, model, width, height = file.take("iiQQ")

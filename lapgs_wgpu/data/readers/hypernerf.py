@@ -13,19 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
+from lapgs_wgpu.data.capture_files import CaptureFiles
 from lapgs_wgpu.data.cloud import find_cloud, read_cloud
 from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
 from lapgs_wgpu.data.images import check_image
-from lapgs_wgpu.data.json_fields import (
-    LARGEST_SIDE,
-    Fields,
-    absent_image,
-    as_fields,
-    kind,
-    number,
-    read_json,
-    vector,
-)
+from lapgs_wgpu.data.json_fields import LARGEST_SIDE, Fields, as_fields, kind, number, read_json, vector
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.masks import find_covisible
 from lapgs_wgpu.data.normalize import Normalization
@@ -36,13 +28,7 @@ from lapgs_wgpu.errors import InputError
 CLOUDS = ("points.npy", "points3D_downsample*.ply", "points3D.ply")  # all in the coordinates of the camera files
 TINY = 1e-12  # what is smaller is 0
 STRIDE = 4  # without val_ids: every fourth id from the first on is for training, from the third on for testing
-
-
 SPLITS = ("val", "val_intl")  # folders of masks: of DyCheck's captures; of rigs that alternate the training camera
-
-
-def _matches(folder: Path) -> bool:
-    return (folder / "dataset.json").is_file()
 
 
 def _read(folder: Path, image_size: int | None) -> Capture:
@@ -54,28 +40,34 @@ def _read(folder: Path, image_size: int | None) -> Capture:
     if depths[0] >= depths[1]:
         raise InputError(f"{scene.where}: near must be below far, got {depths[0]:g} and {depths[1]:g}.")
     times = _times(_object(folder / "metadata.json"), ids)
-    cameras = {name: _read_camera(_object(folder / "camera" / f"{name}.json")) for name in train_ids + test_ids}
     rgb = _image_folder(folder / "rgb", train_ids + test_ids, image_size)
-    covisible = folder / "covisible"
+    files, covisible = CaptureFiles(rgb), folder / "covisible"
     factors = [covisible / rgb.name, *_factor_folders(covisible)]  # that of the images first, then the smallest
-    masks = find_covisible([factor / split for factor in factors for split in SPLITS], test_ids)
+    images = {name: files.find_image(f"{name}.png", f"dataset.json names {name}") for name in train_ids + test_ids}
+    tested = [name for name in test_ids if images[name]]
+    masks = find_covisible([factor / split for factor in factors for split in SPLITS], tested)
     splits: list[tuple[Split, list[str]]] = [("train", train_ids), ("test", test_ids)]
-    frames = [
-        Frame(
-            check_image(rgb / f"{name}.png"),
-            cameras[name][0],
-            moved.pose(cameras[name][1]),
-            f"{folder / 'camera' / name}.json (image_size, focal_length, radial_distortion, tangential_distortion)",
-            ImageName(name),
-            time=times[name],
-            split=split,
-            label=f"{index:03d}",
-            depths=depths,
-            mask=masks.get(name),
-        )
-        for split, names in splits
-        for index, name in enumerate(names)
-    ]
+    frames = []
+    for split, names in splits:
+        for index, name in enumerate(names):
+            image, where = images[name], folder / "camera" / f"{name}.json"
+            if image is None:
+                continue
+            lens, pose = _read_camera(_object(where))
+            frames.append(
+                Frame(
+                    check_image(rgb / image),
+                    lens,
+                    moved.pose(pose),
+                    f"{where} (image_size, focal_length, radial_distortion, tangential_distortion)",
+                    ImageName(name),
+                    time=times[name],
+                    split=split,
+                    label=f"{index:03d}",
+                    depths=depths,
+                    mask=masks.get(name),
+                )
+            )
     cloud = find_cloud(folder, CLOUDS)
     return Capture(
         frames,
@@ -83,6 +75,8 @@ def _read(folder: Path, image_size: int | None) -> Capture:
         source=cloud or folder / "scene.json",
         time_source=f"time_id (else warp_id) in {folder / 'metadata.json'}",
         time_range=(min(times.values()), max(times.values())),
+        warnings=files.left_out(len(train_ids) + len(test_ids), folder / "dataset.json"),
+        left_out=len(files.absent),
         moved=moved,
     )
 
@@ -96,7 +90,7 @@ def _splits(data: Fields) -> tuple[list[str], list[str], list[str]]:
         if both:
             raise InputError(
                 f"{data.where}: {len(both)} of {len(test)} val_ids are train_ids, too, such as {both[0]}; no test "
-                "image may be trained on."
+                "image may be trained on: remove them from one of the two."
             )
     else:  # "interp": the frames between
         train, test = ids[::STRIDE], ids[STRIDE // 2 :: STRIDE]
@@ -104,7 +98,9 @@ def _splits(data: Fields) -> tuple[list[str], list[str], list[str]]:
         raise InputError(f"{data.where}: {len(train)} train_ids and {len(test)} test ids; at least one of each.")
     for field, names in (("train_ids", train), ("val_ids", test)):
         for name in set(names) - set(ids):
-            raise InputError(f"{data.where}: {field} names {name}, which is not among its {len(ids)} ids.")
+            raise InputError(
+                f"{data.where}: {field} names {name}, which is not among its {len(ids)} ids; add it there."
+            )
     return ids, train, test
 
 
@@ -112,10 +108,7 @@ def _times(metadata: Fields, ids: Sequence[str]) -> dict[str, int]:
     """Return the time_id or warp_id of each id."""
     entries = {name: as_fields(metadata.required(name), f"{metadata.where}: {name}") for name in ids}
     field = "time_id" if any("time_id" in entry for entry in entries.values()) else "warp_id"
-    times = {}
-    for name, entry in entries.items():
-        times[name] = int(entry.number(field, 0))
-    return times
+    return {name: int(entry.number(field, 0)) for name, entry in entries.items()}
 
 
 def _read_camera(data: Fields) -> tuple[Lens, np.ndarray]:
@@ -145,19 +138,16 @@ def _factor_folders(folder: Path) -> list[Path]:
 
 
 def _image_folder(rgb: Path, names: Sequence[str], image_size: int | None) -> Path:
-    """Return the folder rgb/Nx that suits the wanted size best, which holds the images of all names."""
+    """Return the folder rgb/Nx that suits the wanted size best."""
     best: Path | None = None
     for folder in _factor_folders(rgb):  # from the largest images on
-        first = folder / f"{names[0]}.png"
-        if first.is_file():
+        first = next((file for name in names if (file := folder / f"{name}.png").is_file()), None)
+        if first is not None:
             longer = max(check_image(first, whole=False).size)
             if best is None or (image_size is not None and longer >= image_size):
                 best = folder
     if best is None:
         raise InputError(f"{rgb} holds no folder 1x, 2x, ... with {names[0]}.png, which dataset.json names.")
-    for name in names:
-        if not (best / f"{name}.png").is_file():
-            raise absent_image(best / f"{name}.png", f"dataset.json names {name}")
     return best
 
 
@@ -182,4 +172,5 @@ def _names(data: Fields, field: str) -> list[str]:
     return names
 
 
-READER = Reader("HyperNeRF", "dataset.json beside camera/ and rgb/", _matches, _read)
+FILES = "dataset.json beside camera/ and rgb/"
+READERS = (Reader("HyperNeRF", FILES, lambda folder: (folder / "dataset.json").is_file(), _read),)

@@ -1,57 +1,81 @@
-"""Rows of LLFF's poses_bounds.npy, which the formats Neu3D and EndoNeRF share.
+"""Readers of captures with LLFF's poses_bounds.npy: Neu3D (DyNeRF), and EndoNeRF.
 
 A row of 17 numbers holds a 3x5 matrix [R, position, (height, width, focal length)], then nearest and furthest depth.
-The pose is camera to world; which axes the columns of R are is each format's own matter.
+The pose is camera to world.
+
+Neu3D: synchronized cameras that do not move. A row for each camera; R has the columns down, right and backward (LLFF).
+camXX.mp4 or camXX/images/*.png hold the frames, in the order of the rows; a cloud (CLOUDS) is optional. The first
+camera is for testing, as in published work, and frame i of n has the time i / n.
+
+EndoNeRF: one camera that stands still before something that moves, such as an endoscope. A row for each image in
+images/; R has the columns right, down and forward, as EndoNeRF's successors read it; in published scenes R is the
+identity and the position 0. depth/ is optional: PNG of 8 or 16 bits, depths along the optical axis in the units of the
+bounds, 0 where unknown; without it nothing tells any depth. masks/ (tools) are not read. Images 1, 9, 17, ... are for
+testing, as in published work.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.data.cloud import read_npy
+from lapgs_wgpu.data.cloud import Cloud, find_cloud, read_cloud, read_npy
+from lapgs_wgpu.data.evenly import evenly
+from lapgs_wgpu.data.frames import Capture, Frame, ImageSource, Reader
+from lapgs_wgpu.data.images import SUFFIXES, ImageFile, check_image, decode, decode_gray, size_text
 from lapgs_wgpu.data.json_fields import LARGEST_ENTRY, LARGEST_SIDE
 from lapgs_wgpu.data.lens import Lens
-from lapgs_wgpu.data.poses import check_rotation
+from lapgs_wgpu.data.poses import check_rotation, world_to_camera
+from lapgs_wgpu.data.stamps import ImageName, natural_key
+from lapgs_wgpu.data.video_frames import Video, VideoFrame
 from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.io.listing import listed
 
 POSES = "poses_bounds.npy"
+CAMERA = re.compile(r"cam(\d{1,4})")
+CLOUDS = ("points3D_downsample*.ply", "points3D.ply")
+IMAGES, DEPTH = "images", "depth"
+EVERY, FIRST = 8, 1  # images of EndoNeRF that are tested
+MAPS = 8  # depth maps that make the cloud, evenly chosen over the clip
+MOST_POINTS = 40_000  # of the cloud
+STILL = (
+    "one camera that stands still sees no parallax, so {depth}; what the camera sees will be right, and views from "
+    "elsewhere the worse the further away they are"
+)
+MOVING = (
+    "{count} poses, whose axes are read as right, down and forward, as EndoNeRF's scenes have them; those of an LLFF "
+    "capture are down, right and backward, so convert it to COLMAP's or nerfstudio's format"
+)
 Array = NDArray[np.float64]
+LLFF = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])  # from down, right and backward to right, down and forward
 
 
-class PoseRow(NamedTuple):
-    """One row. R: (3, 3) rotation, columns as stored. position: (3,). depths: nearest and furthest. where: file and
-    row, for errors."""
+def _read_rows(path: Path, names: Sequence[str], what: str, axes: Array) -> list[dict[str, Any]]:
+    """Read what a row tells of a frame, as arguments of `Frame`, for each of the names, in their order.
 
-    lens: Lens
-    R: Array
-    position: Array
-    depths: tuple[float, float]
-    where: str
-
-
-def read_rows(path: Path, names: Sequence[str], what: str) -> list[PoseRow]:
-    """Read a row for each of the names, in their order. names: at least one, of `what`, such as "images".
-
+    names: at least one, of `what`, such as "images". axes: (3, 3), from the columns of R to right, down and forward.
     Raises InputError: the file is not readable, has another number of rows, or one of them is no camera.
     """
     rows = read_npy(path).astype(np.float64)
     if rows.ndim != 2 or rows.shape[1] != 17:
-        raise InputError(f"{path} must hold 17 numbers a pose, an array of (poses, 17), got {rows.shape}.")
+        raise InputError(
+            f"{path} must hold 17 numbers a pose, an array of (poses, 17), got {rows.shape}; write it with LLFF's "
+            "imgs2poses.py."
+        )
     if len(rows) != len(names):
         raise InputError(
             f"{path} holds {len(rows)} poses, but there are {len(names)} {what}, {names[0]} to {names[-1]}; each of "
             "them needs a row, in this order."
         )
-    return [_row(row, f"{path}, row {i} ({name})") for i, (row, name) in enumerate(zip(rows, names, strict=True))]
+    return [_row(row, f"{path}, row {i} ({name})", axes) for i, (row, name) in enumerate(zip(rows, names, strict=True))]
 
 
-def _row(row: Array, where: str) -> PoseRow:
-    """Check a row (17,). Raises InputError."""
+def _row(row: Array, where: str, axes: Array) -> dict[str, Any]:
     bad = ~(np.abs(row) <= LARGEST_ENTRY)  # true for NaN, too
     if bad.any():
         column = int(np.argmax(bad))
@@ -65,5 +89,169 @@ def _row(row: Array, where: str) -> PoseRow:
     if not 0 < near < far:
         raise InputError(f"{where}: the depth bounds must be 0 < near < far, got {near:g} and {far:g}.")
     check_rotation(pose[:, :3], f"{where}: the pose")
-    lens = Lens(round(width), round(height), focal, focal, width / 2, height / 2)
-    return PoseRow(lens, pose[:, :3], pose[:, 3], (float(near), float(far)), where)
+    return {
+        "lens": Lens(round(width), round(height), focal, focal, width / 2, height / 2),
+        "T_cam_world": world_to_camera(pose[:, :3] @ axes, pose[:, 3]),
+        "where": where,
+        "depths": (float(near), float(far)),
+    }
+
+
+# Neu3D
+
+
+def _read_neu3d(folder: Path, image_size: int | None) -> Capture:
+    path = folder / POSES
+    recordings = _recordings(folder)
+    rows = _read_rows(path, [recording.name for recording in recordings], "recordings", LLFF)
+    names = [recording.stem for recording in recordings]
+    warnings = []
+    if names != sorted(names):
+        odd = next(i for i, name in enumerate(sorted(names)) if name != names[i])
+        warnings.append(
+            f"{path}: its rows are taken in the order of the cameras' numbers, so row {odd} is of {names[odd]}; if "
+            f"they are in the order of the names, in which it is of {sorted(names)[odd]}, number the cameras with "
+            "leading zeros."
+        )
+    first, *others = recordings
+    count = len(recordings[first])
+    for other in others:
+        if len(recordings[other]) != count:
+            raise InputError(
+                f"{other} has {len(recordings[other])} frames and {first} has {count}; all cameras must have as many: "
+                "cut them to the same frames."
+            )
+    frames = [
+        Frame(
+            image,
+            name=ImageName(f"{recording.stem}/{_file_name(image, index)}", recording.stem),
+            time=index,
+            split="test" if recording is first else "train",
+            label=f"{recording.stem}_{index:05d}",
+            **row,
+        )
+        for (recording, images), row in zip(recordings.items(), rows, strict=True)
+        for index, image in enumerate(images)
+    ]
+    cloud = find_cloud(folder, CLOUDS)
+    return Capture(
+        frames,
+        None if cloud is None else read_cloud(cloud),
+        source=cloud or path,
+        warnings=warnings,
+        time_source=f"the number of frames in {others[0]}",
+        time_range=(0.0, float(count)),
+        shares_cameras=True,
+    )
+
+
+def _recordings(folder: Path) -> dict[Path, list[ImageSource]]:
+    """Return the frames of each camera, by its number. Images take precedence over a video of the same camera."""
+    videos = {child.stem: child for child in sorted(folder.iterdir()) if child.suffix.lower() == ".mp4"}
+    folders = {child.name: child for child in sorted(folder.iterdir()) if (child / IMAGES).is_dir()}
+    recordings = {name: path for name, path in (videos | folders).items() if CAMERA.fullmatch(name)}
+    if len(recordings) < 2:
+        raise InputError(
+            f"{folder} holds the recordings of {len(recordings)} cameras, cam00.mp4, ... or cam00/images/*.png, ...; "
+            "at least 2 are needed: one for testing, one for training."
+        )
+    paths = sorted(recordings.values(), key=lambda path: natural_key(path.stem))
+    return {path: _of_folder(path / IMAGES) if path.is_dir() else _of_video(path) for path in paths}
+
+
+def _file_name(image: ImageSource, index: int = 0) -> str:
+    """The name of an image; of a film's frame, its number from 0 on, which masks are named by."""
+    return image.path.name if isinstance(image, ImageFile) else f"{index}.png"
+
+
+def _of_video(path: Path) -> list[ImageSource]:
+    video = Video(path)
+    return [VideoFrame(video, index) for index in range(video.frames)]
+
+
+def _of_folder(folder: Path, *, whole: bool = False) -> list[ImageSource]:
+    """Return the images of a folder, by number. whole: of `check_image`; whole, those of a rig may be gigabytes.
+
+    Raises InputError if there is none.
+    """
+    files = sorted((f for f in listed(folder) if f.suffix.lower() in SUFFIXES), key=lambda f: natural_key(f.name))
+    if not files:
+        raise InputError(f"{folder} holds no images (.png or .jpg); extract the camera's frames into it.")
+    return [check_image(file, whole=whole) for file in files]
+
+
+# EndoNeRF
+
+
+def _read_endonerf(folder: Path, image_size: int | None) -> Capture:
+    path = folder / POSES
+    images = _of_folder(folder / IMAGES, whole=True)
+    names = [_file_name(image) for image in images]
+    rows = _read_rows(path, names, "images", np.eye(3))
+    frames = [
+        Frame(
+            image,
+            name=ImageName(name),
+            time=index,
+            split="test" if index % EVERY == FIRST else "train",
+            **row,
+        )
+        for index, (image, name, row) in enumerate(zip(images, names, rows, strict=True))
+    ]
+    cloud = _depth_cloud(folder, frames) if (folder / DEPTH).is_dir() else None
+    depth = f"depths are those of {folder / DEPTH}" if cloud is not None else "depths are a guess between the bounds"
+    poses = len({frame.T_cam_world.tobytes() for frame in frames})
+    return Capture(
+        frames,
+        cloud,
+        source=path if cloud is None else folder / DEPTH,
+        time_source=f"the order of the images in {folder / IMAGES}",
+        warnings=[f"{folder}: {STILL.format(depth=depth) if poses == 1 else MOVING.format(count=poses)}."],
+        shares_cameras=True,
+    )
+
+
+def _depth_cloud(folder: Path, frames: list[Frame]) -> Cloud:
+    """Make points at the depths of some of the maps, in their images' colors. Raises InputError."""
+    maps = [Path(str(image)) for image in _of_folder(folder / DEPTH)]
+    if len(maps) != len(frames):
+        raise InputError(
+            f"{folder / DEPTH} holds {len(maps)} depth maps for {len(frames)} images; each image needs one, or remove "
+            "the folder."
+        )
+    chosen = evenly(list(zip(frames, maps, strict=True)), MAPS)
+    random, points, colors = np.random.default_rng(0), [], []
+    for frame, path in chosen:
+        depth, image = decode_gray(path).astype(np.float64), decode(folder / IMAGES / frame.name.file)[..., :3]
+        if depth.shape != image.shape[:2]:
+            raise InputError(
+                f"{path} is {size_text(depth.shape[::-1])} pixels, and its image is "
+                f"{size_text(image.shape[1::-1])}; a depth map needs the size of its image."
+            )
+        row, column = np.nonzero(depth > 0)
+        kept = random.permutation(len(row))[: MOST_POINTS // len(chosen)]
+        row, column = row[kept], column[kept]
+        pixels = np.stack([column + 0.5, row + 0.5, np.ones(len(row))], axis=1)
+        rays = pixels @ np.linalg.inv(frame.lens.resized(image.shape[1], image.shape[0]).K).T
+        R, t = frame.T_cam_world[:3, :3], frame.T_cam_world[:3, 3]
+        points.append((depth[row, column, None] * rays - t) @ R)
+        colors.append(image[row, column] / 255)
+    if not sum(map(len, points)):
+        raise InputError(f"{folder / DEPTH}: all depths are 0, which means unknown; remove the folder.")
+    return Cloud(np.concatenate(points).astype(np.float32), np.concatenate(colors).astype(np.float32))
+
+
+READERS = (
+    Reader(
+        "Neu3D",
+        "poses_bounds.npy beside cam00.mp4, ... or cam00/images/, ...",
+        lambda folder: (folder / POSES).is_file() and not (folder / IMAGES).is_dir(),
+        _read_neu3d,
+    ),
+    Reader(
+        "EndoNeRF",
+        "poses_bounds.npy beside images/",
+        lambda folder: (folder / POSES).is_file() and (folder / IMAGES).is_dir(),
+        _read_endonerf,
+    ),
+)

@@ -1,15 +1,34 @@
-"""What the D-NeRF and the nerfstudio formats share: a list of frames with optional times, and a lens for each."""
+"""Readers of transforms files: nerfstudio's transforms.json, and D-NeRF's transforms_{train,test,val}.json.
+
+Both list frames: path, pose (`transform_matrix`, camera to world, OpenGL's axes) and perhaps time of each image, with
+intrinsics of each or of all. docs/data.md lists the fields.
+
+nerfstudio: the cloud of ply_file_path is in the coordinates of transform_matrix, since applied_transform was applied to
+both. Apps that write ARKit's or ARCore's poses in this form state `timestamp` instead of `time`.
+
+D-NeRF: times lie in [0, 1]; frames without are evenly spaced. transforms_val.json is optional, and left out with a
+warning if it is not usable. A cloud (CLOUDS) is optional.
+"""
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from pathlib import Path, PurePosixPath
 
-from lapgs_wgpu.data.images import Size
-from lapgs_wgpu.data.json_fields import LARGEST_INTRINSIC, LARGEST_SIDE, Fields, kind, number
+from lapgs_wgpu.data.capture_files import CaptureFiles
+from lapgs_wgpu.data.cloud import find_cloud, is_random, read_cloud
+from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
+from lapgs_wgpu.data.images import SIDEWAYS, ImageFile
+from lapgs_wgpu.data.json_fields import LARGEST_INTRINSIC, LARGEST_SIDE, Fields, kind, number, read_json
 from lapgs_wgpu.data.lens import Lens
+from lapgs_wgpu.data.poses import opengl_pose
+from lapgs_wgpu.data.stamps import ImageName, image_names
+from lapgs_wgpu.data.validation import check_frames
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import intrinsics_of_fov
 
+CLOUDS = ("fused.ply", "points3d.ply", "points3D.ply")
 MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 SIDE, FOCAL, ANY = (1, LARGEST_SIDE), (1e-9, LARGEST_INTRINSIC), (-LARGEST_INTRINSIC, LARGEST_INTRINSIC)
 INTRINSICS = {  # bounds, in pixels of an image w x h
@@ -18,29 +37,37 @@ INTRINSICS = {  # bounds, in pixels of an image w x h
 }  # fmt: skip
 
 
-def timed_frames(data: Fields, field: str = "time") -> list[tuple[Fields, float | None]]:
-    """Return each entry of `frames` and its time as stated; None if no frame has one.
+def _read_frames(data: Fields, files: CaptureFiles, time: str) -> list[Frame | None]:
+    """Return the frame of each entry of a transforms file, None where its image does not exist.
 
-    field: that states the time. Raises InputError, also if only some frames have a time.
+    time: the field of the times, in all entries or in none. Raises InputError.
     """
-    frames = data.objects("frames", "frame")
-    timed = sum(field in frame for frame in frames)
-    if not timed:
-        return [(frame, None) for frame in frames]
-    for frame in frames:
-        if field not in frame:
+    entries = data.objects("frames", "frame")
+    timed = sum(time in entry for entry in entries)
+    frames: list[Frame | None] = []
+    for entry in entries:
+        if timed and time not in entry:
             raise InputError(
-                f"{frame.where} has no field {field}, though {timed} of {len(frames)} frames have it; give it for all "
+                f"{entry.where} has no field {time}, though {timed} of {len(entries)} frames have it; give it for all "
                 "frames or for none."
             )
-    return [(frame, number(frame.required(field), field, frame.where)) for frame in frames]
+        stated = number(entry.required(time), time, entry.where) if timed else None
+        pose = opengl_pose(entry.required("transform_matrix"), entry.where)
+        found = files.image(entry, "file_path")
+        if found is None:
+            frames.append(None)
+            continue
+        name, image = found
+        lens, sized = _read_lens(entry, data, image)
+        frames.append(Frame(image, lens, pose, entry.where, ImageName(name), time=stated, states_size=sized))
+    return frames
 
 
-def read_lens(frame: Fields, shared: Fields, image: Size) -> Lens:
-    """Return the lens of a frame: each value is the frame's own, else its file's (`shared`).
+def _read_lens(frame: Fields, shared: Fields, image: ImageFile) -> tuple[Lens, bool]:
+    """Return the lens of a frame, and whether size or center are stated; each value is the frame's, else its file's.
 
-    The size is that of the image, (width, height), where none is stated, the focal length is that of camera_angle_x
-    (radians) where fl_x is missing. Raises InputError, also for other lens models.
+    A missing size is the image's; the focal length is that of camera_angle_x (radians) where fl_x is missing. Raises
+    InputError, also for other lens models.
     """
 
     def source(name: str) -> Fields:
@@ -58,19 +85,162 @@ def read_lens(frame: Fields, shared: Fields, image: Size) -> Lens:
         for name, (least, most) in INTRINSICS.items()
         if source(name).values.get(name) is not None
     }
-    width, height = int(values.get("w", image[0])), int(values.get("h", image[1]))
+    centered = {"cx", "cy"} <= values.keys()
+    size = image.size
+    if centered and image.orientation >= SIDEWAYS:  # of the two sizes, that whose middle is nearer
+        size = min(size, size[::-1], key=lambda s: abs(s[0] - 2 * values["cx"]) + abs(s[1] - 2 * values["cy"]))
+    width, height = int(values.get("w", size[0])), int(values.get("h", size[1]))
     if "fl_x" in values:
-        fx = fy = values["fl_x"]
+        fx = values["fl_x"]
     else:
         angle = source("camera_angle_x")
         if "camera_angle_x" not in angle:
-            raise InputError(f"{frame.where} and {shared.where} have neither the field fl_x nor camera_angle_x.")
+            raise InputError(
+                f"{frame.where} and {shared.where} have neither fl_x nor camera_angle_x; give one of the two."
+            )
         fov_x = angle.number("camera_angle_x")
         if not 1e-6 < fov_x < math.pi:
             raise InputError(f"{angle.where}: camera_angle_x must be radians between 0 and pi, got {fov_x:g}.")
-        fx = fy = float(intrinsics_of_fov(fov_x, width, height)[0, 0])
+        fx = float(intrinsics_of_fov(fov_x, width, height)[0, 0])
     k1, k2, k3, p1, p2 = (values.get(name, 0.0) for name in ("k1", "k2", "k3", "p1", "p2"))
-    return Lens(
-        width, height, fx, values.get("fl_y", fy), values.get("cx", width / 2), values.get("cy", height / 2),
+    lens = Lens(
+        width, height, fx, values.get("fl_y", fx), values.get("cx", width / 2), values.get("cy", height / 2),
         radial=(k1, k2, k3), tangential=(p1, p2),
     )  # fmt: skip
+    return lens, centered or {"w", "h"} <= values.keys()
+
+
+# nerfstudio
+
+
+def _read_nerfstudio(folder: Path, image_size: int | None) -> Capture:
+    path, files = folder / "transforms.json", CaptureFiles(folder)
+    data = read_json(path)
+    entries = data.objects("frames", "frame")
+    time = "time" if any("time" in entry for entry in entries) else "timestamp"
+    read = _read_frames(data, files, time)
+    warnings = files.left_out(len(entries), path)
+    frames = [
+        dataclasses.replace(frame, mask=files.optional(entry, "mask_path"), mask_kind="black")
+        for frame, entry in zip(read, entries, strict=True)
+        if frame is not None
+    ]
+    names = [frame.name.file for frame in frames]
+    if len(set(names)) < len(names):
+        twice = next(name for i, name in enumerate(names) if name in names[:i])
+        raise InputError(
+            f"{path}: {len(names)} frames name {len(set(names))} images; {twice} is there twice: keep one frame of it."
+        )
+    if splits := _splits(data, names, files):
+        unlisted = [name for name in names if name not in splits]
+        frames = [dataclasses.replace(frame, split=splits.get(frame.name.file)) for frame in frames]
+        frames = [frame for frame in frames if frame.split is not None]
+        if unlisted:
+            warnings.append(
+                f"{path}: {len(unlisted)} of {len(names)} images, such as {unlisted[0]}, are in none of "
+                "train_filenames, val_filenames and test_filenames, and are left out."
+            )
+    named = image_names([frame.name.file for frame in frames], {frame.name.file: frame.place for frame in frames})
+    cloud = files.optional(data, "ply_file_path")
+    return Capture(
+        [dataclasses.replace(frame, name=name) for frame, name in zip(frames, named, strict=True)],
+        None if cloud is None else read_cloud(cloud),
+        source=cloud or path,
+        warnings=warnings,
+        left_out=len(entries) - len(frames),
+        time_source=f"{time} in {path}",
+        shares_cameras=True,
+        own_footage=True,
+    )
+
+
+def _splits(data: Fields, names: list[str], files: CaptureFiles) -> dict[str, Split]:
+    """Return the split of each image, as the file's lists state it; {} if they hold nothing out.
+
+    An image in no list is for training, but missing here if the file lists those for training.
+    """
+    test, validation, train = (_listed(data, f"{split}_filenames", names, files) for split in ("test", "val", "train"))
+    if not test:  # one list is enough to measure by
+        test, validation = validation, []
+    if not test:
+        return {}
+    splits: dict[str, Split] = dict.fromkeys(train or names, "train")
+    return splits | dict.fromkeys(validation, "val") | dict.fromkeys(test, "test")
+
+
+def _listed(data: Fields, field: str, names: list[str], files: CaptureFiles) -> list[str]:
+    """Return the images that a list of the file names and that exist. Raises InputError for one that no frame names."""
+    listed = data.values.get(field) or []
+    if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
+        raise InputError(f"{data.where}: {field} must be a list of names, got {kind(listed)}.")
+    known, found = set(names), []
+    stated = {PurePosixPath(str(entry["file_path"]).replace("\\", "/")) for entry in data.values["frames"]}
+    for name in listed:
+        if (file := files.find(name)) in known:
+            found.append(str(file))
+        elif PurePosixPath(name.replace("\\", "/")) not in stated:
+            raise InputError(
+                f"{data.where}: {field} names {name[:80]}, which is none of its {len(names)} frames; remove it there."
+            )
+    return found
+
+
+# D-NeRF
+
+
+def _read_dnerf(folder: Path, image_size: int | None) -> Capture:
+    warnings: list[str] = []
+    frames = [*_read_split(folder, "train", warnings), *_read_split(folder, "test", warnings)]
+    if (folder / "transforms_val.json").is_file():
+        try:
+            validation = _read_split(folder, "val", warnings)
+            check_frames([frames[0], *validation])
+            frames += validation
+        except InputError as error:
+            warnings.append(f"the validation views are left out: {error}")
+    path = find_cloud(folder, CLOUDS)
+    cloud = None if path is None else read_cloud(path)
+    if cloud is not None and is_random(cloud):  # other trainers write one, often of 1.3 whatever the scene's size
+        cloud = None
+    cameras = folder / "transforms_train.json"
+    return Capture(
+        frames,
+        cloud,
+        warnings=warnings,
+        source=cameras if path is None or cloud is None else path,
+        time_source=f"time in {cameras}",
+        time_range=(0.0, 1.0),
+        keeps_coordinates=True,
+    )
+
+
+def _read_split(folder: Path, split: Split, warnings: list[str]) -> list[Frame]:
+    """Read the frames of one transforms file. Appends a warning about images that do not exist."""
+    path, files = folder / f"transforms_{split}.json", CaptureFiles(folder)
+    if not path.is_file():
+        raise InputError(
+            f"{path} does not exist, which a D-NeRF scene needs; if there is one file alone, name it transforms.json, "
+            "and every eighth image is held out."
+        )
+    read = _read_frames(read_json(path), files, "time")
+    frames = []
+    for index, frame in enumerate(read):
+        if frame is None:
+            continue
+        time = index / max(len(read) - 1, 1) if frame.time is None else frame.time
+        if not 0 <= time <= 1:
+            raise InputError(f"{frame.where}: time must lie in [0, 1], got {time:g}; divide by the clip's duration.")
+        frames.append(dataclasses.replace(frame, time=time, split=split, label=f"{index:03d}"))
+    warnings += files.left_out(len(read), path)
+    return frames
+
+
+READERS = (
+    Reader(
+        "D-NeRF",
+        "transforms_train.json and transforms_test.json",
+        lambda folder: any((folder / f"transforms_{split}.json").is_file() for split in ("train", "test")),
+        _read_dnerf,
+    ),
+    Reader("nerfstudio", "transforms.json", lambda folder: (folder / "transforms.json").is_file(), _read_nerfstudio),
+)

@@ -38,7 +38,7 @@ def aligned_view(scene: Scene4D, view: View, background: Tensor, unit: float) ->
     truth = upload_rgba(scene.device, marked_pixels(view, background))
     descent, camera = CameraDescent(1), view.camera
     for step in range(1, STEPS + 1):
-        change = torch.zeros(7, requires_grad=True)
+        change = torch.zeros(6, requires_grad=True)
         render_loss(
             gaussians, camera, truth, background, WEIGHTS, scene.device, camera_change=change, camera_unit=unit
         ).loss.backward()
@@ -46,6 +46,6 @@ def aligned_view(scene: Scene4D, view: View, background: Tensor, unit: float) ->
             break
         damping = DAMPING[0] ** (1 - step / STEPS) * DAMPING[1] ** (step / STEPS)
         whiten = whitening(image_motion(camera, points, unit), damping)
-        move = descent.change(0, change.grad[:6].double().numpy(), whiten, RATE.at(step))
+        move = descent.change(0, change.grad.double().numpy(), whiten, RATE.at(step))
         camera = changed_camera(camera, move * np.repeat([1.0, unit], 3))
     return dataclasses.replace(view, camera=camera)

@@ -11,7 +11,6 @@ from lapgs_wgpu.discovery.discover import discover
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.make_field import check_own
 from lapgs_wgpu.train.config import Config
-from lapgs_wgpu.train.distributed import SINGLE_PROCESS, Ranks
 from lapgs_wgpu.train.host_threads import step_threads, torch_threads
 from lapgs_wgpu.train.parts import Parts
 from lapgs_wgpu.train.setup import set_up
@@ -22,7 +21,6 @@ def start_training(
     config: Config,
     dataset: Dataset | None = None,
     device: Device | None = None,
-    ranks: Ranks = SINGLE_PROCESS,
     *,
     parts: Parts | None = None,
 ) -> Trainer:
@@ -35,7 +33,6 @@ def start_training(
         config: as `load_config` gives it.
         dataset: None for the one that config.data names; a built-in scene is then written into the folder runs.
         device: None for the default adapter.
-        ranks: this process among those that train together. The first one alone does discovery.
         parts: own field, losses, density control, learning rates and callbacks.
 
     Returns:
@@ -45,17 +42,17 @@ def start_training(
         InputError: the configuration, the data and the parts do not fit each other, or the images show nothing.
     """
     parts = parts or Parts()
-    user_config, resolved, dataset, device = set_up(config, dataset, device, parts, ranks)
+    user_config, resolved, dataset, device = set_up(config, dataset, device, parts)
     check_own(resolved.field, parts.field)
     start, notes = None, []
-    if ranks.first and resolved.discovery.enabled and resolved.field.kind != "static":
+    if resolved.discovery.enabled and resolved.field.kind != "static":
         if reason := _no_discovery(resolved, parts.field):
             notes.append(f"motion discovery is left out: {reason}")
         else:
             with torch_threads(step_threads(resolved.field, device)):
                 start = discover(resolved, dataset, device, parts.field)
-    trainer = Trainer(user_config, dataset, device, ranks, start=start, parts=parts)
-    for note in [*notes, *_unused_settings(trainer)] if ranks.first else ():
+    trainer = Trainer(user_config, dataset, device, start=start, parts=parts)
+    for note in [*notes, *_unused_settings(trainer)]:
         print(f"note: {note}", file=sys.stderr, flush=True)
     return trainer
 
