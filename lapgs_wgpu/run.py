@@ -233,7 +233,14 @@ def _saved(training: Trainer, out: Path) -> str:
             save_state(out, training.state())
         except InputError as error:  # no second trouble instead of the first
             return f" (and {error})"
+        except DeviceError:  # which has the newest parameters, and gives nothing any more
+            return _saved_before(out)
         return f"; stopped after step {training.done}, from which lapgs-train --resume {quoted(out)} goes on."
+    return _saved_before(out)
+
+
+def _saved_before(out: Path) -> str:
+    """What a user should know of a training whose present state is lost."""
     if (out / STATE).exists():
         return f"; lapgs-train --resume {quoted(out)} goes on from the state that was saved last."
     return "; nothing was saved yet."

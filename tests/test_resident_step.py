@@ -14,7 +14,7 @@ from helpers.training import configure
 from torch import Tensor
 
 from lapgs_wgpu.data import Dataset
-from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.errors import DeviceMemoryError, InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.deformation import Nearby, TimeSamples
 from lapgs_wgpu.train.config import Config
@@ -190,6 +190,40 @@ def test_a_step_that_is_not_finite_is_skipped_and_named(device: Device, dataset:
         assert "the loss term l1 is nan" in skipped[6].what
         assert "gradient of means" in skipped[6].what
     assert [name for name in states[0] if not np.array_equal(states[0][name], states[1][name])] == []
+
+
+def test_an_error_goes_back_to_the_last_step_that_was_waited_for(
+    device: Device, dataset: Dataset, data: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Memory gives out where intersections outgrow it, with steps in flight: what is left goes on to the same bytes."""
+    config = configure(data__path=str(data), schedule__steps="12", density__start="100")
+    straight, broken = (started(config, dataset, device, "resident") for _ in range(2))
+    steps(straight, 12)
+    steps(broken, 5)
+    broken._resident.settle()
+    rasterizer = broken._resident._passes.rasterizer
+    rasterizer.plans.now = dataclasses.replace(rasterizer.plans.now, capacity=64)
+    with monkeypatch.context() as patched:
+        patched.setattr(rasterizer, "grow_on_overflow", fails)
+        with pytest.raises(DeviceMemoryError):
+            steps(broken, 5)
+    assert broken.whole
+    assert broken.done == 5
+    rest = started(config, dataset, device, "resident")
+    rest.restore(broken.state())
+    for _ in rest:
+        pass
+    expected, found = straight.state(), rest.state()
+    assert [name for name in expected if not np.array_equal(expected[name], found[name])] == []
+
+
+def steps(trainer: Trainer, count: int) -> None:
+    for _ in range(count):
+        trainer.step()
+
+
+def fails(*_: object) -> bool:
+    raise DeviceMemoryError("too many intersections")
 
 
 def test_what_only_torch_computes_is_refused_by_name(device: Device, dataset: Dataset) -> None:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lapgs_wgpu.data.views import View
+from lapgs_wgpu.errors import NumericalError
 from lapgs_wgpu.gpu.kernel import Commands
 from lapgs_wgpu.gpu.later import Later, Ring
 from lapgs_wgpu.motion.passes.samples import Samples
@@ -67,6 +68,8 @@ class ResidentStep:
     """Takes the steps of a training whose parameters stay on the device.
 
     redraw: called after a step that was skipped, with the steps behind it that were in flight; gives their tasks anew.
+    settled: the last step that was waited for. broken: called with it where an error ends the steps behind it, and with
+    None where the parameters themselves are not finite.
     tell: called with what each step tells, in their order.
     """
 
@@ -88,6 +91,8 @@ class ResidentStep:
         self.statistics: Statistics | None = None
         self.field_fitted = False
         self.redraw: Callable[[int, list[int]], list[Task]] = lambda step, behind: []
+        self.settled = 0
+        self.broken: Callable[[int | None], None] = lambda step: None
         self.tell: Callable[[Measured], None] = lambda measured: None
         self.dead_scales = 0.0
         scene.on_access = self.to_host
@@ -158,6 +163,8 @@ class ResidentStep:
     def take(self, task: Task) -> Pending:
         """Submit a step, after `make_room`; what it will have told."""
         self._push()
+        if not self._flying:
+            self.settled = task.step - 1
         flying = self._submit(task, Pending(self._settle_first))
         self._flying.append(flying)
         return flying.result
@@ -172,12 +179,22 @@ class ResidentStep:
     # A step's end ----------------------------------------------------------------------------------------------------
 
     def _settle_first(self) -> None:
-        """Wait for the step that was submitted first, and mend what it asks for."""
+        """Wait for the step that was submitted first, and mend what it asks for. An error leaves the parameters as the
+        last step left them that was waited for, which `broken` is told of."""
+        try:
+            self._settle()
+        except Exception:
+            self._flying.clear()
+            self.broken(self.settled)
+            raise
+
+    def _settle(self) -> None:
         flying = self._flying[0]
         words, terms, totals, needed = self._told(flying)
         if not words["guard"]:
             self._passes.rasterizer.grow_on_overflow(flying.drawing, needed)
             self._flying.popleft()
+            self.settled = flying.task.step
             self.dead_scales = int(words["dead"]) / max(1, 3 * self.count)
             flying.result.value = self._measured(flying.task, terms, totals, None)
             self.tell(flying.result.value)
@@ -195,12 +212,17 @@ class ResidentStep:
             self.parameters.clear_gradients(commands)
         self.parameters.steps = dict(flying.task.counts)
         self.parameters.pull_values()
-        check_parameters(self._learners.parameters())
+        try:
+            check_parameters(self._learners.parameters())
+        except NumericalError:
+            self.broken(None)
+            raise
         self._passes.word("guard").write(np.zeros(1, np.uint32))
         values = self._terms(flying.task, terms, totals)
         what = cause([values], gradients)
         skipped = Skipped(flying.task.step, flying.task.sample.view.name, what)
         flying.result.value = self._measured(flying.task, terms, totals, skipped)
+        self.settled = flying.task.step
         tasks = self.redraw(flying.task.step, [each.task.step for each in behind[1:]])
         self.tell(flying.result.value)
         self.parameters.push()

@@ -46,9 +46,11 @@ AHEAD = 8  # images that are decoded before they are needed
 class _Past(NamedTuple):
     """Where a step began whose samples were not yet drawn.
 
-    drawn: state of the generator. left: of the order of views. chosen: the view and its background. sh_degree: in use.
+    before: state of the generator, and what was left of the order of views, before its view was chosen. drawn: state of
+    the generator. left: of the order of views. chosen: the view and its background. sh_degree: in use.
     """
 
+    before: tuple[Tensor, list[int]]
     drawn: Tensor
     left: list[int]
     chosen: tuple[View, Tensor]
@@ -153,6 +155,7 @@ class Trainer:
         if config.step == "resident":
             self._resident = ResidentStep(config, scene, self._learners, self._truth, dataset.moments)
             self._resident.redraw = self._redraw
+            self._resident.broken = self._broken
             self._resident.tell = lambda measured: self._skips.note(measured.skipped)
         self._plans, camera = rasterizer_of(scene.device).plans, dataset.train[0].camera
         self._drawn = (camera.width, camera.height, True)  # the kind of images that the steps draw
@@ -245,12 +248,12 @@ class Trainer:
         """
         if self._resident is not None:
             self._resident.make_room()  # which may take steps again, and draw for them
-        random, order = self._generator.get_state(), list(self._order.left)
+        random, order, done = self._generator.get_state(), list(self._order.left), self.done
         try:
             with torch_threads(self._threads):
                 result = self._step()
         except BaseException:
-            if self.whole:  # the device gave out, or somebody broke it off: as if the step had not begun
+            if self.whole and self.done == done:  # the device gave out, or somebody broke it off: as if not begun
                 self._generator.set_state(random)
                 self._order.left = order
             raise
@@ -261,13 +264,14 @@ class Trainer:
     def _step(self) -> StepResult:
         config, step = self.config, self.done + 1
         moving = step > self.warm_up_steps
+        before = self._generator.get_state(), list(self._order.left)
         chosen = [self._choose() for _ in range(config.schedule.batch)]
         drawn = self._generator.get_state()
         field_times = None
         if self.timing is not None and moving and step in self._timing_steps:
             field_times = self.timing.fitted(self._timing_steps.index(step))
         if self._resident is not None:
-            self._past[step] = _Past(drawn, list(self._order.left), chosen[0], self.scene.sh_degree)
+            self._past[step] = _Past(before, drawn, list(self._order.left), chosen[0], self.scene.sh_degree)
             measured: Callable[[], Measured] = self._resident.take(self._task(step))
             self.whole = False
         else:
@@ -322,6 +326,16 @@ class Trainer:
             seen=step < self.config.density.stop,
         )
 
+    def _broken(self, settled: int | None) -> None:
+        """Go back to the end of a step: those behind it changed nothing, and an error ends them."""
+        if settled is None:
+            self.whole = False
+        elif (past := self._past.get(settled + 1)) is not None:
+            self.whole = True
+            self.done, self.scene.sh_degree = settled, past.sh_degree
+            self._generator.set_state(past.before[0])
+            self._order.left = list(past.before[1])
+
     def _redraw(self, skipped: int, behind: list[int]) -> list[Task]:
         """The steps behind one that was skipped, drawn anew: no random number was drawn for that one's samples."""
         past = self._past[skipped]
@@ -329,9 +343,10 @@ class Trainer:
         self._order.left = list(past.left)
         tasks = []
         for step in behind:
+            before = self._generator.get_state(), list(self._order.left)
             chosen = self._choose()
             self._past[step] = _Past(
-                self._generator.get_state(), list(self._order.left), chosen, self._past[step].sh_degree
+                before, self._generator.get_state(), list(self._order.left), chosen, self._past[step].sh_degree
             )
             tasks.append(self._task(step))
         return tasks
