@@ -35,7 +35,8 @@ fn projected(i: u32) -> Projected {
     if (!finite(camera.z) || !finite(opacity) || !finite(norm)) {
         return p;
     }
-    if (!(camera.z > NEAR) || !(opacity >= ALPHA_MIN) || !(norm > 0.0)) {
+    let near = max(frame.near, NEAR);
+    if (!(camera.z > near) || !(opacity >= ALPHA_MIN) || !(norm > 0.0)) {
         return p;
     }
 

@@ -28,6 +28,7 @@ from helpers.captures import (
     write_nerfies,
     write_nerfstudio,
     write_neu3d,
+    write_panoptic,
     write_points,
     write_polycam,
     write_record3d,
@@ -94,15 +95,46 @@ def test_cameras_see_what_the_images_show(name: str, device: Device, tmp_path: P
         assert data.test[0].time == pytest.approx(expected[4])
 
 
-@pytest.mark.parametrize(("write", "last"), [(write_rig, 1.0), (write_neu3d, 2 / 3)])
+@pytest.mark.parametrize(("write", "last"), [(write_rig, 1.0), (write_neu3d, 2 / 3), (write_panoptic, 1.0)])
 def test_still_cameras_share_one_pose(write: Write, last: float, device: Device, tmp_path: Path) -> None:
     """The first camera is held out."""
     data = load_dataset(write(tmp_path / "toy", device))
     assert (len(data.train), len(data.test), len(data.cameras)) == (9, 3, 3)
     np.testing.assert_allclose(data.times, [0, last / 2, last])
-    assert all("cam00" in view.source for view in data.test)
-    assert not any("cam00" in view.source for view in data.train)
+    first = "ims/0/" if write is write_panoptic else "cam00"
+    assert all(first in view.source for view in data.test)
+    assert not any(first in view.source for view in data.train)
     assert agreement(data, device, lambda view: moved(round(2 * view.time / last))) > 50
+
+
+def test_panoptics_cameras_are_kept(device: Device, tmp_path: Path) -> None:
+    """They are calibrated, so no training corrects them; nothing is drawn just before a lens."""
+    data = load_dataset(write_panoptic(tmp_path / "toy", device))
+    assert not data.own_footage
+    assert data.is_rig
+    assert data.depths is not None
+    assert {view.camera.near for view in everything(data)} == {0.5 * data.depths[0]}
+    assert data.test[0].name == "test_cam0_00000"
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        (put("train_meta.json", "w2c", 0, 1, 0, 0, 5.0), "w2c"),
+        (put("train_meta.json", "k", 2, 0, 0, 0, -5.0), "k"),
+        (put("train_meta.json", "k", 2, 0, 2, 2, 5.0), "k"),
+        (put("train_meta.json", "fn", 1, 0, "../1/000000.png"), "fn"),
+        (put("train_meta.json", "fn", 1, 0, 7), "fn"),
+        (put("train_meta.json", "cam_id", 1, [1]), "cam_id"),
+        (put("test_meta.json", "h", 0), "h"),
+    ],
+)
+def test_damaged_panoptic_captures_are_refused(
+    change: Callable[[Path], None], field: str, device: Device, tmp_path: Path
+) -> None:
+    folder = write_panoptic(tmp_path / "toy", device)
+    change(folder)
+    refused(folder, field)
 
 
 CLOUDS: dict[str, tuple[Write, int]] = {

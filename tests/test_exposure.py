@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from pathlib import Path
 
@@ -25,6 +26,7 @@ from lapgs_wgpu.train.exposure import ExposurePasses, Exposures
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
 from lapgs_wgpu.train.ground_truth import upload_rgba
 from lapgs_wgpu.train.learning_rate import Rate
+from lapgs_wgpu.train.trainer import Trainer
 
 CORRECTION = torch.tensor([[0.9, 0.1, -0.05, 0.02], [0.03, 1.2, 0.0, -0.1], [-0.02, 0.05, 0.8, 0.2]])
 IDENTITY = torch.eye(3, 4)
@@ -112,6 +114,19 @@ def test_a_state_of_other_pictures_is_refused(name: str) -> None:
 
 
 # In a training
+
+
+def test_each_camera_of_a_rig_has_one_correction(dataset: Dataset, device: Device) -> None:
+    """Images of cameras that move have one each."""
+    few = [dataclasses.replace(view, time=0.0) for view in dataset.train[:3]]
+    later = [dataclasses.replace(view, name=f"later_{view.name}", time=1.0) for view in few]
+    config = configure(exposure__enabled="true")
+    for views, count in (([*few, *later], 3), (few, 3)):
+        with Trainer(config, dataclasses.replace(dataset, train=tuple(views)), device) as trainer:
+            corrections = [trainer.exposure_of(view) for view in views]
+            assert len({each.data_ptr() for each in corrections if each is not None}) == count
+            if len(views) == 6:
+                assert [each.data_ptr() for each in corrections[:3]] == [each.data_ptr() for each in corrections[3:]]
 
 
 def test_an_interrupted_run_goes_on_to_the_same_bytes(

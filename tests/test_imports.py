@@ -26,6 +26,7 @@ ALLOWED = {
     "motion": {"errors", "gpu", "splat", "io"},
     "data": {
         "errors",
+        "progress",
         "splat.camera",
         "io.atomic",
         "io.listing",

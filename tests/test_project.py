@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import re
 
@@ -64,6 +65,16 @@ def test_random_gaussians(
 ) -> None:
     scene = random_scene(count, 1, size=size, spread=spread)
     check(monkeypatch, device, scene, oblique_camera(101, 61), antialiased=antialiased)
+
+
+def test_nothing_is_drawn_before_near(monkeypatch: pytest.MonkeyPatch, device: Device) -> None:
+    camera = oblique_camera(101, 61)
+    scene = random_scene(1000, 1, size=0.05, spread=0.8)
+    depths = camera.project(scene["means"].double().numpy())[1]
+    near = dataclasses.replace(camera, near=float(np.median(depths)))
+    check(monkeypatch, device, scene, near)
+    splats, _ = projected(monkeypatch, device, scene, near)
+    assert 100 < int((splats[:, 10] > 0).sum()) < 600
 
 
 def test_needles(monkeypatch: pytest.MonkeyPatch, device: Device) -> None:

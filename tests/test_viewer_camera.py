@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
 import pytest
 
+from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.viewer.camera import ViewCamera
 
@@ -136,3 +138,14 @@ def test_a_rolled_camera_turns_without_a_jump() -> None:
     np.testing.assert_allclose(view.rotation @ view.rotation.T, np.eye(3), atol=1e-12)
     view.orbit(0.5, 0.1)
     assert abs(view.rotation[0] @ view.up) == pytest.approx(abs(before[0] @ view.up), abs=0.05)
+
+
+def test_a_camera_keeps_the_near_plane_of_where_it_starts(view: ViewCamera) -> None:
+    """A capture's camera may stand in a wall, which must not hide what is before it; checkpoints hold the depth."""
+    start = dataclasses.replace(view.camera(400, 300), near=0.2)
+    again = InitialView.from_json(InitialView(start, view.focus, view.up, 10).to_json())
+    assert again is not None
+    moved = ViewCamera.of(again.camera, again.focus, again.up)
+    moved.orbit(0.1, 0.0)
+    assert moved.camera(200, 100).near == 0.2
+    assert view.camera(200, 100).near == 0.0

@@ -18,13 +18,14 @@ class ViewCamera:
     """A camera that turns about a focus. World frame and units are the scene's; camera axes are OpenCV's.
 
     position (3,), focus (3,), up (3,) of unit length; fov_y: vertical field of view in radians.
+    near: depth up to which nothing is drawn, world units.
     """
 
     def __init__(self, position: ArrayLike, focus: ArrayLike, up: ArrayLike, fov_y: float) -> None:
         self.position: Vector = np.asarray(position, np.float64)
         self.focus: Vector = np.asarray(focus, np.float64)
         self.up: Vector = _unit(np.asarray(up, np.float64))
-        self.fov_y = fov_y
+        self.fov_y, self.near = fov_y, 0.0
         self.rotation = self._level(self.focus - self.position)
         self._start = (self.position, self.focus, self.rotation, self.fov_y)
 
@@ -33,6 +34,7 @@ class ViewCamera:
         """Make a camera that starts where another one stands; the focus is moved onto its line of sight."""
         made = ViewCamera(camera.position, focus, up, 2 * math.atan(0.5 * camera.height / camera.K[1, 1]))
         made.stand_at(camera)
+        made.near = camera.near
         made._start = (made.position, made.focus, made.rotation, made.fov_y)
         return made
 
@@ -87,7 +89,7 @@ class ViewCamera:
         """Make the rasterizer's camera for a picture of this size."""
         f = 0.5 * height / math.tan(0.5 * self.fov_y)
         K = np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]])
-        return Camera(K, world_to_camera(self.rotation.T, self.position), width, height)
+        return Camera(K, world_to_camera(self.rotation.T, self.position), width, height, self.near)
 
     def _shift(self, by: Vector) -> None:
         self.position, self.focus = self.position + by, self.focus + by

@@ -48,7 +48,7 @@ def framed(camera: Camera, width: int, height: int) -> Camera:
     K = camera.K.copy()
     K[:2] *= scale
     K[0, 2] += 0.5 * (width - scale * camera.width)
-    return Camera(K, camera.T_cam_world, width, height)
+    return Camera(K, camera.T_cam_world, width, height, camera.near)
 
 
 def write_png(file: Path, picture: NDArray[np.uint8]) -> None:

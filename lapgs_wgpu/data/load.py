@@ -16,7 +16,7 @@ from lapgs_wgpu.data.images import Pixels, Size, shrink, shrunk_size
 from lapgs_wgpu.data.lens import Lens, Undistortion
 from lapgs_wgpu.data.masks import MASKED, Mask, MaskKind, check_masks, find_masks, read_mask
 from lapgs_wgpu.data.placement import place
-from lapgs_wgpu.data.readers import apps, colmap, hypernerf, poses_bounds, transforms
+from lapgs_wgpu.data.readers import apps, colmap, hypernerf, panoptic, poses_bounds, transforms
 from lapgs_wgpu.data.split import held_out
 from lapgs_wgpu.data.stamps import natural_key
 from lapgs_wgpu.data.timestamps import as_one_camera, by_camera, disorder, in_step, read_times, to_unit_range
@@ -26,8 +26,10 @@ from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
 
 READERS: tuple[Reader, ...] = tuple(
-    reader for module in (transforms, hypernerf, poses_bounds, colmap, apps) for reader in module.READERS
+    reader for module in (transforms, hypernerf, poses_bounds, panoptic, colmap, apps) for reader in module.READERS
 )
+
+NEAR_SHARE = 0.5  # of the nearest depth that a capture states, or that its cameras let guess: nothing is drawn before
 
 
 def load_dataset(
@@ -89,6 +91,10 @@ def load_dataset(
     fit = placement.normalization
     whole = fit if fit is None or capture.moved is None else capture.moved.then(fit)
     placed = {camera: camera if fit is None else fit.camera(camera) for camera in {shot.camera for shot in shots}}
+    # Without a cloud, what stands just before one camera would explain its images alone, and block those beside it.
+    if placement.depths is not None and placement.cloud is None:
+        near = NEAR_SHARE * placement.depths[0]
+        placed = {camera: dataclasses.replace(seen, near=near) for camera, seen in placed.items()}
 
     def views(split: Split) -> tuple[View, ...]:
         chosen = [shot for shot in shots if shot.frame.split == split]

@@ -45,7 +45,8 @@ class Normalization(NamedTuple):
 
     def camera(self, camera: Camera) -> Camera:
         """Transform a camera."""
-        return Camera(camera.K, self.pose(camera.T_cam_world), camera.width, camera.height)
+        near = self.scale * camera.near
+        return Camera(camera.K, self.pose(camera.T_cam_world), camera.width, camera.height, near)
 
     def then(self, other: Normalization) -> Normalization:
         """Compose: this one first, then the other."""

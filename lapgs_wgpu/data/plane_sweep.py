@@ -1,39 +1,53 @@
-"""Surfaces of what stands still, by a plane sweep between cameras that stand still.
+"""Surfaces that cameras see, by a plane sweep between neighbors: where Gaussians of a capture without a cloud start.
 
-The median of a camera's images over the clip shows what does not move. Where a plane before a camera, at the depth of a
-surface, carries the other cameras' images to it, they look as its own there. A depth is believed that other cameras'
-depths confirm. Source: Collins, A space-sweep approach to true multi-image matching (CVPR 1996).
+The median of a still camera's images over the clip shows what does not move. Where a plane before a camera, at the
+depth of a surface, carries the other cameras' images to it, they look as its own there. A depth is believed that other
+cameras' depths confirm, and beyond which fewer of them see. Between believed depths, blank surfaces are filled in: a
+plane's inverse depth is linear in the image, and so the solution of Laplace's equation; it spreads less across edges of
+color. Sources: Collins, A space-sweep approach to true multi-image matching (CVPR 1996); Levin et al., Colorization
+using optimization (SIGGRAPH 2004).
 """
 
 from __future__ import annotations
 
-from functools import lru_cache
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache, partial
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
+from PIL import Image
+from scipy import ndimage, sparse
+from scipy.sparse.linalg import spsolve
 
 from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.data.views import Dataset, small_views
+from lapgs_wgpu.progress import Progress, say
 from lapgs_wgpu.splat.camera import Camera
 
 Array = NDArray[np.float64]
+Points = NDArray[np.float32]
+Mask = NDArray[np.bool_]
 
-SIDE = 168  # pixels, of the images that are compared
+SIDE = 128  # pixels, of the images that are compared
 IMAGES = 25  # of a camera, whose median shows what stands still
-CAMERAS = 24  # of a rig, at most
-NEIGHBOURS = 6  # the nearest cameras, with which one is compared
-DEPTHS = 128  # planes, evenly in 1 / depth
+CAMERAS = 32  # at most
+NEIGHBORS = 4  # the nearest cameras, with which one is compared
+BASELINE = 0.02  # of the nearest depth: a camera that stands nearer by sees no parallax
+DEPTHS = 96  # planes, evenly in 1 / depth
 WINDOW = 7  # pixels; side of the square whose colors are compared
 MIN_CORRELATION = 0.6  # normalized cross-correlation of a surface's image in two cameras
 CONFIRMED = 2  # other cameras that must find the same depth
 NEAR = 2.5  # planes by which two cameras' depths may differ
+PATCH = 12  # pixels of a window at about one depth: fewer are chance
+EDGE = 0.05  # difference of two colors across which depths hardly spread
+HELD = 1e3  # weight of believed depths, relative to those of their neighbors
+MOVED = 0.08  # difference of a color from the median from which on something moves there
 FLAT = 1e-8  # product of two variances, below which windows are flat and look like nothing
 
 
 class Surface(NamedTuple):
-    """points: (N, 3) world units. colors: (N, 3) in [0, 1]. share: of all pixels, those whose depth is point_count."""
+    """points: (N, 3) world units. colors: (N, 3) in [0, 1]. share: of all pixels, those at which a point lies."""
 
     points: NDArray[np.float32]
     colors: NDArray[np.float32]
@@ -53,34 +67,71 @@ class _Still(NamedTuple):
 
 @lru_cache(maxsize=2)
 def still_surface(dataset: Dataset) -> Surface | None:
-    """The surfaces that the training cameras of a rig see, a point a pixel; None where cameras move, where there are
-    fewer than three, or where nothing states how deep they see. Raises InputError where an image cannot be read."""
-    if dataset.depths is None or not dataset.still_cameras or len(dataset.cameras) < 3:
+    """The surfaces that the training cameras see, a point a pixel. Says what was found.
+
+    None where there are fewer than three cameras, where nothing states how deep they see, and where no surface is
+    found. Raises InputError where an image cannot be read.
+    """
+    if dataset.depths is None or len(dataset.cameras) < 3:
         return None
     stills = _stills(dataset)
-    near, far = dataset.depths
+    found = _surfaces(stills, dataset.depths)
+    share = float(np.mean([kept.mean() for _, _, kept in found]))
+    points, colors = _kept(found)
+    text = f"start: {len(points)} points on surfaces, {share:.0%} of the pixels of {len(stills)} cameras"
+    if dataset.is_rig:
+        middle = _stills(dataset, at=float(np.median(dataset.times)))
+        changes = [np.abs(now.colors - still.colors).mean(axis=2) for now, still in zip(middle, stills, strict=True)]
+        moved = [_box(change).ravel() > MOVED for change in changes]
+        if any(mask.any() for mask in moved):
+            found = _surfaces(middle, dataset.depths)
+            found = [(*each[:2], each[2] & mask) for each, mask in zip(found, moved, strict=True)]
+            points_moved, colors_moved = _kept(found)
+            points, colors = np.concatenate([points, points_moved]), np.concatenate([colors, colors_moved])
+            text += f", and {len(points_moved)} on what moves, at the clip's middle"
+    say(text)
+    return Surface(points, colors, share) if share else None
+
+
+def _kept(found: list[tuple[Points, Points, Mask]]) -> tuple[Points, Points]:
+    """Points and colors (N, 3) of what `_surfaces` found."""
+    points, colors = (np.concatenate([each[i][each[2]] for each in found]) for i in (0, 1))
+    return points, colors
+
+
+def _surfaces(stills: list[_Still], bounds: tuple[float, float]) -> list[tuple[Points, Points, Mask]]:
+    """Of each camera a point (H W, 3) for each pixel, its color (H W, 3), and whether a surface is there (H W,).
+
+    bounds: nearest and furthest depth, world units.
+    """
+    near, far = bounds
     planes = np.linspace(1 / far, 1 / near, DEPTHS)
-    maps = [_sweep(still, _nearest(still, stills), planes) for still in stills]
-    points, colors, point_count, pixel_count = [], [], 0, 0
-    for i, (still, inverse) in enumerate(zip(stills, maps, strict=True)):
-        places = _places(still.camera, 1 / inverse.ravel())
-        agreeing = sum(
-            _agrees(places, other.camera, of_other, NEAR * (planes[1] - planes[0]))
-            for j, (other, of_other) in enumerate(zip(stills, maps, strict=True))
-            if j != i
-        )
-        kept = np.isfinite(inverse.ravel()) & (agreeing >= CONFIRMED)
-        points.append(places[kept].astype(np.float32))
-        colors.append(still.colors.reshape(-1, 3)[kept])
-        point_count, pixel_count = point_count + int(kept.sum()), pixel_count + kept.size
-    return Surface(np.concatenate(points), np.concatenate(colors), point_count / pixel_count)
+    maps = []
+    with Progress(len(stills), "cameras searched for surfaces") as progress, ThreadPoolExecutor() as threads:
+        for depths in threads.map(partial(_sweep, stills=stills, planes=planes, least=BASELINE * near), stills):
+            maps.append(depths)
+            progress.step()
+    tolerance = NEAR * (planes[1] - planes[0])
+    found = _confirmed(stills, maps, tolerance)
+    known = [np.where(kept, depths, np.nan) for kept, depths in zip(found, maps, strict=True)]
+    filled = [_filled(still, depths) for still, depths in zip(stills, known, strict=True)]
+    surfaces = []
+    for still, depths, believed in zip(stills, filled, known, strict=True):
+        places = _places(still.camera, 1 / np.where(np.isfinite(depths), depths, 1.0).ravel())
+        agreeing, _ = _votes(places, still, stills, filled, tolerance)
+        _, beyond = _votes(places, still, stills, known, tolerance)
+        kept = np.isfinite(believed.ravel()) | (np.isfinite(depths.ravel()) & (agreeing >= CONFIRMED) & (beyond == 0))
+        surfaces.append((places.astype(np.float32), still.colors.reshape(-1, 3), kept))
+    return surfaces
 
 
-def _stills(dataset: Dataset) -> list[_Still]:
+def _stills(dataset: Dataset, at: float | None = None) -> list[_Still]:
+    """at: the time whose images are taken instead of the median of all."""
     stills = []
     for camera in evenly(dataset.cameras, CAMERAS):
         views = sorted((view for view in dataset.train if view.camera is camera), key=lambda view: view.time)
-        small = small_views(evenly(views, IMAGES), SIDE)
+        chosen = evenly(views, IMAGES) if at is None else [min(views, key=lambda view: abs(view.time - at))]
+        small = small_views(chosen, SIDE)
         colors = (np.median([view.load()[..., :3] for view in small], axis=0) / 255).astype(np.float32)
         gray = colors.mean(axis=2, dtype=np.float64)
         mean = _box(gray)
@@ -88,16 +139,16 @@ def _stills(dataset: Dataset) -> list[_Still]:
     return stills
 
 
-def _nearest(still: _Still, stills: list[_Still]) -> list[_Still]:
-    def distance(other: _Still) -> float:
-        return float(np.linalg.norm(other.camera.position - still.camera.position))
+def _sweep(still: _Still, stills: list[_Still], planes: Array, least: float) -> Array:
+    """(H, W) the inverse depth at which the better half of the neighbors sees the same; NaN where none does.
 
-    return sorted((other for other in stills if other is not still), key=distance)[:NEIGHBOURS]
-
-
-def _sweep(still: _Still, others: list[_Still], planes: Array) -> Array:
-    """(H, W) the inverse depth at which the better half of the other cameras sees the same; NaN where none does."""
-    scores = np.stack([_likeness(still, others, plane) for plane in planes])
+    least: distance of a neighbor, world units.
+    """
+    apart = [float(np.linalg.norm(other.camera.position - still.camera.position)) for other in stills]
+    order = [i for i in np.argsort(apart, kind="stable") if apart[i] > least][:NEIGHBORS]
+    if len(order) < 2:
+        return np.full(still.gray.shape, np.nan)
+    scores = np.stack([_likeness(still, [stills[i] for i in order], plane) for plane in planes])
     best = scores.argmax(axis=0)[None]
     score = np.take_along_axis(scores, best, 0)
     before, after = (np.take_along_axis(scores, (best + k).clip(0, len(planes) - 1), 0) for k in (-1, 1))
@@ -111,23 +162,37 @@ def _sweep(still: _Still, others: list[_Still], planes: Array) -> Array:
 def _likeness(still: _Still, others: list[_Still], plane: float) -> Array:
     """(H, W) mean normalized cross-correlation with the better half of the others at this inverse depth; -1 where
     fewer than two see it."""
-    height, width = still.gray.shape
-    places = _places(still.camera, np.full(height * width, 1 / plane))
     correlations = []
     for other in others:
-        x, y, inside = _pixels(places, other.camera)
-        at = np.stack([y, x]).reshape(2, height, width) - 0.5
-        there = ndimage.map_coordinates(other.gray, at, order=1, mode="nearest")
+        there = _carried(other, still.camera, plane)
         its_mean = _box(there)
         both = still.variance * (_box(there**2) - its_mean**2)
         likeness = (_box(still.gray * there) - still.mean * its_mean) / np.sqrt(np.maximum(both, FLAT))
-        correlations.append(np.where(inside.reshape(height, width), likeness, np.nan))
+        correlations.append(np.where(there >= 0, likeness, np.nan))
     ordered = np.sort(correlations, axis=0)  # NaN last
     seeing = np.isfinite(ordered).sum(axis=0)
     taken = np.maximum(2, (seeing + 1) // 2)
-    sums = np.concatenate([np.zeros((1, height, width)), np.cumsum(np.nan_to_num(ordered), axis=0)])
+    sums = np.concatenate([np.zeros((1, *still.gray.shape)), np.cumsum(np.nan_to_num(ordered), axis=0)])
     all_of, worse = (np.take_along_axis(sums, k[None], 0)[0] for k in (seeing, np.maximum(seeing - taken, 0)))
     return np.where(seeing >= 2, (all_of - worse) / taken, -1.0)
+
+
+def _carried(other: _Still, camera: Camera, plane: float) -> Array:
+    """(H, W) the gray of another camera at the points of a plane across this camera's axis; -1 where it sees none.
+
+    plane: 1 / depth. The plane's homography is K' (R K^-1 + t e3^T / depth).
+    """
+    relative = other.camera.T_cam_world @ np.linalg.inv(camera.T_cam_world)
+    H = relative[:3, :3] @ np.linalg.inv(camera.K)
+    H[:, 2] += plane * relative[:3, 3]
+    H = other.camera.K @ H
+    scaled = (H / (H[2, 2] if abs(H[2, 2]) > 1e-9 else 1e-9)).ravel()[:8]
+    size = camera.width, camera.height
+    image = Image.fromarray(other.gray.astype(np.float32))
+    there = image.transform(size, Image.Transform.PERSPECTIVE, scaled, Image.Resampling.BILINEAR, fillcolor=-1)
+    y, x = np.ogrid[: camera.height, : camera.width]
+    ahead = H[2, 0] * (x + 0.5) + H[2, 1] * (y + 0.5) + H[2, 2] > 1e-9
+    return np.where(ahead, np.asarray(there, np.float64), -1.0)
 
 
 def _box(image: Array) -> Array:
@@ -141,18 +206,51 @@ def _places(camera: Camera, depths: Array) -> Array:
     return (rays * depths - camera.T_cam_world[:3, 3:]).T @ camera.T_cam_world[:3, :3]
 
 
-def _pixels(places: Array, camera: Camera) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Where points (N, 3) are in a camera's image, x and y (N,) in pixels, and whether they are inside it."""
-    pixels, depths = camera.project(places)
-    x, y = pixels.T
-    inside = (depths > 1e-9) & (x >= 0.5) & (y >= 0.5) & (x <= camera.width - 0.5) & (y <= camera.height - 0.5)
-    return np.where(inside, x, 0.5), np.where(inside, y, 0.5), inside
+def _votes(places: Array, still: _Still, stills: list[_Still], maps: list[Array], most: float) -> tuple[Array, Array]:
+    """How many other cameras see a surface at the points (N, 3) of a camera, and how many see one beyond: (N,) each.
+
+    maps: inverse depths (H, W) of the cameras, NaN where unknown. most: by which they may differ.
+    """
+    agreeing, beyond = np.zeros((2, len(places)))
+    for other, depths in zip(stills, maps, strict=True):
+        if other is still:
+            continue
+        pixels, depth = other.camera.project(places)
+        size = other.camera.width, other.camera.height
+        inside = (depth > 1e-9) & ((pixels >= 0) & (pixels < size)).all(axis=1)
+        x, y = np.where(inside[:, None], pixels, 0).astype(np.int64).T
+        nearer = 1 / np.where(inside, depth, 1.0) - depths[y, x]  # NaN compares as false
+        agreeing += inside & (np.abs(nearer) < most)
+        beyond += inside & (nearer > 2 * most)
+    return agreeing, beyond
 
 
-def _agrees(places: Array, camera: Camera, inverse: Array, most: float) -> NDArray[np.bool_]:
-    """(N,) whether a camera's inverse depths (H, W) are those of the points."""
-    x, y, inside = _pixels(places, camera)
-    of_camera = inverse[y.astype(np.int64), x.astype(np.int64)]
-    depths = places @ camera.T_cam_world[2, :3] + camera.T_cam_world[2, 3]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return inside & (np.abs(of_camera - 1 / depths) < most)
+def _confirmed(stills: list[_Still], maps: list[Array], most: float) -> list[Mask]:
+    """(H, W) of each camera: inverse depths that others confirm, that fewer see through, and that lie in a patch."""
+    masks = []
+    for still, depths in zip(stills, maps, strict=True):
+        places = _places(still.camera, 1 / np.where(np.isfinite(depths), depths, 1.0).ravel())
+        agreeing, beyond = (votes.reshape(depths.shape) for votes in _votes(places, still, stills, maps, most))
+        kept = np.isfinite(depths) & (agreeing >= CONFIRMED) & (agreeing > beyond)
+        padded = np.pad(np.where(kept, depths, np.nan), WINDOW // 2, constant_values=np.nan)
+        windows = np.lib.stride_tricks.sliding_window_view(padded, (WINDOW, WINDOW))
+        near = (np.abs(windows - np.where(kept, depths, np.nan)[..., None, None]) < most).sum(axis=(2, 3))
+        masks.append(kept & (near >= PATCH))
+    return masks
+
+
+def _filled(still: _Still, known: Array) -> Array:
+    """(H, W) inverse depths, where they are NaN by Laplace's equation, whose weights fall across edges of color; NaN
+    where none is known."""
+    held = np.isfinite(known).ravel()
+    if not held.any():
+        return known
+    number = np.arange(known.size).reshape(known.shape)
+    first = np.concatenate([number[:, :-1].ravel(), number[:-1].ravel()])
+    second = np.concatenate([number[:, 1:].ravel(), number[1:].ravel()])
+    colors = still.colors.reshape(-1, 3).astype(np.float64)
+    weights = np.exp(-((colors[first] - colors[second]) ** 2).sum(axis=1) / (2 * EDGE**2)) + 1e-3
+    links = sparse.coo_matrix((weights, (first, second)), shape=(known.size, known.size)).tocsr()
+    links = links + links.T
+    total = np.asarray(links.sum(axis=1)).ravel() + HELD * held
+    return spsolve((sparse.diags(total) - links).tocsc(), HELD * np.nan_to_num(known.ravel())).reshape(known.shape)

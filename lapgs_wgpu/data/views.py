@@ -142,6 +142,11 @@ class Dataset:
         """Whether cameras stand still: each shows several training images."""
         return len(self.train) >= 2 * len(self.cameras)
 
+    @property
+    def is_rig(self) -> bool:
+        """Whether several cameras stand still: each keeps its own colors."""
+        return len(self.cameras) > 1 and self.still_cameras
+
     @cached_property
     def moments(self) -> int:
         """The number of moments of the clip: that of its times. Of a few still cameras, which may not be in step, it is

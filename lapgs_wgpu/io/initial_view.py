@@ -52,7 +52,7 @@ class InitialView(NamedTuple):
             "frames": self.frames,
             "arc": self.arc,
         }
-        return json.dumps(values)
+        return json.dumps(values | ({"near": camera.near} if camera.near else {}))
 
     @staticmethod
     def from_json(text: str) -> InitialView | None:
@@ -60,9 +60,8 @@ class InitialView(NamedTuple):
         try:
             values: dict[str, Any] = json.loads(text)
             width, height = values["size"]
-            camera = Camera(
-                np.array(values["K"], float), np.array(values["T_cam_world"], float), int(width), int(height)
-            )
+            K, T = np.array(values["K"], float), np.array(values["T_cam_world"], float)
+            camera = Camera(K, T, int(width), int(height), float(values.get("near", 0.0)))
             focus, up = np.array(values["focus"], float), np.array(values["up"], float)
             usable = (
                 focus.shape == up.shape == (3,)

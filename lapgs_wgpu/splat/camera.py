@@ -20,6 +20,7 @@ class Camera:
         T_cam_world: (4, 4) float64 rigid transform from world to camera coordinates.
         width: of the image, pixels.
         height: of the image, pixels.
+        near: depth up to which nothing is drawn, world units; the shaders' NEAR where that is larger.
 
     Raises:
         ValueError: a shape or a size is wrong, or a value is not finite.
@@ -29,6 +30,7 @@ class Camera:
     T_cam_world: NDArray[np.float64]
     width: int
     height: int
+    near: float = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "K", np.asarray(self.K, dtype=np.float64))
@@ -39,6 +41,8 @@ class Camera:
             )
         if not (np.isfinite(self.K).all() and np.isfinite(self.T_cam_world).all()):
             raise ValueError("Camera: K and T_cam_world must be finite")
+        if not 0 <= self.near < math.inf:
+            raise ValueError(f"Camera: near must be a finite depth of at least 0, got {self.near}")
         if self.width < 1 or self.height < 1:
             raise ValueError(f"Camera: width and height must be at least 1, got {self.width}x{self.height}")
 
@@ -57,7 +61,7 @@ class Camera:
     def resized(self, width: int, height: int) -> Camera:
         """Return the same camera for an image of another size: width and height in pixels."""
         scale = np.diag([width / self.width, height / self.height, 1.0])
-        return Camera(scale @ self.K, self.T_cam_world, width, height)
+        return Camera(scale @ self.K, self.T_cam_world, width, height, self.near)
 
     @staticmethod
     def looking_at(

@@ -248,6 +248,7 @@ class Rasterizer:
             tiles=(columns, rows),
             band=self._band_rows(drawing, band),
             antialiased=int(drawing.gaussians.antialiased),
+            near=camera.near,
         )
         return self.pool.constant(f"frame {band}", content)
 

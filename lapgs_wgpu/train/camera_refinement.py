@@ -226,7 +226,7 @@ def changed_camera(camera: Camera, change: Array) -> Camera:
     T = camera.T_cam_world.copy()
     T[:3, :3] = T[:3, :3] @ rotation_of(change[:3]).T
     T[:3, 3] = -T[:3, :3] @ (camera.position + change[3:])
-    return Camera(camera.K, T, camera.width, camera.height)
+    return Camera(camera.K, T, camera.width, camera.height, camera.near)
 
 
 def rotation_of(vector: Array) -> Array:

@@ -198,7 +198,9 @@ class ExposureConfig(Options):
     """Per-image color correction. Has defaults, since older config.toml files lack it."""
 
     enabled: bool = option(
-        "learn an affine color correction for each training image; never applied in evaluation", False
+        "learn an affine color correction for each training image, or for each camera of a rig that stands still; "
+        "never applied in evaluation",
+        False,
     )
     rate: Rate = option("color corrections", Rate(2e-2, 2e-3, 20_000))
 

@@ -46,13 +46,19 @@ class Learners:
         if scene.spectrum is not None:
             limit = nyquist_frequency(dataset)
             self.frequencies = FrequencyOptimizer(scene.spectrum, config.rates.frequencies, limit)
-        self.exposures = Exposures(len(dataset.train), config.exposure.rate) if config.exposure.enabled else None
+        self.exposures = None
+        if config.exposure.enabled:
+            count = len(dataset.cameras) if dataset.is_rig else len(dataset.train)
+            self.exposures = Exposures(count, config.exposure.rate)
         self.cameras = None
         if config.cameras.refines(own_footage=dataset.own_footage):
             self.cameras = CameraRefinement(
                 dataset.cameras, dataset.extent, config.cameras, lambda: _points_of(scene), start.corrections
             )
-        self._numbers = {view.name: number for number, view in enumerate(dataset.train)}
+        of_camera = {camera: number for number, camera in enumerate(dataset.cameras)}
+        self._numbers = {
+            view.name: of_camera[view.camera] if dataset.is_rig else number for number, view in enumerate(dataset.train)
+        }
 
     def limit_field_rates(self, *, field_fitted: bool) -> None:
         """Hold the field's learning rates low where discovery has fitted it to nearly all that moves."""

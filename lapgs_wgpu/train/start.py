@@ -20,6 +20,7 @@ from lapgs_wgpu.train.camera_refinement import Corrections
 from lapgs_wgpu.train.config import Config, PointsConfig
 
 INITIAL_OPACITY = 0.1
+MOST_PIXELS = 0.5  # share from which on random points would only be a fog before the surfaces
 # Learning rates at which a field keeps what discovery fitted; at higher ones Adam's noise undoes the fit.
 MAX_HASH_RATE, MAX_MLP_RATE = 5e-3, 1e-3
 
@@ -77,12 +78,13 @@ def initial_points(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """The first Gaussians, along a Morton curve: points (N, 3), colors (N, 3) and scales (N,).
 
-    Without a cloud, the cameras of a rig tell where what stands still is (data/plane_sweep): as large a share of the
-    points as of the pixels lies there. The others, and those of other captures, lie as data/initial_gaussians says.
+    Without a cloud, the cameras tell where what stands still is (data/plane_sweep). All points lie there if most pixels
+    show it, else as large a share as of the pixels. The others lie as data/initial_gaussians says.
     """
     points, colors = first_points(dataset, config.count, config.box, seed)
     if dataset.cloud is None and (surface := still_surface(dataset)) is not None:
-        known = min(round(surface.share * len(points)), len(surface.points))
+        share = 1.0 if surface.share > MOST_PIXELS else surface.share
+        known = min(round(share * len(points)), len(surface.points))
         chosen = np.random.default_rng(seed).choice(len(surface.points), known, replace=False)
         points[:known], colors[:known] = surface.points[chosen], surface.colors[chosen]
     scales = initial_scales(points)

@@ -11,4 +11,5 @@ struct Frame {
     tiles: vec2<u32>,       // columns and rows of tiles
     band: vec2<u32>,        // first and one past the last row of tiles that this submission draws
     antialiased: u32,       // 1: a splat is as much fainter as DILATION makes it larger
+    near: f32,              // world units; a Gaussian at or before this camera depth, or NEAR, is culled
 }

@@ -256,6 +256,24 @@ def write_neu3d(folder: Path, device: Device, *, count: int = 4, frames: int = 3
     return folder
 
 
+def write_panoptic(folder: Path, device: Device, *, count: int = 4, frames: int = 3) -> Path:
+    """Cameras that see the moving blobs; the first is held out."""
+    for name, taken in (("test", {0: cameras(count)[0]}), ("train", dict(enumerate(cameras(count))))):
+        if name == "train":
+            del taken[0]
+        rows = {
+            "fn": [[f"{number}/{frame:06d}.png" for number in taken] for frame in range(frames)],
+            "k": [[camera.K.tolist() for camera in taken.values()]] * frames,
+            "w2c": [[camera.T_cam_world.tolist() for camera in taken.values()]] * frames,
+            "cam_id": [list(taken)] * frames,
+        }
+        for number, camera in taken.items():
+            for frame in range(frames):
+                Shot(camera, moved(frame).drawn(camera, device)).save(folder / f"ims/{number}/{frame:06d}.png")
+        (folder / f"{name}_meta.json").write_text(json.dumps({"w": WIDTH, "h": HEIGHT, **rows}))
+    return folder
+
+
 def write_video(path: Path, images: Sequence[np.ndarray], *, cut: float = 0.0) -> None:
     """H.264 with colors at full resolution, almost lossless; one keyframe, at the beginning.
 

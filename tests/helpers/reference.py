@@ -105,15 +105,15 @@ def project(
 
     means: (N, 3) world. quats: (N, 4) wxyz. scales: (N, 3) standard deviations, world units. opacities: (N,);
     antialiased, they are drawn fainter by the ratio of the splat's area without DILATION to that with it.
-    Invisible: depth <= NEAR, opacity as drawn < ALPHA_MIN, anything not finite, or an ellipse whose bounding box lies
-    wholly outside the image. camera.K's skew is ignored.
+    Invisible: depth <= NEAR or camera.near, opacity as drawn < ALPHA_MIN, anything not finite, or an ellipse whose
+    bounding box lies wholly outside the image. camera.K's skew is ignored.
     """
     with torch.no_grad():  # first who is visible, so that no division by the others' depths reaches the gradients
         means2d, conics, depths, tau, half_sides, _ = _project(means, quats, scales, opacities, camera, antialiased)
         size = means.new_tensor([camera.width, camera.height])
         finite = torch.cat([means2d, conics, half_sides], dim=-1).isfinite().all(-1)
         meets_image = ((means2d + half_sides > 0) & (means2d - half_sides < size)).all(-1)
-        visible = finite & meets_image & (depths > NEAR) & (tau >= 0)
+        visible = finite & meets_image & (depths > max(NEAR, camera.near)) & (tau >= 0)
     rows = visible.nonzero().squeeze(-1)
     means2d, conics, depths, tau, half_sides, opacities = (
         _scattered(values, rows, len(means))

@@ -12,8 +12,9 @@ const turned = (v, axis, angle) => { // a row times the rotation about a unit ax
 
 export class ViewCamera {
     // Where the scene begins. narrowest: width by height of a picture; in a narrower one fovY grows, so that no side is cut.
-    constructor({ rotation, position, fovY, focus, up, narrowest }) {
-        Object.assign(this, { up: unit(up), narrowest });
+    // near: depth up to which nothing is drawn.
+    constructor({ rotation, position, fovY, focus, up, narrowest, near = 0 }) {
+        Object.assign(this, { up: unit(up), narrowest, near });
         this.reset = () => {
             const far = Math.hypot(...add(focus, position, -1));
             const ahead = Math.max(dot(add(focus, position, -1), rotation[2]), 1e-3 * far, 1e-6);
@@ -87,22 +88,24 @@ export class ViewCamera {
         const f = 0.5 * this.pictureHeight(width, height) / Math.tan(0.5 * this.fovY);
         const shift = [x, y, z].map(row => -dot(row, this.position));
         const view = [0, 1, 2].flatMap(i => [x[i], y[i], z[i], 0]).concat(shift, 1);
-        return { view, focal: [f, f], center: [width / 2, height / 2], position: this.position, width, height };
+        const { position, near } = this;
+        return { view, focal: [f, f], center: [width / 2, height / 2], position, width, height, near };
     }
 }
 
 // Where a scene begins, of its metadata; without such a view, the middle of its means from a distance.
 export function firstView(text, means) {
     try {
-        const { K, T_cam_world: T, size, focus, up, frames } = JSON.parse(text);
+        const { K, T_cam_world: T, size, focus, up, frames, near = 0 } = JSON.parse(text);
         const rotation = [0, 1, 2].map(i => T[i].slice(0, 3));
         const position = [0, 1, 2].map(i => -(T[0][i] * T[0][3] + T[1][i] * T[1][3] + T[2][i] * T[2][3]));
         const fovY = 2 * Math.atan(0.5 * size[1] / K[1][1]);
-        const values = [...rotation.flat(), ...position, fovY, ...focus, ...up];
+        const values = [...rotation.flat(), ...position, fovY, ...focus, ...up, near];
         const square = [0, 1, 2].every(i => Math.abs(dot(rotation[i], rotation[i]) - 1) < 1e-3);
-        if (values.length === 19 && values.every(Number.isFinite) && square && fovY > 0 && Math.hypot(...up) > 1e-3) {
+        if (values.length === 20 && values.every(Number.isFinite) && square && fovY > 0 && Math.hypot(...up) > 1e-3) {
             const narrowest = Math.min(Math.max(size[0] / size[1], 0.1), 1);
-            return { rotation, position, fovY, focus, up, narrowest, frames: Math.min(Math.max(Math.round(frames) || 1, 1), 1e6) };
+            const count = Math.min(Math.max(Math.round(frames) || 1, 1), 1e6);
+            return { rotation, position, fovY, focus, up, narrowest, near, frames: count };
         }
     } catch {
         // as without one
