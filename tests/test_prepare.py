@@ -46,7 +46,7 @@ def test_one_film(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest
     assert prepare_command([str(path), "--out", str(out)]) == 0
     said = capfd.readouterr()
     assert not re.findall(r"^[IWEF]\d{8} ", said.err, re.MULTILINE), "COLMAP's log"
-    assert said.out.count("(wanted: ") == 5
+    assert said.out.count("(wanted: ") == 6
     times = json.loads((out / "times.json").read_text())
     assert COUNT - 3 <= len(times) <= COUNT + 1
     assert times == {f"{100 * i:08d}.jpg": i / 10 for i in range(len(times))}
@@ -121,7 +121,7 @@ def test_a_full_disk(film: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("missing", ["av", "pycolmap"])
+@pytest.mark.parametrize("missing", ["av", "pycolmap", "cv2"])
 def test_without_the_extra(missing: str, film: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, missing, None)
     with pytest.raises(InputError, match=r"lapgs-wgpu\[prepare\]"):
