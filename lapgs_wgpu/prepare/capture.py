@@ -170,9 +170,8 @@ def _still_cameras(images: Path, cameras: Sequence[Sequence[Picture]], fps: floa
     """Compare all cameras at several times. Returns the pycolmap.Reconstruction, None where nothing fits together."""
     times = [[picture.name for picture in each] for each in common_times(cameras, fps, TIMES)]
     groups = list(zip(*times, strict=True))  # of each camera
-    sizes = {check_image(images / group[0], whole=False).size for group in groups}
     names = [name for group in groups for name in group]
-    source = Reconstruction(images, names, work, FEW_CAMERAS_LENS, single=len(sizes) == 1)
+    source = Reconstruction(images, names, work, FEW_CAMERAS_LENS)
     pairs = [pair for names in times for pair in itertools.combinations(names, 2)]
     matches = source.match(pairs, source.find_features())
     return merged(source, matches, groups, work / "merged").solve()

@@ -37,16 +37,16 @@ class Features(NamedTuple):
 
 
 class Reconstruction:
-    """Structure from motion over images.
+    """Structure from motion over images that share one lens.
 
     images: the folder of all images. names: of those to use, below it, in the order of time. work: folder for the
-    database. model: COLMAP's name for the lens. single: all images share one lens; else those of a folder share one.
+    database. model: COLMAP's name for the lens.
     """
 
-    def __init__(self, images: Path, names: Sequence[str], work: Path, model: str, *, single: bool = True) -> None:
+    def __init__(self, images: Path, names: Sequence[str], work: Path, model: str) -> None:
         """Raises InputError where pycolmap is not installed."""
         self._colmap = colmap = import_pycolmap()
-        self.images, self.names, self.model, self.single = images, list(names), model, single
+        self.images, self.names, self.model = images, list(names), model
         self.work = work
         self.places: dict[str, NDArray[np.float32]] = {}
         self._database = work / "database.db"
@@ -55,8 +55,7 @@ class Reconstruction:
             pass
         options = colmap.ImageReaderOptions()
         options.camera_model = model
-        mode = colmap.CameraMode.SINGLE if single else colmap.CameraMode.PER_FOLDER
-        colmap.import_images(self._database, images, mode, self.names, options)
+        colmap.import_images(self._database, images, colmap.CameraMode.SINGLE, self.names, options)
         with self.database() as database:
             self.ids = {image.name: image.image_id for image in database.read_all_images()}
             camera = database.read_all_cameras()[0]
@@ -218,7 +217,7 @@ def merged(source: Reconstruction, matches: Match, groups: Sequence[Sequence[str
     cameras together, too, and the noise of several times is averaged.
     groups: names of images, as many for each camera. The first of each stands for the camera.
     """
-    result = Reconstruction(source.images, [group[0] for group in groups], work, source.model, single=source.single)
+    result = Reconstruction(source.images, [group[0] for group in groups], work, source.model)
     first: dict[str, int] = {}  # of each image's features among those of its group
     with result.database() as database:
         for group in groups:
