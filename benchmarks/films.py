@@ -4,8 +4,8 @@ DIR holds rendered/swing_mv, eight films of still cameras whose poses are known,
 hand, which become a film. Two more rows are of a film that is rendered here: a walk past a room in which a moving board
 covers much of the picture, with the masks that are found and with black ones, which leave out nothing.
 
-python benchmarks/films.py --davis DIR [FILM ...] measures films of DAVIS 2016, JPEGImages/480p and Annotations/480p in DIR,
-against the annotated masks (docs/results.md): the mean intersection over union of all images, unplaced ones included.
+python benchmarks/films.py --davis DIR [FILM ...] measures films of DAVIS 2016, JPEGImages/480p and Annotations/480p in
+DIR, against the annotated masks (docs/results.md): the mean intersection over union of all images.
 
 lapgs-prepare runs with a new HOME and nothing but its own programs on the PATH. Errors are distances of cameras from
 the true ones after the best similarity, in parts of the cameras' spread.

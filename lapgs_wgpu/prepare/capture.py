@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from lapgs_wgpu.data.images import Size, check_image
 from lapgs_wgpu.data.masks import Mask, check_mask_folder
 from lapgs_wgpu.data.readers.colmap import IMAGES, SPARSE
@@ -35,9 +37,9 @@ TIMES = 8  # at which still cameras are compared
 LENS, FEW_CAMERAS_LENS = "RADIAL", "SIMPLE_RADIAL"  # few images do not determine more parameters
 FEWEST, WHOLE = 0.3, 0.9  # of the images need a pose; of fewer than this only a part of the film fits
 LITTLE, MUCH = 0.002, 0.1  # share of the images: less motion needs no masks; more may have led the cameras astray
-FOLLOWED = 0.8  # share of the image area where flow must tell whether it moves
+FOLLOWED, UNKNOWN = 0.8, 0.2  # share of the image area where flow must tell whether it moves; less makes no masks
 STANDING = 4e-3  # of the longer side: the image of a camera that stands still moves less over the film
-ADVICE = "film slower, with more texture and overlap, and walk around what moves instead of turning on the spot"
+FEATURES, SHARED = 200, 60  # of an image; in common with the next one: fewer say why cameras are not found
 
 
 class Prepared(NamedTuple):
@@ -75,10 +77,7 @@ def prepare(videos: Sequence[Path], out: Path, *, fps: float | None = None, mask
         else:
             pictures = extract(films[0], folder / IMAGES, rate)
             wanted, model = len(pictures), _moving_camera(films[0], folder, pictures, masks, work)
-        placed = 0 if model is None else model.num_reg_images()
-        if placed < max(2, round(FEWEST * wanted)):
-            what, least = "cameras" if len(films) > 1 else "images", max(2, round(FEWEST * wanted))
-            raise InputError(f"{placed} of {wanted} {what} could be placed (at least {least} are needed): {ADVICE}.")
+        placed = model.num_reg_images()
         write_times(folder, {picture.name: picture.seconds for picture in pictures})
         (folder / SPARSE / "0").mkdir(parents=True)
         model.write_binary(str(folder / SPARSE / "0"))
@@ -87,10 +86,7 @@ def prepare(videos: Sequence[Path], out: Path, *, fps: float | None = None, mask
 
 
 def _moving_camera(film: Film, folder: Path, pictures: Sequence[Picture], masks: Path | None, work: Path) -> Any:
-    """The pycolmap.Reconstruction, None where nothing fits together; writes masks of what moves.
-
-    masks: the user's; None to find them.
-    """
+    """The pycolmap.Reconstruction; writes masks of what moves. masks: the user's; None to find them."""
     names = [picture.name for picture in pictures]
     size = check_image(folder / IMAGES / names[0], whole=False).size
     given = None if masks is None else read_masks(masks, names, size)
@@ -102,13 +98,11 @@ def _moving_camera(film: Film, folder: Path, pictures: Sequence[Picture], masks:
         say(f"{masks}: {1 - after / max(before, 1):.0%} of the matches are masked.")
         source.use(rest)
     found = search(source, size)
-    _check_standing(found, size)
-    if found is not None and given is None:
+    found = _checked(source, found, size)
+    if given is None:
         motion = Motion(film_frames(film, pictures), len(pictures))
         found, given = _without_movers(source, found, motion, matches, size)
-    if found is None:
-        return None
-    write_masks(folder / MASKS, given or {})
+    write_masks(folder / MASKS, given)
     if found.pan is not None:
         say(
             f"the camera turns on the spot: turning alone explains {found.pan.explained:.0%} of what several images "
@@ -145,33 +139,55 @@ def _without_movers(
     if seen.followed < FOLLOWED:
         say(
             f"what moves could not be looked for in {1 - seen.followed:.0%} of the image area, where nothing could be "
-            "followed from image to image: its masks have holes there; film slower or with more light."
+            "followed from image to image: no mask covers that; film slower or with more light."
         )
     if seen.moving > LITTLE:
         say(f"{seen.moving:.1%} of the image area moves: masked, and the cameras are placed again.")
-        other = again(source, found, without(matches, source.places, seen.rough(source.names), size), size)
+        other = again(source, found, matches, seen.rough(source.names), size)
         kept = other is not None and len(other.placed) >= len(found.placed) and len(other.faults) <= len(found.faults)
         if other is not None and kept:  # else the masks took too much
             found, seen = other, judge(motion, source.names, other.model)
-    return found, cut_out(motion, source.names, seen)
+    return found, cut_out(motion, source.names, seen) if seen.followed > UNKNOWN else {}
 
 
-def _check_standing(found: Found | None, size: Size) -> None:
-    """Raises InputError for a camera that neither walks nor turns."""
-    if found is not None and found.pan is not None and found.pan.travel < STANDING * max(size):
+def _checked(source: Reconstruction, found: Found | None, size: Size) -> Found:
+    """Raises InputError where too few images have a pose, and for a camera that neither walks nor turns."""
+    placed, least = len(found.placed) if found else 0, max(2, round(FEWEST * len(source.names)))
+    if found is None or placed < least:
+        features = int(np.median([len(places) for places in source.places.values()]))
+        verified = source.verified()
+        shared = int(np.median([len(verified.get(pair, ())) for pair in itertools.pairwise(source.names)]))
+        advice = "film more of what stands still, or mask what moves (--masks)"
+        if features < FEATURES:
+            advice = "film something with more texture, in focus and with more light"
+        elif shared < SHARED:
+            advice = "film slower, so that an image shows most of what the one before it shows"
+        raise InputError(
+            f"{placed} of {len(source.names)} images could be placed (at least {least} are needed): an image has "
+            f"{features} features, of which {shared} fit the next image (medians); {advice}."
+        )
+    if found.pan is not None and found.pan.travel < STANDING * max(size):
         raise InputError(
             f"the camera stands still: its image moves by {found.pan.travel:.1f} pixels over the film (at least "
             f"{STANDING * max(size):.1f} are needed), so nothing tells how far away anything is; walk around what "
             "moves, or film it with several cameras at once."
         )
+    return found
 
 
 def _still_cameras(images: Path, cameras: Sequence[Sequence[Picture]], fps: float, work: Path) -> Any:
-    """Compare all cameras at several times. Returns the pycolmap.Reconstruction, None where nothing fits together."""
+    """Compare all cameras at several times. Returns the pycolmap.Reconstruction. Raises InputError."""
     times = [[picture.name for picture in each] for each in common_times(cameras, fps, TIMES)]
     groups = list(zip(*times, strict=True))  # of each camera
     names = [name for group in groups for name in group]
     source = Reconstruction(images, names, work, FEW_CAMERAS_LENS)
     pairs = [pair for names in times for pair in itertools.combinations(names, 2)]
     matches = source.match(pairs, source.find_features())
-    return merged(source, matches, groups, work / "merged").solve()
+    model = merged(source, matches, groups, work / "merged").solve()
+    placed, least = 0 if model is None else model.num_reg_images(), max(2, len(groups) // 2)
+    if placed < least:
+        raise InputError(
+            f"{placed} of {len(groups)} cameras could be placed (at least {least} are needed): put them closer "
+            "together, so that neighbours show the same things from sides that differ by less than 30 degrees."
+        )
+    return model

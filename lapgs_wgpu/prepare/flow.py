@@ -7,13 +7,12 @@ chained from image to image. A place is lost where the flow forth and back do no
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.data.images import Pixels, shrunk_size
+from lapgs_wgpu.data.images import Pixels
 from lapgs_wgpu.prepare.film import Film
 from lapgs_wgpu.prepare.images import Picture
 from lapgs_wgpu.prepare.poses import import_cv2
@@ -110,12 +109,3 @@ def film_frames(film: Film, pictures: Sequence[Picture]) -> Iterator[tuple[Pixel
         number += chosen
         if number == len(times):
             return
-
-
-def image_frames(paths: Sequence[Path]) -> Iterator[tuple[Pixels, bool]]:
-    """Images that are no film, shrunk."""
-    from PIL import Image
-
-    for path in paths:
-        with Image.open(path) as image:
-            yield np.array(image.convert("RGB").resize(shrunk_size(image.size, SIDE))), True

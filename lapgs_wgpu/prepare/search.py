@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from PIL import Image
 
 from lapgs_wgpu.data.images import Size
+from lapgs_wgpu.prepare.masks import Mask
 from lapgs_wgpu.prepare.measures import path_faults
+from lapgs_wgpu.prepare.movers import without
 from lapgs_wgpu.prepare.pan import RADIUS, Pan, rays, solve_pan
 from lapgs_wgpu.prepare.poses import Match, Reconstruction
 from lapgs_wgpu.progress import say
@@ -62,7 +64,12 @@ def search(source: Reconstruction, size: Size) -> Found | None:
             best = found
         if best is not None and _good(source, best, size):
             break
-        say(f"{_text(source, found)}; at most {max(end - time.monotonic(), 0):.0f} s more to look for better ones")
+        if found is not None:
+            more = f"{len(found.faults)} faults of the path; " * bool(found.faults)
+            say(
+                f"{len(found.placed)} of {len(source.names)} cameras placed, {found.error:.2f} pixels off; {more}"
+                f"looking for better ones for at most {max(end - time.monotonic(), 0):.0f} s more"
+            )
     short = best is None or len(best.placed) < GOOD * len(source.names)
     if pan is not None and short and pan.explained >= NEARLY:
         return panned(source, pan, size)
@@ -104,12 +111,13 @@ def panned(source: Reconstruction, pan: Pan, size: Size) -> Found:
     return Found(model, pan.names, (), 0.0, pan.focal, pan)
 
 
-def again(source: Reconstruction, found: Found, matches: Match, size: Size) -> Found | None:
-    """The same search with other matches, from where it ended."""
-    source.use(matches)
+def again(source: Reconstruction, found: Found, matches: Match, masks: Mapping[str, Mask], size: Size) -> Found | None:
+    """The cameras without what masks cover, from where the search ended. matches: all of them."""
     if found.pan is not None:
-        pan = solve_pan(source.names, source.places, source.verified(), size, found.pan.focal)
+        rest = without(source.verified(), source.places, masks, size)
+        pan = solve_pan(source.names, source.places, rest, size, found.pan.focal)
         return None if pan is None else panned(source, pan, size)
+    source.use(without(matches, source.places, masks, size))
     seconds = SECONDS + SECONDS_EACH * len(source.names)
     return solved(source, found.focal, together=found.together, seconds=seconds)
 
@@ -121,13 +129,6 @@ def _good(source: Reconstruction, found: Found, size: Size) -> bool:
 
 def _rank(source: Reconstruction, found: Found) -> tuple[float, float, float]:
     return round(20 * len(found.placed) / len(source.names)), -float(len(found.faults)), -found.error
-
-
-def _text(source: Reconstruction, found: Found | None) -> str:
-    if found is None:
-        return "no cameras explain the images so far"
-    faults = f", {len(found.faults)} faults of the path" if found.faults else ""
-    return f"{len(found.placed)} of {len(source.names)} cameras placed, {found.error:.2f} pixels off{faults}"
 
 
 def longest_part(names: Sequence[str], placed: Sequence[str], gap: int) -> tuple[str, ...]:
