@@ -31,6 +31,7 @@ NEAR = 0.5  # times the depth of the nearest points of the scene: nothing is nea
 FEWEST = 2  # images around one, in which a place must be followed
 VOTES = 4  # images to either side that vote
 MOVES = 5.0  # times the noise, at least: it moves
+HALO = 1.5  # times the error that parts what moves from the rest: flow bends around what moves
 SHARP = 2.5  # times the noise of the better of two reconstructions: it agrees
 LITTLE = 0.002  # share of an image: a smaller mask is noise
 AROUND, INSIDE = 10, 5  # pixels around what moves, where colors decide; within it, where they do not
@@ -75,7 +76,7 @@ def judge(motion: Motion, names: Sequence[str], model: Any) -> Judged:
     errors, noise = unexplained(motion, names, model)
     votes = _votes(motion, errors)
     known = np.concatenate([vote[np.isfinite(vote)] for vote in votes])
-    return Judged(errors, votes, max(float(np.log(MOVES)), _valley(known[known > np.log(1.5)])), noise)
+    return Judged(errors, votes, max(float(np.log(MOVES)), np.log(HALO) + _valley(known[known > np.log(1.5)])), noise)
 
 
 def cut_out(motion: Motion, names: Sequence[str], judged: Judged) -> dict[str, Mask]:

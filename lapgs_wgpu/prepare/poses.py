@@ -17,7 +17,7 @@ from lapgs_wgpu.progress import Progress
 
 FEATURE_SIDE = 1600  # longer side, pixels: larger images are shrunk to find features
 MOST_FEATURES = 2000  # of an image, the strongest; the time of matching grows with their square
-RATIO, LIKE = 0.85, 0.7  # of the distances of the best and the second match; cosine of two descriptors, at least
+RATIO, LIKE = 0.9, 0.7  # of the distances of the best and the second match; cosine of two descriptors, at least
 NEIGHBOURS = 6  # an image is matched with so many after it, then with ever more distant ones, each further by GROWTH
 GROWTH = 1.5
 LEAST_ANGLE = 0.5  # degrees between the rays of a point
@@ -135,10 +135,10 @@ class Reconstruction:
             options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = SEED
             options.min_model_size = FEWEST_IMAGES
             options.max_runtime_seconds = round(seconds)
-            # COLMAP's limits are for photos from all around; a film has many images from nearly one side.
-            options.mapper.init_min_tri_angle, options.mapper.ba_local_min_tri_angle = 4, 2
-            options.mapper.filter_min_tri_angle = options.triangulation.min_angle = LEAST_ANGLE
-            options.ba_global_max_refinements, options.ba_local_max_refinements = 2, 1
+            if focal is not None:  # a film: many images from nearly one side, where COLMAP's limits are for photos
+                options.mapper.init_min_tri_angle, options.mapper.ba_local_min_tri_angle = 4, 2
+                options.mapper.filter_min_tri_angle = options.triangulation.min_angle = LEAST_ANGLE
+                options.ba_global_max_refinements, options.ba_local_max_refinements = 2, 1
             found = colmap.incremental_mapping(self._database, self.images, folder, options)
         return max(found.values(), key=lambda model: model.num_reg_images(), default=None)
 
