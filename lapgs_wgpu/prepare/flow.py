@@ -83,7 +83,7 @@ class Motion:
 
     def on_grid(self, values: Plane, at: Plane) -> Plane:
         """Values (rows, columns) of a grid at places (rows, columns, 2) in pixels; NaN outside."""
-        return self._at(values, (at - STEP // 2) / STEP)
+        return self._at(values, ((at - STEP // 2) / STEP).astype(np.float32))
 
     def _at(self, values: Plane, at: Plane) -> Plane:
         cv2 = self._cv2
