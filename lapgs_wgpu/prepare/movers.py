@@ -90,7 +90,7 @@ def unexplained(motion: Motion, names: Sequence[str], model: Any) -> tuple[list[
     noise between neighbouring images, pixels."""
     placed = {model.image(i).name: model.image(i) for i in model.reg_image_ids()}
     images = [placed.get(name) for name in names]
-    poses = [None if image is None else image.cam_from_world().matrix() for image in images]
+    poses: list[Any] = [None if image is None else image.cam_from_world().matrix() for image in images]
     points = np.stack([point.xyz for point in model.points3D.values()])
     depths = [points @ pose[2, :3] + pose[2, 3] for pose in poses[:: max(1, len(poses) // 20)] if pose is not None]
     nearest = float(np.median([np.percentile(depth[depth > 0], 5) for depth in depths if (depth > 0).any()] or [1.0]))
@@ -120,7 +120,7 @@ def unexplained(motion: Motion, names: Sequence[str], model: Any) -> tuple[list[
         for k, error in zip(offsets, each, strict=True):
             samples[abs(k)].append(error[np.isfinite(error)])
     low = [float(np.percentile(np.concatenate(s), QUARTER)) if sum(map(len, s)) else 0.0 for s in samples]
-    noise = np.maximum(least, MEDIAN * np.array(low))
+    noise: Floats = np.maximum(least, MEDIAN * np.array(low))
     planes = [errors(i, noise)[0].reshape(motion.grid.shape[:2]).astype(np.float32) for i in range(len(names))]
     return planes, float(noise[1])
 
@@ -137,7 +137,7 @@ def depth_errors(
     deep = np.concatenate([ray, np.ones((len(ray), 1))], axis=1)
     far = np.stack([deep @ R.T for R, _ in relative])  # of a point at infinity
     move = np.stack([t for _, t in relative])[:, None]
-    known = np.isfinite(seen).all(axis=2)
+    known: Mask = np.asarray(np.isfinite(seen).all(axis=2))
     seen = np.where(known[..., None], seen, 0.0)
     a = move[..., :2] - seen * move[..., 2:]  # b + inverse depth * a = 0, up to depth
     b = far[..., :2] - seen * far[..., 2:]

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lapgs_wgpu.data.images import Size
 from lapgs_wgpu.prepare.measures import Floats
@@ -57,7 +58,9 @@ class Pan:
 class _Sample:
     """Matches: image numbers (m,) and places (m, 2) in pixels from the middle of the image."""
 
-    def __init__(self, names: Sequence[str], places: Mapping[str, Floats], matches: Match, size: Size) -> None:
+    def __init__(
+        self, names: Sequence[str], places: Mapping[str, NDArray[np.floating]], matches: Match, size: Size
+    ) -> None:
         number = {name: i for i, name in enumerate(names)}
         rng, middle = np.random.default_rng(0), np.array(size) / 2
         chosen = {pair: m[rng.permutation(len(m))[:MATCHES]].astype(np.int64) for pair, m in matches.items() if len(m)}
@@ -69,7 +72,7 @@ class _Sample:
 
 
 def solve_pan(
-    names: Sequence[str], places: Mapping[str, Floats], matches: Match, size: Size, focal: float
+    names: Sequence[str], places: Mapping[str, NDArray[np.floating]], matches: Match, size: Size, focal: float
 ) -> Pan | None:
     """The rotations that explain most matches, None where images share none. focal: a first guess, pixels.
 
