@@ -120,7 +120,7 @@ def unexplained(motion: Motion, names: Sequence[str], model: Any) -> tuple[list[
         for k, error in zip(offsets, each, strict=True):
             samples[abs(k)].append(error[np.isfinite(error)])
     low = [float(np.percentile(np.concatenate(s), QUARTER)) if sum(map(len, s)) else 0.0 for s in samples]
-    noise = np.maximum(least, MEDIAN * np.array(low)).astype(np.float64)
+    noise = np.asarray(np.maximum(least, MEDIAN * np.array(low)), np.float64)
     planes = [errors(i, noise)[0].reshape(motion.grid.shape[:2]).astype(np.float32) for i in range(len(names))]
     return planes, float(noise[1])
 
