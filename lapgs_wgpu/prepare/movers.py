@@ -103,7 +103,7 @@ def unexplained(motion: Motion, names: Sequence[str], model: Any) -> tuple[list[
         seen = np.asarray(camera.cam_from_img((flat + 0.5) * scale))
         return np.where(np.isfinite(at.reshape(-1, 2)), seen, np.nan)
 
-    def errors(i: int, noise: Floats) -> tuple[Floats, list[int], Floats]:
+    def errors(i: int, noise: NDArray[np.floating]) -> tuple[Floats, list[int], Floats]:
         tracks = {k: at for k, at in motion.tracks(i).items() if poses[i + k] is not None}
         if poses[i] is None or len(tracks) < FEWEST:
             return np.full(motion.grid.shape[0] * motion.grid.shape[1], np.nan), [], np.zeros((0, 0))
@@ -120,7 +120,7 @@ def unexplained(motion: Motion, names: Sequence[str], model: Any) -> tuple[list[
         for k, error in zip(offsets, each, strict=True):
             samples[abs(k)].append(error[np.isfinite(error)])
     low = [float(np.percentile(np.concatenate(s), QUARTER)) if sum(map(len, s)) else 0.0 for s in samples]
-    noise = np.asarray(np.maximum(least, MEDIAN * np.array(low)), np.float64)
+    noise = np.maximum(least, MEDIAN * np.array(low))
     planes = [errors(i, noise)[0].reshape(motion.grid.shape[:2]).astype(np.float32) for i in range(len(names))]
     return planes, float(noise[1])
 
