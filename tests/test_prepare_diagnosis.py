@@ -168,7 +168,7 @@ def test_the_report_needs_no_other_file(pictures, tmp_path: Path) -> None:
     assert len(re.findall(r'<circle cx="[\d.]+" cy="[\d.]+" r="3"/>', page)) == COUNT
     assert not re.findall(r'(?:src|href)="(?!data:)', page)
     assert "what moves in red" in page
-    for name in ("parallax", "moving share", "coverage", "blur", "exposure"):
+    for name in ("parallax", "path", "moving share", "coverage", "blur", "exposure"):
         assert f"<td>{name}</td>" in page
 
 
@@ -178,7 +178,7 @@ def test_check_prints_and_writes(pictures, tmp_path: Path, capsys: pytest.Captur
     for _ in range(2):  # the page of an earlier run is replaced
         assert prepare_command(["--check", str(folder)]) == 0
         said = capsys.readouterr()
-        assert said.out.count("(wanted: ") == 5
+        assert said.out.count("(wanted: ") == 6
         assert "note: " not in said.err
     (folder / "report.html").write_text("<title>mine</title>")
     assert prepare_command(["--check", str(folder)]) == 0

@@ -14,11 +14,13 @@ from PIL import Image
 from lapgs_wgpu.data.images import encode_png
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.prepare.capture import prepare
+from lapgs_wgpu.prepare.flow import Motion
 from lapgs_wgpu.prepare.masks import read_masks
-from lapgs_wgpu.prepare.movers import Tracks, agreement, in_mask, rim, standing_share, track_errors
+from lapgs_wgpu.prepare.movers import depth_errors, in_mask, rim, without
 
 pycolmap = pytest.importorskip("pycolmap")
 pytest.importorskip("av")
+pytest.importorskip("cv2")
 
 COUNT, SIZE = 16, (240, 180)
 
@@ -81,72 +83,91 @@ def test_a_camera_that_stands_still(tmp_path: Path) -> None:
     assert [child.name for child in tmp_path.iterdir()] == ["film.mp4"]
 
 
-def test_features_that_stay_in_their_place() -> None:
-    """Of 4 tracks through 6 images, one stays, one stays too shortly, one drifts, one walks."""
-    tracks = Tracks(
-        tuple("012345"),
-        np.array([*range(6), 0, 1, *range(6), *range(6)]),
-        np.array([*[[50.0, 50]] * 6, *[[9.0, 9]] * 2, *([v * i, 9] for v in (0.5, 9.0) for i in range(6))]),
-        np.array([0, 6, 8, 14]),
-    )  # fmt: skip
-    assert standing_share(tracks, (320, 240)) == 0.25
-    assert standing_share(tracks, (1920, 1440)) == 0.5  # where 2.5 pixels are little
-    nothing = Tracks((), np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, np.int64))
-    assert standing_share(nothing, (320, 240)) == 0.0
-    assert standing_share(synthetic(0.0)[0], (320, 240)) < 0.1  # of a camera that walks
+# Errors of ways
 
 
-def synthetic(noise: float) -> tuple[Tracks, object]:
-    """Tracks of 30 still points and 20 that move up, in 6 images; and the true cameras as a reconstruction."""
-    rng = np.random.default_rng(0)
-    cameras = walk(6, 320, 240)
-    points = rng.uniform(-0.8, 0.8, (50, 3))
-    model = pycolmap.Reconstruction()
-    K = cameras[0].K
-    lens = pycolmap.Camera(
-        model="PINHOLE", width=320, height=240, params=[K[0, 0], K[1, 1], K[0, 2], K[1, 2]], camera_id=1
-    )
-    model.add_camera_with_trivial_rig(lens)
-    places = np.zeros((6, 50, 2))
+def seen_by(cameras: list, points: np.ndarray) -> np.ndarray:
+    """(k, n, 2) directions of points (n, 3), or of (k, n, 3) that move."""
+    found = []
     for i, camera in enumerate(cameras):
-        pose = pycolmap.Rigid3d(camera.T_cam_world[:3])
-        model.add_image_with_trivial_frame(pycolmap.Image(name=f"{i}.png", camera_id=1, image_id=i + 1), pose)
-        moved = points + np.where(np.arange(50) < 30, 0, 0.06 * i)[:, None] * [0, 0, 1]
-        seen = moved @ camera.T_cam_world[:3, :3].T + camera.T_cam_world[:3, 3]
-        places[i] = seen[:, :2] / seen[:, 2:] * [K[0, 0], K[1, 1]] + [K[0, 2], K[1, 2]]
-    places += noise * rng.normal(size=places.shape)
-    names = tuple(f"{i}.png" for i in range(6))
-    return Tracks(names, np.tile(np.arange(6), 50), places.transpose(1, 0, 2).reshape(-1, 2), 6 * np.arange(50)), model
+        at = (points if points.ndim == 2 else points[i]) @ camera.T_cam_world[:3, :3].T + camera.T_cam_world[:3, 3]
+        found.append(at[:, :2] / at[:, 2:])
+    return np.stack(found)
 
 
-def test_errors_of_tracks() -> None:
-    tracks, model = synthetic(0.0)
-    found = track_errors(tracks, model)
-    assert found[:30].max() < 1e-6
-    assert found[30:].min() > 1.0
-    noisy = track_errors(synthetic(0.3)[0], model)
-    assert noisy[:30].max() < 1.0
+def relative(cameras: list) -> list:
+    first = cameras[0].T_cam_world
+    pairs = []
+    for camera in cameras[1:]:
+        R = camera.T_cam_world[:3, :3] @ first[:3, :3].T
+        pairs.append((R, camera.T_cam_world[:3, 3] - R @ first[:3, 3]))
+    return pairs
 
 
-def test_places_are_masked_by_the_features_around_them() -> None:
-    """Tracks of one image: on the left all still, on the right all moving, but for one in each half."""
-    rng = np.random.default_rng(1)
-    places = rng.uniform([0, 0], [320, 240], (400, 2))
-    right = places[:, 0] > 160
-    errors = np.where(right, 5.0, 0.2)
-    errors[np.flatnonzero(right)[0]], errors[np.flatnonzero(~right)[0]] = 0.2, 5.0
-    tracks = Tracks(("0.png",), np.zeros(400, np.int64), places, np.arange(400))
-    still, moving = (masks["0.png"] for masks in agreement(tracks, errors, (320, 240), 1.0))
-    assert not (still & moving).any()
-    assert still[:, 5:70].mean() > 0.9
-    assert moving[:, 90:155].mean() > 0.9
-    errors[:] = np.nan
-    assert not any(masks["0.png"].any() for masks in agreement(tracks, errors, (320, 240), 1.0))
+def test_still_points_are_explained_and_others_are_not() -> None:
+    rng = np.random.default_rng(0)
+    cameras = walk(12, 320, 240)[:5]
+    points = rng.uniform(-0.8, 0.8, (50, 3))
+    lift = np.where(np.arange(50) < 30, 0, 0.05) * np.arange(5)[:, None]  # the last 20 go up
+    moved = points + lift[..., None] * [0, 0, 1]
+    seen = seen_by(cameras, moved) + rng.normal(size=(5, 50, 2)) * 1e-4
+    seen[2, 0] = np.nan  # lost in one image, and in all but one
+    seen[1:4, 1] = np.nan
+    total, each = depth_errors(seen[0], seen[1:], relative(cameras), np.full(4, 2e-4), 1.0)
+    assert np.isnan(total[1])
+    assert np.isnan(each[1, 0])
+    assert np.nanmax(total[:30]) < 2
+    assert total[30:].min() > 10
 
 
-def test_places_in_masks_of_another_size() -> None:
-    mask = rim((320, 240))
-    assert mask.shape == (120, 160)
+def test_what_is_nearer_than_the_scene_or_behind_infinity_is_not_explained() -> None:
+    """What goes along with a camera that walks sideways lies on each epipolar line, but at no depth there is."""
+    cameras = walk(12, 320, 240)[:5]
+    points = np.random.default_rng(1).uniform(-0.8, 0.8, (20, 3))
+    seen = seen_by(cameras, points)
+    pairs, sigma = relative(cameras), np.full(4, 2e-4)
+    assert depth_errors(seen[0], seen[1:], pairs, sigma, 1.0)[0].max() < 0.1
+    assert depth_errors(seen[0], seen[1:], pairs, sigma, 0.05)[0].min() > 5, "all is nearer than allowed"
+    away = [(R, -t) for R, t in pairs]
+    assert depth_errors(seen[0], seen[1:], away, sigma, 1.0)[0].min() > 5, "all is behind infinity"
+
+
+def test_a_camera_that_turns_needs_no_depth() -> None:
+    rng = np.random.default_rng(2)
+    ray = rng.uniform(-0.3, 0.3, (30, 2))
+    pairs, seen = [], []
+    for turn in (0.02, 0.05, 0.09):
+        R = np.array([[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]])
+        at = np.column_stack([ray, np.ones(30)]) @ R.T
+        pairs.append((R, np.zeros(3)))
+        seen.append(at[:, :2] / at[:, 2:] + np.where(np.arange(30) < 20, 0, turn / 4)[:, None])
+    total, _ = depth_errors(ray, np.stack(seen), pairs, np.full(3, 5e-4), 1.0)
+    assert total[:20].max() < 1e-6
+    assert total[20:].min() > 5
+
+
+def test_places_are_followed_and_lost() -> None:
+    """A texture that wanders by 3 pixels an image, and out of it on the left."""
+    rng = np.random.default_rng(3)
+    wide = np.asarray(Image.fromarray(rng.integers(0, 255, (40, 60, 3), dtype=np.uint8)).resize((180, 120)))
+    images = [np.ascontiguousarray(wide[:, 3 * i : 3 * i + 160]) for i in range(5)]
+    motion = Motion([(image, True) for image in images], 5)
+    way = motion.tracks(0)[4] - motion.grid
+    inside = (slice(3, 8), slice(4, 12))
+    assert np.abs(way[inside] - [-12, 0]).max() < 0.7
+    assert np.isnan(way[:, :2]).all()
+    assert np.isfinite(way[:, 4:]).mean() > 0.9
+    assert sorted(motion.tracks(3)) == [-3, -2, -1, 1]
+    half = Motion([(image, i % 2 == 0) for i, image in enumerate(images)], 3)  # two steps from one to the next
+    assert np.abs((half.tracks(0)[2] - half.grid)[inside] - [-12, 0]).max() < 0.7
+
+
+def test_matches_without_masked_features() -> None:
+    mask = rim()
+    size = (320, 240)
     places = np.array([[160.0, 120.0], [5.0, 5.0], [319.9, 239.9]])
-    assert in_mask(mask, places, (320, 240)).tolist() == [True, False, False]
-    assert in_mask(None, places, (320, 240)).tolist() == [False] * 3
+    assert in_mask(mask, places, size).tolist() == [True, False, False]
+    assert in_mask(None, places, size).tolist() == [False] * 3
+    matches = {("a", "b"): np.array([[0, 1], [1, 1], [2, 0]])}
+    found = without(matches, {"a": places, "b": places}, {"a": mask}, size)
+    assert found["a", "b"].tolist() == [[1, 1], [2, 0]]

@@ -26,6 +26,7 @@ from lapgs_wgpu.prepare.measures import (
     gray,
     moving_share,
     parallax,
+    path,
 )
 from lapgs_wgpu.progress import Progress
 from lapgs_wgpu.splat.camera import Camera
@@ -66,6 +67,7 @@ def diagnose(folder: Path) -> Diagnosis:
     points = _points(dataset)
     measures = [
         parallax(cameras, points),
+        *([] if still else [path(views, points)]),
         moving_share(looks),
         coverage_of_still(looks) if still else coverage_of_moving(cameras, points),
         blur_measure(looks),

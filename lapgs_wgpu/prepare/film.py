@@ -55,7 +55,7 @@ class Film:
     """A film whose header was checked.
 
     size: (width, height) of the upright frames, in pixels that are square. seconds: length as the header states it, 0
-    if it does not.
+    if it does not. rate: frames a second, about.
     notes: what the user should know of the file, one sentence each; `frames` adds to them while it decodes.
     """
 
@@ -76,6 +76,7 @@ class Film:
                 coded = (int(stream.width), int(stream.height))
                 self._aspect = pixel_aspect(stream)
                 self.seconds = _seconds(stream, file)
+                self.rate = float(stream.average_rate or stream.guessed_rate or 30.0)
         except (av.error.FFmpegError, OSError) as error:
             raise InputError(f"{path} is not a readable film ({error}); copy or record it again.") from None
         if min(coded) < 1 or coded[0] * coded[1] > LARGEST_FRAME:
@@ -88,13 +89,12 @@ class Film:
         """Decode the frames in the order of their times. Raises InputError; a film that is damaged after its first
         frames ends there, with a note."""
         av = import_av(self.path)
-        number, first, last, guessed, rate = 0, 0.0, -1.0, False, 30.0
+        number, first, last, guessed, rate = 0, 0.0, -1.0, False, self.rate
         try:
             with av.open(str(self.path), metadata_errors="replace") as file:
                 stream = self._stream(file)
                 stream.thread_type = "AUTO"
                 stream.codec_context.options = {"max_pixels": str(LARGEST_FRAME)}  # whatever the header states
-                rate = float(stream.average_rate or stream.guessed_rate or rate)
                 for frame in file.decode(stream):
                     shape = display(frame)
                     shown = _squared((frame.width, frame.height), self._aspect)

@@ -19,6 +19,7 @@ from lapgs_wgpu.progress import Progress, say
 
 FRAMES_PER_SECOND = 10.0  # of one moving camera: poses change slowly
 STILL_FRAMES_PER_SECOND = 30.0  # of cameras on tripods, which need one pose for all their frames
+LEAST_IMAGES = 60  # of one moving camera, where the film has so many frames
 MOST_IMAGES = 300  # of a film, unless --fps asks for more
 LONGER_SIDE = 1920  # pixels: larger frames are shrunk
 BLACK = 6.0  # levels of 255: the mean of a black image
@@ -36,7 +37,10 @@ def images_per_second(films: Sequence[Film], asked: float | None) -> float:
     """As asked, else so many that the shortest film gives at most MOST_IMAGES: several films have one rate."""
     if asked is not None:
         return asked
-    usual = STILL_FRAMES_PER_SECOND if len(films) > 1 else FRAMES_PER_SECOND
+    usual = STILL_FRAMES_PER_SECOND
+    if len(films) == 1:  # a short film gives more, each one of the same number of frames
+        frames = films[0].rate * films[0].seconds
+        usual = max(FRAMES_PER_SECOND, films[0].rate / max(1, math.ceil(frames / LEAST_IMAGES - 1e-6)))
     return min(usual, MOST_IMAGES / max(min(film.seconds for film in films), 1e-3))
 
 

@@ -25,6 +25,8 @@ LITTLE, MUCH = 0.01, 0.5  # share of the images that moves
 SEEN = 0.002  # share of an image that moves, from which on it shows something that does
 BLUR = 0.45  # Crete et al.'s measure, of images of 320 pixels
 STOPS = 0.3  # of exposure, between the darkest and the brightest images
+STEP, TURN = 8.0, 8.0  # of a path: largest step and turn over their medians
+FEWEST_OF_PATH, NAMED = 8, 3  # images whose path is judged; faults that are named
 POINTS_SEEN = 30  # in an image whose exposure is measured
 
 Floats = NDArray[np.float64]
@@ -90,6 +92,52 @@ def parallax(cameras: Sequence[Camera], points: Floats) -> Measure:
         f"{PARALLAX:g} or more",
         degrees >= PARALLAX,
         "walk around what moves instead of turning on the spot, or put the cameras further apart: depth is a guess",
+    )
+
+
+def path_faults(places: Floats, axes: Floats, points: Floats) -> list[tuple[str, int]]:
+    """What a hand-held camera does not do, with the number of the image at which it does.
+
+    places, axes: (n, 3) of the cameras and where they look, in the order of time. points: (N, 3) of the scene. Steps
+    that are small beside the scene's distance are noise, of a camera that turns or stands.
+    """
+    if len(places) < FEWEST_OF_PATH:
+        return []
+    steps = np.diff(places, axis=0)
+    length = np.linalg.norm(steps, axis=1)
+    away = float(np.median(np.linalg.norm(points - np.median(places, axis=0), axis=1)))
+    usual = max(float(np.median(length)), 1e-3 * away)
+    turns = np.degrees(np.arccos(np.clip((axes[1:] * axes[:-1]).sum(axis=1), -1, 1)))
+    turn = max(float(np.median(turns)), 0.5)
+    cosine = (steps[1:] * steps[:-1]).sum(axis=1) / np.maximum(length[1:] * length[:-1], 1e-12)
+    back = (cosine < -0.5) & (np.minimum(length[1:], length[:-1]) > max(usual, 1e-2 * away))
+    still = length < 0.02 * float(np.median(length))
+    faults = [(f"a step of {length[i] / usual:.0f} times the usual one", i + 1) for i in _above(length, STEP * usual)]
+    faults += [(f"a turn of {turns[i]:.0f} degrees", i + 1) for i in _above(turns, TURN * turn)]
+    faults += [("the path doubles back", int(i) + 1) for i in np.flatnonzero(back)]
+    long = max(3, len(still) // 10)
+    stalls = [i for i in range(len(still) - long + 1) if still[i : i + long].all()][:1]
+    return faults + [("the path stalls", i) for i in stalls]
+
+
+def _above(values: Floats, limit: float) -> list[int]:
+    return [int(i) for i in np.flatnonzero(values > limit)]
+
+
+def path(views: Sequence[View], points: Floats) -> Measure:
+    """Of a camera that moves: whether its path is one that a hand can walk."""
+    places = np.stack([view.camera.position for view in views])
+    axes = np.stack([view.camera.T_cam_world[2, :3] for view in views])
+    faults = path_faults(places, axes, points)
+    named = ", ".join(f"{what} at {Path(views[i].source).name}" for what, i in faults[:NAMED])
+    more = f" and {len(faults) - NAMED} more" if len(faults) > NAMED else ""
+    return Measure(
+        "path",
+        float(len(faults)),
+        f"{named}{more}" if faults else "smooth",
+        f"no step above {STEP:g} times the usual one, no turn above {TURN:g} times, no doubling back, no stall",
+        not faults,
+        "the cameras are likely wrong there: cut the film before and after these images, or film that part more slowly",
     )
 
 

@@ -1,244 +1,219 @@
-"""Masks of what moves, from the film itself: tracks of features that no single point explains, seen by the cameras.
+"""Masks of what moves: places that no still point explains, as the solved cameras and the film's flow say.
 
-A reconstruction follows whatever its features agree on most. That may be the thing that moves, if it is rich in
-texture and always in the image. So area decides: of what agrees with a reconstruction and what does not,
-the part that covers more of the images stands still. The rest is masked, and the cameras are solved again.
+A place that is followed through the images around it is explained if one depth, between near and infinity, puts a still
+point on its whole way, as exactly as the film's noise allows. So a camera that turns on the spot needs no depth, and
+one that walks leaves only what moves along the rays of its own path undecided. Neighbouring images vote, along the
+flow; colors then draw the border (GrabCut: Rother, Kolmogorov, Blake 2004).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.data.images import Size
-from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.prepare.flow import REACH, Motion, Plane
 from lapgs_wgpu.prepare.masks import Mask
 from lapgs_wgpu.prepare.measures import Floats
-from lapgs_wgpu.prepare.poses import Reconstruction, import_pycolmap
-from lapgs_wgpu.progress import say
+from lapgs_wgpu.prepare.poses import Match, import_cv2
 
-Ints = NDArray[np.int64]
+NOISE, NOISE_GROWS = 0.15, 0.05  # pixels of flow, at least: between neighbouring images; for each further one
+QUARTER, MEDIAN = (
+    25,
+    1.55,
+)  # percentile of the errors that tells the noise, as most may move; a median of noise beside it
+MOST = 30.0  # times the noise: larger errors are equal
+PASSES = 4  # of the robust fit of a depth
+NEAR = 0.5  # times the depth of the nearest points of the scene: nothing is nearer
+FEWEST = 2  # images around one, in which a place must be followed
+VOTES = 4  # images to either side that vote
+MOVES = 5.0  # times the noise, at least: it moves
+HALO = 1.5  # times the error that parts what moves from the rest: flow bends around what moves
+SHARP = 2.5  # times the noise of the better of two reconstructions: it agrees
+LITTLE = 0.002  # share of an image: a smaller mask is noise
+AROUND, INSIDE = 10, 5  # pixels around what moves, where colors decide; within it, where they do not
+CUTS = 2  # of GrabCut
+MIDDLE = 0.7  # of width and height, that a reconstruction of the rims leaves out
 
-SHORTEST = 5  # images of a track that counts: two images agree with almost any motion along their epipolar lines
-TOLERANCE, MIN_TOLERANCE = 2.5e-3, 1.0  # median reprojection error of a still track: of the longer side; pixels
-SHARP = 3.0  # times the error of what fits best: an error that is noise
-GRID = 160  # pixels along the longer side of a mask
-REACH = 0.025  # of the longer side: standard deviation of the weight with which features decide around them
-LEAST_WEIGHT = 0.2  # of the features around a place, in features next to it: emptier places are not masked
-MIDDLE = 0.7  # of width and height, that the second reconstruction leaves out
-LITTLE, MUCH = 0.01, 0.1  # share of the images: less motion needs no masks; more may have led the reconstruction astray
-LONG, STANDING = 0.5, 0.3  # a camera stands still: this share of the tracks stay in place for that share of the film
-BEHIND = 1e6  # pixels: error of a point behind its camera
 
+class Judged(NamedTuple):
+    """What a reconstruction does not explain. errors: (rows, columns) of the grid of each image, in times the noise,
+    NaN where nothing can be said. votes: the logarithms that neighbouring images agree on; above `limit` it moves.
+    noise: pixels, between neighbouring images."""
 
-class World(NamedTuple):
-    """What a reconstruction takes for still. model: a pycolmap.Reconstruction, None where nothing fits together.
-    errors: of all tracks. masks: of what moves, by image, (h, w)."""
-
-    model: Any
-    errors: Floats
-    masks: dict[str, Mask]
+    errors: list[Plane]
+    votes: list[Plane]
+    limit: float
+    noise: float
 
     @property
     def moving(self) -> float:
-        """Share of the images that moves."""
-        return float(np.mean([mask.mean() for mask in self.masks.values()]))
+        """Share of the images' area that moves."""
+        return float(np.mean([(vote > self.limit).mean() for vote in self.votes]))
 
     @property
-    def noise(self) -> float:
-        """Pixels: error of the tracks that fit well; infinite without tracks."""
-        known = self.errors[np.isfinite(self.errors)]
-        return float(np.percentile(known, 25)) if len(known) else np.inf
+    def followed(self) -> float:
+        """Share of the area, of the images with cameras, in which flow can tell."""
+        known = [np.isfinite(errors).mean() for errors in self.errors]
+        return float(np.mean([share for share in known if share] or [0.0]))
+
+    def still(self, noise: float) -> float:
+        """Share of the images' area that is explained up to SHARP times a noise in pixels."""
+        return float(np.mean([(errors * self.noise < SHARP * noise).mean() for errors in self.errors]))
+
+    def rough(self, names: Sequence[str]) -> dict[str, Mask]:
+        """Masks on the grid, a little wider than what moves."""
+        cv2 = import_cv2()
+        masks = [(vote > self.limit).astype(np.uint8) for vote in self.votes]
+        return {name: cv2.dilate(mask, np.ones((3, 3), np.uint8)) > 0 for name, mask in zip(names, masks, strict=True)}
 
 
-def solve_masked(matched: Reconstruction, size: Size) -> tuple[Any, dict[str, Mask]]:
-    """Place the cameras by what stands still. matched: with verified matches; size: (width, height) of its images.
-
-    Where much disagrees with a first reconstruction, a second one is made of the images' rims alone. The one that
-    explains more of the images' area tells what moves. Returns a pycolmap.Reconstruction, None where nothing fits
-    together, and the masks of what moves, by image. Raises InputError for a camera that stands still.
-    """
-    with matched.database() as database:
-        tracks = find_tracks(database)
-    standing = standing_share(tracks, size)
-    if standing > STANDING:
-        raise InputError(
-            f"the camera stands still: {standing:.0%} of the features that are followed stay within "
-            f"{tolerance(size):.1f} pixels for half of the film or longer (at most {STANDING:.0%} may), so nothing "
-            "tells how far away anything is; walk around what moves, or film it with several cameras at once."
-        )
-    best = _judged(matched.solve(), tracks, size)
-    if best.moving > MUCH:
-        say(f"{best.moving:.0%} of the image area disagrees with the first cameras: trying the images' rims alone.")
-        other = _judged(_without(matched, dict.fromkeys(matched.names, rim(size)), size, "rim"), tracks, size)
-        # What is nearly rigid fits a wrong reconstruction nearly: the better fit of the two sets the standard.
-        limit = SHARP * min(best.noise, other.noise)
-        best = max(best, other, key=lambda world: _still_area(tracks, world.errors, size, limit))
-    if best.moving < LITTLE:
-        return best.model, dict.fromkeys(matched.names, np.zeros_like(rim(size)))
-    say(f"{best.moving:.0%} of the image area moves: masked, and the cameras are placed again.")
-    again = _judged(_without(matched, best.masks, size, "masked"), tracks, size)
-    if again.model is None or again.model.num_reg_images() < best.model.num_reg_images():  # the masks took too much
-        again = best
-    return again.model, again.masks
+def judge(motion: Motion, names: Sequence[str], model: Any) -> Judged:
+    """names: of the images of the flow. model: a pycolmap.Reconstruction of some of them."""
+    errors, noise = unexplained(motion, names, model)
+    votes = _votes(motion, errors)
+    known = np.concatenate([vote[np.isfinite(vote)] for vote in votes])
+    return Judged(errors, votes, max(float(np.log(MOVES)), np.log(HALO) + _valley(known[known > np.log(1.5)])), noise)
 
 
-def _judged(model: Any, tracks: Tracks, size: Size) -> World:
-    errors = np.full(len(tracks), np.nan) if model is None or not len(tracks) else track_errors(tracks, model)
-    return World(model, errors, agreement(tracks, errors, size, tolerance(size))[1])
+def cut_out(motion: Motion, names: Sequence[str], judged: Judged) -> dict[str, Mask]:
+    """Masks of what moves (h, w), of the size of the flow's images."""
+    planes = zip(names, motion.images, judged.votes, strict=True)
+    return {name: _cut(image, vote, judged.limit) for name, image, vote in planes}
 
 
-def _still_area(tracks: Tracks, errors: Floats, size: Size, limit: float) -> float:
-    """Share of the images where tracks have errors below `limit` pixels."""
-    return float(np.mean([mask.mean() for mask in agreement(tracks, errors, size, limit)[0].values()]))
-
-
-def _without(matched: Reconstruction, masks: Mapping[str, Mask], size: Size, name: str) -> Any:
-    """The largest reconstruction without the matches in masked places."""
-    rest = matched.copy(matched.work / name)
-    with rest.database() as database:
-        remove_matches(database, masks, size)
-    rest.verify()
-    return rest.solve()
-
-
-@dataclass(frozen=True)
-class Tracks:
-    """Features that matches connect, each image at most once.
-
-    image, place: of each observation (n,) the image's number in `names`, and (n, 2) its pixels. starts: (T,) first
-    observation of each track.
-    """
-
-    names: tuple[str, ...]
-    image: Ints
-    place: Floats
-    starts: Ints
-
-    def __len__(self) -> int:
-        return len(self.starts)
-
-    @property
-    def track(self) -> Ints:
-        """(n,) the track of each observation."""
-        return np.repeat(np.arange(len(self)), np.diff(np.append(self.starts, len(self.image))))
-
-
-def find_tracks(database: Any) -> Tracks:
-    """The tracks of at least SHORTEST images in a database with verified matches."""
-    from scipy.sparse import coo_matrix  # slow to import
-    from scipy.sparse.csgraph import connected_components
-
-    colmap = import_pycolmap()
-    images = sorted(database.read_all_images(), key=lambda image: image.image_id)
-    keypoints = [database.read_keypoints(image.image_id)[:, :2].astype(np.float64) for image in images]
-    numbers = {image.image_id: number for number, image in enumerate(images)}
-    first = np.concatenate([[0], np.cumsum([len(each) for each in keypoints])])
-    edges = [np.zeros((0, 2), np.int64)]
-    for pair, geometry in zip(*database.read_two_view_geometries(), strict=True):
-        a, b = (numbers[i] for i in colmap.pair_id_to_image_pair(pair))
-        edges.append(geometry.inlier_matches.astype(np.int64).reshape(-1, 2) + np.array([first[a], first[b]]))
-    one, other = np.concatenate(edges).T
-    count = int(first[-1])
-    if count == 0:  # nothing but blank images
-        return Tracks(tuple(image.name for image in images), np.zeros(0, int), np.zeros((0, 2)), np.zeros(0, int))
-    _, labels = connected_components(
-        coo_matrix((np.ones(len(one)), (one, other)), shape=(count, count)), directed=False
-    )
-    image = np.repeat(np.arange(len(images)), np.diff(first))
-    order = np.lexsort((image, labels))
-    sizes = np.bincount(labels)[labels[order]]
-    twice = np.zeros(labels.max() + 1, bool)  # tracks with two features of one image hold a wrong match
-    same = (np.diff(labels[order]) == 0) & (np.diff(image[order]) == 0)
-    twice[labels[order][1:][same]] = True
-    order = order[(sizes >= SHORTEST) & ~twice[labels[order]]]
-    starts = np.flatnonzero(np.diff(labels[order], prepend=-1))
-    places = np.concatenate(keypoints) if keypoints else np.zeros((0, 2))
-    return Tracks(tuple(image.name for image in images), image[order], places[order], starts)
-
-
-def standing_share(tracks: Tracks, size: Size) -> float:
-    """Share of the tracks that stay in their place while LONG of the film passes. size: (width, height) of images."""
-    if len(tracks) == 0:
-        return 0.0
-    spread = np.zeros(len(tracks))
-    for column in tracks.place.T:
-        both = np.maximum.reduceat(column, tracks.starts) - np.minimum.reduceat(column, tracks.starts)
-        spread = np.maximum(spread, both)
-    last = np.append(tracks.starts[1:], len(tracks.image)) - 1
-    long = tracks.image[last] - tracks.image[tracks.starts] >= LONG * (len(tracks.names) - 1)
-    return float((long & (spread < tolerance(size))).mean())
-
-
-def track_errors(tracks: Tracks, model: Any) -> Floats:
-    """(T,) pixels: the median error of the point that a track's observations triangulate to. NaN for tracks of which
-    less than SHORTEST images have a camera in the pycolmap.Reconstruction."""
+def unexplained(motion: Motion, names: Sequence[str], model: Any) -> tuple[list[Plane], float]:
+    """For each image the error (rows, columns) of its grid, in times the noise, NaN where nothing can be said; and the
+    noise between neighbouring images, pixels."""
     placed = {model.image(i).name: model.image(i) for i in model.reg_image_ids()}
-    poses = np.stack([placed[n].cam_from_world().matrix() if n in placed else np.zeros((3, 4)) for n in tracks.names])
+    images = [placed.get(name) for name in names]
+    poses: list[Any] = [None if image is None else image.cam_from_world().matrix() for image in images]
+    points = np.stack([point.xyz for point in model.points3D.values()])
+    depths = [points @ pose[2, :3] + pose[2, 3] for pose in poses[:: max(1, len(poses) // 20)] if pose is not None]
+    nearest = float(np.median([np.percentile(depth[depth > 0], 5) for depth in depths if (depth > 0).any()] or [1.0]))
     camera = next(iter(placed.values())).camera
-    ray = np.asarray(camera.cam_from_img(tracks.place))
-    pose = poses[tracks.image]
-    rows = ray[:, :, None] * pose[:, 2:3] - pose[:, :2]  # of the linear triangulation; zeros where there is no camera
-    normal = np.add.reduceat(np.einsum("nki,nkj->nij", rows, rows), tracks.starts, axis=0)
-    point = np.linalg.eigh(np.where(np.isfinite(normal), normal, 0.0))[1][:, :, 0]
-    seen = np.einsum("nij,nj->ni", pose, point[tracks.track])
-    front = seen[:, 2] * point[tracks.track, 3] > 0
-    with np.errstate(divide="ignore", invalid="ignore"):
-        offset = np.where(front[:, None], seen[:, :2] / seen[:, 2:] - ray, BEHIND)
-    error = camera.mean_focal_length() * np.linalg.norm(offset, axis=1)
-    has_camera = np.array([name in placed for name in tracks.names])[tracks.image]
-    error[~has_camera] = np.nan
-    sizes = np.add.reduceat(has_camera.astype(np.int64), tracks.starts)
-    order = np.lexsort((error, tracks.track))  # NaN last
-    median = error[order][tracks.starts + np.maximum(sizes - 1, 0) // 2]
-    return np.where(sizes >= SHORTEST, median, np.nan)
+    scale = camera.width / motion.images[0].shape[1]
+    focal = camera.mean_focal_length() / scale
+
+    def directions(at: Plane) -> Floats:
+        flat = np.nan_to_num(at.reshape(-1, 2).astype(np.float64))
+        seen = np.asarray(camera.cam_from_img((flat + 0.5) * scale))
+        return np.where(np.isfinite(at.reshape(-1, 2)), seen, np.nan)
+
+    def errors(i: int, noise: NDArray[np.floating]) -> tuple[Floats, list[int], Floats]:
+        tracks = {k: at for k, at in motion.tracks(i).items() if poses[i + k] is not None}
+        if poses[i] is None or len(tracks) < FEWEST:
+            return np.full(motion.grid.shape[0] * motion.grid.shape[1], np.nan), [], np.zeros((0, 0))
+        relative = [_relative(poses[i], poses[i + k]) for k in tracks]
+        seen = np.stack([directions(at) for at in tracks.values()])
+        sigma = np.array([noise[abs(k)] for k in tracks]) / focal
+        total, each = depth_errors(directions(motion.grid), seen, relative, sigma, 1 / (NEAR * nearest))
+        return total, list(tracks), each * sigma[:, None] * focal
+
+    least = NOISE + NOISE_GROWS * np.arange(REACH + 1)
+    samples: list[list[Floats]] = [[np.zeros(0)] for _ in least]
+    for i in range(0, len(names), max(1, len(names) // 12)):
+        _, offsets, each = errors(i, least)
+        for k, error in zip(offsets, each, strict=True):
+            samples[abs(k)].append(error[np.isfinite(error)])
+    low = [float(np.percentile(np.concatenate(s), QUARTER)) if sum(map(len, s)) else 0.0 for s in samples]
+    noise = np.maximum(least, MEDIAN * np.array(low))
+    planes = [errors(i, noise)[0].reshape(motion.grid.shape[:2]).astype(np.float32) for i in range(len(names))]
+    return planes, float(noise[1])
 
 
-def agreement(tracks: Tracks, errors: Floats, size: Size, limit: float) -> tuple[dict[str, Mask], dict[str, Mask]]:
-    """Where most tracks agree with a reconstruction, and where most disagree, by image: masks (h, w) whose longer side
-    is GRID. errors: of `track_errors`; below `limit` pixels they agree. size: (width, height) of the images."""
-    from scipy.ndimage import binary_closing, binary_opening, gaussian_filter  # slow to import
+def depth_errors(
+    ray: Floats, seen: Floats, relative: Sequence[tuple[Floats, Floats]], sigma: Floats, most: float
+) -> tuple[Floats, Floats]:
+    """How far still points miss their ways: (n,) of all images together and (k, n) of each, in times the noise.
 
-    known = np.isfinite(errors)[tracks.track]
-    moves = (errors >= limit)[tracks.track]
-    scale = GRID / max(size)
-    shape = (max(1, round(size[1] * scale)), max(1, round(size[0] * scale)))
-    deviation = REACH * GRID
-    least = LEAST_WEIGHT / (2 * np.pi * deviation**2)
-    still, moving = {}, {}
-    for number, name in enumerate(tracks.names):
-        mine = known & (tracks.image == number)
-        column, row = np.clip((tracks.place[mine] * scale).astype(int), 0, [shape[1] - 1, shape[0] - 1]).T
-        weights = [np.zeros(shape), np.zeros(shape)]
-        np.add.at(weights[0], (row, column), 1.0)
-        np.add.at(weights[1], (row, column), moves[mine].astype(float))
-        total, against = (gaussian_filter(weight, deviation, mode="constant") for weight in weights)
-        covered = total > least
-        against_most = binary_closing(binary_opening(covered & (against > 0.5 * total), iterations=2), iterations=3)
-        moving[name], still[name] = against_most, covered & ~against_most
-    return still, moving
+    ray: (n, 2) directions x / z, y / z in one image. seen: (k, n, 2) in others, NaN where unknown. relative: rotation
+    and translation from the one to each other. sigma: (k,) noise of `seen`. The inverse depth, from 0 to `most`, is
+    fitted robustly. NaN where less than FEWEST images know a place.
+    """
+    deep = np.concatenate([ray, np.ones((len(ray), 1))], axis=1)
+    far = np.stack([deep @ R.T for R, _ in relative])  # of a point at infinity
+    move = np.stack([t for _, t in relative])[:, None]
+    known: Mask = np.asarray(np.isfinite(seen).all(axis=2))
+    seen = np.where(known[..., None], seen, 0.0)
+    a = move[..., :2] - seen * move[..., 2:]  # b + inverse depth * a = 0, up to depth
+    b = far[..., :2] - seen * far[..., 2:]
+    weight = known / sigma[:, None] ** 2
+    inverse, total, error = np.zeros(len(ray)), np.full(len(ray), np.inf), np.zeros(known.shape)
+    for step in range(PASSES + 1):
+        if step:
+            z = np.maximum(far[..., 2] + inverse * move[..., 2], 1e-3)
+            w = (weight / z**2 / (1.0 if step == 1 else 1 + np.square(error / 2)))[..., None]
+            inverse = np.clip(-(w * a * b).sum(axis=(0, 2)) / np.maximum((w * a * a).sum(axis=(0, 2)), 1e-12), 0, most)
+        at = far + inverse[:, None] * move
+        error = np.linalg.norm(at[..., :2] / np.maximum(at[..., 2:], 1e-3) - seen, axis=2) / sigma[:, None]
+        squares = np.square(np.minimum(error, MOST)) * known
+        total = np.minimum(total, np.sqrt(squares.sum(axis=0) / np.maximum(known.sum(axis=0), 1)))
+    return np.where(known.sum(axis=0) >= FEWEST, total, np.nan), np.where(known, error, np.nan)
 
 
-def remove_matches(database: Any, masks: Mapping[str, Mask], size: Size) -> float:
-    """Remove the matches of features in masked places. Returns the share of all matches that was removed."""
-    colmap = import_pycolmap()
-    masked = {
-        image.image_id: in_mask(masks.get(image.name), database.read_keypoints(image.image_id)[:, :2], size)
-        for image in database.read_all_images()
-    }
-    before = after = 0
-    for pair, matches in zip(*database.read_all_matches(), strict=True):
-        a, b = colmap.pair_id_to_image_pair(pair)
-        kept = matches[~(masked[a][matches[:, 0]] | masked[b][matches[:, 1]])] if len(matches) else matches
-        before, after = before + len(matches), after + len(kept)
-        if len(kept) < len(matches):
-            database.delete_matches(a, b)
-            database.write_matches(a, b, kept)
-    return 1 - after / max(before, 1)
+def _relative(one: Floats, other: Floats) -> tuple[Floats, Floats]:
+    """Rotation and translation from one camera to another one, of two (3, 4) poses."""
+    R = other[:, :3] @ one[:, :3].T
+    return R, other[:, 3] - R @ one[:, 3]
+
+
+def _votes(motion: Motion, errors: Sequence[Plane]) -> list[Plane]:
+    """The mean logarithm of the errors along each place's way, near images first."""
+    logs = [np.log(np.maximum(error, 0.5)) for error in errors]
+    result = []
+    for i, own in enumerate(logs):
+        ways = {0: own} | {k: motion.on_grid(logs[i + k], at) for k, at in motion.tracks(i).items() if abs(k) <= VOTES}
+        votes = np.stack(list(ways.values()))
+        weight = np.isfinite(votes) / (1.0 + np.abs(list(ways)))[:, None, None]
+        total = weight.sum(axis=0)
+        mean = (np.nan_to_num(votes) * weight).sum(axis=0) / np.maximum(total, 1e-9)
+        result.append(np.where(total > 0, mean, np.nan).astype(np.float32))
+    return result
+
+
+def _valley(values: NDArray[np.floating]) -> float:
+    """The value that parts values best into two classes. Otsu 1979."""
+    if len(values) < 2:
+        return 0.0
+    count, edges = np.histogram(values, 64)
+    middle = (edges[1:] + edges[:-1]) / 2
+    below, mean = np.cumsum(count), np.cumsum(count * middle)
+    between = (mean[-1] * below / below[-1] - mean) ** 2 / np.maximum(below * (below[-1] - below), 1)
+    return float(middle[between.argmax()])
+
+
+def _cut(image: NDArray[np.uint8], vote: Plane, limit: float) -> Mask:
+    """The mask (h, w) of an image, from the votes on its grid."""
+    cv2 = import_cv2()
+    height, width = image.shape[:2]
+    value = cv2.resize(np.nan_to_num(vote, nan=0.0), (width, height), interpolation=cv2.INTER_LINEAR)
+
+    def disk(radius: int) -> Any:
+        return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+
+    moves = cv2.morphologyEx((value > limit).astype(np.uint8), cv2.MORPH_OPEN, disk(2))
+    if moves.mean() < LITTLE:
+        return np.zeros((height, width), bool)
+    label = np.full((height, width), cv2.GC_BGD, np.uint8)
+    label[cv2.dilate(moves, disk(AROUND)) > 0] = cv2.GC_PR_BGD
+    label[moves > 0] = cv2.GC_PR_FGD
+    label[cv2.erode((value > limit + np.log(2)).astype(np.uint8), disk(INSIDE)) > 0] = cv2.GC_FGD
+    if (label == cv2.GC_BGD).any():
+        cv2.grabCut(image, label, None, np.zeros((1, 65)), np.zeros((1, 65)), CUTS, cv2.GC_INIT_WITH_MASK)
+    inside = ((label == cv2.GC_FGD) | (label == cv2.GC_PR_FGD)).astype(np.uint8)
+    return cv2.morphologyEx(inside, cv2.MORPH_OPEN, disk(1)) > 0
+
+
+def without(
+    matches: Match, places: Mapping[str, NDArray[np.float32]], masks: Mapping[str, Mask], size: Size
+) -> dict[tuple[str, str], Any]:
+    """The matches of which neither feature lies in a mask. size: (width, height) of the images."""
+    free = {name: ~in_mask(masks.get(name), at[:, :2], size) for name, at in places.items()}
+    return {(a, b): m[free[a][m[:, 0]] & free[b][m[:, 1]]] for (a, b), m in matches.items()}
 
 
 def in_mask(mask: Mask | None, places: NDArray[np.floating], size: Size) -> Mask:
@@ -250,15 +225,9 @@ def in_mask(mask: Mask | None, places: NDArray[np.floating], size: Size) -> Mask
     return mask[row, column]
 
 
-def tolerance(size: Size) -> float:
-    """Median reprojection error, in pixels, up to which a track stands still."""
-    return max(MIN_TOLERANCE, TOLERANCE * max(size))
-
-
-def rim(size: Size) -> Mask:
-    """Mask of the middle of an image. Its rim seldom shows what moves."""
-    height, width = (max(1, round(side * GRID / max(size))) for side in (size[1], size[0]))
-    mask = np.zeros((height, width), bool)
-    rows, columns = (round(side * (1 - MIDDLE) / 2) for side in mask.shape)
-    mask[rows : height - rows, columns : width - columns] = True
+def rim() -> Mask:
+    """Mask of the middle of an image, of any size. Its rim seldom shows what moves."""
+    mask = np.zeros((60, 60), bool)
+    edge = round(60 * (1 - MIDDLE) / 2)
+    mask[edge:-edge, edge:-edge] = True
     return mask

@@ -4,24 +4,36 @@ from __future__ import annotations
 
 import itertools
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lapgs_wgpu.errors import InputError, pip_install
 from lapgs_wgpu.progress import Progress
 
 FEATURE_SIDE = 1600  # longer side, pixels: larger images are shrunk to find features
-MOST_FEATURES = 3000  # of an image, those of the largest scales; the time of matching grows with their square
+MOST_FEATURES = 2000  # of an image, the strongest; the time of matching grows with their square
+RATIO, LIKE = 0.9, 0.7  # of the distances of the best and the second match; cosine of two descriptors, at least
 NEIGHBOURS = 6  # an image is matched with so many after it, then with ever more distant ones, each further by GROWTH
 GROWTH = 1.5
-EXTRACTED_AT_ONCE, MATCHED_AT_ONCE = 8, 64  # images and pairs between two updates of the progress
-FEWEST_IMAGES = 2  # of a reconstruction
+LEAST_ANGLE = 0.5  # degrees between the rays of a point
+FEWEST_IMAGES, FEWEST_MATCHES = 2, 15  # of a reconstruction; of a pair of images that counts
 SEED = 0
 Pair = tuple[str, str]
+Ints = NDArray[np.integer]
+Match = Mapping[Pair, Ints]  # of pairs of images: (m, 2) numbers of their features
+
+
+class Features(NamedTuple):
+    """Of an image. places: (n, 4) float32, pixels (the middle of the first is 0.5, 0.5), size, radians. looks: (n, 128)
+    float32, square roots of SIFT's histograms, of length 1 (Arandjelovic and Zisserman 2012)."""
+
+    places: NDArray[np.float32]
+    looks: NDArray[np.float32]
 
 
 class Reconstruction:
@@ -33,72 +45,101 @@ class Reconstruction:
 
     def __init__(self, images: Path, names: Sequence[str], work: Path, model: str) -> None:
         """Raises InputError where pycolmap is not installed."""
-        self._colmap = import_pycolmap()
+        self._colmap = colmap = import_pycolmap()
         self.images, self.names, self.model = images, list(names), model
         self.work = work
+        self.places: dict[str, NDArray[np.float32]] = {}
         self._database = work / "database.db"
         work.mkdir(parents=True, exist_ok=True)
-
-    def find_features(self) -> None:
-        """Find the features of all images."""
-        colmap = self._colmap
-        options = colmap.ImageReaderOptions()
-        options.camera_model = self.model
-        extraction = colmap.FeatureExtractionOptions()
-        extraction.max_image_size = FEATURE_SIDE
-        extraction.sift.max_num_features = MOST_FEATURES
-        with Progress(len(self.names), "images searched for features") as progress:
-            for names in _chunks(self.names, EXTRACTED_AT_ONCE):
-                colmap.extract_features(
-                    self._database, self.images, names, colmap.CameraMode.SINGLE, options, extraction, colmap.Device.cpu
-                )
-                options.existing_camera_id = 1  # the lens of the first ones
-                progress.at(min(len(self.names), self.names.index(names[-1]) + 1))
-
-    def import_images(self) -> None:
-        """Enter the images into the database without searching them for features."""
-        colmap = self._colmap
-        options = colmap.ImageReaderOptions()
-        options.camera_model = self.model
         with self.database():  # makes the file
             pass
-        colmap.import_images(self._database, self.images, colmap.CameraMode.SINGLE, self.names, options)
+        options = colmap.ImageReaderOptions()
+        options.camera_model = model
+        colmap.import_images(self._database, images, colmap.CameraMode.SINGLE, self.names, options)
+        with self.database() as database:
+            self.ids = {image.name: image.image_id for image in database.read_all_images()}
+            camera = database.read_all_cameras()[0]
+        self.prior, self.exif = float(camera.mean_focal_length()), bool(camera.has_prior_focal_length)
 
-    def match(self, pairs: Sequence[Pair]) -> None:
-        """Match the features of pairs of images, and keep what an epipolar geometry explains."""
-        colmap, listed = self._colmap, self.work / "pairs.txt"
-        options = colmap.ImportedPairingOptions()
-        options.match_list_path = listed
+    def find_features(self) -> dict[str, Features]:
+        """Find the features of all images."""
+        found = {}
+        with Progress(len(self.names), "images searched for features") as progress, self.database() as database:
+            for name in self.names:
+                found[name] = sift(self.images / name)
+                self.places[name] = found[name].places
+                database.write_keypoints(self.ids[name], self.places[name])
+                progress.step()
+        return found
+
+    def match(self, pairs: Sequence[Pair], features: Mapping[str, Features]) -> dict[Pair, Ints]:
+        """Match the features of pairs of images, and verify the matches."""
+        matches = {}
         with Progress(len(pairs), "pairs of images matched") as progress:
-            for number, some in enumerate(_chunks(pairs, MATCHED_AT_ONCE)):
-                listed.write_text("".join(f"{a} {b}\n" for a, b in some), encoding="utf-8")
-                colmap.match_image_pairs(
-                    self._database,
-                    pairing_options=options,
-                    verification_options=self._verification(),
-                    device=colmap.Device.cpu,
-                )
-                progress.at(min(len(pairs), (number + 1) * MATCHED_AT_ONCE))
+            for one, other in pairs:
+                matches[one, other] = nearest(features[one].looks, features[other].looks)
+                progress.step()
+        self.use(matches)
+        return matches
 
-    def solve(self) -> Any:
-        """The largest reconstruction, a pycolmap.Reconstruction; None where no two images fit together."""
+    def use(self, matches: Match) -> None:
+        """Take these matches in place of all earlier ones, and find epipolar geometries that explain many of them."""
         colmap = self._colmap
-        options = colmap.IncrementalPipelineOptions()
-        options.random_seed = SEED
-        options.min_model_size = FEWEST_IMAGES
-        options.mapper.random_seed = options.triangulation.random_seed = SEED
-        options.extract_colors = True
-        folder = self.work / "models"
-        folder.mkdir(exist_ok=True)
-        with Progress(len(self.names), "cameras placed") as progress:
-            placed = itertools.count(1)
-            found = colmap.incremental_mapping(
-                self._database,
-                self.images,
-                folder,
-                options,
-                next_image_callback=lambda: progress.at(min(next(placed), len(self.names))),
-            )
+        with self.database() as database:
+            database.clear_matches()
+            database.clear_two_view_geometries()
+            for (one, other), each in matches.items():
+                database.write_matches(self.ids[one], self.ids[other], each.astype(np.uint32))
+        options = colmap.TwoViewGeometryOptions()
+        options.ransac.random_seed = SEED
+        options.detect_watermark = False  # what follows the camera is no watermark
+        colmap.geometric_verification(self._database, two_view_geometry_options=options)
+
+    def verified(self) -> dict[Pair, Ints]:
+        """The matches that an epipolar geometry explains, of pairs that share enough of them."""
+        with self.database() as database:
+            names = {image.image_id: image.name for image in database.read_all_images()}
+            found = {}
+            for pair, geometry in zip(*database.read_two_view_geometries(), strict=True):
+                one, other = (names[i] for i in self._colmap.pair_id_to_image_pair(pair))
+                if len(geometry.inlier_matches) >= FEWEST_MATCHES:
+                    matches = geometry.inlier_matches.astype(np.int64)
+                    found[(one, other) if one <= other else (other, one)] = matches[:, :: 1 if one <= other else -1]
+        return found
+
+    def solve(self, focal: float | None = None, *, together: bool = False, seconds: float = -1) -> Any:
+        """The largest reconstruction, a pycolmap.Reconstruction; None where no two images fit together.
+
+        focal: length to begin with, pixels; None leaves what the database has. together: all cameras at once
+        (GLOMAP), else one after the other, for at most so many seconds.
+        """
+        colmap, folder = self._colmap, self.work / "models"
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir()
+        if focal is not None:
+            with self.database() as database:
+                for camera in database.read_all_cameras():
+                    camera.params = [focal, *camera.params[1:3], *[0.0] * (len(camera.params) - 3)]
+                    camera.has_prior_focal_length = True
+                    database.update_camera(camera)
+        if together:
+            options = colmap.GlobalPipelineOptions()
+            parts = options, options.mapper, options.mapper.rotation_averaging, options.mapper.global_positioning
+            for part in parts:
+                part.random_seed = SEED
+            options.mapper.min_tri_angle_deg = LEAST_ANGLE
+            options.mapper.track_required_tracks_per_view = 300
+            found = colmap.global_mapping(self._database, self.images, folder, options)
+        else:
+            options = colmap.IncrementalPipelineOptions()
+            options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = SEED
+            options.min_model_size = FEWEST_IMAGES
+            options.max_runtime_seconds = round(seconds)
+            if focal is not None:  # a film: many images from nearly one side, where COLMAP's limits are for photos
+                options.mapper.init_min_tri_angle, options.mapper.ba_local_min_tri_angle = 4, 2
+                options.mapper.filter_min_tri_angle = options.triangulation.min_angle = LEAST_ANGLE
+                options.ba_global_max_refinements, options.ba_local_max_refinements = 2, 1
+            found = colmap.incremental_mapping(self._database, self.images, folder, options)
         return max(found.values(), key=lambda model: model.num_reg_images(), default=None)
 
     @contextmanager
@@ -110,23 +151,31 @@ class Reconstruction:
         finally:
             database.close()
 
-    def copy(self, work: Path) -> Reconstruction:
-        """The same images, features and matches in a database of their own."""
-        result = Reconstruction(self.images, self.names, work, self.model)
-        shutil.copyfile(self._database, result._database)
-        return result
 
-    def verify(self) -> None:
-        """Find the epipolar geometries of all matches in the database anew."""
-        colmap = self._colmap
-        with self.database() as database:
-            database.clear_two_view_geometries()
-        colmap.geometric_verification(self._database, two_view_geometry_options=self._verification())
+def sift(path: Path) -> Features:
+    """The features of an image file."""
+    cv2 = import_cv2()
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    scale = min(1.0, FEATURE_SIDE / max(image.shape))
+    if scale < 1:
+        image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    points, looks = cv2.SIFT_create(MOST_FEATURES, contrastThreshold=0.02).detectAndCompute(image, None)
+    if not points:
+        return Features(np.zeros((0, 4), np.float32), np.zeros((0, 128), np.float32))
+    found = [((p.pt[0] + 0.5) / scale, (p.pt[1] + 0.5) / scale, p.size / scale, np.radians(p.angle)) for p in points]
+    return Features(np.array(found, np.float32), np.sqrt(looks / np.maximum(looks.sum(axis=1, keepdims=True), 1e-9)))
 
-    def _verification(self) -> Any:
-        options = self._colmap.TwoViewGeometryOptions()
-        options.ransac.random_seed = SEED
-        return options
+
+def nearest(one: NDArray[np.float32], other: NDArray[np.float32]) -> Ints:
+    """(m, 2) numbers of descriptors (n, 128) that are each other's nearest, and clearly nearer than the second."""
+    if min(len(one), len(other)) < 2:
+        return np.zeros((0, 2), np.int64)
+    alike, rows = one @ other.T, np.arange(len(one))
+    match = alike.argmax(axis=1)
+    best, back = alike[rows, match], alike.argmax(axis=0)
+    alike[rows, match] = -1
+    kept = (back[match] == rows) & (np.maximum(1 - best, 1e-6) < RATIO**2 * (1 - alike.max(axis=1))) & (best > LIKE)
+    return np.stack([rows[kept], match[kept]], axis=1)
 
 
 def neighbouring_pairs(names: Sequence[str]) -> list[Pair]:
@@ -149,34 +198,39 @@ def import_pycolmap() -> Any:
     return pycolmap
 
 
-def _chunks(items: Sequence[Any], size: int) -> Iterator[list[Any]]:
-    for first in range(0, len(items), size):
-        yield list(items[first : first + size])
+def import_cv2() -> Any:
+    """The module cv2 of OpenCV. Raises InputError where it is not installed."""
+    try:
+        import cv2
+    except ImportError:
+        raise InputError(
+            f"OpenCV, which finds and follows features, is not installed: {pip_install('prepare')}."
+        ) from None
+    cv2.setRNGSeed(0)
+    return cv2
 
 
-def merged(source: Reconstruction, groups: Sequence[Sequence[str]], work: Path) -> Reconstruction:
+def merged(source: Reconstruction, matches: Match, groups: Sequence[Sequence[str]], work: Path) -> Reconstruction:
     """One image for each group of images of a camera that stands still: it has the features of all of them.
 
-    source: has matched images of equal places in their groups, which were taken at the same time. So what moves ties
-    the cameras together, too, and the noise of several times is averaged.
+    matches: of images of equal places in their groups, which were taken at the same time. So what moves ties the
+    cameras together, too, and the noise of several times is averaged.
     groups: names of images, as many for each camera. The first of each stands for the camera.
     """
     result = Reconstruction(source.images, [group[0] for group in groups], work, source.model)
-    result.import_images()
-    with source.database() as old, result.database() as new:
-        ids = {image.name: image.image_id for image in old.read_all_images()}
-        own = {image.name: image.image_id for image in new.read_all_images()}
-        first: dict[str, int] = {}  # of each image's features among those of its group
+    first: dict[str, int] = {}  # of each image's features among those of its group
+    with result.database() as database:
         for group in groups:
-            keypoints = [old.read_keypoints(ids[name]) for name in group]
-            counts = [0, *itertools.accumulate(len(each) for each in keypoints)]
-            first |= dict(zip(group, counts, strict=False))
-            new.write_keypoints(own[group[0]], np.concatenate(keypoints))
-        for one, other in itertools.combinations(groups, 2):
-            matches = [
-                old.read_matches(ids[a], ids[b]).reshape(-1, 2) + np.array([first[a], first[b]], dtype=np.uint32)
-                for a, b in zip(one, other, strict=True)
-            ]
-            new.write_matches(own[one[0]], own[other[0]], np.concatenate(matches))
-    result.verify()
+            places = [source.places[name] for name in group]
+            first |= dict(zip(group, [0, *itertools.accumulate(len(each) for each in places)], strict=False))
+            result.places[group[0]] = np.concatenate(places)
+            database.write_keypoints(result.ids[group[0]], result.places[group[0]])
+    result.use(
+        {
+            (one[0], other[0]): np.concatenate(
+                [matches[a, b] + np.array([first[a], first[b]]) for a, b in zip(one, other, strict=True)]
+            )
+            for one, other in itertools.combinations(groups, 2)
+        }
+    )
     return result

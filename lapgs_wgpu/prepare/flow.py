@@ -1,0 +1,111 @@
+"""Where each place of an image is in the images before and after it, by optical flow at the film's own rate.
+
+Flow: DIS (Kroeger et al., "Fast optical flow using dense inverse search", 2016) of OpenCV, between neighbouring frames,
+chained from image to image. A place is lost where the flow forth and back do not meet.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lapgs_wgpu.data.images import Pixels
+from lapgs_wgpu.prepare.film import Film
+from lapgs_wgpu.prepare.images import Picture
+from lapgs_wgpu.prepare.poses import import_cv2
+from lapgs_wgpu.progress import Progress
+
+SIDE = 480  # longer side of the images that are followed, pixels
+STEP = 4  # pixels between the places that are followed
+REACH = 6  # images, to either side
+BETWEEN = 4  # steps from one image to the next, at most
+MEET, MEET_SHARE = 1.5, 0.05  # pixels between a place and its way forth and back, and more by this share of the way
+
+Plane = NDArray[np.float32]
+
+
+class Motion:
+    """The flow of a film. images: (h, w, 3) RGB, SIDE pixels at most, one of each picture. forth, back: (h, w, 2)
+    float16 pixels from each to the next one, and from the next one to each."""
+
+    def __init__(self, frames: Iterable[tuple[Pixels, bool]], count: int) -> None:
+        """frames: small images of equal size in order, and whether each is one of the `count` pictures."""
+        cv2 = self._cv2 = import_cv2()
+        dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+        dis.setFinestScale(1)
+        self.images: list[Pixels] = []
+        self.forth: list[NDArray[np.float16]] = []
+        self.back: list[NDArray[np.float16]] = []
+        before: Any = None
+        forth: Plane | None = None
+        back: Plane | None = None
+        with Progress(count, "images followed") as progress:
+            for image, chosen in frames:
+                gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+                if before is not None:
+                    there, again = dis.calc(before, gray, None), dis.calc(gray, before, None)
+                    forth = there if forth is None else forth + self._moved(there, forth)
+                    back = again if back is None else again + self._moved(back, again)
+                before = gray if before is not None or chosen else None
+                if chosen:
+                    self.images.append(image)
+                    if forth is not None and back is not None:
+                        self.forth.append(forth.astype(np.float16))
+                        self.back.append(back.astype(np.float16))
+                    forth = back = None
+                    progress.at(len(self.images))
+
+    @property
+    def grid(self) -> Plane:
+        """(rows, columns, 2) the places of an image that are followed, pixels."""
+        height, width = self.images[0].shape[:2]
+        columns, rows = np.arange(STEP // 2, width, STEP), np.arange(STEP // 2, height, STEP)
+        return np.stack(np.meshgrid(columns, rows), axis=-1).astype(np.float32)
+
+    def tracks(self, image: int) -> dict[int, Plane]:
+        """Where the grid of an image is in the images around it, by their offsets; NaN where it is lost."""
+        found = {}
+        for way, there, again in ((1, self.forth, self.back), (-1, self.back, self.forth)):
+            at = self.grid
+            for offset in range(1, REACH + 1):
+                edge = image + way * (offset - 1) - (way < 0)
+                if not 0 <= edge < len(self.forth):
+                    break
+                step = self._at(there[edge].astype(np.float32), at)
+                on = at + step
+                apart = np.linalg.norm(step + self._at(again[edge].astype(np.float32), on), axis=-1)
+                on[~(apart < MEET + MEET_SHARE * np.linalg.norm(step, axis=-1))] = np.nan
+                found[way * offset] = at = on
+        return found
+
+    def on_grid(self, values: Plane, at: Plane) -> Plane:
+        """Values (rows, columns) of a grid at places (rows, columns, 2) in pixels; NaN outside."""
+        return self._at(values, ((at - STEP // 2) / STEP).astype(np.float32))
+
+    def _at(self, values: Plane, at: Plane) -> Plane:
+        cv2 = self._cv2
+        x, y = (np.ascontiguousarray(np.nan_to_num(at[..., i], nan=-9.0), dtype=np.float32) for i in (0, 1))
+        return cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(np.nan,) * 4)
+
+    def _moved(self, values: Plane, flow: Plane) -> Plane:
+        height, width = flow.shape[:2]
+        pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float32)
+        return self._at(values, pixels + flow)
+
+
+def film_frames(film: Film, pictures: Sequence[Picture]) -> Iterator[tuple[Pixels, bool]]:
+    """Small frames of a film from its first picture to its last, at most BETWEEN steps from one to the next."""
+    times = [picture.seconds for picture in pictures]
+    number, last = 0, 0.0
+    for frame in film.frames():
+        chosen = abs(frame.seconds - times[number]) < 1e-6
+        span = times[number] - times[number - 1] if number else 0.0
+        if chosen or (number and frame.seconds - last >= span / BETWEEN - 1e-6):
+            yield np.ascontiguousarray(frame.pixels(SIDE)), chosen
+            last = frame.seconds
+        number += chosen
+        if number == len(times):
+            return

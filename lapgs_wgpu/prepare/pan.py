@@ -1,0 +1,194 @@
+"""Rotations of a camera that turns on the spot, and its lens, by the matches of its images: no depth enters.
+
+Bundle adjustment of rotations (Brown and Lowe, "Automatic panoramic image stitching", 2007) with a robust loss, from
+rotations that are chained through the film. What moves stays unexplained, and what is near where the camera walks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lapgs_wgpu.data.images import Size
+from lapgs_wgpu.prepare.measures import Floats
+from lapgs_wgpu.prepare.poses import Ints, Match, import_pycolmap
+
+MATCHES = 40  # of a pair of images
+SIGMA = 1.5e-3  # of the longer side: residual from which on a match counts little
+CHAINED = 3  # images before one, from which its rotation may be chained
+ITERATIONS, TRIALS = 30, 60
+FIT = 2.5e-3  # of the longer side: a match up to this residual is explained
+FAR = 6  # images apart: near images of a camera that walks look turned, too
+RADIUS = 1.0  # of the sphere on which the points of a panorama lie
+
+
+@dataclass(frozen=True, eq=False)
+class Pan:
+    """names: of the images. rotations: (n, 3, 3), world to camera (x right, y down). focal: pixels. radial: first
+    coefficient. explained: share of the matches of images at least FAR apart (of all, in a shorter film). travel:
+    pixels that the middle of the image moves between two images at most."""
+
+    names: tuple[str, ...]
+    rotations: Floats
+    focal: float
+    radial: float
+    explained: float
+    travel: float
+
+    def model(self, size: Size, points: Floats, colors: Ints) -> Any:
+        """A pycolmap.Reconstruction whose cameras stand in one place, with points (N, 3) and colors (N, 3)."""
+        colmap = import_pycolmap()
+        result = colmap.Reconstruction()
+        lens = [self.focal, size[0] / 2, size[1] / 2, self.radial]
+        result.add_camera_with_trivial_rig(
+            colmap.Camera(model="SIMPLE_RADIAL", width=size[0], height=size[1], params=lens, camera_id=1)
+        )
+        for number, (name, rotation) in enumerate(zip(self.names, self.rotations, strict=True), 1):
+            image = colmap.Image(name=name, camera_id=1, image_id=number)
+            result.add_image_with_trivial_frame(image, colmap.Rigid3d(np.hstack([rotation, np.zeros((3, 1))])))
+        for point, color in zip(points, colors.astype(np.uint8), strict=True):
+            result.add_point3D(point, colmap.Track(), color)
+        return result
+
+
+class _Sample:
+    """Matches: image numbers (m,) and places (m, 2) in pixels from the middle of the image."""
+
+    def __init__(
+        self, names: Sequence[str], places: Mapping[str, NDArray[np.floating]], matches: Match, size: Size
+    ) -> None:
+        number = {name: i for i, name in enumerate(names)}
+        rng, middle = np.random.default_rng(0), np.array(size) / 2
+        chosen = {pair: m[rng.permutation(len(m))[:MATCHES]].astype(np.int64) for pair, m in matches.items() if len(m)}
+        count = [len(m) for m in chosen.values()]
+        self.a = np.repeat([number[a] for a, _ in chosen], count).astype(np.int64)
+        self.b = np.repeat([number[b] for _, b in chosen], count).astype(np.int64)
+        self.at_a = np.concatenate([places[a][m[:, 0], :2] - middle for (a, _), m in chosen.items()]).astype(float)
+        self.at_b = np.concatenate([places[b][m[:, 1], :2] - middle for (_, b), m in chosen.items()]).astype(float)
+
+
+def solve_pan(
+    names: Sequence[str], places: Mapping[str, NDArray[np.floating]], matches: Match, size: Size, focal: float
+) -> Pan | None:
+    """The rotations that explain most matches, None where images share none. focal: a first guess, pixels.
+
+    places: (n, 2 or more) of the features of each image, pixels. size: (width, height) of the images.
+    """
+    if sum(len(m) for m in matches.values()) < 8 * len(names):
+        return None
+    sample = _Sample(names, places, matches, size)
+    sigma = SIGMA * max(size)
+    rotations, focal, radial, error = _refined(sample, _chained(sample, len(names), focal, sigma), focal, sigma)
+    far = sample.b - sample.a >= FAR
+    fits = error < FIT * max(size)
+    axes = rotations[:, 2]
+    turn = float(np.arccos(np.clip((axes @ axes.T).min(), -1, 1)))
+    explained = float(fits[far].mean() if far.sum() > 100 else fits.mean())
+    return Pan(tuple(names), rotations, focal, radial, explained, focal * turn)
+
+
+def rays(places: Floats, focal: float, radial: float) -> Floats:
+    """(m, 3) directions of places (m, 2) in pixels from the middle of the image; their depth is 1."""
+    bent = places / focal
+    flat = bent
+    for _ in range(5):  # r = f u (1 + k u^2), solved for u
+        flat = bent / np.maximum(1 + radial * np.square(flat).sum(axis=1, keepdims=True), 0.2)
+    return np.concatenate([flat, np.ones((len(flat), 1))], axis=1)
+
+
+def _residuals(s: _Sample, R: Floats, focal: float, radial: float) -> tuple[Floats, Floats, Floats]:
+    """Rays in the first image (m, 3), the same seen by the second one, and pixels (m, 2) from where they are."""
+    ray = rays(s.at_a, focal, radial)
+    seen = np.einsum("mij,mj->mi", R[s.b] @ R[s.a].transpose(0, 2, 1), ray)
+    flat = seen[:, :2] / np.maximum(seen[:, 2:], 1e-3)
+    return ray, seen, focal * flat * (1 + radial * np.square(flat).sum(axis=1, keepdims=True)) - s.at_b
+
+
+def _chained(s: _Sample, count: int, focal: float, sigma: float) -> Floats:
+    """(n, 3, 3) rotations, each from an image just before: of many by two matches the one that explains most."""
+    rng = np.random.default_rng(0)
+    rotations = np.tile(np.eye(3), (count, 1, 1))
+    for image in range(1, count):
+        rotations[image] = rotations[image - 1]
+        for before in range(image - 1, max(-1, image - 1 - CHAINED), -1):
+            both = np.flatnonzero((s.a == before) & (s.b == image))
+            if len(both) < 8:
+                continue
+            one, other = (rays(each[both], focal, 0.0) for each in (s.at_a, s.at_b))
+            one, other = (each / np.linalg.norm(each, axis=1, keepdims=True) for each in (one, other))
+            pairs = [rng.choice(len(both), 2, replace=False) for _ in range(TRIALS)]
+            turns = np.stack([_turn(one[pair], other[pair]) for pair in pairs])
+            apart = np.linalg.norm(other - one @ turns.transpose(0, 2, 1), axis=2)
+            best = turns[(focal * apart < 3 * sigma).sum(axis=1).argmax()]
+            rotations[image] = best @ rotations[before]
+            break
+    return rotations
+
+
+def _turn(one: Floats, other: Floats) -> Floats:
+    """The rotation that takes two directions to two others. Kabsch 1976."""
+    normal = [np.cross(each[0], each[1]) for each in (one, other)]
+    U, _, Vt = np.linalg.svd(other.T @ one + np.outer(normal[1], normal[0]))
+    return U @ np.diag([1, 1, np.sign(np.linalg.det(U @ Vt))]) @ Vt
+
+
+def _refined(s: _Sample, R: Floats, focal: float, sigma: float) -> tuple[Floats, float, float, Floats]:
+    """Levenberg-Marquardt with the loss e / (1 + e), e = (residual / sigma)^2. Returns rotations, focal length, radial
+    coefficient and the residuals (m,) in pixels."""
+    from scipy.spatial.transform import Rotation  # slow to import
+
+    n, radial, damping = len(R), 0.0, 1e-3
+    ray, seen, r = _residuals(s, R, focal, radial)
+    index = np.concatenate([3 * s.a[:, None] + np.arange(3), 3 * s.b[:, None] + np.arange(3)], axis=1)
+    index = np.concatenate([index, np.tile([3 * n, 3 * n + 1], (len(r), 1))], axis=1)
+
+    def cost(r: Floats) -> float:
+        e = np.square(r).sum(axis=1) / sigma**2
+        return float((e / (1 + e)).sum())
+
+    now = cost(r)
+    for _ in range(ITERATIONS):
+        weight = 1 / (1 + np.square(r).sum(axis=1) / sigma**2)  # square root of the loss's slope
+        inverse = 1 / np.maximum(seen[:, 2], 1e-3)
+        by_point = np.zeros((len(r), 2, 3))
+        by_point[:, 0, 0] = by_point[:, 1, 1] = focal * inverse
+        by_point[:, :, 2] = -focal * seen[:, :2] * inverse[:, None] ** 2
+        by_focal = (_residuals(s, R, focal * 1.0001, radial)[2] - r) / 1e-4  # of its logarithm
+        by_radial = (_residuals(s, R, focal, radial + 1e-4)[2] - r) / 1e-4
+        by_a = by_point @ (R[s.b] @ R[s.a].transpose(0, 2, 1)) @ _cross(ray)
+        J = np.concatenate([by_a, -by_point @ _cross(seen), by_focal[:, :, None], by_radial[:, :, None]], axis=2)
+        J = J * weight[:, None, None]
+        H, gradient = np.zeros((3 * n + 2, 3 * n + 2)), np.zeros(3 * n + 2)
+        np.add.at(H, (index[:, :, None], index[:, None, :]), np.einsum("mki,mkj->mij", J, J))
+        np.add.at(gradient, index, np.einsum("mki,mk->mi", J, r * weight[:, None]))
+        H[:3], H[:, :3], gradient[:3] = 0, 0, 0  # the first image stays
+        H[range(3), range(3)] = 1
+        H[-1, -1] += 1e3  # a lens without distortion, unless the matches say otherwise
+        gradient[-1] += 1e3 * radial
+        H[range(len(H)), range(len(H))] += 1e-6  # images without matches
+        for _ in range(6):
+            step = -np.linalg.solve(H + damping * np.diag(np.diag(H)), gradient)
+            tried = Rotation.from_rotvec(step[:-2].reshape(n, 3)).as_matrix() @ R
+            lens = focal * float(np.exp(np.clip(step[-2], -0.3, 0.3))), radial + float(step[-1])
+            result = _residuals(s, tried, *lens)
+            if cost(result[2]) < now:
+                break
+            damping *= 8
+        else:
+            break
+        gain, (focal, radial), R = now - cost(result[2]), lens, tried
+        (ray, seen, r), now, damping = result, now - gain, max(damping / 4, 1e-7)
+        if gain < 1e-5 * now:
+            break
+    return R, focal, radial, np.linalg.norm(r, axis=1)
+
+
+def _cross(v: Floats) -> Floats:
+    """(m, 3, 3) matrices of the cross products with (m, 3)."""
+    x, y, z = v.T
+    o = np.zeros(len(v))
+    return np.stack([o, -z, y, z, o, -x, -y, x, o], axis=1).reshape(-1, 3, 3)

@@ -1,0 +1,139 @@
+"""Which cameras explain a film: a pan, or the best of reconstructions that begin with several focal lengths."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from PIL import Image
+
+from lapgs_wgpu.data.images import Size
+from lapgs_wgpu.prepare.masks import Mask
+from lapgs_wgpu.prepare.measures import path_faults
+from lapgs_wgpu.prepare.movers import without
+from lapgs_wgpu.prepare.pan import RADIUS, Pan, rays, solve_pan
+from lapgs_wgpu.prepare.poses import Match, Reconstruction
+from lapgs_wgpu.progress import say
+
+FOCALS = 1.0, 0.7, 1.4  # times the width, where EXIF says nothing
+PURE, NEARLY = 0.8, 0.6  # share of the verified matches that turning alone explains: a pan; one, if nothing else fits
+GOOD, SHARP = 0.95, 1.5e-3  # the search ends: share of the images, and the mean error in parts of the longer side
+SECONDS, SECONDS_EACH = 60.0, 2.0  # of the search: for any film, and for each image
+BENT = 0.4  # first radial coefficient of a lens, at most
+PANORAMA = 3000  # points of a pan
+
+
+class Found(NamedTuple):
+    """model: a pycolmap.Reconstruction. placed: names of its images, in the order of time. faults: of its path, by the
+    images' numbers in `placed`. error: mean, pixels. focal: at the end, pixels. pan: None where the camera walks.
+    together: all cameras were placed at once."""
+
+    model: Any
+    placed: tuple[str, ...]
+    faults: tuple[tuple[str, int], ...]
+    error: float
+    focal: float
+    pan: Pan | None = None
+    together: bool = False
+
+
+def search(source: Reconstruction, size: Size) -> Found | None:
+    """The cameras that explain most images, then least implausibly, then best. None where no two images fit together.
+
+    source: with verified matches. size: (width, height) of its images.
+    """
+    pan = solve_pan(source.names, source.places, source.verified(), size, source.prior)
+    if pan is not None and pan.explained >= PURE:
+        return panned(source, pan, size)
+    focals = [source.prior, *FOCALS] if source.exif else list(FOCALS)
+    tries = [(f if source.exif and f == source.prior else f * size[0], way) for f in focals for way in (True, False)]
+    end = time.monotonic() + SECONDS + SECONDS_EACH * len(source.names)
+    best: Found | None = None
+    longest = 0.0
+    for focal, together in tries:
+        left = end - time.monotonic()
+        if best is not None and left < longest:
+            break
+        started = time.monotonic()
+        found = solved(source, focal, together=together, seconds=max(left, 10))
+        longest = max(longest, time.monotonic() - started)
+        if found is not None and (best is None or _rank(source, found) > _rank(source, best)):
+            best = found
+        if best is not None and _good(source, best, size):
+            break
+        if found is not None:
+            more = f"{len(found.faults)} faults of the path; " * bool(found.faults)
+            say(
+                f"{len(found.placed)} of {len(source.names)} cameras placed, {found.error:.2f} pixels off; {more}"
+                f"looking for better ones for at most {max(end - time.monotonic(), 0):.0f} s more"
+            )
+    short = best is None or len(best.placed) < GOOD * len(source.names)
+    if pan is not None and short and pan.explained >= NEARLY:
+        return panned(source, pan, size)
+    return best
+
+
+def solved(source: Reconstruction, focal: float, *, together: bool, seconds: float) -> Found | None:
+    """One reconstruction. focal: length to begin with, pixels."""
+    model = source.solve(focal, together=together, seconds=seconds)
+    if model is None or model.num_reg_images() < 2 or not model.num_points3D():
+        return None
+    images = {model.image(i).name: model.image(i) for i in model.reg_image_ids()}
+    placed = tuple(name for name in source.names if name in images)
+    poses = np.stack([images[name].cam_from_world().matrix() for name in placed])
+    points = np.stack([point.xyz for point in model.points3D.values()])
+    faults = path_faults(-np.einsum("nij,ni->nj", poses[:, :, :3], poses[:, :, 3]), poses[:, 2, :3], points)
+    camera = next(iter(model.cameras.values()))
+    if abs(camera.params[3]) > BENT:
+        faults.append(("a lens that no camera has", 0))
+    error = float(model.compute_mean_reprojection_error())
+    return Found(model, placed, tuple(faults), error, camera.mean_focal_length(), together=together)
+
+
+def panned(source: Reconstruction, pan: Pan, size: Size) -> Found:
+    """A pan as a reconstruction, with points of its features on a sphere."""
+    rng = np.random.default_rng(0)
+    points, colors = [], []
+    each = max(1, PANORAMA // len(pan.names))
+    for name, rotation in zip(pan.names, pan.rotations, strict=True):
+        at = source.places[name][:, :2].astype(np.float64)
+        at = at[rng.permutation(len(at))[:each]]
+        ray = rays(at - np.array(size) / 2, pan.focal, pan.radial)
+        points.append(RADIUS * ray / np.linalg.norm(ray, axis=1, keepdims=True) @ rotation)
+        with Image.open(source.images / name) as image:
+            pixels = np.asarray(image.convert("RGB"))
+        column, row = np.clip(at.astype(int), 0, [size[0] - 1, size[1] - 1]).T
+        colors.append(pixels[row, column])
+    model = pan.model(size, np.concatenate(points), np.concatenate(colors))
+    return Found(model, pan.names, (), 0.0, pan.focal, pan)
+
+
+def again(source: Reconstruction, found: Found, matches: Match, masks: Mapping[str, Mask], size: Size) -> Found | None:
+    """The cameras without what masks cover, from where the search ended. matches: all of them."""
+    if found.pan is not None:
+        rest = without(source.verified(), source.places, masks, size)
+        pan = solve_pan(source.names, source.places, rest, size, found.pan.focal)
+        return None if pan is None else panned(source, pan, size)
+    source.use(without(matches, source.places, masks, size))
+    seconds = SECONDS + SECONDS_EACH * len(source.names)
+    return solved(source, found.focal, together=found.together, seconds=seconds)
+
+
+def _good(source: Reconstruction, found: Found, size: Size) -> bool:
+    enough = len(found.placed) >= GOOD * len(source.names)
+    return enough and not found.faults and found.error < max(1.0, SHARP * max(size))
+
+
+def _rank(source: Reconstruction, found: Found) -> tuple[float, float, float]:
+    return round(20 * len(found.placed) / len(source.names)), -float(len(found.faults)), -found.error
+
+
+def longest_part(names: Sequence[str], placed: Sequence[str], gap: int) -> tuple[str, ...]:
+    """The longest run of placed images, in which at most `gap` images in a row are missing."""
+    number = {name: i for i, name in enumerate(names)}
+    ends = [0, *(i for i in range(1, len(placed)) if number[placed[i]] - number[placed[i - 1]] > gap + 1), len(placed)]
+    first, last = max(itertools.pairwise(ends), key=lambda part: part[1] - part[0])
+    return tuple(placed[first:last])
