@@ -73,7 +73,7 @@ def no_time() -> Iterator[None]:
 def bench_host(device: Device, preset: str, repeat: int, step: str = "auto", *, null: bool = True) -> HostReport:
     """Steps of a training by a preset, on the built-in scene; discovery and density control are left out."""
     count, size = CASES[preset]
-    keys = {"points.count": str(count), "schedule.warm_up": "0", "discovery.enabled": "false", "step": step}
+    keys = {"points.count": str(count), "schedule.warm_up": "0", "discovery.enabled": "false", "step_place": step}
     keys |= {"density.start": "1000000", "density.stop": "1000001", "data.size": "0", "timing.refine": "false"}
     config = load_config(preset, keys)
     submit, submissions = GPUQueue.submit, [0]

@@ -91,7 +91,7 @@ def train(
         start_run_folder(out, training.user_config, training.scene.device, dataset)
         if training.discovery is not None:
             say(f"discovery: {training.discovery}; {training.discovery_seconds:.0f} s")
-        say(f"step: {training.step_place}")
+        say(f"steps: {training.steps_are}")
         return _run(training, out, watch, lpips)
 
 

@@ -207,7 +207,7 @@ def _holds(folder: Path, config: Config) -> bool:
 
     def comparable(config: Config) -> Config:
         data = dataclasses.replace(config.data, path="", masks="")
-        return dataclasses.replace(config, step="auto", data=data)
+        return dataclasses.replace(config, step_place="auto", data=data)
 
     try:
         return comparable(load_config(str(folder / "config.toml"))) == comparable(config)

@@ -40,6 +40,7 @@ from lapgs_wgpu.motion.fields.own_field import OwnField
 from lapgs_wgpu.motion.timing import Timing
 from lapgs_wgpu.splat.rotation import rotate, rotation_matrices
 from lapgs_wgpu.train.config import LossWeights
+from lapgs_wgpu.train.exchange_step import ExchangeStep
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
 from lapgs_wgpu.train.ground_truth import LEFT_OUT, upload_rgba
 from lapgs_wgpu.train.learning_rate import Rate
@@ -145,13 +146,13 @@ def test_a_step_that_breaks_off_did_not_begin(
 ) -> None:
     """A notebook's interrupt, too."""
 
-    def fail(self: Trainer, sample: object, **share: int) -> None:
+    def fail(self: ExchangeStep, sample: object, step: int, **share: int) -> None:
         raise error
 
     with Trainer(configure(), dataset, device) as trainer:
         trainer.step()
         before = trainer.state()
-        monkeypatch.setattr(Trainer, "_descend", fail)
+        monkeypatch.setattr(ExchangeStep, "_descend", fail)
         with pytest.raises(error):
             trainer.step()
         assert trainer.whole

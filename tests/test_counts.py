@@ -167,7 +167,7 @@ def test_a_resident_step_is_one_submission_and_waits_for_nothing(
     """Nor does it move more than a few kilobytes between host and device."""
     submitted, submit = [], GPUQueue.submit
     monkeypatch.setattr(GPUQueue, "submit", lambda self, buffers: submitted.append(1) or submit(self, buffers))
-    config = dataclasses.replace(configure(method, schedule__warm_up="0", density__start="100"), step="resident")
+    config = dataclasses.replace(configure(method, schedule__warm_up="0", density__start="100"), step_place="resident")
     with Trainer(config, dataset, device) as trainer:
         for _ in range(len(dataset.train) + 1):  # in which the images cross, too
             trainer.step()

@@ -32,7 +32,7 @@ from lapgs_wgpu.table import read_spec
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.run_folder import STATE, load_state, save_state, start_run_folder
-from lapgs_wgpu.train.step_result import StepResult
+from lapgs_wgpu.train.step_result import Measured, StepResult
 from lapgs_wgpu.train.trainer import Trainer
 
 TABLE = "__metadata__"
@@ -139,7 +139,7 @@ def test_nothing_is_written_through_a_link(tmp_path: Path) -> None:
         start_run_folder(run, load_config("tiny"), None, None)  # type: ignore[arg-type]
     save_state(run, {"training.done": np.array(1)})
     with Log(run / "log.jsonl", 1, terminal=io.StringIO()) as log:
-        log.step(StepResult(1, 1, 0.5, 10.0), 3)
+        log.step(StepResult(1, 1, lambda: Measured(0.5, 10.0)), 3)
     assert [file.name for file in mine.iterdir()] == ["file"]
     assert (mine / "file").read_text() == "precious"
 

@@ -75,7 +75,7 @@ def test_an_old_config_opens() -> None:
             if isinstance(value, dict):
                 found, value = vars(found), {key: tuple(v) if isinstance(v, list) else v for key, v in value.items()}
             assert found == value, f"{section}.{name}"
-    assert (config.seed, config.step) == (0, "auto")
+    assert (config.seed, config.step_place) == (0, "auto")
     # Keys that are younger than the file.
     assert not config.discovery.enabled
     assert config.density.limit == 0

@@ -36,7 +36,7 @@ KINDS = {
 
 
 def started(config: Config, dataset: Dataset, device: Device, step: str) -> Trainer:
-    return Trainer(dataclasses.replace(config, step=step), dataset, device)
+    return Trainer(dataclasses.replace(config, step_place=step), dataset, device)
 
 
 def disturb(trainer: Trainer) -> None:

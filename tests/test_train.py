@@ -7,6 +7,7 @@ import io
 import json
 import re
 import signal
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,7 @@ from lapgs_wgpu.train.parts import Parts
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.resolve_config import resolve_for_dataset, resolve_step
 from lapgs_wgpu.train.start import initial_points
-from lapgs_wgpu.train.step_result import StepResult
+from lapgs_wgpu.train.step_result import Measured, StepResult
 
 
 def lines(run: Path) -> list[dict]:
@@ -63,7 +64,7 @@ def test_a_run_is_whole(trained_run: Path, data: Path, dataset: Dataset) -> None
     }  # fmt: skip
     assert resolve_for_dataset(configure(), dataset).field.components == 4  # of 8 times
     assert load_config(str(trained_run / "config.toml")) == dataclasses.replace(
-        configure(data__path=str(data)), step="exchange"
+        configure(data__path=str(data)), step_place="exchange"
     )
     record = (trained_run / "config.toml").read_text().split("[record]")[1]
     assert all(f"\n{key} = " in record for key in ("lapgs_wgpu", "torch", "adapter", "driver"))
@@ -187,7 +188,7 @@ def test_a_training_repeats_to_the_last_byte(
 def test_the_resident_step_trains_as_well_and_repeats(
     trained_run: Path, dataset: Dataset, device: Device, tmp_path: Path
 ) -> None:
-    config = dataclasses.replace(configure(), step="resident")
+    config = dataclasses.replace(configure(), step_place="resident")
     for name in ("first", "again"):
         train(config, dataset, tmp_path / name, device=device)
     assert load_config(str(tmp_path / "first/config.toml")) == config
@@ -207,8 +208,8 @@ def test_the_resident_step_trains_as_well_and_repeats(
         ({"field__depth": "1"}, False, "exchange"),
         ({"schedule__batch": "2"}, False, "exchange"),
         ({"cameras__refine": "on"}, False, "exchange"),
-        ({"step": "exchange"}, False, "exchange"),
-        ({"step": "resident"}, True, "resident"),
+        ({"step_place": "exchange"}, False, "exchange"),
+        ({"step_place": "resident"}, True, "resident"),
     ],
 )
 def test_where_the_step_is_computed(
@@ -216,7 +217,7 @@ def test_where_the_step_is_computed(
 ) -> None:
     monkeypatch.setattr(device, "is_cpu", is_cpu)
     config = configure(**given)
-    assert resolve_step(config, dataset, device, Parts()) == dataclasses.replace(config, step=place)
+    assert resolve_step(config, dataset, device, Parts()) == dataclasses.replace(config, step_place=place)
 
 
 def test_nothing_moves_during_the_warm_up(dataset: Dataset, device: Device, tmp_path: Path) -> None:
@@ -302,7 +303,7 @@ def test_seconds_before_the_first_step_count_once(tmp_path: Path) -> None:
             if not done:
                 log.discovered("nothing")
             for step in range(done + 1, steps + 1):
-                log.step(StepResult(step, 100, 0.5, 20.0, terms={}), 1000)
+                log.step(StepResult(step, 100, lambda: Measured(0.5, 20.0)), 1000)
     lines = [json.loads(line) for line in path.read_text().splitlines()]
     assert [line["step"] for line in lines] == [0, 50, 100]
     assert lines[0]["discovery"] == "nothing"
@@ -319,7 +320,9 @@ def test_log_lines_and_the_progress_line(tmp_path: Path) -> None:
         with Log(tmp_path / "log.jsonl", 120, terminal=stream) as log:
             for step in range(1, 121):
                 terms = {"l1": 0.25, "ssim": 0.25 + step}
-                log.step(StepResult(step, 120, 0.5 + step, 20.0, terms=terms, pruned=2 * (step in (60, 70))), 1000)
+                measured = Measured(0.5 + step, 20.0, terms=terms)
+                pruned = 2 * (step in (60, 70))
+                log.step(StepResult(step, 120, partial(lambda told: told, measured), pruned), 1000)
         text = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
         assert [line["step"] for line in text] == [50, 100, 120]
         assert [line["pruned"] for line in text] == [0, 4, 0]

@@ -66,11 +66,7 @@ class Scene4D:
     """A moving scene.
 
     Attributes:
-        parameters: canonical Gaussians as they are optimized, each an nn.Parameter of float32: means (N, 3) world
-            units, log_scales (N, 3), quats (N, 4) wxyz of any length, opacity_logits (N,), sh_dc (N, 1, 3), sh_rest
-            (N, 15, 3); for the field laplacian and one's own also dynamics (N, D) (paper eq. 8).
         field_config: configuration of the field.
-        field: the module that moves the Gaussians; None for static scenes.
         on_access: called before the parameters or the field are given out, where a training keeps newer ones on the
             device; else None.
         device: that renders.
@@ -135,9 +131,12 @@ class Scene4D:
             points: (N, 3) means, world units.
             colors: (N, 3) in [0, 1].
             scales: (N,) standard deviations, world units.
-            field_config, antialiased, seed, own_field: as for `Scene4D`.
+            field_config: as for `Scene4D`.
             opacity: of all Gaussians, in (0, 1).
+            antialiased: as for `Scene4D`.
             device: None for the default adapter.
+            seed: as for `Scene4D`.
+            own_field: as for `Scene4D`.
 
         Returns:
             The scene.
@@ -152,7 +151,12 @@ class Scene4D:
 
     @property
     def parameters(self) -> dict[str, nn.Parameter]:
-        """The canonical Gaussians, see above."""
+        """The canonical Gaussians as they are optimized.
+
+        Each is an nn.Parameter of float32: means (N, 3) world units, log_scales (N, 3), quats (N, 4) wxyz of any
+        length, opacity_logits (N,), sh_dc (N, 1, 3), sh_rest (N, 15, 3); for the field laplacian and one's own also
+        dynamics (N, D) (paper eq. 8).
+        """
         if self.on_access is not None:
             self.on_access()
         return self._parameters

@@ -275,7 +275,7 @@ class Config(Options):
         "lower the opacity of thin Gaussians by the factor by which the low-pass filter enlarges them (as in gsplat)",
         False,
     )
-    step: StepPlace = option(
+    step_place: StepPlace = option(
         "where a training step is computed; resident: on the device from end to end, where its parameters stay; "
         "exchange: by torch, which exchanges buffers with the device; auto: exchange on CPU devices and for what only "
         "torch computes (fields other than static, grid4d and laplacian, corrected cameras and colors, --batch), else "

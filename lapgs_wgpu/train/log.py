@@ -58,6 +58,9 @@ class Log:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
+        if kind is not None:
+            with suppress(Exception):  # one trouble is enough
+                self._take_in()
         self._progress.__exit__(kind, error, traceback)
         self._file.close()
 

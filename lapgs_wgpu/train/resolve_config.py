@@ -53,11 +53,11 @@ def resolve_step(config: Config, dataset: Dataset, device: Device, parts: Parts)
     where it is to be resident and cannot be.
     """
     reason = why_exchange(config, dataset, parts)
-    if config.step == "resident" and reason:
-        raise InputError(f"the step cannot be resident: {reason}; give --step auto.")
-    if config.step != "auto":
+    if config.step_place == "resident" and reason:
+        raise InputError(f"the step cannot be resident: {reason}; give --step_place auto.")
+    if config.step_place != "auto":
         return config
-    return dataclasses.replace(config, step="exchange" if reason or device.is_cpu else "resident")
+    return dataclasses.replace(config, step_place="exchange" if reason or device.is_cpu else "resident")
 
 
 def why_exchange(config: Config, dataset: Dataset, parts: Parts) -> str:

@@ -51,5 +51,5 @@ def static_config(config: Config) -> Config:
         loss=dataclasses.replace(config.loss, pyramid=0.0, ncc=0.0, dynamics=0.0),
         smoothness=dataclasses.replace(config.smoothness, share=0.0),
         acceleration=dataclasses.replace(config.acceleration, weight=0.0),
-        step="auto",
+        step_place="auto",
     )

@@ -152,7 +152,7 @@ class Trainer:
         self._stepper = ExchangeStep(self._objective, self._learners, self._density, self._truth)
         self._resident = None
         self._past: dict[int, _Past] = {}
-        if config.step == "resident":
+        if config.step_place == "resident":
             self._resident = ResidentStep(config, scene, self._learners, self._truth, dataset.moments)
             self._resident.redraw = self._redraw
             self._resident.broken = self._broken
@@ -179,7 +179,7 @@ class Trainer:
         return self._learners.exposure(view)
 
     @property
-    def step_place(self) -> str:
+    def steps_are(self) -> str:
         """Where the steps are computed, and why, in words."""
         if self._resident is not None:
             return "resident: on the device from end to end"
