@@ -17,7 +17,7 @@ from typing import Any
 from unittest import mock
 
 from measure import Timing, recording, summary
-from wgpu import GPUQueue
+from wgpu.backends.wgpu_native import GPUQueue
 
 from lapgs_wgpu import Trainer
 from lapgs_wgpu.data import load_dataset
