@@ -93,11 +93,13 @@ def test_gradients_are_those_of_torch(device: Device, dataset: Dataset, kind: st
     task = Task(4, sample, trainers[0].scene.timing(view.time), 2, rates, 1e-3, seen=True)
     mine, expected = by_resident(trainers[0], task), by_torch(trainers[1], sample)
     assert mine.keys() == expected.keys()
+    # SwiftShader's exp is off by more, which the losses' signs of small differences make larger.
+    bound = 1e-3 if "SwiftShader" in device.info.name else 3e-5
     for name, exact in expected.items():
         if exact.abs().max() == 0:
             assert mine[name].abs().max() == 0, name
         else:
-            assert relative(mine[name], exact) < 3e-5, name
+            assert relative(mine[name], exact) < bound, name
 
 
 @pytest.mark.parametrize("method", ["laplacian", "static"])
