@@ -9,16 +9,7 @@
 @group(0) @binding(8) var<storage, read_write> dead: atomic<u32>;   // scales at the floor, counted
 #ifdef MOVING
 @group(0) @binding(3) var<storage, read> outputs: array<f32>;       // (N, outputs), without their biases
-
-fn vec3_at(i: u32, column: u32) -> vec3<f32> {
-    let at = i * activation.outputs + column;
-    return vec3(outputs[at], outputs[at + 1u], outputs[at + 2u]) + vec3_bias(column);
-}
-
-fn vec4_at(i: u32, column: u32) -> vec4<f32> {
-    let at = i * activation.outputs + column;
-    return vec4(outputs[at], outputs[at + 1u], outputs[at + 2u], outputs[at + 3u]) + vec4_bias(column);
-}
+#import common/activate_outputs
 #endif
 
 @compute @workgroup_size(64)

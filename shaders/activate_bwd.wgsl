@@ -11,16 +11,7 @@
 @group(0) @binding(9) var<storage, read_write> d_geometry: array<vec4<f32>>;   // added to
 #ifdef MOVING
 @group(0) @binding(3) var<storage, read_write> outputs: array<f32>;
-
-fn vec3_at(i: u32, column: u32) -> vec3<f32> {
-    let at = i * activation.outputs + column;
-    return vec3(outputs[at], outputs[at + 1u], outputs[at + 2u]) + vec3_bias(column);
-}
-
-fn vec4_at(i: u32, column: u32) -> vec4<f32> {
-    let at = i * activation.outputs + column;
-    return vec4(outputs[at], outputs[at + 1u], outputs[at + 2u], outputs[at + 3u]) + vec4_bias(column);
-}
+#import common/activate_outputs
 #endif
 
 @compute @workgroup_size(64)
