@@ -27,14 +27,12 @@ _FRAMES = 150  # of a clip whose file does not say how many it has
 
 class LoadedScene(NamedTuple):
     """path: where it came from, None for a training under way. initial_view: camera, focus, up and frames to
-    begin with. file: its content, None for a training. up, antialiased: asked for by the user (`load_scene`)."""
+    begin with. file: its content, None for a training."""
 
     path: Path | None
     playback: Playback
     initial_view: InitialView
     file: SceneFile | None = None
-    up: str | None = None
-    antialiased: bool | None = None
 
     def camera(self) -> ViewCamera:
         """Make a camera where the viewer begins."""
@@ -67,7 +65,7 @@ def load_scene(
         initial_view = guess_view(playback, up or file.metadata.get("up"))
     elif up is not None:
         initial_view = guess_view(playback, up)._replace(frames=initial_view.frames)
-    return LoadedScene(path, playback, initial_view, file, up, antialiased)
+    return LoadedScene(path, playback, initial_view, file)
 
 
 def guess_view(playback: Playback, axis: str | None = None) -> InitialView:

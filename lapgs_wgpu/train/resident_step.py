@@ -179,8 +179,10 @@ class ResidentStep:
     # A step's end ----------------------------------------------------------------------------------------------------
 
     def _settle_first(self) -> None:
-        """Wait for the step that was submitted first, and mend what it asks for. An error leaves the parameters as the
-        last step left them that was waited for, which `broken` is told of."""
+        """Wait for the step that was submitted first, and mend what it asks for.
+
+        After an error the parameters are those after the step `settled`, and `broken` is told so.
+        """
         try:
             self._settle()
         except Exception:

@@ -26,7 +26,7 @@ from lapgs_wgpu.data.stamps import ImageName
 from lapgs_wgpu.errors import InputError
 
 CLOUDS = ("points.npy", "points3D_downsample*.ply", "points3D.ply")  # all in the coordinates of the camera files
-TINY = 1e-12  # what is smaller is 0
+TINY = 1e-12  # smaller values count as 0
 STRIDE = 4  # without val_ids: every fourth id from the first on is for training, from the third on for testing
 SPLITS = ("val", "val_intl")  # folders of masks: of DyCheck's captures; of rigs that alternate the training camera
 
