@@ -137,6 +137,22 @@ def test_a_resumed_training_and_one_that_was_looked_at_end_with_the_same_bytes(
     assert [name for name in state if not np.array_equal(state[name], again[name])] == []
 
 
+def test_what_nobody_reads_stays_on_the_device(device: Device, dataset: Dataset, data: Path) -> None:
+    """Pictures are drawn there, and a change of the Gaussians leaves the field alone."""
+    trainer = started(configure(data__path=str(data), schedule__warm_up="0"), dataset, device, "resident")
+    steps(trainer, 3)
+    scene, parameters = trainer.scene, trainer._resident.parameters
+    with torch.no_grad():
+        drawn = scene.at(0.3)
+    assert parameters.values_on_host == parameters.state_on_host == set()
+    trainer._learners.optimizer.reorder(torch.arange(len(scene)).flip(0))
+    assert parameters.values_on_host == parameters.state_on_host == {"gaussians"}
+    exact = scene.at(0.3)  # by torch, since it is differentiable
+    assert parameters.values_on_host == {"gaussians", "field"}
+    for name, values in exact.arrays().items():
+        assert relative(drawn.arrays()[name].flip(0), values.detach()) < 1e-5, name
+
+
 def test_what_was_recorded_is_right_when_gaussians_go(device: Device, dataset: Dataset, data: Path) -> None:
     """The same bytes as if every step were recorded anew, where fewer Gaussians need no new buffers."""
     config = configure(data__path=str(data), density__start="1000", density__stop="1001", schedule__warm_up="2")

@@ -67,8 +67,9 @@ class Scene4D:
 
     Attributes:
         field_config: configuration of the field.
-        on_access: called before the parameters or the field are given out, where a training keeps newer ones on the
-            device; else None.
+        on_access: called with "gaussians" before the parameters are given out, and with "field" before the field is,
+            where a training keeps newer ones on the device; else None.
+        on_device: gives the Gaussians at a time of the field, where a training keeps newer ones there; else None.
         device: that renders.
         sh_degree: degree of the harmonics in use, 0 to 3.
         antialiased: how the Gaussians are drawn, see Gaussians.
@@ -99,7 +100,8 @@ class Scene4D:
             InputError: own_field is missing or superfluous for field_config.kind.
         """
         check_own(field_config, own_field)
-        self.on_access: Callable[[], None] | None = None
+        self.on_access: Callable[[str], None] | None = None
+        self.on_device: Callable[[float], Gaussians[Tensor]] | None = None
         self._parameters = {
             name: nn.Parameter(parameters[name].detach().float().contiguous().clone())
             for name in row_shapes(field_config)
@@ -158,14 +160,14 @@ class Scene4D:
         dynamics (N, D) (paper eq. 8).
         """
         if self.on_access is not None:
-            self.on_access()
+            self.on_access("gaussians")
         return self._parameters
 
     @property
     def field(self) -> Field | None:
         """The module that moves the Gaussians; None for static scenes."""
         if self.on_access is not None:
-            self.on_access()
+            self.on_access("field")
         return self._field
 
     @property
@@ -212,11 +214,14 @@ class Scene4D:
         Returns:
             Deformed. Differentiable in `parameters` and the field's parameters.
         """
+        t = (timing or self.timing)(t)
+        if self.on_device is not None and not torch.is_grad_enabled() and nearby is None and time_samples is None:
+            return Deformed(self.on_device(t), None, [])
         p = self.parameters
         canonical = self.canonical()
         if self.field is None or len(self) == 0:
             return Deformed(canonical, None, [])
-        move, *others = self._moves((timing or self.timing)(t), nearby, time_samples)
+        move, *others = self._moves(t, nearby, time_samples)
         quats, sh, opacities = canonical.quats, canonical.sh, canonical.opacities
         if move.orientation is not None:
             quats = quat_multiply(move.orientation, quats)
@@ -301,7 +306,7 @@ class Scene4D:
             now = self.at(t)
             sh = torch.cat([now.sh[:, :1], self.parameters["sh_rest"]], dim=1)
             logits = self.parameters["opacity_logits"].detach()
-            if not torch.equal(now.opacities, logits.sigmoid()):
+            if not torch.allclose(now.opacities, logits.sigmoid(), rtol=1e-5, atol=1e-7):
                 logits = now.opacities.logit(eps=1e-7)
         return GaussianSnapshot(
             means=now.means.numpy(force=True),

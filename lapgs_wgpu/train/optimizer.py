@@ -32,8 +32,8 @@ class Optimizer:
     gaussians: name -> parameter with a row for each Gaussian. This very mapping is changed when rows come and go.
     field: group -> parameters, such as the field's `parameter_groups()`. rates: the schedule of each name and group.
     highest: name or group -> rate that it never exceeds. The same gradients in the same order give the same bits.
-    on_access: called before the state, or the Gaussians with it, is read or changed from outside: a device may have
-    newer ones.
+    on_access: called with "gaussians" or "field" before the state of these, or they with it, are read or changed from
+    outside, without a name for both: a device may have newer ones.
     """
 
     def __init__(
@@ -46,7 +46,7 @@ class Optimizer:
         self.gaussians = gaussians
         self.rates = dict(rates)
         self.highest: dict[str, float] = {}
-        self.on_access: Callable[[], None] = lambda: None
+        self.on_access: Callable[..., None] = lambda *parts: None
         # Fused: one pass over the memory, 2.5 times as fast as the others on the dnerf preset's hash tables.
         named = [{"params": parameters, "name": name} for name, parameters in groups.items()]
         self._adam = torch.optim.Adam(named, lr=0.0, eps=ADAM_EPS, fused=True)
@@ -82,7 +82,7 @@ class Optimizer:
 
     def edit_rows(self, keep: Tensor, added: Mapping[str, Tensor]) -> None:
         """Keep the Gaussians of a mask (N,) with their state, and append rows (M, ...) with a zero state."""
-        self.on_access()
+        self.on_access("gaussians")
         for name, old in self.gaussians.items():
             rows = added[name]
             zeros = torch.zeros_like(rows)
@@ -91,14 +91,14 @@ class Optimizer:
 
     def reorder(self, order: Tensor) -> None:
         """Put the Gaussians, with their state, into another order: indices (N,)."""
-        self.on_access()
+        self.on_access("gaussians")
         for name, old in self.gaussians.items():
             moments = {key: moment[order] for key, moment in self.moments(name).items()}
             self._replace(name, old.detach()[order], moments)
 
     def reset(self, name: str, values: Tensor) -> None:
         """Give one of the Gaussians' parameters new values (N, ...) and a zero state."""
-        self.on_access()
+        self.on_access("gaussians")
         self._replace(name, values, {key: torch.zeros_like(values) for key in self.moments(name)})
 
     def moments(self, name: str) -> dict[str, Tensor]:

@@ -28,6 +28,7 @@ from lapgs_wgpu.train.optimizer import LARGEST_FREQUENCY_STEP, AdamState, Freque
 
 _MOST_RATES = 512  # columns with a rate of their own
 KINDS = ("value", "gradient", "mean", "square")
+PARTS = ("gaussians", "field")  # of a scene, which go between host and device by themselves
 FREQUENCIES = "motion.frequencies"
 Place = tuple[slice, slice]  # rows and columns of an array
 
@@ -44,6 +45,7 @@ class Block:
         ones: whether the last column holds ones, which no step changes.
         moved: number of values that Adam moves; the others have an optimizer of their own.
         moving: whether only steps with motion move them.
+        of: the Gaussians or the field, see PARTS.
         arrays: by kind.
     """
 
@@ -55,6 +57,7 @@ class Block:
     ones: bool = False
     moved: int | None = None
     moving: bool = True
+    of: str = "gaussians"
     arrays: dict[str, DeviceArray] = field(default_factory=dict)
 
     @property
@@ -102,14 +105,27 @@ class ResidentParameters:
         self._weights = weights
         self.blocks: dict[str, Block] = {}
         self.steps: dict[str, int] = {}
-        self.on_host = {"values": True, "state": True}  # what the host may have changed since it was pushed
+        # The parts that the host may have changed since they were pushed: their values, the optimizers' state of them.
+        self.values_on_host, self.state_on_host = set(PARTS), set(PARTS)
 
     # The host's tensors and the device's arrays ----------------------------------------------------------------------
 
-    def _tensors(self) -> dict[str, Tensor]:
-        return {**self._gaussians, **self._field}
+    def _tensors(self, *parts: str) -> dict[str, Tensor]:
+        """By name; those of all parts if none is named."""
+        chosen = {"gaussians": self._gaussians, "field": self._field}
+        return {name: tensor for part in parts or PARTS for name, tensor in chosen[part].items()}
 
-    def _layout(self) -> dict[str, Block]:
+    def _blocks_of(self, part: str) -> list[Block]:
+        return [block for block in self.blocks.values() if block.of == part]
+
+    def _layout(self, part: str) -> dict[str, Block]:
+        """The blocks of a part, with arrays for its tensors as they are."""
+        blocks = self._gaussians_layout() if part == "gaussians" else self._field_layout()
+        for block in blocks:
+            block.arrays = {kind: self._pool.array(f"{block.name} {kind}", block.shape) for kind in KINDS}
+        return {block.name: block for block in blocks}
+
+    def _gaussians_layout(self) -> list[Block]:
         n, every = len(self._gaussians["means"]), slice(None)
         columns = {"means": (0, 3), "opacity_logits": (3, 4), "quats": (4, 8), "log_scales": (8, 11)}
         geometry = {name: (every, slice(*place)) for name, place in columns.items()}
@@ -122,56 +138,66 @@ class ResidentParameters:
             beside = self._weights.shape.beside
             dynamics = {"dynamics": (every, slice(0, beside - 1))} if "dynamics" in self._gaussians else {}
             blocks.append(Block("beside", (n, beside), None, 4, dynamics, ones=True))
-            tables = [name for name in self._field if name.endswith(".table")]
-            for bit, name in enumerate(tables):
-                shape = (self._field[name].shape[0], 2)
-                blocks.append(Block(name, shape, "hash", 8 << bit, {name: (every, every)}))
-            rows = {
-                name: (slice(p.first, p.first + self._field[name].numel()), every)
-                for name, p in self._weights.places.items()
-            }
-            moved = self._weights.places[FREQUENCIES].first if FREQUENCIES in rows else None
-            blocks.append(Block("weights", (self._weights.count, 1), "mlp", 8 << len(tables), rows, moved=moved))
-        for block in blocks:
-            block.arrays = {kind: self._pool.array(f"{block.name} {kind}", block.shape) for kind in KINDS}
-        return {block.name: block for block in blocks}
+        return blocks
+
+    def _field_layout(self) -> list[Block]:
+        if self._weights is None:
+            return []
+        every, tables = slice(None), [name for name in self._field if name.endswith(".table")]
+        blocks = []
+        for bit, name in enumerate(tables):
+            shape = (self._field[name].shape[0], 2)
+            blocks.append(Block(name, shape, "hash", 8 << bit, {name: (every, every)}, of="field"))
+        rows = {
+            name: (slice(p.first, p.first + self._field[name].numel()), every)
+            for name, p in self._weights.places.items()
+        }
+        moved, shape = (
+            self._weights.places[FREQUENCIES].first if FREQUENCIES in rows else None,
+            (self._weights.count, 1),
+        )
+        return [*blocks, Block("weights", shape, "mlp", 8 << len(tables), rows, moved=moved, of="field")]
+
+    def push_values(self) -> None:
+        """Upload the values that the host may have changed."""
+        for part in [part for part in PARTS if part in self.values_on_host]:
+            self.blocks |= self._layout(part)
+            for block in self._blocks_of(part):
+                block.arrays["value"].write(block.gather(self._tensors(part), value=True))
 
     def push(self) -> None:
-        """Upload what the host has had since the last step."""
-        if self.on_host["values"]:
-            self.blocks, tensors = self._layout(), self._tensors()
-            for block in self.blocks.values():
-                block.arrays["value"].write(block.gather(tensors, value=True))
-        if self.on_host["state"]:
-            state = {name: self._optimizer.state_of(tensor) for name, tensor in self._tensors().items()}
-            self.steps = {name: each.steps if each else 0 for name, each in state.items()}
+        """Upload what the host may have changed; from now on the device has the newest."""
+        self.push_values()
+        for part in [part for part in PARTS if part in self.state_on_host]:
+            state = {name: self._optimizer.state_of(tensor) for name, tensor in self._tensors(part).items()}
+            self.steps |= {name: each.steps if each else 0 for name, each in state.items()}
             for kind in ("mean", "square"):
                 moments = {name: getattr(each, kind) if each else None for name, each in state.items()}
-                for block in self.blocks.values():
+                for block in self._blocks_of(part):
                     block.arrays[kind].write(block.gather(moments, value=False))
-            if self._frequencies is not None:
+            if part == "field" and self._frequencies is not None:
                 content, self.steps[FREQUENCIES] = self._frequencies.packed()
                 self._pool.upload("frequencies", content)
-        self.on_host = {"values": False, "state": False}
+        self.values_on_host, self.state_on_host = set(), set()
 
     @torch.no_grad()
-    def pull_values(self) -> None:
-        """Make torch's tensors the newest ones."""
-        if self.on_host["values"]:
-            return
-        self.on_host["values"] = True
-        tensors, blocks = self._tensors(), list(self.blocks.values())
-        for block, content in zip(blocks, read_all([b.arrays["value"] for b in blocks]), strict=True):
-            block.scatter(content, tensors)
+    def pull_values(self, *parts: str) -> None:
+        """Make torch's tensors of some parts, of all if none is named, the newest ones."""
+        for part in set(parts or PARTS) - self.values_on_host:
+            self.values_on_host.add(part)
+            tensors, blocks = self._tensors(part), self._blocks_of(part)
+            for block, content in zip(blocks, read_all([b.arrays["value"] for b in blocks]), strict=True):
+                block.scatter(content, tensors)
 
     @torch.no_grad()
-    def pull_state(self) -> None:
-        """Make torch's state of the optimizers the newest one."""
-        if self.on_host["state"]:
-            return
-        self.on_host["state"] = True
-        blocks = list(self.blocks.values())
-        tensors = self._tensors()
+    def pull_state(self, *parts: str) -> None:
+        """Make torch's state of the optimizers of some parts, of all if none is named, the newest one."""
+        for part in set(parts or PARTS) - self.state_on_host:
+            self.state_on_host.add(part)
+            self._pull_state(part)
+
+    def _pull_state(self, part: str) -> None:
+        tensors, blocks = self._tensors(part), self._blocks_of(part)
         both = [{name: torch.zeros_like(tensor) for name, tensor in tensors.items()} for _ in range(2)]
         for kind, into in zip(("mean", "square"), both, strict=True):
             for block, content in zip(blocks, read_all([b.arrays[kind] for b in blocks]), strict=True):
@@ -179,12 +205,12 @@ class ResidentParameters:
         for name, tensor in tensors.items():
             if self.steps[name] and name != FREQUENCIES:
                 self._optimizer.set_state(tensor, AdamState(self.steps[name], both[0][name], both[1][name]))
-        if self._frequencies is not None:
+        if part == "field" and self._frequencies is not None:
             self._frequencies.unpack(self._pool.array("frequencies", self._state_shape).read(), self.steps[FREQUENCIES])
 
     def spectrum(self) -> dict[str, Tensor]:
         """The motion's frequencies (K,) and amplitudes (K,), the newest ones."""
-        if self.on_host["values"]:
+        if "field" in self.values_on_host:
             tensors = {name: self._field[f"motion.{name}"].detach() for name in ("frequencies", "alpha", "beta")}
         else:
             assert self._weights is not None

@@ -132,6 +132,16 @@ class ResidentPasses:
         commands.copy(truth, held)
         return self._recorded(commands, task, held, judged=judged)
 
+    def at(self, t: float, degree: int) -> Gaussians[DeviceArray]:
+        """The Gaussians at a time of the field, in arrays that the next step overwrites. degree: of the harmonics."""
+        values, decoding, dead = self.parameters.arrays("value"), None, self.word("dead")
+        with Commands(self._device) as commands:
+            commands.clear(dead)
+            if self._field is not None:
+                self._field.begin(commands, values)
+                decoding = self._field.decode(commands, 0, values, lambda: t)
+            return self._activate(commands, degree, decoding, dead)
+
     def check_driver(self, task: Task) -> None:
         """Draw an image and its gradient once the ordinary way, which checks the driver's subgroups."""
         if self._checked:
@@ -140,7 +150,7 @@ class ResidentPasses:
         view = task.sample.view
         with Commands(self._device) as commands:
             commands.clear(self.word("dead"))
-            drawn = self._activate(commands, task, None, self.word("dead"))
+            drawn = self._activate(commands, task.sh_degree, None, self.word("dead"))
         d_image = self._losses.pool.array("d_image", (4, view.camera.height, view.camera.width))
         while True:
             drawing = self.rasterizer.draw(drawn, view.camera, gradient=True)
@@ -180,7 +190,7 @@ class ResidentPasses:
         for array in (bad, dead, totals):
             commands.clear(array)
         decoding, comparison, line = self._decode(commands, task, values)
-        drawn = self._activate(commands, task, decoding, dead)
+        drawn = self._activate(commands, task.sh_degree, decoding, dead)
         drawing = self.rasterizer.record(commands, drawn, sample.view.camera, sample.background)
         terms, d_image = self._losses.record(
             commands, drawing.image, truth, sample.background, self.weights(task), gradient=True
@@ -225,14 +235,14 @@ class ResidentPasses:
         return (self._task.time - before) / (after - before)
 
     def _activate(
-        self, commands: Commands, task: Task, decoding: Decoding | None, dead: DeviceArray
+        self, commands: Commands, degree: int, decoding: Decoding | None, dead: DeviceArray
     ) -> Gaussians[DeviceArray]:
         blocks = self.parameters.blocks
         return self._activation.activate(
             commands,
             blocks["geometry"].arrays["value"],
             blocks["sh"].arrays["value"],
-            task.sh_degree,
+            degree,
             decoding,
             dead,
             antialiased=self._scene.antialiased,

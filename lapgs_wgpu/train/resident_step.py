@@ -20,11 +20,13 @@ from torch import Tensor
 
 from lapgs_wgpu.data.views import View
 from lapgs_wgpu.errors import NumericalError
+from lapgs_wgpu.gpu.array import read_all
 from lapgs_wgpu.gpu.kernel import Commands
 from lapgs_wgpu.gpu.later import Later, Ring
 from lapgs_wgpu.motion.passes.samples import Samples
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.drawing import Drawing
+from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.train.acceleration import LARGEST_DISTANCE
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.densify import Statistics
@@ -32,6 +34,7 @@ from lapgs_wgpu.train.ground_truth import GroundTruth
 from lapgs_wgpu.train.image_metrics import psnr_of
 from lapgs_wgpu.train.learners import Learners
 from lapgs_wgpu.train.nonfinite import Skipped, cause, check_parameters
+from lapgs_wgpu.train.resident_parameters import PARTS
 from lapgs_wgpu.train.resident_passes import ResidentPasses, ResidentSample, Task
 from lapgs_wgpu.train.step_result import Measured
 
@@ -95,25 +98,33 @@ class ResidentStep:
         self.broken: Callable[[int | None], None] = lambda step: None
         self.tell: Callable[[Measured], None] = lambda measured: None
         self.dead_scales = 0.0
-        scene.on_access = self.to_host
+        scene.on_access, scene.on_device = self.to_host, self.at
         learners.optimizer.on_access = self.to_rest
 
     # Between steps ---------------------------------------------------------------------------------------------------
 
-    def to_host(self) -> None:
-        """Wait for all steps, and make the scene's tensors the newest ones."""
+    def to_host(self, *parts: str) -> None:
+        """Wait for all steps, and make the scene's tensors of some parts, of all if none is named, the newest ones."""
         self.settle()
-        self.parameters.pull_values()
-        if not self._statistics_on_host and self.statistics is not None:
+        self.parameters.pull_values(*parts)
+        if "gaussians" in (parts or PARTS) and not self._statistics_on_host and self.statistics is not None:
             self._statistics_on_host = True
             seen = torch.from_numpy(self._passes.seen().read())
             for target, column in zip(vars(self.statistics).values(), seen.T, strict=False):
                 target.copy_(column)
 
-    def to_rest(self) -> None:
+    def to_rest(self, *parts: str) -> None:
         """The same with the optimizers' state."""
-        self.to_host()
-        self.parameters.pull_state()
+        self.to_host(*parts)
+        self.parameters.pull_state(*parts)
+
+    def at(self, t: float) -> Gaussians[Tensor]:
+        """The scene's Gaussians at a time of the field, from the newest parameters, which are not given out."""
+        self.settle()
+        self.parameters.push_values()
+        now = self._passes.at(t, self._scene.sh_degree)
+        tensors = [torch.from_numpy(array) for array in read_all(list(now.arrays().values()))]
+        return Gaussians(**dict(zip(now.arrays(), tensors, strict=True)), antialiased=now.antialiased)
 
     @torch.no_grad()
     def spectrum(self) -> dict[str, Tensor]:
