@@ -1,7 +1,8 @@
-// The sum of some values, times a factor, by one workgroup.
+// The sums of columns of values, times a factor, by a workgroup each.
 struct Values {
-    count: u32,
-    place: u32,     // of the sum in `totals`
+    rows: u32,
+    columns: u32,
+    place: u32,     // of the first sum in `totals`
     factor: f32,
 }
 
@@ -14,10 +15,10 @@ const LANES = 256u;
 var<workgroup> of_lane: array<f32, LANES>;
 
 @compute @workgroup_size(256)
-fn main(@builtin(local_invocation_index) lane: u32) {
+fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
     var mine = 0.0;
-    for (var i = lane; i < sum.count; i += LANES) {
-        mine += values[i];
+    for (var i = lane; i < sum.rows; i += LANES) {
+        mine += values[sum.columns * i + group.x];
     }
     of_lane[lane] = mine;
     workgroupBarrier();
@@ -26,6 +27,6 @@ fn main(@builtin(local_invocation_index) lane: u32) {
         for (var i = 0u; i < LANES; i++) {
             total += of_lane[i];
         }
-        totals[sum.place] = sum.factor * total;
+        totals[sum.place + group.x] = sum.factor * total;
     }
 }

@@ -93,7 +93,7 @@ def test_the_change_of_a_camera_is_that_of_the_gradient() -> None:
     """The first step goes down the whitened gradient, and moves the image by the learning rate."""
     given = cameras()
     refinement = refinement_of(given)
-    refinement._common = torch.zeros(30, 0, dtype=torch.float64)
+    refinement.common = torch.zeros(30, 0, dtype=torch.float64)
     gradient = torch.zeros(5, 6)
     gradient[1] = torch.tensor([0.3, -0.1, -0.3, 20.0, -5.0, 1.0])
     refinement.values.grad = gradient
@@ -144,7 +144,7 @@ def test_corrections_are_pulled_back() -> None:
     gradient[[1, 4]] = 0.0
     pulled, twin = (refinement_of(cameras(), dataclasses.replace(CONFIG, pull=each)) for each in (pull, 0.0))
     for refinement in (pulled, twin):
-        refinement._common = torch.zeros(30, 0, dtype=torch.float64)
+        refinement.common = torch.zeros(30, 0, dtype=torch.float64)
         refinement._learnt.copy_(first)
         refinement.values.grad = gradient.clone()
         refinement.step(1)

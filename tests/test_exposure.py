@@ -44,9 +44,10 @@ def test_exposure(device: Device, size: tuple[int, int]) -> None:
     image, d_exposed = (rng.random((4, *size), np.float32) for _ in range(2))
     passes = ExposurePasses(device)
     drawn, d = DeviceArray.upload(device, "image", image), DeviceArray.upload(device, "d_exposed", d_exposed)
+    rows = DeviceArray.upload(device, "rows", np.concatenate([np.zeros((2, 4), np.float32), CORRECTION.numpy()]))
     with Commands(device) as commands:
-        exposed = passes.record(commands, drawn, CORRECTION)
-        back = passes.record_bwd(commands, drawn, d, CORRECTION)
+        exposed = passes.record(commands, drawn, rows, lambda: 2)
+        back = passes.record_bwd(commands, drawn, d, rows, lambda: 2)
 
     def tensor(planes: NDArray[np.float32]) -> torch.Tensor:
         return torch.from_numpy(planes[:3]).permute(1, 2, 0).double()

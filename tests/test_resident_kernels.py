@@ -3,25 +3,36 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 import torch
 from helpers import sampled_rows
 from helpers.matrices import on_device, random, read
+from helpers.scenes import relative
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.pool import BufferPool
+from lapgs_wgpu.gpu.sums import sum_columns
 from lapgs_wgpu.motion.fields.dynamics import dynamics_loss
 from lapgs_wgpu.motion.fields.laplacian import VARIANCE_FLOOR, VARIANCE_SPREAD, LaplacianMotion
 from lapgs_wgpu.motion.passes.samples import SamplePasses, Samples
+from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.splat.gaussians import Gaussians
+from lapgs_wgpu.splat.rasterizer import Rasterizer
 from lapgs_wgpu.splat.splat_layout import MEAN, RADIUS, SPLAT_FLOATS
+from lapgs_wgpu.train.camera_refinement import MOST_POINTS, CameraRefinement, image_motion, scene_points
+from lapgs_wgpu.train.config import CamerasConfig
 from lapgs_wgpu.train.densify import Statistics
+from lapgs_wgpu.train.exposure import Exposures
 from lapgs_wgpu.train.learning_rate import Rate
 from lapgs_wgpu.train.optimizer import ADAM_EPS, LARGEST_FREQUENCY_STEP, FrequencyOptimizer
+from lapgs_wgpu.train.resident_corrections import ResidentCorrections
 
 pytestmark = pytest.mark.kernels
 OPEN, CLOSED = 0, 7
@@ -108,10 +119,9 @@ def test_the_dynamics_loss(device: Device, count: int, columns: int) -> None:
         arrays["dynamics"] = uniform(device, kernel, "Dynamics", **sizes)
         with Commands(device) as commands:
             commands.run(kernel, 64, arrays)
-    totals, total = on_device(device, torch.zeros(3)), Kernel.get(device, "sum_values")
+    totals = on_device(device, torch.zeros(3))
     with Commands(device) as commands:
-        given = uniform(device, total, "Values", count=64, place=1, factor=2.0)
-        commands.dispatch(total, 1, sum=given, values=arrays["losses"], totals=totals)
+        sum_columns(commands, pool, "loss", arrays["losses"], totals, place=1, factor=2.0)
     torch.testing.assert_close(
         read(totals).double(), torch.tensor([0.0, 2 * loss.item(), 0.0]).double(), rtol=1e-5, atol=1e-7
     )
@@ -194,3 +204,79 @@ def test_offsets_fill_their_cube() -> None:
     assert offsets.abs().max() <= 1
     assert offsets.mean(dim=0).abs().max() < 0.06
     assert (offsets.std(dim=0) - 3**-0.5).abs().max() < 0.03
+
+
+@pytest.mark.parametrize("gaussians", [1, 60, 5003])
+def test_image_motion(device: Device, gaussians: int) -> None:
+    camera = looking_at(np.array([3, -6, 1]))
+    geometry = 2 * random(gaussians, 12)
+    geometry[: gaussians // 5, 1] -= 9  # behind the camera
+    points = scene_points(geometry[:, :3], geometry[:, 3].sigmoid())
+    kernel, found = Kernel.get(device, "image_motion"), on_device(device, torch.zeros(22))
+    drawing = Rasterizer(device).draw(nothing_but_one(device), camera)
+    given = uniform(device, kernel, "Seen", gaussians=gaussians, spacing=-(-gaussians // MOST_POINTS), unit=2.0)
+    with Commands(device) as commands:
+        commands.dispatch(
+            kernel, 1, seen=given, frame=drawing.frames[0], geometry=on_device(device, geometry), motion=found
+        )
+    motion = read(found).double()
+    full = torch.zeros(6, 6, dtype=torch.float64)
+    full[tuple(torch.tril_indices(6, 6))] = motion[:21]
+    expected = torch.from_numpy(image_motion(camera, points, 2.0))
+    assert relative((full + full.T - full.diag().diag()) / motion[21].clamp_min(1e-9), expected) < 1e-5
+
+
+class View(NamedTuple):
+    name: str
+    camera: Camera
+
+
+@pytest.mark.parametrize("guard", [OPEN, CLOSED])
+def test_steps_of_corrections(device: Device, guard: int) -> None:
+    """Of cameras and of colors, some without a gradient; and the frame that a corrected camera sees."""
+    rng, geometry = np.random.default_rng(0), 3 * random(300, 12)
+    cameras = [looking_at(rng.uniform([-3, -11, -3], [3, -5, 3])) for _ in range(5)]
+    views = [View(f"train_{number}", camera) for number, camera in enumerate(cameras)]
+
+    def twin() -> tuple[CameraRefinement, Exposures]:
+        points = scene_points(geometry[:, :3], geometry[:, 3].sigmoid())
+        refinement = CameraRefinement(
+            cameras, 2.0, CamerasConfig("on", Rate(1e-2, 1e-3, 6), 0.3, 1), lambda: points, before
+        )
+        return refinement, Exposures(5, Rate(2e-2, 2e-3, 9))
+
+    before = {number: rng.normal(scale=0.02, size=6) for number in range(5)}
+    (exact, exact_colors), (mine, mine_colors) = twin(), twin()
+    numbers = {view.name: number for number, view in enumerate(views)}
+    learners = SimpleNamespace(cameras=mine, exposures=mine_colors, image_numbers=numbers)
+    corrections, rasterizer = ResidentCorrections(device, learners), Rasterizer(device)
+    corrections.push()
+    for step, number in enumerate((1, 3, 1, 0, 3, 2), start=1):
+        d_camera, d_colors = (torch.from_numpy(rng.normal(size=n) * (step != 4)).float() for n in (6, 12))
+        drawing = rasterizer.draw(nothing_but_one(device), cameras[number])
+        corrections.begin(views[number], step)
+        corrections._d_camera.write(nn.functional.pad(d_camera.reshape(2, 3), (0, 1)).flatten().numpy())
+        corrections._d_exposure.write(d_colors.numpy())
+        with Commands(device) as commands:
+            frame = corrections.move(commands, drawing.frames[0], 0)
+            corrections.record_step(commands, word(device, guard), frame, on_device(device, geometry))
+        view = frame.read().view(np.float32)[:16].reshape(4, 4).T
+        np.testing.assert_allclose(view, exact.camera(number).T_cam_world, atol=2e-5)
+        if guard == OPEN:
+            exact.values.grad, exact_colors.values.grad = torch.zeros(5, 6), torch.zeros(5, 3, 4)
+            exact.values.grad[number], exact_colors.values.grad[number] = d_camera, d_colors.reshape(3, 4)
+            exact.step(step)
+            exact_colors.step(step)
+    corrections.pull()
+    for found, wanted in ((mine, exact), (mine_colors, exact_colors)):
+        for name, value in wanted.state().items():
+            assert relative(found.state()[name].detach(), value.detach()) < 3e-5 or not value.any(), name
+
+
+def looking_at(place: NDArray[np.float64]) -> Camera:
+    return Camera.looking_at(place, [0, 0, 0], up=[0, 0, 1], fov_x=0.7, width=40, height=30)
+
+
+def nothing_but_one(device: Device) -> Gaussians[DeviceArray]:
+    tensors = [torch.zeros(1, 3), torch.ones(1, 4), torch.ones(1, 3), torch.zeros(1), torch.zeros(1, 3)]
+    return Gaussians(*(on_device(device, tensor) for tensor in tensors), antialiased=False)

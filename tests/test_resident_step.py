@@ -14,9 +14,11 @@ from helpers.training import configure
 from torch import Tensor
 
 from lapgs_wgpu.data import Dataset
+from lapgs_wgpu.data.views import View
 from lapgs_wgpu.errors import DeviceMemoryError, InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.deformation import Nearby, TimeSamples
+from lapgs_wgpu.splat import buffer_plan
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.objective import Sample
 from lapgs_wgpu.train.resident_passes import ResidentSample, Task
@@ -32,6 +34,7 @@ KINDS = {
     "no appearance": {"field__appearance": "none"},
     "no dynamics": {"field__dynamics": "0"},
     "no temporal grids": {"field__temporal_hash": "false"},
+    "corrections": {"cameras__refine": "on", "cameras__start": "1", "exposure__enabled": "true"},
 }
 
 
@@ -53,13 +56,17 @@ def disturb(trainer: Trainer) -> None:
                 tensor += 0.2 * torch.randn(tensor.shape, generator=generator)
             scene.field.heads.weight *= 0.3
     scene.sh_degree = 2
+    if trainer.cameras is not None:
+        for tensor in (trainer.cameras.state()["learnt"], trainer._learners.exposures.values.detach()):
+            tensor += 0.02 * torch.randn(tensor.shape, generator=generator)
 
 
 def by_resident(trainer: Trainer, task: Task) -> dict[str, Tensor]:
     step = trainer._resident
     step._push()
     step._told(step._submit(task, Pending(step.settle), judged=True))
-    return {name: tensors[0] for name, tensors in step.parameters.gradients().items()}
+    gradients = {**step.parameters.gradients(), **step._passes.corrections.gradients()}
+    return {name: tensors[0] for name, tensors in gradients.items()}
 
 
 def by_torch(trainer: Trainer, sample: ResidentSample) -> dict[str, Tensor]:
@@ -74,7 +81,13 @@ def by_torch(trainer: Trainer, sample: ResidentSample) -> dict[str, Tensor]:
     trainer._stepper._descend(given, 4, share=1)
     scene = trainer.scene
     named = {**scene.parameters, **(dict(scene.field.named_parameters()) if scene.field else {})}
-    return {name: torch.zeros_like(p) if p.grad is None else p.grad for name, p in named.items()}
+    gradients = {name: torch.zeros_like(p) if p.grad is None else p.grad for name, p in named.items()}
+    if trainer.cameras is not None:
+        corrections = trainer.cameras.values.grad.sum(dim=0), trainer._learners.exposures.values.grad.sum(dim=0)
+        zero = torch.zeros(1)
+        gradients["cameras"] = torch.cat([corrections[0][:3], zero, corrections[0][3:], zero])
+        gradients["exposures"] = corrections[1].flatten()
+    return gradients
 
 
 @pytest.mark.parametrize("kind", [*KINDS, "grid4d", "static", "warm-up"])
@@ -102,12 +115,11 @@ def test_gradients_are_those_of_torch(device: Device, dataset: Dataset, kind: st
             assert relative(mine[name], exact) < bound, name
 
 
-@pytest.mark.parametrize("method", ["laplacian", "static"])
-def test_steps_are_those_of_torch(device: Device, dataset: Dataset, data: Path, method: str) -> None:
+@pytest.mark.parametrize("kind", ["laplacian", "static", "corrections"])
+def test_steps_are_those_of_torch(device: Device, dataset: Dataset, data: Path, kind: str) -> None:
     """Without what each draws by itself, over steps with and without motion, density control and a rising degree."""
-    config = configure(
-        method, data__path=str(data), points__count="150", smoothness__share="0", acceleration__weight="0"
-    )
+    given = {"points__count": "150", "smoothness__share": "0", "acceleration__weight": "0", **KINDS.get(kind, {})}
+    config = configure("static" if kind == "static" else "laplacian", data__path=str(data), **given)
     trainers = [started(config, dataset, device, step) for step in ("resident", "exchange")]
     results = [[trainer.step() for _ in range(20)] for trainer in trainers]
     for mine, other in zip(*results, strict=True):
@@ -115,12 +127,17 @@ def test_steps_are_those_of_torch(device: Device, dataset: Dataset, data: Path, 
         assert mine.terms.keys() == other.terms.keys()
     counts = [len(trainer.scene) for trainer in trainers]
     assert counts[0] == pytest.approx(counts[1], rel=0.1)
+    if kind == "corrections":
+        mine, other = (trainer._learners.state() for trainer in trainers)
+        assert relative(mine["cameras"]["learnt"], other["cameras"]["learnt"]) < 0.1
+        exposures = [part["exposure"]["values"].detach() - torch.eye(3, 4) for part in (mine, other)]
+        assert relative(*exposures) < 0.1
 
 
 def test_a_resumed_training_and_one_that_was_looked_at_end_with_the_same_bytes(
     device: Device, dataset: Dataset, data: Path
 ) -> None:
-    config = configure(data__path=str(data))
+    config = configure(data__path=str(data), **KINDS["corrections"])
     straight, watched = (started(config, dataset, device, "resident") for _ in range(2))
     for _ in straight:
         pass
@@ -153,8 +170,13 @@ def test_what_nobody_reads_stays_on_the_device(device: Device, dataset: Dataset,
         assert relative(drawn.arrays()[name].flip(0), values.detach()) < 1e-5, name
 
 
-def test_what_was_recorded_is_right_when_gaussians_go(device: Device, dataset: Dataset, data: Path) -> None:
-    """The same bytes as if every step were recorded anew, where fewer Gaussians need no new buffers."""
+def test_what_was_recorded_is_right_when_gaussians_go_and_sizes_change(
+    device: Device, dataset: Dataset, data: Path
+) -> None:
+    """The same bytes as if every step were recorded anew, where fewer Gaussians need no new buffers, and images of
+    several sizes take turns."""
+    views = tuple(smaller(view) if number % 2 else view for number, view in enumerate(dataset.train))
+    dataset = dataclasses.replace(dataset, train=views)
     config = configure(data__path=str(data), density__start="1000", density__stop="1001", schedule__warm_up="2")
     states = []
     for anew in (False, True):
@@ -172,8 +194,11 @@ def test_what_was_recorded_is_right_when_gaussians_go(device: Device, dataset: D
     assert [name for name in states[0] if not np.array_equal(states[0][name], states[1][name])] == []
 
 
-def test_steps_in_flight_behind_an_overflow_are_taken_again(device: Device, dataset: Dataset, data: Path) -> None:
-    """The same bytes as with buffers that sufficed from the start."""
+def test_steps_in_flight_behind_an_overflow_are_taken_again(
+    device: Device, dataset: Dataset, data: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same bytes as with buffers that sufficed from the start; also where they shrink again."""
+    monkeypatch.setattr(buffer_plan, "_WATCHED", 5)
     config = configure(data__path=str(data), schedule__steps="12")
     states = []
     for capacity in (None, 64):
@@ -233,6 +258,14 @@ def test_an_error_goes_back_to_the_last_step_that_was_waited_for(
         pass
     expected, found = straight.state(), rest.state()
     assert [name for name in expected if not np.array_equal(expected[name], found[name])] == []
+
+
+def smaller(view: View) -> View:
+    """The upper left part of a view."""
+    camera = dataclasses.replace(view.camera, width=view.camera.width - 5, height=view.camera.height - 9)
+    return dataclasses.replace(
+        view, camera=camera, pixels=lambda: view.pixels()[: camera.height, : camera.width].copy()
+    )
 
 
 def steps(trainer: Trainer, count: int) -> None:

@@ -144,7 +144,6 @@ class Commands:
         whole: bool = False,
     ) -> None:
         self.device = device
-        self._recording: Recording | None = None
         self._whole = whole
         self._profile = profile
         self._encoder = Encoder(device.wgpu_device)
@@ -198,7 +197,7 @@ class Commands:
         self._encoder.copy(
             source.buffer.wgpu_buffer, source.offset, target.buffer.wgpu_buffer, target.offset, source.nbytes
         )
-        if self._recording is not None:
+        if self.device.recording is not None:
             raise ValueError("copies are not recorded")
 
     def copy_out(self, source: DeviceArray, target: Any, offset: int) -> None:
@@ -207,24 +206,33 @@ class Commands:
 
     def varying(self, write: Callable[[], DeviceArray]) -> DeviceArray:
         """A uniform whose content differs from one replay to the next: `write` writes it, and is called before each."""
-        if self._recording is not None:
-            self._recording.writers.append(write)
-        return write()
+        if (recording := self.device.recording) is None:
+            return write()
+        recording.writers.append(write)
+        self.device.recording = None
+        try:
+            return write()
+        finally:
+            self.device.recording = recording
 
     @contextmanager
     def taken_down(self, recording: Recording | None) -> Iterator[None]:
         """Take down in a recording what is done within, for `replay`."""
-        self._recording = recording
-        yield
-        self._recording = None
+        self.device.recording = recording
+        try:
+            yield
+        finally:
+            self.device.recording = None
 
     def _record(self, kind: str, objects: tuple[Any, ...], *numbers: int) -> None:
-        if self._recording is not None:
-            self._recording.kept.append(objects)
-            self._recording.commands.append((kind, *(each._internal for each in objects), *numbers))
+        if (recording := self.device.recording) is not None:
+            recording.kept.append(objects)
+            recording.commands.append((kind, *(each._internal for each in objects), *numbers))
 
     def replay(self, recording: Recording) -> None:
-        """Do what was recorded, after its varying uniforms were written."""
+        """Do what was recorded, after its uniforms were written."""
+        for pool, name, content in recording.constants:
+            pool.refresh(name, content)
         for write in recording.writers:
             write()
         self._encoder.replay(recording.commands)

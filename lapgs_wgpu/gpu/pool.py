@@ -44,11 +44,18 @@ class BufferPool:
 
         The content must not change between recording and submission of a command that reads it.
         """
+        if self.device.recording is not None:
+            self.device.recording.constants.append((self, name, content))
         array = self.array(f"constant {name}", (len(content),), "uint8")
         if self._constants.get(name) != content:
             array.write(np.frombuffer(content, np.uint8))
             self._constants[name] = content
         return array
+
+    def refresh(self, name: str, content: bytes) -> None:
+        """Write a constant again, unless it still has this content."""
+        if self._constants.get(name) != content:
+            self.constant(name, content)
 
     @property
     def nbytes(self) -> int:

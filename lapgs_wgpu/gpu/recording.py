@@ -15,5 +15,6 @@ class Recording:
     def __init__(self, generation: int) -> None:
         self.generation = generation
         self.commands: list[tuple[Any, ...]] = []
+        self.constants: list[tuple[Any, str, bytes]] = []  # of which pool, name, content: others may write over them
         self.writers: list[Callable[[], object]] = []
         self.kept: list[Any] = []  # objects whose native ones the commands use

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -9,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.kernel import Commands
 from lapgs_wgpu.splat.buffer_plan import BufferPlan
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.gaussians import Gaussians
@@ -33,6 +35,8 @@ class Drawing:
     image: (4, H, W) red, green, blue, transmittance; with `depth` (5, H, W), the last plane is the sum of weight times
     camera depth. splats: (N, SPLAT_FLOATS), see splat_layout. needed: (3,) uint32 per band: number of intersections;
     unused; whether a list needs more rounds. lists: of the band drawn last. number: counts the rasterizer's drawings.
+    frames: what each band's passes share. move: records a band's frame, given that of `camera`, with the camera moved;
+    None where it stands.
     """
 
     gaussians: Gaussians[DeviceArray]
@@ -44,7 +48,9 @@ class Drawing:
     image: DeviceArray
     splats: DeviceArray
     needed: list[DeviceArray]
+    move: Callable[[Commands, DeviceArray, int], DeviceArray] | None = None
     lists: TileLists = field(init=False)
+    frames: dict[int, DeviceArray] = field(default_factory=dict)
 
     @property
     def sh_defines(self) -> dict[str, int]:

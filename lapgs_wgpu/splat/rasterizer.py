@@ -6,6 +6,7 @@ Only `grow_on_overflow` and, the first time that a pass runs, `Rasterizer._subgr
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -85,10 +86,12 @@ class Rasterizer:
         gaussians: Gaussians[DeviceArray],
         camera: Camera,
         background: tuple[float, float, float],
+        move: Callable[[Commands, DeviceArray, int], DeviceArray] | None = None,
     ) -> Drawing:
         """Record the passes that draw an image whose gradient `record_bwd` will want, among others that are submitted
-        together. `draw` and `backward` were called before, which check the driver's subgroups."""
+        together. `draw` and `backward` were called before, which check the driver's subgroups. move: of the Drawing."""
         drawing = self._begin(gaussians, camera, background, depth=False, gradient=True)
+        drawing.move = move
         for band in range(drawing.plan.bands):
             drawing.lists = self._draw_band(commands, drawing, band)
         return drawing
@@ -162,6 +165,7 @@ class Rasterizer:
         device, pool, config, gaussians = self.device, self.pool, self.config, drawing.gaussians
         n, capacity, tiles = len(gaussians), drawing.plan.capacity, self._band_tiles(drawing, band)
         frame = commands.varying(lambda: self._frame(drawing, band))
+        frame = drawing.frames[band] = drawing.move(commands, frame, band) if drawing.move else frame
         needed, visible = drawing.needed[band], pool.array("visible", (1,), "uint32")
         tile_counts, ids, keys, offsets = (
             pool.array(name, (n,), "uint32") for name in ("tile counts", "ids", "depth keys", "offsets")
@@ -290,12 +294,14 @@ class Rasterizer:
         with Commands(self.device, profile) as commands:
             return self._project_bwd(commands, drawing, d_splats, camera=camera)
 
-    def record_bwd(self, commands: Commands, drawing: Drawing, d_image: DeviceArray) -> GaussianGradients:
-        """Record the backward passes of a drawing that `record` has recorded last; d_image as for `backward`."""
+    def record_bwd(
+        self, commands: Commands, drawing: Drawing, d_image: DeviceArray, *, camera: bool
+    ) -> GaussianGradients:
+        """Record the backward passes of a drawing that `record` has recorded last; arguments as for `backward`."""
         d_splats = self.pool.array("d_splats", (len(drawing.gaussians), SPLAT_FLOATS))
         for band in range(drawing.plan.bands):
             self._backward_band(commands, drawing, band, d_image, d_splats)
-        return self._project_bwd(commands, drawing, d_splats, camera=False)
+        return self._project_bwd(commands, drawing, d_splats, camera=camera)
 
     def _project_bwd(
         self, commands: Commands, drawing: Drawing, d_splats: DeviceArray, *, camera: bool
@@ -306,7 +312,7 @@ class Rasterizer:
         d_sh = d_camera = None
         if camera:  # a row for each workgroup of camera_bwd, twice; each half begins at a multiple of 256 bytes
             d_camera = self.pool.array("d_camera", (2, (_groups(n) + 15) // 16 * 16, 4))
-        arrays = gaussians.arrays() | {"frame": self._frame(drawing, 0), "d_splats": d_splats}
+        arrays = gaussians.arrays() | {"frame": drawing.frames[0], "d_splats": d_splats}
         arrays |= {"d_means": d_means, "d_quats": d_quats, "d_scales": d_scales}
         commands.run(Kernel.get(self.device, "project_bwd"), _groups(n), arrays)
         if d_camera is not None:
@@ -343,7 +349,7 @@ class Rasterizer:
         defines = self.config.raster_defines(depth=drawing.depth)
         kernel = Kernel.get(self.device, "rasterize_bwd", ROUNDS=plan.rounds > 1, **defines)
         gather = Kernel.get(self.device, "gather_gradients", DEPTH=drawing.depth)
-        arrays = lists._asdict() | {"ids": lists.sorted_ids, "frame": self._frame(drawing, band)}
+        arrays = lists._asdict() | {"ids": lists.sorted_ids, "frame": drawing.frames[band]}
         arrays |= {"splats": drawing.splats, "image": drawing.image, "d_image": d_image, "d_splats": d_splats}
         arrays |= {"records": records, "record_tails": record_tails}
         arrays["tails"] = self.pool.constant("tails", gather.uniform("Tails", capacity=plan.capacity))
@@ -360,7 +366,7 @@ class Rasterizer:
     ) -> None:
         kernel = Kernel.get(self.device, "color_bwd", **drawing.sh_defines)
         inputs, outputs = self._color_parts(kernel, drawing.gaussians.sh), self._color_parts(kernel, d_sh)
-        arrays = {"frame": self._frame(drawing, 0), "means": drawing.gaussians.means}
+        arrays = {"frame": drawing.frames[0], "means": drawing.gaussians.means}
         arrays |= {"d_splats": d_splats, "d_means": d_means}
         for (part, colors), (_, d_colors) in zip(inputs, outputs, strict=True):
             arrays |= {"part": part, "colors": colors, "d_colors": d_colors}

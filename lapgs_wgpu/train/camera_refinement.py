@@ -114,6 +114,15 @@ class RefinedCamera(NamedTuple):
     change: Tensor | None
 
 
+class Pace(NamedTuple):
+    """How far a step moves a camera: rate, radians of the image's motion; damping, of `whitening`; kept, the share of
+    the correction that is not pulled back."""
+
+    rate: float
+    damping: float
+    kept: float
+
+
 # By the number of a camera, as far as it is known: (6,) rotation vector and shift, world units.
 Corrections = Mapping[int, Array]
 
@@ -127,6 +136,10 @@ class CameraRefinement:
         config: of the refinement.
         points: the scene as it is, asked at each step: what moves how far in the image when a camera moves.
         before: corrections to go on from, at the final learning rate and from the first step on.
+
+    Attributes:
+        numbers: of the cameras (the same objects).
+        common: (6 C, r) orthonormal: changes of all cameras that no image shows.
     """
 
     name = "cameras"
@@ -139,13 +152,13 @@ class CameraRefinement:
         points: Callable[[], ScenePoints],
         before: Corrections | None = None,
     ) -> None:
-        self._cameras, self._extent, self._config, self._points = list(cameras), extent, config, points
-        self._numbers = {camera: number for number, camera in enumerate(self._cameras)}
+        self._cameras, self.extent, self._config, self._points = list(cameras), extent, config, points
+        self.numbers = {camera: number for number, camera in enumerate(self._cameras)}
         count = len(self._cameras)
         self.values = nn.Parameter(torch.zeros(count, 6))  # zeros that get the gradient
         self._learnt = torch.zeros(count, 6, dtype=torch.float64)  # rotation vectors, shifts
         self._descent = CameraDescent(count)
-        self._common = torch.from_numpy(_common_motions(self._cameras, extent))
+        self.common = torch.from_numpy(_common_motions(self._cameras, extent))
         self._settled = torch.zeros(1)
         if before is not None:
             self._settled += 1
@@ -154,38 +167,45 @@ class CameraRefinement:
 
     def refined(self, camera: Camera) -> RefinedCamera:
         """The corrected form of one of the cameras (the same object)."""
-        number = self._numbers[camera]
+        number = self.numbers[camera]
         return RefinedCamera(self.camera(number), self.values[number])
 
     def camera(self, number: int) -> Camera:
         """The corrected form of a camera, by its number."""
-        return changed_camera(self._cameras[number], self._learnt[number].numpy() * _units(self._extent))
+        return changed_camera(self._cameras[number], self._learnt[number].numpy() * _units(self.extent))
 
     def corrections_of(self, cameras: Mapping[int, Camera]) -> Corrections:
         """What the cameras (the same objects) are corrected by, under the given numbers."""
-        learnt = self._learnt.numpy() * _units(self._extent)
-        return {number: learnt[self._numbers[camera]] for number, camera in cameras.items()}
+        learnt = self._learnt.numpy() * _units(self.extent)
+        return {number: learnt[self.numbers[camera]] for number, camera in cameras.items()}
+
+    def pace(self, step: int) -> Pace | None:
+        """How far cameras move in a step, counted from 1; None in steps that move none."""
+        config = self._config
+        if not (self._settled or step >= config.start):
+            return None
+        rate = config.rate.end if self._settled else config.rate.at(step)
+        # A scene that is still blurred says nothing of what only parallax tells: the damping falls with the rate.
+        return Pace(rate, (rate / config.rate.start) ** 2 if config.rate.start else 1.0, 1 - rate * config.pull)
 
     @torch.no_grad()
     def step(self, step: int) -> None:
         """Move the cameras that have a gradient, at the rate of this step (counted from 1), and forget it."""
-        config, gradient = self._config, self.values.grad
+        gradient, pace = self.values.grad, self.pace(step)
         self.values.grad = None
-        if gradient is None or not (self._settled or step >= config.start):
+        if gradient is None or pace is None:
             return
-        rate = config.rate.end if self._settled else config.rate.at(step)
-        # A scene that is still blurred says nothing of what only parallax tells: the damping falls with the rate.
-        damping = (rate / config.rate.start) ** 2 if config.rate.start else 1.0
+        rate, damping, kept = pace
         rows, points = gradient.any(dim=1).nonzero()[:, 0].tolist(), self._points()
         for row in rows:
-            whiten = whitening(image_motion(self.camera(row), points, self._extent), damping)
+            whiten = whitening(image_motion(self.camera(row), points, self.extent), damping)
             change = self._descent.change(row, gradient[row].double().numpy(), whiten, rate)
             before = rotation_of(self._learnt[row, :3].numpy())
             self._learnt[row, :3] = torch.from_numpy(rotation_vector(rotation_of(change[:3]) @ before))
             self._learnt[row, 3:] += torch.from_numpy(change[3:])
-        self._learnt[rows] *= 1 - rate * config.pull
+        self._learnt[rows] *= kept
         flat = self._learnt.view(-1)
-        flat -= self._common @ (self._common.T @ flat)
+        flat -= self.common @ (self.common.T @ flat)
 
     def report(self) -> dict[str, Any]:
         """How far the cameras went: degrees, and per cent of their extent."""

@@ -6,7 +6,7 @@ applied to the rendered image before the losses, and never to a view that is mea
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -46,27 +46,43 @@ class ExposurePasses:
         self.pool = BufferPool(device)
         self._lanes = 8 if device.is_cpu else 64
 
-    def record(self, commands: Commands, image: DeviceArray, correction: Tensor) -> DeviceArray:
-        """The corrected image. image: planes (4, H, W) of float32, the first three red, green, blue."""
+    def record(
+        self, commands: Commands, image: DeviceArray, corrections: DeviceArray, first: Callable[[], int] = lambda: 0
+    ) -> DeviceArray:
+        """The corrected image.
+
+        image: planes (4, H, W) of float32, the first three red, green, blue. corrections: rows of four; `first` says
+        which are the first of the image's three.
+        """
         exposed = self.pool.array("exposed", image.shape)
-        self._dispatch(commands, "exposure", correction, image=image, exposed=exposed)
+        self._dispatch(commands, "exposure", first, image=image, corrections=corrections, exposed=exposed)
         return exposed
 
-    def record_bwd(self, commands: Commands, image: DeviceArray, d_exposed: DeviceArray, correction: Tensor) -> Exposed:
+    def record_bwd(
+        self,
+        commands: Commands,
+        image: DeviceArray,
+        d_exposed: DeviceArray,
+        corrections: DeviceArray,
+        first: Callable[[], int] = lambda: 0,
+    ) -> Exposed:
         """d_exposed: the gradient by the corrected image; its fourth plane counts as zeros."""
-        height = image.shape[1]
-        done = Exposed(self.pool.array("d_image", image.shape), self.pool.array("d_rows", (height, 3, 4)))
-        self._dispatch(commands, "exposure_bwd", correction, image=image, d_exposed=d_exposed, **done._asdict())
+        done = Exposed(self.pool.array("d_image", image.shape), self.pool.array("d_rows", (image.shape[1], 3, 4)))
+        arrays = {"image": image, "d_exposed": d_exposed, "corrections": corrections, **done._asdict()}
+        self._dispatch(commands, "exposure_bwd", first, **arrays)
         return done
 
     def _dispatch(
-        self, commands: Commands, name: str, correction: Tensor, *, image: DeviceArray, **arrays: DeviceArray
+        self, commands: Commands, name: str, first: Callable[[], int], *, image: DeviceArray, **arrays: DeviceArray
     ) -> None:
         _, height, width = image.shape
         kernel = Kernel.get(self.device, name, LANES=self._lanes)
-        rows = dict(zip(("red", "green", "blue"), correction.tolist(), strict=True))
-        uniform = self.pool.constant("exposure", kernel.uniform("Exposure", size=(width, height), **rows))
-        commands.dispatch_grid(kernel, (1, height), exposure=uniform, image=image, **arrays)
+
+        def uniform() -> DeviceArray:
+            content = kernel.uniform("Exposure", size=(width, height), first=first())
+            return self.pool.constant("exposure", content)
+
+        commands.dispatch_grid(kernel, (1, height), exposure=commands.varying(uniform), image=image, **arrays)
 
 
 class Exposures:
@@ -80,7 +96,7 @@ class Exposures:
 
     def __init__(self, count: int, rate: Rate) -> None:
         self._identity = torch.eye(3, 4)
-        self._rate = rate
+        self.rate = rate
         self.values = nn.Parameter(self._identity.repeat(count, 1, 1))
         self._mean, self._square = torch.zeros(2, count, 3, 4).unbind()
         self._steps = torch.zeros(count, 1, 1)
@@ -97,7 +113,7 @@ class Exposures:
         self._square[rows] = SQUARE_DECAY * self._square[rows] + (1 - SQUARE_DECAY) * gradient.square()
         mean = self._mean[rows] / (1 - MEAN_DECAY ** self._steps[rows])
         size = (self._square[rows] / (1 - SQUARE_DECAY ** self._steps[rows])).sqrt()
-        self.values[rows] -= self._rate.at(step) * mean / (size + EPS)
+        self.values[rows] -= self.rate.at(step) * mean / (size + EPS)
         self.values.sub_(self.values.mean(dim=0) - self._identity)
         self.values.grad = None
 

@@ -16,7 +16,7 @@ from lapgs_wgpu.gpu.kernel import Commands
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.drawing import camera_gradient
 from lapgs_wgpu.splat.gaussians import Gaussians
-from lapgs_wgpu.splat.rasterize import gradient_tensors, radii_and_centres, rasterizer_of, upload_gaussians
+from lapgs_wgpu.splat.rasterize import gradient_tensors, radii_and_centres, rasterizer_of, upload, upload_gaussians
 from lapgs_wgpu.train.config import LossWeights
 from lapgs_wgpu.train.exposure import ExposurePasses
 from lapgs_wgpu.train.image_loss import ImageLoss
@@ -141,16 +141,17 @@ class _FusedLoss(torch.autograd.Function):
         rasterizer, losses, exposing = rasterizer_of(device), image_loss_of(device), exposure_of(device)
         leaves = Gaussians(means, quats, scales, opacities, sh=sh, antialiased=antialiased)
         gaussians = upload_gaussians(rasterizer.pool, leaves)
+        corrections = None if correction is None else upload(exposing.pool, "correction", correction)
         while True:
             drawing = rasterizer.draw(gaussians, camera, background, gradient=wanted)
             d_rows, d_gaussians = [], []
             with Commands(device) as commands:
-                image = drawing.image if correction is None else exposing.record(commands, drawing.image, correction)
+                image = drawing.image if corrections is None else exposing.record(commands, drawing.image, corrections)
                 terms, d_image = losses.record(commands, image, truth, background, weights, gradient=wanted)
             own_values, pixels = _own_terms(own, image, truth, background, losses, d_image)
-            if d_image is not None and correction is not None:
+            if d_image is not None and corrections is not None:
                 with Commands(device) as commands:
-                    d_image, d_correction = exposing.record_bwd(commands, drawing.image, d_image, correction)
+                    d_image, d_correction = exposing.record_bwd(commands, drawing.image, d_image, corrections)
                     d_rows = [d_correction]
             if d_image is not None:
                 back = rasterizer.backward(drawing, d_image, camera=change is not None)

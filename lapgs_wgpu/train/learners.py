@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 
 from torch import Tensor
 
@@ -33,8 +33,8 @@ class Learners:
     Attributes:
         optimizer: of the Gaussians and the field.
         frequencies: of the motion spectrum; None where there is none.
-        cameras: the corrections of the training cameras; None where they are kept.
-        exposures: the corrections of the training images' colors; None where they are taken as they are.
+        image_numbers: by name of a training view the number of its colors' correction.
+        on_access: called before corrections are read or changed from outside: a device may have newer ones.
     """
 
     def __init__(self, config: Config, dataset: Dataset, parts: Parts, start: Start) -> None:
@@ -46,19 +46,31 @@ class Learners:
         if scene.spectrum is not None:
             limit = nyquist_frequency(dataset)
             self.frequencies = FrequencyOptimizer(scene.spectrum, config.rates.frequencies, limit)
-        self.exposures = None
+        self._exposures = self._cameras = None
         if config.exposure.enabled:
             count = len(dataset.cameras) if dataset.is_rig else len(dataset.train)
-            self.exposures = Exposures(count, config.exposure.rate)
-        self.cameras = None
+            self._exposures = Exposures(count, config.exposure.rate)
         if config.cameras.refines(own_footage=dataset.own_footage):
-            self.cameras = CameraRefinement(
+            self._cameras = CameraRefinement(
                 dataset.cameras, dataset.extent, config.cameras, lambda: _points_of(scene), start.corrections
             )
+        self.on_access: Callable[[], None] = lambda: None
         of_camera = {camera: number for number, camera in enumerate(dataset.cameras)}
-        self._numbers = {
+        self.image_numbers = {
             view.name: of_camera[view.camera] if dataset.is_rig else number for number, view in enumerate(dataset.train)
         }
+
+    @property
+    def cameras(self) -> CameraRefinement | None:
+        """The corrections of the training cameras; None where they are kept."""
+        self.on_access()
+        return self._cameras
+
+    @property
+    def exposures(self) -> Exposures | None:
+        """The corrections of the training images' colors; None where they are taken as they are."""
+        self.on_access()
+        return self._exposures
 
     def limit_field_rates(self, *, field_fitted: bool) -> None:
         """Hold the field's learning rates low where discovery has fitted it to nearly all that moves."""
@@ -66,7 +78,8 @@ class Learners:
 
     def refined_camera(self, view: View) -> RefinedCamera:
         """The camera of a training view, corrected where it is, and what gets the gradient by it."""
-        return RefinedCamera(view.camera, None) if self.cameras is None else self.cameras.refined(view.camera)
+        cameras = self.cameras
+        return RefinedCamera(view.camera, None) if cameras is None else cameras.refined(view.camera)
 
     def camera(self, view: View) -> Camera:
         """The camera of a training view, corrected where it is."""
@@ -74,7 +87,8 @@ class Learners:
 
     def exposure(self, view: View) -> Tensor | None:
         """The correction (3, 4) of the colors of a training view; None where they are taken as they are."""
-        return None if self.exposures is None else self.exposures.values[self._numbers[view.name]]
+        exposures = self.exposures
+        return None if exposures is None else exposures.values[self.image_numbers[view.name]]
 
     def parameters(self) -> Tensors:
         """All that learns, by group."""
@@ -102,8 +116,8 @@ class Learners:
         return {
             "adam": self.optimizer.state(),
             "frequencies": self.frequencies.state() if self.frequencies else {},
-            "exposure": self.exposures.state() if self.exposures else {},
-            "cameras": self.cameras.state() if self.cameras else {},
+            "exposure": exposures.state() if (exposures := self.exposures) else {},
+            "cameras": cameras.state() if (cameras := self.cameras) else {},
         }
 
     def restore(self, state: Mapping[str, Mapping[str, Tensor]]) -> None:
@@ -111,10 +125,10 @@ class Learners:
         self.optimizer.restore(state.get("adam", {}))
         if self.frequencies is not None:
             self.frequencies.restore(state["frequencies"])
-        if self.exposures is not None:
-            self.exposures.restore(state["exposure"])
-        if self.cameras is not None:
-            self.cameras.restore(state["cameras"])
+        if (exposures := self.exposures) is not None:
+            exposures.restore(state["exposure"])
+        if (cameras := self.cameras) is not None:
+            cameras.restore(state["cameras"])
 
     def _refiners(self) -> Iterator[Refiner]:
         for each in (self.frequencies, self.exposures, self.cameras):

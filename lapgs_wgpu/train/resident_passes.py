@@ -13,6 +13,7 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.gpu.recording import Recording
+from lapgs_wgpu.gpu.sums import sum_columns
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.passes.activation_passes import ActivationPasses, Line
 from lapgs_wgpu.motion.passes.grid_field_passes import Comparison, Decoding, FieldArrays, GridFieldPasses
@@ -25,6 +26,7 @@ from lapgs_wgpu.train.config import Config, LossWeights
 from lapgs_wgpu.train.fused_loss import image_loss_of
 from lapgs_wgpu.train.image_loss import TERMS
 from lapgs_wgpu.train.learners import Learners
+from lapgs_wgpu.train.resident_corrections import ResidentCorrections
 from lapgs_wgpu.train.resident_parameters import ResidentParameters
 
 TOTALS = ("static", "temporal", "acceleration", "dynamics")  # sums of losses of motion, in their places
@@ -85,7 +87,7 @@ class ResidentPasses:
     """Records the passes of the steps of a training.
 
     Attributes:
-        parameters: what the steps move.
+        parameters: what the steps move. corrections: of cameras and colors, which they move, too.
         rasterizer: that draws.
         dynamics_loss: whether the loss has a term of the dynamics attributes.
     """
@@ -98,6 +100,7 @@ class ResidentPasses:
         self.parameters = ResidentParameters(
             scene.device, scene.parameters, field, weights, learners.optimizer, learners.frequencies
         )
+        self.corrections = ResidentCorrections(scene.device, learners)
         self._activation = ActivationPasses(scene.device, scene.field_config)
         self.rasterizer, self._losses = rasterizer_of(scene.device), image_loss_of(scene.device)
         self._pool = BufferPool(scene.device)
@@ -126,6 +129,7 @@ class ResidentPasses:
     def record(self, commands: Commands, task: Task, truth: DeviceArray, *, judged: bool) -> Recorded:
         """Record a step. truth: (H, W), of its view. judged: only up to the gradients, which stay."""
         self._task = task
+        self.corrections.begin(task.sample.view, task.step)
         self.parameters.count_step(moving=task.sample.moving)
         self.parameters.write_rates(task.rates, moving=task.sample.moving)
         held = self._losses.held(truth)
@@ -164,6 +168,7 @@ class ResidentPasses:
         shape = (
             *(task.sample.moving, task.sample.near is None, task.sample.even is None, task.sh_degree, task.seen),
             *(task.sample.background, camera.width, camera.height, plan, judged, len(self._scene)),
+            self.corrections.moves_camera,
         )
         found = self._recordings.get(shape)
         if found is not None and found.recording is not None and found.holds(self._device):
@@ -191,12 +196,16 @@ class ResidentPasses:
             commands.clear(array)
         decoding, comparison, line = self._decode(commands, task, values)
         drawn = self._activate(commands, task.sh_degree, decoding, dead)
-        drawing = self.rasterizer.record(commands, drawn, sample.view.camera, sample.background)
+        corrections = self.corrections
+        drawing = self.rasterizer.record(commands, drawn, sample.view.camera, sample.background, corrections.move)
+        image = corrections.expose(commands, drawing.image)
         terms, d_image = self._losses.record(
-            commands, drawing.image, truth, sample.background, self.weights(task), gradient=True
+            commands, image, truth, sample.background, self.weights(task), gradient=True
         )
         assert d_image is not None
-        by_drawn = self.rasterizer.record_bwd(commands, drawing, d_image)
+        d_image = corrections.expose_bwd(commands, drawing.image, d_image)
+        by_drawn = self.rasterizer.record_bwd(commands, drawing, d_image, camera=corrections.moves_camera)
+        corrections.sum_camera(commands, by_drawn.camera)
         self._activate_bwd(commands, drawn, by_drawn, decoding, line, totals)
         if self._field is not None and decoding is not None:
             self._decode_bwd(commands, values, gradients, decoding, comparison, line, totals)
@@ -291,10 +300,7 @@ class ResidentPasses:
 
     def _total(self, commands: Commands, values: DeviceArray, name: str, factor: float, totals: DeviceArray) -> None:
         """Record the sum of values, times a factor, in the place of this name."""
-        kernel = Kernel.get(self._device, "sum_values")
-        content = kernel.uniform("Values", count=values.size, place=TOTALS.index(name), factor=factor)
-        uniform = self._pool.constant(f"total {name}", content)
-        commands.dispatch(kernel, 1, sum=uniform, values=values, totals=totals)
+        sum_columns(commands, self._pool, name, values, totals, place=TOTALS.index(name), factor=factor)
 
     def _dynamics(self, commands: Commands, rows: DeviceArray, d_rows: DeviceArray, totals: DeviceArray) -> None:
         """Record the loss of the dynamics attributes and its gradient (motion/fields/dynamics)."""
@@ -330,6 +336,7 @@ class ResidentPasses:
         device, moving = self._device, task.sample.moving
         guard, bad = self.word("guard"), self.word("bad")
         self.parameters.record_check(commands, bad, moving=moving)
+        self.corrections.record_check(commands, bad)
         check = Kernel.get(device, "check_finite")
         content = check.uniform("Check", count=TERMS, bit=_TERM_BIT)
         commands.dispatch(check, 1, check=self._pool.constant("check terms", content), values=terms, bad=bad)
@@ -361,3 +368,5 @@ class ResidentPasses:
                 statistics=self.seen(),
             )
         self.parameters.record_adam(commands, guard, lambda: self._task.frequency_rate, moving=moving)
+        geometry = self.parameters.blocks["geometry"].arrays["value"]
+        self.corrections.record_step(commands, guard, drawing.frames[0], geometry)

@@ -100,6 +100,7 @@ class ResidentStep:
         self.dead_scales = 0.0
         scene.on_access, scene.on_device = self.to_host, self.at
         learners.optimizer.on_access = self.to_rest
+        learners.on_access = self.corrections_to_host
 
     # Between steps ---------------------------------------------------------------------------------------------------
 
@@ -112,6 +113,11 @@ class ResidentStep:
             seen = torch.from_numpy(self._passes.seen().read())
             for target, column in zip(vars(self.statistics).values(), seen.T, strict=False):
                 target.copy_(column)
+
+    def corrections_to_host(self) -> None:
+        """Wait for all steps, and make the host's corrections of cameras and colors the newest ones."""
+        self.settle()
+        self._passes.corrections.pull()
 
     def to_rest(self, *parts: str) -> None:
         """The same with the optimizers' state."""
@@ -182,6 +188,7 @@ class ResidentStep:
 
     def _push(self) -> None:
         self.parameters.push()
+        self._passes.corrections.push()
         if self._statistics_on_host and self.statistics is not None:
             self._statistics_on_host = False
             columns = [*(values.numpy(force=True) for values in vars(self.statistics).values()), np.zeros(self.count)]
@@ -220,11 +227,11 @@ class ResidentStep:
         # Not finite. The gradients are gone that were: this step alone once more, behind the closed guard.
         self._passes.word("guard").write(np.array([flying.task.step], np.uint32))
         self._told(self._submit(flying.task, flying.result, judged=True))
-        gradients = self.parameters.gradients()
+        gradients = self.parameters.gradients() | self._passes.corrections.gradients()
         with Commands(self._scene.device) as commands:
             self.parameters.clear_gradients(commands)
         self.parameters.steps = dict(flying.task.counts)
-        self.parameters.pull_values()
+        self.to_host()
         try:
             check_parameters(self._learners.parameters())
         except NumericalError:
@@ -238,7 +245,7 @@ class ResidentStep:
         self.settled = flying.task.step
         tasks = self.redraw(flying.task.step, [each.task.step for each in behind[1:]])
         self.tell(flying.result.value)
-        self.parameters.push()
+        self._push()
         self._again(list(zip(tasks, [each.result for each in behind[1:]], strict=True)))
 
     def _ground(self) -> list[_Flying]:

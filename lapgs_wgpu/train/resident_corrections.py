@@ -1,0 +1,190 @@
+"""The corrections of cameras and colors in device arrays, and the passes of a resident step that use and move them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from lapgs_wgpu.data.views import View
+from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.kernel import Commands, Kernel
+from lapgs_wgpu.gpu.pool import BufferPool
+from lapgs_wgpu.gpu.sums import sum_columns
+from lapgs_wgpu.train.camera_refinement import MOST_POINTS, CameraRefinement
+from lapgs_wgpu.train.exposure import Exposures
+from lapgs_wgpu.train.fused_loss import exposure_of
+from lapgs_wgpu.train.learners import Learners
+from lapgs_wgpu.train.resident_parameters import Block
+
+_BIT = 1 << 29  # of check_finite.wgsl
+_CAMERA_FLOATS, _EXPOSURE_FLOATS = 16, 40  # rows of camera_step.wgsl and exposure_step.wgsl
+_MOTION_FLOATS, _MOST_COMMON = 22, 8  # image_motion.wgsl, camera_step.wgsl
+_EVERY, _CAMERAS, _ALL = slice(None), slice(-1), slice(-1, None)
+_PLACES = {
+    "cameras": {
+        "learnt": (_CAMERAS, slice(0, 6)),
+        "mean": (_CAMERAS, slice(6, 12)),
+        "steps": (_CAMERAS, slice(12, 13)),
+        "square": (_ALL, slice(0, 1)),
+        "moves": (_ALL, slice(1, 2)),
+    },
+    "exposures": {
+        "values": (_EVERY, slice(0, 12)),
+        "mean": (_EVERY, slice(12, 24)),
+        "square": (_EVERY, slice(24, 36)),
+        "steps": (_EVERY, slice(36, 37)),
+    },
+}
+
+
+class ResidentCorrections:
+    """The corrections of a training and the state by which they learn, on a device.
+
+    Attributes:
+        on_host: whether the host may have changed them since they were pushed.
+    """
+
+    def __init__(self, device: Device, learners: Learners) -> None:
+        self._device, self._pool, self._exposing = device, BufferPool(device), exposure_of(device)
+        self._cameras, self._exposures, self._numbers = learners.cameras, learners.exposures, learners.image_numbers
+        self._blocks: dict[str, tuple[Block, CameraRefinement | Exposures]] = {}
+        if self._cameras is not None:
+            self._add("cameras", (len(self._cameras.numbers) + 1, _CAMERA_FLOATS), self._cameras)
+            common = torch.zeros(6 * len(self._cameras.numbers), _MOST_COMMON)
+            common[:, : self._cameras.common.shape[1]] = self._cameras.common
+            self._common = self._pool.upload("common motions", common.numpy())
+        if self._exposures is not None:
+            self._add("exposures", (len(self._exposures.values), _EXPOSURE_FLOATS), self._exposures)
+        self._d_camera, self._d_exposure = self._pool.array("d_camera", (8,)), self._pool.array("d_exposure", (12,))
+        self.on_host = True
+
+    def _add(self, name: str, shape: tuple[int, int], of: CameraRefinement | Exposures) -> None:
+        block = Block(name, shape, None, _BIT, _PLACES[name], arrays={"value": self._pool.array(name, shape)})
+        self._blocks[name] = block, of
+
+    def push(self) -> None:
+        """Upload what the host has had since the last step."""
+        if self.on_host:
+            for block, of in self._blocks.values():
+                block.arrays["value"].write(block.gather(of.state(), value=False))
+        self.on_host = False
+
+    @torch.no_grad()
+    def pull(self) -> None:
+        """Make the host's corrections the newest ones."""
+        if not self.on_host:
+            for block, of in self._blocks.values():
+                block.scatter(block.arrays["value"].read(), of.state())
+        self.on_host = True
+
+    def begin(self, view: View, step: int) -> None:
+        """Say what is recorded or replayed next: a step, counted from 1, and its view."""
+        self._view, self._step = view, step
+        self._pace = None if self._cameras is None else self._cameras.pace(step)
+
+    @property
+    def moves_camera(self) -> bool:
+        """Whether this step moves its camera."""
+        return self._pace is not None
+
+    # Passes, in their order ------------------------------------------------------------------------------------------
+
+    def move(self, commands: Commands, frame: DeviceArray, band: int) -> DeviceArray:
+        """Record the frame of a band's passes with the view's camera corrected."""
+        cameras = self._cameras
+        if cameras is None:
+            return frame
+        kernel = Kernel.get(self._device, "move_camera")
+
+        def uniform() -> DeviceArray:
+            content = kernel.uniform("Moved", row=cameras.numbers[self._view.camera], unit=cameras.extent)
+            return self._pool.constant("moved", content)
+
+        moved = self._pool.array(f"frame {band}", frame.shape, frame.dtype)
+        given = {"moved": commands.varying(uniform), "placed": frame, "cameras": self._value("cameras")}
+        commands.dispatch(kernel, 1, **given, frame=moved)
+        return moved
+
+    def expose(self, commands: Commands, image: DeviceArray) -> DeviceArray:
+        """Record the image with its colors corrected."""
+        if self._exposures is None:
+            return image
+        return self._exposing.record(commands, image, self._value("exposures"), self._first_row)
+
+    def expose_bwd(self, commands: Commands, image: DeviceArray, d_exposed: DeviceArray) -> DeviceArray:
+        """Record the gradient by the image, and that by the correction of its colors."""
+        if self._exposures is None:
+            return d_exposed
+        back = self._exposing.record_bwd(commands, image, d_exposed, self._value("exposures"), self._first_row)
+        sum_columns(commands, self._pool, "exposure", back.d_rows, self._d_exposure, columns=12)
+        return back.d_image
+
+    def sum_camera(self, commands: Commands, sums: DeviceArray | None) -> None:
+        """Record the gradient by the camera. sums: of `GaussianGradients.camera`."""
+        if sums is None or self._cameras is None:
+            return
+        for half, factor in enumerate((-1.0, -self._cameras.extent)):
+            place = {"columns": 4, "place": 4 * half, "factor": factor}
+            sum_columns(commands, self._pool, f"camera {half}", sums.rows(half, 1), self._d_camera, **place)
+
+    def record_check(self, commands: Commands, bad: DeviceArray) -> None:
+        """Record the search for gradients that are not finite."""
+        kernel = Kernel.get(self._device, "check_finite")
+        for name, gradient in self._gradients():
+            content = kernel.uniform("Check", count=gradient.size, bit=_BIT)
+            commands.dispatch(kernel, 1, check=self._pool.constant(f"check {name}", content), values=gradient, bad=bad)
+
+    def record_step(self, commands: Commands, guard: DeviceArray, frame: DeviceArray, geometry: DeviceArray) -> None:
+        """Record a step of the corrections, after the one of the Gaussians. frame: that `move` gave; geometry: (N, 12)
+        of the Gaussians."""
+        if self.moves_camera:
+            self._step_camera(commands, guard, frame, geometry)
+        if (exposures := self._exposures) is None:
+            return
+        kernel = Kernel.get(self._device, "exposure_step")
+
+        def uniform() -> DeviceArray:
+            count, rate = len(exposures.values), exposures.rate.at(self._step)
+            content = kernel.uniform("ExposureStep", number=self._numbers[self._view.name], count=count, rate=rate)
+            return self._pool.constant("exposure step", content)
+
+        arrays = {"guard": guard, "d_exposure": self._d_exposure, "exposures": self._value("exposures")}
+        commands.dispatch(kernel, 1, descent=commands.varying(uniform), **arrays)
+
+    def _step_camera(self, commands: Commands, guard: DeviceArray, frame: DeviceArray, geometry: DeviceArray) -> None:
+        cameras, count = self._cameras, geometry.shape[0]
+        assert cameras is not None
+        motion, motion_kernel = self._pool.array("motion", (_MOTION_FLOATS,)), Kernel.get(self._device, "image_motion")
+        content = motion_kernel.uniform("Seen", gaussians=count, spacing=-(-count // MOST_POINTS), unit=cameras.extent)
+        seen = self._pool.constant("seen", content)
+        commands.dispatch(motion_kernel, 1, seen=seen, frame=frame, geometry=geometry, motion=motion)
+        kernel = Kernel.get(self._device, "camera_step")
+
+        def uniform() -> DeviceArray:
+            assert self._pace is not None
+            number, pace = cameras.numbers[self._view.camera], self._pace._asdict()
+            content = kernel.uniform("CameraStep", number=number, cameras=len(cameras.numbers), **pace)
+            return self._pool.constant("camera step", content)
+
+        arrays = {"guard": guard, "motion": motion, "d_camera": self._d_camera, "common_motions": self._common}
+        descent = commands.varying(uniform)
+        commands.dispatch(kernel, 1, descent=descent, cameras=self._value("cameras"), **arrays)
+
+    def gradients(self) -> dict[str, list[Tensor]]:
+        """Of the view's corrections, read back; for the text of an error."""
+        return {name: [torch.from_numpy(gradient.read())] for name, gradient in self._gradients()}
+
+    def _gradients(self) -> Iterator[tuple[str, DeviceArray]]:
+        if self.moves_camera:
+            yield "cameras", self._d_camera
+        if self._exposures is not None:
+            yield "exposures", self._d_exposure
+
+    def _value(self, name: str) -> DeviceArray:
+        return self._blocks[name][0].arrays["value"]
+
+    def _first_row(self) -> int:
+        return self._numbers[self._view.name] * _EXPOSURE_FLOATS // 4
