@@ -206,14 +206,9 @@ class Commands:
 
     def varying(self, write: Callable[[], DeviceArray]) -> DeviceArray:
         """A uniform whose content differs from one replay to the next: `write` writes it, and is called before each."""
-        if (recording := self.device.recording) is None:
-            return write()
-        recording.writers.append(write)
-        self.device.recording = None
-        try:
-            return write()
-        finally:
-            self.device.recording = recording
+        recording = self.device.recording
+        varied: DeviceArray = write() if recording is None else recording.vary(write)
+        return varied
 
     @contextmanager
     def taken_down(self, recording: Recording | None) -> Iterator[None]:
@@ -231,7 +226,7 @@ class Commands:
 
     def replay(self, recording: Recording) -> None:
         """Do what was recorded, after its uniforms were written."""
-        for pool, name, content in recording.constants:
+        for (pool, name), content in recording.constants.items():
             pool.refresh(name, content)
         for write in recording.writers:
             write()

@@ -45,7 +45,7 @@ class BufferPool:
         The content must not change between recording and submission of a command that reads it.
         """
         if self.device.recording is not None:
-            self.device.recording.constants.append((self, name, content))
+            self.device.recording.note(self, name, content)
         array = self.array(f"constant {name}", (len(content),), "uint8")
         if self._constants.get(name) != content:
             array.write(np.frombuffer(content, np.uint8))
