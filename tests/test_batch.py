@@ -22,7 +22,7 @@ def test_gradients_of_a_step_are_the_mean_over_its_views(
     for views in ([0], [1], [0, 1]):
         config = configure(schedule__batch=str(len(views)), schedule__warm_up="0", smoothness__share="0")
         training = Trainer(config, dataset, device)
-        training._order.left = list(views)
+        training._draws.order.left = list(views)
         monkeypatch.setattr(training._learners.optimizer, "step", lambda step, share: None)
         training.step()
         gradients = {name: [g.clone() for g in group] for name, group in training._learners.gradients().items()}

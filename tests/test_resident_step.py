@@ -21,8 +21,9 @@ from lapgs_wgpu.motion.fields.deformation import Nearby, TimeSamples
 from lapgs_wgpu.splat import buffer_plan
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.objective import Sample
-from lapgs_wgpu.train.resident_passes import ResidentSample, Task
 from lapgs_wgpu.train.resident_step import Pending
+from lapgs_wgpu.train.resident_task import ResidentSample, Task
+from lapgs_wgpu.train.step_result import Scheduled
 from lapgs_wgpu.train.trainer import Trainer
 
 pytestmark = pytest.mark.kernels
@@ -69,7 +70,7 @@ def by_resident(trainer: Trainer, task: Task) -> dict[str, Tensor]:
     return {name: tensors[0] for name, tensors in gradients.items()}
 
 
-def by_torch(trainer: Trainer, sample: ResidentSample) -> dict[str, Tensor]:
+def by_torch(trainer: Trainer, sample: ResidentSample, *, moving: bool) -> dict[str, Tensor]:
     nearby = times = None
     smooth = trainer.config.smoothness
     if sample.near is not None:
@@ -77,8 +78,8 @@ def by_torch(trainer: Trainer, sample: ResidentSample) -> dict[str, Tensor]:
         nearby = Nearby(chosen, offsets, sample.near_time, smooth.static, smooth.temporal)
     if sample.even is not None:
         times = TimeSamples(sampled_rows.rows(sample.even), sample.even_times)
-    given = Sample(sample.view, torch.tensor(sample.background), sample.moving, nearby, times)
-    trainer._stepper._descend(given, 4, share=1)
+    given = Sample(sample.view, torch.tensor(sample.background), moving, nearby, times)
+    trainer._exchange._descend(given, 4, share=1)
     scene = trainer.scene
     named = {**scene.parameters, **(dict(scene.field.named_parameters()) if scene.field else {})}
     gradients = {name: torch.zeros_like(p) if p.grad is None else p.grad for name, p in named.items()}
@@ -103,8 +104,11 @@ def test_gradients_are_those_of_torch(device: Device, dataset: Dataset, kind: st
     sample = resident.draw(view, torch.zeros(3), 4, torch.Generator().manual_seed(3), moving=moving)
     assert (sample.near is not None) == (sample.even is not None) == moving
     rates = trainers[0]._learners.optimizer.rates_at(4)
-    task = Task(4, sample, trainers[0].scene.timing(view.time), 2, rates, 1e-3, seen=True)
-    mine, expected = by_resident(trainers[0], task), by_torch(trainers[1], sample)
+    mark = trainers[0]._draws.mark()
+    task = Task(
+        Scheduled(4, moving, 1.0, seen=True), mark, mark, sample, trainers[0].scene.timing(view.time), 2, rates, 1e-3
+    )
+    mine, expected = by_resident(trainers[0], task), by_torch(trainers[1], sample, moving=moving)
     assert mine.keys() == expected.keys()
     # SwiftShader's exp is off by more, which the losses' signs of small differences make larger.
     bound = 1e-3 if "SwiftShader" in device.info.name else 3e-5
@@ -219,13 +223,14 @@ def test_a_step_that_is_not_finite_is_skipped_and_named(device: Device, dataset:
     states, told = [], []
     for waits in (False, True):
         trainer = started(config, dataset, device, "resident")
-        color, results = trainer._color, []
+        draws, results = trainer._draws, []
+        color = draws.background
         for number in range(1, 13):
-            trainer._color = torch.full((3,), torch.nan) if number == 7 else color
+            draws.background = torch.full((3,), torch.nan) if number == 7 else color
             results.append(trainer.step())
             if waits:
                 trainer._resident.settle()
-        trainer._color = color
+        draws.background = color
         states.append(trainer.state())
         told.append([result.skipped for result in results])
     for skipped in told:

@@ -7,16 +7,13 @@ import math
 from collections import Counter
 from collections.abc import Callable
 
-import torch
-from torch import Tensor
-
-from lapgs_wgpu.data.views import View
 from lapgs_wgpu.train.density_control import DensityControl
-from lapgs_wgpu.train.ground_truth import GroundTruth
+from lapgs_wgpu.train.ground_truth import AHEAD, GroundTruth
 from lapgs_wgpu.train.learners import Learners
 from lapgs_wgpu.train.nonfinite import Skipped, cause, check_parameters, finite
 from lapgs_wgpu.train.objective import Objective, Sample, ViewResult
-from lapgs_wgpu.train.step_result import Measured
+from lapgs_wgpu.train.step_result import Measured, Scheduled
+from lapgs_wgpu.train.view_order import Draws
 
 
 class ExchangeStep:
@@ -27,36 +24,38 @@ class ExchangeStep:
         learners: that are moved.
         density: whose statistics take the views in.
         truth: of the views.
+        draws: of the training.
+        batch: number of views of a step, whose losses count as their mean.
     """
 
-    def __init__(self, objective: Objective, learners: Learners, density: DensityControl, truth: GroundTruth) -> None:
+    def __init__(
+        self,
+        objective: Objective,
+        learners: Learners,
+        density: DensityControl,
+        truth: GroundTruth,
+        draws: Draws,
+        batch: int,
+    ) -> None:
         self._objective, self._learners, self._density = objective, learners, density
-        self._truth = truth
+        self._truth, self._draws, self._batch = truth, draws, batch
 
     @property
     def dead_scales(self) -> float:
         """`Objective.dead_scales`."""
         return self._objective.dead_scales
 
-    def draw(self, view: View, background: Tensor, step: int, generator: torch.Generator, *, moving: bool) -> Sample:
-        """`Objective.sample`."""
-        return self._objective.sample(view, background, step, generator, moving=moving)
+    def take(self, scheduled: Scheduled, began: Callable[[], None]) -> Callable[[], Measured]:
+        """Take a step; gives what it told.
 
-    def take(
-        self, step: int, samples: list[Sample], share: float, *, seen: bool, began: Callable[[], None]
-    ) -> Measured:
-        """Take a step, counted from 1.
-
-        Args:
-            step: counted from 1.
-            samples: of its views.
-            share: of the learning rates.
-            seen: whether density control takes the views in.
-            began: called before anything changes, and after the last error that leaves all as it was.
-
-        Raises:
-            NumericalError: a parameter is not finite.
+        began: called before anything changes, and after the last error that leaves all as it was.
+        Raises NumericalError where a parameter is not finite.
         """
+        step, draws = scheduled.step, self._draws
+        chosen = [draws.next() for _ in range(self._batch)]
+        drawn = draws.mark()
+        samples = [self._objective.sample(*each, step, draws.generator, moving=scheduled.moving) for each in chosen]
+        self._truth.prefetch([*(sample.view for sample in samples), *draws.order.coming(AHEAD)])
         self._learners.zero_grad()
         statistics = self._density.nothing_seen()
         results, totals = [], Counter[str]()
@@ -71,13 +70,15 @@ class ExchangeStep:
         skipped = Skipped(step, ", ".join(sample.view.name for sample in samples), what) if what else None
         began()
         if skipped is None:
-            self._learners.step(step, share)
+            self._learners.step(step, scheduled.share)
             # After the optimizer's step, so that no gradient is lost with the rows that change.
-            if seen:
+            if scheduled.seen:
                 self._density.statistics.merge(statistics)
         else:
             self._learners.zero_grad()
-        return Measured(loss, psnr, skipped, means)
+            draws.go_back(drawn)
+        measured = Measured(loss, psnr, skipped, means)
+        return lambda: measured
 
     def _descend(self, sample: Sample, step: int, *, share: int) -> ViewResult:
         """`Objective.descend` for a view, as its camera and its colors are corrected."""

@@ -24,6 +24,8 @@ from lapgs_wgpu.gpu.device import Device
 LEFT_OUT = (1, 0, 0, 0)  # RGBA of a pixel that the losses leave out
 DECODERS = min(4, os.cpu_count() or 1)  # threads that decode images before they are needed
 
+AHEAD = 8  # images that are decoded before they are needed
+
 
 class GroundTruth:
     """The ground truth of training views. The most recently used images stay on the device.

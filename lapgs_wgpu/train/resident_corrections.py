@@ -127,8 +127,8 @@ class ResidentCorrections:
         if sums is None or self._cameras is None:
             return
         for half, factor in enumerate((-1.0, -self._cameras.extent)):
-            place = {"columns": 4, "place": 4 * half, "factor": factor}
-            sum_columns(commands, self._pool, f"camera {half}", sums.rows(half, 1), self._d_camera, **place)
+            name, rows, total = f"camera {half}", sums.rows(half, 1), self._d_camera
+            sum_columns(commands, self._pool, name, rows, total, columns=4, place=4 * half, factor=factor)
 
     def record_check(self, commands: Commands, bad: DeviceArray) -> None:
         """Record the search for gradients that are not finite."""

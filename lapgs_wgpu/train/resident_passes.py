@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from lapgs_wgpu.data.views import View
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
@@ -17,7 +14,6 @@ from lapgs_wgpu.gpu.sums import sum_columns
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.passes.activation_passes import ActivationPasses, Line
 from lapgs_wgpu.motion.passes.grid_field_passes import Comparison, Decoding, FieldArrays, GridFieldPasses
-from lapgs_wgpu.motion.passes.samples import Samples
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.drawing import Drawing, GaussianGradients
 from lapgs_wgpu.splat.gaussians import Gaussians
@@ -28,47 +24,11 @@ from lapgs_wgpu.train.image_loss import TERMS
 from lapgs_wgpu.train.learners import Learners
 from lapgs_wgpu.train.resident_corrections import ResidentCorrections
 from lapgs_wgpu.train.resident_parameters import ResidentParameters
+from lapgs_wgpu.train.resident_task import Task
 
 TOTALS = ("static", "temporal", "acceleration", "dynamics")  # sums of losses of motion, in their places
 _DYNAMICS_GROUPS, _MOST_COLUMNS = 64, 256  # common/dynamics.wgsl
 _TERM_BIT = 1 << 30  # of check_finite.wgsl: the image losses
-
-
-@dataclass(frozen=True)
-class ResidentSample:
-    """What a step looks at.
-
-    view: of the training, on a background (3,). moving: whether the field moves the Gaussians. near, near_time: the
-    places and the time that the smoothness loss compares; None in steps without it. even, even_times: those of the
-    acceleration loss.
-    """
-
-    view: View
-    background: tuple[float, float, float]
-    moving: bool
-    near: Samples | None = None
-    near_time: float = 0.0
-    even: Samples | None = None
-    even_times: tuple[float, float] = (0.0, 0.0)
-
-
-@dataclass
-class Task:
-    """A step to be taken.
-
-    step: counted from 1. sample: drawn for it. time: of the field. sh_degree: of the harmonics in use. rates: of the
-    optimizer's groups, and of the frequencies. seen: whether density control takes the view in. counts: how many steps
-    had moved each tensor before.
-    """
-
-    step: int
-    sample: ResidentSample
-    time: float
-    sh_degree: int
-    rates: dict[str, float]
-    frequency_rate: float
-    seen: bool
-    counts: dict[str, int] = dataclasses.field(default_factory=dict)
 
 
 class Recorded(NamedTuple):
@@ -116,7 +76,7 @@ class ResidentPasses:
 
     def weights(self, task: Task) -> LossWeights:
         """Of the image losses of a step."""
-        return self._config.loss.weights(warm=task.sample.moving)
+        return self._config.loss.weights(warm=task.scheduled.moving)
 
     def seen(self) -> DeviceArray:
         """Density control's statistics, (N, 4)."""
@@ -129,9 +89,9 @@ class ResidentPasses:
     def record(self, commands: Commands, task: Task, truth: DeviceArray, *, judged: bool) -> Recorded:
         """Record a step. truth: (H, W), of its view. judged: only up to the gradients, which stay."""
         self._task = task
-        self.corrections.begin(task.sample.view, task.step)
-        self.parameters.count_step(moving=task.sample.moving)
-        self.parameters.write_rates(task.rates, moving=task.sample.moving)
+        self.corrections.begin(task.sample.view, task.scheduled.step)
+        self.parameters.count_step(moving=task.scheduled.moving)
+        self.parameters.write_rates(task.rates, moving=task.scheduled.moving)
         held = self._losses.held(truth)
         commands.copy(truth, held)
         return self._recorded(commands, task, held, judged=judged)
@@ -166,8 +126,8 @@ class ResidentPasses:
         """Record a step's passes, or replay those of one of the same shape."""
         camera, plan = task.sample.view.camera, self.rasterizer.plan_of(task.sample.view.camera)
         shape = (
-            *(task.sample.moving, task.sample.near is None, task.sample.even is None, task.sh_degree, task.seen),
-            *(task.sample.background, camera.width, camera.height, plan, judged, len(self._scene)),
+            *(task.scheduled.moving, task.scheduled.seen, task.sample.near is None, task.sample.even is None),
+            *(task.sh_degree, task.sample.background, camera.width, camera.height, plan, judged, len(self._scene)),
             self.corrections.moves_camera,
         )
         found = self._recordings.get(shape)
@@ -216,7 +176,7 @@ class ResidentPasses:
         self, commands: Commands, task: Task, values: FieldArrays
     ) -> tuple[Decoding | None, Comparison | None, Line | None]:
         sample, field = task.sample, self._field
-        if field is None or not sample.moving:
+        if field is None or not task.scheduled.moving:
             return None, None, None
         field.begin(commands, values)
         decoding, comparison, line = field.decode(commands, 0, values, self._time), None, None
@@ -333,7 +293,7 @@ class ResidentPasses:
         *,
         judged: bool,
     ) -> None:
-        device, moving = self._device, task.sample.moving
+        device, moving = self._device, task.scheduled.moving
         guard, bad = self.word("guard"), self.word("bad")
         self.parameters.record_check(commands, bad, moving=moving)
         self.corrections.record_check(commands, bad)
@@ -345,7 +305,7 @@ class ResidentPasses:
         rounds = int(bool(self.rasterizer.config.round_splats))
 
         def guarded_step() -> DeviceArray:
-            content = close.uniform("Guarded", step=self._task.step, capacity=plan.capacity, rounds=rounds)
+            content = close.uniform("Guarded", step=self._task.scheduled.step, capacity=plan.capacity, rounds=rounds)
             return self._pool.constant("guarded", content)
 
         guarded = commands.varying(guarded_step)
@@ -353,7 +313,7 @@ class ResidentPasses:
             commands.dispatch(close, 1, guarded=guarded, needed=needed, bad=bad, guard=guard)
         if judged:
             return
-        if task.seen:
+        if task.scheduled.seen:
             kernel, camera = Kernel.get(device, "accumulate_statistics"), task.sample.view.camera
             content = kernel.uniform(
                 "Seen", half_size=(camera.width / 2, camera.height / 2), gaussians=len(self._scene)

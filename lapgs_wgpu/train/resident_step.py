@@ -29,14 +29,16 @@ from lapgs_wgpu.splat.drawing import Drawing
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.train.acceleration import LARGEST_DISTANCE
 from lapgs_wgpu.train.config import Config
-from lapgs_wgpu.train.densify import Statistics
-from lapgs_wgpu.train.ground_truth import GroundTruth
+from lapgs_wgpu.train.density_control import DensityControl
+from lapgs_wgpu.train.ground_truth import AHEAD, GroundTruth
 from lapgs_wgpu.train.image_metrics import psnr_of
 from lapgs_wgpu.train.learners import Learners
 from lapgs_wgpu.train.nonfinite import Skipped, cause, check_parameters
 from lapgs_wgpu.train.resident_parameters import PARTS
-from lapgs_wgpu.train.resident_passes import ResidentPasses, ResidentSample, Task
-from lapgs_wgpu.train.step_result import Measured
+from lapgs_wgpu.train.resident_passes import ResidentPasses
+from lapgs_wgpu.train.resident_task import ResidentSample, Task
+from lapgs_wgpu.train.step_result import Measured, Scheduled
+from lapgs_wgpu.train.view_order import Draws
 
 IN_FLIGHT = 2  # steps that are submitted and not waited for
 _RING_BYTES = 8192
@@ -70,7 +72,6 @@ class Pending:
 class ResidentStep:
     """Takes the steps of a training whose parameters stay on the device.
 
-    redraw: called after a step that was skipped, with the steps behind it that were in flight; gives their tasks anew.
     settled: the last step that was waited for. broken: called with it where an error ends the steps behind it, and with
     None where the parameters themselves are not finite.
     tell: called with what each step tells, in their order.
@@ -81,19 +82,19 @@ class ResidentStep:
         config: Config,
         scene: Scene4D,
         learners: Learners,
+        density: DensityControl,
         truth: GroundTruth,
+        draws: Draws,
         time_count: int,
     ) -> None:
-        self._config, self._scene, self._truth = config, scene, truth
-        self._time_count, self._learners = time_count, learners
+        self._config, self._scene, self._learners, self._density = config, scene, learners, density
+        self._truth, self._draws, self._time_count = truth, draws, time_count
         self._passes = ResidentPasses(config, scene, learners)
         self.parameters = self._passes.parameters
         self._ring = Ring(scene.device, _RING_BYTES)
         self._flying: deque[_Flying] = deque()
         self._statistics_on_host = True
-        self.statistics: Statistics | None = None
         self.field_fitted = False
-        self.redraw: Callable[[int, list[int]], list[Task]] = lambda step, behind: []
         self.settled = 0
         self.broken: Callable[[int | None], None] = lambda step: None
         self.tell: Callable[[Measured], None] = lambda measured: None
@@ -108,10 +109,10 @@ class ResidentStep:
         """Wait for all steps, and make the scene's tensors of some parts, of all if none is named, the newest ones."""
         self.settle()
         self.parameters.pull_values(*parts)
-        if "gaussians" in (parts or PARTS) and not self._statistics_on_host and self.statistics is not None:
+        if "gaussians" in (parts or PARTS) and not self._statistics_on_host:
             self._statistics_on_host = True
             seen = torch.from_numpy(self._passes.seen().read())
-            for target, column in zip(vars(self.statistics).values(), seen.T, strict=False):
+            for target, column in zip(vars(self._density.statistics).values(), seen.T, strict=False):
                 target.copy_(column)
 
     def corrections_to_host(self) -> None:
@@ -150,13 +151,40 @@ class ResidentStep:
         while len(self._flying) >= IN_FLIGHT:
             self._settle_first()
 
+    @property
+    def count(self) -> int:
+        """Number of Gaussians."""
+        return len(self._scene)
+
+    def take(self, scheduled: Scheduled, began: Callable[[], None]) -> Pending:
+        """Submit a step, after `make_room`; what it will have told. began: called when it is submitted."""
+        task = self._task(scheduled, self._scene.sh_degree)
+        self._push()
+        if not self._flying:
+            self.settled = scheduled.step - 1
+        flying = self._submit(task, Pending(self._settle_first))
+        self._flying.append(flying)
+        began()
+        return flying.result
+
+    def _task(self, scheduled: Scheduled, sh_degree: int) -> Task:
+        """Draw for a step."""
+        step, draws, frequencies = scheduled.step, self._draws, self._learners.frequencies
+        before, (view, background), drawn = draws.mark(), draws.next(), draws.mark()
+        sample = self.draw(view, background, step, draws.generator, moving=scheduled.moving)
+        self._truth.prefetch([view, *draws.order.coming(AHEAD)])
+        rates = self._learners.optimizer.rates_at(step, scheduled.share)
+        frequency_rate = frequencies.rate.at(step) if frequencies else 0.0
+        time = self._scene.timing(view.time)
+        return Task(scheduled, before, drawn, sample, time, sh_degree, rates, frequency_rate)
+
     def draw(
         self, view: View, background: Tensor, step: int, generator: torch.Generator, *, moving: bool
     ) -> ResidentSample:
         """Draw what a step, counted from 1, looks at."""
         config, count, t = self._config, self.count, self._scene.timing(view.time)
         red, green, blue = background.tolist()
-        sample = ResidentSample(view, (red, green, blue), moving)
+        sample = ResidentSample(view, (red, green, blue))
         if not moving or not self._passes.moves or step <= config.smoothness.start:
             return sample
         smooth, even = config.smoothness, config.acceleration
@@ -172,26 +200,13 @@ class ResidentStep:
             sample = dataclasses.replace(sample, even=samples, even_times=(max(t - reach, 0.0), min(t + reach, 1.0)))
         return sample
 
-    @property
-    def count(self) -> int:
-        """Number of Gaussians."""
-        return len(self._scene)
-
-    def take(self, task: Task) -> Pending:
-        """Submit a step, after `make_room`; what it will have told."""
-        self._push()
-        if not self._flying:
-            self.settled = task.step - 1
-        flying = self._submit(task, Pending(self._settle_first))
-        self._flying.append(flying)
-        return flying.result
-
     def _push(self) -> None:
         self.parameters.push()
         self._passes.corrections.push()
-        if self._statistics_on_host and self.statistics is not None:
+        if self._statistics_on_host:
             self._statistics_on_host = False
-            columns = [*(values.numpy(force=True) for values in vars(self.statistics).values()), np.zeros(self.count)]
+            known = vars(self._density.statistics).values()
+            columns = [*(values.numpy(force=True) for values in known), np.zeros(self.count)]
             self._passes.seen().write(np.stack(columns, axis=1).astype(np.float32))
 
     # A step's end ----------------------------------------------------------------------------------------------------
@@ -199,12 +214,16 @@ class ResidentStep:
     def _settle_first(self) -> None:
         """Wait for the step that was submitted first, and mend what it asks for.
 
-        After an error the parameters are those after the step `settled`, and `broken` is told so.
+        After an error all is as after the step `settled`, and `broken` is told so.
         """
+        tasks = [each.task for each in self._flying]
         try:
             self._settle()
         except Exception:
             self._flying.clear()
+            for task in [task for task in tasks if task.scheduled.step == self.settled + 1]:
+                self._draws.go_back(task.before)
+                self._scene.sh_degree = task.sh_degree
             self.broken(self.settled)
             raise
 
@@ -214,7 +233,7 @@ class ResidentStep:
         if not words["guard"]:
             self._passes.rasterizer.grow_on_overflow(flying.drawing, needed)
             self._flying.popleft()
-            self.settled = flying.task.step
+            self.settled = flying.task.scheduled.step
             self.dead_scales = int(words["dead"]) / max(1, 3 * self.count)
             flying.result.value = self._measured(flying.task, terms, totals, None)
             self.tell(flying.result.value)
@@ -225,7 +244,7 @@ class ResidentStep:
             self._again([(each.task, each.result) for each in behind])
             return
         # Not finite. The gradients are gone that were: this step alone once more, behind the closed guard.
-        self._passes.word("guard").write(np.array([flying.task.step], np.uint32))
+        self._passes.word("guard").write(np.array([flying.task.scheduled.step], np.uint32))
         self._told(self._submit(flying.task, flying.result, judged=True))
         gradients = self.parameters.gradients() | self._passes.corrections.gradients()
         with Commands(self._scene.device) as commands:
@@ -240,11 +259,15 @@ class ResidentStep:
         self._passes.word("guard").write(np.zeros(1, np.uint32))
         values = self._terms(flying.task, terms, totals)
         what = cause([values], gradients)
-        skipped = Skipped(flying.task.step, flying.task.sample.view.name, what)
+        skipped = Skipped(flying.task.scheduled.step, flying.task.sample.view.name, what)
         flying.result.value = self._measured(flying.task, terms, totals, skipped)
-        self.settled = flying.task.step
-        tasks = self.redraw(flying.task.step, [each.task.step for each in behind[1:]])
+        self.settled = flying.task.scheduled.step
+        # No random number was drawn for the sample of a step that is skipped.
+        self._draws.go_back(flying.task.drawn)
+        for each in behind[1:2]:
+            each.task.before = flying.task.drawn
         self.tell(flying.result.value)
+        tasks = [self._task(each.task.scheduled, each.task.sh_degree) for each in behind[1:]]
         self._push()
         self._again(list(zip(tasks, [each.result for each in behind[1:]], strict=True)))
 
@@ -279,7 +302,7 @@ class ResidentStep:
             found["smoothness"] = static + temporal
         if task.sample.even is not None:
             found["acceleration"] = even
-        if task.sample.moving and self._passes.dynamics_loss:
+        if task.scheduled.moving and self._passes.dynamics_loss:
             found["dynamics"] = dynamics
         return found
 

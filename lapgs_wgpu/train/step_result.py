@@ -9,6 +9,22 @@ from typing import NamedTuple
 from lapgs_wgpu.train.nonfinite import Skipped
 
 
+class Scheduled(NamedTuple):
+    """What the schedule says of a step.
+
+    Attributes:
+        step: its number, counted from 1.
+        moving: whether the field moves the Gaussians.
+        share: of the learning rates, which rise over the first steps.
+        seen: whether density control takes the views in.
+    """
+
+    step: int
+    moving: bool
+    share: float
+    seen: bool
+
+
 class Measured(NamedTuple):
     """What a step measured; see StepResult."""
 

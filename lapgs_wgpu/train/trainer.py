@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -30,31 +30,15 @@ from lapgs_wgpu.train.learners import Learners
 from lapgs_wgpu.train.nonfinite import SkipCounter
 from lapgs_wgpu.train.objective import Objective
 from lapgs_wgpu.train.parts import Parts
-from lapgs_wgpu.train.resident_passes import Task
-from lapgs_wgpu.train.resident_step import IN_FLIGHT, ResidentStep
+from lapgs_wgpu.train.resident_step import ResidentStep
 from lapgs_wgpu.train.resolve_config import why_exchange
 from lapgs_wgpu.train.setup import set_up
 from lapgs_wgpu.train.start import Start, start_from_points
-from lapgs_wgpu.train.step_result import Measured, StepResult
+from lapgs_wgpu.train.step_result import Scheduled, StepResult
 from lapgs_wgpu.train.timing_refinement import KeptTiming, TimingRefinement
-from lapgs_wgpu.train.view_order import ViewOrder
+from lapgs_wgpu.train.view_order import Draws
 
 MAX_SH_DEGREE = 3
-AHEAD = 8  # images that are decoded before they are needed
-
-
-class _Past(NamedTuple):
-    """Where a step began whose samples were not yet drawn.
-
-    before: state of the generator, and what was left of the order of views, before its view was chosen. drawn: state of
-    the generator. left: of the order of views. chosen: the view and its background. sh_degree: in use.
-    """
-
-    before: tuple[Tensor, list[int]]
-    drawn: Tensor
-    left: list[int]
-    chosen: tuple[View, Tensor]
-    sh_degree: int
 
 
 class Trainer:
@@ -122,10 +106,9 @@ class Trainer:
         """Make what the steps work with."""
         config, scene, dataset, extent = self.config, self.scene, self.dataset, self.dataset.extent
         self._color = torch.full((3,), BACKGROUND_LEVELS[config.data.background])  # of measurements
-        self._random_color = config.data.background == "random"
-        color = None if self._random_color else self._color
+        color = None if config.data.background == "random" else self._color
         self._truth = GroundTruth(scene.device, color, int(config.data.cache_gb * 1e9))
-        self._order = ViewOrder(dataset.train, self._generator)
+        self._draws = Draws(dataset.train, self._generator, color)
         self._learners = Learners(config, dataset, self.parts, start)
         self._objective = Objective(config, scene, self.parts.losses, dataset.moments, extent)
         self._density = DensityControl(
@@ -149,12 +132,11 @@ class Trainer:
             )
         self._timing_steps = config.timing.corrections(config.schedule.steps) if self.timing else []
         self._skips = SkipCounter()
-        self._stepper = ExchangeStep(self._objective, self._learners, self._density, self._truth)
+        shared = self._learners, self._density, self._truth, self._draws
+        self._exchange = ExchangeStep(self._objective, *shared, config.schedule.batch)
         self._resident = None
-        self._past: dict[int, _Past] = {}
         if config.step_place == "resident":
-            self._resident = ResidentStep(config, scene, self._learners, self._truth, dataset.moments)
-            self._resident.redraw = self._redraw
+            self._resident = ResidentStep(config, scene, *shared, dataset.moments)
             self._resident.broken = self._broken
             self._resident.tell = lambda measured: self._skips.note(measured.skipped)
         self._plans, camera = rasterizer_of(scene.device).plans, dataset.train[0].camera
@@ -204,7 +186,7 @@ class Trainer:
     @property
     def dead_scales(self) -> float:
         """The share of the Gaussians' scales in the last view that are at the floor, where they get no gradient."""
-        return (self._resident or self._stepper).dead_scales
+        return (self._resident or self._exchange).dead_scales
 
     def spectrum(self) -> dict[str, Tensor]:
         """The motion's frequencies (K,), cycles over the clip, and amplitudes (K,); nothing for a field without one."""
@@ -246,115 +228,48 @@ class Trainer:
         control's state stay as they were; what the schedule plans for this step is done. Raises NumericalError where
         too many are skipped, or where a parameter is not finite, and DeviceError.
         """
-        if self._resident is not None:
-            self._resident.make_room()  # which may take steps again, and draw for them
-        random, order, done = self._generator.get_state(), list(self._order.left), self.done
-        try:
-            with torch_threads(self._threads):
-                result = self._step()
-        except BaseException:
-            if self.whole and self.done == done:  # the device gave out, or somebody broke it off: as if not begun
-                self._generator.set_state(random)
-                self._order.left = order
-            raise
+        with torch_threads(self._threads):
+            result = self._step()
         for callback in self.callbacks:
             callback(self, result)
         return result
 
     def _step(self) -> StepResult:
-        config, step = self.config, self.done + 1
-        moving = step > self.warm_up_steps
-        before = self._generator.get_state(), list(self._order.left)
-        chosen = [self._choose() for _ in range(config.schedule.batch)]
-        drawn = self._generator.get_state()
+        step, rising = self.done + 1, self._ramp_steps
+        moving, share = step > self.warm_up_steps, min(1.0, step / rising) if rising else 1.0
+        # Before this step draws: both may wait for steps in flight, which may draw again.
+        if self._resident is not None:
+            self._resident.make_room()
         field_times = None
         if self.timing is not None and moving and step in self._timing_steps:
             field_times = self.timing.fitted(self._timing_steps.index(step))
-        if self._resident is not None:
-            self._past[step] = _Past(before, drawn, list(self._order.left), chosen[0], self.scene.sh_degree)
-            measured: Callable[[], Measured] = self._resident.take(self._task(step))
-            self.whole = False
-        else:
-            measured = self._exchange(step, chosen, drawn, moving=moving)
+        before = self._draws.mark()
+        try:
+            scheduled = Scheduled(step, moving, share, step < self.config.density.stop)
+            measured = (self._resident or self._exchange).take(scheduled, self._began)
+        except BaseException:
+            if self.whole:  # the device gave out, or somebody broke it off: as if not begun
+                self._draws.go_back(before)
+            raise
         if self.timing is not None and field_times is not None:
             self.timing.set(field_times)
         pruned = self._density.change(step, moving=moving)
-        if step % config.schedule.sh_interval == 0:
+        if step % self.config.schedule.sh_interval == 0:
             self.scene.sh_degree = min(self.scene.sh_degree + 1, MAX_SH_DEGREE)
         self.done = step
         self.whole = True
         if self._resident is None:
             self._skips.note(measured().skipped)
-        return StepResult(step, config.schedule.steps, measured, pruned)
+        return StepResult(step, self.config.schedule.steps, measured, pruned)
 
-    def _share(self, step: int) -> float:
-        """Of the learning rates of a step: they rise over the first ones."""
-        return min(1.0, step / self._ramp_steps) if self._ramp_steps else 1.0
-
-    def _exchange(
-        self, step: int, chosen: list[tuple[View, Tensor]], drawn: Tensor, *, moving: bool
-    ) -> Callable[[], Measured]:
-        """Take a step by torch."""
-
-        def began() -> None:
-            self.whole = False
-
-        samples = [self._stepper.draw(*each, step, self._generator, moving=moving) for each in chosen]
-        self._truth.prefetch([*(sample.view for sample in samples), *self._order.coming(AHEAD)])
-        seen = step < self.config.density.stop
-        measured = self._stepper.take(step, samples, self._share(step), seen=seen, began=began)
-        if measured.skipped is not None:
-            self._generator.set_state(drawn)
-        return lambda: measured
-
-    def _task(self, step: int) -> Task:
-        """What a step on the device is given, its samples drawn from the generator's present state."""
-        assert self._resident is not None
-        past, optimizer, frequencies = self._past[step], self._learners.optimizer, self._learners.frequencies
-        sample = self._resident.draw(*past.chosen, step, self._generator, moving=step > self.warm_up_steps)
-        self._truth.prefetch([sample.view, *self._order.coming(AHEAD)])
-        self._resident.statistics = self._density.statistics
-        for old in [number for number in self._past if number < step - IN_FLIGHT]:
-            del self._past[old]
-        return Task(
-            step,
-            sample,
-            self.scene.timing(sample.view.time),
-            past.sh_degree,
-            optimizer.rates_at(step, self._share(step)),
-            frequencies.rate.at(step) if frequencies else 0.0,
-            seen=step < self.config.density.stop,
-        )
+    def _began(self) -> None:
+        self.whole = False
 
     def _broken(self, settled: int | None) -> None:
-        """Go back to the end of a step: those behind it changed nothing, and an error ends them."""
-        if settled is None:
-            self.whole = False
-        elif (past := self._past.get(settled + 1)) is not None:
-            self.whole = True
-            self.done, self.scene.sh_degree = settled, past.sh_degree
-            self._generator.set_state(past.before[0])
-            self._order.left = list(past.before[1])
-
-    def _redraw(self, skipped: int, behind: list[int]) -> list[Task]:
-        """The steps behind one that was skipped, drawn anew: no random number was drawn for that one's samples."""
-        past = self._past[skipped]
-        self._generator.set_state(past.drawn)
-        self._order.left = list(past.left)
-        tasks = []
-        for step in behind:
-            before = self._generator.get_state(), list(self._order.left)
-            chosen = self._choose()
-            self._past[step] = _Past(
-                before, self._generator.get_state(), list(self._order.left), chosen, self._past[step].sh_degree
-            )
-            tasks.append(self._task(step))
-        return tasks
-
-    def _choose(self) -> tuple[View, Tensor]:
-        """The next view, and the background (3,) that its image lies on."""
-        view = self._order.next()
-        return view, torch.rand(3, generator=self._generator) if self._random_color else self._color
+        """Go back to the end of a step: those behind it changed nothing, and an error ends them. None: no step is
+        left to go back to."""
+        self.whole = settled is not None
+        self.done = self.done if settled is None else settled
 
     def _as_seen(self, views: Sequence[View]) -> list[View]:
         """The views, those by cameras of the training with the corrections of these."""
@@ -389,7 +304,7 @@ class Trainer:
                 "field_fitted": torch.tensor(int(self._objective.field_fitted)),
                 "sh_degree": torch.tensor(scene.sh_degree),
                 "random": self._generator.get_state(),
-                "order": torch.tensor(self._order.left, dtype=torch.int64),
+                "order": torch.tensor(self._draws.order.left, dtype=torch.int64),
                 "bands": torch.tensor(self._plans.bands(self._drawn)),
             },
         }
@@ -426,5 +341,5 @@ class Trainer:
             raise ValueError("its rates rise over a negative number of steps")
         self._set_field_fitted(bool(own.get("field_fitted", False)))
         self._generator.set_state(own["random"])
-        self._order.left = own["order"].tolist()
+        self._draws.order.left = own["order"].tolist()
         self._plans.set_bands(self._drawn, int(own.get("bands", 1)))

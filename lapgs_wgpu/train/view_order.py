@@ -1,10 +1,12 @@
-"""The order in which a training looks at its views."""
+"""What a training draws by chance: the order in which it looks at its views, and what else comes from its generator."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
+from torch import Tensor
 
 from lapgs_wgpu.data.views import View
 
@@ -29,3 +31,37 @@ class ViewOrder:
     def coming(self, count: int) -> list[View]:
         """At most so many views that come after it in this epoch."""
         return [self._views[number] for number in self.left[:count]]
+
+
+class Mark(NamedTuple):
+    """Where the draws stand: the generator's state, and the views that are left of an epoch."""
+
+    random: Tensor
+    left: list[int]
+
+
+class Draws:
+    """What the steps of a training draw.
+
+    Attributes:
+        order: of the views.
+        generator: of all random numbers.
+        background: (3,) under every image; None for a new one in each step.
+    """
+
+    def __init__(self, views: Sequence[View], generator: torch.Generator, background: Tensor | None) -> None:
+        self.order, self.generator, self.background = ViewOrder(views, generator), generator, background
+
+    def next(self) -> tuple[View, Tensor]:
+        """The next view, and the background (3,) that its image lies on."""
+        view = self.order.next()
+        return view, torch.rand(3, generator=self.generator) if self.background is None else self.background
+
+    def mark(self) -> Mark:
+        """Where they stand, for `go_back`."""
+        return Mark(self.generator.get_state(), list(self.order.left))
+
+    def go_back(self, mark: Mark) -> None:
+        """Draw again what was drawn since."""
+        self.generator.set_state(mark.random)
+        self.order.left = list(mark.left)
