@@ -8,22 +8,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from conftest import open_test_device
 from helpers import sampled_rows
+from helpers.interrupts import after_step, interrupt_at
 from helpers.scenes import relative
 from helpers.training import configure
 from torch import Tensor
 
 from lapgs_wgpu.data import Dataset
 from lapgs_wgpu.data.views import View
-from lapgs_wgpu.errors import DeviceMemoryError, InputError
+from lapgs_wgpu.errors import DeviceLostError, DeviceMemoryError, InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.deformation import Nearby, TimeSamples
+from lapgs_wgpu.run import resume, train
 from lapgs_wgpu.splat import buffer_plan
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.objective import Sample
 from lapgs_wgpu.train.resident_step import Pending
 from lapgs_wgpu.train.resident_task import ResidentSample, Task
-from lapgs_wgpu.train.step_result import Scheduled
+from lapgs_wgpu.train.run_folder import load_state
+from lapgs_wgpu.train.step_result import Scheduled, StepResult
 from lapgs_wgpu.train.trainer import Trainer
 
 pytestmark = pytest.mark.kernels
@@ -139,7 +143,7 @@ def test_steps_are_those_of_torch(device: Device, dataset: Dataset, data: Path, 
 
 
 def test_a_resumed_training_and_one_that_was_looked_at_end_with_the_same_bytes(
-    device: Device, dataset: Dataset, data: Path
+    device: Device, dataset: Dataset, data: Path, tmp_path: Path
 ) -> None:
     config = configure(data__path=str(data), **KINDS["corrections"])
     straight, watched = (started(config, dataset, device, "resident") for _ in range(2))
@@ -149,6 +153,7 @@ def test_a_resumed_training_and_one_that_was_looked_at_end_with_the_same_bytes(
         watched.step()
         if number % 5 == 2:
             watched.scene.at(0.3)
+            watched.save(tmp_path / "now.ply")
     resumed = started(config, dataset, device, "resident")
     resumed.restore(watched.state())
     for _ in resumed:
@@ -172,6 +177,52 @@ def test_what_nobody_reads_stays_on_the_device(device: Device, dataset: Dataset,
     assert parameters.values_on_host == {"gaussians", "field"}
     for name, values in exact.arrays().items():
         assert relative(drawn.arrays()[name].flip(0), values.detach()) < 1e-5, name
+
+
+def test_what_a_callback_edits_counts(device: Device, dataset: Dataset, data: Path) -> None:
+    """The same bytes whether steps are in flight or not."""
+    config = configure(data__path=str(data), schedule__steps="12", schedule__warm_up="2")
+    states = []
+    for waits in (False, True):
+        trainer = started(config, dataset, device, "resident")
+        trainer.callbacks.append(edits)
+        for _ in range(12):
+            trainer.step()
+            if waits:
+                trainer._resident.settle()
+        states.append(trainer.state())
+    assert [name for name in states[0] if not np.array_equal(states[0][name], states[1][name])] == []
+    trainer = started(config, dataset, device, "resident")
+    steps(trainer, 12)
+    assert not np.array_equal(trainer.state()["gaussians.opacity_logits"], states[0]["gaussians.opacity_logits"])
+
+
+@torch.no_grad()
+def edits(trainer: Trainer, result: StepResult) -> None:
+    if result.step in (4, 5, 9):
+        trainer.scene.parameters["opacity_logits"] -= 0.5
+        trainer.scene.field.heads.weight *= 0.9
+
+
+@pytest.mark.parametrize("how", ["Ctrl-C", "lost"])
+def test_a_run_that_ends_with_steps_in_flight_goes_on_to_the_same_bytes(
+    device: Device, configuration: str, dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str
+) -> None:
+    """After Ctrl-C from the last step, after the loss of the device, as after a kill, from the last saved state."""
+    config = dataclasses.replace(configure(schedule__steps="16", schedule__save_interval="6"), step_place="resident")
+    train(config, dataset, tmp_path / "whole", device=device)
+    out, broken = tmp_path / "run", open_test_device(configuration)
+    with monkeypatch.context() as patched:
+        if how == "lost":
+            after_step(11, broken.wgpu_device.destroy, patched)
+        else:
+            interrupt_at(11, patched)
+        with pytest.raises((KeyboardInterrupt, DeviceLostError)) as raised:
+            train(config, dataset, out, device=broken)
+    assert how == "Ctrl-C" or f"--resume {out} goes on from the state that was saved last" in str(raised.value)
+    assert load_state(out)["training.done"] == (11 if how == "Ctrl-C" else 6)
+    resume(config, dataset, out, device=device)
+    assert (out / "checkpoint.ply").read_bytes() == (tmp_path / "whole" / "checkpoint.ply").read_bytes()
 
 
 def test_what_was_recorded_is_right_when_gaussians_go_and_sizes_change(

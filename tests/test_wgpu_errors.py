@@ -15,6 +15,7 @@ import pytest
 import torch
 import wgpu
 from conftest import open_test_device
+from helpers.interrupts import after_step
 from helpers.training import configure
 from wgpu.backends.wgpu_native import lib
 
@@ -29,9 +30,7 @@ from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.wgpu_errors import TranslatedErrors
 from lapgs_wgpu.run import resume, train
 from lapgs_wgpu.splat.rasterize import rasterizer_of
-from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.run_folder import load_state
-from lapgs_wgpu.train.step_result import StepResult
 
 NO_MEMORY = "Validation Error\n\nCaused by:\n  In wgpuDeviceCreateBuffer\n    Not enough memory left.\n"
 
@@ -40,17 +39,6 @@ NO_MEMORY = "Validation Error\n\nCaused by:\n  In wgpuDeviceCreateBuffer\n    No
 def doomed(configuration: str) -> Device:
     """A device of its own."""
     return open_test_device(configuration)
-
-
-def after_step(at: int, what: Callable[[], None], monkeypatch: pytest.MonkeyPatch) -> None:
-    original = Log.step
-
-    def step(self: Log, result: StepResult, *rest: Any) -> None:
-        original(self, result, *rest)
-        if result.step == at:
-            what()
-
-    monkeypatch.setattr(Log, "step", step)
 
 
 def fail_to_allocate(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:

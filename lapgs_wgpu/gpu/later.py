@@ -14,7 +14,7 @@ from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands
 from lapgs_wgpu.gpu.native import LONGEST_WAIT, Mapping
-from lapgs_wgpu.gpu.wgpu_errors import TranslatedErrors
+from lapgs_wgpu.gpu.wgpu_errors import TranslatedErrors, is_lost
 
 _PAUSE = 50e-6  # seconds between two looks
 
@@ -40,6 +40,8 @@ class Later:
                 if time.monotonic() > deadline:
                     raise DeviceLostError(f"{device.info.name} has not answered for {LONGEST_WAIT:.0f} seconds")
                 time.sleep(_PAUSE)
+            if is_lost(device.wgpu_device):  # the native library would end the process
+                raise DeviceLostError(f"{device.info.name} was lost, because its driver gave up or it was removed")
             content = self._mapping.take()
         self._ring.free.append(self._buffer)
         found, at = [], 0

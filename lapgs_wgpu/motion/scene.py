@@ -67,8 +67,7 @@ class Scene4D:
 
     Attributes:
         field_config: configuration of the field.
-        on_access: called with "gaussians" before the parameters are given out, and with "field" before the field is,
-            where a training keeps newer ones on the device; else None.
+        on_access: called with "gaussians" or "field" before these are given out: a device may have newer ones.
         on_device: gives the Gaussians at a time of the field, where a training keeps newer ones there; else None.
         device: that renders.
         sh_degree: degree of the harmonics in use, 0 to 3.
@@ -100,7 +99,7 @@ class Scene4D:
             InputError: own_field is missing or superfluous for field_config.kind.
         """
         check_own(field_config, own_field)
-        self.on_access: Callable[[str], None] | None = None
+        self.on_access: Callable[[str], None] = lambda part: None
         self.on_device: Callable[[float], Gaussians[Tensor]] | None = None
         self._parameters = {
             name: nn.Parameter(parameters[name].detach().float().contiguous().clone())
@@ -133,15 +132,9 @@ class Scene4D:
             points: (N, 3) means, world units.
             colors: (N, 3) in [0, 1].
             scales: (N,) standard deviations, world units.
-            field_config: as for `Scene4D`.
             opacity: of all Gaussians, in (0, 1).
-            antialiased: as for `Scene4D`.
             device: None for the default adapter.
-            seed: as for `Scene4D`.
-            own_field: as for `Scene4D`.
-
-        Returns:
-            The scene.
+            field_config, antialiased, seed, own_field: as for `Scene4D`.
         """
         parameters = isotropic_rows(points, colors, scales, opacity)
         parameters["dynamics"] = torch.zeros(len(points), field_config.dynamics_size)
@@ -159,15 +152,13 @@ class Scene4D:
         length, opacity_logits (N,), sh_dc (N, 1, 3), sh_rest (N, 15, 3); for the field laplacian and one's own also
         dynamics (N, D) (paper eq. 8).
         """
-        if self.on_access is not None:
-            self.on_access("gaussians")
+        self.on_access("gaussians")
         return self._parameters
 
     @property
     def field(self) -> Field | None:
         """The module that moves the Gaussians; None for static scenes."""
-        if self.on_access is not None:
-            self.on_access("field")
+        self.on_access("field")
         return self._field
 
     @property
@@ -268,7 +259,7 @@ class Scene4D:
         depth: bool = True,
         timing: Timing | None = None,
     ) -> Rendering:
-        """Render the scene, without gradients.
+        """Render the scene on the CPU, without gradients. Raises InputError where the camera is none.
 
         Args:
             camera: which renders the image.
@@ -276,12 +267,6 @@ class Scene4D:
             background: (3,); None for black.
             depth: whether to render depth, see `rasterize`.
             timing: takes the place of the scene's, as in `at`; None for the scene's.
-
-        Returns:
-            Rendering, on the CPU.
-
-        Raises:
-            InputError: the camera is none.
         """
         if not isinstance(camera, Camera):
             raise InputError(f"render takes a Camera, such as view.camera, got a {type(camera).__name__}.")
@@ -308,13 +293,8 @@ class Scene4D:
             logits = self.parameters["opacity_logits"].detach()
             if not torch.allclose(now.opacities, logits.sigmoid(), rtol=1e-5, atol=1e-7):
                 logits = now.opacities.logit(eps=1e-7)
-        return GaussianSnapshot(
-            means=now.means.numpy(force=True),
-            sh=sh.numpy(force=True),
-            opacity_logits=logits.numpy(force=True),
-            log_scales=now.scales.log().numpy(force=True),
-            quats=now.quats.numpy(force=True),
-        )
+        means, log_scales, quats = (each.numpy(force=True) for each in (now.means, now.scales.log(), now.quats))
+        return GaussianSnapshot(means, sh.numpy(force=True), logits.numpy(force=True), log_scales, quats)
 
     def save(self, path: str | os.PathLike[str], metadata: Mapping[str, str] | None = None) -> None:
         """Write the scene to one file, which 3DGS viewers open as a static scene at time 0 (docs/format.md). Atomic.
@@ -341,9 +321,6 @@ def load(path: str | os.PathLike[str], device: Device | None = None, *, field: n
         path: of the file.
         device: None for the default adapter.
         field: the module of a scene that was trained with a field of one's own, which takes the file's parameters.
-
-    Returns:
-        The scene.
 
     Raises:
         InputError: not such a file; or a compact scene that moves, which lacks the static grid (`lapgs-view` shows it).

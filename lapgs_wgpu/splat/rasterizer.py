@@ -5,7 +5,6 @@ Only `grow_on_overflow` and, the first time that a pass runs, `Rasterizer._subgr
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -22,6 +21,7 @@ from lapgs_wgpu.gpu.radix_sort import RadixSort
 from lapgs_wgpu.gpu.scan import Scan
 from lapgs_wgpu.splat.buffer_plan import BufferPlan, BufferPlans, roomy
 from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.splat.color_passes import ColorPasses
 from lapgs_wgpu.splat.drawing import Drawing, GaussianGradients, TileLists
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.raster_config import MAX_BAND_TILES, RasterConfig, raster_config
@@ -53,6 +53,7 @@ class Rasterizer:
         self._offset_scan = Scan(device, self.pool, "offsets", "gather")
         self._depth_sort = RadixSort(device, self.pool, "depth sort", lane_runs=self.config.lane_runs)
         self._tile_sort = RadixSort(device, self.pool, "tile sort", lane_runs=self.config.lane_runs)
+        self._colors = ColorPasses(device, self.pool)
         self._drawings = 0
         self._trusted: set[tuple[str, bool, bool]] = set()  # passes whose subgroups were checked
 
@@ -180,7 +181,7 @@ class Rasterizer:
         if config.round_splats:
             commands.clear(needed)
         commands.run(Kernel.get(device, "project", **config.tile_defines), _groups(n), arrays)
-        self._color(commands, drawing, frame, tile_counts)
+        self._colors.record(commands, drawing, frame, tile_counts)
         self._flags_scan(commands, length=length, capacity=n, values=tile_counts, prefix=offsets, total=visible)
         commands.run(Kernel.get(device, "compact"), _groups(n), arrays)
         _, arrays["ids"] = self._depth_sort(
@@ -201,28 +202,6 @@ class Rasterizer:
                 defines |= {"CONTINUED": number > 0, "LAST_ROUND": number == drawing.plan.rounds - 1}
             commands.run(Kernel.get(device, "rasterize", **defines), tiles, arrays)
         return TileLists(tile_counts, visible, arrays["ids"], offsets, slot_ids, arrays["slots"], ranges)
-
-    def _color(self, commands: Commands, drawing: Drawing, frame: DeviceArray, tile_counts: DeviceArray) -> None:
-        kernel = Kernel.get(self.device, "color", **drawing.sh_defines)
-        arrays = {
-            "frame": frame,
-            "means": drawing.gaussians.means,
-            "tile_counts": tile_counts,
-            "splats": drawing.splats,
-        }
-        for part, colors in self._color_parts(kernel, drawing.gaussians.sh):
-            commands.run(kernel, _groups(colors.shape[0]), arrays | {"part": part, "colors": colors})
-
-    def _color_parts(self, kernel: Kernel, colors: DeviceArray) -> list[tuple[DeviceArray, DeviceArray]]:
-        """Return the kernel's uniform and the rows of colors for each range of Gaussians that fits into one binding."""
-        count = colors.shape[0]
-        most = self.device.max_binding // (4 * math.prod(colors.shape[1:])) // 64 * 64  # parts begin at 256 bytes
-        parts = []
-        for first in range(0, count, most):
-            rows = colors.rows(first, min(most, count - first))
-            uniform = self.pool.constant(f"part {first}", kernel.uniform("Part", first=first, count=rows.shape[0]))
-            parts.append((uniform, rows))
-        return parts
 
     def _tiles(self, camera: Camera) -> tuple[int, int]:
         """Return the numbers of rows and columns of tiles."""
@@ -321,7 +300,7 @@ class Rasterizer:
             commands.run(Kernel.get(self.device, "camera_bwd"), _groups(n), turned)
         if gaussians.sh_degree is not None:
             d_sh = self.pool.array("d_sh", gaussians.sh.shape)
-            self._color_bwd(commands, drawing, d_splats, d_means, d_sh)
+            self._colors.record_bwd(commands, drawing, d_splats, d_means, d_sh)
         if d_camera is not None:
             shifted = {"frame": arrays["frame"], "d_means": d_means, "d_camera": d_camera.rows(1, 1)}
             commands.run(Kernel.get(self.device, "camera_bwd", FORCE=True), _groups(n), shifted)
@@ -360,14 +339,3 @@ class Rasterizer:
                 arrays["piece"] = self.pool.constant(f"piece {number}", uniform)
             commands.run(kernel, self._band_tiles(drawing, band), arrays)
         commands.run(gather, _groups(len(drawing.gaussians)), arrays)
-
-    def _color_bwd(
-        self, commands: Commands, drawing: Drawing, d_splats: DeviceArray, d_means: DeviceArray, d_sh: DeviceArray
-    ) -> None:
-        kernel = Kernel.get(self.device, "color_bwd", **drawing.sh_defines)
-        inputs, outputs = self._color_parts(kernel, drawing.gaussians.sh), self._color_parts(kernel, d_sh)
-        arrays = {"frame": drawing.frames[0], "means": drawing.gaussians.means}
-        arrays |= {"d_splats": d_splats, "d_means": d_means}
-        for (part, colors), (_, d_colors) in zip(inputs, outputs, strict=True):
-            arrays |= {"part": part, "colors": colors, "d_colors": d_colors}
-            commands.run(kernel, _groups(colors.shape[0]), arrays)

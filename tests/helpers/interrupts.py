@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -13,15 +13,20 @@ from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.step_result import StepResult
 
 
-def interrupt_at(at: int, monkeypatch: pytest.MonkeyPatch, number: signal.Signals = signal.SIGINT) -> None:
+def after_step(at: int, what: Callable[[], object], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have a run do this when it has logged a step."""
     original = Log.step
 
-    def interrupt(self: Log, result: StepResult, *rest: Any) -> None:
+    def step(self: Log, result: StepResult, *rest: Any) -> None:
         original(self, result, *rest)
         if result.step == at:
-            signal.raise_signal(number)
+            what()
 
-    monkeypatch.setattr(Log, "step", interrupt)
+    monkeypatch.setattr(Log, "step", step)
+
+
+def interrupt_at(at: int, monkeypatch: pytest.MonkeyPatch, number: signal.Signals = signal.SIGINT) -> None:
+    after_step(at, lambda: signal.raise_signal(number), monkeypatch)
 
 
 @contextmanager
