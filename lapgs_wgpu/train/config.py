@@ -278,7 +278,6 @@ class Config(Options):
     step_place: StepPlace = option(
         "where a training step is computed; resident: on the device from end to end, where its parameters stay; "
         "exchange: by torch, which exchanges buffers with the device; auto: exchange on CPU devices and for what only "
-        "torch computes (fields other than static, grid4d and laplacian, corrected cameras and colors, --batch), else "
-        "resident",
+        "torch computes (fields other than static, grid4d and laplacian, --batch), else resident",
         "auto",
     )
