@@ -87,16 +87,13 @@ class Scene4D:
         seed: int = 0,
         own_field: nn.Module | None = None,
     ) -> None:
-        """Make a scene of Gaussians and a field that is new.
+        """Make a scene of Gaussians and a field that is new. Raises InputError where own_field does not fit the kind.
 
         Args:
             parameters: as the attribute; copied.
             field_config, device, sh_degree, antialiased: as the attributes.
             seed: of the field's initial parameters.
             own_field: a module in place of the configured field (docs/api.md).
-
-        Raises:
-            InputError: own_field is missing or superfluous for field_config.kind.
         """
         check_own(field_config, own_field)
         self.on_access: Callable[[str], None] = lambda part: None

@@ -148,14 +148,9 @@ class ResidentParameters:
         for bit, name in enumerate(tables):
             shape = (self._field[name].shape[0], 2)
             blocks.append(Block(name, shape, "hash", 8 << bit, {name: (every, every)}, of="field"))
-        rows = {
-            name: (slice(p.first, p.first + self._field[name].numel()), every)
-            for name, p in self._weights.places.items()
-        }
-        moved, shape = (
-            self._weights.places[FREQUENCIES].first if FREQUENCIES in rows else None,
-            (self._weights.count, 1),
-        )
+        places, shape = self._weights.places, (self._weights.count, 1)
+        rows = {name: (slice(p.first, p.first + self._field[name].numel()), every) for name, p in places.items()}
+        moved = places[FREQUENCIES].first if FREQUENCIES in rows else None
         return [*blocks, Block("weights", shape, "mlp", 8 << len(tables), rows, moved=moved, of="field")]
 
     def push_values(self) -> None:
