@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from helpers.image_losses import BACKGROUND, CAMERA, TRUTH, WEIGHTS, gaussians, gradients
-from helpers.interrupts import interrupt_at
 from helpers.loss_reference import exposure, total
 from helpers.scenes import relative
 from helpers.training import configure
@@ -20,7 +18,6 @@ from lapgs_wgpu.data import Dataset
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands
-from lapgs_wgpu.run import resume, train
 from lapgs_wgpu.splat.rasterize import rasterize
 from lapgs_wgpu.train.exposure import ExposurePasses, Exposures
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
@@ -128,17 +125,3 @@ def test_each_camera_of_a_rig_has_one_correction(dataset: Dataset, device: Devic
             assert len({each.data_ptr() for each in corrections if each is not None}) == count
             if len(views) == 6:
                 assert [each.data_ptr() for each in corrections[:3]] == [each.data_ptr() for each in corrections[3:]]
-
-
-def test_an_interrupted_run_goes_on_to_the_same_bytes(
-    dataset: Dataset, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    config = configure(exposure__enabled="true", schedule__batch="2", schedule__steps="20")
-    train(config, dataset, tmp_path / "whole", device=device)
-    with monkeypatch.context() as patched:
-        interrupt_at(16, patched)
-        with pytest.raises(KeyboardInterrupt):
-            train(config, dataset, tmp_path / "run", device=device)
-    resume(config, dataset, tmp_path / "run", device=device)
-    first, second = (tmp_path / name / "checkpoint.ply" for name in ("run", "whole"))
-    assert first.read_bytes() == second.read_bytes()

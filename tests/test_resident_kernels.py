@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
-from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -11,7 +10,6 @@ import torch
 from helpers import sampled_rows
 from helpers.matrices import on_device, random, read
 from helpers.scenes import relative
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from lapgs_wgpu.gpu.array import DeviceArray
@@ -26,7 +24,7 @@ from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 from lapgs_wgpu.splat.splat_layout import MEAN, RADIUS, SPLAT_FLOATS
-from lapgs_wgpu.train.camera_refinement import MOST_POINTS, CameraRefinement, image_motion, scene_points
+from lapgs_wgpu.train.camera_refinement import CameraRefinement, scene_points
 from lapgs_wgpu.train.config import CamerasConfig
 from lapgs_wgpu.train.densify import Statistics
 from lapgs_wgpu.train.exposure import Exposures
@@ -206,50 +204,27 @@ def test_offsets_fill_their_cube() -> None:
     assert (offsets.std(dim=0) - 3**-0.5).abs().max() < 0.03
 
 
-@pytest.mark.parametrize("gaussians", [1, 60, 5003])
-def test_image_motion(device: Device, gaussians: int) -> None:
-    camera = looking_at(np.array([3, -6, 1]))
-    geometry = 2 * random(gaussians, 12)
-    geometry[: gaussians // 5, 1] -= 9  # behind the camera
-    points = scene_points(geometry[:, :3], geometry[:, 3].sigmoid())
-    kernel, found = Kernel.get(device, "image_motion"), on_device(device, torch.zeros(22))
-    drawing = Rasterizer(device).draw(nothing_but_one(device), camera)
-    given = uniform(device, kernel, "Seen", gaussians=gaussians, spacing=-(-gaussians // MOST_POINTS), unit=2.0)
-    with Commands(device) as commands:
-        commands.dispatch(
-            kernel, 1, seen=given, frame=drawing.frames[0], geometry=on_device(device, geometry), motion=found
-        )
-    motion = read(found).double()
-    full = torch.zeros(6, 6, dtype=torch.float64)
-    full[tuple(torch.tril_indices(6, 6))] = motion[:21]
-    expected = torch.from_numpy(image_motion(camera, points, 2.0))
-    assert relative((full + full.T - full.diag().diag()) / motion[21].clamp_min(1e-9), expected) < 1e-5
-
-
-class View(NamedTuple):
-    name: str
-    camera: Camera
-
-
 @pytest.mark.parametrize("guard", [OPEN, CLOSED])
 def test_steps_of_corrections(device: Device, guard: int) -> None:
     """Of cameras and of colors, some without a gradient; and the frame that a corrected camera sees."""
-    rng, geometry = np.random.default_rng(0), 3 * random(300, 12)
-    cameras = [looking_at(rng.uniform([-3, -11, -3], [3, -5, 3])) for _ in range(5)]
-    views = [View(f"train_{number}", camera) for number, camera in enumerate(cameras)]
+    rng, geometry = np.random.default_rng(0), 3 * random(5003, 12)  # of which some lie behind the cameras
+    places = rng.uniform([-3, -11, -3], [3, -5, 3], (5, 3))
+    cameras = [Camera.looking_at(p, [0, 0, 0], up=[0, 0, 1], fov_x=0.7, width=40, height=30) for p in places]
+    views = [SimpleNamespace(name=f"train_{number}", camera=camera) for number, camera in enumerate(cameras)]
+
+    points = scene_points(geometry[:, :3], geometry[:, 3].sigmoid())
+    config = CamerasConfig("on", Rate(1e-2, 1e-3, 6), 0.3, 1)
 
     def twin() -> tuple[CameraRefinement, Exposures]:
-        points = scene_points(geometry[:, :3], geometry[:, 3].sigmoid())
-        refinement = CameraRefinement(
-            cameras, 2.0, CamerasConfig("on", Rate(1e-2, 1e-3, 6), 0.3, 1), lambda: points, before
-        )
-        return refinement, Exposures(5, Rate(2e-2, 2e-3, 9))
+        return CameraRefinement(cameras, 2.0, config, lambda: points), Exposures(5, Rate(2e-2, 2e-3, 9))
 
-    before = {number: rng.normal(scale=0.02, size=6) for number in range(5)}
     (exact, exact_colors), (mine, mine_colors) = twin(), twin()
+    before = torch.from_numpy(rng.normal(scale=0.02, size=(5, 6)))
     numbers = {view.name: number for number, view in enumerate(views)}
     learners = SimpleNamespace(cameras=mine, exposures=mine_colors, image_numbers=numbers)
     corrections, rasterizer = ResidentCorrections(device, learners), Rasterizer(device)
+    for refinement in (exact, mine):
+        refinement.state()["learnt"].copy_(before)
     corrections.push()
     for step, number in enumerate((1, 3, 1, 0, 3, 2), start=1):
         d_camera, d_colors = (torch.from_numpy(rng.normal(size=n) * (step != 4)).float() for n in (6, 12))
@@ -271,10 +246,6 @@ def test_steps_of_corrections(device: Device, guard: int) -> None:
     for found, wanted in ((mine, exact), (mine_colors, exact_colors)):
         for name, value in wanted.state().items():
             assert relative(found.state()[name].detach(), value.detach()) < 3e-5 or not value.any(), name
-
-
-def looking_at(place: NDArray[np.float64]) -> Camera:
-    return Camera.looking_at(place, [0, 0, 0], up=[0, 0, 1], fov_x=0.7, width=40, height=30)
 
 
 def nothing_but_one(device: Device) -> Gaussians[DeviceArray]:

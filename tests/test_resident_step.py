@@ -22,6 +22,7 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.deformation import Nearby, TimeSamples
 from lapgs_wgpu.run import resume, train
 from lapgs_wgpu.splat import buffer_plan
+from lapgs_wgpu.splat.rasterize import rasterizer_of
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.objective import Sample
 from lapgs_wgpu.train.resident_step import Pending
@@ -204,23 +205,26 @@ def edits(trainer: Trainer, result: StepResult) -> None:
         trainer.scene.field.heads.weight *= 0.9
 
 
-@pytest.mark.parametrize("how", ["Ctrl-C", "lost"])
+@pytest.mark.parametrize("how", ["Ctrl-C", "lost", "memory"])
 def test_a_run_that_ends_with_steps_in_flight_goes_on_to_the_same_bytes(
     device: Device, configuration: str, dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str
 ) -> None:
-    """After Ctrl-C from the last step, after the loss of the device, as after a kill, from the last saved state."""
+    """After Ctrl-C from the last step; after the loss of the device, as after a kill, from the last saved state; where
+    memory gives out because intersections outgrow it, from the last step that was waited for."""
     config = dataclasses.replace(configure(schedule__steps="16", schedule__save_interval="6"), step_place="resident")
     train(config, dataset, tmp_path / "whole", device=device)
     out, broken = tmp_path / "run", open_test_device(configuration)
     with monkeypatch.context() as patched:
-        if how == "lost":
+        if how == "Ctrl-C":
+            interrupt_at(11, patched)
+        elif how == "lost":
             after_step(11, broken.wgpu_device.destroy, patched)
         else:
-            interrupt_at(11, patched)
-        with pytest.raises((KeyboardInterrupt, DeviceLostError)) as raised:
+            after_step(11, lambda: patched.setattr(rasterizer_of(broken), "grow_on_overflow", fails), patched)
+        with pytest.raises((KeyboardInterrupt, DeviceLostError, DeviceMemoryError)) as raised:
             train(config, dataset, out, device=broken)
-    assert how == "Ctrl-C" or f"--resume {out} goes on from the state that was saved last" in str(raised.value)
-    assert load_state(out)["training.done"] == (11 if how == "Ctrl-C" else 6)
+    assert how != "lost" or f"--resume {out} goes on from the state that was saved last" in str(raised.value)
+    assert load_state(out)["training.done"] == {"Ctrl-C": 11, "lost": 6, "memory": 10}[how]
     resume(config, dataset, out, device=device)
     assert (out / "checkpoint.ply").read_bytes() == (tmp_path / "whole" / "checkpoint.ply").read_bytes()
 
@@ -289,31 +293,6 @@ def test_a_step_that_is_not_finite_is_skipped_and_named(device: Device, dataset:
         assert "the loss term l1 is nan" in skipped[6].what
         assert "gradient of means" in skipped[6].what
     assert [name for name in states[0] if not np.array_equal(states[0][name], states[1][name])] == []
-
-
-def test_an_error_goes_back_to_the_last_step_that_was_waited_for(
-    device: Device, dataset: Dataset, data: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Memory gives out where intersections outgrow it, with steps in flight: what is left goes on to the same bytes."""
-    config = configure(data__path=str(data), schedule__steps="12", density__start="100")
-    straight, broken = (started(config, dataset, device, "resident") for _ in range(2))
-    steps(straight, 12)
-    steps(broken, 5)
-    broken._resident.settle()
-    rasterizer = broken._resident._passes.rasterizer
-    rasterizer.plans.now = dataclasses.replace(rasterizer.plans.now, capacity=64)
-    with monkeypatch.context() as patched:
-        patched.setattr(rasterizer, "grow_on_overflow", fails)
-        with pytest.raises(DeviceMemoryError):
-            steps(broken, 5)
-    assert broken.whole
-    assert broken.done == 5
-    rest = started(config, dataset, device, "resident")
-    rest.restore(broken.state())
-    for _ in rest:
-        pass
-    expected, found = straight.state(), rest.state()
-    assert [name for name in expected if not np.array_equal(expected[name], found[name])] == []
 
 
 def smaller(view: View) -> View:
