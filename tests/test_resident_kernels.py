@@ -31,6 +31,7 @@ from lapgs_wgpu.train.exposure import Exposures
 from lapgs_wgpu.train.learning_rate import Rate
 from lapgs_wgpu.train.optimizer import ADAM_EPS, LARGEST_FREQUENCY_STEP, FrequencyOptimizer
 from lapgs_wgpu.train.resident_corrections import ResidentCorrections
+from lapgs_wgpu.train.resident_parameters import check_finite
 
 pytestmark = pytest.mark.kernels
 OPEN, CLOSED = 0, 7
@@ -169,11 +170,10 @@ def test_the_guard_closes(device: Device, bad: int, capacity: int, needed: int, 
 def test_values_that_are_not_finite_are_found(device: Device, value: float, place: int) -> None:
     values = random(3000)
     values[place] = value
-    kernel, bad = Kernel.get(device, "check_finite"), word(device, 2)
-    given = uniform(device, kernel, "Check", count=3000, bit=8)
+    bad = word(device, 2)
     with Commands(device) as commands:
-        commands.dispatch(kernel, 3, check=given, values=on_device(device, values), bad=bad)
-    assert bad.read()[0] == (2 if abs(value) < 1e19 else 10)
+        check_finite(commands, BufferPool(device), "values", on_device(device, values), bad)
+    assert bad.read()[0] == (2 if abs(value) < 1e19 else 3)
 
 
 @pytest.mark.parametrize(("count", "gaussians"), [(1, 1), (7, 100), (100, 100), (33, 70)])

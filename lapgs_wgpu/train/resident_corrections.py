@@ -17,9 +17,8 @@ from lapgs_wgpu.train.camera_refinement import MOST_POINTS, CameraRefinement
 from lapgs_wgpu.train.exposure import Exposures
 from lapgs_wgpu.train.fused_loss import exposure_of
 from lapgs_wgpu.train.learners import Learners
-from lapgs_wgpu.train.resident_parameters import Block
+from lapgs_wgpu.train.resident_parameters import Block, check_finite
 
-_BIT = 1 << 29  # of check_finite.wgsl
 _CAMERA_FLOATS, _EXPOSURE_FLOATS = 16, 40  # rows of camera_step.wgsl and exposure_step.wgsl
 _MOTION_FLOATS, _MOST_COMMON = 22, 8  # image_motion.wgsl, camera_step.wgsl
 _EVERY, _CAMERAS, _ALL = slice(None), slice(-1), slice(-1, None)
@@ -62,7 +61,7 @@ class ResidentCorrections:
         self.on_host = True
 
     def _add(self, name: str, shape: tuple[int, int], of: CameraRefinement | Exposures) -> None:
-        block = Block(name, shape, None, _BIT, _PLACES[name], arrays={"value": self._pool.array(name, shape)})
+        block = Block(name, shape, None, _PLACES[name], arrays={"value": self._pool.array(name, shape)})
         self._blocks[name] = block, of
 
     def push(self) -> None:
@@ -132,10 +131,8 @@ class ResidentCorrections:
 
     def record_check(self, commands: Commands, bad: DeviceArray) -> None:
         """Record the search for gradients that are not finite."""
-        kernel = Kernel.get(self._device, "check_finite")
         for name, gradient in self._gradients():
-            content = kernel.uniform("Check", count=gradient.size, bit=_BIT)
-            commands.dispatch(kernel, 1, check=self._pool.constant(f"check {name}", content), values=gradient, bad=bad)
+            check_finite(commands, self._pool, name, gradient, bad)
 
     def record_step(self, commands: Commands, guard: DeviceArray, frame: DeviceArray, geometry: DeviceArray) -> None:
         """Record a step of the corrections, after the one of the Gaussians. frame: that `move` gave; geometry: (N, 12)

@@ -40,7 +40,6 @@ class Block:
     Attributes:
         shape: (rows, columns).
         group: of the optimizer that all values belong to; None where each tensor is a group of its own.
-        bit: that stands for its gradient where that is not finite.
         parts: by name of a tensor its place.
         ones: whether the last column holds ones, which no step changes.
         moved: number of values that Adam moves; the others have an optimizer of their own.
@@ -52,7 +51,6 @@ class Block:
     name: str
     shape: tuple[int, int]
     group: str | None
-    bit: int
     parts: dict[str, Place]
     ones: bool = False
     moved: int | None = None
@@ -131,27 +129,27 @@ class ResidentParameters:
         geometry = {name: (every, slice(*place)) for name, place in columns.items()}
         colors = {"sh_dc": (every, slice(0, 3)), "sh_rest": (every, slice(3, SH_FLOATS))}
         blocks = [
-            Block("geometry", (n, GEOMETRY_FLOATS), None, 1, geometry, moving=False),
-            Block("sh", (n, SH_FLOATS), None, 2, colors, moving=False),
+            Block("geometry", (n, GEOMETRY_FLOATS), None, geometry, moving=False),
+            Block("sh", (n, SH_FLOATS), None, colors, moving=False),
         ]
         if self._weights is not None:
             beside = self._weights.shape.beside
             dynamics = {"dynamics": (every, slice(0, beside - 1))} if "dynamics" in self._gaussians else {}
-            blocks.append(Block("beside", (n, beside), None, 4, dynamics, ones=True))
+            blocks.append(Block("beside", (n, beside), None, dynamics, ones=True))
         return blocks
 
     def _field_layout(self) -> list[Block]:
         if self._weights is None:
             return []
-        every, tables = slice(None), [name for name in self._field if name.endswith(".table")]
-        blocks = []
-        for bit, name in enumerate(tables):
-            shape = (self._field[name].shape[0], 2)
-            blocks.append(Block(name, shape, "hash", 8 << bit, {name: (every, every)}, of="field"))
+        every, tables = slice(None), {name: table for name, table in self._field.items() if name.endswith(".table")}
+        blocks = [
+            Block(name, (table.shape[0], 2), "hash", {name: (every, every)}, of="field")
+            for name, table in tables.items()
+        ]
         places, shape = self._weights.places, (self._weights.count, 1)
         rows = {name: (slice(p.first, p.first + self._field[name].numel()), every) for name, p in places.items()}
         moved = places[FREQUENCIES].first if FREQUENCIES in rows else None
-        return [*blocks, Block("weights", shape, "mlp", 8 << len(tables), rows, moved=moved, of="field")]
+        return [*blocks, Block("weights", shape, "mlp", rows, moved=moved, of="field")]
 
     def push_values(self) -> None:
         """Upload the values that the host may have changed."""
@@ -244,12 +242,8 @@ class ResidentParameters:
 
     def record_check(self, commands: Commands, bad: DeviceArray, *, moving: bool) -> None:
         """Record the search for gradients that are not finite."""
-        kernel = Kernel.get(self._device, "check_finite")
         for block in self._moved(moving=moving):
-            gradient = block.arrays["gradient"]
-            content = kernel.uniform("Check", count=gradient.size, bit=block.bit)
-            uniform = self._pool.constant(f"check {block.name}", content)
-            commands.dispatch(kernel, -(-gradient.size // 1024), check=uniform, values=gradient, bad=bad)
+            check_finite(commands, self._pool, block.name, block.arrays["gradient"], bad)
 
     def count_step(self, *, moving: bool) -> None:
         """A step that moves the parameters is about to be recorded."""
@@ -335,6 +329,13 @@ class ResidentParameters:
         for block in self.blocks.values():
             block.scatter(block.arrays["gradient"].read(), tensors)
         return {name: [tensor] for name, tensor in tensors.items()}
+
+
+def check_finite(commands: Commands, pool: BufferPool, name: str, values: DeviceArray, bad: DeviceArray) -> None:
+    """Record that `bad` becomes odd where a value is not finite. name: of the uniform in the pool."""
+    kernel = Kernel.get(commands.device, "check_finite")
+    uniform = pool.constant(f"check {name}", kernel.uniform("Check", count=values.size))
+    commands.dispatch(kernel, -(-values.size // 1024), check=uniform, values=values, bad=bad)
 
 
 def _view(flat: Tensor, place: Segment) -> Tensor:

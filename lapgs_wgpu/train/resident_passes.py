@@ -20,15 +20,13 @@ from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterize import rasterizer_of
 from lapgs_wgpu.train.config import Config, LossWeights
 from lapgs_wgpu.train.fused_loss import image_loss_of
-from lapgs_wgpu.train.image_loss import TERMS
 from lapgs_wgpu.train.learners import Learners
 from lapgs_wgpu.train.resident_corrections import ResidentCorrections
-from lapgs_wgpu.train.resident_parameters import ResidentParameters
+from lapgs_wgpu.train.resident_parameters import ResidentParameters, check_finite
 from lapgs_wgpu.train.resident_task import Task
 
 TOTALS = ("static", "temporal", "acceleration", "dynamics")  # sums of losses of motion, in their places
 _DYNAMICS_GROUPS, _MOST_COLUMNS = 64, 256  # common/dynamics.wgsl
-_TERM_BIT = 1 << 30  # of check_finite.wgsl: the image losses
 
 
 class Recorded(NamedTuple):
@@ -297,9 +295,7 @@ class ResidentPasses:
         guard, bad = self.word("guard"), self.word("bad")
         self.parameters.record_check(commands, bad, moving=moving)
         self.corrections.record_check(commands, bad)
-        check = Kernel.get(device, "check_finite")
-        content = check.uniform("Check", count=TERMS, bit=_TERM_BIT)
-        commands.dispatch(check, 1, check=self._pool.constant("check terms", content), values=terms, bad=bad)
+        check_finite(commands, self._pool, "terms", terms, bad)
         close = Kernel.get(device, "close_guard")
         plan = drawing.plan
         rounds = int(bool(self.rasterizer.config.round_splats))
