@@ -31,8 +31,13 @@ def draw_times(
     if chosen == 0 or config.weight == 0 or time_count < 3:
         return None
     rows = torch.randint(count, (chosen,), generator=generator)
+    return TimeSamples(rows, even_times(t, time_count, generator))
+
+
+def even_times(t: float, time_count: int, generator: torch.Generator) -> tuple[float, float]:
+    """Draw the times before and after t."""
     reach = LARGEST_DISTANCE / (time_count - 1) * (1 + float(torch.rand((), generator=generator))) / 2
-    return TimeSamples(rows, (max(t - reach, 0.0), min(t + reach, 1.0)))
+    return max(t - reach, 0.0), min(t + reach, 1.0)
 
 
 def acceleration_loss(now: Deformed, t: float, samples: TimeSamples) -> Tensor:

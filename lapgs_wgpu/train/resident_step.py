@@ -27,7 +27,7 @@ from lapgs_wgpu.motion.passes.samples import Samples
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.drawing import Drawing
 from lapgs_wgpu.splat.gaussians import Gaussians
-from lapgs_wgpu.train.acceleration import LARGEST_DISTANCE
+from lapgs_wgpu.train.acceleration import even_times
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.density_control import DensityControl
 from lapgs_wgpu.train.ground_truth import AHEAD, GroundTruth
@@ -37,6 +37,7 @@ from lapgs_wgpu.train.nonfinite import Skipped, cause, check_parameters
 from lapgs_wgpu.train.resident_parameters import PARTS
 from lapgs_wgpu.train.resident_passes import ResidentPasses
 from lapgs_wgpu.train.resident_task import ResidentSample, Task
+from lapgs_wgpu.train.smoothness import near_time
 from lapgs_wgpu.train.step_result import Measured, Scheduled
 from lapgs_wgpu.train.view_order import Draws
 
@@ -191,13 +192,11 @@ class ResidentStep:
         near_count, even_count = round(smooth.share * count), round(even.share * count)
         if near_count and (smooth.static or smooth.temporal):
             near = Samples(near_count, count, *_draw_rows(count, generator), smooth.reach)
-            shift = smooth.time_reach * (2 * float(torch.rand((), generator=generator)) - 1)
-            sample = dataclasses.replace(sample, near=near, near_time=min(max(t + shift, 0.0), 1.0))
+            sample = dataclasses.replace(sample, near=near, near_time=near_time(smooth, t, generator))
         left_out = self.field_fitted or step % even.interval or not even.weight or self._time_count < 3
         if even_count and not left_out:
             samples = Samples(even_count, count, *_draw_rows(count, generator))
-            reach = LARGEST_DISTANCE / (self._time_count - 1) * (1 + float(torch.rand((), generator=generator))) / 2
-            sample = dataclasses.replace(sample, even=samples, even_times=(max(t - reach, 0.0), min(t + reach, 1.0)))
+            sample = dataclasses.replace(sample, even=samples, even_times=even_times(t, self._time_count, generator))
         return sample
 
     def _push(self) -> None:

@@ -15,5 +15,9 @@ def draw_nearby(config: SmoothnessConfig, count: int, t: float, generator: torch
         return None
     rows = torch.randint(count, (chosen,), generator=generator)
     offsets = config.reach * (2 * torch.rand(chosen, 3, generator=generator) - 1)
-    other = t + config.time_reach * (2 * float(torch.rand((), generator=generator)) - 1)
-    return Nearby(rows, offsets, min(max(other, 0.0), 1.0), config.static, config.temporal)
+    return Nearby(rows, offsets, near_time(config, t, generator), config.static, config.temporal)
+
+
+def near_time(config: SmoothnessConfig, t: float, generator: torch.Generator) -> float:
+    """Draw the other time at which the field is looked at."""
+    return min(max(t + config.time_reach * (2 * float(torch.rand((), generator=generator)) - 1), 0.0), 1.0)
