@@ -110,7 +110,7 @@ class ResidentStep:
         if "gaussians" in (parts or PARTS) and not self._statistics_on_host and self.statistics is not None:
             self._statistics_on_host = True
             seen = torch.from_numpy(self._passes.seen().read())
-            for target, column in zip(vars(self.statistics).values(), seen.T, strict=False):
+            for target, column in zip(vars(self.statistics).values(), seen.T, strict=True):
                 target.copy_(column)
 
     def to_rest(self, *parts: str) -> None:
@@ -184,7 +184,7 @@ class ResidentStep:
         self.parameters.push()
         if self._statistics_on_host and self.statistics is not None:
             self._statistics_on_host = False
-            columns = [*(values.numpy(force=True) for values in vars(self.statistics).values()), np.zeros(self.count)]
+            columns = [values.numpy(force=True) for values in vars(self.statistics).values()]
             self._passes.seen().write(np.stack(columns, axis=1).astype(np.float32))
 
     # A step's end ----------------------------------------------------------------------------------------------------
