@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lapgs_wgpu.data.capture_files import MOST_ABSENT
 from lapgs_wgpu.data.cloud import Cloud, in_view, views_of
 from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.data.focus import spread
@@ -310,15 +311,21 @@ def check_film(images: Sequence[Path]) -> list[str]:
         warnings.append(
             f"blurred images: {_named([images[i].name for i in blurry])} ({len(blurry)} of {len(images)}) have less "
             f"than {BLURRED:g} of their neighbours' sharpness, {images[worst].name} {shares[worst]:.2g}; leave them "
-            "out."
+            f"out{_with_poses(blurry, images)}."
         )
     repeated = [images[i].name for i in range(1, len(images)) if repeats(thumbnails[i], thumbnails[i - 1])]
     if repeated:
         warnings.append(
             f"repeated images: {_named(repeated)} ({len(repeated)} of {len(images)}) differ by at most {EQUAL} of "
-            "255 levels from the image before; motion stands still there, so leave them out."
+            f"255 levels from the image before; motion stands still there, so leave them out"
+            f"{_with_poses(repeated, images)}."
         )
     return warnings
+
+
+def _with_poses(some: Sequence[object], images: Sequence[Path]) -> str:
+    """What else to remove with some of the images, where so many may not be absent."""
+    return ", and what names them" if len(some) > MOST_ABSENT * len(images) else ""
 
 
 def _named(names: Sequence[str]) -> str:
