@@ -101,6 +101,14 @@ def vector(value: Any, length: int, name: str, where: str | Path) -> NDArray[np.
     return np.array([number(entry, f"each entry of {name}", where, *bounds) for entry in value])
 
 
+def matrix(value: Any, shape: tuple[int, int], name: str, where: str | Path) -> NDArray[np.float64]:
+    """Convert a JSON list of rows to numbers (rows, columns) of at most LARGEST_ENTRY. Raises InputError."""
+    rows, columns = shape
+    if not isinstance(value, list) or len(value) != rows:
+        raise InputError(f"{where}: {name} must be {rows} rows of {columns} numbers, got {kind(value)}.")
+    return np.stack([vector(row, columns, name, where) for row in value])
+
+
 def kind(value: Any) -> str:
     """Describe a JSON value in JSON's terms, short enough for an error."""
     if isinstance(value, list):
