@@ -68,10 +68,10 @@ def image_names(files: Sequence[str], places: Mapping[str, NDArray[np.float64]])
     same_depth = len(set(map(len, parts))) == 1
     varying = [level for level, names in enumerate(zip(*parts, strict=same_depth)) if len(set(names)) > 1]
     stem = len(parts[0]) - 1
-    if varying == [stem]:
-        return _named_by_both(files, places) or cameras
     if not same_depth or len(varying) not in (1, 2):
         return cameras
+    if varying == [stem]:
+        return _named_by_both(files, places) or cameras
     outer, inner = varying[0], (*varying, stem)[1]
 
     def timed(level: int) -> list[ImageName]:
