@@ -11,8 +11,8 @@ struct Seen {
 @group(0) @binding(1) var<storage, read> guard: u32;
 @group(0) @binding(2) var<storage, read> splats: array<vec4<f32>>;
 @group(0) @binding(3) var<storage, read> d_splats: array<vec4<f32>>;
-// (N,): sum of the lengths of the gradients by the center, image 2 units wide; views; largest radius, pixels; 0
-@group(0) @binding(4) var<storage, read_write> statistics: array<vec4<f32>>;
+// (N,): sum of the lengths of the gradients by the center, image 2 units wide; views
+@group(0) @binding(4) var<storage, read_write> statistics: array<vec2<f32>>;
 
 @compute @workgroup_size(64)
 fn main(
@@ -24,11 +24,9 @@ fn main(
     if (guard != 0u || i >= seen.gaussians) {
         return;
     }
-    let radius = splats[SPLAT_STRIDE * i + 2u].z;
-    if (radius <= 0.0) {
+    if (splats[SPLAT_STRIDE * i + 2u].z <= 0.0) {  // its radius
         return;
     }
-    let before = statistics[i];
     let slope = length(d_splats[SPLAT_STRIDE * i].xy * seen.half_size);
-    statistics[i] = vec4(before.x + slope, before.y + 1.0, max(before.z, trunc(radius)), 0.0);
+    statistics[i] += vec2(slope, 1.0);
 }

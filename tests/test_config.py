@@ -30,7 +30,7 @@ def test_dnerf_is_the_papers_schedule() -> None:
     assert (rates.log_scales, rates.quats) == (5e-3, 1e-3)
     density = config.density
     assert (density.start, density.stop, density.interval, density.gradient) == (500, 15_000, 100, 2e-4)
-    assert (density.min_opacity, density.max_screen_radius, density.max_world_size) == (0.005, 0, 0.1)
+    assert (density.min_opacity, density.max_world_size) == (0.005, 0.1)
     assert (density.reset_interval, density.reset_opacity) == (3000, 0.01)
     assert (density.neighbours, density.divergence_weight, density.split_quantile) == (10, 0.5, 0.4)
     assert (config.points.count, config.points.box) == (100_000, 1.3)

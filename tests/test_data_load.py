@@ -13,6 +13,7 @@ from lapgs_wgpu.data.frames import Capture, Frame, Reader
 from lapgs_wgpu.data.images import ImageFile, check_image, decode, encode_png
 from lapgs_wgpu.data.lens import Lens, Undistortion
 from lapgs_wgpu.data.stamps import ImageName
+from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
 
 COUNT = 6
@@ -80,4 +81,12 @@ def test_png_keeps_every_bit(shape: tuple[int, ...], tmp_path: Path) -> None:
     (tmp_path / "a.png").write_bytes(encode_png(image))
     expected = image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
     np.testing.assert_array_equal(decode(tmp_path / "a.png"), expected)
-    assert check_image(tmp_path / "a.png") == ImageFile(tmp_path / "a.png", (shape[1], shape[0]))
+    assert check_image(tmp_path / "a.png") == ImageFile(tmp_path / "a.png", (shape[1], shape[0]), alpha=shape[-1] == 4)
+
+
+@pytest.mark.parametrize(("name", "what"), [("walk/IMG_1.JPG", "images"), ("walk.mp4", "films")])
+def test_what_has_no_poses_is_for_lapgs_prepare(name: str, what: str, tmp_path: Path) -> None:
+    (tmp_path / "walk").mkdir()
+    (tmp_path / name).touch()
+    with pytest.raises(InputError, match=f"it holds {what} without poses, which lapgs-prepare finds"):
+        load_dataset(tmp_path)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from lapgs_wgpu.data import Dataset, load_dataset
+from lapgs_wgpu.data.images import gray_thumbnail
 from lapgs_wgpu.data.normalize import BOX, Normalization
 from lapgs_wgpu.data.poses import world_to_camera
 from lapgs_wgpu.errors import InputError
@@ -178,6 +179,15 @@ def test_gray_of_sixteen_bits(tmp_path: Path) -> None:
         capture(tmp_path / "gray", lambda _, p: Image.fromarray(levels.astype(np.uint16) * 257).save(p))
     )
     np.testing.assert_array_equal(data.train[0].load()[..., 1], levels)
+    np.testing.assert_array_equal(gray_thumbnail(Path(data.train[0].source), WIDTH), levels)
+
+
+@pytest.mark.parametrize(("alpha", "clear"), [(0, True), (1, True), (255, False)])
+def test_images_that_are_transparent(tmp_path: Path, alpha: int, clear: bool) -> None:
+    def write(image: NDArray[np.uint8], path: Path) -> None:
+        Image.fromarray(np.dstack([image, np.full((HEIGHT, WIDTH), alpha, np.uint8)])).save(path)
+
+    assert told(load_dataset(capture(tmp_path / "clear", write)), "nearly transparent") == clear
 
 
 def test_format_is_named_whatever_the_file_is_called(tmp_path: Path) -> None:

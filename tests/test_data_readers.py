@@ -123,7 +123,7 @@ def test_panoptics_cameras_are_kept(device: Device, tmp_path: Path) -> None:
         (put("train_meta.json", "w2c", 0, 1, 0, 0, 5.0), "w2c"),
         (put("train_meta.json", "k", 2, 0, 0, 0, -5.0), "k"),
         (put("train_meta.json", "k", 2, 0, 2, 2, 5.0), "k"),
-        (put("train_meta.json", "fn", 1, 0, "../1/000000.png"), "fn"),
+        (put("train_meta.json", "fn", 1, 0, "../ims9/000000.png"), "fn"),
         (put("train_meta.json", "fn", 1, 0, 7), "fn"),
         (put("train_meta.json", "cam_id", 1, [1]), "cam_id"),
         (put("test_meta.json", "h", 0), "h"),

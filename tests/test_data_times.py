@@ -55,6 +55,8 @@ NAMES = {
     "letter case": ("CAM/{:04d}.jpg", "cam/{:04d}.JPG"),
     "absolute": ("C:\\walk\\Images\\{:04d}.png", "{:04d}.png"),
     "the folder's own name": ("images/{:04d}.png", "{:04d}.png"),
+    "blanks of a URL": ("My%20film/{:04d}.png", "My film/{:04d}.png"),
+    "above the folder": ("../walk/a/{:04d}.png", "a/{:04d}.png"),
     "type": ("{:04d}.jpg", "{:04d}.jpeg"),
 }
 
@@ -80,9 +82,10 @@ def transforms(folder: Path, names: Sequence[str]) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("named", ["no suffix", "three rows", "masks", "cloud"])
+@pytest.mark.parametrize("named", ["no suffix", "three rows", "masks", "cloud", "texts", "absolute"])
 def test_transforms_as_other_programs_write_them(named: str, tmp_path: Path) -> None:
-    """JPEGs without their suffix, poses of three rows; masks and cloud under names with other case and slashes."""
+    """JPEGs without their suffix, poses of three rows, numbers as texts; names that are absolute, or have other case
+    and slashes."""
     names = [f"images/{i:04d}.jpg" for i in range(12)]
     folder = transforms(write(tmp_path / "toy", [f"{i:04d}.jpg" for i in range(12)]), names)
     data = json.loads((folder / "transforms.json").read_text())
@@ -91,6 +94,10 @@ def test_transforms_as_other_programs_write_them(named: str, tmp_path: Path) -> 
             frame["file_path"] = f"images/{i:04d}"
         if named == "three rows":
             frame["transform_matrix"].pop()
+        if named == "texts":
+            frame["time"] = str(frame["time"])
+        if named == "absolute":
+            frame["file_path"] = f"C:\\walk\\images\\{i:04d}.jpg"
         if named == "masks":
             frame["mask_path"] = f"Masks\\{i:04d}.PNG"
     if named == "cloud":
@@ -163,6 +170,9 @@ def test_frames_of_apps_without_an_image_are_left_out(named: str, device: Device
         "{c:02d}/{t:04d}.png",
         "{t:04d}/cam_{c}_x.png",
         "{t:03d}/{c}/image.png",
+        "cam{c:02d}_{t:04d}.png",
+        "frame_{t:04d}_{c}.png",
+        "{t:06d}left{c}.png",
     ],
 )
 @pytest.mark.parametrize("placed", [1, 3, 8])
@@ -182,6 +192,11 @@ STAMPS = {
     "phone": [f"IMG_20260110_{95848 + i if i < 12 else 95900 + i - 12:06d}.png" for i in range(16)],
     "milliseconds": [f"PXL_20260110_0958{48 + i:02d}123.png" for i in range(12)],
     "decimals": [f"{round(i / 30, 3)}.png" for i in range(24)],
+    "twelve hours": [
+        f"Shot 2026-01-10 at {(t // 60 - 1) % 12 + 1}.{t % 60:02d}.30 {'AP'[t >= 720]}M.png"
+        for t in range(710, 830, 10)
+    ],
+    "with the unit": [f"{i / 4:g}s.png" for i in range(24)],
     "Unix": [f"{1305031102.175304 + 0.5 * i:.6f}.png" for i in range(12)],
 }
 

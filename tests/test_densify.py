@@ -15,7 +15,7 @@ from lapgs_wgpu.train.config import DensityConfig
 from lapgs_wgpu.train.densify import Change, DensityState, Statistics, published_rule, reset_opacities, split_rows
 from lapgs_wgpu.train.presets import load_config
 
-CONFIG = dataclasses.replace(load_config("dnerf").density, max_screen_radius=20)
+CONFIG = load_config("dnerf").density
 EXTENT = 4.0
 SMALL, LARGE = 0.02, 0.2  # standard deviations on either side of split_size times the extent
 
@@ -33,11 +33,10 @@ def make_rows(scales: list[float], opacities: list[float] | None = None) -> dict
     }
 
 
-def make_statistics(gradients: list[float], radii: list[float] | None = None) -> Statistics:
+def make_statistics(gradients: list[float]) -> Statistics:
     statistics = Statistics.zeros(len(gradients), torch.device("cpu"))
     statistics.gradients = torch.tensor(gradients) * 5
     statistics.views = torch.full((len(gradients),), 5.0)
-    statistics.radii = torch.tensor(radii or [1.0] * len(gradients))
     return statistics
 
 
@@ -55,7 +54,7 @@ def test_statistics_are_means_over_visible_views_in_normalised_device_coordinate
     statistics.add(torch.tensor([2, 7, 0]), torch.tensor([[0.0, 0.0], [0.01, 0.0], [0.0, 0.0]]), camera)
     # Pixel gradients times half the image's width and height; what is not visible does not count.
     assert statistics.mean_gradients.tolist() == pytest.approx([math.hypot(3, 4) / 2, 1.0, 0.0])
-    assert statistics.radii.tolist() == [4, 7, 0]
+    assert statistics.views.tolist() == [2, 1, 0]
 
 
 def test_small_ones_are_cloned_and_large_ones_split() -> None:
@@ -110,13 +109,11 @@ def test_clones_of_faint_ones_go_with_them() -> None:
 
 
 def test_sizes_are_bounded_from_the_first_reset_on() -> None:
-    scales, radii = [SMALL, SMALL, 0.5], [5.0, 21.0, 5.0]
-    before = change(make_rows(scales), make_statistics([0.0] * 3, radii))
-    assert before.keep.all()
-    after = change(make_rows(scales), make_statistics([0.0] * 3, radii), bound_sizes=True)
-    assert after.keep.tolist() == [True, False, False]
-    unbounded = dataclasses.replace(CONFIG, max_screen_radius=0, max_world_size=0)
-    assert change(make_rows(scales), make_statistics([0.0] * 3, radii), bound_sizes=True, config=unbounded).keep.all()
+    rows, seen = make_rows([SMALL, 0.5]), make_statistics([0.0] * 2)
+    assert change(rows, seen).keep.all()
+    assert change(rows, seen, bound_sizes=True).keep.tolist() == [True, False]
+    unbounded = dataclasses.replace(CONFIG, max_world_size=0)
+    assert change(rows, seen, bound_sizes=True, config=unbounded).keep.all()
 
 
 def test_reset_lowers_only() -> None:

@@ -63,6 +63,9 @@ def test_single_bad_rows_are_left_out(
 def test_flat_gaussians_and_colors_in_place_of_harmonics(tmp_path: Path) -> None:
     still = read_ply(changed(tmp_path, {}, without=("scale_2",)))
     np.testing.assert_allclose(np.exp(still.log_scales[:, 2]), 1e-7, rtol=1e-5)
+    spheres = read_ply(changed(tmp_path, {}, without=("scale_1", "scale_2", *(f"rot_{i}" for i in range(4)))))
+    np.testing.assert_array_equal(spheres.log_scales, np.repeat(random_still(N, 0).log_scales[:, :1], 3, axis=1))
+    assert (spheres.quats == [1, 0, 0, 0]).all()
     columns = {name: column for name, column in columns_of(random_still(N, 0)).items() if "f_dc" not in name}
     levels = np.arange(3 * N).reshape(3, N) % 256
     columns |= dict(zip(("red", "green", "blue"), (("uchar", level) for level in levels), strict=True))
@@ -79,11 +82,19 @@ def test_a_line_end_behind_the_rows_and_any_encoding_of_comments(tmp_path: Path)
         assert_same(read_ply(file), random_still(N, 0))
 
 
-def test_gaussians_that_move_are_refused(tmp_path: Path) -> None:
-    columns = columns_of(random_still(3, 0)) | {"trbf_center": ("float", np.zeros(3)), "omega_0": ("float", [0, 0, 0])}
+@pytest.mark.parametrize("names", [("trbf_center", "omega_0"), ("vx", "mean_t"), ("motion", "lifetime")])
+def test_gaussians_that_move_are_refused(tmp_path: Path, names: tuple[str, ...]) -> None:
+    columns = columns_of(random_still(3, 0)) | dict.fromkeys(names, ("float", [0.0, 0.0, 0.0]))
     (tmp_path / "a.ply").write_bytes(ply_bytes(columns))
-    with pytest.raises(InputError, match="trbf_center, omega_0, 2 in all"):
+    with pytest.raises(InputError, match=f"{', '.join(names)}, 2 in all"):
         read_ply(tmp_path / "a.ply")
+
+
+def test_properties_that_are_not_used_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    columns = columns_of(random_still(3, 0)) | {"filter_3D": ("float", [0.0, 0.0, 0.0])}
+    (tmp_path / "a.ply").write_bytes(ply_bytes(columns))
+    read_ply(tmp_path / "a.ply")
+    assert "filter_3D" in capsys.readouterr().err
 
 
 def test_a_folder_of_stills(tmp_path: Path) -> None:

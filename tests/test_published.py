@@ -117,7 +117,6 @@ def test_a_preset_is_what_was_published_times_the_captures_scale(name: str, scal
 def test_presets_of_dnerf() -> None:
     full = load_config("dnerf")
     assert on_capture(full, 0.1) == full, "lengths in world units are left alone"
-    assert full.density.max_screen_radius == 0, "its published code zeroes the radii first"
     assert full.field.negative_scales == "mirror"
 
 

@@ -10,12 +10,9 @@ from imgui_bundle import imgui
 T = TypeVar("T")
 
 
-def button(label: str, width: float = 66, *, enabled: bool = True) -> bool:
+def button(label: str, width: float = 66) -> bool:
     """Draw a button; returns whether it was pressed."""
-    imgui.begin_disabled(not enabled)
-    pressed = imgui.button(label, (width, 0))
-    imgui.end_disabled()
-    return bool(pressed)
+    return bool(imgui.button(label, (width, 0)))
 
 
 def choice(label: str, present: T, choices: Sequence[T], names: Sequence[str] | None = None, width: float = -70) -> T:

@@ -6,6 +6,7 @@ import os
 import re
 import unicodedata
 from pathlib import Path, PurePosixPath, PureWindowsPath
+from urllib.parse import unquote
 
 from lapgs_wgpu.data.images import SUFFIXES, ImageFile, check_image
 from lapgs_wgpu.data.json_fields import Fields, kind
@@ -29,21 +30,25 @@ class CaptureFiles:
     def find(self, name: str) -> str | None:
         """Return the path of an existing file relative to the folder, with slashes; None if there is none.
 
-        The name may differ from the file's in slashes, number of blanks, Unicode form, letter case, .jpeg for .jpg, and
-        images_4 for images, and may be absolute or begin with the folder's own. The file whose name is the same goes
+        The name may differ from the file's in slashes, number of blanks (also %20), Unicode form, letter case, .jpeg
+        for .jpg, and images_4 for images. Of one that leads out of the folder, as it was written elsewhere, or begins
+        with the folder's own name, the end that is a file in the folder counts. The file whose name is the same goes
         before others.
         """
         path = os.path.relpath(self.folder / name, self.folder)
         if os.path.isfile(self.folder / name) and not path.startswith(".."):  # Path.is_file raises for long names
             return path.replace(os.sep, "/")
         parts = [part for part in name.replace("\\", "/").split("/") if part not in ("", ".")]
-        if ".." in parts:
-            return None
-        own = [i for i, part in enumerate(parts[:-1], start=1) if _folded(part) == _folded(self.folder.name)]
-        return self._walk(parts) or (self._walk(parts[own[-1] :]) if own else None)
+        ends = [i for i, part in enumerate(parts[:-1], start=1) if _folded(part) == _folded(self.folder.name)][-1:]
+        if _leads_out(name):
+            ends += range(1, len(parts))
+        found = next((found for start in (0, *ends) if (found := self._walk(parts[start:]))), None)
+        return self.find(unquote(name)) if found is None and unquote(name) != name else found
 
     def _walk(self, parts: list[str]) -> str | None:
         at = self.folder
+        if ".." in parts:
+            return None
         for part in parts:
             entries = self._folded_entries(at)
             found = part if os.path.exists(at / part) else entries.get(_folded(part))
@@ -106,16 +111,18 @@ class CaptureFiles:
         ]
 
     def _text(self, entry: Fields, field: str) -> str:
-        """Return a path that stays below the folder, on any system; symbolic links may lead out. Raises InputError."""
+        """Return a path whose file, if there is one, lies below the folder; symbolic links may lead out.
+
+        Raises InputError.
+        """
         name = entry.required(field)
         if not isinstance(name, str) or not name:
             raise InputError(f"{entry.where}: {field} must be the path of a file, got {kind(name)}.")
-        for system in (PurePosixPath, PureWindowsPath):
-            if system(name).anchor or ".." in system(os.path.normpath(name)).parts:
-                raise InputError(
-                    f"{entry.where}: {field} {kind(name)} leads out of the scene's folder; put the file, or a link to "
-                    "it, into the folder, and name that."
-                )
+        if _leads_out(name) and self.find(name) is None:
+            raise InputError(
+                f"{entry.where}: {field} {kind(name)} leads out of the scene's folder, which holds no file of this "
+                "name; put the file, or a link to it, into the folder, and name that."
+            )
         return name
 
     def _folded_entries(self, folder: Path) -> dict[str, str]:
@@ -123,6 +130,14 @@ class CaptureFiles:
             names = sorted(os.listdir(folder), reverse=True) if os.path.isdir(folder) else []
             self._entries[folder] = {_folded(name): name for name in names}
         return self._entries[folder]
+
+
+def _leads_out(name: str) -> bool:
+    """Whether a path leads out of any folder, on any system."""
+    return any(
+        system(name).anchor or ".." in system(os.path.normpath(name)).parts
+        for system in (PurePosixPath, PureWindowsPath)
+    )
 
 
 def _folded(name: str) -> str:

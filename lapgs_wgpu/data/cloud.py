@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.ply_colors import read_colors
-from lapgs_wgpu.io.ply_elements import Floats, open_ply
+from lapgs_wgpu.io.ply_elements import BAD_SHARE, Floats, open_ply
 from lapgs_wgpu.splat.camera import Camera
 
 Array = NDArray[np.float64]
@@ -59,12 +59,14 @@ def read_cloud(path: Path) -> Cloud:
         raise InputError(f"{path} must hold at least one point of 3 numbers, an array of (N, 3), got {points.shape}.")
     points = points.astype(np.float64)  # float32 would round what lies far from the origin, before it is centered
     bad = np.flatnonzero(~(np.abs(points) <= np.finfo(np.float32).max).all(axis=1))  # true for NaN, too
-    if len(bad):
-        raise InputError(
-            f"{path} holds NaN or infinite coordinates in {len(bad)} of {len(points)} points, first in point {bad[0]}; "
-            "remove them."
-        )
-    return Cloud(points, np.full(points.shape, 0.5, np.float32) if colors is None else colors)
+    cloud = Cloud(points, np.full(points.shape, 0.5, np.float32) if colors is None else colors)
+    if not len(bad):
+        return cloud
+    told = f"{path} holds NaN or infinite coordinates in {len(bad)} of {len(points)} points"
+    if len(bad) > BAD_SHARE * len(points):
+        raise InputError(f"{told}, first in point {bad[0]}; remove them.")
+    print(f"note: {told}, which are left out.", file=sys.stderr)
+    return Cloud(np.delete(cloud.points, bad, axis=0), np.delete(cloud.colors, bad, axis=0))
 
 
 def read_points(path: Path) -> tuple[NDArray[np.float64], Floats | None]:

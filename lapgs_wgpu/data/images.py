@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.io.ply_elements import LFS_POINTER
 
 Pixels = NDArray[np.uint8]
 Size = tuple[int, int]  # (width, height) in pixels
@@ -46,13 +47,15 @@ class ImageFile(NamedTuple):
     """An image file whose header was checked.
 
     size: (width, height) in pixels. orientation: as EXIF states it, 1 to 8; 1 is upright. deep: whether it has 16 bits
-    per channel, of which the upper 8 are read. upright: whether `read` turns it as `orientation` says.
+    per channel, of which the upper 8 are read. alpha: whether it states opacities. upright: whether `read` turns it as
+    `orientation` says.
     """
 
     path: Path
     size: Size
     orientation: int = 1
     deep: bool = False
+    alpha: bool = False
     upright: bool = False
 
     def __str__(self) -> str:
@@ -97,6 +100,7 @@ def check_image(path: Path, *, whole: bool = True) -> ImageFile:
             exif = file.format != "PNG" or "exif" in file.info  # else Pillow would decode a PNG to look for more
             orientation = file.getexif().get(_ORIENTATION, 1) if exif else 1
             deep = file.format == "PNG" and "16" in str(file.tile[0][3])
+            alpha = _has_alpha(file)
             if whole:
                 file.verify()
     except Image.UnidentifiedImageError:
@@ -105,12 +109,21 @@ def check_image(path: Path, *, whole: bool = True) -> ImageFile:
         raise InputError(f"{path} is not a readable image ({reason}); copy or render it again.") from None
     if mode not in _MODES:
         raise InputError(f"{path} has pixels of mode {mode}; save it as RGB or RGBA with 8 bits per channel.")
-    return ImageFile(path, size, orientation if orientation in range(1, 9) else 1, deep)
+    return ImageFile(path, size, orientation if orientation in range(1, 9) else 1, deep, alpha)
+
+
+def _has_alpha(file: Image.Image) -> bool:
+    return "A" in file.getbands() or "transparency" in file.info
 
 
 def _content(path: Path) -> str:
     """What a file that is neither PNG nor JPEG holds, and what to do, for errors."""
-    head = path.read_bytes()[:16]
+    with path.open("rb") as file:
+        head = file.read(64)
+    if not head:
+        return "is empty (0 bytes); copy or render it again."
+    if head.startswith(LFS_POINTER):
+        return "is a pointer of Git LFS in place of the image; fetch it by git lfs pull."
     for start, at, name in _SIGNATURES:
         if head[at:].startswith(start):
             return f"holds an image in the format {name}, whatever its name; convert it to PNG or JPEG."
@@ -124,7 +137,7 @@ def decode(path: Path) -> Pixels:
     """
     with _decoding(path), open(path, "rb") as file:  # not the path: imageio would look into archives
         header = Image.open(file, formats=_FORMATS)
-        transparent = "A" in header.getbands() or "transparency" in header.info
+        transparent = _has_alpha(header)
         if header.mode.startswith("I"):  # Pillow clips 16 bits of gray, and takes the upper 8 of RGB
             gray = (np.asarray(header) >> 8).astype(np.uint8)
             return np.repeat(gray[..., None], 3, axis=2)
@@ -144,7 +157,7 @@ def gray_thumbnail(path: Path, side: int) -> NDArray[np.float32]:
     """Gray levels 0 to 255 of a small version of an image, its longer side at most `side`. Raises InputError."""
     with _decoding(path), Image.open(path, formats=_FORMATS) as file:
         file.draft("L", (side, side))
-        image = file.convert("L")
+        image = (file if file.mode[0] != "I" else Image.fromarray(decode(path))).convert("L")  # 16 bits of gray
         image.thumbnail((side, side), Image.Resampling.BOX)
         return np.asarray(image, dtype=np.float32)
 

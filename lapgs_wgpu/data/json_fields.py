@@ -76,11 +76,16 @@ def read_json(path: Path) -> Fields:
 def number(
     value: Any, name: str, where: str | Path, least: float = -sys.float_info.max, most: float = sys.float_info.max
 ) -> float:
-    """Convert a JSON number within bounds to a float; NaN and infinity never are. Raises InputError."""
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise InputError(f"{where}: {name} must be made of numbers, got {kind(value)}.")
+    """Convert a JSON number, or a text that states one, within bounds to a float; NaN and infinity never are.
+
+    Raises InputError.
+    """
     try:
+        if isinstance(value, bool) or not isinstance(value, int | float | str):
+            raise ValueError
         converted = float(value)
+    except ValueError:
+        raise InputError(f"{where}: {name} must be a number, got {kind(value)}.") from None
     except OverflowError:  # an integer of more than 308 digits
         converted = math.inf
     if not least <= converted <= most:  # true for NaN, too
@@ -92,7 +97,16 @@ def vector(value: Any, length: int, name: str, where: str | Path) -> NDArray[np.
     """Convert a JSON list to (length,) numbers of at most LARGEST_ENTRY. Raises InputError."""
     if not isinstance(value, list) or len(value) != length:
         raise InputError(f"{where}: {name} must be a list of {length} numbers, got {kind(value)}.")
-    return np.array([number(entry, name, where, -LARGEST_ENTRY, LARGEST_ENTRY) for entry in value])
+    bounds = -LARGEST_ENTRY, LARGEST_ENTRY
+    return np.array([number(entry, f"each entry of {name}", where, *bounds) for entry in value])
+
+
+def matrix(value: Any, shape: tuple[int, int], name: str, where: str | Path) -> NDArray[np.float64]:
+    """Convert a JSON list of rows to numbers (rows, columns) of at most LARGEST_ENTRY. Raises InputError."""
+    rows, columns = shape
+    if not isinstance(value, list) or len(value) != rows:
+        raise InputError(f"{where}: {name} must be {rows} rows of {columns} numbers, got {kind(value)}.")
+    return np.stack([vector(row, columns, name, where) for row in value])
 
 
 def kind(value: Any) -> str:

@@ -12,7 +12,7 @@ from pathlib import Path, PurePath
 from typing import NamedTuple, get_args
 
 from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
-from lapgs_wgpu.data.images import Pixels, Size, shrink, shrunk_size
+from lapgs_wgpu.data.images import SUFFIXES, Pixels, Size, shrink, shrunk_size
 from lapgs_wgpu.data.lens import Lens, Undistortion
 from lapgs_wgpu.data.masks import MASKED, Mask, MaskKind, check_masks, find_masks, read_mask
 from lapgs_wgpu.data.placement import place
@@ -29,6 +29,7 @@ READERS: tuple[Reader, ...] = tuple(
     reader for module in (transforms, hypernerf, poses_bounds, panoptic, colmap, apps) for reader in module.READERS
 )
 
+FILMS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
 NEAR_SHARE = 0.5  # of the nearest depth that a capture states, or that its cameras let guess: nothing is drawn before
 
 
@@ -153,6 +154,11 @@ def _reader(folder: Path) -> Reader:
     inside = f"; it holds the scenes {', '.join(scenes[:8])}: name one of them" if scenes else ""
     if any(reader.matches(folder.resolve().parent) for reader in READERS):
         inside = f"; its parent folder {folder.resolve().parent} is one: name that"
+    held = {path.suffix.lower() for pattern in ("*.*", "*/*.*") for path in folder.glob(pattern)}
+    if not inside and not held.isdisjoint((*SUFFIXES, *FILMS)):
+        inside = (
+            f"; it holds {'films' if held.isdisjoint(SUFFIXES) else 'images'} without poses, which lapgs-prepare finds"
+        )
     expected = ", or ".join(f"{reader.files} ({reader.name})" for reader in READERS)
     raise InputError(f"{folder} is no scene in a known format: expected {expected}{inside}.")
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.data.json_fields import kind, vector
+from lapgs_wgpu.data.json_fields import matrix
 from lapgs_wgpu.errors import InputError
 
 Array = NDArray[np.float64]
@@ -34,7 +34,9 @@ def check_rotation(R: Array, name: str) -> None:
             f"{ROTATION_TOLERANCE:g} is allowed), its axes have lengths {axes}; remove scale and shear."
         )
     if np.linalg.det(R) < 0:
-        raise InputError(f"{name} is left-handed (determinant -1, must be 1); its axes are not those of the format.")
+        raise InputError(
+            f"{name} is left-handed (determinant -1, must be 1); its axes are not the format's: export it again."
+        )
 
 
 def unit_quaternion(quaternion: Array, where: str) -> Array:
@@ -77,9 +79,9 @@ def opengl_pose(value: Any, where: str) -> Array:
     the matrix is a rigid motion.
     """
     name = f"{where}: transform_matrix"
-    if not isinstance(value, list) or len(value) not in (3, 4):
-        raise InputError(f"{name} must be 4 rows of 4 numbers (the last, 0 0 0 1, may be missing), got {kind(value)}.")
-    T = np.stack([vector(row, 4, "transform_matrix", where) for row in [*value, [0, 0, 0, 1]][:4]])
+    if isinstance(value, list) and len(value) == 3:
+        value = [*value, [0, 0, 0, 1]]
+    T = matrix(value, (4, 4), "transform_matrix", where)
     if np.abs(T[3] - [0, 0, 0, 1]).max() > ROTATION_TOLERANCE:
         got = " ".join(f"{x:g}" for x in T[3])
         raise InputError(f"{name} must end with the row 0 0 0 1, got {got}; the position stands at the right.")

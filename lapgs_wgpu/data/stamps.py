@@ -15,28 +15,36 @@ from numpy.typing import NDArray
 # Words before the number in the name of a folder or file.
 TIME_WORDS = {"frame", "fr", "time", "timestep", "timestamp", "ts", "t", "step", "moment", "sec"}
 CAMERA_WORDS = {"cam", "camera", "c", "view", "kinect", "device"}
+FILLED = 1.25  # of the images: cameras times their moments, where a fifth of these may lack an image
 STILL = 0.02  # of the distance of cameras: the places of one that stands still are apart by less
-_CLOCK = re.compile(  # 20260110_095848, 2026-01-10 at 09.58.48, 09-58-48; digits after that are a fraction of a second
-    r"(?<!\d)(?:((?:19|20)\d\d)[-_.]?(\d\d)[-_.]?(\d\d)\D{0,4})?(\d\d)[-_.:]?(\d\d)[-_.:]?(\d\d)"
-    r"(?:[-_.]?(\d{3}|\d{6}))?(?!\d)"
+_CLOCK = re.compile(  # 20260110_095848, 2026-01-10 at 9.58.48 PM, 09-58-48; digits after that are parts of a second
+    r"(?<!\d)(?:(?P<date>(?:19|20)\d\d([-_.]?)\d\d\2\d\d)\D{0,4})?"
+    r"(?P<hour>\d\d|(?<!\d)\d(?=[-_.:]))(?P<by>[-_.:]?)(?P<minute>\d\d)(?P=by)(?P<second>\d\d)"
+    r"(?:[-_.]?(?P<part>\d{3}|\d{6}))?(?!\d)(?:\s?(?P<half>[AaPp])[Mm]\b)?"
 )
 _UNIX = re.compile(r"(?<!\d)(1\d{9})[-_.](\d{3,9})(?!\d)")
-_DECIMAL = re.compile(r"(?<![\w.])\d+(?:\.(\d+))?(?![\w.])|(?<=[_-])\d+(?:\.(\d+))?(?![\w.])")
+_DECIMAL = re.compile(r"(?:(?<![\w.])|(?<=[_-]))(\d+(?:\.(\d+))?)s?(?![\w.])")  # 0.25, t_0.25, 0.25s
 _DAY = 86400.0  # seconds
 
 
 class ImageName(NamedTuple):
     """file: relative path of an image, as in times.json. camera: the camera that took it, the name of its folder, or of
-    its file where the folders are times. folder: that states the time; empty where the file's name does."""
+    its file where the folders are times. part: of the path, which states the time; empty where all of the file's name
+    does."""
 
     file: str
     camera: str = ""
-    folder: str = ""
+    part: str = ""
 
     @property
     def stamp(self) -> str:
         """The text that states the time."""
-        return self.folder or PurePosixPath(self.file).stem
+        return self.part or PurePosixPath(self.file).stem
+
+    @property
+    def timed_folder(self) -> bool:
+        """Whether a folder states the time."""
+        return self.part in PurePosixPath(self.file).parts
 
 
 def natural_key(name: str) -> tuple[tuple[int, int | str], ...]:
@@ -50,7 +58,7 @@ def natural_key(name: str) -> tuple[tuple[int, int | str], ...]:
 
 def image_names(files: Sequence[str], places: Mapping[str, NDArray[np.float64]]) -> list[ImageName]:
     """Tell cameras from times in relative paths: each folder is a camera (cam00/0001.png), or each is a time
-    (frame000001/cam00.png).
+    (frame000001/cam00.png), or names state both (cam00_0001.png).
 
     The words in the names decide; where they do not, whether cameras stand still in one of the two readings alone; else
     there are more times than cameras. places: (3,) of the cameras of some of the files.
@@ -60,8 +68,10 @@ def image_names(files: Sequence[str], places: Mapping[str, NDArray[np.float64]])
     same_depth = len(set(map(len, parts))) == 1
     varying = [level for level, names in enumerate(zip(*parts, strict=same_depth)) if len(set(names)) > 1]
     stem = len(parts[0]) - 1
-    if not same_depth or len(varying) not in (1, 2) or varying[0] == stem:
+    if not same_depth or len(varying) not in (1, 2):
         return cameras
+    if varying == [stem]:
+        return _named_by_both(files, places) or cameras
     outer, inner = varying[0], (*varying, stem)[1]
 
     def timed(level: int) -> list[ImageName]:
@@ -76,6 +86,23 @@ def image_names(files: Sequence[str], places: Mapping[str, NDArray[np.float64]])
         fewer = len({name.camera for name in readings[0]}) < len({name.camera for name in readings[1]})
         decided = still[0] if still[0] != still[1] else fewer
     return readings[0] if decided else readings[1]
+
+
+def _named_by_both(files: Sequence[str], places: Mapping[str, NDArray[np.float64]]) -> list[ImageName] | None:
+    """Take two varying words or numbers of the files' names as camera and time where cameras, so taken, stand apart and
+    still, and most have an image at each time; else None."""
+    rows = [re.findall(r"\d+|[^\W\d_]+", PurePosixPath(file).stem) for file in files]
+    varying = [at for at, words in enumerate(zip(*rows)) if len(set(words)) > 1]  # noqa: B905
+    apart = len(places) > 1 and np.ptp(list(places.values()), axis=0).max() > 0
+    if len(set(map(len, rows))) > 1 or len(varying) != 2 or not apart:
+        return None
+    for camera, time in (varying, varying[::-1]):
+        word = rows[0][camera - 1] if camera and rows[0][camera - 1].lower() in CAMERA_WORDS else ""
+        names = [ImageName(file, word + row[camera], row[time]) for file, row in zip(files, rows, strict=True)]
+        grid = len({name.camera for name in names}) * len({name.part for name in names})
+        if grid <= FILLED * len(files) and stand_still(_places_of_each(names, places)):
+            return names
+    return None
 
 
 def _folders_are_times(folders: Sequence[str], stems: Sequence[str]) -> bool | None:
@@ -144,28 +171,34 @@ def _of_each(stamps: Sequence[str], read: Callable[[str], float | None]) -> list
 
 def _date(stamp: str) -> float | None:
     """Seconds of a date and a time of day."""
-    if not (found := _CLOCK.search(stamp)) or found[1] is None:
+    if not (found := _CLOCK.search(stamp)) or found["date"] is None or (clock := _time_of_day(found)) is None:
         return None
-    *date, fraction = found.groups()
     try:
-        clock = datetime.strptime("".join(date), "%Y%m%d%H%M%S").replace(tzinfo=UTC)
+        day = datetime.strptime(re.sub(r"\D", "", found["date"]), "%Y%m%d").replace(tzinfo=UTC)
     except ValueError:  # 20261399_000001
         return None
-    return clock.timestamp() + float(f"0.{fraction or 0}")
+    return day.timestamp() + clock
+
+
+def _time_of_day(found: re.Match[str]) -> float | None:
+    """Seconds from midnight of a match of _CLOCK; None where it is no time of day."""
+    hour, minute, second = (int(found[part]) for part in ("hour", "minute", "second"))
+    if found["half"]:
+        hour = hour % 12 + 12 * (found["half"] in "Pp")
+    possible = hour < 24 and minute < 60 and second < 60
+    return 3600 * hour + 60 * minute + second + float(f"0.{found['part'] or 0}") if possible else None
 
 
 def _times_of_day(names: Sequence[ImageName]) -> list[float] | None:
     """Seconds of HHMMSS without a date, also past midnight; None unless all are possible times of day, alike in all
     else that the names of a camera hold, and more even as times than as numbers, which jump by 40 each minute."""
     found = [_CLOCK.search(name.stamp) for name in names]
-    matches = [match for match in found if match and match[1] is None]
-    if len(matches) < len(names):
-        return None
+    matches = [match for match in found if match and match["date"] is None]
+    clocks = [clock for match in matches if (clock := _time_of_day(match)) is not None]
     around = {(name.camera, _CLOCK.sub("", name.stamp, count=1)) for name in names}
-    parts = np.array([[float(match[part]) for part in (4, 5, 6)] for match in matches])
-    if len(around) > len({name.camera for name in names}) or (parts >= [24, 60, 60]).any():
+    if len(clocks) < len(names) or len(around) > len({name.camera for name in names}):
         return None
-    times = parts @ [3600, 60, 1] + [float(f"0.{match[7] or 0}") for match in matches]
+    times = np.array(clocks)
     ordered = np.sort(times)
     pause = int(np.argmax(np.diff(ordered, append=ordered[-1])))
     if pause + 1 < len(ordered) and ordered[pause + 1] - ordered[pause] > _DAY / 2:
@@ -190,10 +223,10 @@ def _decimals(stamps: Sequence[str]) -> list[float] | None:
     rows = [list(_DECIMAL.finditer(stamp)) for stamp in stamps]
     if any(len(row) != 1 for row in rows):
         return None
-    fractions = [row[0][1] or row[0][2] or "" for row in rows]
+    fractions = [row[0][2] or "" for row in rows]
     trailing = any(len(fraction) > 1 and fraction.endswith("0") for fraction in fractions)
     if len({len(fraction) for fraction in fractions}) == 1 or trailing:
-        whole = {row[0][0].split(".")[0] for row in rows}
+        whole = {row[0][1].split(".")[0] for row in rows}
         if len(whole) == 1 or min(map(len, fractions)) < 2:  # a version before a counter
             return None
-    return [float(row[0][0]) for row in rows]
+    return [float(row[0][1]) for row in rows]

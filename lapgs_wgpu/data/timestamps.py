@@ -30,7 +30,7 @@ def read_times(names: Sequence[ImageName], folder: Path, warnings: list[str]) ->
     path = folder / TIMES
     if path.is_file():
         return _listed(names, path), str(path)
-    whose = f"the names of folders in {folder}" if names[0].folder else f"the names of {folder}"
+    whose = f"the names of folders in {folder}" if names[0].timed_folder else f"the names of {folder}"
     if clocks := clock_times(names):
         times, kind = clocks
         return times, f"the {kind} in {whose}"
@@ -139,7 +139,8 @@ def frame_numbers(names: Sequence[ImageName]) -> list[int]:
             number_of[i] = row[column]
             if row[column] in numbers:
                 raise InputError(
-                    f"{file} has the frame number {row[column]}, as {numbers[row[column]]} has; remove or rename one."
+                    f"{file} has the frame number {row[column]}, as {numbers[row[column]]} has; rename one, or "
+                    "put the images of each camera into a folder of their own."
                 )
             numbers[row[column]] = file
     return [number_of[i] for i in range(len(names))]

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lapgs_wgpu.data.capture_files import MOST_ABSENT
 from lapgs_wgpu.data.cloud import Cloud, in_view, views_of
 from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.data.focus import spread
@@ -62,7 +63,8 @@ def upright(frames: Sequence[Frame]) -> tuple[list[Frame], list[str]]:
 
 
 def check_plausible(frames: Sequence[Frame]) -> list[str]:
-    """Warn about principal points far from the image's middle, and about images of 16 bits that are nearly black."""
+    """Warn about principal points far from the image's middle, and about images that are nearly black or transparent:
+    those of 16 bits that use fewer, and those with alpha."""
     warnings = []
     off = {frame.lens: frame.where for frame in reversed(frames) if _off_center(frame.lens)}
     if off:
@@ -70,18 +72,27 @@ def check_plausible(frames: Sequence[Frame]) -> list[str]:
         warnings.append(
             f"{where}: the principal point ({lens.cx:.5g}, {lens.cy:.5g}) is far from the middle of images of "
             f"{lens.width}x{lens.height}, in {len(off)} cameras; unless the images were cut out of larger ones, the "
-            f"intrinsics are those of another size, such as {2 * lens.cx:.0f}x{2 * lens.cy:.0f}."
+            "intrinsics are those of another size, or in other units than pixels."
         )
-    deep = [frame.image for frame in frames if isinstance(frame.image, ImageFile) and frame.image.deep]
-    looked_at = evenly(deep, LOOKED_AT)
-    highest = max((int(decode(image.path)[..., :3].max()) for image in looked_at), default=255)
-    if highest < DARK:
-        warnings.append(
-            f"images of 16 bits are nearly black: in {len(looked_at)} of {len(deep)}, such as {looked_at[0]}, no level "
-            f"is above {highest} of 255, so they seem to use {8 + highest.bit_length()} bits; multiply them by "
-            f"{2 ** (8 - highest.bit_length())}."
-        )
+    images = [frame.image for frame in frames if isinstance(frame.image, ImageFile)]
+    deep, transparent = [image for image in images if image.deep], [image for image in images if image.alpha]
+    if told := _low_levels(deep, slice(3), "images of 16 bits are nearly black", "level"):
+        text, highest = told
+        bits = highest.bit_length()
+        warnings.append(f"{text}, so they seem to use {8 + bits} bits; multiply them by {2 ** (8 - bits)}.")
+    if told := _low_levels(transparent, slice(3, 4), "images are nearly transparent", "alpha"):
+        warnings.append(f"{told[0]}, and what is transparent is the background; save them without alpha.")
     return warnings
+
+
+def _low_levels(images: Sequence[ImageFile], channels: slice, what: str, of: str) -> tuple[str, int] | None:
+    """Begin a warning, and return the highest level, where some channels of all images that are looked at are dark."""
+    looked_at = evenly(images, LOOKED_AT)
+    highest = max((int(decode(image.path)[..., channels].max()) for image in looked_at), default=255)
+    if highest >= DARK:
+        return None
+    told = f"{what}: in {len(looked_at)} of {len(images)}, such as {looked_at[0]}, no {of} is above {highest} of 255"
+    return told, highest
 
 
 def _off_center(lens: Lens) -> bool:
@@ -300,15 +311,21 @@ def check_film(images: Sequence[Path]) -> list[str]:
         warnings.append(
             f"blurred images: {_named([images[i].name for i in blurry])} ({len(blurry)} of {len(images)}) have less "
             f"than {BLURRED:g} of their neighbours' sharpness, {images[worst].name} {shares[worst]:.2g}; leave them "
-            "out."
+            f"out{_with_poses(blurry, images)}."
         )
     repeated = [images[i].name for i in range(1, len(images)) if repeats(thumbnails[i], thumbnails[i - 1])]
     if repeated:
         warnings.append(
             f"repeated images: {_named(repeated)} ({len(repeated)} of {len(images)}) differ by at most {EQUAL} of "
-            "255 levels from the image before; motion stands still there, so leave them out."
+            f"255 levels from the image before; motion stands still there, so leave them out"
+            f"{_with_poses(repeated, images)}."
         )
     return warnings
+
+
+def _with_poses(some: Sequence[object], images: Sequence[Path]) -> str:
+    """What else to remove with some of the images, where so many may not be absent."""
+    return ", and what names them" if len(some) > MOST_ABSENT * len(images) else ""
 
 
 def _named(names: Sequence[str]) -> str:

@@ -7,7 +7,7 @@ import numpy as np
 from lapgs_wgpu.io.ply_elements import Element, Floats, PlyFile
 
 SH_C0 = 0.28209479177387814  # the harmonic of degree 0: f_dc * SH_C0 + 0.5 is a color
-_PREFIXES = ("", "diffuse_", "vertex_", "scalar_", "ambient_")
+_PREFIXES = ("", "diffuse_", "vertex_", "scalar_", "ambient_", "color_", "cd_")
 _TRIPLES = [
     [f"{before}{name}" for name in names] for before in _PREFIXES for names in (("red", "green", "blue"), "rgb")
 ]

@@ -24,6 +24,9 @@ from lapgs_wgpu.errors import InputError
 PathLike = str | os.PathLike[str]
 Floats = NDArray[np.float32]
 
+BAD_SHARE = 0.01  # of all rows: up to it rows with NaN are left out, above it a file is damaged
+LFS_POINTER = b"version https://git-lfs"  # begins what a clone without Git LFS holds in place of a file
+SPLATS = (".splat", ".ksplat", ".spz", ".sog")  # formats of splats that editors convert to .ply
 MAX_HEADER_BYTES = 64 * 1024
 _BLOCK_BYTES = 1 << 20  # rows are converted in blocks that stay in the cache
 _BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
@@ -146,9 +149,15 @@ def _read_header(file: BinaryIO, path: PathLike) -> PlyFile:
     if re.match(rb"ply\r?\n", head) is None:
         if not head:
             raise InputError(f"{path}: is empty (0 bytes); copy or write it again.")
+        if head.startswith(LFS_POINTER):
+            raise InputError(f"{path}: is a pointer of Git LFS in place of the file; fetch it by git lfs pull.")
+        splats = Path(path).suffix.lower() in SPLATS
+        if head.startswith(b"\x1f\x8b") and not splats:
+            raise InputError(f"{path}: is packed by gzip; unpack it.")
+        advice = "splats with SuperSplat or splat-transform" if splats else "a cloud of points with CloudCompare"
         raise InputError(
-            f"{path}: begins with {head[:8]!r}, where a PLY file begins with the line 'ply'; convert it to .ply, for "
-            "example with SuperSplat or splat-transform."
+            f"{path}: begins with {head[:8]!r}, where a PLY file begins with the line 'ply'; convert it to .ply, "
+            f"{advice} for example."
         )
     end = re.search(rb"^end_header\r?\n", head, re.MULTILINE)
     if end is None:

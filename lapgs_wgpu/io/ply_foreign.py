@@ -12,12 +12,16 @@ from numpy.typing import NDArray
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.ply import MAX_LOG_SCALE, GaussianSnapshot, gaussian_names, snapshot_of, vertex_of
 from lapgs_wgpu.io.ply_colors import SH_C0, read_colors
-from lapgs_wgpu.io.ply_elements import Element, Floats, PathLike, PlyFile
+from lapgs_wgpu.io.ply_elements import BAD_SHARE, Element, Floats, PathLike, PlyFile
 
-_MOTION = re.compile("(trbf|motion|omega|velocity|rot_r)_.*|t|scal(e|ing)_t|t_scale", re.IGNORECASE)
+_MOTION = re.compile(  # words of a property's name that speak of time or of motion
+    "(.*_)?(trbf|motion|omega|velocity|vel|v[xyz]|rot_r|t|time|timestamp|duration|lifetime|poly|fourier|traj|deform|temporal)"
+    "(_.*)?",
+    re.IGNORECASE,
+)
 _FLAT = float(np.log(1e-7))  # log of the smallest scale that is drawn
+_SCALES, _UNTURNED = {"scale_0", "scale_1", "scale_2"}, {"rot_0": 1.0, "rot_1": 0.0, "rot_2": 0.0, "rot_3": 0.0}
 _OPAQUE = 20.0  # its sigmoid is 1 in float32
-_BAD_SHARE = 0.01  # of all rows: up to it rows with NaN are left out, above it the file is damaged
 _FAR = 100.0  # distance of the scene's middle from the origin, in extents of the scene
 
 
@@ -27,7 +31,8 @@ def read_foreign(ply: PlyFile) -> tuple[GaussianSnapshot, dict[str, str]]:
     Metadata: `antialiased` is "true" where a comment says so; `up`, an axis such as "z" or "-y", is the comment's
     vertical axis; `offset` is a JSON list of 3 numbers, which were taken off the means.
 
-    Degree 0 may be given as colors, and the third scale of flat Gaussians be missing. An infinite opacity is opaque, or
+    Degree 0 may be given as colors; the third scale of flat Gaussians, or two scales and the quaternion of spherical
+    ones, may be missing; a note names the properties that are not used. An infinite opacity is opaque, or
     leaves the Gaussian out; a scale of 0 is flat; a quaternion of 0 does not turn. A few rows that cannot be rendered
     are left out. Raises InputError for all else that `snapshot_of` refuses, and for Gaussians that move.
     """
@@ -39,13 +44,21 @@ def read_foreign(ply: PlyFile) -> tuple[GaussianSnapshot, dict[str, str]]:
             "Spacetime Gaussians, in a way that is not played; give a .ply that its program exports at one time"
         )
     held, missing = set(vertex.properties), dict[str, Floats | float]()
-    if {"scale_0", "scale_1"} <= held and "scale_2" not in held:
+    scales = held & _SCALES
+    if scales == {"scale_0", "scale_1"}:
         missing["scale_2"] = _FLAT
+    elif scales == {"scale_0"}:
+        missing |= dict.fromkeys(("scale_1", "scale_2"), ply.columns(vertex, ["scale_0"])[:, 0])
+        if not held & set(_UNTURNED):
+            missing |= _UNTURNED
     if not held & {"f_dc_0", "f_dc_1", "f_dc_2"} and "opacity" in held:
         colors = read_colors(ply, vertex)
         if colors is not None:
             missing |= {f"f_dc_{i}": (colors[:, i] - 0.5) / np.float32(SH_C0) for i in range(3)}
     names = gaussian_names(vertex, held | set(missing), ply.path)
+    unused = [name for name in vertex.properties if name not in (*names, "nx", "ny", "nz", "red", "green", "blue")]
+    if unused:
+        _note(ply.path, f"{len(unused)} further properties, such as {', '.join(unused[:5])}, are not used")
     values = ply.columns(vertex, [name for name in names if name not in missing])
     for index, name in enumerate(names):
         if name in missing:
@@ -53,7 +66,7 @@ def read_foreign(ply: PlyFile) -> tuple[GaussianSnapshot, dict[str, str]]:
     metadata, text = {}, "\n".join(ply.comments)
     if re.search(r"SplatRenderMode\s*[:=]\s*mip", text, re.IGNORECASE):
         metadata["antialiased"] = "true"
-    axis = re.search(r"vertical[ _]axis\s*[:=]\s*\+?(-?[xyz])\b", text, re.IGNORECASE)
+    axis = re.search(r"(?:vertical|up)[ _]?axis\s*[:=]\s*\+?(-?[xyz])\b", text, re.IGNORECASE)
     if axis:
         metadata["up"] = axis[1].lower()
     offset = _take_off_offset(ply, vertex, values)
@@ -106,18 +119,19 @@ def _mended(values: Floats, path: PathLike) -> Floats:
     quats[unusual & (largest == 0)] = [1, 0, 0, 0]
     bad = ~np.isfinite(values).all(axis=1) & ~invisible
     bad |= (scales > MAX_LOG_SCALE).any(axis=1) & ~invisible
-    if bad.mean() > _BAD_SHARE:
+    if bad.mean() > BAD_SHARE:
         return values  # refused as a whole
     if bad.any():
-        _note(path, f"{bad.sum()} of {len(bad)} Gaussians hold NaN or infinite values and are left out")
+        _note(path, f"{bad.sum()} of {len(bad)} Gaussians hold NaN, infinite or enormous values and are left out")
     if invisible.all():
         raise InputError(f"{path}: no Gaussian is visible (property opacity is minus infinity in all {len(bad)} rows)")
     kept = ~(bad | invisible)
     shown = values if kept.all() else values[kept]
-    if (shown[:, -7:-4] > 0).all() and ((shown[:, -8] >= 0) & (shown[:, -8] <= 1)).all() and len(shown) > 1:
+    if ((shown[:, -8] >= 0) & (shown[:, -8] <= 1)).all() and len(shown) > 1:
+        both = " and all scales above 0" * bool((shown[:, -7:-4] > 0).all())
         _note(
             path,
-            "all opacities lie in 0 to 1 and all scales above 0, as after their activation; 3DGS files hold logits and "
-            "logarithms, and these are shown as such",
+            f"all opacities lie in 0 to 1{both}, as after their activation; 3DGS files hold logits and logarithms, and "
+            "these are shown as such",
         )
     return shown

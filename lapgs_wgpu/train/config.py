@@ -95,9 +95,6 @@ class DensityConfig(Options):
         "adaptive split: fraction of the candidates that are not split", at_least=0, at_most=1
     )
     min_opacity: float = option("prune Gaussians with a lower opacity", at_least=0, below=1)
-    max_screen_radius: float = option(
-        "prune Gaussians with a larger radius in an image, pixels, after the first opacity reset; 0: no limit"
-    )
     max_world_size: float = option(
         "prune Gaussians with a larger standard deviation, relative to the cameras' extent, after the first opacity "
         "reset; 0: no limit"

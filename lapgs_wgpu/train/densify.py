@@ -34,20 +34,19 @@ class Statistics:
     """What was seen of N Gaussians since the last change of their number.
 
     gradients (N,): sum of the lengths of the image gradients, in normalised device coordinates. views (N,): how often
-    each was visible. radii (N,): the largest radius on an image, in pixels.
+    each was visible.
     """
 
     gradients: Tensor
     views: Tensor
-    radii: Tensor
 
     @staticmethod
     def zeros(count: int, device: torch.device) -> Statistics:
         """Nothing was seen yet."""
-        return Statistics(*torch.zeros(3, count, device=device).unbind())
+        return Statistics(*torch.zeros(2, count, device=device).unbind())
 
     def add(self, radii: Tensor, d_means2d: Tensor, camera: Camera, *, scale: float = 1.0) -> None:
-        """Take in a view: radii (N,), pixels, and gradients (N, 2) by the centers on the image, per pixel.
+        """Take in a view: radii (N,), 0 of what it does not show, and gradients (N, 2) by the centers, per pixel.
 
         scale: of the gradients, where the view's loss had a share in a sum.
         """
@@ -55,13 +54,11 @@ class Statistics:
         visible = radii > 0
         self.gradients += torch.where(visible, (d_means2d * (scale * to_ndc)).norm(dim=1), 0.0)
         self.views += visible
-        self.radii = torch.maximum(self.radii, radii.to(self.radii.dtype))
 
     def merge(self, other: Statistics) -> None:
         """Take in what another has seen of the same Gaussians."""
         self.gradients += other.gradients
         self.views += other.views
-        self.radii = torch.maximum(self.radii, other.radii)
 
     def of(self, keep: Tensor) -> Statistics:
         """The statistics of the Gaussians of a mask (N,)."""
@@ -94,8 +91,7 @@ class DensityState(NamedTuple):
             (N, 4) wxyz of any length, opacity_logits (N,), sh_dc (N, 1, 3), sh_rest (N, 15, 3), and dynamics (N, D)
             where the field has them.
         statistics: since the last change: mean_gradients (N,), mean length of the gradient of the projected mean, in
-            normalized device coordinates; views (N,), the number of images in which each was visible; radii (N,), the
-            largest in pixels.
+            normalized device coordinates; views (N,), the number of images in which each was visible.
         config: the table `density` of the configuration.
         extent: of the cameras, world units.
         generator: seeded, for random numbers, on the CPU; with any other a training does not repeat.
@@ -142,7 +138,7 @@ def published_rule(state: DensityState) -> Change:
         Which Gaussians stay, and which are added.
     """
     rows, config, gradients = state.rows, state.config, state.statistics.mean_gradients
-    faint, oversized = _faint(rows, config), _oversized(state, rows, state.statistics.radii)
+    faint, oversized = _faint(rows, config), _oversized(state, rows)
     # Clones and children of faint ones are faint: they would go at once, and a split parent with them.
     wanted = (gradients >= config.gradient) & ~faint
     large = rows["log_scales"].amax(dim=1) > math.log(config.split_size * state.extent)
@@ -157,8 +153,7 @@ def published_rule(state: DensityState) -> Change:
     clones = {name: row[clone] for name, row in rows.items()}
     children = split_rows({name: row[split] for name, row in rows.items()}, state.generator)
     born = {name: torch.cat([clones[name], children[name]]) for name in rows}
-    unseen = torch.zeros_like(born["opacity_logits"])  # no image has shown them yet
-    alive = ~(_faint(born, config) | _oversized(state, born, unseen))
+    alive = ~(_faint(born, config) | _oversized(state, born))
     return Change(keep=~(split | prune), added={name: row[alive] for name, row in born.items()})
 
 
@@ -177,15 +172,11 @@ def _faint(rows: Rows, config: DensityConfig) -> Tensor:
     return rows["opacity_logits"] < _logit(config.min_opacity)
 
 
-def _oversized(state: DensityState, rows: Rows, radii: Tensor) -> Tensor:
-    """(N,) bool: Gaussians that are too large, after the first opacity reset. radii: (N,) pixels, largest so far."""
-    config, large = state.config, torch.zeros_like(rows["opacity_logits"], dtype=torch.bool)
-    if state.step > config.reset_interval:
-        if config.max_screen_radius > 0:
-            large |= radii > config.max_screen_radius
-        if config.max_world_size > 0:
-            large |= rows["log_scales"].amax(dim=1) > math.log(config.max_world_size * state.extent)
-    return large
+def _oversized(state: DensityState, rows: Rows) -> Tensor:
+    """(N,) bool: Gaussians that are too large, after the first opacity reset."""
+    config, sizes = state.config, rows["log_scales"].amax(dim=1)
+    bounded = state.step > config.reset_interval and config.max_world_size > 0
+    return sizes > (math.log(config.max_world_size * state.extent) if bounded else math.inf)
 
 
 def largest(values: Tensor, count: int) -> Tensor:

@@ -79,8 +79,7 @@ class DensityControl:
         check_change(change, rows)
         if not change.keep.any() and len(change.added["means"]) == 0:
             raise InputError(
-                f"density control leaves no Gaussian at step {step}; raise density.max_world_size or "
-                "density.max_screen_radius (0 switches these two off)."
+                f"density control leaves no Gaussian at step {step}; raise density.max_world_size (0 switches it off)."
             )
         self._optimizer.edit_rows(change.keep, change.added)
         self._optimizer.reorder(morton_order(scene.parameters["means"].detach()))

@@ -44,6 +44,7 @@ REMOVED = {
     "cameras.focal": "focal lengths are taken as they are",
     "data.split": "a run is measured on its test views",
     "decoder": "it is in torch where the step is, and on the device where that is; step_place says which",
+    "density.max_screen_radius": "density.max_world_size bounds sizes",
     "eval.snapshots": "only the last model is saved",
     "eval.tensorboard": "log.jsonl has the figures",
     "eval.views": "the validation views are measured, or 8 training views if there are none",

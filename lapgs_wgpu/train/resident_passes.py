@@ -77,8 +77,8 @@ class ResidentPasses:
         return self._config.loss.weights(warm=task.scheduled.moving)
 
     def seen(self) -> DeviceArray:
-        """Density control's statistics, (N, 4)."""
-        return self._pool.array("statistics", (len(self._scene), 4))
+        """Density control's statistics, (N, 2)."""
+        return self._pool.array("statistics", (len(self._scene), 2))
 
     def word(self, name: str) -> DeviceArray:
         """A word that passes share: guard, bad or dead."""

@@ -113,7 +113,7 @@ class ResidentStep:
         if "gaussians" in (parts or PARTS) and not self._statistics_on_host:
             self._statistics_on_host = True
             seen = torch.from_numpy(self._passes.seen().read())
-            for target, column in zip(vars(self._density.statistics).values(), seen.T, strict=False):
+            for target, column in zip(vars(self._density.statistics).values(), seen.T, strict=True):
                 target.copy_(column)
 
     def corrections_to_host(self) -> None:
@@ -204,8 +204,7 @@ class ResidentStep:
         self._passes.corrections.push()
         if self._statistics_on_host:
             self._statistics_on_host = False
-            known = vars(self._density.statistics).values()
-            columns = [*(values.numpy(force=True) for values in known), np.zeros(self.count)]
+            columns = [values.numpy(force=True) for values in vars(self._density.statistics).values()]
             self._passes.seen().write(np.stack(columns, axis=1).astype(np.float32))
 
     # A step's end ----------------------------------------------------------------------------------------------------

@@ -17,7 +17,7 @@ from lapgs_wgpu.data.capture_files import CaptureFiles
 from lapgs_wgpu.data.cloud import find_cloud, read_cloud
 from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
 from lapgs_wgpu.data.images import check_image
-from lapgs_wgpu.data.json_fields import LARGEST_SIDE, Fields, as_fields, kind, number, read_json, vector
+from lapgs_wgpu.data.json_fields import LARGEST_SIDE, Fields, as_fields, kind, matrix, number, read_json
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.masks import find_covisible
 from lapgs_wgpu.data.normalize import Normalization
@@ -113,8 +113,7 @@ def _times(metadata: Fields, ids: Sequence[str]) -> dict[str, int]:
 
 def _read_camera(data: Fields) -> tuple[Lens, np.ndarray]:
     """Return the lens and the pose of a camera file, in the file's coordinates."""
-    rows = data.entries("orientation", 3)
-    R_cam_world = np.stack([vector(row, 3, "orientation", data.where) for row in rows])
+    R_cam_world = matrix(data.required("orientation"), (3, 3), "orientation", data.where)
     check_rotation(R_cam_world.T, f"{data.where}: orientation")
     width, height = (
         int(number(side, "image_size", data.where, 1, LARGEST_SIDE)) for side in data.entries("image_size", 2)

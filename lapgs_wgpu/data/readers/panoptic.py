@@ -13,7 +13,7 @@ import numpy as np
 
 from lapgs_wgpu.data.capture_files import CaptureFiles
 from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
-from lapgs_wgpu.data.json_fields import LARGEST_INTRINSIC, Fields, kind, read_json, vector
+from lapgs_wgpu.data.json_fields import LARGEST_INTRINSIC, Fields, kind, matrix, read_json
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.poses import Array, check_rotation, world_to_camera
 from lapgs_wgpu.data.stamps import ImageName
@@ -72,7 +72,7 @@ def _read_split(folder: Path, data: Fields, split: Split, warnings: list[str]) -
 
 def _lens(k: object, width: int, height: int, where: str) -> Lens:
     """The pinhole of a field k. Raises InputError."""
-    K = _matrix(k, 3, "k", where)
+    K = matrix(k, (3, 3), "k", where)
     if not ((np.diag(K)[:2] > 0).all() and (np.abs(K) <= LARGEST_INTRINSIC).all()):
         raise InputError(f"{where}: k must hold focal lengths from 0 to {LARGEST_INTRINSIC:g} pixels.")
     if np.abs(K[[1, 2, 2, 2], [0, 0, 1, 2]] - [0, 0, 0, 1]).max() > 0:
@@ -82,16 +82,9 @@ def _lens(k: object, width: int, height: int, where: str) -> Lens:
 
 def _pose(w2c: object, where: str) -> Array:
     """(4, 4) of a field w2c. Raises InputError."""
-    T = _matrix(w2c, 4, "w2c", where)
+    T = matrix(w2c, (4, 4), "w2c", where)
     check_rotation(T[:3, :3], f"{where}: w2c")
     return world_to_camera(T[:3, :3].T, -T[:3, :3].T @ T[:3, 3])
-
-
-def _matrix(value: object, side: int, field: str, where: str) -> Array:
-    """A field as a matrix (side, side). Raises InputError."""
-    if not isinstance(value, list) or len(value) != side:
-        raise InputError(f"{where}: {field} must be {side} rows of {side} numbers, got {kind(value)}.")
-    return np.stack([vector(row, side, field, where) for row in value])
 
 
 READERS = (Reader("Panoptic", "train_meta.json and test_meta.json beside ims/", _matches, _read),)

@@ -43,10 +43,10 @@ def _read_frames(data: Fields, files: CaptureFiles, time: str) -> list[Frame | N
     time: the field of the times, in all entries or in none. Raises InputError.
     """
     entries = data.objects("frames", "frame")
-    timed = sum(time in entry for entry in entries)
+    timed = sum(_states(entry, time) for entry in entries)
     frames: list[Frame | None] = []
     for entry in entries:
-        if timed and time not in entry:
+        if timed and not _states(entry, time):
             raise InputError(
                 f"{entry.where} has no field {time}, though {timed} of {len(entries)} frames have it; give it for all "
                 "frames or for none."
@@ -61,6 +61,10 @@ def _read_frames(data: Fields, files: CaptureFiles, time: str) -> list[Frame | N
         lens, sized = _read_lens(entry, data, image)
         frames.append(Frame(image, lens, pose, entry.where, ImageName(name), time=stated, states_size=sized))
     return frames
+
+
+def _states(entry: Fields, field: str) -> bool:
+    return entry.values.get(field) is not None
 
 
 def _read_lens(frame: Fields, shared: Fields, image: ImageFile) -> tuple[Lens, bool]:
@@ -117,7 +121,7 @@ def _read_nerfstudio(folder: Path, image_size: int | None) -> Capture:
     path, files = folder / "transforms.json", CaptureFiles(folder)
     data = read_json(path)
     entries = data.objects("frames", "frame")
-    time = "time" if any("time" in entry for entry in entries) else "timestamp"
+    time = "time" if any(_states(entry, "time") for entry in entries) else "timestamp"
     read = _read_frames(data, files, time)
     warnings = files.left_out(len(entries), path)
     frames = [

@@ -6,7 +6,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,18 +21,6 @@ from lapgs_wgpu.motion.fields.hash_grid_config import GridShape, HashConfig
 from lapgs_wgpu.motion.passes.hash_encoder_passes import HashEncoderPasses, PointSet
 
 Place = tuple[Tensor, float]  # points (N, 3), world units, and a time in [0, 1]
-
-
-class Encoded(NamedTuple):
-    """Sets of points and their encodings on the device. Valid until the encoder writes other points.
-
-    tables: (entries, 2) of each grid. encodings: (N, features) of each set and group; where gradients are recorded,
-    they and the tables become their gradients.
-    """
-
-    points: list[PointSet]
-    tables: list[DeviceArray]
-    encodings: list[list[DeviceArray]]
 
 
 class HashGrid(GridShape, nn.Module):
@@ -63,7 +51,6 @@ class HashEncoder:
         self._passes = [HashEncoderPasses(device, group, bound, lane_levels=lane_levels) for group in self.groups]
         self._pool = BufferPool(device)
         self._device = device
-        self._held: Encoded | None = None  # what the buffers hold
 
     @property
     def grids(self) -> list[HashGrid]:
@@ -91,66 +78,64 @@ class HashEncoder:
 
     def encode(self, places: Sequence[Place], tables: Sequence[Tensor]) -> list[Tensor]:
         """Return the encodings by place, then by group, without autograd."""
-        encoded = self.write(places, tables)
+        arrays, sets = self._tables(), self._upload(places)
+        for array, table in zip(arrays, tables, strict=True):
+            array.write(_host(table))
         with Commands(self._device) as commands:
-            self.record(commands, encoded)
-        arrays = read_all(list(itertools.chain(*encoded.encodings)))
-        return [torch.from_numpy(array).to(places[0][0].device) for array in arrays]
+            for points, encodings in sets:
+                for passes, of_group, encoding in self._by_group(points, arrays, encodings):
+                    passes.encode(commands, points, of_group, encoding)
+        return _read([array for _, encodings in sets for array in encodings], places)
 
     def backward(self, places: Sequence[Place], d_encodings: Sequence[Tensor]) -> list[Tensor]:
         """Return the gradients of the tables from those of the encodings, in the order of `encode`."""
-        encoded = self.write(places)
-        for array, d_encoding in zip(itertools.chain(*encoded.encodings), d_encodings, strict=True):
-            array.write(_host(d_encoding))
+        arrays, sets = self._tables(), self._upload(places)
+        given = iter(d_encodings)
+        for _, encodings in sets:
+            for array in encodings:
+                array.write(_host(next(given)))
         with Commands(self._device) as commands:
-            gradients = self.record_gradient(commands, encoded)
-        return [torch.from_numpy(array).to(places[0][0].device) for array in read_all(gradients)]
+            for array in arrays:
+                commands.clear(array)
+            for points, encodings in sets:
+                for passes, of_group, encoding in self._by_group(points, arrays, encodings):
+                    passes.add_gradient(commands, points, encoding, of_group)
+        return _read(arrays, places)
 
-    # The parts of `encode` and `backward`, which do not wait for the device. All writes precede the first submission: a
-    # buffer can only be mapped while the device does not use it.
+    def _tables(self) -> list[DeviceArray]:
+        """Arrays for the tables of all grids, or for their gradients."""
+        return [self._pool.array(f"table {i}", tuple(grid.table.shape)) for i, grid in enumerate(self.grids)]
 
-    def write(self, places: Sequence[Place], tables: Sequence[Tensor] = ()) -> Encoded:
-        """Upload points and, if given, tables."""
-        arrays = [self._pool.array(f"table {i}", tuple(grid.table.shape)) for i, grid in enumerate(self.grids)]
-        for array, table in zip(arrays, tables, strict=False):
-            array.write(_host(table))
-        self._held = Encoded([], arrays, [])
+    def _upload(self, places: Sequence[Place]) -> list[tuple[PointSet, list[DeviceArray]]]:
+        """Upload points; with each set an array (N, features) for the encoding of each group, or for its gradient.
+
+        All writes precede the submission: a buffer can only be mapped while the device does not use it.
+        """
+        sets = []
         for number, (points, time) in enumerate(places):
             padded = _host(torch.nn.functional.pad(points.detach().float(), (0, 1)))
-            uploaded = self._pool.upload(f"points {number}", padded)
-            self._held.points.append(PointSet(number, uploaded, len(points), partial(float, time)))
-            shapes = [(len(points), features) for features in self.features]
-            self._held.encodings.append(
-                [self._pool.array(f"encoding {number} {group}", shape) for group, shape in enumerate(shapes)]
+            uploaded = PointSet(
+                number, self._pool.upload(f"points {number}", padded), len(points), partial(float, time)
             )
-        return self._held
+            shapes = [(len(points), features) for features in self.features]
+            encodings = [self._pool.array(f"encoding {number} {group}", shape) for group, shape in enumerate(shapes)]
+            sets.append((uploaded, encodings))
+        return sets
 
-    def holds(self, encoded: Encoded) -> bool:
-        """Return whether the device still holds these encodings: no other points or gradients have overwritten them."""
-        return encoded is self._held
+    def _by_group(
+        self, points: PointSet, tables: Sequence[DeviceArray], encodings: Sequence[DeviceArray]
+    ) -> Iterator[tuple[HashEncoderPasses, list[DeviceArray], DeviceArray]]:
+        """Passes, tables and encoding of each group; nothing where there are no points."""
+        rest = iter(tables)
+        for passes, encoding in zip(self._passes, encodings, strict=True):
+            of_group = list(itertools.islice(rest, len(passes.grids)))
+            if points.count:
+                yield passes, of_group, encoding
 
-    def record(self, commands: Commands, encoded: Encoded) -> None:
-        """Record the passes that encode the written points."""
-        for points, passes, tables, encoding in self._calls(encoded):
-            passes.encode(commands, points, tables, encoding)
 
-    def record_gradient(self, commands: Commands, encoded: Encoded) -> list[DeviceArray]:
-        """Record the backward passes. They read the encodings' gradients from the arrays of the encodings, and write
-        those of the tables to the arrays of the tables, which are returned."""
-        self._held = None
-        for table in encoded.tables:
-            commands.clear(table)
-        for points, passes, tables, encoding in self._calls(encoded):
-            passes.add_gradient(commands, points, encoding, tables)
-        return encoded.tables
-
-    def _calls(self, encoded: Encoded) -> Iterator[tuple[PointSet, HashEncoderPasses, list[DeviceArray], DeviceArray]]:
-        for points, encodings in zip(encoded.points, encoded.encodings, strict=True):
-            tables = iter(encoded.tables)
-            for passes, encoding in zip(self._passes, encodings, strict=True):
-                of_group = list(itertools.islice(tables, len(passes.grids)))
-                if points.count:
-                    yield points, passes, of_group, encoding
+def _read(arrays: Sequence[DeviceArray], places: Sequence[Place]) -> list[Tensor]:
+    """The content of arrays, as tensors where the points are."""
+    return [torch.from_numpy(array).to(places[0][0].device) for array in read_all(arrays)]
 
 
 def _host(tensor: Tensor) -> NDArray[np.float32]:

@@ -71,12 +71,9 @@ def playback_of(file: SceneFile, device: Device) -> Playback:
 
 
 class DevicePlayback:
-    """A Playback of static scenes, and of fields that the device evaluates.
+    """A Playback of static scenes, and of fields that the device evaluates."""
 
-    block: number of Gaussians per dispatch, see GridFieldPlayback.
-    """
-
-    def __init__(self, file: SceneFile, device: Device, *, block: int | None = None) -> None:
+    def __init__(self, file: SceneFile, device: Device) -> None:
         self.device, self.field_config, self.metadata = device, file.field_config, file.metadata
         self.count, self.sh_degree = len(file.gaussians["means"]), file.sh_degree
         self.moves = file.field_config.kind != "static"
@@ -89,7 +86,7 @@ class DevicePlayback:
         self._field: GridFieldPlayback | None = None
         self._time: float | None = None  # of the Gaussians in the buffers, where a field moves them
         if self.moves:
-            self._field = GridFieldPlayback(device, file.field_config, file.field, activated, block=block)
+            self._field = GridFieldPlayback(device, file.field_config, file.field, activated)
 
     def at(self, t: float) -> Gaussians[DeviceArray]:
         t = self.timing(t)
