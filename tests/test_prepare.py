@@ -100,12 +100,29 @@ def test_films_of_no_use(pictures: list[np.ndarray], words: str, tmp_path: Path)
     path = write_film(tmp_path / "film.mkv", pictures)
     with pytest.raises(InputError, match=words):
         prepare([path], tmp_path / "out")
-    assert [child.name for child in tmp_path.iterdir()] == ["film.mkv"]
+    kept = {"images", "refused.txt", "times.json"} if "placed" in words else set()
+    assert {child.name for child in tmp_path.glob("out/*")} >= kept
 
 
-@pytest.mark.parametrize("name", ["film.mp4", "folder", "none.mp4"])
+def test_what_a_refusal_has_found_stays(film: Path, tmp_path: Path) -> None:
+    """And the next run goes on there."""
+    out = tmp_path / "out"
+    assert prepare_command([str(film), "--out", str(out)]) == 2
+    why = (out / "refused.txt").read_text()
+    page = (out / "report.html").read_text()
+    assert re.search(r"\d+ of 12 images could be placed", why)
+    assert why[:40] in page
+    assert page.count("<img ") >= 2
+    cameras = walk(4, *SIZE)
+    still = [write_film(tmp_path / f"{i}.mp4", [drawn(camera, 0, Board())[0]] * 6) for i, camera in enumerate(cameras)]
+    prepare(still, out)
+    assert sorted(child.name for child in out.iterdir()) == ["images", "sparse", "times.json"]
+
+
+@pytest.mark.parametrize("name", ["film.mp4", "folder", "none.mp4", "film.zip", "*.webp", "a.heic"])
 def test_what_is_no_film(name: str, tmp_path: Path) -> None:
-    (tmp_path / "film.mp4").write_text("hello")
+    for file in ("film.mp4", "film.zip", "a.heic", "b.heic"):
+        (tmp_path / file).write_text("hello")
     (tmp_path / "folder").mkdir()
     with pytest.raises(InputError, match=name):
         prepare([tmp_path / name], tmp_path / "out")

@@ -8,12 +8,17 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from lapgs_wgpu.data.load import READERS
+from lapgs_wgpu.data.readers.colmap import IMAGES, SPARSE
+from lapgs_wgpu.data.timestamps import TIMES
 from lapgs_wgpu.errors import InputError, quoted
 from lapgs_wgpu.io.atomic import move
 from lapgs_wgpu.io.folder_lock import LOCK, locked_folder
 from lapgs_wgpu.io.listing import listed
+from lapgs_wgpu.prepare.masks import MASKS
 
-UNFINISHED = ".unfinished"
+REPORT = "report.html"
+
+UNFINISHED, REFUSED = ".unfinished", "refused.txt"  # the latter says why there are no, or too few, cameras
 
 
 @contextmanager
@@ -22,7 +27,8 @@ def appearing(out: Path) -> Iterator[Path]:
 
     The folder is made inside `out`, so `out` may be the current folder, a link or a mount. An exception removes the
     folder, and `out` too if it is new. Raises InputError if `out` is not empty, if another process writes to it, or if
-    the contents cannot be moved: then they stay, and the error says where.
+    the contents cannot be moved: then they stay, and the error says where. What a refused capture left in `out` is
+    replaced, and stays until then.
     """
     _check_empty(out)
     partial = out / UNFINISHED
@@ -36,6 +42,9 @@ def appearing(out: Path) -> Iterator[Path]:
             shutil.rmtree(partial, ignore_errors=True)
             raise
         try:
+            if (out / REFUSED).is_file():
+                for name in (IMAGES, SPARSE, TIMES, MASKS, REPORT, REFUSED):
+                    shutil.rmtree(out / name) if (out / name).is_dir() else (out / name).unlink(missing_ok=True)
             for child in sorted(partial.iterdir()):
                 move(child, out / child.name)
             partial.rmdir()
@@ -47,6 +56,8 @@ def appearing(out: Path) -> Iterator[Path]:
 
 
 def _check_empty(out: Path) -> None:
+    if (out / REFUSED).is_file():
+        return
     if out.is_dir() and not {entry.name for entry in listed(out)} - {UNFINISHED, LOCK}:
         return
     if out.is_dir() and any(reader.matches(out) for reader in READERS):

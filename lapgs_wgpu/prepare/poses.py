@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.errors import InputError, pip_install
 from lapgs_wgpu.progress import Progress
 
@@ -37,16 +38,16 @@ class Features(NamedTuple):
 
 
 class Reconstruction:
-    """Structure from motion over images that share one lens.
+    """Structure from motion over images.
 
     images: the folder of all images. names: of those to use, below it, in the order of time. work: folder for the
-    database. model: COLMAP's name for the lens.
+    database. model: COLMAP's name for the lens. lenses: SINGLE for one, PER_FOLDER, or PER_IMAGE.
     """
 
-    def __init__(self, images: Path, names: Sequence[str], work: Path, model: str) -> None:
+    def __init__(self, images: Path, names: Sequence[str], work: Path, model: str, lenses: str = "SINGLE") -> None:
         """Raises InputError where pycolmap is not installed."""
         self._colmap = colmap = import_pycolmap()
-        self.images, self.names, self.model = images, list(names), model
+        self.images, self.names, self.model, self.lenses = images, list(names), model, lenses
         self.work = work
         self.places: dict[str, NDArray[np.float32]] = {}
         self._database = work / "database.db"
@@ -55,9 +56,10 @@ class Reconstruction:
             pass
         options = colmap.ImageReaderOptions()
         options.camera_model = model
-        colmap.import_images(self._database, images, colmap.CameraMode.SINGLE, self.names, options)
+        colmap.import_images(self._database, images, colmap.CameraMode.__members__[lenses], self.names, options)
         with self.database() as database:
             self.ids = {image.name: image.image_id for image in database.read_all_images()}
+            self.cameras = {image.name: image.camera_id for image in database.read_all_images()}
             camera = database.read_all_cameras()[0]
         self.prior, self.exif = float(camera.mean_focal_length()), bool(camera.has_prior_focal_length)
 
@@ -142,6 +144,27 @@ class Reconstruction:
             found = colmap.incremental_mapping(self._database, self.images, folder, options)
         return max(found.values(), key=lambda model: model.num_reg_images(), default=None)
 
+    def given(self, lenses: Mapping[str, Lens], poses: Mapping[str, NDArray[np.float64]]) -> Any:
+        """A pycolmap.Reconstruction of cameras that are known, with points by the verified matches.
+
+        The model must be OPENCV. lenses: of images, at their size. poses: (4, 4), world to camera.
+        """
+        colmap, folder = self._colmap, self.work / "models"
+        model = colmap.Reconstruction()
+        for number, lens in {self.cameras[name]: lens for name, lens in lenses.items()}.items():
+            values = [lens.fx, lens.fy, lens.cx, lens.cy, *lens.radial[:2], *lens.tangential]
+            model.add_camera_with_trivial_rig(
+                colmap.Camera(model="OPENCV", width=lens.width, height=lens.height, params=values, camera_id=number)
+            )
+        for name in lenses:
+            image = colmap.Image(name=name, camera_id=self.cameras[name], image_id=self.ids[name])
+            model.add_image_with_trivial_frame(image, colmap.Rigid3d(poses[name][:3]))
+        options = colmap.IncrementalPipelineOptions()
+        options.triangulation.random_seed, options.triangulation.min_angle = SEED, LEAST_ANGLE
+        options.mapper.filter_min_tri_angle = LEAST_ANGLE
+        folder.mkdir(exist_ok=True)
+        return colmap.triangulate_points(model, self._database, self.images, folder, options=options)
+
     @contextmanager
     def database(self) -> Iterator[Any]:
         """The open pycolmap.Database."""
@@ -217,7 +240,8 @@ def merged(source: Reconstruction, matches: Match, groups: Sequence[Sequence[str
     cameras together, too, and the noise of several times is averaged.
     groups: names of images, as many for each camera. The first of each stands for the camera.
     """
-    result = Reconstruction(source.images, [group[0] for group in groups], work, source.model)
+    names = [group[0] for group in groups]
+    result = Reconstruction(source.images, names, work, source.model, source.lenses)
     first: dict[str, int] = {}  # of each image's features among those of its group
     with result.database() as database:
         for group in groups:

@@ -58,7 +58,8 @@ def search(source: Reconstruction, size: Size) -> Found | None:
         if best is not None and left < longest:
             break
         started = time.monotonic()
-        found = solved(source, focal, together=together, seconds=max(left, 10))
+        model = source.solve(focal, together=together, seconds=max(left, 10))
+        found = described(source, model, together=together)
         longest = max(longest, time.monotonic() - started)
         if found is not None and (best is None or _rank(source, found) > _rank(source, best)):
             best = found
@@ -76,9 +77,8 @@ def search(source: Reconstruction, size: Size) -> Found | None:
     return best
 
 
-def solved(source: Reconstruction, focal: float, *, together: bool, seconds: float) -> Found | None:
-    """One reconstruction. focal: length to begin with, pixels."""
-    model = source.solve(focal, together=together, seconds=seconds)
+def described(source: Reconstruction, model: Any, *, together: bool = False) -> Found | None:
+    """A reconstruction, and what tells how good it is. None where it has no points."""
     if model is None or model.num_reg_images() < 2 or not model.num_points3D():
         return None
     images = {model.image(i).name: model.image(i) for i in model.reg_image_ids()}
@@ -87,7 +87,7 @@ def solved(source: Reconstruction, focal: float, *, together: bool, seconds: flo
     points = np.stack([point.xyz for point in model.points3D.values()])
     faults = path_faults(-np.einsum("nij,ni->nj", poses[:, :, :3], poses[:, :, 3]), poses[:, 2, :3], points)
     camera = next(iter(model.cameras.values()))
-    if abs(camera.params[3]) > BENT:
+    if source.model == camera.model.name and abs(camera.params[3]) > BENT:
         faults.append(("a lens that no camera has", 0))
     error = float(model.compute_mean_reprojection_error())
     return Found(model, placed, tuple(faults), error, camera.mean_focal_length(), together=together)
@@ -119,7 +119,8 @@ def again(source: Reconstruction, found: Found, matches: Match, masks: Mapping[s
         return None if pan is None else panned(source, pan, size)
     source.use(without(matches, source.places, masks, size))
     seconds = SECONDS + SECONDS_EACH * len(source.names)
-    return solved(source, found.focal, together=found.together, seconds=seconds)
+    model = source.solve(found.focal, together=found.together, seconds=seconds)
+    return described(source, model, together=found.together)
 
 
 def _good(source: Reconstruction, found: Found, size: Size) -> bool:
