@@ -110,7 +110,7 @@ def test_what_a_refusal_has_found_stays(film: Path, tmp_path: Path) -> None:
     assert prepare_command([str(film), "--out", str(out)]) == 2
     why = (out / "refused.txt").read_text()
     page = (out / "report.html").read_text()
-    assert re.search(r"\d+ of 12 images could be placed", why)
+    assert re.search(r"\d+ of 8 images could be placed", why)
     assert why[:40] in page
     assert page.count("<img ") >= 2
     cameras = walk(4, *SIZE)
@@ -124,7 +124,7 @@ def test_what_is_no_film(name: str, tmp_path: Path) -> None:
     for file in ("film.mp4", "film.zip", "a.heic", "b.heic"):
         (tmp_path / file).write_text("hello")
     (tmp_path / "folder").mkdir()
-    with pytest.raises(InputError, match=name):
+    with pytest.raises(InputError, match=re.escape(name)):
         prepare([tmp_path / name], tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
@@ -156,7 +156,6 @@ def test_without_the_extra(missing: str, film: Path, tmp_path: Path, monkeypatch
         (["film.mp4", "--out", "DIR", "--minutes", "3"], "--minutes"),
         (["film.mp4", "--out", "DIR", "--train", "--minutes", "nan"], "--minutes"),
         (["film.mp4", "--out", "DIR", "--masks", "typo"], "typo"),
-        (["a.mp4", "b.mp4", "--out", "DIR", "--masks", "DIR"], "--masks"),
     ],
 )
 def test_options_that_do_not_go_together(arguments: list[str], named: str, capsys: pytest.CaptureFixture) -> None:

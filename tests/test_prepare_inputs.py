@@ -179,6 +179,10 @@ def test_films_of_calibrated_cameras(tmp_path: Path) -> None:
         films.append(write_film(tmp_path / f"cam{number}.mp4", pictures, rate=10))
     with pytest.raises(InputError, match=r"200x150.*200x144"):
         prepare(films, tmp_path / "out", calibration=write_calibration(tmp_path, "Calib.toml", cameras, (0.0,) * 4))
+    with pytest.raises(InputError, match="--poses"):
+        prepare(films, tmp_path / "out", poses=tmp_path)
+    with pytest.raises(InputError, match="--calibration"):
+        prepare(films[:1], tmp_path / "out", calibration=tmp_path)
     sized = [Camera(c.K, c.T_cam_world, 200, 150 if i == 1 else 144) for i, c in enumerate(cameras)]
     prepare(films, tmp_path / "out", calibration=write_calibration(tmp_path, "Calib.toml", sized, (0.0,) * 4))
     data = load_dataset(tmp_path / "out")

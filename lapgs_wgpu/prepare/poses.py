@@ -26,6 +26,7 @@ FEWEST_IMAGES, FEWEST_MATCHES = 2, 15  # of a reconstruction; of a pair of image
 SEED = 0
 Pair = tuple[str, str]
 Ints = NDArray[np.integer]
+Floats = NDArray[np.float64]
 Match = Mapping[Pair, Ints]  # of pairs of images: (m, 2) numbers of their features
 
 
@@ -144,21 +145,13 @@ class Reconstruction:
             found = colmap.incremental_mapping(self._database, self.images, folder, options)
         return max(found.values(), key=lambda model: model.num_reg_images(), default=None)
 
-    def given(self, lenses: Mapping[str, Lens], poses: Mapping[str, NDArray[np.float64]]) -> Any:
+    def given(self, lenses: Mapping[str, Lens], poses: Mapping[str, Floats]) -> Any:
         """A pycolmap.Reconstruction of cameras that are known, with points by the verified matches.
 
         The model must be OPENCV. lenses: of images, at their size. poses: (4, 4), world to camera.
         """
         colmap, folder = self._colmap, self.work / "models"
-        model = colmap.Reconstruction()
-        for number, lens in {self.cameras[name]: lens for name, lens in lenses.items()}.items():
-            values = [lens.fx, lens.fy, lens.cx, lens.cy, *lens.radial[:2], *lens.tangential]
-            model.add_camera_with_trivial_rig(
-                colmap.Camera(model="OPENCV", width=lens.width, height=lens.height, params=values, camera_id=number)
-            )
-        for name in lenses:
-            image = colmap.Image(name=name, camera_id=self.cameras[name], image_id=self.ids[name])
-            model.add_image_with_trivial_frame(image, colmap.Rigid3d(poses[name][:3]))
+        model = reconstruction(lenses, poses, self.cameras, self.ids)
         options = colmap.IncrementalPipelineOptions()
         options.triangulation.random_seed, options.triangulation.min_angle = SEED, LEAST_ANGLE
         options.mapper.filter_min_tri_angle = LEAST_ANGLE
@@ -173,6 +166,24 @@ class Reconstruction:
             yield database
         finally:
             database.close()
+
+
+def reconstruction(
+    lenses: Mapping[str, Lens], poses: Mapping[str, Floats], cameras: Mapping[str, int], ids: Mapping[str, int]
+) -> Any:
+    """A pycolmap.Reconstruction without points, of images that have a pose (3 or 4, 4), world to camera. cameras, ids:
+    COLMAP's numbers of each image's camera, and of the image."""
+    colmap = import_pycolmap()
+    model = colmap.Reconstruction()
+    for number, lens in {cameras[name]: lens for name, lens in lenses.items()}.items():
+        values = [lens.fx, lens.fy, lens.cx, lens.cy, *lens.radial[:2], *lens.tangential]
+        model.add_camera_with_trivial_rig(
+            colmap.Camera(model="OPENCV", width=lens.width, height=lens.height, params=values, camera_id=number)
+        )
+    for name, pose in poses.items():
+        image = colmap.Image(name=name, camera_id=cameras[name], image_id=ids[name])
+        model.add_image_with_trivial_frame(image, colmap.Rigid3d(pose[:3]))
+    return model
 
 
 def sift(path: Path) -> Features:

@@ -11,17 +11,18 @@ import numpy as np
 from PIL import Image
 
 from lapgs_wgpu.data.images import Size
+from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.prepare.masks import Mask
 from lapgs_wgpu.prepare.measures import path_faults
 from lapgs_wgpu.prepare.movers import without
 from lapgs_wgpu.prepare.pan import RADIUS, Pan, rays, solve_pan
-from lapgs_wgpu.prepare.poses import Match, Reconstruction
+from lapgs_wgpu.prepare.poses import Match, Reconstruction, import_pycolmap, reconstruction
 from lapgs_wgpu.progress import say
 
 FOCALS = 1.0, 0.7, 1.4  # times the width, where EXIF says nothing
 PURE, NEARLY = 0.8, 0.6  # share of the verified matches that turning alone explains: a pan; one, if nothing else fits
 GOOD, SHARP = 0.95, 1.5e-3  # the search ends: share of the images, and the mean error in parts of the longer side
-SECONDS, SECONDS_EACH = 60.0, 2.0  # of the search: for any film, and for each image
+SECONDS, SECONDS_EACH, CORES = 60.0, 2.0, 2  # of the search: for any film, and for each image, on so many cores
 BENT = 0.4  # first radial coefficient of a lens, at most
 PANORAMA = 3000  # points of a pan
 
@@ -50,31 +51,47 @@ def search(source: Reconstruction, size: Size) -> Found | None:
         return panned(source, pan, size)
     focals = [source.prior, *FOCALS] if source.exif else list(FOCALS)
     tries = [(f if source.exif and f == source.prior else f * size[0], way) for f in focals for way in (True, False)]
-    end = time.monotonic() + SECONDS + SECONDS_EACH * len(source.names)
     best: Found | None = None
-    longest = 0.0
+    longest, spent = 0.0, _Spent()
     for focal, together in tries:
-        left = end - time.monotonic()
+        left = SECONDS + SECONDS_EACH * len(source.names) - spent.seconds
         if best is not None and left < longest:
             break
-        started = time.monotonic()
-        model = source.solve(focal, together=together, seconds=max(left, 10))
+        started = spent.seconds
+        model = source.solve(focal, together=together, seconds=max(left, 10) * spent.slower)
         found = described(source, model, together=together)
-        longest = max(longest, time.monotonic() - started)
+        longest = max(longest, spent.seconds - started)
         if found is not None and (best is None or _rank(source, found) > _rank(source, best)):
             best = found
         if best is not None and _good(source, best, size):
             break
         if found is not None:
+            rest = max(left + started - spent.seconds, 0) * spent.slower
             more = f"{len(found.faults)} faults of the path; " * bool(found.faults)
             say(
                 f"{len(found.placed)} of {len(source.names)} cameras placed, {found.error:.2f} pixels off; {more}"
-                f"looking for better ones for at most {max(end - time.monotonic(), 0):.0f} s more"
+                f"looking for better ones for at most {rest:.0f} s more"
             )
     short = best is None or len(best.placed) < GOOD * len(source.names)
     if pan is not None and short and pan.explained >= NEARLY:
         return panned(source, pan, size)
     return best
+
+
+class _Spent:
+    """The time of this process on CORES cores, so that what else a machine does changes no result."""
+
+    def __init__(self) -> None:
+        self._wall, self._processor = time.monotonic(), time.process_time()
+
+    @property
+    def seconds(self) -> float:
+        return (time.process_time() - self._processor) / CORES
+
+    @property
+    def slower(self) -> float:
+        """By how much time passes faster than that, at least 1."""
+        return max(1.0, (time.monotonic() - self._wall) / max(self.seconds, 1.0))
 
 
 def described(source: Reconstruction, model: Any, *, together: bool = False) -> Found | None:
@@ -85,7 +102,7 @@ def described(source: Reconstruction, model: Any, *, together: bool = False) -> 
     placed = tuple(name for name in source.names if name in images)
     poses = np.stack([images[name].cam_from_world().matrix() for name in placed])
     points = np.stack([point.xyz for point in model.points3D.values()])
-    faults = path_faults(-np.einsum("nij,ni->nj", poses[:, :, :3], poses[:, :, 3]), poses[:, 2, :3], points)
+    faults = path_faults(-np.einsum("nij,ni->nj", poses[:, :, :3], poses[:, :, 3]), poses[:, 2, :3], points, placed)
     camera = next(iter(model.cameras.values()))
     if source.model == camera.model.name and abs(camera.params[3]) > BENT:
         faults.append(("a lens that no camera has", 0))
@@ -107,7 +124,11 @@ def panned(source: Reconstruction, pan: Pan, size: Size) -> Found:
             pixels = np.asarray(image.convert("RGB"))
         column, row = np.clip(at.astype(int), 0, [size[0] - 1, size[1] - 1]).T
         colors.append(pixels[row, column])
-    model = pan.model(size, np.concatenate(points), np.concatenate(colors))
+    lens = Lens(*size, pan.focal, pan.focal, size[0] / 2, size[1] / 2, radial=(pan.radial, 0.0, 0.0))
+    poses = {name: np.hstack([R, np.zeros((3, 1))]) for name, R in zip(pan.names, pan.rotations, strict=True)}
+    model = reconstruction(dict.fromkeys(pan.names, lens), poses, source.cameras, source.ids)
+    for point, color in zip(np.concatenate(points), np.concatenate(colors), strict=True):
+        model.add_point3D(point, import_pycolmap().Track(), color)
     return Found(model, pan.names, (), 0.0, pan.focal, pan)
 
 
