@@ -1,4 +1,4 @@
-"""From films to poses: python benchmarks/films.py DIR prints a Markdown table (docs/own-data.md).
+"""From films to poses: python benchmarks/films.py DIR prints a Markdown table (docs/results.md).
 
 DIR holds rendered/swing_mv, eight films of still cameras whose poses are known, and hypernerf/hand, pictures of a real
 hand, which become a film. Two more rows are of a film that is rendered here: a walk past a room in which a moving board

@@ -107,15 +107,14 @@ def check_options(given: argparse.Namespace) -> None:
 
 def _convert(given: argparse.Namespace, out: Path) -> None:
     from lapgs_wgpu.prepare.capture import prepare  # after --help: numpy and Pillow take a while
-    from lapgs_wgpu.prepare.capture_folder import REFUSED
+    from lapgs_wgpu.prepare.capture_folder import RefusedError
     from lapgs_wgpu.prepare.report import write_refusal
 
     paths = {name: Path(value) for name in ("masks", "poses", "calibration") if (value := getattr(given, name))}
     try:
         done = prepare([Path(film) for film in given.films], out, fps=given.fps, **paths)
-    except InputError:
-        if (out / REFUSED).is_file():
-            write_refusal(out)
+    except RefusedError:
+        write_refusal(out)
         raise
     print(f"{out}: {done.images} images, {done.placed} of {done.cameras} cameras placed", flush=True)
 

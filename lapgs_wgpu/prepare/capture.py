@@ -17,7 +17,7 @@ from lapgs_wgpu.data.readers.calibration import match_names, read_calibration
 from lapgs_wgpu.data.readers.colmap import IMAGES, SPARSE
 from lapgs_wgpu.data.timestamps import write_times
 from lapgs_wgpu.errors import InputError
-from lapgs_wgpu.prepare.capture_folder import REFUSED, appearing
+from lapgs_wgpu.prepare.capture_folder import WORK, RefusedError, appearing
 from lapgs_wgpu.prepare.film import Film
 from lapgs_wgpu.prepare.flow import Motion, film_frames
 from lapgs_wgpu.prepare.images import Picture, extract, images_per_second
@@ -72,9 +72,8 @@ def prepare(
         check_mask_folder(masks, "each image")
     import_pycolmap()
     import_cv2()
-    refused, done = None, None
     with appearing(out) as folder:
-        work = folder / "work"
+        work = folder / WORK
         films = open_inputs(inputs, work)
         of_one = [option for option, given in (("--masks", masks), ("--poses", poses)) if given is not None]
         if of_one and len(films) > 1:
@@ -83,36 +82,24 @@ def prepare(
             raise InputError("--calibration goes with several cameras; --poses gives those of one that moves.")
         rate = images_per_second(films, fps)
         if calibration is not None:
-            pictures = place_calibrated(films, folder, rate, calibration)
-            done = Prepared(len(pictures), len(films), len(films))
+            pictures, placed = place_calibrated(films, folder, rate, calibration), len(films)
         elif len(films) > 1:
             pictures, model = place_still(films, folder / IMAGES, rate, work)
-            write_model(folder, model, pictures)
-            done = Prepared(len(pictures), model.num_reg_images(), len(films))
+            placed = write_model(folder, model, pictures)
         else:
             pictures = extract(films[0], folder / IMAGES, rate)
-            try:
-                model = _moving_camera(films[0], folder, pictures, masks, poses, work)
-                write_model(folder, model, pictures)
-                done = Prepared(len(pictures), model.num_reg_images(), len(pictures))
-            except InputError as error:
-                refused = str(error)
-                write_times(folder, {picture.name: picture.seconds for picture in pictures})
-                (folder / REFUSED).write_text(refused, encoding="utf-8")
+            model = _moving_camera(films[0], folder, pictures, masks, poses, work)
+            placed = write_model(folder, model, pictures)
         shutil.rmtree(work, ignore_errors=True)
-    if done is None:
-        raise InputError(
-            f"{refused} The images and what was found stay in {out}; the same command goes on there, with --masks or "
-            "--poses for these images."
-        )
-    return done
+    return Prepared(len(pictures), placed, len(films) if len(films) > 1 else len(pictures))
 
 
-def write_model(folder: Path, model: Any, pictures: Sequence[Picture]) -> None:
-    """Write times.json and a pycolmap.Reconstruction."""
+def write_model(folder: Path, model: Any, pictures: Sequence[Picture]) -> int:
+    """Write times.json and a pycolmap.Reconstruction, and return the number of its images."""
     write_times(folder, {picture.name: picture.seconds for picture in pictures})
     (folder / SPARSE / "0").mkdir(parents=True)
     model.write_binary(str(folder / SPARSE / "0"))
+    return int(model.num_reg_images())
 
 
 def _moving_camera(
@@ -134,7 +121,7 @@ def _moving_camera(
     if known is not None:
         found = described(source, source.given(*known))
         if found is None:
-            raise InputError(f"{poses}: what {len(known[0])} images show fits none of its cameras; give their own.")
+            raise RefusedError(f"{poses}: what {len(known[0])} images show fits none of its cameras; give their own.")
         say(f"{poses}: {len(found.placed)} of {len(names)} images have cameras, {found.error:.2f} pixels off (mean).")
     else:
         found = _checked(source, search(source, size), size, folder, pictures)
@@ -210,7 +197,7 @@ def _without_movers(
 def _checked(
     source: Reconstruction, found: Found | None, size: Size, folder: Path, pictures: Sequence[Picture]
 ) -> Found:
-    """Raises InputError where too few images have a pose, whose cameras are written, and for a camera that neither
+    """Raises RefusedError where too few images have a pose, whose cameras are written, and for a camera that neither
     walks nor turns."""
     placed, least = len(found.placed) if found else 0, max(2, round(FEWEST * len(source.names)))
     if found is None or placed < least:
@@ -228,13 +215,13 @@ def _checked(
             whole = longest_part(source.names, found.placed, 2)
             part = f"; what fits together are {len(whole)} images from {whole[0]} to {whole[-1]}"
         worst = int(np.argmin(shared))
-        raise InputError(
+        raise RefusedError(
             f"{placed} of {len(source.names)} images could be placed (at least {least} are needed): an image has "
             f"{features} features, of which {np.median(shared):.0f} fit the next image (medians), fewest, "
             f"{shared[worst]}, from {source.names[worst]} to {source.names[worst + 1]}{part}; {advice}."
         )
     if found.pan is not None and found.pan.travel < STANDING * max(size):
-        raise InputError(
+        raise RefusedError(
             f"the camera stands still: its image moves by {found.pan.travel:.1f} pixels over the film (at least "
             f"{STANDING * max(size):.1f} are needed), so nothing tells how far away anything is; walk around what "
             "moves, or film it with several cameras at once."

@@ -18,7 +18,11 @@ from lapgs_wgpu.prepare.masks import MASKS
 
 REPORT = "report.html"
 
-UNFINISHED, REFUSED = ".unfinished", "refused.txt"  # the latter says why there are no, or too few, cameras
+UNFINISHED, WORK, REFUSED = ".unfinished", "work", "refused.txt"
+
+
+class RefusedError(InputError):
+    """Too few cameras could be placed. What was found stays."""
 
 
 @contextmanager
@@ -36,8 +40,13 @@ def appearing(out: Path) -> Iterator[Path]:
         _check_empty(out)
         shutil.rmtree(partial, ignore_errors=True)  # of a process that was killed
         partial.mkdir()
+        refused = None
         try:
             yield partial
+        except RefusedError as error:
+            refused = str(error)
+            shutil.rmtree(partial / WORK, ignore_errors=True)
+            (partial / REFUSED).write_text(refused, encoding="utf-8")
         except BaseException:
             shutil.rmtree(partial, ignore_errors=True)
             raise
@@ -53,6 +62,11 @@ def appearing(out: Path) -> Iterator[Path]:
                 f"{partial} holds the finished capture, which could not be moved to {out} ({error.strerror or error}); "
                 "move what is in it to a folder of your choice."
             ) from None
+        if refused is not None:
+            raise RefusedError(
+                f"{refused} Images and what was found stay in {out}: the same command goes on there, with --masks or "
+                "--poses for these images if you have any."
+            )
 
 
 def _check_empty(out: Path) -> None:

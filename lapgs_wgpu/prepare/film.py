@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import difflib
-import os
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,44 +22,31 @@ from lapgs_wgpu.data.video_frames import (
     pixel_aspect,
 )
 from lapgs_wgpu.errors import InputError
-from lapgs_wgpu.prepare.hdr import Transfer, to_sdr, transfer_of
+from lapgs_wgpu.prepare.hdr import to_sdr, transfer_of
 
 _FAST_BILINEAR = 0x1  # of swscale: exact enough for a thumbnail
 _ATTACHED_PICTURE = 0x400  # libavformat's flag of a cover image
 
 
-@dataclass(eq=False)
-class Frame:
+class Frame(NamedTuple):
     """seconds: since the first frame. gray: (h, w) float32, levels 0 to 255, upright, longer side THUMBNAIL at most.
-    name: of its file, of which its image gets the name and the tags `exif`."""
+    pixels: (H, W, 3) RGB, upright, shrunk to at most so many pixels of the longer side. name: of its file, of which its
+    image gets the name and the tags `exif`."""
 
     seconds: float
     gray: NDArray[np.float32]
+    pixels: Callable[[int], Pixels]
     name: str = ""
     exif: bytes = b""
 
-    def pixels(self, longer_side: int) -> Pixels:
-        """(H, W, 3) RGB, upright, shrunk to at most `longer_side` pixels."""
-        raise NotImplementedError
 
-
-@dataclass(eq=False, kw_only=True)
-class FilmFrame(Frame):
-    """A decoded frame of a film."""
-
-    _frame: Any
-    _size: Size  # of square pixels, not yet turned
-    _display: Display
-    _transfer: Transfer | None
-
-    def pixels(self, longer_side: int) -> Pixels:
-        width, height = shrunk_size(self._size, longer_side)
-        if self._transfer is None:
-            image = self._frame.to_ndarray(format="rgb24", width=width, height=height, interpolation=EXACT_COLORS)
-        else:
-            deep = self._frame.to_ndarray(format="rgb48le", width=width, height=height, interpolation=EXACT_COLORS)
-            image = to_sdr(deep, self._transfer)
-        return self._display.apply(image)
+def _pixels(frame: Any, size: Size, shape: Display, longer_side: int) -> Pixels:
+    """size: of the frame's square pixels, not yet turned."""
+    width, height = shrunk_size(size, longer_side)
+    transfer = transfer_of(frame)
+    form = "rgb24" if transfer is None else "rgb48le"
+    image = frame.to_ndarray(format=form, width=width, height=height, interpolation=EXACT_COLORS)
+    return shape.apply(image if transfer is None else to_sdr(image, transfer))
 
 
 class Film:
@@ -79,11 +64,7 @@ class Film:
         self.path = path
         self.notes: list[str] = []
         if not path.is_file():
-            near = difflib.get_close_matches(path.name, os.listdir(path.parent) if path.parent.is_dir() else [], 1)
-            raise InputError(
-                f"{path} does not exist; "
-                + (f"did you mean {near[0]}?" if near else f"the folder {path.parent.resolve()} holds nothing like it.")
-            )
+            raise InputError(f"{path} does not exist; check its name, and the folder {path.parent.resolve()}.")
         av = import_av(path)
         try:
             with av.open(str(path), metadata_errors="replace") as file:
@@ -130,9 +111,7 @@ class Film:
                         guessed, seconds = True, last + 1 / rate
                     seconds = max(seconds, 0.0)
                     gray = _gray(frame, shown, shape)
-                    yield FilmFrame(
-                        seconds, gray, _frame=frame, _size=shown, _display=shape, _transfer=transfer_of(frame)
-                    )
+                    yield Frame(seconds, gray, partial(_pixels, frame, shown, shape))
                     number, last = number + 1, seconds
         except (av.error.FFmpegError, OSError) as error:
             if number < 2:

@@ -6,7 +6,7 @@ import shutil
 import zipfile
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from functools import partial
 from glob import glob
 from importlib import import_module
 from pathlib import Path
@@ -64,15 +64,12 @@ class Stills(Film):
                 )
             gray = image.convert("L")
             gray.thumbnail((THUMBNAIL, THUMBNAIL), Image.Resampling.BOX)
-            yield _Still(seconds, np.asarray(gray, np.float32), file.stem, image.info["exif"], _image=image)
+            thumbnail = np.asarray(gray, np.float32)
+            yield Frame(seconds, thumbnail, partial(_pixels, image), file.stem, image.info["exif"])
 
 
-@dataclass(eq=False, kw_only=True)
-class _Still(Frame):
-    _image: Image.Image
-
-    def pixels(self, longer_side: int) -> Pixels:
-        return shrink(np.asarray(self._image.convert("RGB")), shrunk_size(self._image.size, longer_side))
+def _pixels(image: Image.Image, longer_side: int) -> Pixels:
+    return shrink(np.asarray(image.convert("RGB")), shrunk_size(image.size, longer_side))
 
 
 def _opened_image(file: Path) -> Image.Image:

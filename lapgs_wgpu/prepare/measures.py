@@ -71,8 +71,8 @@ class Measure:
 def measured(wanted: str, number: float, value: str, advice: str = "", name: str = "") -> Measure:
     """A number judged by a row of WANTED; NaN where it cannot be measured, for the reason `advice`."""
     least, most, threshold, usual = WANTED[wanted]
-    good = None if np.isnan(number) else least <= number <= most
-    return Measure(name or wanted, number, value, threshold, good, advice or usual)
+    good = None if np.isnan(number) else bool(least <= number <= most)
+    return Measure(name or wanted, float(number), value, threshold, good, advice or usual)
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,6 +17,7 @@ from lapgs_wgpu.data.readers.panoptic import FILES, IMAGES
 from lapgs_wgpu.data.split import CAMERAS
 from lapgs_wgpu.data.stamps import natural_key
 from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.prepare.capture_folder import RefusedError
 from lapgs_wgpu.prepare.film import Film
 from lapgs_wgpu.prepare.images import LONGER_SIDE, Picture, Shape, common_times, extract_in_step
 from lapgs_wgpu.prepare.poses import Reconstruction, merged
@@ -70,14 +71,12 @@ def place_still(films: Sequence[Film], images: Path, fps: float, work: Path) -> 
     model = joined.solve()
     placed, least = 0 if model is None else model.num_reg_images(), max(2, len(groups) // 2)
     if placed < least:
-        shared = {pair: len(found) for pair, found in joined.verified().items()}
-        best = max(shared, key=lambda pair: shared[pair], default=None)
-        told = "no two cameras see the same" if best is None else (
-            f"{best[0][:5]} and {best[1][:5]} share most, {shared[best]} places at {len(times)} times"
-        )  # fmt: skip
-        raise InputError(
-            f"{placed} of {len(groups)} cameras could be placed (at least {least} are needed): {told}; put cameras "
-            "between these, less than 30 degrees apart, or give where they stand (--calibration FILE)."
+        shared = {pair: len(found) for pair, found in joined.verified().items()} or {("no camera",) * 2: 0}
+        one, other = max(shared, key=lambda pair: shared[pair])
+        raise RefusedError(
+            f"{placed} of {len(groups)} cameras could be placed (at least {least} are needed): {one} and {other} share "
+            f"most, {max(shared.values())} places at {len(times)} times; put cameras between them, less than 30 "
+            "degrees apart, or give where they stand (--calibration FILE)."
         )
     return [picture for camera in cameras for picture in camera], model
 

@@ -19,7 +19,7 @@ from lapgs_wgpu.prepare.pan import RADIUS, Pan, rays, solve_pan
 from lapgs_wgpu.prepare.poses import Match, Reconstruction, import_pycolmap, reconstruction
 from lapgs_wgpu.progress import say
 
-FOCALS = 1.0, 0.7, 1.4  # times the width, where EXIF says nothing
+FOCALS = 1.0, 1.4, 0.7  # times the width, where EXIF says nothing
 PURE, NEARLY = 0.8, 0.6  # share of the verified matches that turning alone explains: a pan; one, if nothing else fits
 GOOD, SHARP = 0.95, 1.5e-3  # the search ends: share of the images, and the mean error in parts of the longer side
 SECONDS, SECONDS_EACH, CORES = 60.0, 2.0, 2  # of the search: for any film, and for each image, on so many cores
@@ -50,10 +50,11 @@ def search(source: Reconstruction, size: Size) -> Found | None:
     if pan is not None and pan.explained >= PURE:
         return panned(source, pan, size)
     focals = [source.prior, *FOCALS] if source.exif else list(FOCALS)
-    tries = [(f if source.exif and f == source.prior else f * size[0], way) for f in focals for way in (True, False)]
+    pixels = [f if source.exif and f == source.prior else f * size[0] for f in focals]
+    tries = [(f, way) for some in (pixels[:2], pixels[2:]) for way in (True, False) for f in some]
     best: Found | None = None
     longest, spent = 0.0, _Spent()
-    for focal, together in tries:
+    for number, (focal, together) in enumerate(tries):
         left = SECONDS + SECONDS_EACH * len(source.names) - spent.seconds
         if best is not None and left < longest:
             break
@@ -63,8 +64,8 @@ def search(source: Reconstruction, size: Size) -> Found | None:
         longest = max(longest, spent.seconds - started)
         if found is not None and (best is None or _rank(source, found) > _rank(source, best)):
             best = found
-        if best is not None and _good(source, best, size):
-            break
+        if best is not None and number and _good(source, best, size):
+            break  # the first one alone may be wrong, and no measure of it tells
         if found is not None:
             rest = max(left + started - spent.seconds, 0) * spent.slower
             more = f"{len(found.faults)} faults of the path; " * bool(found.faults)
