@@ -100,7 +100,7 @@ def test_films_of_no_use(pictures: list[np.ndarray], words: str, tmp_path: Path)
     path = write_film(tmp_path / "film.mkv", pictures)
     with pytest.raises(InputError, match=words):
         prepare([path], tmp_path / "out")
-    kept = {"images", "refused.txt", "times.json"} if "placed" in words else set()
+    kept = {"images", "refused.txt"} if "placed" in words else set()
     assert {child.name for child in tmp_path.glob("out/*")} >= kept
 
 

@@ -137,7 +137,7 @@ def path_faults(places: Floats, axes: Floats, points: Floats, names: Sequence[st
     if all(len(stem) == 8 and stem.isdecimal() for stem in stems):
         seconds = (int(stems[-1]) - int(stems[0])) / 1000
         around = (places[[0, -1]] - np.median(points, axis=0)) / away
-        speed = 2 * np.degrees(np.arcsin(min(np.linalg.norm(around[1] - around[0]) / 2, 1))) / seconds
+        speed = np.degrees(2 * np.arcsin(min(float(np.linalg.norm(around[1] - around[0])) / 2, 1.0))) / seconds
         faults += [(f"{speed:.0f} degrees a second around the scene", 0)] * bool(speed > AROUND)
     return faults
 
