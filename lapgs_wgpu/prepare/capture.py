@@ -139,7 +139,10 @@ def _moving_camera(
             f"show, over {found.pan.travel:.0f} pixels. It is placed as a pan: a panorama at one depth, what moves in "
             "front of it. Walk while you film if views from other places are wanted."
         )
-    elif len(found.placed) < WHOLE * len(names):
+    if found.held:
+        width = f"{found.focal / size[0]:.1f} of the width"
+        say(f"the film does not tell the focal length: {found.focal:.0f} pixels are taken, {width}.")
+    if found.pan is None and len(found.placed) < WHOLE * len(names):
         part = longest_part(names, found.placed, 2)
         say(
             f"only a part of the film fits together: {len(found.placed)} of {len(names)} images, {len(part)} of them "

@@ -110,11 +110,14 @@ class Reconstruction:
                     found[(one, other) if one <= other else (other, one)] = matches[:, :: 1 if one <= other else -1]
         return found
 
-    def solve(self, focal: float | None = None, *, together: bool = False, seconds: float = -1) -> Any:
+    def solve(
+        self, focal: float | None = None, *, together: bool = False, held: bool = False, seconds: float = -1
+    ) -> Any:
         """The largest reconstruction, a pycolmap.Reconstruction; None where no two images fit together.
 
         focal: length to begin with, pixels; None leaves what the database has. together: all cameras at once
-        (GLOMAP), else one after the other, for at most so many seconds.
+        (GLOMAP), else one after the other, for at most so many seconds. held: the lens stays as it begins, since a wall
+        or a far scene does not tell it.
         """
         colmap, folder = self._colmap, self.work / "models"
         shutil.rmtree(folder, ignore_errors=True)
@@ -132,12 +135,16 @@ class Reconstruction:
                 part.random_seed = SEED
             options.mapper.min_tri_angle_deg = LEAST_ANGLE
             options.mapper.track_required_tracks_per_view = 300
+            if held:
+                adjustment = options.mapper.bundle_adjustment
+                adjustment.refine_focal_length = adjustment.refine_extra_params = False
             found = colmap.global_mapping(self._database, self.images, folder, options)
         else:
             options = colmap.IncrementalPipelineOptions()
             options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = SEED
             options.min_model_size = FEWEST_IMAGES
             options.max_runtime_seconds = round(seconds)
+            options.ba_refine_focal_length = options.ba_refine_extra_params = not held
             if focal is not None:  # a film: many images from nearly one side, where COLMAP's limits are for photos
                 options.mapper.init_min_tri_angle, options.mapper.ba_local_min_tri_angle = 4, 2
                 options.mapper.filter_min_tri_angle = options.triangulation.min_angle = LEAST_ANGLE

@@ -30,7 +30,7 @@ PANORAMA = 3000  # points of a pan
 class Found(NamedTuple):
     """model: a pycolmap.Reconstruction. placed: names of its images, in the order of time. faults: of its path, by the
     images' numbers in `placed`. error: mean, pixels. focal: at the end, pixels. pan: None where the camera walks.
-    together: all cameras were placed at once."""
+    together: all cameras were placed at once. held: the focal length is not the film's, but where the search began."""
 
     model: Any
     placed: tuple[str, ...]
@@ -39,6 +39,7 @@ class Found(NamedTuple):
     focal: float
     pan: Pan | None = None
     together: bool = False
+    held: bool = False
 
 
 def search(source: Reconstruction, size: Size) -> Found | None:
@@ -51,16 +52,18 @@ def search(source: Reconstruction, size: Size) -> Found | None:
         return panned(source, pan, size)
     focals = [source.prior, *FOCALS] if source.exif else list(FOCALS)
     pixels = [f if source.exif and f == source.prior else f * size[0] for f in focals]
-    tries = [(f, way) for some in (pixels[:2], pixels[2:]) for way in (True, False) for f in some]
+    tries = [(f, True, False) for f in pixels[:2]] + [(pixels[0], way, True) for way in (True, False)]
+    tries += [(f, False, False) for f in pixels] + [(f, True, False) for f in pixels[2:]]
     best: Found | None = None
     longest, spent = 0.0, _Spent()
-    for number, (focal, together) in enumerate(tries):
+    for number, (focal, together, held) in enumerate(tries):
         left = SECONDS + SECONDS_EACH * len(source.names) - spent.seconds
         if best is not None and left < longest:
             break
         started = spent.seconds
-        model = source.solve(focal, together=together, seconds=max(left, 10) * spent.slower)
-        found = described(source, model, together=together)
+        seconds = max(left, 10) * spent.slower
+        model = source.solve(focal, together=together, held=held, seconds=seconds)
+        found = described(source, model, together=together, held=held)
         longest = max(longest, spent.seconds - started)
         if found is not None and (best is None or _rank(source, found) > _rank(source, best)):
             best = found
@@ -95,7 +98,7 @@ class _Spent:
         return max(1.0, (time.monotonic() - self._wall) / max(self.seconds, 1.0))
 
 
-def described(source: Reconstruction, model: Any, *, together: bool = False) -> Found | None:
+def described(source: Reconstruction, model: Any, *, together: bool = False, held: bool = False) -> Found | None:
     """A reconstruction, and what tells how good it is. None where it has no points."""
     if model is None or model.num_reg_images() < 2 or not model.num_points3D():
         return None
@@ -108,7 +111,7 @@ def described(source: Reconstruction, model: Any, *, together: bool = False) -> 
     if source.model == camera.model.name and abs(camera.params[3]) > BENT:
         faults.append(("a lens that no camera has", 0))
     error = float(model.compute_mean_reprojection_error())
-    return Found(model, placed, tuple(faults), error, camera.mean_focal_length(), together=together)
+    return Found(model, placed, tuple(faults), error, camera.mean_focal_length(), together=together, held=held)
 
 
 def panned(source: Reconstruction, pan: Pan, size: Size) -> Found:
@@ -141,8 +144,8 @@ def again(source: Reconstruction, found: Found, matches: Match, masks: Mapping[s
         return None if pan is None else panned(source, pan, size)
     source.use(without(matches, source.places, masks, size))
     seconds = SECONDS + SECONDS_EACH * len(source.names)
-    model = source.solve(found.focal, together=found.together, seconds=seconds)
-    return described(source, model, together=found.together)
+    model = source.solve(found.focal, together=found.together, held=found.held, seconds=seconds)
+    return described(source, model, together=found.together, held=found.held)
 
 
 def _good(source: Reconstruction, found: Found, size: Size) -> bool:
