@@ -1,11 +1,12 @@
-"""From films to poses: python benchmarks/films.py DIR prints a Markdown table (docs/own-data.md).
+"""From films to poses: python benchmarks/films.py DIR prints a Markdown table (docs/results.md).
 
 DIR holds rendered/swing_mv, eight films of still cameras whose poses are known, and hypernerf/hand, pictures of a real
 hand, which become a film. Two more rows are of a film that is rendered here: a walk past a room in which a moving board
 covers much of the picture, with the masks that are found and with black ones, which leave out nothing.
 
-python benchmarks/films.py --davis DIR [FILM ...] measures films of DAVIS 2016, JPEGImages/480p and Annotations/480p in
-DIR, against the annotated masks (docs/results.md): the mean intersection over union of all images.
+python benchmarks/films.py --davis DIR OUT [FILM ...] measures films of DAVIS 2016, JPEGImages/480p and Annotations/480p
+in DIR, against the annotated masks (docs/results.md): the mean intersection over union of all images. Captures stay in
+OUT.
 
 lapgs-prepare runs with a new HOME and nothing but its own programs on the PATH. Errors are distances of cameras from
 the true ones after the best similarity, in parts of the cameras' spread.
@@ -13,6 +14,7 @@ the true ones after the best similarity, in parts of the cameras' spread.
 
 from __future__ import annotations
 
+import resource
 import subprocess
 import sys
 import tempfile
@@ -109,40 +111,47 @@ def board(folder: Path) -> list[str]:
     ]
 
 
-def davis(folder: Path, films: list[str]) -> None:
-    """Films of 24 frames a second, named by their folders; all where none is named."""
-    print("| film | images | placed | path | moves, true | IoU | seconds |")
-    print("|---|---:|---:|---|---:|---:|---:|", flush=True)
+def _used() -> float:
+    """Processor seconds of the programs that have ended."""
+    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return usage.ru_utime + usage.ru_stime
+
+
+def davis(folder: Path, captures: Path, films: list[str]) -> None:
+    """Films of 24 frames a second, named by their folders; all where none is named. captures: new or empty folders."""
+    print("| film | images | placed | path | moves, true | IoU | seconds | of processor time |")
+    print("|---|---:|---:|---|---:|---:|---:|---:|", flush=True)
+    captures.mkdir(parents=True, exist_ok=True)
     for film in films or sorted(path.name for path in (folder / "JPEGImages/480p").iterdir()):
-        with tempfile.TemporaryDirectory() as name:
-            frames = sorted((folder / "JPEGImages/480p" / film).glob("*.jpg"))
-            path = write_film(Path(name) / "film.mp4", [np.array(Image.open(file)) for file in frames], rate=24)
-            out, started = Path(name) / "out", time.perf_counter()
-            command = [str(PROGRAMS / "lapgs-prepare"), str(path), "--out", str(out)]
-            done = subprocess.run(command, stdout=subprocess.PIPE, stderr=sys.stderr, text=True)
-            seconds = time.perf_counter() - started
-            if done.returncode:
-                print(f"| {film} | | refused | | | | {seconds:.0f} |", flush=True)
-                continue
-            faults = next(line for line in done.stdout.splitlines() if "path: " in line)
-            kind = "a pan" if "turns on the spot" in done.stdout else faults.split("path: ")[1].split(" (wanted")[0]
-            model = pycolmap.Reconstruction(str(out / "sparse" / "0"))
-            overlaps, shares = [], []
-            masks = sorted((out / "masks").glob("*.png"))
-            for file in masks:
-                number = round(int(file.stem) * 24 / 1000)
-                with Image.open(folder / "Annotations/480p" / film / f"{frames[number].stem}.png") as image:
-                    true = np.asarray(image) > 0
-                with Image.open(file) as image:
-                    found = np.asarray(image.resize(true.shape[::-1], Image.Resampling.NEAREST)) > 127
-                union = (found | true).sum()
-                overlaps.append((found & true).sum() / union if union else 1.0)
-                shares.append(true.mean())
-            print(
-                f"| {film} | {len(masks)} | {model.num_reg_images()} | {kind} | {np.mean(shares):.1%} | "
-                f"{np.mean(overlaps):.2f} | {seconds:.0f} |",
-                flush=True,
-            )
+        frames = sorted((folder / "JPEGImages/480p" / film).glob("*.jpg"))
+        path = write_film(captures / f"{film}.mp4", [np.array(Image.open(file)) for file in frames], rate=24)
+        out, started, used = captures / film, time.perf_counter(), _used()
+        command = [str(PROGRAMS / "lapgs-prepare"), str(path), "--out", str(out)]
+        done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        seconds = f"{time.perf_counter() - started:.0f} | {_used() - used:.0f}"
+        (captures / f"{film}.txt").write_text(done.stdout)
+        if done.returncode:
+            print(f"| {film} | | refused | | | | {seconds} |", flush=True)
+            continue
+        faults = next(line for line in done.stdout.splitlines() if "path: " in line)
+        kind = "a pan" if "turns on the spot" in done.stdout else faults.split("path: ")[1].split(" (wanted")[0]
+        model = pycolmap.Reconstruction(str(out / "sparse" / "0"))
+        overlaps, shares = [], []
+        masks = sorted((out / "masks").glob("*.png"))
+        for file in masks:
+            number = round(int(file.stem) * 24 / 1000)
+            with Image.open(folder / "Annotations/480p" / film / f"{frames[number].stem}.png") as image:
+                true = np.asarray(image) > 0
+            with Image.open(file) as image:
+                found = np.asarray(image.resize(true.shape[::-1], Image.Resampling.NEAREST)) > 127
+            union = (found | true).sum()
+            overlaps.append((found & true).sum() / union if union else 1.0)
+            shares.append(true.mean())
+        print(
+            f"| {film} | {len(masks)} | {model.num_reg_images()} | {kind} | {np.mean(shares):.1%} | "
+            f"{np.mean(overlaps):.2f} | {seconds} |",
+            flush=True,
+        )
 
 
 def main(data: Path) -> None:
@@ -157,6 +166,6 @@ def main(data: Path) -> None:
 
 if __name__ == "__main__":
     if sys.argv[1] == "--davis":
-        davis(Path(sys.argv[2]), sys.argv[3:])
+        davis(Path(sys.argv[2]), Path(sys.argv[3]), sys.argv[4:])
     else:
         main(Path(sys.argv[1]).absolute())

@@ -17,12 +17,16 @@ if TYPE_CHECKING:
     from lapgs_wgpu.prepare.diagnosis import Diagnosis
 
 DESCRIPTION = """\
-Convert films to a capture for lapgs-train: choose images and reconstruct the cameras. Needs no other programs, but the
-extra prepare: pip install "lapgs-wgpu[prepare]".
+Convert films or images to a capture for lapgs-train: choose images and reconstruct the cameras. Needs no other
+programs, but the extra prepare: pip install "lapgs-wgpu[prepare]".
 
   lapgs-prepare walk.mp4 --out DIR              one moving camera: a pose for each image
   lapgs-prepare a.mp4 b.mp4 c.mp4 --out DIR     several static cameras: a pose for each film; all films must start at
                                                 the same time
+  lapgs-prepare IMAGES --out DIR                a folder, zip file or pattern ("*.jpg") of one camera's images; folders
+                                                in a folder are cameras
+  lapgs-prepare cam*.mp4 --calibration FILE --out DIR   static cameras whose places are known
+  lapgs-prepare IMAGES --poses SPARSE --out DIR         one moving camera that another program placed
   lapgs-prepare walk.mp4 --out DIR --train      the same, then train a model that suits this machine and the film
   lapgs-prepare --check DIR                     measure what a capture is worth, and what to film differently
 
@@ -38,12 +42,17 @@ def options() -> Parser:
     parser = Parser("lapgs-prepare", description=DESCRIPTION, formatter_class=HelpFormatter, allow_abbrev=False)
     # fmt: off
     add = parser.add_argument
-    add("films", nargs="*", metavar="FILM", help="films, one per camera, all of the same size in pixels")
+    add("films", nargs="*", metavar="FILM", help="films, one per camera; or images, folders, patterns, zip files")
     add("--out", metavar="DIR", help="output folder for the capture; must be new or empty")
     add("--fps", type=float, help="maximum number of images per second of film [10 for a moving camera, 30 for "
         "static ones; less if a film would give more than 300 images]")
     add("--masks", metavar="DIR", help="for one moving camera: folder of PNG masks, white where something moves, "
         "with the file names of the images that an earlier run wrote; replaces the masks that are otherwise detected")
+    add("--poses", metavar="PATH", help="for one moving camera: the cameras of its images, by their names, from "
+        "COLMAP's layout (so VGGT's and MegaSaM's) or nerfstudio's; masks and diagnosis are made as usual")
+    add("--calibration", metavar="FILE", help="for static cameras: their lenses and places, from COLMAP, nerfstudio "
+        "(transforms.json), Qualisys (.qca.txt), Pose2Sim (.toml), OpenCV (.yml) or Panoptic (.json); each film is "
+        "named as its camera. Images are undistorted, and no training changes these cameras")
     add("--check", metavar="DIR", help="instead of films: measure the existing capture in DIR, of any format that "
         "lapgs-train reads, print parallax, motion, coverage, blur and exposure, and write DIR/report.html. "
         "Can be combined with --train and --minutes only")
@@ -82,7 +91,7 @@ def _prepare(arguments: list[str]) -> None:
 def check_options(given: argparse.Namespace) -> None:
     """Raises InputError for options that do not go together."""
     if given.check:
-        others = [name for name in ("out", "fps", "masks") if getattr(given, name) is not None]
+        others = [name for name in ("out", "fps", "masks", "poses", "calibration") if getattr(given, name) is not None]
         if given.films or others:
             word = given.films[0] if given.films else f"--{others[0]}"
             raise InputError(f"--check measures a capture that exists, so {word} cannot be given.")
@@ -98,16 +107,23 @@ def check_options(given: argparse.Namespace) -> None:
 
 def _convert(given: argparse.Namespace, out: Path) -> None:
     from lapgs_wgpu.prepare.capture import prepare  # after --help: numpy and Pillow take a while
+    from lapgs_wgpu.prepare.capture_folder import RefusedError
+    from lapgs_wgpu.prepare.report import write_refusal
 
-    films, masks = [Path(film) for film in given.films], Path(given.masks) if given.masks else None
-    done = prepare(films, out, fps=given.fps, masks=masks)
+    paths = {name: Path(value) for name in ("masks", "poses", "calibration") if (value := getattr(given, name))}
+    try:
+        done = prepare([Path(film) for film in given.films], out, fps=given.fps, **paths)
+    except RefusedError:
+        write_refusal(out)
+        raise
     print(f"{out}: {done.images} images, {done.placed} of {done.cameras} cameras placed", flush=True)
 
 
 def _measure(folder: Path) -> Diagnosis:
     """Print what a capture is worth, and write the report into its folder."""
+    from lapgs_wgpu.prepare.capture_folder import REPORT
     from lapgs_wgpu.prepare.diagnosis import diagnose
-    from lapgs_wgpu.prepare.report import REPORT, write_report
+    from lapgs_wgpu.prepare.report import write_report
 
     diagnosis = diagnose(folder)
     print(f"{folder}: {diagnosis}", flush=True)

@@ -17,6 +17,7 @@ from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.prepare.film import Film
 from lapgs_wgpu.prepare.hdr import Transfer, to_sdr
 from lapgs_wgpu.prepare.images import Picture, common_times, extract, extract_in_step, images_per_second
+from lapgs_wgpu.prepare.rig import shapes_of
 
 av = pytest.importorskip("av")
 
@@ -142,31 +143,34 @@ def test_a_long_film_gives_fewer_images_a_second(tmp_path: Path) -> None:
 
 def test_films_of_still_cameras_are_taken_in_step(tmp_path: Path) -> None:
     films = [Film(write_film(tmp_path / f"{n}.mkv", noise_pictures(n))) for n in (12, 18)]
-    found = extract_in_step(films, tmp_path / "images", 10)
+    found = extract_in_step(films, tmp_path / "images", 10, shapes_of(films)[1])
     for number, pictures in enumerate(found):
         names = [f"cam{number:02d}/{100 * i:08d}.jpg" for i in range(4)]
         assert [picture.name for picture in pictures] == names
         assert sorted(path.name for path in (tmp_path / f"images/cam{number:02d}").iterdir()) == [n[6:] for n in names]
-    with pytest.raises(InputError, match=r"80x48.*64x48"):
-        extract_in_step([films[0], Film(write_film(tmp_path / "w.mkv", noise_pictures(4, 80)))], tmp_path / "w", 10)
+
+
+def test_films_of_other_sizes_get_one(tmp_path: Path) -> None:
+    """Shrunk until one side is equal, then cut at the middle; what would lose half is refused."""
+
+    def film(width: int, height: int) -> Film:
+        return Film(write_film(tmp_path / f"{width}.mkv", noise_pictures(4, width, height)))
+
+    size, shapes, covering = shapes_of([film(64, 48), film(80, 48), film(128, 120)])
+    assert (size, covering) == ((64, 48), [(64, 48), (80, 48), (64, 60)])
+    assert [shape.cut[1].start for shape in shapes] == [0, 8, 0]
+    assert [shape.apply(next(film(128, 120).frames())).shape for shape in shapes[2:]] == [(48, 64, 3)]
+    with pytest.raises(InputError, match="160x48"):
+        shapes_of([film(48, 160), film(160, 48)])
 
 
 def test_common_times() -> None:
-    """Where one camera has no image for a while, and one has another rate."""
-
-    def camera(number: int, seconds: list[float]) -> list[Picture]:
-        return [Picture(f"cam{number}/{s:.3f}", s) for s in seconds]
-
-    even = [0.1 * i for i in range(20)]
-    cameras = [camera(0, even), camera(1, [s for s in even if not 0.45 < s < 0.95])]
-    cameras.append(camera(2, [0.04 * i for i in range(48)]))
-    found = common_times(cameras, 10, 5)
+    """Where one camera has no image for a while."""
+    cameras = [[Picture(f"{n}/{i}", i / 10, i) for i in range(20) if n == 0 or not 5 <= i < 9] for n in range(2)]
+    found = common_times(cameras, 5)
+    assert [[picture.name for picture in each] for each in found[:2]] == [["0/0", "1/0"], ["0/4", "1/4"]]
     assert len(found) == 5
-    for pictures in found:
-        assert [picture.name[:4] for picture in pictures] == ["cam0", "cam1", "cam2"]
-        assert np.ptp([picture.seconds for picture in pictures]) < 1e-6, "0, 0.2, ... are those of all three"
-        assert not 0.45 < pictures[0].seconds < 0.95
-    assert common_times(cameras[:2], 10, 99)[5][1].seconds == pytest.approx(1.0)
+    assert len(common_times(cameras, 99)) == 16
 
 
 @pytest.mark.parametrize(

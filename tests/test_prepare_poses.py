@@ -96,20 +96,22 @@ def test_what_a_hand_does_not_do() -> None:
     cameras = walk(20, 320, 240)
     places, axes = (np.stack(each) for each in zip(*((c.position, c.T_cam_world[2, :3]) for c in cameras), strict=True))
     points = np.random.default_rng(0).normal(size=(50, 3))
-    assert path_faults(places, axes, points) == []
+    names, fast = ([f"{step * i:08d}.jpg" for i in range(20)] for step in (100, 20))
+    assert "a second" in path_faults(places, axes, points, fast)[0][0]
+    assert path_faults(places, axes, points, names) == []
     jump = places + np.where(np.arange(20) >= 9, 3.0, 0.0)[:, None]
-    assert [i for what, i in path_faults(jump, axes, points) if "step" in what] == [9]
+    assert [i for what, i in path_faults(jump, axes, points, names) if "step" in what] == [9]
     turned = axes.copy()
     turned[14:] = turned[14:] @ Rotation.from_euler("z", 50, degrees=True).as_matrix()
-    assert [i for what, i in path_faults(places, turned, points) if "turn" in what] == [14]
+    assert [i for what, i in path_faults(places, turned, points, names) if "turn" in what] == [14]
     back = places.copy()
     back[12:] = places[10:2:-1]
-    assert [i for what, i in path_faults(back, axes, points) if "back" in what] == [11]
+    assert [i for what, i in path_faults(back, axes, points, names) if "back" in what] == [11]
     stalled = places.copy()
     stalled[5:9] = places[5]
-    assert [i for what, i in path_faults(stalled, axes, points) if "stalls" in what] == [5]
+    assert [i for what, i in path_faults(stalled, axes, points, names) if "stalls" in what] == [5]
     shaken = places[0] + np.random.default_rng(1).normal(size=(20, 3)) * 1e-4  # of a tripod
-    assert path_faults(shaken, axes, points) == []
+    assert path_faults(shaken, axes, points, names) == []
 
 
 def test_the_part_that_fits() -> None:
@@ -133,5 +135,5 @@ def test_nearest_descriptors() -> None:
 
 @pytest.mark.parametrize(("rate", "seconds", "images"), [(24, 2.5, 24), (24, 4.3, 12), (30, 20, 10), (60, 3, 20)])
 def test_a_short_film_gives_more_images(rate: float, seconds: float, images: float) -> None:
-    film = SimpleNamespace(rate=float(rate), seconds=float(seconds))
+    film = SimpleNamespace(rate=float(rate), seconds=float(seconds), keeps_all=False)
     assert images_per_second([film], None) == images  # type: ignore[list-item]

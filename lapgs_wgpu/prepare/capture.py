@@ -11,30 +11,27 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lapgs_wgpu.data.images import Size, check_image
+from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.masks import Mask, check_mask_folder
+from lapgs_wgpu.data.readers.calibration import match_names, read_calibration
 from lapgs_wgpu.data.readers.colmap import IMAGES, SPARSE
 from lapgs_wgpu.data.timestamps import write_times
 from lapgs_wgpu.errors import InputError
-from lapgs_wgpu.prepare.capture_folder import appearing
+from lapgs_wgpu.prepare.capture_folder import WORK, RefusedError, appearing
 from lapgs_wgpu.prepare.film import Film
 from lapgs_wgpu.prepare.flow import Motion, film_frames
-from lapgs_wgpu.prepare.images import Picture, common_times, extract, extract_in_step, images_per_second
+from lapgs_wgpu.prepare.images import Picture, extract, images_per_second
+from lapgs_wgpu.prepare.inputs import open_inputs
 from lapgs_wgpu.prepare.masks import MASKS, read_masks, write_masks
+from lapgs_wgpu.prepare.measures import Floats
 from lapgs_wgpu.prepare.movers import cut_out, judge, rim, without
-from lapgs_wgpu.prepare.poses import (
-    Match,
-    Reconstruction,
-    import_cv2,
-    import_pycolmap,
-    merged,
-    neighbouring_pairs,
-)
-from lapgs_wgpu.prepare.search import Found, again, longest_part, search
+from lapgs_wgpu.prepare.poses import Match, Reconstruction, import_cv2, import_pycolmap, neighbouring_pairs
+from lapgs_wgpu.prepare.rig import place_calibrated, place_still
+from lapgs_wgpu.prepare.search import Found, again, described, longest_part, search
 from lapgs_wgpu.progress import say
 
-TIMES = 8  # at which still cameras are compared
 # Square pixels: a lens with more freedom bends until things that move seem to stand still.
-LENS, FEW_CAMERAS_LENS = "RADIAL", "SIMPLE_RADIAL"  # few images do not determine more parameters
+LENS = "RADIAL"
 FEWEST, WHOLE = 0.3, 0.9  # of the images need a pose; of fewer than this only a part of the film fits
 LITTLE, MUCH = 0.002, 0.1  # share of the images: less motion needs no masks; more may have led the cameras astray
 FOLLOWED, UNKNOWN = 0.8, 0.2  # share of the image area where flow must tell whether it moves; less makes no masks
@@ -50,58 +47,91 @@ class Prepared(NamedTuple):
     cameras: int
 
 
-def prepare(videos: Sequence[Path], out: Path, *, fps: float | None = None, masks: Path | None = None) -> Prepared:
-    """Make a capture of one film of a moving camera, or of the films of several cameras that stand still.
+def prepare(
+    inputs: Sequence[Path],
+    out: Path,
+    *,
+    fps: float | None = None,
+    masks: Path | None = None,
+    poses: Path | None = None,
+    calibration: Path | None = None,
+) -> Prepared:
+    """Make a capture of what one moving camera recorded, or several cameras that stand still.
 
-    out: a new or empty folder for images/, times.json, sparse/0 and masks/; it appears when all of it is there.
+    inputs: films, images, folders, patterns or zip files (`open_inputs`).
+    out: a new or empty folder, or one whose capture was refused; it gets the capture when all of it is there.
     fps: images a second, at most; None lets the length of the films decide.
     masks: folder with a mask of what moves for each image of a moving camera; None to find them in the film.
-    Raises InputError.
+    poses: cameras of the images of a moving camera, by their names (`read_calibration`); None to find them.
+    calibration: the same of cameras that stand still.
+    Raises InputError. Where images were taken already, these, and what was found, stay in `out`.
     """
     if fps is not None and not 0 < fps <= 1000:
         raise InputError(f"--fps must be above 0 and at most 1000, got {fps:g}.")
-    if masks is not None and len(videos) > 1:
-        raise InputError("--masks goes with one moving camera; cameras that stand still need no masks.")
     if masks is not None:
         check_mask_folder(masks, "each image")
     import_pycolmap()
     import_cv2()
-    films = [Film(video) for video in videos]
-    rate = images_per_second(films, fps)
     with appearing(out) as folder:
-        work = folder / "colmap"
-        if len(films) > 1:
-            cameras = extract_in_step(films, folder / IMAGES, rate)
-            pictures = [picture for camera in cameras for picture in camera]
-            wanted, model = len(films), _still_cameras(folder / IMAGES, cameras, rate, work)
+        work = folder / WORK
+        films = open_inputs(inputs, work)
+        of_one = [option for option, given in (("--masks", masks), ("--poses", poses)) if given is not None]
+        if of_one and len(films) > 1:
+            raise InputError(f"{of_one[0]} goes with one moving camera, and there are {len(films)} films.")
+        if calibration is not None and len(films) == 1:
+            raise InputError("--calibration goes with several cameras; --poses gives those of one that moves.")
+        rate = images_per_second(films, fps)
+        if calibration is not None:
+            pictures, placed = place_calibrated(films, folder, rate, calibration), len(films)
+        elif len(films) > 1:
+            pictures, model = place_still(films, folder / IMAGES, rate, work)
+            placed = write_model(folder, model, pictures)
         else:
             pictures = extract(films[0], folder / IMAGES, rate)
-            wanted, model = len(pictures), _moving_camera(films[0], folder, pictures, masks, work)
-        placed = model.num_reg_images()
-        write_times(folder, {picture.name: picture.seconds for picture in pictures})
-        (folder / SPARSE / "0").mkdir(parents=True)
-        model.write_binary(str(folder / SPARSE / "0"))
-        shutil.rmtree(work)
-    return Prepared(len(pictures), placed, wanted)
+            model = _moving_camera(films[0], folder, pictures, masks, poses, work)
+            placed = write_model(folder, model, pictures)
+        shutil.rmtree(work, ignore_errors=True)
+    return Prepared(len(pictures), placed, len(films) if len(films) > 1 else len(pictures))
 
 
-def _moving_camera(film: Film, folder: Path, pictures: Sequence[Picture], masks: Path | None, work: Path) -> Any:
-    """The pycolmap.Reconstruction; writes masks of what moves. masks: the user's; None to find them."""
+def write_model(folder: Path, model: Any, pictures: Sequence[Picture]) -> int:
+    """Write times.json and a pycolmap.Reconstruction, and return the number of its images."""
+    write_times(folder, {picture.name: picture.seconds for picture in pictures})
+    (folder / SPARSE / "0").mkdir(parents=True)
+    model.write_binary(str(folder / SPARSE / "0"))
+    return int(model.num_reg_images())
+
+
+def _moving_camera(
+    film: Film, folder: Path, pictures: Sequence[Picture], masks: Path | None, poses: Path | None, work: Path
+) -> Any:
+    """The pycolmap.Reconstruction; writes masks of what moves. masks, poses: the user's; None to find them."""
     names = [picture.name for picture in pictures]
     size = check_image(folder / IMAGES / names[0], whole=False).size
     given = None if masks is None else read_masks(masks, names, size)
-    source = Reconstruction(folder / IMAGES, names, work, LENS)
+    known = None if poses is None else _known(names, poses, size)
+    lenses = "SINGLE" if known is None or len(set(known[0].values())) == 1 else "PER_IMAGE"
+    source = Reconstruction(folder / IMAGES, names, work, LENS if known is None else "OPENCV", lenses)
     matches = source.match(neighbouring_pairs(names), source.find_features())
     if given is not None:
         rest = without(matches, source.places, given, size)
         before, after = (sum(map(len, each.values())) for each in (matches, rest))
         say(f"{masks}: {1 - after / max(before, 1):.0%} of the matches are masked.")
         source.use(rest)
-    found = search(source, size)
-    found = _checked(source, found, size)
+    if known is not None:
+        found = described(source, source.given(*known))
+        if found is None:
+            raise RefusedError(f"{poses}: what {len(known[0])} images show fits none of its cameras; give their own.")
+        say(f"{poses}: {len(found.placed)} of {len(names)} images have cameras, {found.error:.2f} pixels off (mean).")
+    else:
+        found = _checked(source, search(source, size), size, folder, pictures)
     if given is None:
         motion = Motion(film_frames(film, pictures), len(pictures))
-        found, given = _without_movers(source, found, motion, matches, size)
+        if known is not None:
+            seen = judge(motion, names, found.model)
+            given = cut_out(motion, names, seen) if seen.followed > UNKNOWN else {}
+        else:
+            found, given = _without_movers(source, found, motion, matches, size)
     write_masks(folder / MASKS, given)
     if found.pan is not None:
         say(
@@ -109,13 +139,30 @@ def _moving_camera(film: Film, folder: Path, pictures: Sequence[Picture], masks:
             f"show, over {found.pan.travel:.0f} pixels. It is placed as a pan: a panorama at one depth, what moves in "
             "front of it. Walk while you film if views from other places are wanted."
         )
-    elif len(found.placed) < WHOLE * len(names):
+    if found.held:
+        width = f"{found.focal / size[0]:.1f} of the width"
+        say(f"the film does not tell the focal length: {found.focal:.0f} pixels are taken, {width}.")
+    if found.pan is None and len(found.placed) < WHOLE * len(names):
         part = longest_part(names, found.placed, 2)
         say(
             f"only a part of the film fits together: {len(found.placed)} of {len(names)} images, {len(part)} of them "
             f"in a row from {part[0]} to {part[-1]}; the training leaves out the others."
         )
     return found.model
+
+
+def _known(names: Sequence[str], poses: Path, size: Size) -> tuple[dict[str, Lens], dict[str, Floats]]:
+    """Lens and pose of the images that have a camera of their name. Raises InputError."""
+    cameras = read_calibration(poses)
+    found = match_names(cameras, names)
+    if len(found) < 2:
+        raise InputError(
+            f"{poses} has {len(cameras)} cameras, such as {next(iter(cameras))[:80]}, and {len(found)} of {len(names)} "
+            f"images, such as {names[0]}, have one of their name; give the images for which it was made in place of "
+            "the film."
+        )
+    lenses = {name: cameras[camera].lens_for(size) for name, camera in found.items()}
+    return lenses, {name: cameras[camera].T_cam_world for name, camera in found.items()}
 
 
 def _without_movers(
@@ -150,44 +197,36 @@ def _without_movers(
     return found, cut_out(motion, source.names, seen) if seen.followed > UNKNOWN else {}
 
 
-def _checked(source: Reconstruction, found: Found | None, size: Size) -> Found:
-    """Raises InputError where too few images have a pose, and for a camera that neither walks nor turns."""
+def _checked(
+    source: Reconstruction, found: Found | None, size: Size, folder: Path, pictures: Sequence[Picture]
+) -> Found:
+    """Raises RefusedError where too few images have a pose, whose cameras are written, and for a camera that neither
+    walks nor turns."""
     placed, least = len(found.placed) if found else 0, max(2, round(FEWEST * len(source.names)))
     if found is None or placed < least:
         features = int(np.median([len(places) for places in source.places.values()]))
         verified = source.verified()
-        shared = int(np.median([len(verified.get(pair, ())) for pair in itertools.pairwise(source.names)]))
+        shared = [len(verified.get(pair, ())) for pair in itertools.pairwise(source.names)]
         advice = "film more of what stands still, or mask what moves (--masks)"
         if features < FEATURES:
             advice = "film something with more texture, in focus and with more light"
-        elif shared < SHARED:
+        elif np.median(shared) < SHARED:
             advice = "film slower, so that an image shows most of what the one before it shows"
-        raise InputError(
+        part = ""
+        if found is not None:
+            write_model(folder, found.model, pictures)
+            whole = longest_part(source.names, found.placed, 2)
+            part = f"; what fits together are {len(whole)} images from {whole[0]} to {whole[-1]}"
+        worst = int(np.argmin(shared))
+        raise RefusedError(
             f"{placed} of {len(source.names)} images could be placed (at least {least} are needed): an image has "
-            f"{features} features, of which {shared} fit the next image (medians); {advice}."
+            f"{features} features, of which {np.median(shared):.0f} fit the next image (medians), fewest, "
+            f"{shared[worst]}, from {source.names[worst]} to {source.names[worst + 1]}{part}; {advice}."
         )
     if found.pan is not None and found.pan.travel < STANDING * max(size):
-        raise InputError(
+        raise RefusedError(
             f"the camera stands still: its image moves by {found.pan.travel:.1f} pixels over the film (at least "
             f"{STANDING * max(size):.1f} are needed), so nothing tells how far away anything is; walk around what "
             "moves, or film it with several cameras at once."
         )
     return found
-
-
-def _still_cameras(images: Path, cameras: Sequence[Sequence[Picture]], fps: float, work: Path) -> Any:
-    """Compare all cameras at several times. Returns the pycolmap.Reconstruction. Raises InputError."""
-    times = [[picture.name for picture in each] for each in common_times(cameras, fps, TIMES)]
-    groups = list(zip(*times, strict=True))  # of each camera
-    names = [name for group in groups for name in group]
-    source = Reconstruction(images, names, work, FEW_CAMERAS_LENS)
-    pairs = [pair for names in times for pair in itertools.combinations(names, 2)]
-    matches = source.match(pairs, source.find_features())
-    model = merged(source, matches, groups, work / "merged").solve()
-    placed, least = 0 if model is None else model.num_reg_images(), max(2, len(groups) // 2)
-    if placed < least:
-        raise InputError(
-            f"{placed} of {len(groups)} cameras could be placed (at least {least} are needed): put them closer "
-            "together, so that neighbours show the same things from sides that differ by less than 30 degrees."
-        )
-    return model

@@ -8,12 +8,21 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from lapgs_wgpu.data.load import READERS
+from lapgs_wgpu.data.readers.colmap import IMAGES, SPARSE
+from lapgs_wgpu.data.timestamps import TIMES
 from lapgs_wgpu.errors import InputError, quoted
 from lapgs_wgpu.io.atomic import move
 from lapgs_wgpu.io.folder_lock import LOCK, locked_folder
 from lapgs_wgpu.io.listing import listed
+from lapgs_wgpu.prepare.masks import MASKS
 
-UNFINISHED = ".unfinished"
+REPORT = "report.html"
+
+UNFINISHED, WORK, REFUSED = ".unfinished", "work", "refused.txt"
+
+
+class RefusedError(InputError):
+    """Too few cameras could be placed. What was found stays."""
 
 
 @contextmanager
@@ -22,7 +31,8 @@ def appearing(out: Path) -> Iterator[Path]:
 
     The folder is made inside `out`, so `out` may be the current folder, a link or a mount. An exception removes the
     folder, and `out` too if it is new. Raises InputError if `out` is not empty, if another process writes to it, or if
-    the contents cannot be moved: then they stay, and the error says where.
+    the contents cannot be moved: then they stay, and the error says where. What a refused capture left in `out` is
+    replaced, and stays until then.
     """
     _check_empty(out)
     partial = out / UNFINISHED
@@ -30,12 +40,20 @@ def appearing(out: Path) -> Iterator[Path]:
         _check_empty(out)
         shutil.rmtree(partial, ignore_errors=True)  # of a process that was killed
         partial.mkdir()
+        refused = None
         try:
             yield partial
+        except RefusedError as error:
+            refused = str(error)
+            shutil.rmtree(partial / WORK, ignore_errors=True)
+            (partial / REFUSED).write_text(refused, encoding="utf-8")
         except BaseException:
             shutil.rmtree(partial, ignore_errors=True)
             raise
         try:
+            if (out / REFUSED).is_file():
+                for name in (IMAGES, SPARSE, TIMES, MASKS, REPORT, REFUSED):
+                    shutil.rmtree(out / name) if (out / name).is_dir() else (out / name).unlink(missing_ok=True)
             for child in sorted(partial.iterdir()):
                 move(child, out / child.name)
             partial.rmdir()
@@ -44,9 +62,16 @@ def appearing(out: Path) -> Iterator[Path]:
                 f"{partial} holds the finished capture, which could not be moved to {out} ({error.strerror or error}); "
                 "move what is in it to a folder of your choice."
             ) from None
+        if refused is not None:
+            raise RefusedError(
+                f"{refused} Images and what was found stay in {out}: the same command goes on there, with --masks or "
+                "--poses for these images if you have any."
+            )
 
 
 def _check_empty(out: Path) -> None:
+    if (out / REFUSED).is_file():
+        return
     if out.is_dir() and not {entry.name for entry in listed(out)} - {UNFINISHED, LOCK}:
         return
     if out.is_dir() and any(reader.matches(out) for reader in READERS):

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,51 +22,49 @@ from lapgs_wgpu.data.video_frames import (
     pixel_aspect,
 )
 from lapgs_wgpu.errors import InputError
-from lapgs_wgpu.prepare.hdr import Transfer, to_sdr, transfer_of
+from lapgs_wgpu.prepare.hdr import to_sdr, transfer_of
 
 _FAST_BILINEAR = 0x1  # of swscale: exact enough for a thumbnail
 _ATTACHED_PICTURE = 0x400  # libavformat's flag of a cover image
 
 
-@dataclass(frozen=True, eq=False)
-class FilmFrame:
-    """A decoded frame. seconds: since the film's first frame. gray: (h, w) float32, levels 0 to 255, upright, longer
-    side THUMBNAIL at most."""
+class Frame(NamedTuple):
+    """seconds: since the first frame. gray: (h, w) float32, levels 0 to 255, upright, longer side THUMBNAIL at most.
+    pixels: (H, W, 3) RGB, upright, shrunk to at most so many pixels of the longer side. name: of its file, of which its
+    image gets the name and the tags `exif`."""
 
     seconds: float
     gray: NDArray[np.float32]
-    _frame: Any
-    _size: Size  # of square pixels, not yet turned
-    _display: Display
-    _transfer: Transfer | None
+    pixels: Callable[[int], Pixels]
+    name: str = ""
+    exif: bytes = b""
 
-    def pixels(self, longer_side: int) -> Pixels:
-        """(H, W, 3) RGB, upright, shrunk to at most `longer_side` pixels."""
-        width, height = shrunk_size(self._size, longer_side)
-        if self._transfer is None:
-            image = self._frame.to_ndarray(format="rgb24", width=width, height=height, interpolation=EXACT_COLORS)
-        else:
-            deep = self._frame.to_ndarray(format="rgb48le", width=width, height=height, interpolation=EXACT_COLORS)
-            image = to_sdr(deep, self._transfer)
-        return self._display.apply(image)
+
+def _pixels(frame: Any, size: Size, shape: Display, longer_side: int) -> Pixels:
+    """size: of the frame's square pixels, not yet turned."""
+    width, height = shrunk_size(size, longer_side)
+    transfer = transfer_of(frame)
+    form = "rgb24" if transfer is None else "rgb48le"
+    image = frame.to_ndarray(format=form, width=width, height=height, interpolation=EXACT_COLORS)
+    return shape.apply(image if transfer is None else to_sdr(image, transfer))
 
 
 class Film:
     """A film whose header was checked.
 
     size: (width, height) of the upright frames, in pixels that are square. seconds: length as the header states it, 0
-    if it does not. rate: frames a second, about.
+    if it does not. rate: frames a second, about. keeps_all: whether somebody chose the frames already.
     notes: what the user should know of the file, one sentence each; `frames` adds to them while it decodes.
     """
+
+    keeps_all = False
 
     def __init__(self, path: Path) -> None:
         """Read the header. Raises InputError."""
         self.path = path
         self.notes: list[str] = []
-        if path.is_dir():
-            raise InputError(f"{path} is a folder; name the film itself, or the films of all cameras one by one.")
         if not path.is_file():
-            raise InputError(f"{path} does not exist; name the films of the capture.")
+            raise InputError(f"{path} does not exist; check its name, and the folder {path.parent.resolve()}.")
         av = import_av(path)
         try:
             with av.open(str(path), metadata_errors="replace") as file:
@@ -85,7 +83,7 @@ class Film:
             )
         self.size: Size = _squared(coded, self._aspect)  # turned by `frames` where the first frame says so
 
-    def frames(self) -> Iterator[FilmFrame]:
+    def frames(self) -> Iterator[Frame]:
         """Decode the frames in the order of their times. Raises InputError; a film that is damaged after its first
         frames ends there, with a note."""
         av = import_av(self.path)
@@ -113,7 +111,7 @@ class Film:
                         guessed, seconds = True, last + 1 / rate
                     seconds = max(seconds, 0.0)
                     gray = _gray(frame, shown, shape)
-                    yield FilmFrame(seconds, gray, frame, shown, shape, transfer_of(frame))
+                    yield Frame(seconds, gray, partial(_pixels, frame, shown, shape))
                     number, last = number + 1, seconds
         except (av.error.FFmpegError, OSError) as error:
             if number < 2:
@@ -122,7 +120,10 @@ class Film:
                 f"{self.path} is damaged after {number} frames, at {last:.2f} s ({error}); what comes before is used."
             )
         if number < 2:
-            raise InputError(f"{self.path} has {number} frames; a film of something that moves is needed.")
+            raise InputError(
+                f"{self.path} has {number} frames that can be decoded, and 2 are needed at least; give the recording "
+                "itself, not its preview or a single picture."
+            )
         if self.seconds > last + max(3 / rate, 0.1 * self.seconds):
             self.notes.append(
                 f"{self.path} states {self.seconds:.1f} s and ends after {last:.1f} s; copy it again if the rest is "

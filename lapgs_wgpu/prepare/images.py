@@ -9,12 +9,15 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 
-from lapgs_wgpu.data.images import size_text
-from lapgs_wgpu.data.thumbnails import blurred, repeats, sharpness
+from lapgs_wgpu.data.evenly import evenly
+from lapgs_wgpu.data.images import Pixels
+from lapgs_wgpu.data.thumbnails import EQUAL, blurred, repeats, sharpness
 from lapgs_wgpu.errors import InputError
-from lapgs_wgpu.prepare.film import Film, FilmFrame
+from lapgs_wgpu.prepare.film import Film, Frame
+from lapgs_wgpu.prepare.poses import import_cv2
 from lapgs_wgpu.progress import Progress, say
 
 FRAMES_PER_SECOND = 10.0  # of one moving camera: poses change slowly
@@ -27,25 +30,45 @@ JPEG_QUALITY = 95
 
 
 class Picture(NamedTuple):
-    """A written image. name: below images/. seconds: since the first frame of its film."""
+    """A written image. name: below the images' folder. seconds: since the first frame of its film. span: number of its
+    span of time, which is that of the other cameras' images of this time."""
 
     name: str
     seconds: float
+    span: int = 0
+
+
+class Shape(NamedTuple):
+    """How the frames of a camera become images of one size. shrunk: longer side of the frames, pixels. cut: rows and
+    columns of the shrunk frame. bent: (H, W, 2) places in the shrunk frame of the image's pixels, to undistort it."""
+
+    shrunk: int
+    cut: tuple[slice, slice] = (slice(None), slice(None))
+    bent: NDArray[np.float32] | None = None
+
+    def apply(self, frame: Frame) -> Pixels:
+        image = frame.pixels(self.shrunk)
+        if self.bent is None:
+            return image[self.cut]
+        cv2 = import_cv2()
+        return cv2.remap(image, self.bent[..., 0], self.bent[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
 def images_per_second(films: Sequence[Film], asked: float | None) -> float:
     """As asked, else so many that the shortest film gives at most MOST_IMAGES: several films have one rate."""
     if asked is not None:
         return asked
-    usual = STILL_FRAMES_PER_SECOND
+    usual = min(STILL_FRAMES_PER_SECOND, *(film.rate for film in films))
     if len(films) == 1:  # a short film gives more, each one of the same number of frames
         frames = films[0].rate * films[0].seconds
         usual = max(FRAMES_PER_SECOND, films[0].rate / max(1, math.ceil(frames / LEAST_IMAGES - 1e-6)))
+        usual = films[0].rate if films[0].keeps_all else usual
     return min(usual, MOST_IMAGES / max(min(film.seconds for film in films), 1e-3))
 
 
 def extract(film: Film, images: Path, fps: float) -> list[Picture]:
-    """Write the images of a camera that moves, at most `fps` a second, whose names are their times in milliseconds.
+    """Write the images of a camera that moves, at most `fps` a second, whose names are their files', else their times
+    in milliseconds.
 
     Raises InputError for a film that is black or gives less than 2 images.
     """
@@ -58,37 +81,36 @@ def extract(film: Film, images: Path, fps: float) -> list[Picture]:
             repeated += 1
             continue
         before = span.best.gray
-        pictures.append(_write(span.best, images, ""))
+        pictures.append(_write(span, span.best, images, "", Shape(LONGER_SIDE)))
         sharp.append(span.sharpness)
     kept = [picture for picture, soft in zip(pictures, blurred(np.array(sharp)), strict=True) if not soft]
     for picture in set(pictures) - set(kept):
         (images / picture.name).unlink()
     if len(kept) < 2:
+        advice = f"nothing moves in it, by more than {EQUAL} of 255 levels: give the part of the recording that does"
+        if not repeated:
+            advice = f"it is {film.seconds:.2g} s long: give a longer one, or a larger --fps"
         raise InputError(
-            f"{film.path} gives {len(kept)} images at {fps:g} a second ({frames} frames, {repeated} of them repeat "
-            "another); film something that moves, for at least a few seconds."
+            f"{film.path} gives {len(kept)} images at {fps:g} a second ({frames} frames, of which {repeated} repeat "
+            f"another); {advice}."
         )
     _tell(film, f"{len(kept)} images of {frames} frames, the sharpest of each {1 / fps:.2g} s; left out: {repeated} "
                 f"repeated, {len(pictures) - len(kept)} blurred")  # fmt: skip
     return kept
 
 
-def extract_in_step(films: Sequence[Film], images: Path, fps: float) -> list[list[Picture]]:
+def extract_in_step(films: Sequence[Film], images: Path, fps: float, shapes: Sequence[Shape]) -> list[list[Picture]]:
     """Write the images of cameras that stand still, below cam00, cam01, ...: as many of each, of the same times.
 
-    None is left out, and all films end with the shortest. Raises InputError for films of different sizes.
+    None is left out, and all films end with the shortest.
     """
     cameras = []
-    for number, film in enumerate(films):
-        pictures = [_write(span.first, images, f"cam{number:02d}/") for span in _spans(film, fps)]
-        _tell(film, f"{len(pictures)} images, one of each {1 / fps:.2g} s")
-        if film.size != films[0].size:
-            raise InputError(
-                f"{film.path} is {size_text(film.size)} pixels and {films[0].path} is {size_text(films[0].size)}; film "
-                "with one size."
-            )
+    for number, (film, shape) in enumerate(zip(films, shapes, strict=True)):
+        pictures = [_write(span, span.first, images, f"cam{number:02d}/", shape) for span in _spans(film, fps)]
+        _tell(film, f"cam{number:02d}, {len(pictures)} images, one of each {1 / fps:.2g} s")
         cameras.append(pictures)
     ends = [pictures[-1].seconds for pictures in cameras]
+    say(f"the first frames of all {len(films)} films are taken to be of one moment.")
     if max(ends) > min(ends) + 1 / fps:
         say(f"the films are {min(ends):.2f} to {max(ends):.2f} s long; all are cut to {min(ends):.2f} s.")
     for pictures in cameras:
@@ -97,29 +119,20 @@ def extract_in_step(films: Sequence[Film], images: Path, fps: float) -> list[lis
     return cameras
 
 
-def common_times(cameras: Sequence[Sequence[Picture]], fps: float, most: int) -> list[tuple[Picture, ...]]:
-    """At most `most` times that all cameras filmed, in order: a picture of each camera.
-
-    A time is that of a picture of the first camera to which each other one has a picture less than half a span away.
-    Of each equal share of the times the one is taken whose pictures are closest together.
-    """
-    times = [np.array([picture.seconds for picture in pictures]) for pictures in cameras]
-    found: list[tuple[float, tuple[Picture, ...]]] = []
-    for now in times[0].tolist():
-        nearest = [int(np.abs(own - now).argmin()) for own in times]
-        apart = max(abs(float(own[i]) - now) for own, i in zip(times, nearest, strict=True))
-        if apart < 0.5 / fps:
-            found.append((apart, tuple(pictures[i] for pictures, i in zip(cameras, nearest, strict=True))))
-    shares = np.array_split(np.arange(len(found)), min(most, len(found)))
-    return [found[min(share, key=lambda i: (round(found[i][0], 4), i))][1] for share in shares]
+def common_times(cameras: Sequence[Sequence[Picture]], most: int) -> list[tuple[Picture, ...]]:
+    """At most `most` times that all cameras filmed, in order: a picture of each camera."""
+    of_span = [{picture.span: picture for picture in pictures} for pictures in cameras]
+    shared = sorted(set.intersection(*(set(own) for own in of_span)))
+    return [tuple(own[span] for own in of_span) for span in evenly(shared, most)]
 
 
 @dataclass
 class _Span:
     """The frames of one span of time: the first and the sharpest of them, how sharp that is, and their number."""
 
-    first: FilmFrame
-    best: FilmFrame
+    number: int
+    first: Frame
+    best: Frame
     sharpness: float
     frames: int = 1
 
@@ -140,26 +153,26 @@ def _spans(film: Film, fps: float) -> Iterator[_Span]:
                     yield span
                     if math.floor(frame.seconds) > math.floor(span.first.seconds):
                         progress.at(math.floor(frame.seconds))
-                number, span = now, _Span(frame, frame, value)
+                number, span = now, _Span(now, frame, frame, value)
                 continue
             if value > span.sharpness:
                 span.best, span.sharpness = frame, value
             span.frames += 1
     if brightest < BLACK:
         raise InputError(
-            f"{film.path} is black: its brightest frame has a mean of {brightest:.1f} of 255 levels; film with light, "
-            "without a lens cap."
+            f"{film.path} is black: its brightest frame has a mean of {brightest:.1f} of 255 levels, and {BLACK:g} are "
+            "needed; film with more light."
         )
     if span is not None:
         yield span
 
 
-def _write(frame: FilmFrame, images: Path, prefix: str) -> Picture:
+def _write(span: _Span, frame: Frame, images: Path, prefix: str, shape: Shape) -> Picture:
     """Write a JPEG image. prefix: of its name, such as "cam00/"."""
-    name = f"{prefix}{round(1000 * frame.seconds):08d}.jpg"
+    name = f"{prefix}{frame.name or f'{round(1000 * frame.seconds):08d}'}.jpg"
     (images / name).parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(frame.pixels(LONGER_SIDE)).save(images / name, quality=JPEG_QUALITY, subsampling=0)
-    return Picture(name, frame.seconds)
+    Image.fromarray(shape.apply(frame)).save(images / name, quality=JPEG_QUALITY, subsampling=0, exif=frame.exif)
+    return Picture(name, frame.seconds, span.number)
 
 
 def _tell(film: Film, what: str) -> None:

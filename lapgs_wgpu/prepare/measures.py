@@ -18,16 +18,33 @@ from lapgs_wgpu.prepare.masks import Mask
 from lapgs_wgpu.splat.camera import Camera
 
 MOST_CAMERAS = 48  # between which angles are measured
-PARALLAX = 5.0  # degrees; half a pixel of a phone's image is then 1 % of the depth
-SPAN = 20.0  # degrees around what moves
-CAMERAS = 3.0  # that see what moves at one time
-LITTLE, MUCH = 0.01, 0.5  # share of the images that moves
+LITTLE = 0.01  # share of the images that moves, at least
 SEEN = 0.002  # share of an image that moves, from which on it shows something that does
-BLUR = 0.45  # Crete et al.'s measure, of images of 320 pixels
-STOPS = 0.3  # of exposure, between the darkest and the brightest images
 STEP, TURN = 8.0, 8.0  # of a path: largest step and turn over their medians
+AROUND = 75.0  # degrees a second, around the middle of the scene, at most
 FEWEST_OF_PATH, NAMED = 8, 3  # images whose path is judged; faults that are named
 POINTS_SEEN = 30  # in an image whose exposure is measured
+ANY = float("inf")
+
+# Least and most, the same as a text, and what to film differently. Half a pixel of a phone's image is 1 % of the depth
+# at 5 degrees.
+WANTED: dict[str, tuple[float, float, str, str]] = {
+    "parallax": (5.0, ANY, "5 or more",
+        "walk around what moves instead of turning on the spot, or put the cameras further apart: depth is a guess"),
+    "path": (0, 0, f"no step above {STEP:g} and no turn above {TURN:g} times the usual one, no doubling back or stall, "
+        f"at most {AROUND:g} degrees a second around the scene",
+        "the cameras are likely wrong there: cut the film at these images, or film that part more slowly"),
+    "moving share": (LITTLE, 0.5, "1% to 50%",
+        "leave more of what stands still in the picture, since the cameras are placed by that"),
+    "cameras": (3.0, ANY, "3 or more",
+        "aim more cameras at what moves: where less than three see it, its place in depth is a guess"),
+    "coverage": (20.0, ANY, "20 or more",
+        "walk further around what moves: its other sides stay empty, and few views of each side tell its depth"),
+    "blur": (0, 0.45, "0.45 or less",
+        "move more slowly, use more light or a shorter exposure, and lock the focus"),
+    "exposure": (0, 0.3, "0.3 stops or less",
+        "lock exposure and white balance; or train with --exposure.enabled true, which corrects each image's colors"),
+}  # fmt: skip
 
 Floats = NDArray[np.float64]
 
@@ -51,8 +68,11 @@ class Measure:
         )
 
 
-def not_measured(name: str, threshold: str, why: str) -> Measure:
-    return Measure(name, float("nan"), "not measured", threshold, None, why)
+def measured(wanted: str, number: float, value: str, advice: str = "", name: str = "") -> Measure:
+    """A number judged by a row of WANTED; NaN where it cannot be measured, for the reason `advice`."""
+    least, most, threshold, usual = WANTED[wanted]
+    good = None if np.isnan(number) else bool(least <= number <= most)
+    return Measure(name or wanted, float(number), value, threshold, good, advice or usual)
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,21 +105,16 @@ def parallax(cameras: Sequence[Camera], points: Floats) -> Measure:
         least = np.fmin(least, np.fmin.reduce(cosines, axis=0))
     several = seen.sum(axis=0) > 1
     degrees = float(np.median(np.degrees(np.arccos(np.clip(least[several], -1, 1))))) if several.any() else 0.0
-    return Measure(
-        "parallax",
-        degrees,
-        f"{degrees:.1f} degrees between the two cameras furthest apart that see a point",
-        f"{PARALLAX:g} or more",
-        degrees >= PARALLAX,
-        "walk around what moves instead of turning on the spot, or put the cameras further apart: depth is a guess",
-    )
+    text = f"{degrees:.1f} degrees between the two cameras furthest apart that see a point"
+    return measured("parallax", degrees, text)
 
 
-def path_faults(places: Floats, axes: Floats, points: Floats) -> list[tuple[str, int]]:
+def path_faults(places: Floats, axes: Floats, points: Floats, names: Sequence[str]) -> list[tuple[str, int]]:
     """What a hand-held camera does not do, with the number of the image at which it does.
 
-    places, axes: (n, 3) of the cameras and where they look, in the order of time. points: (N, 3) of the scene. Steps
-    that are small beside the scene's distance are noise, of a camera that turns or stands.
+    places, axes: (n, 3) of the cameras and where they look, in the order of time. points: (N, 3) of the scene. names:
+    of the images, which are milliseconds in films. Steps that are small beside the scene's distance are noise, of a
+    camera that turns or stands.
     """
     if len(places) < FEWEST_OF_PATH:
         return []
@@ -117,7 +132,14 @@ def path_faults(places: Floats, axes: Floats, points: Floats) -> list[tuple[str,
     faults += [("the path doubles back", int(i) + 1) for i in np.flatnonzero(back)]
     long = max(3, len(still) // 10)
     stalls = [i for i in range(len(still) - long + 1) if still[i : i + long].all()][:1]
-    return faults + [("the path stalls", i) for i in stalls]
+    faults += [("the path stalls", i) for i in stalls]
+    stems = [Path(name).stem for name in names]
+    if all(len(stem) == 8 and stem.isdecimal() for stem in stems):
+        seconds = (int(stems[-1]) - int(stems[0])) / 1000
+        around = (places[[0, -1]] - np.median(points, axis=0)) / away
+        speed = np.degrees(2 * np.arcsin(min(float(np.linalg.norm(around[1] - around[0])) / 2, 1.0))) / seconds
+        faults += [(f"{speed:.0f} degrees a second around the scene", 0)] * bool(speed > AROUND)
+    return faults
 
 
 def _above(values: Floats, limit: float) -> list[int]:
@@ -128,30 +150,21 @@ def path(views: Sequence[View], points: Floats) -> Measure:
     """Of a camera that moves: whether its path is one that a hand can walk."""
     places = np.stack([view.camera.position for view in views])
     axes = np.stack([view.camera.T_cam_world[2, :3] for view in views])
-    faults = path_faults(places, axes, points)
+    faults = path_faults(places, axes, points, [view.source for view in views])
     named = ", ".join(f"{what} at {Path(views[i].source).name}" for what, i in faults[:NAMED])
     more = f" and {len(faults) - NAMED} more" if len(faults) > NAMED else ""
-    return Measure(
-        "path",
-        float(len(faults)),
-        f"{named}{more}" if faults else "smooth",
-        f"no step above {STEP:g} times the usual one, no turn above {TURN:g} times, no doubling back, no stall",
-        not faults,
-        "the cameras are likely wrong there: cut the film before and after these images, or film that part more slowly",
-    )
+    return measured("path", float(len(faults)), f"{named}{more}" if faults else "smooth")
 
 
 def moving_share(looks: Sequence[Look]) -> Measure:
     """Share of the images that moves."""
-    name, threshold = "moving share", f"{LITTLE:.0%} to {MUCH:.0%}"
     masks = [look.mask for look in looks if look.mask is not None]
     if not masks:
-        return not_measured(name, threshold, "no masks of what moves, which lapgs-prepare makes of films")
+        why = "no masks of what moves, which lapgs-prepare makes of films"
+        return measured("moving share", float("nan"), "not measured", why)
     share = float(np.mean([mask.mean() for mask in masks]))
-    advice = "leave more of what stands still in the picture, since the cameras are placed by that"
-    if share < LITTLE:
-        advice = "film longer, or closer, or train with --field static: hardly anything moves"
-    return Measure(name, share, f"{share:.1%} of the image area moves", threshold, LITTLE <= share <= MUCH, advice)
+    still = "film longer, or closer, or train with --field static: hardly anything moves" if share < LITTLE else ""
+    return measured("moving share", share, f"{share:.1%} of the image area moves", still)
 
 
 def coverage_of_still(looks: Sequence[Look]) -> Measure:
@@ -162,14 +175,7 @@ def coverage_of_still(looks: Sequence[Look]) -> Measure:
         counts[time] = counts.get(time, 0) + (look.mask is not None and bool(look.mask.mean() > SEEN))
     moving = [count for count in counts.values() if count]
     cameras = float(np.median(moving)) if moving else 0.0
-    return Measure(
-        "coverage",
-        cameras,
-        f"{cameras:g} cameras see something move at one time",
-        f"{CAMERAS:g} or more",
-        cameras >= CAMERAS,
-        "aim more cameras at what moves: where less than three see it, its place in depth is a guess",
-    )
+    return measured("cameras", cameras, f"{cameras:g} cameras see something move at one time", name="coverage")
 
 
 def coverage_of_moving(cameras: Sequence[Camera], points: Floats) -> Measure:
@@ -177,28 +183,15 @@ def coverage_of_moving(cameras: Sequence[Camera], points: Floats) -> Measure:
     away = np.stack([camera.position for camera in cameras]) - np.median(points, axis=0)
     directions = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
     degrees = float(np.degrees(np.arccos(np.clip((directions @ directions.T).min(), -1, 1))))
-    return Measure(
-        "coverage",
-        degrees,
-        f"the camera goes {degrees:.0f} degrees around the scene",
-        f"{SPAN:g} or more",
-        degrees >= SPAN,
-        "walk further around what moves: its other sides stay empty, and few views of each side tell its depth",
-    )
+    return measured("coverage", degrees, f"the camera goes {degrees:.0f} degrees around the scene")
 
 
 def blur_measure(looks: Sequence[Look]) -> Measure:
     values = [blur(gray(look.image)) for look in looks]
     middle = float(np.median(values))
     worst = looks[int(np.argmax(values))]
-    return Measure(
-        "blur",
-        middle,
-        f"{middle:.2f} on a scale from 0 to 1, at most {max(values):.2f} ({Path(worst.view.source).name})",
-        f"{BLUR:g} or less",
-        middle <= BLUR,
-        "move more slowly, use more light or a shorter exposure, and lock the focus",
-    )
+    text = f"{middle:.2f} on a scale from 0 to 1, at most {max(values):.2f} ({Path(worst.view.source).name})"
+    return measured("blur", middle, text)
 
 
 def blur(gray: NDArray[np.floating]) -> float:
@@ -220,9 +213,9 @@ def exposure(looks: Sequence[Look], points: Floats | None, still: bool) -> Measu
 
     A place is a pixel of a camera that stands still, else a point of the cloud.
     """
-    name, threshold = "exposure", f"{STOPS:g} stops or less"
+    nothing = "exposure", float("nan"), "not measured"
     if points is None and not still:
-        return not_measured(name, threshold, "no cloud of points, by which the same places are found in other images")
+        return measured(*nothing, "no cloud of points, by which the same places are found in other images")
     cameras = distinct_cameras([look.view for look in looks])
     groups = [[look for look in looks if look.view.camera is camera] for camera in cameras] if still else [looks]
     gains = []
@@ -233,17 +226,9 @@ def exposure(looks: Sequence[Look], points: Floats | None, still: bool) -> Measu
             relative = stops - np.nanmedian(stops, axis=0)
             gains += [np.nanmedian(row) for row in relative if np.isfinite(row).sum() >= POINTS_SEEN]
     if len(gains) < 3:
-        return not_measured(name, threshold, f"less than 3 images show {POINTS_SEEN} points of the cloud")
+        return measured(*nothing, f"less than 3 images show {POINTS_SEEN} points of the cloud")
     low, high = np.percentile(gains, [5, 95])
-    span = float(high - low)
-    return Measure(
-        name,
-        span,
-        f"changes by {span:.2f} stops between dark and bright images",
-        threshold,
-        span <= STOPS,
-        "lock exposure and white balance; or train with --exposure.enabled true, which corrects each image's colors",
-    )
+    return measured("exposure", high - low, f"changes by {high - low:.2f} stops between dark and bright images")
 
 
 def _stops(look: Look, points: Floats | None) -> Floats:

@@ -21,10 +21,7 @@ from lapgs_wgpu.prepare.measures import Floats
 from lapgs_wgpu.prepare.poses import Match, import_cv2
 
 NOISE, NOISE_GROWS = 0.15, 0.05  # pixels of flow, at least: between neighbouring images; for each further one
-QUARTER, MEDIAN = (
-    25,
-    1.55,
-)  # percentile of the errors that tells the noise, as most may move; a median of noise beside it
+QUARTER, MEDIAN = 25, 1.55  # percentile of the errors that tells the noise; a median of noise beside it
 MOST = 30.0  # times the noise: larger errors are equal
 PASSES = 4  # of the robust fit of a depth
 NEAR = 0.5  # times the depth of the nearest points of the scene: nothing is nearer
@@ -179,11 +176,9 @@ def _valley(values: NDArray[np.floating]) -> float:
     """The value that parts values best into two classes. Otsu 1979."""
     if len(values) < 2:
         return 0.0
-    count, edges = np.histogram(values, 64)
-    middle = (edges[1:] + edges[:-1]) / 2
-    below, mean = np.cumsum(count), np.cumsum(count * middle)
-    between = (mean[-1] * below / below[-1] - mean) ** 2 / np.maximum(below * (below[-1] - below), 1)
-    return float(middle[between.argmax()])
+    low, span = float(values.min()), max(float(np.ptp(values)), 1e-9)
+    levels = np.round(255 * (values - low) / span).astype(np.uint8)
+    return low + span / 255 * float(import_cv2().threshold(levels, 0, 255, 8)[0])  # 8: THRESH_OTSU
 
 
 def _cut(image: NDArray[np.uint8], vote: Plane, limit: float) -> Mask:

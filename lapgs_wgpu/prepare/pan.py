@@ -8,14 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.data.images import Size
 from lapgs_wgpu.prepare.measures import Floats
-from lapgs_wgpu.prepare.poses import Ints, Match, import_pycolmap
+from lapgs_wgpu.prepare.poses import Match
 
 MATCHES = 40  # of a pair of images
 SIGMA = 1.5e-3  # of the longer side: residual from which on a match counts little
@@ -38,21 +37,6 @@ class Pan:
     radial: float
     explained: float
     travel: float
-
-    def model(self, size: Size, points: Floats, colors: Ints) -> Any:
-        """A pycolmap.Reconstruction whose cameras stand in one place, with points (N, 3) and colors (N, 3)."""
-        colmap = import_pycolmap()
-        result = colmap.Reconstruction()
-        lens = [self.focal, size[0] / 2, size[1] / 2, self.radial]
-        result.add_camera_with_trivial_rig(
-            colmap.Camera(model="SIMPLE_RADIAL", width=size[0], height=size[1], params=lens, camera_id=1)
-        )
-        for number, (name, rotation) in enumerate(zip(self.names, self.rotations, strict=True), 1):
-            image = colmap.Image(name=name, camera_id=1, image_id=number)
-            result.add_image_with_trivial_frame(image, colmap.Rigid3d(np.hstack([rotation, np.zeros((3, 1))])))
-        for point, color in zip(points, colors.astype(np.uint8), strict=True):
-            result.add_point3D(point, colmap.Track(), color)
-        return result
 
 
 class _Sample:

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.errors import InputError, pip_install
 from lapgs_wgpu.progress import Progress
 
@@ -25,6 +26,7 @@ FEWEST_IMAGES, FEWEST_MATCHES = 2, 15  # of a reconstruction; of a pair of image
 SEED = 0
 Pair = tuple[str, str]
 Ints = NDArray[np.integer]
+Floats = NDArray[np.float64]
 Match = Mapping[Pair, Ints]  # of pairs of images: (m, 2) numbers of their features
 
 
@@ -37,16 +39,16 @@ class Features(NamedTuple):
 
 
 class Reconstruction:
-    """Structure from motion over images that share one lens.
+    """Structure from motion over images.
 
     images: the folder of all images. names: of those to use, below it, in the order of time. work: folder for the
-    database. model: COLMAP's name for the lens.
+    database. model: COLMAP's name for the lens. lenses: SINGLE for one, PER_FOLDER, or PER_IMAGE.
     """
 
-    def __init__(self, images: Path, names: Sequence[str], work: Path, model: str) -> None:
+    def __init__(self, images: Path, names: Sequence[str], work: Path, model: str, lenses: str = "SINGLE") -> None:
         """Raises InputError where pycolmap is not installed."""
         self._colmap = colmap = import_pycolmap()
-        self.images, self.names, self.model = images, list(names), model
+        self.images, self.names, self.model, self.lenses = images, list(names), model, lenses
         self.work = work
         self.places: dict[str, NDArray[np.float32]] = {}
         self._database = work / "database.db"
@@ -55,9 +57,10 @@ class Reconstruction:
             pass
         options = colmap.ImageReaderOptions()
         options.camera_model = model
-        colmap.import_images(self._database, images, colmap.CameraMode.SINGLE, self.names, options)
+        colmap.import_images(self._database, images, colmap.CameraMode.__members__[lenses], self.names, options)
         with self.database() as database:
             self.ids = {image.name: image.image_id for image in database.read_all_images()}
+            self.cameras = {image.name: image.camera_id for image in database.read_all_images()}
             camera = database.read_all_cameras()[0]
         self.prior, self.exif = float(camera.mean_focal_length()), bool(camera.has_prior_focal_length)
 
@@ -107,11 +110,14 @@ class Reconstruction:
                     found[(one, other) if one <= other else (other, one)] = matches[:, :: 1 if one <= other else -1]
         return found
 
-    def solve(self, focal: float | None = None, *, together: bool = False, seconds: float = -1) -> Any:
+    def solve(
+        self, focal: float | None = None, *, together: bool = False, held: bool = False, seconds: float = -1
+    ) -> Any:
         """The largest reconstruction, a pycolmap.Reconstruction; None where no two images fit together.
 
         focal: length to begin with, pixels; None leaves what the database has. together: all cameras at once
-        (GLOMAP), else one after the other, for at most so many seconds.
+        (GLOMAP), else one after the other, for at most so many seconds. held: the lens stays as it begins, since a wall
+        or a far scene does not tell it.
         """
         colmap, folder = self._colmap, self.work / "models"
         shutil.rmtree(folder, ignore_errors=True)
@@ -129,18 +135,35 @@ class Reconstruction:
                 part.random_seed = SEED
             options.mapper.min_tri_angle_deg = LEAST_ANGLE
             options.mapper.track_required_tracks_per_view = 300
+            if held:
+                adjustment = options.mapper.bundle_adjustment
+                adjustment.refine_focal_length = adjustment.refine_extra_params = False
             found = colmap.global_mapping(self._database, self.images, folder, options)
         else:
             options = colmap.IncrementalPipelineOptions()
             options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = SEED
             options.min_model_size = FEWEST_IMAGES
             options.max_runtime_seconds = round(seconds)
+            options.ba_refine_focal_length = options.ba_refine_extra_params = not held
             if focal is not None:  # a film: many images from nearly one side, where COLMAP's limits are for photos
                 options.mapper.init_min_tri_angle, options.mapper.ba_local_min_tri_angle = 4, 2
                 options.mapper.filter_min_tri_angle = options.triangulation.min_angle = LEAST_ANGLE
                 options.ba_global_max_refinements, options.ba_local_max_refinements = 2, 1
             found = colmap.incremental_mapping(self._database, self.images, folder, options)
         return max(found.values(), key=lambda model: model.num_reg_images(), default=None)
+
+    def given(self, lenses: Mapping[str, Lens], poses: Mapping[str, Floats]) -> Any:
+        """A pycolmap.Reconstruction of cameras that are known, with points by the verified matches.
+
+        The model must be OPENCV. lenses: of images, at their size. poses: (4, 4), world to camera.
+        """
+        colmap, folder = self._colmap, self.work / "models"
+        model = reconstruction(lenses, poses, self.cameras, self.ids)
+        options = colmap.IncrementalPipelineOptions()
+        options.triangulation.random_seed, options.triangulation.min_angle = SEED, LEAST_ANGLE
+        options.mapper.filter_min_tri_angle = LEAST_ANGLE
+        folder.mkdir(exist_ok=True)
+        return colmap.triangulate_points(model, self._database, self.images, folder, options=options)
 
     @contextmanager
     def database(self) -> Iterator[Any]:
@@ -150,6 +173,24 @@ class Reconstruction:
             yield database
         finally:
             database.close()
+
+
+def reconstruction(
+    lenses: Mapping[str, Lens], poses: Mapping[str, Floats], cameras: Mapping[str, int], ids: Mapping[str, int]
+) -> Any:
+    """A pycolmap.Reconstruction without points, of images that have a pose (3 or 4, 4), world to camera. cameras, ids:
+    COLMAP's numbers of each image's camera, and of the image."""
+    colmap = import_pycolmap()
+    model = colmap.Reconstruction()
+    for number, lens in {cameras[name]: lens for name, lens in lenses.items()}.items():
+        values = [lens.fx, lens.fy, lens.cx, lens.cy, *lens.radial[:2], *lens.tangential]
+        model.add_camera_with_trivial_rig(
+            colmap.Camera(model="OPENCV", width=lens.width, height=lens.height, params=values, camera_id=number)
+        )
+    for name, pose in poses.items():
+        image = colmap.Image(name=name, camera_id=cameras[name], image_id=ids[name])
+        model.add_image_with_trivial_frame(image, colmap.Rigid3d(pose[:3]))
+    return model
 
 
 def sift(path: Path) -> Features:
@@ -217,7 +258,8 @@ def merged(source: Reconstruction, matches: Match, groups: Sequence[Sequence[str
     cameras together, too, and the noise of several times is averaged.
     groups: names of images, as many for each camera. The first of each stands for the camera.
     """
-    result = Reconstruction(source.images, [group[0] for group in groups], work, source.model)
+    names = [group[0] for group in groups]
+    result = Reconstruction(source.images, names, work, source.model, source.lenses)
     first: dict[str, int] = {}  # of each image's features among those of its group
     with result.database() as database:
         for group in groups:

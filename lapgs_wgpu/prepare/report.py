@@ -14,14 +14,15 @@ from PIL import Image
 
 from lapgs_wgpu.data import Dataset, View
 from lapgs_wgpu.data.evenly import evenly
-from lapgs_wgpu.data.images import Pixels
+from lapgs_wgpu.data.images import Pixels, decode
+from lapgs_wgpu.data.readers.colmap import IMAGES
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.atomic import atomic_write
-from lapgs_wgpu.prepare.diagnosis import Diagnosis
+from lapgs_wgpu.prepare.capture_folder import REFUSED, REPORT
+from lapgs_wgpu.prepare.diagnosis import Diagnosis, diagnose
 from lapgs_wgpu.prepare.masks import Mask
-from lapgs_wgpu.prepare.measures import Look, Measure
+from lapgs_wgpu.prepare.measures import Measure
 
-REPORT = "report.html"
 THUMBNAILS = 24  # evenly chosen from the views that were looked at
 _WIDTH = 220  # pixels of a thumbnail
 _MOST_POINTS = 1200  # of the cloud, in the drawing
@@ -52,10 +53,23 @@ def write_report(diagnosis: Diagnosis, path: Path, title: str) -> None:
     if path.exists() and _MARK not in path.read_bytes():
         raise InputError(f"{path} is of another program and stays as it is; the report was not written.")
     with atomic_write(path) as file:
-        file.write(_page(diagnosis, title).encode())
+        file.write(_page(_body(diagnosis), title).encode())
 
 
-def _page(diagnosis: Diagnosis, title: str) -> str:
+def write_refusal(folder: Path) -> None:
+    """Write the page of a capture that was refused: why, its images, and the cameras where some were placed."""
+    why = f"<p>{escape((folder / REFUSED).read_text(encoding='utf-8'))}</p>"
+    try:
+        body = _body(diagnose(folder))
+    except InputError:
+        files = evenly(sorted((folder / IMAGES).rglob("*.jpg")), THUMBNAILS)
+        images = "".join(_figure(decode(file), None, file.name) for file in files)
+        body = f'<h2>Images</h2><div class="grid">{images}</div>'
+    with atomic_write(folder / REPORT) as file:
+        file.write(_page(f"<h2>Not finished</h2>{why}{body}", folder.resolve().name).encode())
+
+
+def _body(diagnosis: Diagnosis) -> str:
     dataset = diagnosis.dataset
     poor = [measure for measure in diagnosis.measures if measure.good is False]
     verdict = f"{len(poor)} of {len(diagnosis.measures)} properties are poor" if poor else "nothing speaks against it"
@@ -65,8 +79,10 @@ def _page(diagnosis: Diagnosis, title: str) -> str:
     layout = "cameras that stand still" if diagnosis.still else "one camera that moves"
     cameras = "Cameras" if diagnosis.still else "Cameras, dark (first) to light (last),"
     notes = "".join(f"<li>{escape(note)}</li>" for note in dataset.warnings)
-    body = [
-        f"<h1>{escape(title)}</h1>",
+    names = [Path(look.view.source) for look in chosen]
+    labels = [f"{p.parent.name}/{p.name}, time {v.view.time:.3f}" for p, v in zip(names, chosen, strict=True)]
+    images = "".join(_figure(v.image, v.mask, label) for v, label in zip(chosen, labels, strict=True))
+    parts = [
         f'<p class="soft">{count} images, {layout}; {verdict}.</p>',
         '<div class="scroll"><table><tr><th></th><th>property</th><th>measured</th><th>wanted</th>'
         f"<th>what to film differently</th></tr>{''.join(map(_row, diagnosis.measures))}</table></div>",
@@ -75,12 +91,17 @@ def _page(diagnosis: Diagnosis, title: str) -> str:
         f'<p class="soft">{cameras} from above, each with its viewing direction; gray: points of the scene.</p>',
         _drawing(dataset),
         f"<h2>Images{', what moves in red' if masked else ''}</h2>",
-        f'<div class="grid">{"".join(map(_figure, chosen))}</div>',
+        f'<div class="grid">{images}</div>',
     ]
+    return "".join(parts)
+
+
+def _page(body: str, title: str) -> str:
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{escape(title)}{_MARK.decode()}<style>{_STYLE}</style></head><body>{''.join(body)}</body></html>\n"
+        f"<title>{escape(title)}{_MARK.decode()}<style>{_STYLE}</style></head><body><h1>{escape(title)}</h1>{body}"
+        "</body></html>\n"
     )
 
 
@@ -91,10 +112,8 @@ def _row(measure: Measure) -> str:
     return f'<tr class="{name}"><td class="mark">{mark}</td>{"".join(f"<td>{cell}</td>" for cell in cells)}</tr>'
 
 
-def _figure(look: Look) -> str:
-    name = Path(look.view.source)
-    label = f"{name.parent.name}/{name.name}, time {look.view.time:.3f}"
-    source = base64.b64encode(_jpeg(look.image, look.mask)).decode()
+def _figure(image: Pixels, mask: Mask | None, label: str) -> str:
+    source = base64.b64encode(_jpeg(image, mask)).decode()
     return (
         f'<figure><img alt="{escape(label)}" src="data:image/jpeg;base64,{source}">'
         f"<figcaption>{escape(label)}</figcaption></figure>"

@@ -11,17 +11,18 @@ import numpy as np
 from PIL import Image
 
 from lapgs_wgpu.data.images import Size
+from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.prepare.masks import Mask
 from lapgs_wgpu.prepare.measures import path_faults
 from lapgs_wgpu.prepare.movers import without
 from lapgs_wgpu.prepare.pan import RADIUS, Pan, rays, solve_pan
-from lapgs_wgpu.prepare.poses import Match, Reconstruction
+from lapgs_wgpu.prepare.poses import Match, Reconstruction, import_pycolmap, reconstruction
 from lapgs_wgpu.progress import say
 
-FOCALS = 1.0, 0.7, 1.4  # times the width, where EXIF says nothing
+FOCALS = 1.0, 1.4, 0.7  # times the width, where EXIF says nothing
 PURE, NEARLY = 0.8, 0.6  # share of the verified matches that turning alone explains: a pan; one, if nothing else fits
 GOOD, SHARP = 0.95, 1.5e-3  # the search ends: share of the images, and the mean error in parts of the longer side
-SECONDS, SECONDS_EACH = 60.0, 2.0  # of the search: for any film, and for each image
+SECONDS, SECONDS_EACH, CORES = 60.0, 2.0, 2  # of the search: for any film, and for each image, on so many cores
 BENT = 0.4  # first radial coefficient of a lens, at most
 PANORAMA = 3000  # points of a pan
 
@@ -29,7 +30,7 @@ PANORAMA = 3000  # points of a pan
 class Found(NamedTuple):
     """model: a pycolmap.Reconstruction. placed: names of its images, in the order of time. faults: of its path, by the
     images' numbers in `placed`. error: mean, pixels. focal: at the end, pixels. pan: None where the camera walks.
-    together: all cameras were placed at once."""
+    together: all cameras were placed at once. held: the focal length is not the film's, but where the search began."""
 
     model: Any
     placed: tuple[str, ...]
@@ -38,6 +39,7 @@ class Found(NamedTuple):
     focal: float
     pan: Pan | None = None
     together: bool = False
+    held: bool = False
 
 
 def search(source: Reconstruction, size: Size) -> Found | None:
@@ -49,26 +51,30 @@ def search(source: Reconstruction, size: Size) -> Found | None:
     if pan is not None and pan.explained >= PURE:
         return panned(source, pan, size)
     focals = [source.prior, *FOCALS] if source.exif else list(FOCALS)
-    tries = [(f if source.exif and f == source.prior else f * size[0], way) for f in focals for way in (True, False)]
-    end = time.monotonic() + SECONDS + SECONDS_EACH * len(source.names)
+    pixels = [f if source.exif and f == source.prior else f * size[0] for f in focals]
+    tries = [(f, True, False) for f in pixels[:2]] + [(pixels[0], way, True) for way in (True, False)]
+    tries += [(f, False, False) for f in pixels] + [(f, True, False) for f in pixels[2:]]
     best: Found | None = None
-    longest = 0.0
-    for focal, together in tries:
-        left = end - time.monotonic()
+    longest, spent = 0.0, _Spent()
+    for number, (focal, together, held) in enumerate(tries):
+        left = SECONDS + SECONDS_EACH * len(source.names) - spent.seconds
         if best is not None and left < longest:
             break
-        started = time.monotonic()
-        found = solved(source, focal, together=together, seconds=max(left, 10))
-        longest = max(longest, time.monotonic() - started)
+        started = spent.seconds
+        seconds = max(left, 10) * spent.slower
+        model = source.solve(focal, together=together, held=held, seconds=seconds)
+        found = described(source, model, together=together, held=held)
+        longest = max(longest, spent.seconds - started)
         if found is not None and (best is None or _rank(source, found) > _rank(source, best)):
             best = found
-        if best is not None and _good(source, best, size):
-            break
+        if best is not None and number and _good(source, best, size):
+            break  # the first one alone may be wrong, and no measure of it tells
         if found is not None:
+            rest = max(left + started - spent.seconds, 0) * spent.slower
             more = f"{len(found.faults)} faults of the path; " * bool(found.faults)
             say(
                 f"{len(found.placed)} of {len(source.names)} cameras placed, {found.error:.2f} pixels off; {more}"
-                f"looking for better ones for at most {max(end - time.monotonic(), 0):.0f} s more"
+                f"looking for better ones for at most {rest:.0f} s more"
             )
     short = best is None or len(best.placed) < GOOD * len(source.names)
     if pan is not None and short and pan.explained >= NEARLY:
@@ -76,21 +82,36 @@ def search(source: Reconstruction, size: Size) -> Found | None:
     return best
 
 
-def solved(source: Reconstruction, focal: float, *, together: bool, seconds: float) -> Found | None:
-    """One reconstruction. focal: length to begin with, pixels."""
-    model = source.solve(focal, together=together, seconds=seconds)
+class _Spent:
+    """The time of this process on CORES cores, so that what else a machine does changes no result."""
+
+    def __init__(self) -> None:
+        self._wall, self._processor = time.monotonic(), time.process_time()
+
+    @property
+    def seconds(self) -> float:
+        return (time.process_time() - self._processor) / CORES
+
+    @property
+    def slower(self) -> float:
+        """By how much time passes faster than that, at least 1."""
+        return max(1.0, (time.monotonic() - self._wall) / max(self.seconds, 1.0))
+
+
+def described(source: Reconstruction, model: Any, *, together: bool = False, held: bool = False) -> Found | None:
+    """A reconstruction, and what tells how good it is. None where it has no points."""
     if model is None or model.num_reg_images() < 2 or not model.num_points3D():
         return None
     images = {model.image(i).name: model.image(i) for i in model.reg_image_ids()}
     placed = tuple(name for name in source.names if name in images)
     poses = np.stack([images[name].cam_from_world().matrix() for name in placed])
     points = np.stack([point.xyz for point in model.points3D.values()])
-    faults = path_faults(-np.einsum("nij,ni->nj", poses[:, :, :3], poses[:, :, 3]), poses[:, 2, :3], points)
+    faults = path_faults(-np.einsum("nij,ni->nj", poses[:, :, :3], poses[:, :, 3]), poses[:, 2, :3], points, placed)
     camera = next(iter(model.cameras.values()))
-    if abs(camera.params[3]) > BENT:
+    if source.model == camera.model.name and abs(camera.params[3]) > BENT:
         faults.append(("a lens that no camera has", 0))
     error = float(model.compute_mean_reprojection_error())
-    return Found(model, placed, tuple(faults), error, camera.mean_focal_length(), together=together)
+    return Found(model, placed, tuple(faults), error, camera.mean_focal_length(), together=together, held=held)
 
 
 def panned(source: Reconstruction, pan: Pan, size: Size) -> Found:
@@ -107,7 +128,11 @@ def panned(source: Reconstruction, pan: Pan, size: Size) -> Found:
             pixels = np.asarray(image.convert("RGB"))
         column, row = np.clip(at.astype(int), 0, [size[0] - 1, size[1] - 1]).T
         colors.append(pixels[row, column])
-    model = pan.model(size, np.concatenate(points), np.concatenate(colors))
+    lens = Lens(*size, pan.focal, pan.focal, size[0] / 2, size[1] / 2, radial=(pan.radial, 0.0, 0.0))
+    poses = {name: np.hstack([R, np.zeros((3, 1))]) for name, R in zip(pan.names, pan.rotations, strict=True)}
+    model = reconstruction(dict.fromkeys(pan.names, lens), poses, source.cameras, source.ids)
+    for point, color in zip(np.concatenate(points), np.concatenate(colors), strict=True):
+        model.add_point3D(point, import_pycolmap().Track(), color)
     return Found(model, pan.names, (), 0.0, pan.focal, pan)
 
 
@@ -119,7 +144,8 @@ def again(source: Reconstruction, found: Found, matches: Match, masks: Mapping[s
         return None if pan is None else panned(source, pan, size)
     source.use(without(matches, source.places, masks, size))
     seconds = SECONDS + SECONDS_EACH * len(source.names)
-    return solved(source, found.focal, together=found.together, seconds=seconds)
+    model = source.solve(found.focal, together=found.together, held=found.held, seconds=seconds)
+    return described(source, model, together=found.together, held=found.held)
 
 
 def _good(source: Reconstruction, found: Found, size: Size) -> bool:

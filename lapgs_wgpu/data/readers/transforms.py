@@ -58,7 +58,7 @@ def _read_frames(data: Fields, files: CaptureFiles, time: str) -> list[Frame | N
             frames.append(None)
             continue
         name, image = found
-        lens, sized = _read_lens(entry, data, image)
+        lens, sized = read_lens(entry, data, image)
         frames.append(Frame(image, lens, pose, entry.where, ImageName(name), time=stated, states_size=sized))
     return frames
 
@@ -67,7 +67,7 @@ def _states(entry: Fields, field: str) -> bool:
     return entry.values.get(field) is not None
 
 
-def _read_lens(frame: Fields, shared: Fields, image: ImageFile) -> tuple[Lens, bool]:
+def read_lens(frame: Fields, shared: Fields, image: ImageFile) -> tuple[Lens, bool]:
     """Return the lens of a frame, and whether size or center are stated; each value is the frame's, else its file's.
 
     A missing size is the image's; the focal length is that of camera_angle_x (radians) where fl_x is missing. Raises

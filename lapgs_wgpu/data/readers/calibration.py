@@ -1,0 +1,215 @@
+"""Cameras without images, by name: calibrations of rigs, and poses that other programs found.
+
+COLMAP's models and nerfstudio's transforms.json are read by their readers. Further formats: Qualisys' .qca.txt (XML; in
+1/64 pixels and millimeters, x right, y up), the .toml of Pose2Sim, Anipose and Caliscope (Rodrigues vectors, world to
+camera), OpenCV's YAML as EasyMocap (K_1, dist_1, R_1 or Rot_1, T_1) and the example of stereoCalibrate (M1, D1, M2, D2,
+R, T) name its matrices, and the .json of CMU Panoptic. All of these count pixels from the middle of the first one.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+from typing import Any, NamedTuple
+from xml.etree import ElementTree
+
+import numpy as np
+
+from lapgs_wgpu.data.images import ImageFile, Size, size_text
+from lapgs_wgpu.data.json_fields import LARGEST_INTRINSIC, Fields, as_fields, read_json, vector
+from lapgs_wgpu.data.lens import Lens
+from lapgs_wgpu.data.poses import OPENGL_TO_OPENCV, Array, check_rotation, opengl_pose, world_to_camera
+from lapgs_wgpu.data.readers.colmap_model import is_model, read_model
+from lapgs_wgpu.data.readers.transforms import read_lens
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.io import safe_json_toml
+
+FORMATS = (
+    "COLMAP's cameras and images, nerfstudio's transforms.json, .qca.txt of Qualisys, .toml of Pose2Sim, .yml of "
+    "OpenCV, .json of Panoptic"
+)
+_MATRIX = re.compile(r"^(\w+):\s*!!opencv-matrix\s+rows:.*\s+cols:.*\s+dt:.*\s+data:\s*\[([^\]]*)\]", re.MULTILINE)
+SAME = 0.01  # by so much the proportions of images may differ from those that a file states
+_STEREO = {"M1": "K_1", "D1": "dist_1", "M2": "K_2", "D2": "dist_2", "R": "Rot_2", "T": "T_2"}
+
+
+class Calibrated(NamedTuple):
+    """A camera. T_cam_world: (4, 4), OpenCV's axes. sized: whether the file states the size of its images."""
+
+    lens: Lens
+    T_cam_world: Array
+    where: str
+    sized: bool = True
+
+    def lens_for(self, size: Size, of: Size | None = None) -> Lens:
+        """The lens for images of `size`, which are those of a film of size `of`. Raises InputError where the file
+        states other proportions."""
+        width, height = of or size
+        if not self.sized:
+            return replace(self.lens, width=width, height=height).resized(*size)
+        if abs(math.log(self.lens.width * height / (self.lens.height * width))) > SAME:
+            raise InputError(
+                f"{self.where} is for images of {size_text((self.lens.width, self.lens.height))} pixels and these have "
+                f"{size_text((width, height))}; give them as they were then, neither cut nor turned."
+            )
+        return self.lens.resized(*size)
+
+
+def read_calibration(path: Path) -> dict[str, Calibrated]:
+    """Return the cameras of a file, or of the folder of a model, by their names or their images'. Raises InputError."""
+    model = next((f for f in (path, path.parent, path / "sparse/0", path / "sparse", path / "0") if is_model(f)), None)
+    if model is not None and (path.is_dir() or path.stem in ("cameras", "images")):
+        lenses, images, *_ = read_model(model)
+        return {image.name: Calibrated(lenses[image.camera], image.T_cam_world, image.where) for image in images}
+    inside = [path / "transforms.json", path / "intri.yml"]
+    path = next((file for file in inside if file.is_file()), path)
+    if not path.is_file():
+        state = "holds no file of these" if path.exists() else "does not exist"
+        raise InputError(f"{path} {state}: cameras are read from {FORMATS}.")
+    head = path.read_bytes()[:200].lstrip()
+    if path.suffix == ".json":
+        data = read_json(path)
+        return _panoptic(data) if "cameras" in data else _nerfstudio(data)
+    formats = (head.startswith(b"<"), _qualisys), (path.suffix == ".toml", _toml), (b"YAML" in head, _opencv)
+    for matches, read in formats:
+        if matches and (cameras := read(path)):
+            return cameras
+    raise InputError(f"{path} holds no cameras in a known format: they are read from {FORMATS}.")
+
+
+def _nerfstudio(data: Fields) -> dict[str, Calibrated]:
+    cameras = {}
+    for entry in data.objects("frames", "frame"):
+        name = str(entry.required("file_path"))
+        size = tuple((entry if side in entry else data).side(side) for side in ("w", "h"))
+        lens, _ = read_lens(entry, data, ImageFile(Path(name), (size[0], size[1])))
+        cameras[name] = Calibrated(lens, opengl_pose(entry.required("transform_matrix"), entry.where), entry.where)
+    return cameras
+
+
+def _panoptic(data: Fields) -> dict[str, Calibrated]:
+    cameras = {}
+    for entry in data.objects("cameras", "camera"):
+        K, R, t = (np.array(entry.entries(name), np.float64) for name in ("K", "R", "t"))
+        width, height = entry.vector("resolution", 2)
+        size = round(float(width)), round(float(height))
+        name = str(entry.required("name"))
+        cameras[name] = _camera(K, entry.entries("distCoef"), R, t, size, f"{entry.where} ({name})")
+    return cameras
+
+
+def _toml(path: Path) -> dict[str, Calibrated]:
+    cameras = {}
+    for key, value in safe_json_toml.read_toml(path).items():
+        if not isinstance(value, dict) or "matrix" not in value:
+            continue  # metadata
+        entry = as_fields(value, f"{path}, {key}")
+        if entry.values.get("fisheye"):
+            raise InputError(f"{entry.where} has a fisheye lens, which is not read; undistort its film first.")
+        K = np.stack([vector(row, 3, "matrix", entry.where) for row in entry.entries("matrix", 3)])
+        width, height = entry.vector("size", 2)
+        rotation, translation = entry.vector("rotation", 3), entry.vector("translation", 3)
+        size = round(float(width)), round(float(height))
+        name = str(value.get("name", key))
+        cameras[name] = _camera(K, entry.entries("distortions"), rotation, translation, size, entry.where)
+    return cameras
+
+
+def _opencv(path: Path) -> dict[str, Calibrated]:
+    """Of all matrices in the file, and in those that usually lie beside it."""
+    beside = [path.with_name(name) for name in ("intri.yml", "extri.yml", "intrinsics.yml", "extrinsics.yml")]
+    files = [path, *(file for file in beside if file.is_file() and path in beside and file != path)]
+    found = {
+        _STEREO.get(name, name): np.array([float(number) for number in _numbers(text, file)])
+        for file in files
+        for name, text in _MATRIX.findall(file.read_text(encoding="utf-8", errors="replace"))
+    }
+    if {"K_1", "Rot_2"} <= found.keys():  # the second camera's pose is that beside the first one
+        found = {"Rot_1": np.eye(3).ravel(), "T_1": np.zeros(3)} | found
+    cameras = {}
+    for name in [key[2:] for key in found if key.startswith("K_")]:
+        rotation, translation = found.get(f"Rot_{name}", found.get(f"R_{name}")), found.get(f"T_{name}")
+        if rotation is None or translation is None:
+            raise InputError(f"{path} has K_{name}, but no R_{name} and T_{name}, nor have files beside it; add them.")
+        distortion = found.get(f"dist_{name}", np.zeros(0))
+        K, R = found[f"K_{name}"].reshape(-1, 3), rotation.reshape((3, 3) if rotation.size == 9 else -1)
+        cameras[name] = _camera(K, distortion, R, translation, None, f"{path}, camera {name}")
+    return cameras
+
+
+def _qualisys(path: Path) -> dict[str, Calibrated]:
+    try:
+        root = ElementTree.parse(path).getroot()
+    except ElementTree.ParseError as error:
+        raise InputError(f"{path} is not readable XML ({error}); export it again.") from None
+    cameras = {}
+    for number, camera in enumerate(root.iter("camera")):
+        where = f"{path}, camera {camera.get('serial', number)}"
+        parts = {tag: camera.find(tag) for tag in ("transform", "intrinsic", "fov_video")}
+        found = {f"{tag}.{k}": v for tag, part in parts.items() if part is not None for k, v in part.attrib.items()}
+        needed = ["transform." + n for n in ("x", "y", "z", *(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)))]
+        needed += [f"intrinsic.{n}{axis}" for n in ("focalLength", "centerPoint") for axis in "UV"]
+        needed += [f"intrinsic.{n}" for n in ("radialDistortion1", "radialDistortion2")]
+        needed += [f"intrinsic.tangentalDistortion{i}" for i in (1, 2)]
+        needed += [f"fov_video.{side}" for side in ("left", "right", "top", "bottom")]
+        if missing := [name for name in needed if name not in found]:
+            raise InputError(f"{where} has no {missing[0]}; export the calibration of video cameras.")
+        x, y, z, *R, fx, fy, cx, cy, k1, k2, p1, p2, left, right, top, bottom = _numbers(
+            " , ".join(found[name] for name in needed), where
+        )
+        rotation = OPENGL_TO_OPENCV @ np.array(R).reshape(3, 3)
+        K = np.array([[fx / 64, 0, cx / 64 - left], [0, fy / 64, cy / 64 - top], [0, 0, 1]])
+        size = round(right - left) + 1, round(bottom - top) + 1
+        place = np.array([x, y, z]) / 1000
+        cameras[camera.get("serial", str(number))] = _camera(
+            K, [k1, k2, p1, p2], rotation, -rotation @ place, size, where
+        )
+    return cameras
+
+
+def _numbers(text: str, where: object) -> list[float]:
+    try:
+        return [float(word) for word in text.split(",")]
+    except ValueError as error:
+        raise InputError(f"{where}: {str(error)[:80]}; export it again.") from None
+
+
+def _camera(
+    K: Array, distortion: Iterable[Any], rotation: Array, translation: Array, size: Size | None, where: str
+) -> Calibrated:
+    """Check the values of a camera of OpenCV. distortion: k1, k2, p1, p2, k3. rotation: (3, 3), or a Rodrigues vector.
+    Raises InputError."""
+    from scipy.spatial.transform import Rotation  # slow to import
+
+    values = np.array([*distortion, *[0.0] * 5], np.float64)
+    k1, k2, p1, p2, k3 = values[:5]
+    finite = all(np.isfinite(each).all() for each in (K, values, rotation, translation))
+    if K.shape != (3, 3) or rotation.shape not in ((3,), (3, 3)) or translation.size != 3 or not finite:
+        raise InputError(f"{where}: its matrices are not those of a camera (3x3, 3x3 or 3, 3 finite numbers).")
+    if values[5:].any():
+        raise InputError(f"{where}: distortion beyond k1, k2, p1, p2, k3 is not read; calibrate without it.")
+    if not (np.diag(K) > 0).all() or np.abs(K).max() > LARGEST_INTRINSIC:
+        raise InputError(f"{where}: focal lengths of {K[0, 0]:g} and {K[1, 1]:g} pixels are those of no camera.")
+    R = Rotation.from_rotvec(rotation).as_matrix() if rotation.ndim == 1 else rotation
+    check_rotation(R, f"{where}: its rotation")
+    width, height = size or (round(2 * K[0, 2]) or 1, round(2 * K[1, 2]) or 1)
+    cx, cy = K[0, 2] + 0.5, K[1, 2] + 0.5
+    lens = Lens(width, height, K[0, 0], K[1, 1], cx, cy, K[0, 1], radial=(k1, k2, k3), tangential=(p1, p2))
+    return Calibrated(lens, world_to_camera(R.T, -R.T @ translation.ravel()), where, size is not None)
+
+
+def match_names(cameras: Iterable[str], names: Sequence[str]) -> dict[str, str]:
+    """Return the camera for each of `names` that has one: its name or a part of its path is the same, whatever the
+    suffixes, or ends the name after an underscore (hd_00_01 is 00_01)."""
+    parts = {name: {PurePosixPath(part).stem.lower() for part in re.split(r"[/\\]", name)} for name in cameras}
+    owner = {part: name for name in reversed(parts) for part in parts[name]}
+    found = {}
+    for name in names:
+        words = PurePosixPath(name).stem.lower().split("_")
+        endings = ("_".join(words[i:]) for i in range(len(words)))
+        if camera := next((owner[ending] for ending in endings if ending in owner), None):
+            found[name] = camera
+    return found
