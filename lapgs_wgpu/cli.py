@@ -19,7 +19,7 @@ if typing.TYPE_CHECKING:
     from lapgs_wgpu.train.config import Config
     from lapgs_wgpu.train.lpips import Lpips
 
-EVAL_KEYS = ("data.path", "data.background", "data.cache_gb")  # keys that can be given with --eval
+EVAL_KEYS = ("data.path", "data.movers", "data.background", "data.cache_gb")  # keys that can be given with --eval
 RESUME_KEYS = ("data.path", "data.masks", "data.cache_gb")  # and with --resume: where the capture is now
 
 

@@ -26,6 +26,7 @@ MASKED = {"white": "train", "black": "train", "measured": "test"}  # the split w
 
 WHITE = 128  # level from which on a pixel is set
 MEASURED = 255  # level of a pixel that the masked metrics measure: what mixes with others does not count
+MOSTLY = 127  # level of a shrunk mask, above which most of the pixels mixed there are set
 CHECKED = 8  # masks that are decoded when a capture is opened
 
 
@@ -122,14 +123,16 @@ def check_masks(masks: Mapping[str, Path], size: Size, kind: MaskKind) -> list[s
     )
 
 
-def read_mask(path: Path, kind: MaskKind, undistortion: Undistortion | None, stored: Size, size: Size) -> Mask:
+def read_mask(
+    path: Path, kind: MaskKind, undistortion: Undistortion | None, stored: Size, size: Size, above: int = 0
+) -> Mask:
     """Decode the mask (H, W) of an image of (width, height) `stored` that is undistorted and shrunk to `size`.
 
     The mask is first resized to `stored` by nearest neighbours. A pixel in which several mix is ignored if any of them
-    is, and measured if all of them are. Raises InputError.
+    is, and measured if all of them are; `above` as in `MOSTLY`. Raises InputError.
     """
     pixels = resize(as_pixels(_taken_out(_levels(decode(path)), kind)), stored, NEAREST)
-    out = shrink(pixels if undistortion is None else undistortion.apply(pixels), size)[..., 0] > 0
+    out = shrink(pixels if undistortion is None else undistortion.apply(pixels), size)[..., 0] > above
     return ~out if kind == "measured" else out
 
 

@@ -10,6 +10,7 @@ from torch import nn
 
 from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.discovery.acceptance import explained_share, rows_with, tracks_in_images
+from lapgs_wgpu.discovery.cutouts import cutout_tracks
 from lapgs_wgpu.discovery.field_fit import fit_field
 from lapgs_wgpu.discovery.static_fit import static_fit
 from lapgs_wgpu.discovery.surface_points import surface_points
@@ -50,7 +51,7 @@ def discover(config: Config, dataset: Dataset, device: Device, own_field: nn.Mod
     started = time.perf_counter()
     steps, fit_steps = config.discovery.steps, config.discovery.field_steps
     meter = Progress(steps, "steps of motion discovery, part 1 of 2: what stands still")
-    static, images, corrections = static_fit(config, dataset, device, meter.at)
+    static, images, depths, corrections = static_fit(config, dataset, device, meter.at)
     meter.at(steps, lambda: "motion discovery: following what moves from one time to the next")
     background = BACKGROUND_LEVELS[config.data.background]
     if all(float(np.abs(image.image - background).max()) < SHOWN for image in images):
@@ -59,12 +60,17 @@ def discover(config: Config, dataset: Dataset, device: Device, own_field: nn.Mod
             f"{config.data.background} background; check the images and data.background."
         )
     half_side = config.points.box
-    clouds = surface_points(images, half_side)
-    tracks = find_tracks(clouds, half_side)
-    if tracks is not None:
+    if depths is not None:
+        tracks = cutout_tracks(images, depths)
+        times, share = np.array([image.time for image in images]), float(tracks is not None)
+    else:
+        clouds = surface_points(images, half_side)
+        tracks, times = find_tracks(clouds, half_side), clouds.times
+    if tracks is not None and depths is None:
         together = 2 * len(dataset.times) <= len(dataset.train)
         tracks = tracks_in_images(tracks, clouds.times, images, static, background, together=together)
-    share = 0.0 if tracks is None else explained_share(clouds, tracks, half_side)
+    if depths is None:
+        share = 0.0 if tracks is None else explained_share(clouds, tracks, half_side)
     if share < config.discovery.least:
         tracks = None
     generator = torch.Generator().manual_seed(config.seed)
@@ -72,7 +78,7 @@ def discover(config: Config, dataset: Dataset, device: Device, own_field: nn.Mod
     found = f"{share:.1%} of what it lacks can be followed: nothing is added"
     if tracks is not None:
         meter = Progress(fit_steps, "steps of motion discovery, part 2 of 2: what moves")
-        error = fit_field(scene, tracks, clouds.times, len(static), fit_steps, generator, meter.at)
+        error = fit_field(scene, tracks, times, len(static), fit_steps, generator, meter.at)
         if error is None:
             tracks, scene = None, scene_with(static, None, config, device, generator, own_field)
             found = f"{share:.1%} of what it lacks can be followed, and the field moves nothing: nothing is added"

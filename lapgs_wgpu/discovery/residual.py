@@ -45,14 +45,15 @@ class Residual:
         time: in [0, 1].
         image: (H, W, 3) in [0, 1].
         still: (H, W, 3), the static fit's image of the same camera.
+        moving: (H, W), the moving pixels; None to find them.
 
     Attributes:
         mask: (H, W), the moving pixels.
     """
 
-    def __init__(self, camera: Camera, time: float, image: Floats, still: Floats) -> None:
+    def __init__(self, camera: Camera, time: float, image: Floats, still: Floats, moving: Mask | None = None) -> None:
         self.camera, self.time, self.image, self.still = camera, time, image, still
-        self.mask = moving_pixels(image, still)
+        self.mask = moving_pixels(image, still) if moving is None else moving
 
     @cached_property
     def _soft(self) -> Floats:
