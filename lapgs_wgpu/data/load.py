@@ -15,6 +15,7 @@ from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
 from lapgs_wgpu.data.images import Pixels, Size, shrink, shrunk_size
 from lapgs_wgpu.data.lens import Lens, Undistortion
 from lapgs_wgpu.data.masks import MASKED, MOSTLY, Mask, MaskKind, check_masks, find_masks, read_mask
+from lapgs_wgpu.data.mover_cube import mover_cube
 from lapgs_wgpu.data.placement import place
 from lapgs_wgpu.data.readers import apps, colmap, hypernerf, panoptic, poses_bounds, transforms
 from lapgs_wgpu.data.split import held_out
@@ -87,7 +88,11 @@ def load_dataset(
             warnings += check_views(capture.cloud, cameras, files, capture.source)
         cloud = check_cloud(capture.cloud, training_cameras, capture.source, warnings)
         capture = dataclasses.replace(capture, cloud=cloud)
-    placement = place(capture, [shot.frame for shot in training], training_cameras, normalize=normalize)
+    moving = None
+    if movers is not None and capture.cloud is not None:
+        by_time = sorted(training, key=lambda shot: shot.frame.time or 0.0)
+        moving = mover_cube(capture.cloud, [(shot.camera, shot.moving) for shot in by_time])
+    placement = place(capture, [shot.frame for shot in training], training_cameras, normalize=normalize, moving=moving)
     warnings += placement.warnings
     summary = _summary(reader.name, capture, shots, time_source)
     if capture.own_footage:

@@ -18,13 +18,13 @@ from lapgs_wgpu.data.evenly import evenly_indices
 from lapgs_wgpu.discovery.residual import Floats, Mask, Residual
 from lapgs_wgpu.discovery.tracks import Tracks
 
-MOST = 40  # cut-outs
-LEAST = 2e-3  # share of an image that a cut-out covers, at least
+MOST = 24  # cut-outs
+LEAST = 4e-3  # share of an image that a cut-out covers, at least
 ENOUGH = 0.15  # share of an image's moving pixels that may stay unexplained
 BLURS = 4.0, 2.0, 1.0  # pixels; of the images that are compared, one after another
 ITERATIONS = 8  # of each
 PIXELS = 1500  # of a cut-out that are compared, at most
-POINTS = 1500  # of a cut-out, at most
+POINTS = 1000  # of a cut-out, at most
 ALIKE = 0.12  # difference of two blurred colors that look alike
 LOST = 0.5  # share of a cut-out that must look alike
 VISIBLE = 0.3  # share of a cut-out that must lie in the image
@@ -76,14 +76,12 @@ def cutout_tracks(residuals: Sequence[Residual], depths: Sequence[Floats]) -> Tr
         return None
     ground = [_depths(image.residual.mask, depth) for image, depth in zip(images, depths, strict=True)]
     parts = [_placed(cutout, images, ground) for cutout in cutouts]
-    positions = [paths[cutout.key] for cutout, (paths, _) in zip(cutouts, parts, strict=True)]
-    return Tracks(
-        np.concatenate(positions),
-        np.concatenate([colors for _, colors in parts]),
-        np.repeat(np.arange(len(parts)), [len(each) for each in positions]),
-        np.concatenate([paths for paths, _ in parts], axis=1),
-        np.concatenate([np.repeat(c.seen[:, None], len(p), 1) for c, p in zip(cutouts, positions, strict=True)], axis=1),
-    )
+    number = np.repeat(np.arange(len(parts)), [len(colors) for _, colors in parts])
+    paths = np.concatenate([paths for paths, _ in parts], axis=1)
+    seen = np.stack([cutout.seen for cutout in cutouts], axis=1)[:, number]
+    key = np.array([cutout.key for cutout in cutouts])[number]
+    positions = paths[key, np.arange(len(key))]
+    return Tracks(positions, np.concatenate([colors for _, colors in parts]), number, paths, seen)
 
 
 def _levels(residual: Residual) -> list[Floats]:
@@ -227,4 +225,4 @@ def _smooth(depth: NDArray[np.float64]) -> NDArray[np.float64]:
     if not known.any():
         return np.ones_like(depth)
     filled = np.interp(np.arange(len(depth)), np.flatnonzero(known), 1 / depth[known])
-    return 1 / ndimage.gaussian_filter1d(ndimage.median_filter(filled, 7, mode="nearest"), 2.0, mode="nearest")
+    return 1 / ndimage.gaussian_filter1d(ndimage.median_filter(filled, 9, mode="nearest"), 3.0, mode="nearest")

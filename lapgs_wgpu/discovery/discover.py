@@ -74,7 +74,7 @@ def discover(config: Config, dataset: Dataset, device: Device, own_field: nn.Mod
     if share < config.discovery.least:
         tracks = None
     generator = torch.Generator().manual_seed(config.seed)
-    scene = scene_with(static, tracks, config, device, generator, own_field)
+    scene = scene_with(static, tracks, config, device, generator, own_field, sheets=depths is not None)
     found = f"{share:.1%} of what it lacks can be followed: nothing is added"
     if tracks is not None:
         meter = Progress(fit_steps, "steps of motion discovery, part 2 of 2: what moves")
@@ -110,13 +110,15 @@ def scene_with(
     device: Device,
     generator: torch.Generator,
     own_field: nn.Module | None = None,
+    *,
+    sheets: bool = False,
 ) -> Scene4D:
     """The static fit's Gaussians, then one for each track; the field does not move them yet."""
     dynamics = torch.zeros(len(static), config.field.dynamics_size)
     if tracks is None:
         rows = {name: values.detach().cpu() for name, values in static.parameters.items()}
     else:
-        rows = rows_with(static, tracks)
+        rows = rows_with(static, tracks, sheets=sheets)
         of_part = DYNAMICS * torch.randn(int(tracks.part.max()) + 1, config.field.dynamics_size, generator=generator)
         dynamics = torch.cat([dynamics, of_part[torch.from_numpy(tracks.part)]])
     rows["dynamics"] = dynamics
