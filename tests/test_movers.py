@@ -27,8 +27,9 @@ def residuals(*, moving: bool = True) -> list[Residual]:
 
 def test_cutouts_show_what_moves_where_it_is_in_each_image() -> None:
     depths = [np.full(mask.shape, FAR, np.float32) for _, mask in TAKEN]
-    tracks = cutout_tracks(residuals(), depths)
+    tracks, share = cutout_tracks(residuals(), depths, 1.3)
     assert tracks is not None
+    assert share > 0.9
     for i, (camera, (image, mask)) in enumerate(zip(CAMERAS, TAKEN, strict=True)):
         seen = tracks.supported[i]
         pixels, depth = camera.project(tracks.paths[i, seen])
@@ -42,7 +43,7 @@ def test_cutouts_show_what_moves_where_it_is_in_each_image() -> None:
 
 
 def test_nothing_moves_where_masks_are_black() -> None:
-    assert cutout_tracks(residuals(moving=False), [np.full((96, 128), FAR, np.float32)] * 10) is None
+    assert cutout_tracks(residuals(moving=False), [np.full((96, 128), FAR, np.float32)] * 10, 1.3) == (None, 0.0)
 
 
 def test_the_cube_of_movers_holds_them_and_not_the_room() -> None:

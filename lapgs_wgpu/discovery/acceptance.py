@@ -23,7 +23,7 @@ from lapgs_wgpu.motion.scene import Scene4D, isotropic_rows
 
 OPACITY = 0.3  # of the Gaussian of a track
 SCALE = 0.4  # of it, in mean distances to its nearest neighbours; more of them lie behind one another
-SHEET_SCALE, SHEET_OPACITY = 0.6, 0.9  # the same of parts that are sheets
+SHEET_SCALE, SHEET_OPACITY = 1.2, 0.9  # the same of parts that are sheets
 IMAGES = 60  # by which a part is judged, at most
 CHANGED = 2.0 / 255  # of a pixel's channel, from which on a part shows there
 MOVING = 0.53  # share of the pixels in which a part shows that move, at least

@@ -31,6 +31,7 @@ VISIBLE = 0.3  # share of a cut-out that must lie in the image
 STIFF = 0.02  # weight of the affine part of a map against that before
 FOOT = 0.15  # of its height: the lowest part of a cut-out, which stands on the ground
 BEFORE = 0.97  # of the depth of the ground
+APART = 0.1, 0.9  # half sides of the box: how far the first and the last cut-out are moved towards the cameras
 FAR_BELOW = 3  # pixels; the ground that a foot stands on lies so far below
 
 Map = NDArray[np.float64]
@@ -52,36 +53,50 @@ class _Cutout(NamedTuple):
     seen: NDArray[np.bool_]
 
 
-def cutout_tracks(residuals: Sequence[Residual], depths: Sequence[Floats]) -> Tracks | None:
-    """Tracks of what moves in the images of one camera; None where nothing does.
+def cutout_tracks(
+    residuals: Sequence[Residual], depths: Sequence[Floats], half_side: float
+) -> tuple[Tracks | None, float]:
+    """Tracks of what moves in the images of one camera, None where nothing does, and the share of the moving pixels
+    that they explain.
+
+    Their positions lie nearer to the cameras than their paths, those of each cut-out by as much again: the field tells
+    Gaussians apart by place.
 
     residuals: images in the order of their times, whose masks say what moves. depths: (H, W) of what stands still in
-    each, world units, NaN where unknown.
+    each, world units, NaN where unknown. half_side: of the box that the field covers, world units.
     """
     images = [_Image(each, _levels(each)) for each in residuals]
-    rest = [image.residual.mask.copy() for image in images]
-    size = rest[0].size
+    masks = [image.residual.mask for image in images]
+    known, rest = [np.zeros_like(mask) for mask in masks], [mask.sum() for mask in masks]
+    size = masks[0].size
     cutouts: list[_Cutout] = []
+    keys: set[int] = set()
     while len(cutouts) < MOST:
-        key = int(np.argmax([mask.sum() for mask in rest]))
-        if rest[key].sum() <= max(ENOUGH * images[key].residual.mask.sum(), LEAST * size):
+        key = int(np.argmax(rest))
+        if rest[key] <= max(ENOUGH * masks[key].sum(), LEAST * size):
             break
-        labels, count = ndimage.label(ndimage.binary_opening(rest[key]))
-        rest[key][:] = False
+        labels, count = ndimage.label(ndimage.binary_opening(masks[key] & ~known[key]))
         for label in range(1, count + 1):
             rows, columns = np.nonzero(labels == label)
             if len(rows) >= LEAST * size:
-                cutouts.append(_followed(images, key, np.stack([columns, rows], axis=1), rest))
+                known[key] |= labels == label
+                cutouts.append(_followed(images, key, np.stack([columns, rows], axis=1), known))
+        keys.add(key)
+        rest = [0 if i in keys else (masks[i] & ~known[i]).sum() for i in range(len(masks))]
     if not cutouts:
-        return None
+        return None, 0.0
+    share = sum(mask.sum() for mask in known) / sum(mask.sum() for mask in masks)
     ground = [_depths(image.residual.mask, depth) for image, depth in zip(images, depths, strict=True)]
     parts = [_placed(cutout, images, ground) for cutout in cutouts]
     number = np.repeat(np.arange(len(parts)), [len(colors) for _, colors in parts])
     paths = np.concatenate([paths for paths, _ in parts], axis=1)
     seen = np.stack([cutout.seen for cutout in cutouts], axis=1)[:, number]
     key = np.array([cutout.key for cutout in cutouts])[number]
-    positions = paths[key, np.arange(len(key))]
-    return Tracks(positions, np.concatenate([colors for _, colors in parts]), number, paths, seen)
+    ahead = np.mean([each.camera.T_cam_world[2, :3] for each in residuals], axis=0).astype(np.float32)
+    apart = np.linspace(*APART, len(parts), dtype=np.float32)[np.argsort(np.argsort([c.key for c in cutouts]))]
+    positions = paths[key, np.arange(len(key))] - half_side * apart[number][:, None] * ahead
+    tracks = Tracks(positions, np.concatenate([colors for _, colors in parts]), number, paths, seen)
+    return tracks, float(share)
 
 
 def _levels(residual: Residual) -> list[Floats]:
@@ -94,8 +109,8 @@ def _levels(residual: Residual) -> list[Floats]:
     return levels
 
 
-def _followed(images: Sequence[_Image], key: int, pixels: NDArray[np.int64], rest: list[Mask]) -> _Cutout:
-    """Follow a cut-out to both ends of the clip; takes what it explains out of the rest."""
+def _followed(images: Sequence[_Image], key: int, pixels: NDArray[np.int64], known: list[Mask]) -> _Cutout:
+    """Follow a cut-out to both ends of the clip; adds what it explains to what is known (H, W) of each image."""
     maps, seen = np.tile(np.eye(2, 3), (len(images), 1, 1)), np.zeros(len(images), bool)
     seen[key] = True
     for way in (-1, 1):
@@ -109,7 +124,7 @@ def _followed(images: Sequence[_Image], key: int, pixels: NDArray[np.int64], res
                 break
             maps[at], seen[at] = found, True
             step, before = found - before, found
-            rest[at] &= ~_explained(images[key], images[at], pixels, found)
+            known[at] |= _explained(images[key], images[at], pixels, found)
     return _Cutout(key, pixels, maps, seen)
 
 

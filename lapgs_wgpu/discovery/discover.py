@@ -60,21 +60,21 @@ def discover(config: Config, dataset: Dataset, device: Device, own_field: nn.Mod
             f"{config.data.background} background; check the images and data.background."
         )
     half_side = config.points.box
-    if depths is not None:
-        tracks = cutout_tracks(images, depths)
-        times, share = np.array([image.time for image in images]), float(tracks is not None)
+    sheets = depths is not None and not dataset.is_rig
+    if sheets and depths is not None:
+        times = np.array([image.time for image in images])
+        tracks, share = cutout_tracks(images, depths, half_side)
     else:
         clouds = surface_points(images, half_side)
-        tracks, times = find_tracks(clouds, half_side), clouds.times
-    if tracks is not None and depths is None:
-        together = 2 * len(dataset.times) <= len(dataset.train)
-        tracks = tracks_in_images(tracks, clouds.times, images, static, background, together=together)
-    if depths is None:
+        times, tracks = clouds.times, find_tracks(clouds, half_side)
+        if tracks is not None:
+            together = 2 * len(dataset.times) <= len(dataset.train)
+            tracks = tracks_in_images(tracks, times, images, static, background, together=together)
         share = 0.0 if tracks is None else explained_share(clouds, tracks, half_side)
     if share < config.discovery.least:
         tracks = None
     generator = torch.Generator().manual_seed(config.seed)
-    scene = scene_with(static, tracks, config, device, generator, own_field, sheets=depths is not None)
+    scene = scene_with(static, tracks, config, device, generator, own_field, sheets=sheets)
     found = f"{share:.1%} of what it lacks can be followed: nothing is added"
     if tracks is not None:
         meter = Progress(fit_steps, "steps of motion discovery, part 2 of 2: what moves")

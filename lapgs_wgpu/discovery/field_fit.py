@@ -17,7 +17,7 @@ MOVING = 1500  # Gaussians of tracks that a step asks, at most
 HASH_RATE, MLP_RATE = 1e-2, 2e-3  # learning rates: half of those of the preset tiny, twice train.start.MAX_*_RATE
 LAST = 0.05  # of the learning rates, in the end; they fall over the second half
 SHAPE_WEIGHT = 0.1  # of changes of scales and quaternions, which the tracks do not know
-FADED, FADE_WEIGHT = 5.0, 0.02  # logits by which what is not seen loses opacity; weight of the distance from that
+FADED, FADE_WEIGHT = 4.0, 0.2  # logits by which what is not seen loses opacity; weight of the distance from that
 SOFTENING = 1e-2  # world units; distances below count as squares
 
 
