@@ -78,7 +78,7 @@ def discover(config: Config, dataset: Dataset, device: Device, own_field: nn.Mod
     found = f"{share:.1%} of what it lacks can be followed: nothing is added"
     if tracks is not None:
         meter = Progress(fit_steps, "steps of motion discovery, part 2 of 2: what moves")
-        error = fit_field(scene, tracks, times, len(static), fit_steps, generator, meter.at)
+        error = fit_field(scene, tracks, times, len(static), fit_steps, generator, meter.at, fades=sheets)
         if error is None:
             tracks, scene = None, scene_with(static, None, config, device, generator, own_field)
             found = f"{share:.1%} of what it lacks can be followed, and the field moves nothing: nothing is added"

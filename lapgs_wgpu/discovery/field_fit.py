@@ -29,11 +29,14 @@ def fit_field(
     steps: int,
     generator: torch.Generator,
     progress: Callable[[int], None],
+    *,
+    fades: bool = False,
 ) -> float | None:
     """Train the field of a scene so that its last Gaussians follow the tracks, and the first `still` ones stay.
 
-    Each step looks at one of the times (T,). Returns the mean distance of tracks and Gaussians in the end, world units;
-    None, and nothing is trained, where the field moves no Gaussians.
+    Each step looks at one of the times (T,). fades: whether tracks lose opacity where they are not seen. Returns the
+    mean distance of tracks and Gaussians in the end, world units; None, and nothing is trained, where the field moves
+    no Gaussians.
     """
     field = scene.field
     assert field is not None
@@ -67,7 +70,7 @@ def fit_field(
         loss = loss + SHAPE_WEIGHT * sum(
             change.abs().mean() for change in (move.d_scales, move.d_quats) if change is not None
         )
-        if move.d_opacity is not None:
+        if fades and move.d_opacity is not None:
             fading = move.d_opacity + FADED * torch.cat([~seen, seen.new_zeros(len(staying))])
             loss = loss + FADE_WEIGHT * fading.abs().mean()
         if not loss.requires_grad:
