@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+from helpers.captures import bright, write_colmap
 from helpers.films import Board, drawn, room_cloud, walk
+from PIL import Image
 
+from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.data.cloud import Cloud
 from lapgs_wgpu.data.mover_cube import mover_cube
 from lapgs_wgpu.discovery.cutouts import cutout_tracks
 from lapgs_wgpu.discovery.residual import Residual
+from lapgs_wgpu.discovery.start_training import start_training
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.train.presets import load_config
 
 BOARD = Board(0.4, 0.6, 0.7)
 CAMERAS = walk(10, 128, 96)
@@ -61,3 +70,29 @@ def test_the_cube_of_movers_holds_them_and_not_the_room() -> None:
         assert abs(pixel[0, 1] - rows.mean()) < 48
     empty = [(CAMERAS[0], lambda: np.zeros((96, 128), bool))]
     assert mover_cube(Cloud(points, colors.astype(np.float32)), empty) is None
+
+
+def test_a_film_starts_from_its_masks(tmp_path: Path, device: Device) -> None:
+    capture = write_colmap(tmp_path / "film", device)
+    files = sorted((capture / "images").glob("*.png"))
+
+    def write_masks(level: int | None) -> None:
+        (capture / "masks").mkdir(exist_ok=True)
+        for file in files:
+            with Image.open(file) as image:
+                shown = bright(np.asarray(image)) if level is None else np.full(image.size[::-1], level > 0)
+            Image.fromarray(shown.astype(np.uint8) * 255).save(capture / "masks" / file.name)
+
+    write_masks(255)
+    with pytest.raises(InputError, match="everything moves"):
+        load_dataset(capture, movers="masks")
+    write_masks(0)
+    assert any("nothing moves" in warning for warning in load_dataset(capture, movers="masks").warnings)
+    write_masks(None)
+    changes = {"data.path": str(capture), "points.count": "300", "density.limit": "500", "schedule.steps": "20"}
+    quick = {"discovery.steps": "10", "discovery.field_steps": "5", "discovery.size": "64"}
+    with start_training(load_config("film", changes | quick), device=device) as training:
+        assert training.discovery is not None
+        assert "moving parts" in training.discovery
+        assert all(view.moving is not None for view in (*training.dataset.train, *training.dataset.test))
+        assert training.step().step == 1

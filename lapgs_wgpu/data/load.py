@@ -76,6 +76,7 @@ def load_dataset(
     warnings += _check_masks(frames)
     if movers is not None:
         found = find_masks(folder / movers, [frame.name.file for frame in frames], "each image, white where it moves")
+        warnings += check_masks(found, frames[0].image.size, "white", movers=True)
         frames = [dataclasses.replace(frame, moving=found[frame.name.file]) for frame in frames]
 
     capture = dataclasses.replace(capture, frames=frames)
