@@ -40,8 +40,8 @@ class DataConfig(Options):
         "folder with a mask for each training image; the loss ignores white pixels; such as masks/ of lapgs-prepare", ""
     )
     movers: str = option(
-        "folder with a mask for each image, white where something moves: there movers are looked for and measured; "
-        "masks: that of lapgs-prepare in the capture",
+        "folder, absolute or in the capture, with a mask for each image, white where something moves: there movers are "
+        "looked for and measured; masks: that of lapgs-prepare",
         "",
     )
     path: str = option(
