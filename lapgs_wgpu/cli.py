@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 import typing
 from collections.abc import Sequence
@@ -19,7 +20,7 @@ if typing.TYPE_CHECKING:
     from lapgs_wgpu.train.config import Config
     from lapgs_wgpu.train.lpips import Lpips
 
-EVAL_KEYS = ("data.path", "data.background", "data.cache_gb")  # keys that can be given with --eval
+EVAL_KEYS = ("data.path", "data.movers", "data.background", "data.cache_gb")  # keys that can be given with --eval
 RESUME_KEYS = ("data.path", "data.masks", "data.cache_gb")  # and with --resume: where the capture is now
 
 
@@ -89,6 +90,7 @@ def _resume(
 
 
 def _evaluate(run: Path, options: dict[str, typing.Any], overrides: dict[str, typing.Any]) -> None:
+    from lapgs_wgpu.data import load_dataset
     from lapgs_wgpu.gpu.device import open_device
     from lapgs_wgpu.io.safe_json_toml import read_json
     from lapgs_wgpu.motion.scene import load
@@ -100,12 +102,18 @@ def _evaluate(run: Path, options: dict[str, typing.Any], overrides: dict[str, ty
     if not (run / "checkpoint.ply").is_file():
         raise InputError(f"{run / 'checkpoint.ply'} does not exist; --eval needs the folder of a finished run.")
     overrides["data.masks"] = ""  # masks are for the training alone
+    movers = overrides.pop("data.movers", None)
     config = _config_of(run, overrides, "--eval needs the folder of a finished run")
     device = open_device(options["device"])
     scene = load(run / "checkpoint.ply", device)
     config, dataset = _open_data(config, run.parent, normalize="placement" in scene.metadata)
     if "data.path" in overrides:
         check_same_data(run, config.data.path, dataset)
+    if movers is not None:  # the world's coordinates follow the masks of the run
+        given = load_dataset(config.data.path, image_size=config.data.size or None, movers=movers).test
+        pairs = zip(dataset.test, given, strict=True)
+        test = tuple(dataclasses.replace(view, moving=other.moving) for view, other in pairs)
+        dataset = dataclasses.replace(dataset, test=test)
     try:
         training = read_json(run / "metrics.json")["training"]
     except (InputError, KeyError, TypeError):

@@ -17,7 +17,7 @@ from lapgs_wgpu.data.views import small_views
 from lapgs_wgpu.discovery.acceptance import explained_share, rows_with, tracks_in_images
 from lapgs_wgpu.discovery.discover import RAMP_STEPS, discover
 from lapgs_wgpu.discovery.field_fit import fit_field
-from lapgs_wgpu.discovery.residual import Residual, moving_pixels
+from lapgs_wgpu.discovery.residual import Residual
 from lapgs_wgpu.discovery.start_training import start_training
 from lapgs_wgpu.discovery.static_fit import static_fit
 from lapgs_wgpu.discovery.surface_points import PointClouds, Points, surface_points
@@ -30,6 +30,7 @@ from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.run import train
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train.config import Config
+from lapgs_wgpu.train.image_metrics import differing_pixels
 from lapgs_wgpu.train.optimizer import Optimizer
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.start import max_field_rates
@@ -89,10 +90,10 @@ def test_moving_pixels_are_those_of_the_ball_and_not_of_blurred_texture() -> Non
     rng = np.random.default_rng(0)
     texture = np.repeat(np.repeat(rng.random((16, 16, 3)), 4, axis=0), 4, axis=1).astype(np.float32)
     shifted = np.roll(texture, 1, axis=1)
-    assert moving_pixels(texture, shifted).mean() < 0.01
+    assert differing_pixels(texture, shifted).mean() < 0.01
     image = texture.copy()
     image[20:32, 24:40] = (0.0, 2.0, 0.0)  # brighter than anything there
-    found = moving_pixels(image, shifted)
+    found = differing_pixels(image, shifted)
     assert found[20:32, 24:40].mean() > 0.95
     found[18:34, 22:42] = False
     assert found.mean() < 0.01

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import json
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train.evaluate import evaluate, mean_psnr, side_by_side, to_8_bit, write_metrics
 from lapgs_wgpu.train.image_metrics import MS_SSIM_SMALLEST, ms_ssim
 from lapgs_wgpu.train.lpips import BLOCKS, Lpips
+from lapgs_wgpu.train.run_folder import result_text
 
 CAMERA = Camera.looking_at([0, -4, 0], [0, 0, 0], up=[0, 0, 1], fov_x=0.7, width=24, height=16)
 
@@ -152,6 +154,30 @@ def test_the_masked_measure_sees_the_pixels_of_the_mask_alone(scene: Scene4D, tm
     write_metrics(tmp_path, metrics)
     with (tmp_path / "metrics.csv").open(newline="") as file:
         assert [float(row["masked_psnr"]) for row in csv.DictReader(file)] == [first["masked_psnr"]] * 2
+
+
+def test_what_moves_is_measured_by_itself_and_drawn_from_beside(scene: Scene4D, tmp_path: Path) -> None:
+    drawn = to_8_bit(scene.render(CAMERA, 0.5).image)
+    moving = np.zeros((16, 24), bool)
+    moving[4:12, 6:18] = True
+    lost = np.where(moving[..., None], drawn + np.uint8(128), drawn)  # another color wherever something moves
+    views = [
+        dataclasses.replace(view("still", drawn), moving=lambda: ~moving & False),
+        dataclasses.replace(view("lost", lost), moving=lambda: moving),
+    ]
+    metrics = evaluate(scene, views, "black", tmp_path)
+    assert metrics["views"][0]["psnr_moving"] == "not available"
+    assert metrics["psnr_still"] == pytest.approx(100)
+    assert metrics["psnr_moving"] == pytest.approx(-20 * np.log10(128 / 255), abs=1e-3)
+    assert metrics["ssim_moving"] < metrics["ssim_still"]
+    assert metrics["explained"] < 0.2
+    with Image.open(tmp_path / "off_lost.png") as picture:
+        left, right = np.split(np.asarray(picture), 2, axis=1)
+    assert not np.array_equal(left, right)
+    write_metrics(tmp_path, metrics)
+    last = result_text(tmp_path).splitlines()
+    assert last[0].startswith("warning: ")
+    assert len(last) == 2
 
 
 def test_what_no_mask_measures_is_not_available(scene: Scene4D) -> None:

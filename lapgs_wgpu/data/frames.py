@@ -41,6 +41,7 @@ class Frame:
     label: suffix of the view's name; None to number the views.
     depths: nearest and furthest depth, the capture's units.
     mask: image, of any size, of what the training leaves out or the masked metrics measure, as mask_kind says.
+    moving: the same of what moves, white.
     """
 
     image: ImageSource
@@ -54,6 +55,7 @@ class Frame:
     depths: tuple[float, float] | None = None
     mask: Path | None = None
     mask_kind: MaskKind = "measured"
+    moving: Path | None = None
     states_size: bool = True
 
     @property

@@ -14,7 +14,8 @@ from typing import NamedTuple, get_args
 from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
 from lapgs_wgpu.data.images import SUFFIXES, Pixels, Size, shrink, shrunk_size
 from lapgs_wgpu.data.lens import Lens, Undistortion
-from lapgs_wgpu.data.masks import MASKED, Mask, MaskKind, check_masks, find_masks, read_mask
+from lapgs_wgpu.data.masks import MASKED, MOSTLY, Mask, MaskKind, check_masks, find_masks, read_mask
+from lapgs_wgpu.data.mover_cube import mover_cube
 from lapgs_wgpu.data.placement import place
 from lapgs_wgpu.data.readers import apps, colmap, hypernerf, panoptic, poses_bounds, transforms
 from lapgs_wgpu.data.split import held_out
@@ -40,6 +41,7 @@ def load_dataset(
     normalize: bool = True,
     undistort: bool = True,
     masks: str | Path | None = None,
+    movers: str | Path | None = None,
 ) -> Dataset:
     """Open a capture; its files determine the format (docs/data.md). Images are decoded later, view by view.
 
@@ -50,6 +52,7 @@ def load_dataset(
         undistort: False takes images as they are, and cameras as pinholes that look at the center of the image,
             whatever the files say of distortion, skew and principal point, as published code on HyperNeRF does.
         masks: folder with a PNG for each training image, under its name, white where the training loss ignores it.
+        movers: the same for each image, white where something moves; a name is one in the capture's folder.
 
     Returns:
         A dataset, whose `train`, `test` and `val` are tuples of views (`name`, `camera`, `time`, `load()`).
@@ -72,6 +75,10 @@ def load_dataset(
     if masks is not None:
         frames = _masked(Path(masks), frames)
     warnings += _check_masks(frames)
+    if movers is not None:
+        found = find_masks(folder / movers, [frame.name.file for frame in frames], "each image, white where it moves")
+        warnings += check_masks(found, frames[0].image.size, "white", movers=True)
+        frames = [dataclasses.replace(frame, moving=found[frame.name.file]) for frame in frames]
 
     capture = dataclasses.replace(capture, frames=frames)
     shots = _undistort(capture, shrunk_size(frames[0].image.size, image_size))
@@ -83,7 +90,11 @@ def load_dataset(
             warnings += check_views(capture.cloud, cameras, files, capture.source)
         cloud = check_cloud(capture.cloud, training_cameras, capture.source, warnings)
         capture = dataclasses.replace(capture, cloud=cloud)
-    placement = place(capture, [shot.frame for shot in training], training_cameras, normalize=normalize)
+    moving = None
+    if movers is not None and capture.cloud is not None:
+        by_time = sorted(training, key=lambda shot: shot.frame.time or 0.0)
+        moving = mover_cube(capture.cloud, [(shot.camera, shot.moving) for shot in by_time])
+    placement = place(capture, [shot.frame for shot in training], training_cameras, normalize=normalize, moving=moving)
     warnings += placement.warnings
     summary = _summary(reader.name, capture, shots, time_source)
     if capture.own_footage:
@@ -232,6 +243,12 @@ class _Shot(NamedTuple):
         assert self.frame.mask is not None
         return read_mask(self.frame.mask, self.frame.mask_kind, self.undistortion, self.frame.image.size, self.size)
 
+    def moving(self) -> Mask:
+        """Decode, undistort and shrink the mask of what moves. Raises InputError."""
+        assert self.frame.moving is not None
+        stored = self.frame.image.size
+        return read_mask(self.frame.moving, "white", self.undistortion, stored, self.size, MOSTLY)
+
     def view(self, number: int, camera: Camera) -> View:
         """Make the view. number: within its split, for its name. camera: in the world's coordinates."""
         frame = self.frame
@@ -245,6 +262,7 @@ class _Shot(NamedTuple):
             pixels=self.pixels,
             mask=mask if frame.split == "test" else None,
             ignored=mask if frame.split == "train" else None,
+            moving=None if frame.moving is None else self.moving,
         )
 
 

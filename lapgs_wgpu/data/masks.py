@@ -26,6 +26,7 @@ MASKED = {"white": "train", "black": "train", "measured": "test"}  # the split w
 
 WHITE = 128  # level from which on a pixel is set
 MEASURED = 255  # level of a pixel that the masked metrics measure: what mixes with others does not count
+MOSTLY = 127  # level of a shrunk mask, above which most of the pixels mixed there are set
 CHECKED = 8  # masks that are decoded when a capture is opened
 
 
@@ -90,11 +91,11 @@ def check_mask_size(path: Path, size: Size) -> None:
         )
 
 
-def check_masks(masks: Mapping[str, Path], size: Size, kind: MaskKind) -> list[str]:
+def check_masks(masks: Mapping[str, Path], size: Size, kind: MaskKind, *, movers: bool = False) -> list[str]:
     """Check the proportions of masks for images of (width, height) `size`, and decode some of those of training images.
 
-    masks: by image. Returns a warning if these take out nothing. Raises InputError for other proportions, or if they
-    take out everything.
+    masks: by image. movers: whether they say what moves, white. Returns a warning if these take out nothing. Raises
+    InputError for other proportions, or if they take out everything.
     """
     for path in masks.values():
         check_mask_size(path, size)
@@ -114,6 +115,13 @@ def check_masks(masks: Mapping[str, Path], size: Size, kind: MaskKind) -> list[s
     looked_at = f"in {len(levels)} of {len(masks)} that were looked at, such as {checked[0]}"
     color = f"{'black (a level below' if kind == 'black' else 'white (a level of at least'} {WHITE} of 255)"
     range_ = f"their levels are {min(level.min() for level in levels)} to {max(level.max() for level in levels)}"
+    if movers and any(pixels.any() for pixels in out):
+        raise InputError(
+            f"everything moves by the masks: {looked_at}, every pixel is {color}; {range_}: invert them, or leave them "
+            "out (data.movers)."
+        )
+    if movers:
+        return [f"nothing moves by the masks: {looked_at}, no pixel is {color}; {range_}."]
     if not any(pixels.any() for pixels in out):
         return [f"the masks leave out nothing: {looked_at}, no pixel is {color}; {range_}."]
     raise InputError(
@@ -122,14 +130,16 @@ def check_masks(masks: Mapping[str, Path], size: Size, kind: MaskKind) -> list[s
     )
 
 
-def read_mask(path: Path, kind: MaskKind, undistortion: Undistortion | None, stored: Size, size: Size) -> Mask:
+def read_mask(
+    path: Path, kind: MaskKind, undistortion: Undistortion | None, stored: Size, size: Size, above: int = 0
+) -> Mask:
     """Decode the mask (H, W) of an image of (width, height) `stored` that is undistorted and shrunk to `size`.
 
     The mask is first resized to `stored` by nearest neighbours. A pixel in which several mix is ignored if any of them
-    is, and measured if all of them are. Raises InputError.
+    is, and measured if all of them are; `above` as in `MOSTLY`. Raises InputError.
     """
     pixels = resize(as_pixels(_taken_out(_levels(decode(path)), kind)), stored, NEAREST)
-    out = shrink(pixels if undistortion is None else undistortion.apply(pixels), size)[..., 0] > 0
+    out = shrink(pixels if undistortion is None else undistortion.apply(pixels), size)[..., 0] > above
     return ~out if kind == "measured" else out
 
 

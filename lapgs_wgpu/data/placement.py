@@ -31,7 +31,14 @@ class Placement(NamedTuple):
     warnings: list[str]
 
 
-def place(capture: Capture, training: Sequence[Frame], cameras: Sequence[Camera], *, normalize: bool) -> Placement:
+def place(
+    capture: Capture,
+    training: Sequence[Frame],
+    cameras: Sequence[Camera],
+    *,
+    normalize: bool,
+    moving: Cube | None = None,
+) -> Placement:
     """Determine the cube that a capture fills, and bring cloud and depths into the world's coordinates.
 
     Args:
@@ -39,12 +46,13 @@ def place(capture: Capture, training: Sequence[Frame], cameras: Sequence[Camera]
         training: its training frames.
         cameras: the distinct cameras of these, in the capture's coordinates.
         normalize: False keeps the coordinates of captures that may keep theirs, whatever their size.
+        moving: the cube of what moves, in the capture's coordinates; None for that of the whole scene.
 
     Raises:
         InputError: nothing tells where the scene is.
     """
     depths, warnings = _depths(capture, training, cameras)
-    cube = _cube(capture, cameras, depths)
+    cube = moving or _cube(capture, cameras, depths)
     if cube is None:
         warnings.append(
             f"{capture.source}: half or more of {len(cameras)} cameras look away from the point nearest to all "

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from lapgs_wgpu.data.cloud import Cloud
 from lapgs_wgpu.data.focus import focus_of, spread
 from lapgs_wgpu.data.images import Size, shrink
-from lapgs_wgpu.data.masks import as_pixels
+from lapgs_wgpu.data.masks import MOSTLY, as_pixels
 from lapgs_wgpu.data.normalize import BOX, Normalization
 from lapgs_wgpu.data.timestamps import time_step
 from lapgs_wgpu.errors import InputError
@@ -38,6 +38,7 @@ class View:
     mask: decodes the mask of the masked metrics of a test view, such as DyCheck's covisibility masks: (height, width)
         bool. Raises InputError.
     ignored: decodes the pixels of a training view that the loss leaves out: (height, width) bool. Raises InputError.
+    moving: decodes the pixels of what moves: (height, width) bool. Raises InputError.
     """
 
     name: str
@@ -47,6 +48,7 @@ class View:
     pixels: Callable[[], NDArray[np.uint8]]
     mask: Callable[[], NDArray[np.bool_]] | None = None
     ignored: Callable[[], NDArray[np.bool_]] | None = None
+    moving: Callable[[], NDArray[np.bool_]] | None = None
 
     def load(self) -> NDArray[np.uint8]:
         """Decode the image: (H, W, 3) RGB or (H, W, 4) straight RGBA, uint8, read-only. Raises InputError."""
@@ -192,8 +194,9 @@ def small_views(views: Sequence[View], size: int) -> list[View]:
         small = max(1, round(scale * width)), max(1, round(scale * height))
         camera = cameras.setdefault(view.camera, view.camera.resized(*small))
         ignored = None if view.ignored is None else partial(_shrunk_mask, view.ignored, small)
+        moving = None if view.moving is None else cache(partial(_shrunk_mask, view.moving, small, MOSTLY))
         pixels = cache(partial(_shrunk, view, small))
-        shrunk_views.append(dataclasses.replace(view, camera=camera, pixels=pixels, ignored=ignored))
+        shrunk_views.append(dataclasses.replace(view, camera=camera, pixels=pixels, ignored=ignored, moving=moving))
     return shrunk_views
 
 
@@ -201,9 +204,9 @@ def _shrunk(view: View, size: Size) -> NDArray[np.uint8]:
     return shrink(view.load(), size)
 
 
-def _shrunk_mask(mask: Callable[[], NDArray[np.bool_]], size: Size) -> NDArray[np.bool_]:
-    """Shrink a mask (H, W): a pixel is set where any of the pixels mixed into it is."""
-    return shrink(as_pixels(mask()), size)[..., 0] > 0
+def _shrunk_mask(mask: Callable[[], NDArray[np.bool_]], size: Size, above: int = 0) -> NDArray[np.bool_]:
+    """Shrink a mask (H, W): a pixel is set where the share that is of the pixels mixed into it is above this / 255."""
+    return shrink(as_pixels(mask()), size)[..., 0] > above
 
 
 def composite(image: NDArray[np.uint8], background: ArrayLike) -> NDArray[np.uint8]:

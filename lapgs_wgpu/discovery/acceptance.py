@@ -23,6 +23,7 @@ from lapgs_wgpu.motion.scene import Scene4D, isotropic_rows
 
 OPACITY = 0.3  # of the Gaussian of a track
 SCALE = 0.4  # of it, in mean distances to its nearest neighbours; more of them lie behind one another
+SHEET_SCALE, SHEET_OPACITY = 1.2, 0.9  # the same of parts that are sheets
 IMAGES = 60  # by which a part is judged, at most
 CHANGED = 2.0 / 255  # of a pixel's channel, from which on a part shows there
 MOVING = 0.53  # share of the pixels in which a part shows that move, at least
@@ -30,12 +31,19 @@ GAIN = 0.05  # or share of the static fit's error there that it takes away: wher
 NEAR = 0.1  # box half sides; distance within which a track explains a surface point
 
 
-def rows_with(static: Scene4D, tracks: Tracks) -> dict[str, Tensor]:
+def rows_with(static: Scene4D, tracks: Tracks, *, sheets: bool = False) -> dict[str, Tensor]:
     """The Gaussians of the static fit, then one for each track at its place at the key time, in host memory.
 
-    They are the parameters of a scene without a field, float32.
+    sheets: whether each part is a sheet of its own, which nothing lies behind. They are the parameters of a scene
+    without a field, float32.
     """
-    new = isotropic_rows(tracks.positions, tracks.colors, SCALE * initial_scales(tracks.positions), OPACITY)
+    if sheets:
+        scales = np.empty(len(tracks.part), np.float32)
+        for part in np.unique(tracks.part):
+            scales[tracks.part == part] = SHEET_SCALE * initial_scales(tracks.positions[tracks.part == part])
+    else:
+        scales = SCALE * initial_scales(tracks.positions)
+    new = isotropic_rows(tracks.positions, tracks.colors, scales, SHEET_OPACITY if sheets else OPACITY)
     return {name: torch.cat([static.parameters[name].detach().cpu(), values]) for name, values in new.items()}
 
 

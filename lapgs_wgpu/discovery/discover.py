@@ -10,6 +10,7 @@ from torch import nn
 
 from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.discovery.acceptance import explained_share, rows_with, tracks_in_images
+from lapgs_wgpu.discovery.cutouts import cutout_tracks
 from lapgs_wgpu.discovery.field_fit import fit_field
 from lapgs_wgpu.discovery.static_fit import static_fit
 from lapgs_wgpu.discovery.surface_points import surface_points
@@ -50,7 +51,7 @@ def discover(config: Config, dataset: Dataset, device: Device, own_field: nn.Mod
     started = time.perf_counter()
     steps, fit_steps = config.discovery.steps, config.discovery.field_steps
     meter = Progress(steps, "steps of motion discovery, part 1 of 2: what stands still")
-    static, images, corrections = static_fit(config, dataset, device, meter.at)
+    static, images, depths, corrections = static_fit(config, dataset, device, meter.at)
     meter.at(steps, lambda: "motion discovery: following what moves from one time to the next")
     background = BACKGROUND_LEVELS[config.data.background]
     if all(float(np.abs(image.image - background).max()) < SHOWN for image in images):
@@ -59,20 +60,25 @@ def discover(config: Config, dataset: Dataset, device: Device, own_field: nn.Mod
             f"{config.data.background} background; check the images and data.background."
         )
     half_side = config.points.box
-    clouds = surface_points(images, half_side)
-    tracks = find_tracks(clouds, half_side)
-    if tracks is not None:
-        together = 2 * len(dataset.times) <= len(dataset.train)
-        tracks = tracks_in_images(tracks, clouds.times, images, static, background, together=together)
-    share = 0.0 if tracks is None else explained_share(clouds, tracks, half_side)
+    sheets = depths is not None and not dataset.is_rig
+    if sheets and depths is not None:
+        times = np.array([image.time for image in images])
+        tracks, share = cutout_tracks(images, depths, half_side)
+    else:
+        clouds = surface_points(images, half_side)
+        times, tracks = clouds.times, find_tracks(clouds, half_side)
+        if tracks is not None:
+            together = 2 * len(dataset.times) <= len(dataset.train)
+            tracks = tracks_in_images(tracks, times, images, static, background, together=together)
+        share = 0.0 if tracks is None else explained_share(clouds, tracks, half_side)
     if share < config.discovery.least:
         tracks = None
     generator = torch.Generator().manual_seed(config.seed)
-    scene = scene_with(static, tracks, config, device, generator, own_field)
+    scene = scene_with(static, tracks, config, device, generator, own_field, sheets=sheets)
     found = f"{share:.1%} of what it lacks can be followed: nothing is added"
     if tracks is not None:
         meter = Progress(fit_steps, "steps of motion discovery, part 2 of 2: what moves")
-        error = fit_field(scene, tracks, clouds.times, len(static), fit_steps, generator, meter.at)
+        error = fit_field(scene, tracks, times, len(static), fit_steps, generator, meter.at, fades=sheets)
         if error is None:
             tracks, scene = None, scene_with(static, None, config, device, generator, own_field)
             found = f"{share:.1%} of what it lacks can be followed, and the field moves nothing: nothing is added"
@@ -104,13 +110,15 @@ def scene_with(
     device: Device,
     generator: torch.Generator,
     own_field: nn.Module | None = None,
+    *,
+    sheets: bool = False,
 ) -> Scene4D:
     """The static fit's Gaussians, then one for each track; the field does not move them yet."""
     dynamics = torch.zeros(len(static), config.field.dynamics_size)
     if tracks is None:
         rows = {name: values.detach().cpu() for name, values in static.parameters.items()}
     else:
-        rows = rows_with(static, tracks)
+        rows = rows_with(static, tracks, sheets=sheets)
         of_part = DYNAMICS * torch.randn(int(tracks.part.max()) + 1, config.field.dynamics_size, generator=generator)
         dynamics = torch.cat([dynamics, of_part[torch.from_numpy(tracks.part)]])
     rows["dynamics"] = dynamics

@@ -11,12 +11,11 @@ from scipy import ndimage
 
 from lapgs_wgpu.data.evenly import evenly_indices
 from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.train.image_metrics import differing_pixels
 
 Floats = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-THRESHOLD = 0.1  # least residual of a moving pixel; colors are in [0, 1]
-REACH = 2  # pixels; texture that the static fit blurs or shifts by less is no residual
 FALLOFF = 1.5  # pixels; standard deviation of the mask's soft border
 BLUR = 2.0  # pixels; standard deviation of the colors that views are compared by
 
@@ -45,14 +44,15 @@ class Residual:
         time: in [0, 1].
         image: (H, W, 3) in [0, 1].
         still: (H, W, 3), the static fit's image of the same camera.
+        moving: (H, W), the moving pixels; None to find them.
 
     Attributes:
         mask: (H, W), the moving pixels.
     """
 
-    def __init__(self, camera: Camera, time: float, image: Floats, still: Floats) -> None:
+    def __init__(self, camera: Camera, time: float, image: Floats, still: Floats, moving: Mask | None = None) -> None:
         self.camera, self.time, self.image, self.still = camera, time, image, still
-        self.mask = moving_pixels(image, still)
+        self.mask = differing_pixels(image, still) if moving is None else moving
 
     @cached_property
     def _soft(self) -> Floats:
@@ -90,16 +90,3 @@ class Residual:
         u, v = (columns + 0.5 - K[0, 2]) / K[0, 0], (rows + 0.5 - K[1, 2]) / K[1, 1]
         directions = np.stack([u, v, np.ones(len(rows))], axis=1) @ self.camera.T_cam_world[:3, :3]
         return Rays(directions.astype(np.float32), self._blurred[rows, columns], self.image[rows, columns])
-
-
-def moving_pixels(image: Floats, still: Floats) -> Mask:
-    """(H, W) bool: where an image (H, W, 3) differs from the static fit's, but for thin lines and single pixels.
-
-    The residual is the distance of a color to the range of the static fit's colors within REACH pixels, the largest
-    over the channels.
-    """
-    size = (2 * REACH + 1, 2 * REACH + 1, 1)
-    low, high = ndimage.minimum_filter(still, size), ndimage.maximum_filter(still, size)
-    residual = np.maximum(np.maximum(low - image, image - high), 0.0).max(axis=2)
-    core = ndimage.binary_opening(residual > THRESHOLD)
-    return ndimage.binary_dilation(core, iterations=2) & (residual > 0.5 * THRESHOLD)

@@ -8,9 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from scipy import ndimage
 
-from lapgs_wgpu.data.views import Dataset, composite, small_views, spread_views
-from lapgs_wgpu.discovery.residual import Residual
+from lapgs_wgpu.data.views import Dataset, View, composite, small_views, spread_views
+from lapgs_wgpu.discovery.residual import Floats, Residual
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.camera_refinement import Corrections
@@ -20,14 +21,18 @@ from lapgs_wgpu.train.static_config import static_config
 from lapgs_wgpu.train.trainer import Trainer
 
 MOST_VIEWS = 400  # of a capture, evenly chosen over the clip
+RIM = 2  # pixels around what moves that the fit does not look at, either
+SOLID = 0.5  # alpha from which on something is there
 
 
 class StaticFit(NamedTuple):
     """scene: what stands still. images: the training images of the clip, by time, with their differences from it.
-    corrections: of the dataset's cameras; None where they are kept."""
+    depths: (H, W) of what stands still in each, world units, NaN where nothing does; None where no masks tell what
+    moves. corrections: of the dataset's cameras; None where they are kept."""
 
     scene: Scene4D
     images: list[Residual]
+    depths: list[Floats] | None
     corrections: Corrections | None
 
 
@@ -38,24 +43,38 @@ def static_fit(config: Config, dataset: Dataset, device: Device, progress: Calla
     of whose losses L1 and SSIM are left. progress: called with each step.
     """
     picked = spread_views(dataset.train, MOST_VIEWS)
-    small = small_views(picked, config.discovery.size)
+    small = [_without_movers(view) for view in small_views(picked, config.discovery.size)]
     with Trainer(static_config(config), dataclasses.replace(dataset, train=tuple(small)), device) as training:
         for result in training:
             progress(result.step)
     background, refinement = torch.full((3,), BACKGROUND_LEVELS[config.data.background]), training.cameras
-    images = []
+    images, depths = [], []
     for view in small:
         image = (composite(view.load(), background.numpy()) / 255).astype(np.float32)
         camera = view.camera if refinement is None else refinement.refined(view.camera).camera
-        still = training.scene.render(camera, view.time, background, depth=False).image.numpy(force=True)
+        rendering = training.scene.render(camera, view.time, background, depth=view.moving is not None)
+        still = rendering.image.numpy(force=True)
         if (correction := training.exposure_of(view)) is not None:
             image = without_exposure(image, correction.numpy(force=True))
         if (ignored := view.load_ignored()) is not None:
             image[ignored] = still[ignored]
-        images.append(Residual(camera, view.time, image, still))
+        moving = None if view.moving is None else view.moving()
+        images.append(Residual(camera, view.time, image, still, moving))
+        if moving is not None:
+            alpha = rendering.alpha.numpy(force=True)
+            depths.append(np.where(alpha > SOLID, rendering.depth.numpy(force=True) / np.maximum(alpha, SOLID), np.nan))
     corrections = None
     if refinement is not None:
         known = {before.camera: after.camera for before, after in zip(picked, small, strict=True)}
         numbers = {n: known[camera] for n, camera in enumerate(dataset.cameras) if camera in known}
         corrections = refinement.corrections_of(numbers)
-    return StaticFit(training.scene, images, corrections)
+    return StaticFit(training.scene, images, depths or None, corrections)
+
+
+def _without_movers(view: View) -> View:
+    """The view, whose moving pixels the loss leaves out."""
+    if view.moving is None:
+        return view
+    moving = ndimage.binary_dilation(view.moving(), iterations=RIM)
+    ignored = view.load_ignored()
+    return dataclasses.replace(view, ignored=lambda: moving if ignored is None else moving | ignored)

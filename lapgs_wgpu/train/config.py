@@ -39,6 +39,11 @@ class DataConfig(Options):
     masks: str = option(
         "folder with a mask for each training image; the loss ignores white pixels; such as masks/ of lapgs-prepare", ""
     )
+    movers: str = option(
+        "folder, absolute or in the capture, with a mask for each image, white where something moves: there movers are "
+        "looked for and measured; masks: that of lapgs-prepare",
+        "",
+    )
     path: str = option(
         'folder of the capture (docs/data.md lists the formats), or "synthetic" for the built-in scene', ""
     )

@@ -6,6 +6,7 @@ Both sides are compared as 8-bit pictures: the model of the last step, clamped a
 from __future__ import annotations
 
 import csv
+import dataclasses
 import io
 import json
 import time
@@ -26,11 +27,13 @@ from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.progress import Progress
 from lapgs_wgpu.train.config import BACKGROUND_LEVELS
 from lapgs_wgpu.train.environment import environment
-from lapgs_wgpu.train.image_metrics import MS_SSIM_SMALLEST, ms_ssim, psnr, ssim
+from lapgs_wgpu.train.image_metrics import MS_SSIM_SMALLEST, differing_pixels, ms_ssim, psnr, ssim
 from lapgs_wgpu.train.lpips import SMALLEST, Lpips
 
 ERROR_GAIN = 4  # of the error pictures
-MEASURES = ("psnr", "ssim", "ms_ssim", "lpips", "lpips_unscaled", "masked_psnr")
+OFF_PATH = 0.05  # of the median depth: how far beside a view's camera pictures of what moves are drawn, too
+PARTS = ("psnr_moving", "ssim_moving", "psnr_still", "ssim_still", "explained")
+MEASURES = ("psnr", "ssim", "ms_ssim", "lpips", "lpips_unscaled", "masked_psnr", *PARTS)
 NOT_AVAILABLE = "not available"
 
 
@@ -50,8 +53,10 @@ def evaluate(
     are no weights for it.
     Each measure is one of an image, then the mean over the images (of PSNR of the dB): psnr over all channels; ssim,
     that of the loss; ms_ssim; lpips on inputs in [-1, 1], and lpips_unscaled on inputs in [0, 1], as 3DGS's code
-    reports it; masked_psnr, of the pixels of the view's mask. "not available" stands for what cannot be
-    measured: pictures too small, no weights, no masks.
+    reports it; masked_psnr, of the pixels of the view's mask. Where masks say what moves: psnr_moving and
+    ssim_moving inside them, psnr_still and ssim_still outside, explained the share of the moving pixels that are drawn
+    as they are (`differing_pixels`); a picture off_NAME.png shows such a view from OFF_PATH to the left and right.
+    "not available" stands for what cannot be measured: pictures too small, no weights, no masks, nothing that moves.
     progress: takes a step for each view.
     Raises InputError where there are no views, or a picture or a mask cannot be read.
     """
@@ -63,14 +68,18 @@ def evaluate(
         truth, image = _on(color, view), _render(scene, view, color)
         row: dict[str, Any] = {"view": view.name, "time": view.time}
         row |= _measures(_unit(image), _unit(truth), view.load_mask(), lpips)
+        row |= _parts(_unit(image), _unit(truth), None if view.moving is None else view.moving())
         rows.append(row)
         if folder is not None:
             with atomic_write(folder / f"{view.name}.png") as file:
                 file.write(encode_png(side_by_side(truth, image)))
+            if view.moving is not None:
+                with atomic_write(folder / f"off_{view.name}.png") as file:
+                    file.write(encode_png(_off_path(scene, view, color)))
         if progress is not None:
             progress.step()
     return {
-        **{name: _mean([row[name] for row in rows]) for name in MEASURES},
+        **{name: _mean(name, [row[name] for row in rows]) for name in MEASURES},
         "gaussians": len(scene),
         "field": scene.field_config.kind,
         "size": [views[0].camera.width, views[0].camera.height],
@@ -119,8 +128,35 @@ def _measures(
     }
 
 
-def _mean(values: list[Any]) -> float | str:
-    return NOT_AVAILABLE if NOT_AVAILABLE in values else float(np.mean(values))
+def _parts(image: Tensor, truth: Tensor, moving: NDArray[np.bool_] | None) -> dict[str, float | str]:
+    if moving is None or not moving.any() or moving.all():
+        return dict.fromkeys(PARTS, NOT_AVAILABLE)
+    measures: dict[str, float | str] = {}
+    for name, pixels in (("moving", torch.from_numpy(moving)), ("still", torch.from_numpy(~moving))):
+        measures[f"psnr_{name}"] = psnr(image[pixels], truth[pixels])
+        measures[f"ssim_{name}"] = float(ssim(image, truth, pixels))
+    differing = differing_pixels(truth.numpy(), image.numpy())
+    return measures | {"explained": float(1 - differing[moving].mean())}
+
+
+def _off_path(scene: Scene4D, view: View, color: Tensor) -> NDArray[np.uint8]:
+    """(H, 2 W, 3) a view from the left and from the right of its camera."""
+    drawn = scene.render(view.camera, view.time, color)
+    shown = drawn.alpha > 0.5
+    depth = float((drawn.depth[shown] / drawn.alpha[shown]).median()) if shown.any() else 1.0
+    pictures = []
+    for way in (OFF_PATH, -OFF_PATH):  # the world moves the other way
+        shift = np.eye(4)
+        shift[0, 3] = way * depth
+        camera = dataclasses.replace(view.camera, T_cam_world=shift @ view.camera.T_cam_world)
+        pictures.append(_render(scene, dataclasses.replace(view, camera=camera), color))
+    return np.concatenate(pictures, axis=1)
+
+
+def _mean(name: str, values: list[Any]) -> float | str:
+    """Of a measure; where it is one of a part of the image, of the images that have any."""
+    known = [value for value in values if value != NOT_AVAILABLE]
+    return float(np.mean(known)) if known and (name in PARTS or len(known) == len(values)) else NOT_AVAILABLE
 
 
 def write_metrics(folder: Path, metrics: dict[str, Any]) -> None:

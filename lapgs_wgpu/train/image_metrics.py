@@ -8,7 +8,10 @@ from __future__ import annotations
 import functools
 import math
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
+from scipy import ndimage
 from torch import Tensor
 from torch.nn import functional
 
@@ -19,13 +22,16 @@ SSIM_SIGMA = 1.5  # pixels
 SSIM_C1, SSIM_C2 = CONSTANTS["SSIM_C1"], CONSTANTS["SSIM_C2"]
 MS_SSIM_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)  # of the scales, the finest first
 MS_SSIM_SMALLEST = (SSIM_WINDOW - 1) * 2 ** (len(MS_SSIM_WEIGHTS) - 1) + 1  # 161: the coarsest has one window
+DIFFERENCE = 0.1  # of a channel, from which on a pixel differs
+REACH = 2  # pixels; texture that is blurred or shifted by less does not differ
 LEAST_ERROR = 1e-10  # mean squared error that PSNR takes equal images to have: 100 dB
 
 
-def ssim(image: Tensor, target: Tensor) -> Tensor:
+def ssim(image: Tensor, target: Tensor, pixels: Tensor | None = None) -> Tensor:
     """Mean structural similarity (Wang et al. 2004) of two (H, W, C) images, as 3DGS and its successors report it.
 
-    A Gaussian window of 11x11 pixels and sigma 1.5; beyond the border lies zero, and the mean is over all pixels.
+    A Gaussian window of 11x11 pixels and sigma 1.5; beyond the border lies zero, and the mean is over all pixels, or
+    over those of a mask (H, W).
     (Other libraries leave the border out or pad it otherwise, and give other numbers.)
     """
     a, b = image.permute(2, 0, 1), target.permute(2, 0, 1)
@@ -33,7 +39,8 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
     covariance = ab - mean_a * mean_b
     variances = (aa - mean_a * mean_a) + (bb - mean_b * mean_b)
     luminance = (2 * mean_a * mean_b + SSIM_C1) / (mean_a * mean_a + mean_b * mean_b + SSIM_C1)
-    return (luminance * (2 * covariance + SSIM_C2) / (variances + SSIM_C2)).mean()
+    similar = luminance * (2 * covariance + SSIM_C2) / (variances + SSIM_C2)
+    return similar.mean() if pixels is None else similar[:, pixels].mean()
 
 
 def ms_ssim(image: Tensor, target: Tensor) -> Tensor:
@@ -69,6 +76,19 @@ def psnr(image: Tensor, target: Tensor) -> float:
 def psnr_of(mean_squared_error: float) -> float:
     """Peak signal-to-noise ratio in dB of values in [0, 1], at most 100 dB."""
     return -10.0 * math.log10(max(mean_squared_error, LEAST_ERROR))
+
+
+def differing_pixels(image: NDArray[np.float32], drawn: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """(H, W) bool: where an image (H, W, 3) differs from one that was drawn, but for thin lines and single pixels.
+
+    The difference is the distance of a color to the range of the drawn colors within REACH pixels, the largest over the
+    channels.
+    """
+    size = (2 * REACH + 1, 2 * REACH + 1, 1)
+    low, high = ndimage.minimum_filter(drawn, size), ndimage.maximum_filter(drawn, size)
+    difference = np.maximum(np.maximum(low - image, image - high), 0.0).max(axis=2)
+    core = ndimage.binary_opening(difference > DIFFERENCE)
+    return ndimage.binary_dilation(core, iterations=2) & (difference > 0.5 * DIFFERENCE)
 
 
 def _blur(planes: Tensor) -> Tensor:

@@ -35,4 +35,5 @@ def open_dataset(config: Config, *, normalize: bool = True) -> Dataset:
         normalize=normalize,
         undistort=data.undistort,
         masks=data.masks or None,
+        movers=data.movers or None,
     )

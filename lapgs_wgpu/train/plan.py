@@ -20,8 +20,14 @@ from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.start import start_from_points
 from lapgs_wgpu.train.trainer import Trainer
 
-LARGE = {"one moving camera": "hypernerf", "static cameras": "neu3d", "cameras all around": "dnerf"}
-SMALL = {"one moving camera": "hypernerf-tiny", "static cameras": "neu3d-tiny", "cameras all around": "tiny"}
+FILM, MASKS = "a film with masks of what moves", "masks"  # the latter is lapgs-prepare's folder of them
+LARGE = {FILM: "film", "one moving camera": "hypernerf", "static cameras": "neu3d", "cameras all around": "dnerf"}
+SMALL = {
+    FILM: "film",
+    "one moving camera": "hypernerf-tiny",
+    "static cameras": "neu3d-tiny",
+    "cameras all around": "tiny",
+}
 PATIENCE = 60.0  # minutes that a training with a large preset may take, unless others are given
 STEPS_PER_TIME = 20  # steps for each time of the clip, at least: what `tiny` has on D-NeRF's scenes
 LEAST_SHARE = 0.4  # of a large preset's steps; with fewer, the small preset is better
@@ -42,7 +48,7 @@ class Plan(NamedTuple):
 
 
 def camera_layout(dataset: Dataset) -> str:
-    """How the cameras of a capture are arranged: a key of LARGE and SMALL."""
+    """How the cameras of a capture are arranged: a key of LARGE and SMALL other than FILM."""
     if dataset.still_cameras:
         return "static cameras"
     return "one moving camera" if dataset.own_footage or dataset.cloud is not None else "cameras all around"
@@ -87,6 +93,8 @@ def plan_training(
     if minutes is not None and not 0 < minutes < math.inf:
         raise InputError(f"--minutes must be above 0, got {minutes:g}.")
     layout = camera_layout(opened)
+    if layout == "one moving camera" and (folder / MASKS).is_dir():
+        layout = FILM
     for preset in [SMALL[layout]] if device.is_cpu else [LARGE[layout], SMALL[layout]]:
         last = preset == SMALL[layout]
         config = load_config(preset, {"data.path": str(folder.resolve()), "exposure.enabled": exposure})

@@ -26,6 +26,7 @@ from lapgs_wgpu.train.environment import environment
 from lapgs_wgpu.train.host_threads import step_threads
 from lapgs_wgpu.train.presets import write_toml
 
+LOST = 0.5  # share of the moving pixels; where fewer are drawn as they are, that is a warning
 STATE = "state.safetensors"
 RUN_FILES = (
     "config.toml", "log.jsonl", "metrics.json", "metrics.csv", "checkpoint.ply", "eval", "tensorboard",
@@ -104,10 +105,18 @@ def _recorded(out: Path) -> dict[str, str]:
 
 
 def result_text(run: Path) -> str:
-    """What metrics.json of a finished run says, in a line."""
+    """What metrics.json of a finished run says, in a line; before it, where masks tell, what became of what moves."""
     metrics = json.loads((run / "metrics.json").read_text())
     width, height = metrics["size"]
-    return (
+    moving = ""
+    if isinstance(explained := metrics.get("explained"), float):
+        moving = f"what moves: {metrics['psnr_moving']:.2f} dB, {explained:.0%} of its pixels are drawn as they are\n"
+        if explained < LOST:
+            moving = (
+                f"warning: {1 - explained:.0%} of what moves in the test views is not drawn as it is, which "
+                f"{run / 'eval'} shows; film slower, or train with more steps.\n"
+            )
+    return moving + (
         f"{run}: {metrics['psnr']:.2f} dB PSNR, {metrics['ssim']:.4f} SSIM on {len(metrics['views'])} test views of "
         f"{width}x{height}, {metrics['gaussians']} Gaussians"
     )

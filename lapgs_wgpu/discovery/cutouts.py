@@ -1,0 +1,243 @@
+"""Tracks of what masks say moves in the images of one camera: cut-outs of some images, followed through the others.
+
+A cut-out is what is connected in the mask of one image and not yet explained by earlier ones. It is followed from
+image to image by an affine map of its colors (Baker and Matthews, Lucas-Kanade 20 years on, IJCV 2004), until it no
+longer looks alike. It stands upright at the depth of the ground below it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from lapgs_wgpu.data.evenly import evenly_indices
+from lapgs_wgpu.discovery.residual import Floats, Mask, Residual
+from lapgs_wgpu.discovery.tracks import Tracks
+
+MOST = 24  # cut-outs
+LEAST = 4e-3  # share of an image that a cut-out covers, at least
+ENOUGH = 0.15  # share of an image's moving pixels that may stay unexplained
+BLURS = 4.0, 2.0, 1.0  # pixels; of the images that are compared, one after another
+ITERATIONS = 8  # of each
+PIXELS = 1500  # of a cut-out that are compared, at most
+POINTS = 1000  # of a cut-out, at most
+ALIKE = 0.12  # difference of two blurred colors that look alike
+LOST = 0.5  # share of a cut-out that must look alike
+VISIBLE = 0.3  # share of a cut-out that must lie in the image
+STIFF = 0.02  # weight of the affine part of a map against that before
+FOOT = 0.15  # of its height: the lowest part of a cut-out, which stands on the ground
+BEFORE = 0.97  # of the depth of the ground
+APART = 0.1, 0.9  # half sides of the box: how far the first and the last cut-out are moved towards the cameras
+FAR_BELOW = 3  # pixels; the ground that a foot stands on lies so far below
+
+Map = NDArray[np.float64]
+
+
+class _Image(NamedTuple):
+    """levels: for each of BLURS (H, W, 12): colors and mask, and their slopes along x and along y."""
+
+    residual: Residual
+    levels: list[Floats]
+
+
+class _Cutout(NamedTuple):
+    """pixels: (n, 2) columns and rows. maps: (T, 2, 3) to the pixels of each image. seen: (T,)."""
+
+    key: int
+    pixels: NDArray[np.int64]
+    maps: Map
+    seen: NDArray[np.bool_]
+
+
+def cutout_tracks(
+    residuals: Sequence[Residual], depths: Sequence[Floats], half_side: float
+) -> tuple[Tracks | None, float]:
+    """Tracks of what moves in the images of one camera, None where nothing does, and the share of the moving pixels
+    that they explain.
+
+    Their positions lie nearer to the cameras than their paths, those of each cut-out by as much again: the field tells
+    Gaussians apart by place.
+
+    residuals: images in the order of their times, whose masks say what moves. depths: (H, W) of what stands still in
+    each, world units, NaN where unknown. half_side: of the box that the field covers, world units.
+    """
+    images = [_Image(each, _levels(each)) for each in residuals]
+    masks = [image.residual.mask for image in images]
+    known, rest = [np.zeros_like(mask) for mask in masks], [mask.sum() for mask in masks]
+    size = masks[0].size
+    cutouts: list[_Cutout] = []
+    keys: set[int] = set()
+    while len(cutouts) < MOST:
+        key = int(np.argmax(rest))
+        if rest[key] <= max(ENOUGH * masks[key].sum(), LEAST * size):
+            break
+        labels, count = ndimage.label(ndimage.binary_opening(masks[key] & ~known[key]))
+        for label in range(1, count + 1):
+            rows, columns = np.nonzero(labels == label)
+            if len(rows) >= LEAST * size:
+                known[key] |= labels == label
+                cutouts.append(_followed(images, key, np.stack([columns, rows], axis=1), known))
+        keys.add(key)
+        rest = [0 if i in keys else (masks[i] & ~known[i]).sum() for i in range(len(masks))]
+    if not cutouts:
+        return None, 0.0
+    share = sum(mask.sum() for mask in known) / sum(mask.sum() for mask in masks)
+    ground = [_depths(image.residual.mask, depth) for image, depth in zip(images, depths, strict=True)]
+    parts = [_placed(cutout, images, ground) for cutout in cutouts]
+    number = np.repeat(np.arange(len(parts)), [len(colors) for _, colors in parts])
+    paths = np.concatenate([paths for paths, _ in parts], axis=1)
+    seen = np.stack([cutout.seen for cutout in cutouts], axis=1)[:, number]
+    key = np.array([cutout.key for cutout in cutouts])[number]
+    ahead = np.mean([each.camera.T_cam_world[2, :3] for each in residuals], axis=0).astype(np.float32)
+    apart = np.linspace(*APART, len(parts), dtype=np.float32)[np.argsort(np.argsort([c.key for c in cutouts]))]
+    positions = paths[key, np.arange(len(key))] - half_side * apart[number][:, None] * ahead
+    tracks = Tracks(positions, np.concatenate([colors for _, colors in parts]), number, paths, seen)
+    return tracks, float(share)
+
+
+def _levels(residual: Residual) -> list[Floats]:
+    planes = np.concatenate([residual.image, residual.mask[..., None]], axis=2).astype(np.float32)
+    levels = []
+    for blur in BLURS:
+        blurred = ndimage.gaussian_filter(planes, (blur, blur, 0))
+        along_y, along_x = np.gradient(blurred, axis=(0, 1))
+        levels.append(np.concatenate([blurred, along_x, along_y], axis=2))
+    return levels
+
+
+def _followed(images: Sequence[_Image], key: int, pixels: NDArray[np.int64], known: list[Mask]) -> _Cutout:
+    """Follow a cut-out to both ends of the clip; adds what it explains to what is known (H, W) of each image."""
+    maps, seen = np.tile(np.eye(2, 3), (len(images), 1, 1)), np.zeros(len(images), bool)
+    seen[key] = True
+    for way in (-1, 1):
+        before, step = np.eye(2, 3), np.zeros((2, 3))
+        for at in range(key + way, len(images) if way > 0 else -1, way):
+            found, alike = max(
+                (_registered(images[key], images[at], pixels, start) for start in (before + step, before)),
+                key=lambda each: each[1],
+            )
+            if alike < LOST:
+                break
+            maps[at], seen[at] = found, True
+            step, before = found - before, found
+            known[at] |= _explained(images[key], images[at], pixels, found)
+    return _Cutout(key, pixels, maps, seen)
+
+
+def _registered(source: _Image, target: _Image, pixels: NDArray[np.int64], start: Map) -> tuple[Map, float]:
+    """The map (2, 3) of a cut-out's pixels to another image, and the share of them that look alike there."""
+    chosen = pixels[evenly_indices(len(pixels), PIXELS)]
+    x, y = chosen.T
+    middle = chosen.mean(axis=0)
+    scale = max(float(chosen.std()), 1.0)
+    u, v = ((chosen - middle) / scale).T
+    M = start.copy()
+    height, width = source.residual.mask.shape
+    alike = 0.0
+    basis = np.stack([u, v, np.ones_like(u)], axis=1)
+    for there, here in zip(target.levels, source.levels, strict=True):
+        wanted = here[y, x, :4]
+        for _ in range(ITERATIONS):
+            at = M[:, :2] @ chosen.T + M[:, 2:]
+            inside = (at >= 0).all(axis=0) & (at[0] <= width - 1) & (at[1] <= height - 1)
+            sampled = _sampled(there, at)
+            difference = sampled[:, :4] - wanted
+            size = np.sqrt(np.square(difference[:, :3]).sum(axis=1))
+            weight = (inside / (1 + np.square(size / ALIKE))).astype(np.float32)
+            J = (sampled[:, 4:].reshape(-1, 2, 4, 1) * basis[:, None, None]).transpose(0, 2, 1, 3).reshape(-1, 6)
+            weighted = J * np.repeat(weight, 4)[:, None]
+            H = (weighted.T @ J).astype(np.float64)
+            ridge = STIFF * np.trace(H) / 6 * np.diag([1, 1, 0.01, 1, 1, 0.01])
+            change = -np.linalg.solve(H + ridge + 1e-6 * np.eye(6), weighted.T @ difference.ravel())
+            A = change.reshape(2, 3) / [scale, scale, 1]
+            M = M + np.column_stack([A[:, :2], A[:, 2] - A[:, :2] @ middle])
+            if np.abs(change).max() < 0.02:
+                break
+        alike = float((inside & (size < ALIKE) & (sampled[:, 3] > 0.5)).sum() / max(inside.sum(), 1))
+        alike *= bool(inside.mean() > VISIBLE)
+    return M, alike
+
+
+def _sampled(planes: Floats, at: NDArray[np.float64]) -> Floats:
+    """(n, C) of planes (H, W, C) at columns and rows (2, n), interpolated; at its rim beyond an image."""
+    height, width, channels = planes.shape
+    x, y = np.clip(at[0], 0, width - 1.001), np.clip(at[1], 0, height - 1.001)
+    column, row = x.astype(np.int64), y.astype(np.int64)
+    a, b = (x - column).astype(np.float32)[:, None], (y - row).astype(np.float32)[:, None]
+    flat, first = planes.reshape(-1, channels), row * width + column
+    above = flat[first] * (1 - a) + flat[first + 1] * a
+    below = flat[first + width] * (1 - a) + flat[first + width + 1] * a
+    return above * (1 - b) + below * b
+
+
+def _explained(source: _Image, target: _Image, pixels: NDArray[np.int64], M: Map) -> Mask:
+    """(H, W) the pixels of another image that look like those of the cut-out that a map takes there."""
+    cut = np.zeros(source.residual.mask.shape, bool)
+    cut[pixels[:, 1], pixels[:, 0]] = True
+    rows, columns = np.nonzero(target.residual.mask)
+    back = np.linalg.inv(M[:, :2]) @ (np.stack([columns, rows]) - M[:, 2:])
+    near = ndimage.binary_dilation(cut)
+    inside = ndimage.map_coordinates(near.astype(np.float32), back[::-1], order=0) > 0
+    here, there = source.levels[1][..., :3], target.levels[1]
+    alike = np.abs(_sampled(here, back) - there[rows, columns, :3]).max(axis=1) < ALIKE
+    result = np.zeros(cut.shape, bool)
+    result[rows, columns] = inside & alike
+    return result
+
+
+def _depths(mask: Mask, depth: Floats) -> Floats:
+    """(H, W) the depth of each moving pixel: of the ground below what is connected; NaN elsewhere."""
+    result = np.full(mask.shape, np.nan, np.float32)
+    free = np.where(ndimage.binary_dilation(mask, iterations=2), np.nan, depth)
+    labels, count = ndimage.label(mask)
+    for label in range(1, count + 1):
+        part = labels == label
+        rows, columns = np.nonzero(part)
+        if len(rows) < LEAST * mask.size:
+            continue
+        lowest = np.full(mask.shape[1], -1)
+        np.maximum.at(lowest, columns, rows)
+        at = np.flatnonzero(lowest >= rows.max() - FOOT * (np.ptp(rows) + 1))
+        below = lowest[at] + FAR_BELOW
+        ground = free[below[below < mask.shape[0]], at[below < mask.shape[0]]]
+        if np.isfinite(ground).mean() < 0.3 if len(ground) else True:  # below the image
+            ring = ndimage.binary_dilation(part, iterations=8)
+            ground = np.sort(free[ring][np.isfinite(free[ring])])[: max(1, int(0.3 * ring.sum()))]
+        if np.isfinite(ground).any():
+            result[part] = BEFORE * np.nanmedian(ground)
+    return result
+
+
+def _placed(cutout: _Cutout, images: Sequence[_Image], depths: Sequence[Floats]) -> tuple[Floats, Floats]:
+    """The paths (T, n, 3) and colors (n, 3) of a cut-out."""
+    chosen = cutout.pixels[evenly_indices(len(cutout.pixels), POINTS)]
+    x, y = chosen.T
+    colors = images[cutout.key].residual.image[y, x]
+    at = np.einsum("tij,jn->tin", cutout.maps[:, :, :2], chosen.T) + cutout.maps[:, :, 2:]
+    times = np.flatnonzero(cutout.seen)
+    depth = np.full(len(images), np.nan)
+    for t in times:
+        height, width = depths[t].shape
+        column, row = np.rint(at[t]).astype(np.int64).clip(0, [[width - 1], [height - 1]])
+        near = depths[t][row, column]
+        depth[t] = np.median(near[np.isfinite(near)]) if np.isfinite(near).any() else np.nan
+    depth = _smooth(depth)
+    paths = np.zeros((len(images), len(chosen), 3), np.float32)
+    for t in times:
+        camera = images[t].residual.camera
+        ray = np.linalg.solve(camera.K, np.stack([at[t, 0] + 0.5, at[t, 1] + 0.5, np.ones(len(chosen))]))
+        paths[t] = (depth[t] * ray - camera.T_cam_world[:3, 3:]).T @ camera.T_cam_world[:3, :3]
+    return paths, colors.astype(np.float32)
+
+
+def _smooth(depth: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(T,) depths whose inverses are nearly a line over a few times."""
+    known = np.isfinite(depth)
+    if not known.any():
+        return np.ones_like(depth)
+    filled = np.interp(np.arange(len(depth)), np.flatnonzero(known), 1 / depth[known])
+    return 1 / ndimage.gaussian_filter1d(ndimage.median_filter(filled, 9, mode="nearest"), 3.0, mode="nearest")

@@ -1,0 +1,98 @@
+"""Movers that masks show: cut-outs that are followed, and the cube in which things move."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.captures import bright, write_colmap
+from helpers.films import Board, drawn, room_cloud, walk
+from PIL import Image
+
+from lapgs_wgpu.data import load_dataset
+from lapgs_wgpu.data.cloud import Cloud
+from lapgs_wgpu.data.mover_cube import mover_cube
+from lapgs_wgpu.discovery.cutouts import cutout_tracks
+from lapgs_wgpu.discovery.residual import Residual
+from lapgs_wgpu.discovery.start_training import start_training
+from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.train.presets import load_config
+
+BOARD = Board(0.4, 0.6, 0.7)
+CAMERAS = walk(10, 128, 96)
+TIMES = [i / (len(CAMERAS) - 1) for i in range(len(CAMERAS))]
+TAKEN = [drawn(camera, t, BOARD) for camera, t in zip(CAMERAS, TIMES, strict=True)]
+FAR = 5.0  # depth of what stands still
+
+
+def residuals(*, moving: bool = True) -> list[Residual]:
+    return [
+        Residual(camera, t, image.astype(np.float32) / 255, image.astype(np.float32) / 255, mask & moving)
+        for camera, t, (image, mask) in zip(CAMERAS, TIMES, TAKEN, strict=True)
+    ]
+
+
+def test_cutouts_show_what_moves_where_it_is_in_each_image() -> None:
+    depths = [np.full(mask.shape, FAR, np.float32) for _, mask in TAKEN]
+    tracks, share = cutout_tracks(residuals(), depths, 1.3)
+    assert tracks is not None
+    assert share > 0.9
+    for i, (camera, (image, mask)) in enumerate(zip(CAMERAS, TAKEN, strict=True)):
+        seen = tracks.supported[i]
+        pixels, depth = camera.project(tracks.paths[i, seen])
+        assert depth == pytest.approx(0.97 * FAR, abs=1e-3)
+        x, y = pixels.astype(int).clip(0, [[127, 95]]).T
+        assert mask[y, x].mean() > 0.9
+        shown = np.zeros_like(mask)
+        shown[y, x] = True
+        assert np.abs(image[y, x] / 255 - tracks.colors[seen]).mean() < 0.06
+        assert shown[mask].mean() > 0.4  # no more than a point a pixel
+
+
+def test_nothing_moves_where_masks_are_black() -> None:
+    assert cutout_tracks(residuals(moving=False), [np.full((96, 128), FAR, np.float32)] * 10, 1.3) == (None, 0.0)
+
+
+def test_the_cube_of_movers_holds_them_and_not_the_room() -> None:
+    points, colors = room_cloud(400, 0.0)
+    seen = [(camera, lambda mask=mask: mask) for camera, (_, mask) in zip(CAMERAS, TAKEN, strict=True)]
+    cube = mover_cube(Cloud(points, colors.astype(np.float32)), seen)
+    assert cube is not None
+    room = np.ptp(points, axis=0).max() / 2
+    assert 0.4 < cube.half < 0.8 * room
+    for camera, (_, mask) in zip(CAMERAS, TAKEN, strict=True):  # its middle is seen where the board is
+        pixel, depth = camera.project(cube.center[None])
+        rows, columns = np.nonzero(mask)
+        assert depth[0] > 0
+        assert abs(pixel[0, 0] - columns.mean()) < 64
+        assert abs(pixel[0, 1] - rows.mean()) < 48
+    empty = [(CAMERAS[0], lambda: np.zeros((96, 128), bool))]
+    assert mover_cube(Cloud(points, colors.astype(np.float32)), empty) is None
+
+
+def test_a_film_starts_from_its_masks(tmp_path: Path, device: Device) -> None:
+    capture = write_colmap(tmp_path / "film", device)
+    files = sorted((capture / "images").glob("*.png"))
+
+    def write_masks(level: int | None) -> None:
+        (capture / "masks").mkdir(exist_ok=True)
+        for file in files:
+            with Image.open(file) as image:
+                shown = bright(np.asarray(image)) if level is None else np.full(image.size[::-1], level > 0)
+            Image.fromarray(shown.astype(np.uint8) * 255).save(capture / "masks" / file.name)
+
+    write_masks(255)
+    with pytest.raises(InputError, match="everything moves"):
+        load_dataset(capture, movers="masks")
+    write_masks(0)
+    assert any("nothing moves" in warning for warning in load_dataset(capture, movers="masks").warnings)
+    write_masks(None)
+    changes = {"data.path": str(capture), "points.count": "300", "density.limit": "500", "schedule.steps": "20"}
+    quick = {"discovery.steps": "10", "discovery.field_steps": "5", "discovery.size": "64"}
+    with start_training(load_config("film", changes | quick), device=device) as training:
+        assert training.discovery is not None
+        assert "moving parts" in training.discovery
+        assert all(view.moving is not None for view in (*training.dataset.train, *training.dataset.test))
+        assert training.step().step == 1
