@@ -24,6 +24,7 @@ from lapgs_wgpu.motion.playback.linear_pieces import Pieces, displacement, linea
 from lapgs_wgpu.motion.playback.playback import Playback
 from lapgs_wgpu.splat.linear_light import directions, display_colors, linear_harmonics, sh_basis, to_display, to_linear
 from lapgs_wgpu.viewer.export_4dgs import _largest_shift, best_degree, export_4dgs
+from lapgs_wgpu.viewer.export_loss import measure, of_playback
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene, load_scene
 
 COUNT = 60
@@ -96,6 +97,13 @@ def test_camera_and_texts(scene: LoadedScene, exported: Path) -> None:
     np.testing.assert_allclose(read.camera.target, scene.camera().focus)
     assert read.camera.fov_y_deg == pytest.approx(np.degrees(scene.camera().fov_y))
     assert read.header.attributes["color_space"] == "linear-rec709-display"
+
+
+def test_the_viewer_opens_it(scene: LoadedScene, exported: Path, device: Device) -> None:
+    read = load_scene(exported, lambda: device)
+    assert read.clock().seconds == pytest.approx(scene.clock().seconds, abs=0.04)
+    assert (read.playback.at(0.3).opacities.read() > 0).sum() == COUNT
+    assert measure(scene, of_playback(read.playback)).psnr > 30
 
 
 def largest_error(playback: Playback, pieces: Pieces) -> float:

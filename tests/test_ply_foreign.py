@@ -89,7 +89,7 @@ def test_gaussians_that_move_are_refused(tmp_path: Path) -> None:
 def test_a_folder_of_stills(tmp_path: Path) -> None:
     for name in ("frame_0.ply", "frame_1.ply"):
         (tmp_path / name).write_bytes(b"")
-    with pytest.raises(InputError, match=r"sequence .* frame_0\.ply"):
+    with pytest.raises(InputError, match=r"frame_0\.ply, or look at all"):
         read_ply(tmp_path)
 
 

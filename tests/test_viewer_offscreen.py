@@ -255,7 +255,7 @@ def test_an_exported_still(run: Path, scene: Scene4D, tmp_path: Path, capsys: py
 def test_an_exported_sequence(run: Path, scene: Scene4D, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "new" / "frames"
     view(run / "checkpoint.ply", "--export", folder, "--frames", "3")
-    assert sorted(file.name for file in folder.iterdir()) == ["frame_0000.ply", "frame_0001.ply", "frame_0002.ply"]
+    assert sorted(file.name for file in folder.iterdir())[1:] == ["frame_0001.ply", "frame_0002.ply", "sequence.json"]
     for number, time in enumerate((0.0, 0.5, 1.0)):
         assert_still(folder / f"frame_{number:04}.ply", scene, time)
     assert "3/3 frames" in capsys.readouterr().err
@@ -263,7 +263,12 @@ def test_an_exported_sequence(run: Path, scene: Scene4D, tmp_path: Path, capsys:
     assert view_command([str(run / "checkpoint.ply"), "--export", str(folder), "--frames", "2"]) == 2
     assert "is not empty" in capsys.readouterr().err
     view(run / "checkpoint.ply", "--export", folder, "--frames", "2", "--overwrite")
-    assert sorted(file.name for file in folder.iterdir()) == ["frame_0000.ply", "frame_0001.ply", "notes.txt"]
+    assert sorted(file.name for file in folder.iterdir()) == [
+        "frame_0000.ply",
+        "frame_0001.ply",
+        "notes.txt",
+        "sequence.json",
+    ]
     assert_still(folder / "frame_0001.ply", scene, 1.0)
 
 

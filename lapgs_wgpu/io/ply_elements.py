@@ -27,6 +27,7 @@ Floats = NDArray[np.float32]
 MAX_HEADER_BYTES = 64 * 1024
 _BLOCK_BYTES = 1 << 20  # rows are converted in blocks that stay in the cache
 _BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
+_CONVERTED = (".spz", ".sog", ".splat", ".ksplat", ".lcc")  # formats of stills that others convert
 _SCALARS = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
     "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
@@ -136,7 +137,7 @@ def _advice(folder: Path) -> str:
         return " without a .ply file; give the .ply file itself"
     if "checkpoint.ply" in names or len(names) == 1:
         return f"; give the file {'checkpoint.ply' if 'checkpoint.ply' in names else names[0]} in it"
-    return f" of {len(names)} .ply files; a sequence of stills is not played: give one of them, such as {names[0]}"
+    return f" of {len(names)} .ply files; give one of them, such as {names[0]}, or look at all by lapgs-view"
 
 
 def _read_header(file: BinaryIO, path: PathLike) -> PlyFile:
@@ -146,10 +147,9 @@ def _read_header(file: BinaryIO, path: PathLike) -> PlyFile:
     if re.match(rb"ply\r?\n", head) is None:
         if not head:
             raise InputError(f"{path}: is empty (0 bytes); copy or write it again.")
-        raise InputError(
-            f"{path}: begins with {head[:8]!r}, where a PLY file begins with the line 'ply'; convert it to .ply, for "
-            "example with SuperSplat or splat-transform."
-        )
+        ending = Path(path).suffix.lower()
+        kind = f"a {ending} file" if ending in _CONVERTED else f"no .ply file: it begins with {head[:8]!r}"
+        raise InputError(f"{path}: is {kind}, which is not read; splat-transform or SuperSplat converts it to .ply.")
     end = re.search(rb"^end_header\r?\n", head, re.MULTILINE)
     if end is None:
         raise InputError(
