@@ -103,7 +103,7 @@ def test_the_viewer_opens_it(scene: LoadedScene, exported: Path, device: Device)
     read = load_scene(exported, lambda: device)
     assert read.clock().seconds == pytest.approx(scene.clock().seconds, abs=0.04)
     assert (read.playback.at(0.3).opacities.read() > 0).sum() == COUNT
-    assert measure(scene, of_playback(read.playback)).psnr > 30
+    assert measure(scene, of_playback(read.playback, fourdgs.read(exported).gaussians.source_index)).psnr > 30
 
 
 def largest_error(playback: Playback, pieces: Pieces) -> float:

@@ -286,7 +286,7 @@ MISTAKES = {
     "a list and more": (["--list-devices", "--time", "0"], "--time"),
     "time of a clip": (["CHECKPOINT", "--video", "a.mp4", "--time", "0.5"], "--path time"),
     "motion of a still scene": (["STILL", "--screenshot", "a.png", "--mode", "motion"], "motion"),
-    "no file": (["--screenshot", "a.png"], ".ply"),
+    "no file": (["--screenshot", "a.png"], "name a file"),
     "time beyond the clip": (["CHECKPOINT", "--screenshot", "a.png", "--time", "1.5"], "from 0 to 1"),
     "no size": (["CHECKPOINT", "--screenshot", "a.png", "--size", "8"], "WIDTHxHEIGHT"),
     "a jpeg": (["CHECKPOINT", "--screenshot", "a.jpg"], "ends with .png"),
