@@ -166,27 +166,27 @@ def _export(given: Any, scene: LoadedScene) -> None:
 
     file, overwrite = Path(given.export), bool(given.overwrite)
     ending, count = file.suffix.lower(), scene.playback.count
+    line = f"{count} Gaussians"
     if ending == ".4dgs":
         from lapgs_wgpu.viewer.export_4dgs import MAX_ERROR, export_4dgs
 
         loss = export_4dgs(scene, file, given.max_error or MAX_ERROR, overwrite=overwrite)
-        line = f"{count} Gaussians, {_megabytes(file)}"
     elif ending in USD:
         from lapgs_wgpu.viewer.export_usd import export_usd
 
         frames = given.frames or scene.clock().frames
         loss = export_usd(scene, file, frames, overwrite=overwrite)
-        line = f"{count} Gaussians at {frames} times, {_megabytes(file)}"
+        line = f"{count} Gaussians at {frames} times"
     elif ending in (".lapgs", ".html"):
         loss = export.export_compact(scene, file, overwrite=overwrite)
-        line = f"{count} Gaussians, {_megabytes(file)}"
     elif ending == ".ply":
         loss = export.export_still(scene, file, given.time or 0.0, overwrite=overwrite)
         line = f"{count} Gaussians at time {given.time or 0.0:g}"
     else:
         loss = export.export_frames(scene, file, given.frames, overwrite=overwrite)
         line = f"{given.frames} frames of {count} Gaussians"
-    print(f"{file}: {line}, {loss.psnr:.1f} dB PSNR against {scene.path}")
+    size = f", {file.stat().st_size / 1e6:.2f} MB" if file.is_file() else ""
+    print(f"{file}: {line}{size}, {loss.psnr:.1f} dB PSNR against {scene.path}")
     if loss.reason:
         print(f"warning: the loss is seen: {loss.reason}.", file=sys.stderr)
     # Our own formats say whether the scene is antialiased, and all programs that play them know it.
@@ -201,10 +201,6 @@ def _export(given: Any, scene: LoadedScene) -> None:
             "elsewhere thin places look a little thicker.",
             file=sys.stderr,
         )
-
-
-def _megabytes(file: Path) -> str:
-    return f"{file.stat().st_size / 1e6:.2f} MB"
 
 
 def _named(name: str, ending: str, option: str) -> Path:

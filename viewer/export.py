@@ -12,10 +12,10 @@ from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.io.ply import write_ply
 from lapgs_wgpu.motion.compact_scene import held_rows
-from lapgs_wgpu.motion.playback.playback import DevicePlayback
+from lapgs_wgpu.motion.playback.playback import DevicePlayback, playback_of
 from lapgs_wgpu.motion.scene_file import SceneFile, compact_bytes, read_compact, read_scene
 from lapgs_wgpu.progress import Progress
-from lapgs_wgpu.viewer.export_loss import Loss, measure, of_playback, of_scene
+from lapgs_wgpu.viewer.export_loss import Loss, measure, of_playback
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene
 from lapgs_wgpu.viewer.moving_files import MANIFEST, SampledPlayback, read_sequence
 from lapgs_wgpu.viewer.offscreen import OffscreenRenderer
@@ -42,7 +42,7 @@ def export_still(scene: LoadedScene, file: Path, time: float, *, overwrite: bool
     """
     check_free(scene, file, overwrite)
     _write_still(scene, file, time)
-    return measure(scene, of_scene(read_scene(file), scene.playback.device), time)
+    return measure(scene, of_playback(playback_of(read_scene(file), scene.playback.device)), time)
 
 
 def _write_still(scene: LoadedScene, file: Path, time: float) -> None:
@@ -76,7 +76,7 @@ def export_frames(scene: LoadedScene, folder: Path, frames: int, *, overwrite: b
     up = scene.initial_view.up
     axis = int(np.abs(up).argmax())
     manifest = {
-        "fps": frame_rate(scene, frames),
+        "fps": max(1, frames - 1) / scene.clock().seconds,  # so that they last as long as the clip
         "up": "-" * bool(up[axis] < 0) + "xyz"[axis],
         "antialiased": scene.playback.at(0.0).antialiased,
         "view": scene.initial_view._replace(frames=frames).to_json(),
@@ -84,16 +84,8 @@ def export_frames(scene: LoadedScene, folder: Path, frames: int, *, overwrite: b
     }
     with atomic_write(folder / MANIFEST) as target:
         target.write(json.dumps(manifest, indent=1).encode())
-    if frames == 1:
-        return measure(scene, of_scene(read_scene(folder / names[0]), scene.playback.device), 0.0)
     written = SampledPlayback(scene.playback.device, read_sequence(folder / MANIFEST))
     return measure(scene, of_playback(written), frames=frames)
-
-
-def frame_rate(scene: LoadedScene, frames: int) -> float:
-    """Frames a second, with which so many of them last as long as the clip."""
-    clock = scene.clock()
-    return (frames - 1) / clock.seconds if frames > 1 else clock.fps
 
 
 def export_compact(scene: LoadedScene, file: Path, *, overwrite: bool = False) -> Loss:
@@ -124,7 +116,8 @@ def _compact(scene: LoadedScene, opened: SceneFile) -> tuple[bytes, Loss]:
     best = b"", Loss(-np.inf, "")
     for finer in _FINER:
         content = compact_bytes(file, features, finer=finer)
-        loss = measure(scene, of_scene(read_compact(content, file.path), scene.playback.device, rows))
+        written = playback_of(read_compact(content, file.path), scene.playback.device)
+        loss = measure(scene, of_playback(written, rows))
         if loss.psnr > best[1].psnr + 1:
             best = content, loss
         if loss.psnr >= _ENOUGH:

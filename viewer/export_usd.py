@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from lapgs_wgpu.gpu.array import read_all
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.progress import Progress
-from lapgs_wgpu.viewer.export import check_free, frame_rate
+from lapgs_wgpu.viewer.export import check_free
 from lapgs_wgpu.viewer.export_loss import Loss, measure, of_playback
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene
 from lapgs_wgpu.viewer.moving_files import SampledPlayback
@@ -24,7 +24,6 @@ _TYPES = {
     "positions": "Point3fArray", "orientations": "QuatfArray", "scales": "Float3Array", "opacities": "FloatArray",
     HARMONICS: "Float3Array", "extent": "Float3Array",
 }  # fmt: skip
-_CAMERA = (640, 480)
 
 
 def export_usd(scene: LoadedScene, file: Path, frames: int, *, overwrite: bool = False) -> Loss:
@@ -51,13 +50,12 @@ def export_usd(scene: LoadedScene, file: Path, frames: int, *, overwrite: bool =
 
 
 def _write(pxr: Any, stage: Any, scene: LoadedScene, frames: int) -> None:
-    metadata = {"view": scene.initial_view._replace(frames=frames).to_json()}
-    if scene.playback.at(0.0).antialiased:
-        metadata["antialiased"] = "true"
-    stage.GetRootLayer().customLayerData = metadata
+    antialiased = {"antialiased": "true"} if scene.playback.at(0.0).antialiased else {}
+    view = scene.initial_view._replace(frames=frames).to_json()
+    stage.GetRootLayer().customLayerData = {"view": view} | antialiased
     pxr.UsdGeom.SetStageUpAxis(stage, pxr.UsdGeom.Tokens.z)
     pxr.UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    rate = frame_rate(scene, frames)
+    rate = max(1, frames - 1) / scene.clock().seconds
     stage.SetTimeCodesPerSecond(rate)
     stage.SetFramesPerSecond(rate)
     stage.SetStartTimeCode(0)
@@ -112,7 +110,7 @@ def _vt(pxr: Any, name: str, values: Floats) -> Any:
 
 def _write_camera(pxr: Any, stage: Any, scene: LoadedScene) -> None:
     """The camera where the viewer begins."""
-    view = scene.camera().camera(*_CAMERA)
+    view = scene.camera().camera(640, 480)
     camera = pxr.UsdGeom.Camera.Define(stage, "/World/Camera")
     pose = np.linalg.inv(view.T_cam_world) @ np.diag([1.0, -1, -1, 1])  # USD's cameras look along -z, with y up
     camera.AddTransformOp().Set(pxr.Gf.Matrix4d(pose.T))

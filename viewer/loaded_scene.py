@@ -17,18 +17,9 @@ from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.motion.playback.playback import Playback, playback_of
 from lapgs_wgpu.motion.scene_file import SceneFile, read_scene
 from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.viewer import moving_files
 from lapgs_wgpu.viewer.camera import ViewCamera
 from lapgs_wgpu.viewer.clock import Clock
-from lapgs_wgpu.viewer.moving_files import (
-    MANIFEST,
-    MovingFile,
-    SampledPlayback,
-    read_4dgs,
-    read_frames,
-    read_sequence,
-    read_spacetime_ply,
-    read_splatv,
-)
 from lapgs_wgpu.viewer.options import USD
 from lapgs_wgpu.viewer.render_modes import AHEAD, BACKGROUNDS
 from lapgs_wgpu.viewer.usd_file import read_usd
@@ -73,7 +64,7 @@ def load_scene(
     playback: Playback
     moving, file = open_moving(path), None
     if moving is not None:
-        playback, frames = SampledPlayback(device(), moving, antialiased), moving.frames
+        playback, frames = moving_files.SampledPlayback(device(), moving, antialiased), moving.frames
     else:
         file = read_scene(path)
         if antialiased is not None:
@@ -84,25 +75,23 @@ def load_scene(
         initial_view = guess_view(playback, up or playback.metadata.get("up"))
     elif up is not None:
         initial_view = guess_view(playback, up)._replace(frames=initial_view.frames)
-    if frames is not None:
-        initial_view = initial_view._replace(frames=frames)
-    return LoadedScene(path, playback, initial_view, file)
+    return LoadedScene(path, playback, initial_view._replace(frames=frames or initial_view.frames), file)
 
 
-def open_moving(path: Path) -> MovingFile | None:
+def open_moving(path: Path) -> moving_files.MovingFile | None:
     """Open a moving file of others; None where it is none. Raises InputError where it is damaged or needs a package."""
     ending = path.suffix.lower()
-    if path.is_dir() and (path / MANIFEST).is_file():
-        return read_sequence(path / MANIFEST)
+    if path.is_dir() and (path / moving_files.MANIFEST).is_file():
+        return moving_files.read_sequence(path / moving_files.MANIFEST)
     if path.is_dir() and not (path / "checkpoint.ply").exists():
         files = sorted(path.glob("*.ply"), key=lambda file: natural_key(file.name))
-        return read_frames(files, {}) if len(files) > 1 else None
+        return moving_files.read_frames(files, {}) if len(files) > 1 else None
     if ending == ".ply" and path.is_file():
-        return read_spacetime_ply(path)
+        return moving_files.read_spacetime_ply(path)
     if ending in USD:
         return read_usd(path)
-    readers = {".json": read_sequence, ".splatv": read_splatv, ".4dgs": read_4dgs}
-    return readers[ending](path) if ending in readers else None
+    read = {".json": moving_files.read_sequence, ".splatv": moving_files.read_splatv, ".4dgs": moving_files.read_4dgs}
+    return read[ending](path) if ending in read else None
 
 
 def guess_view(playback: Playback, axis: str | None = None) -> InitialView:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import struct
 import sys
 from collections.abc import Callable
@@ -22,7 +23,7 @@ from lapgs_wgpu.io.ply_elements import open_ply
 from lapgs_wgpu.io.safe_json_toml import parse_json, read_json
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.playback.playback import activate
-from lapgs_wgpu.motion.scene_file import read_scene
+from lapgs_wgpu.motion.scene_file import SceneFile, read_scene
 from lapgs_wgpu.motion.timing import EVEN
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.constants import CONSTANTS
@@ -106,30 +107,25 @@ def read_frames(files: list[Path], metadata: dict[str, str]) -> MovingFile:
         with open_ply(file) as ply:
             counts.append(vertex_of(ply).count)
     first = read_scene(files[0])
-    start = np.array(parse_json(first.metadata.get("offset", "[0, 0, 0]"), str(files[0])))
+    start = _offset(first)
 
     @lru_cache(maxsize=4)
     def frame(number: int) -> Gaussians[Floats]:
         file = read_scene(files[number])
-        now, shift = activate(file.gaussians, first.sh_degree), np.zeros(3)
-        if "offset" in file.metadata:
-            shift = np.array(parse_json(file.metadata["offset"], str(files[number]))) - start
-        missing = max(counts) - len(now["means"])
-        columns = (
-            now["means"] + shift.astype(np.float32),
-            now["quats"],
-            now["scales"],
-            now["opacities"],
-            now["colors"],
-        )
-        padded = (np.concatenate([c, np.repeat(c[:1], missing, axis=0)]) if missing else c for c in columns)
-        means, quats, scales, opacities, colors = padded
-        if missing:
-            opacities[-missing:] = 0
-        return Gaussians(means, quats, scales, opacities, colors, antialiased=file.antialiased)
+        now = activate(file.gaussians, first.sh_degree)
+        present = np.arange(max(counts)) < len(now["means"])
+        rows = np.where(present, np.arange(max(counts)), 0)
+        names = ("means", "quats", "scales", "opacities", "colors")
+        means, quats, scales, opacities, colors = (now[name][rows] for name in names)
+        means += (_offset(file) - start).astype(np.float32)
+        return Gaussians(means, quats, scales, opacities * present, colors, antialiased=file.antialiased)
 
     metadata = {name: text for name, text in first.metadata.items() if name == "up"} | metadata
     return MovingFile(lambda t: frame(round(t * (len(files) - 1))), len(files), metadata)
+
+
+def _offset(file: SceneFile) -> NDArray[np.float64]:
+    return np.array(json.loads(file.metadata.get("offset", "[0, 0, 0]")), np.float64)
 
 
 def read_spacetime_ply(path: Path) -> MovingFile | None:
@@ -152,7 +148,7 @@ def read_spacetime_ply(path: Path) -> MovingFile | None:
 
 def read_splatv(path: Path) -> MovingFile:
     """The same in halves and bytes, 64 of them a Gaussian, behind a list of parts in JSON (antimatter15/splaTV)."""
-    data = _bytes(path)
+    data = path.read_bytes()
     magic, length = struct.unpack("<II", data[:8].ljust(8, b"\0"))
     if magic != _SPLATV or 8 + length > len(data):
         raise InputError(f"{path}: begins with {data[:4]!r} and has {len(data)} bytes; it is no whole .splatv.")
@@ -217,7 +213,7 @@ def read_4dgs(path: Path) -> MovingFile:
         import fourdgs
     except ImportError:
         raise InputError(f"reading .4dgs needs fourdgs: {pip_install('export')}") from None
-    data = _bytes(path)
+    data = path.read_bytes()
     try:
         scene = fourdgs.read(data)
     except (fourdgs.FourdgsError, ValueError, OverflowError, MemoryError) as error:
@@ -249,13 +245,6 @@ def harmonics_4dgs(gaussians: Any) -> NDArray[np.floating]:
     return light
 
 
-def _bytes(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the path.") from error
-
-
 def _finite(values: Floats, path: Path) -> Floats:
     bad = int((~np.isfinite(values).all(axis=1)).sum())
     if bad or not len(values):
@@ -266,4 +255,4 @@ def _finite(values: Floats, path: Path) -> Floats:
 
 
 def _sigmoid(values: Floats) -> Floats:
-    return 0.5 + 0.5 * np.tanh(0.5 * values)
+    return (0.5 + 0.5 * np.tanh(0.5 * values)).astype(np.float32)

@@ -29,7 +29,6 @@ Without a display:
   lapgs-view CHECKPOINT.ply --export frames --frames 60               sequence of static .ply files for SuperSplat
   lapgs-view CHECKPOINT.ply --export scene.usdz                       OpenUSD with time samples (Houdini, Omniverse)
   lapgs-view CHECKPOINT.ply --export scene.html                       web page that plays the scene on the visitor's GPU
-  lapgs-view CHECKPOINT.ply --export scene.lapgs                      compact scene for such a page, or for lapgs-view
   lapgs-view CHECKPOINT.ply --export scene.4dgs                       motion as straight lines, for players of .4dgs
 
 [Values in brackets] are defaults.

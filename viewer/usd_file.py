@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -63,13 +64,8 @@ def read_usd(path: Path) -> MovingFile:
 def load_pxr() -> Any:
     """Import usd-core. Raises InputError where it is missing."""
     try:
-        import pxr.Gf
-        import pxr.Sdf
-        import pxr.Tf
-        import pxr.Usd
-        import pxr.UsdGeom
-        import pxr.UsdUtils
-        import pxr.Vt
+        for name in ("Gf", "Sdf", "Tf", "Usd", "UsdGeom", "UsdUtils", "Vt"):
+            importlib.import_module(f"pxr.{name}")
     except ImportError:
         raise InputError(f"OpenUSD files need usd-core: {pip_install('usd')}") from None
-    return pxr
+    return importlib.import_module("pxr")

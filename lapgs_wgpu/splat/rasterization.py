@@ -15,14 +15,6 @@ from lapgs_wgpu.splat.splat_layout import MEAN, OPACITY, RADIUS
 
 _CONIC, _DEPTH = slice(2, 5), 9  # columns of projected Gaussians
 _MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
-# Further arguments of gsplat 1.6, with the only value that is supported.
-_OTHERS = {"with_ut": False, "with_eval3d": False, "return_normals": False, "global_z_order": True} | dict.fromkeys(
-    [
-        "rays", "radial_coeffs", "tangential_coeffs", "thin_prism_coeffs", "ftheta_coeffs", "lidar_coeffs",
-        "external_distortion_coeffs", "rolling_shutter", "viewmats_rs", "ut_params", "extra_signals",
-        "extra_signals_sh_degree", "renderer_config",
-    ]
-)  # fmt: skip
 
 
 def rasterization(
@@ -82,11 +74,18 @@ def rasterization(
         NotImplementedError: an argument asks for what is not supported.
         ValueError: shapes do not match.
     """
-    _check_supported(locals() | others)
-    if render_mode not in _MODES:
-        raise NotImplementedError(f"rasterization: render_mode {render_mode!r} is not one of {', '.join(_MODES)}")
-    if others.keys() - _OTHERS.keys():
-        raise TypeError(f"rasterization: unknown argument {min(others.keys() - _OTHERS.keys())!r}")
+    zeros = {"radius_clip": radius_clip, "sparse_grad": sparse_grad, "absgrad": absgrad, "distributed": distributed}
+    others |= zeros | {"covars": covars, "eps2d": eps2d - CONSTANTS["DILATION"]}
+    others["global_z_order"] = not others.get("global_z_order", True)
+    for name, value in others.items():
+        if isinstance(value, Tensor) or value:
+            raise NotImplementedError(f"rasterization: {name} is not supported but by gsplat's default")
+    modes = {"render_mode": (render_mode, _MODES), "rasterize_mode": (rasterize_mode, ("classic", "antialiased"))}
+    for name, (value, known) in (modes | {"camera_model": (camera_model, ("pinhole",))}).items():
+        if value not in known:
+            raise NotImplementedError(f"rasterization: {name} {value!r} is not one of {', '.join(known)}")
+    if near_plane < CONSTANTS["NEAR"] or means.ndim != 2:
+        raise NotImplementedError("rasterization: near_plane below 0.01 and batches of scenes are not supported")
     count, views = len(means), len(viewmats)
     colors = means.new_zeros(count, 3) if colors is None else colors
     of_view = colors.ndim == (3 if sh_degree is None else 4)  # each camera sees its own
@@ -144,21 +143,3 @@ def _meta(splats: Tensor, full: Tensor, packed: bool) -> dict[str, Any]:
         "conics": splats[..., _CONIC].clone(),
         "opacities": torch.where(visible, splats[..., OPACITY].exp2(), 0.0),
     }
-
-
-def _check_supported(given: dict[str, Any]) -> None:
-    """Raise NotImplementedError for an argument that would change the result, and is not supported."""
-    dilation, near = CONSTANTS["DILATION"], CONSTANTS["NEAR"]
-    supported = _OTHERS | {
-        "radius_clip": 0.0, "eps2d": dilation, "sparse_grad": False, "absgrad": False, "distributed": False,
-        "camera_model": "pinhole", "covars": None,
-    }  # fmt: skip
-    for name, value in supported.items():
-        if name in given and given[name] is not value and (value is None or given[name] != value):
-            raise NotImplementedError(f"rasterization: {name}={given[name]!r} is not supported, only {value!r}")
-    if given["near_plane"] < near:
-        raise NotImplementedError(f"rasterization: near_plane={given['near_plane']} is less than {near}, the nearest")
-    if given["rasterize_mode"] not in ("classic", "antialiased"):
-        raise NotImplementedError(f"rasterization: rasterize_mode={given['rasterize_mode']!r} is not supported")
-    if given["means"].ndim != 2:
-        raise NotImplementedError("rasterization: batches of scenes are not supported, only of cameras")

@@ -162,11 +162,12 @@ class Rasterize(torch.autograd.Function):
             planes[3] = d_alpha.numpy(force=True)
         if ctx.depth and d_depth is not None:
             planes[4] = d_depth.numpy(force=True)
-        wanted = ctx.needs_input_grad[7]
-        gradients = rasterizer.backward(ctx.drawing, rasterizer.pool.upload("d_image", planes), camera=wanted)
-        arrays = read_all(gradients.arrays() + ([gradients.camera] if wanted else []))
-        d_viewmat = _viewmat_gradient(arrays.pop(), ctx.camera).to(background) if wanted else None
-        by_gaussians, d_means2d = gradient_tensors(arrays, tensors[3])
+        d_planes = rasterizer.pool.upload("d_image", planes)
+        gradients = rasterizer.backward(ctx.drawing, d_planes, camera=ctx.needs_input_grad[7])
+        d_viewmat = None
+        if gradients.camera is not None:
+            d_viewmat = _viewmat_gradient(gradients.camera.read(), ctx.camera).to(background)
+        by_gaussians, d_means2d = gradient_tensors(read_all(gradients.arrays()), tensors[3])
         return (*by_gaussians, d_background, d_means2d, d_viewmat, *[None] * 4)
 
 
