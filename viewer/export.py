@@ -16,7 +16,7 @@ from lapgs_wgpu.motion.playback.playback import DevicePlayback, playback_of
 from lapgs_wgpu.motion.scene_file import SceneFile, compact_bytes, read_compact, read_scene
 from lapgs_wgpu.progress import Progress
 from lapgs_wgpu.viewer.export_loss import Loss, measure, of_playback
-from lapgs_wgpu.viewer.loaded_scene import LoadedScene
+from lapgs_wgpu.viewer.loaded_scene import LoadedScene, nearest_axis
 from lapgs_wgpu.viewer.moving_files import MANIFEST, SampledPlayback, read_sequence
 from lapgs_wgpu.viewer.offscreen import OffscreenRenderer
 from lapgs_wgpu.viewer.web_page import page_html
@@ -73,11 +73,9 @@ def export_frames(scene: LoadedScene, folder: Path, frames: int, *, overwrite: b
         for name, time in zip(names, np.linspace(0, 1, frames).tolist(), strict=True):
             _write_still(scene, folder / name, time)
             progress.step()
-    up = scene.initial_view.up
-    axis = int(np.abs(up).argmax())
     manifest = {
         "fps": max(1, frames - 1) / scene.clock().seconds,  # so that they last as long as the clip
-        "up": "-" * bool(up[axis] < 0) + "xyz"[axis],
+        "up": nearest_axis(scene.initial_view.up),
         "antialiased": scene.playback.at(0.0).antialiased,
         "view": scene.initial_view._replace(frames=frames).to_json(),
         "frames": names,

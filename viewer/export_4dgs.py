@@ -25,8 +25,8 @@ from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.linear_light import directions, display_colors, linear_harmonics, sh_basis, to_display
 from lapgs_wgpu.viewer.export import check_free
 from lapgs_wgpu.viewer.export_loss import Loss, Written, measure, seen, upload
-from lapgs_wgpu.viewer.loaded_scene import LoadedScene
-from lapgs_wgpu.viewer.moving_files import LAST, SH_RANGE, harmonics_4dgs
+from lapgs_wgpu.viewer.loaded_scene import LoadedScene, nearest_axis
+from lapgs_wgpu.viewer.moving_files import AXES, LAST, SH_RANGE, harmonics_4dgs
 
 MAX_ERROR = 0.5  # pixels, without --max-error
 _SHADE = 4 / 255  # largest change of opacity and color within a piece
@@ -169,13 +169,7 @@ def _frame(view: InitialView) -> Any:
     """Name the axes of the file that are nearest to up and ahead."""
     import fourdgs
 
-    up = _axis(view.up)
-    ahead = _axis(view.camera.T_cam_world[2, :3] * (np.arange(3) != up % 3))
+    up = AXES.index(nearest_axis(view.up))
+    ahead = AXES.index(nearest_axis(view.camera.T_cam_world[2, :3] * (np.arange(3) != up % 3)))
     frame = fourdgs.CoordinateFrame(handedness=1, up_axis=up, forward_axis=ahead)  # right-handed, of no unit
     return fourdgs.Provenance(frames=[frame])
-
-
-def _axis(direction: NDArray[np.floating]) -> int:
-    """Return the index of the nearest of +x +y +z -x -y -z."""
-    largest = int(np.abs(direction).argmax())
-    return largest + (3 if direction[largest] < 0 else 0)

@@ -15,7 +15,7 @@ from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.progress import Progress
 from lapgs_wgpu.viewer.export import check_free
 from lapgs_wgpu.viewer.export_loss import Loss, measure, of_playback
-from lapgs_wgpu.viewer.loaded_scene import LoadedScene
+from lapgs_wgpu.viewer.loaded_scene import LoadedScene, direction, nearest_axis
 from lapgs_wgpu.viewer.moving_files import SampledPlayback
 from lapgs_wgpu.viewer.usd_file import HARMONICS, KIND, load_pxr, read_usd
 
@@ -29,7 +29,8 @@ _TYPES = {
 def export_usd(scene: LoadedScene, file: Path, frames: int, *, overwrite: bool = False) -> Loss:
     """Write Gaussians at `frames` times evenly from 0 to 1, and compare what usd-core reads with the scene. Atomic.
 
-    Coordinates are the scene's, below a transform that turns its up to z. Values that do not change have one sample.
+    Coordinates are the scene's, below a transform that turns its up axis to z where it is neither y nor z. Values that
+    do not change have one sample.
     Raises InputError where the file cannot be written or is there already, or usd-core is missing.
     """
     pxr = load_pxr()
@@ -53,7 +54,8 @@ def _write(pxr: Any, stage: Any, scene: LoadedScene, frames: int) -> None:
     antialiased = {"antialiased": "true"} if scene.playback.at(0.0).antialiased else {}
     view = scene.initial_view._replace(frames=frames).to_json()
     stage.GetRootLayer().customLayerData = {"view": view} | antialiased
-    pxr.UsdGeom.SetStageUpAxis(stage, pxr.UsdGeom.Tokens.z)
+    axis, tokens = nearest_axis(scene.initial_view.up), pxr.UsdGeom.Tokens
+    pxr.UsdGeom.SetStageUpAxis(stage, tokens.y if axis == "y" else tokens.z)  # it knows these two
     pxr.UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     rate = max(1, frames - 1) / scene.clock().seconds
     stage.SetTimeCodesPerSecond(rate)
@@ -63,7 +65,7 @@ def _write(pxr: Any, stage: Any, scene: LoadedScene, frames: int) -> None:
     world = pxr.UsdGeom.Xform.Define(stage, "/World")
     stage.SetDefaultPrim(world.GetPrim())
     turn = np.eye(4)
-    turn[:3, :3] = _onto_z(scene.initial_view.up)
+    turn[:3, :3] = np.eye(3) if axis == "y" else _onto_z(direction(axis))
     world.AddTransformOp().Set(pxr.Gf.Matrix4d(turn.T))  # USD multiplies rows
     _write_camera(pxr, stage, scene)
     prim = stage.DefinePrim("/World/Splats", KIND)
@@ -122,9 +124,9 @@ def _write_camera(pxr: Any, stage: Any, scene: LoadedScene) -> None:
 
 
 def _onto_z(up: NDArray[np.floating]) -> NDArray[np.floating]:
-    """(3, 3) the smallest rotation that takes a unit vector to z (Rodrigues)."""
-    x, y, z = up / np.linalg.norm(up)
-    if z < -0.999999:
+    """(3, 3) the smallest rotation that takes an axis to z (Rodrigues)."""
+    x, y, z = up
+    if z < 0:
         return np.diag([1.0, -1, -1])
     cross = np.array([[0, 0, -x], [0, 0, -y], [x, y, 0]])
     return np.asarray(np.eye(3) + cross + cross @ cross / (1 + z))

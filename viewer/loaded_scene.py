@@ -125,3 +125,9 @@ def direction(axis: str) -> NDArray[np.float64]:
     vector = np.zeros(3)
     vector["xyz".index(axis[-1])] = -1.0 if axis.startswith("-") else 1.0
     return vector
+
+
+def nearest_axis(vector: NDArray[np.floating]) -> str:
+    """Return the name of the axis, such as "x" or "-y", that is nearest to a vector (3,)."""
+    largest = int(np.abs(vector).argmax())
+    return "-" * bool(vector[largest] < 0) + "xyz"[largest]

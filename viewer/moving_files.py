@@ -35,7 +35,7 @@ MANIFEST = "sequence.json"
 SH_RANGE = 4.0  # of .4dgs: a coefficient is a byte from -this to +this (section 6.5 of the specification)
 LAST = 1 - 1e-6  # time in the clip of a .4dgs at which its last pieces are still there
 _SPLATV = 0x674B  # the first word of a .splatv
-_AXES = ("x", "y", "z", "-x", "-y", "-z")
+AXES = ("x", "y", "z", "-x", "-y", "-z")  # as .4dgs numbers them
 _POLYNOMIAL = [
     "x", "y", "z", *(f"motion_{i}" for i in range(9)), *(f"rot_{i}" for i in range(4)),
     *(f"omega_{i}" for i in range(4)), *(f"scale_{i}" for i in range(3)), "opacity", *(f"f_dc_{i}" for i in range(3)),
@@ -87,7 +87,7 @@ class SampledPlayback:
 
 
 def read_sequence(path: Path) -> MovingFile:
-    """Read the manifest of a sequence (docs/format.md). Raises InputError."""
+    """Read the manifest of a sequence (docs/pipelines.md). Raises InputError."""
     manifest = read_json(path)
     files = manifest.get("frames") if isinstance(manifest, dict) else None
     if not (
@@ -232,7 +232,7 @@ def read_4dgs(path: Path) -> MovingFile:
 
     metadata = {"fps": "30"}
     if scene.provenance.frames and 0 <= scene.provenance.frames[0].up_axis < 6:
-        metadata["up"] = _AXES[scene.provenance.frames[0].up_axis]
+        metadata["up"] = AXES[scene.provenance.frames[0].up_axis]
     return MovingFile(sample, max(2, round(30 * seconds) + 1), metadata)
 
 
