@@ -67,7 +67,11 @@ def test_usd(scene: LoadedScene, device: Device, tmp_path: Path, ending: str) ->
 
 
 def test_a_sequence_and_back_to_usd(scene: LoadedScene, device: Device, tmp_path: Path) -> None:
-    assert export_frames(scene, tmp_path / "frames", 4).psnr > 90
+    (tmp_path / "frames").mkdir()
+    (tmp_path / "frames" / "frame_7.ply").touch()
+    with pytest.raises(InputError, match="is not empty"):
+        export_frames(scene, tmp_path / "frames", 4)
+    assert export_frames(scene, tmp_path / "frames", 4, overwrite=True).psnr > 90
     read = load_scene(tmp_path / "frames", lambda: device)
     assert (read.clock().frames, read.clock().seconds) == (4, pytest.approx(scene.clock().seconds))
     for t in (0.0, 1 / 3, 1.0):

@@ -86,13 +86,6 @@ def test_gaussians_that_move_are_refused(tmp_path: Path) -> None:
         read_ply(tmp_path / "a.ply")
 
 
-def test_a_folder_of_stills(tmp_path: Path) -> None:
-    for name in ("frame_0.ply", "frame_1.ply"):
-        (tmp_path / name).write_bytes(b"")
-    with pytest.raises(InputError, match=r"frame_0\.ply, or look at all"):
-        read_ply(tmp_path)
-
-
 @pytest.mark.parametrize("kind", ["double", "text"])
 def test_doubles_far_from_the_origin(tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str) -> None:
     offset = np.array([448262.0, 5411932.0, 120.0])

@@ -108,10 +108,11 @@ def test_cameras_learn(sh: int | None) -> None:
 
     theirs = np.array([(loss(1e-7 * row) - loss(-1e-7 * row)) / 2e-7 for row in np.eye(6)])
     change = torch.zeros(6, requires_grad=True)
-    x, y, z, *shift = change.unbind()
-    one, zero = torch.ones(()), torch.zeros(())
-    rows = [[one, -z, y, shift[0]], [z, one, -x, shift[1]], [-y, x, one, shift[2]], [zero, zero, zero, one]]
-    pose = torch.stack([torch.stack(row) for row in rows]) @ VIEWMATS[0]
+    basis = torch.zeros(6, 4, 4)
+    for i, (row, column) in enumerate([(2, 1), (0, 2), (1, 0), (0, 3), (1, 3), (2, 3)]):
+        basis[i, row, column] = 1
+        basis[i, column, row] -= float(i < 3)
+    pose = (torch.eye(4) + torch.einsum("i,irc->rc", change, basis)) @ VIEWMATS[0]
     image, _, _ = rasterization(**scene, viewmats=pose[None], Ks=KS[:1], width=61, height=47, **how)
     (image[0] * weights).sum().backward()
     assert change.grad is not None

@@ -59,7 +59,8 @@ def rasterization(
         colors: (N, 3) or (C, N, 3); with sh_degree (N, K, 3) or (C, N, K, 3). None where only depth is rendered.
         viewmats: (C, 4, 4) from world to camera, OpenCV axes.
         Ks: (C, 3, 3) intrinsics, pixels.
-        near_plane, far_plane: depths between which Gaussians are drawn.
+        near_plane: depth from which Gaussians are drawn, world units.
+        far_plane: depth up to which they are.
         packed: how the dictionary lists projected Gaussians: rows of visible ones only, or all of every camera.
         backgrounds: (C, 3).
         render_mode: one of RGB, D (sum of weight times depth), ED (D divided by alpha), RGB+D, RGB+ED.
