@@ -166,7 +166,8 @@ def read_splatv(path: Path) -> MovingFile:
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         raise InputError(f"{path}: its parts cannot be read ({type(error).__name__}: {error}).") from None
     words = words[words[:, 7] >> 24 > 0]  # rows that pad the texture are invisible
-    halves, rgba = words.view("<f2").astype(np.float32), words[:, 7:8].copy().view(np.uint8) / np.float32(255)
+    halves = words.view("<f2").astype(np.float32)
+    rgba = (words[:, 7:8].copy().view(np.uint8) / 255).astype(np.float32)
     means = words[:, :3].copy().view("<f4")
     if not len(words):
         raise InputError(f"{path}: holds no Gaussians that can be seen.")

@@ -138,7 +138,7 @@ def _parse(arguments: Sequence[str]) -> Any:
     add("--max-error", type=_number(0.01, 100.0), metavar="PX", help="of a .4dgs: how far lines may be off the learned "
         "motion, pixels of the captured images at the focus [0.5]")
     add("--frames", type=_whole(1, 100_000), metavar="N", help="of DIR and .usd: times, evenly from 0 to 1 [of .usd: "
-        "those of the clip]")
+        "those of the clip, at least 61]")
     add("--overwrite", action="store_const", const=True, help="replace an existing file, or the frame_*.ply in DIR")
     # fmt: on
     arguments = list(arguments)
