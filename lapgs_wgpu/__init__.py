@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from lapgs_wgpu.motion.scene import Scene4D, load
     from lapgs_wgpu.splat.camera import Camera
     from lapgs_wgpu.splat.gaussians import Gaussians
+    from lapgs_wgpu.splat.rasterization import rasterization
     from lapgs_wgpu.splat.rasterize import Rendering, rasterize
     from lapgs_wgpu.train.densify import Change, DensityState, published_rule
     from lapgs_wgpu.train.loss_terms import Regularizer, TorchLoss, WgslLoss
@@ -29,6 +30,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 _HOMES = {
     "rasterize": "splat.rasterize",
+    "rasterization": "splat.rasterization",
     "Rendering": "splat.rasterize",
     "Camera": "splat.camera",
     "Gaussians": "splat.gaussians",
@@ -53,7 +55,7 @@ _HOMES = {
 __all__ = [
     "Camera", "Change", "Deformation", "DensityState", "Gaussians", "Parts", "Regularizer", "Rendering", "Scene4D",
     "StepResult", "TorchLoss", "Trainer", "WgslLoss", "list_devices", "load", "load_config", "load_dataset",
-    "open_device", "published_rule", "rasterize", "start_training",
+    "open_device", "published_rule", "rasterization", "rasterize", "start_training",
 ]  # fmt: skip
 
 

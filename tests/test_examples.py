@@ -24,6 +24,7 @@ ARGUMENTS = {
     "render_path": ["--frames", "4", "--size", "48"],
     "fit_image": ["--steps", "60", "--gaussians", "400", "--size", "48"],
     "export_web": [],
+    "simple_trainer": ["--steps", "50", "--gaussians", "800"],
 }
 
 
@@ -88,6 +89,10 @@ def test_fit_image(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     image = next((data / "train").glob("*.png"))
     assert run("fit_image", image, tmp_path, monkeypatch, option="--image") > 20
     assert (tmp_path / "fitted.png").is_file()
+
+
+def test_simple_trainer(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert run("simple_trainer", data, tmp_path, monkeypatch) > 13
 
 
 def test_export_web(checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -86,17 +86,6 @@ def test_the_still_is_that_of_the_scene(device: Device, tmp_path: Path, name: st
             np.testing.assert_allclose(a, b, rtol=tolerance, atol=tolerance, err_msg=part)
 
 
-@pytest.mark.parametrize("name", ["static", "mlp", "grid4d", "laplacian"])
-def test_dynamics(device: Device, tmp_path: Path, name: str) -> None:
-    scene, path = saved(device, tmp_path, KINDS[name])
-    found = open_playback(path, device).dynamics()
-    if name == "laplacian":
-        assert found is not None
-        np.testing.assert_array_equal(found, scene.parameters["dynamics"].detach().numpy())
-    else:
-        assert found is None
-
-
 @pytest.mark.parametrize("name", ["mlp", "hidden layers"])
 def test_torch_evaluates_what_has_changed_alone(
     device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str

@@ -76,12 +76,6 @@ def test_values_by_a_scale_of_colors(bench: Bench, shows: str, plane: int) -> No
     near(got, scaled(bench.planes[plane], 1 - bench.planes[3], 0.5, 3.0))
 
 
-def test_a_scale_without_length_is_no_accident(bench: Bench) -> None:
-    got = bench.show(bench.image._replace(shows="depth", low=1.0, high=1.0))
-    assert np.isfinite(got).all()
-    near(got[0, :3], np.broadcast_to(BACKGROUND, (3, 3)))
-
-
 def enlarged(picture: Floats, width: int, height: int) -> Floats:
     """Bilinear, pixel centres at halves, the border repeated."""
     rows, columns = picture.shape[:2]

@@ -33,24 +33,6 @@ def test_the_ends(loop: str, start: float, seconds: float, time: float, goes_on:
     assert clock.playing is goes_on
 
 
-def test_a_bounce_comes_back_in_small_steps_too() -> None:
-    clock = playing(time=0.9, loop="bounce")
-    for _ in range(20):
-        clock.advance(0.01)
-    assert clock.time == pytest.approx(0.9)
-    assert not clock.forward
-
-
-def test_speed_and_rate() -> None:
-    clock = playing(speed=0.5)
-    clock.advance(0.4)
-    assert clock.time == pytest.approx(0.2)
-    clock.fps = 20.0
-    assert clock.seconds == pytest.approx(0.5)
-    clock.advance(0.4)
-    assert clock.time == pytest.approx(0.6)
-
-
 def test_steps_pause_and_stop_at_the_ends() -> None:
     clock = playing(time=0.52)
     clock.step(1)
@@ -69,10 +51,3 @@ def test_a_clip_that_ended_starts_anew() -> None:
     assert (clock.time, clock.playing) == (0.0, True)
     clock.toggle()
     assert not clock.playing
-
-
-@pytest.mark.parametrize(("asked", "got"), [(-1.0, 0.0), (0.25, 0.25), (7.0, 1.0)])
-def test_seeking_stays_in_the_clip(asked: float, got: float) -> None:
-    clock = Clock(11)
-    clock.seek(asked)
-    assert clock.time == got

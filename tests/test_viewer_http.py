@@ -77,12 +77,6 @@ def test_where_it_listens() -> None:
             open_entry(host, 0)
 
 
-def test_options_of_the_server_need_it(capsys: pytest.CaptureFixture[str]) -> None:
-    for arguments in (["--port", "8080"], ["--host", "0.0.0.0"], ["--backend", "http", "--size", "8x8"]):
-        assert cli.view_command(["scene.ply", *arguments]) == 2
-        assert capsys.readouterr().err.count("\n") == 1
-
-
 def test_a_missing_library_of_the_system_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

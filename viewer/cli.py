@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from lapgs_wgpu.command import guarded, print_devices
 from lapgs_wgpu.errors import InputError
-from lapgs_wgpu.viewer.options import parse_options
+from lapgs_wgpu.viewer.options import USD, parse_options
 from lapgs_wgpu.viewer.render_modes import BACKGROUNDS
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ def _view(arguments: list[str]) -> None:
         print_devices()
         return
     if given.file is None:
-        raise InputError("name a .ply or .lapgs file; lapgs-view --help says more.")
+        raise InputError("name a file or a folder of frames; lapgs-view --help says more.")
     with ThreadPoolExecutor(1) as other:
         # Beside all that follows: the driver and its compiler take longer than the rest together.
         device = other.submit(_warm_device, given.device)
@@ -166,35 +166,41 @@ def _export(given: Any, scene: LoadedScene) -> None:
 
     file, overwrite = Path(given.export), bool(given.overwrite)
     ending, count = file.suffix.lower(), scene.playback.count
+    line = f"{count} Gaussians"
     if ending == ".4dgs":
         from lapgs_wgpu.viewer.export_4dgs import MAX_ERROR, export_4dgs
 
         loss = export_4dgs(scene, file, given.max_error or MAX_ERROR, overwrite=overwrite)
-        line = f"{count} Gaussians, {_megabytes(file)}"
+    elif ending in USD:
+        from lapgs_wgpu.viewer.export_usd import export_usd
+
+        frames = given.frames or max(61, scene.clock().frames)  # between samples programs go straight
+        loss = export_usd(scene, file, frames, overwrite=overwrite)
+        line = f"{count} Gaussians at {frames} times"
     elif ending in (".lapgs", ".html"):
         loss = export.export_compact(scene, file, overwrite=overwrite)
-        line = f"{count} Gaussians, {_megabytes(file)}"
     elif ending == ".ply":
         loss = export.export_still(scene, file, given.time or 0.0, overwrite=overwrite)
         line = f"{count} Gaussians at time {given.time or 0.0:g}"
     else:
         loss = export.export_frames(scene, file, given.frames, overwrite=overwrite)
         line = f"{given.frames} frames of {count} Gaussians"
-    print(f"{file}: {line}, {loss.psnr:.1f} dB PSNR against {scene.path}")
+    size = f", {file.stat().st_size / 1e6:.2f} MB" if file.is_file() else ""
+    print(f"{file}: {line}{size}, {loss.psnr:.1f} dB PSNR against {scene.path}")
     if loss.reason:
         print(f"warning: the loss is seen: {loss.reason}.", file=sys.stderr)
     # Our own formats say whether the scene is antialiased, and all programs that play them know it.
     if ending not in (".lapgs", ".html") and scene.playback.at(0.0).antialiased:
-        says = "a .4dgs cannot say" if ending == ".4dgs" else "its comment 'SplatRenderMode: mip' tells few viewers"
+        says = (
+            "no player reads from this format"
+            if ending in (".4dgs", *USD)
+            else "its comment 'SplatRenderMode: mip' tells few viewers"
+        )
         print(
             f"note: the scene was trained antialiased, which {says}: where they offer antialiased drawing, turn it on; "
             "elsewhere thin places look a little thicker.",
             file=sys.stderr,
         )
-
-
-def _megabytes(file: Path) -> str:
-    return f"{file.stat().st_size / 1e6:.2f} MB"
 
 
 def _named(name: str, ending: str, option: str) -> Path:

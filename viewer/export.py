@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +12,12 @@ from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.io.ply import write_ply
 from lapgs_wgpu.motion.compact_scene import held_rows
-from lapgs_wgpu.motion.playback.playback import DevicePlayback
+from lapgs_wgpu.motion.playback.playback import DevicePlayback, playback_of
 from lapgs_wgpu.motion.scene_file import SceneFile, compact_bytes, read_compact, read_scene
 from lapgs_wgpu.progress import Progress
-from lapgs_wgpu.viewer.export_loss import Loss, measure, of_scene
-from lapgs_wgpu.viewer.loaded_scene import LoadedScene
+from lapgs_wgpu.viewer.export_loss import Loss, measure, of_playback
+from lapgs_wgpu.viewer.loaded_scene import LoadedScene, nearest_axis
+from lapgs_wgpu.viewer.moving_files import MANIFEST, SampledPlayback, read_sequence
 from lapgs_wgpu.viewer.offscreen import OffscreenRenderer
 from lapgs_wgpu.viewer.web_page import page_html
 
@@ -40,22 +42,18 @@ def export_still(scene: LoadedScene, file: Path, time: float, *, overwrite: bool
     """
     check_free(scene, file, overwrite)
     _write_still(scene, file, time)
-    return _loss_of_still(scene, file, time)
+    return measure(scene, of_playback(playback_of(read_scene(file), scene.playback.device)), time)
 
 
 def _write_still(scene: LoadedScene, file: Path, time: float) -> None:
     write_ply(file, scene.playback.snapshot(time), antialiased=scene.playback.at(time).antialiased)
 
 
-def _loss_of_still(scene: LoadedScene, file: Path, time: float) -> Loss:
-    return measure(scene, of_scene(read_scene(file), scene.playback.device), time)
-
-
 def export_frames(scene: LoadedScene, folder: Path, frames: int, *, overwrite: bool = False) -> Loss:
-    """Write frame_0000.ply to the last one, at times evenly from 0 to 1, into a new or an empty folder.
+    """Write a still frame_0000.ply for each of the times evenly from 0 to 1, and their manifest, into a new or an empty
+    folder; compare what is played with the scene.
 
-    overwrite: frames of an earlier export go, other files stay. Returns the loss of the last frame. Raises InputError
-    where it cannot be written.
+    overwrite: frames of an earlier export go, other files stay. Raises InputError where it cannot be written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -64,18 +62,28 @@ def export_frames(scene: LoadedScene, folder: Path, frames: int, *, overwrite: b
         raise InputError(f"{folder}: cannot be used as a folder ({error.strerror or error}).") from error
     if held and not overwrite:
         raise InputError(f"{folder}: is not empty; --overwrite replaces the frames in it.")
-    old = [file for file in held if file.match("frame_*.ply")]
+    old = [file for file in held if file.match("frame_*.ply") or file.name == MANIFEST]
     for file in old:
         check_free(scene, file, overwrite)
     for file in old:
         file.unlink()
     digits = max(4, len(str(frames - 1)))
+    names = [f"frame_{number:0{digits}}.ply" for number in range(frames)]
     with Progress(frames, "frames") as progress:
-        for number, time in enumerate(np.linspace(0, 1, frames).tolist()):
-            file = folder / f"frame_{number:0{digits}}.ply"
-            _write_still(scene, file, time)
+        for name, time in zip(names, np.linspace(0, 1, frames).tolist(), strict=True):
+            _write_still(scene, folder / name, time)
             progress.step()
-    return _loss_of_still(scene, file, time)
+    manifest = {
+        "fps": max(1, frames - 1) / scene.clock().seconds,  # so that they last as long as the clip
+        "up": nearest_axis(scene.initial_view.up),
+        "antialiased": scene.playback.at(0.0).antialiased,
+        "view": scene.initial_view._replace(frames=frames).to_json(),
+        "frames": names,
+    }
+    with atomic_write(folder / MANIFEST) as target:
+        target.write(json.dumps(manifest, indent=1).encode())
+    written = SampledPlayback(scene.playback.device, read_sequence(folder / MANIFEST))
+    return measure(scene, of_playback(written), frames=frames)
 
 
 def export_compact(scene: LoadedScene, file: Path, *, overwrite: bool = False) -> Loss:
@@ -84,7 +92,10 @@ def export_compact(scene: LoadedScene, file: Path, *, overwrite: bool = False) -
     Raises InputError where it cannot be written, where the file is there already and `overwrite` is not given, and
     where only torch evaluates the field.
     """
-    assert scene.file is not None
+    if scene.file is None:
+        raise InputError(
+            f"{scene.path}: holds no field of lapgs_wgpu; --export takes a folder, or a .ply, .usd or .4dgs."
+        )
     check_free(scene, file, overwrite)
     with atomic_write(file) as target:  # before a minute of work
         content, loss = _compact(scene, scene.file)
@@ -103,7 +114,8 @@ def _compact(scene: LoadedScene, opened: SceneFile) -> tuple[bytes, Loss]:
     best = b"", Loss(-np.inf, "")
     for finer in _FINER:
         content = compact_bytes(file, features, finer=finer)
-        loss = measure(scene, of_scene(read_compact(content, file.path), scene.playback.device, rows))
+        written = playback_of(read_compact(content, file.path), scene.playback.device)
+        loss = measure(scene, of_playback(written, rows))
         if loss.psnr > best[1].psnr + 1:
             best = content, loss
         if loss.psnr >= _ENOUGH:

@@ -25,16 +25,15 @@ from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.linear_light import directions, display_colors, linear_harmonics, sh_basis, to_display
 from lapgs_wgpu.viewer.export import check_free
 from lapgs_wgpu.viewer.export_loss import Loss, Written, measure, seen, upload
-from lapgs_wgpu.viewer.loaded_scene import LoadedScene
+from lapgs_wgpu.viewer.loaded_scene import LoadedScene, nearest_axis
+from lapgs_wgpu.viewer.moving_files import AXES, LAST, SH_RANGE, harmonics_4dgs
 
 MAX_ERROR = 0.5  # pixels, without --max-error
 _SHADE = 4 / 255  # largest change of opacity and color within a piece
 _OF_LINES = 0.85  # share of the error that straight lines may use up; the rest is for the format's rounding
 _TIME_STEP = 1e-3  # seconds: the library rounds the middles of pieces to it (profile "fine")
-_SH_RANGE = 4.0  # a coefficient is a byte from -this to +this (section 6.5 of the specification)
 _PROGRESS = 1000
 _CHECKS = 97  # times at which the written file is compared with the playback
-_LAST = 1 - 1e-6  # time in the clip at which its last pieces are still there
 
 
 def export_4dgs(scene: LoadedScene, file: Path, max_error: float, *, overwrite: bool = False) -> Loss:
@@ -91,7 +90,7 @@ def export_4dgs(scene: LoadedScene, file: Path, max_error: float, *, overwrite: 
 def _largest_shift(read: Any, playback: Playback) -> float:
     """Return the largest distance of means in a file from the playback's, world units, over _CHECKS times."""
     largest = 0.0
-    for t in np.linspace(0, _LAST, _CHECKS).tolist():
+    for t in np.linspace(0, LAST, _CHECKS).tolist():
         now, means = read.gaussians.state_at(t * read.duration_sec), playback.at(t).means.read()
         shift = now["centers"] - means[read.gaussians.source_index[now["indices"]]]
         largest = max(largest, float(np.linalg.norm(shift, axis=1).max(initial=0)))
@@ -129,13 +128,10 @@ def _gaussian_set(pieces: Pieces, sh: NDArray[np.float32], seconds: float) -> An
 def _shown(scene: Any, device: Device) -> Written:
     """Draw what the library read; its harmonics are of linear light."""
     gaussians = scene.gaussians
-    light = gaussians.colors[:, None, :3] / CONSTANTS["SH_C0"]
-    if gaussians.sh_degree:
-        others = gaussians.sh.reshape(len(light), 3, -1).transpose(0, 2, 1) * (2 * _SH_RANGE / 255) - _SH_RANGE
-        light = np.concatenate([light, others], axis=1)
+    light = harmonics_4dgs(gaussians)
 
     def at(camera: Camera, t: float) -> tuple[Gaussians[DeviceArray], NDArray[np.integer]]:
-        now = gaussians.state_at(min(t, _LAST) * scene.duration_sec)
+        now = gaussians.state_at(min(t, LAST) * scene.duration_sec)
         rows, means = now["indices"], now["centers"]
         colors = to_display(seen(means, light[rows], camera).clip(0, 1))
         quats = np.roll(gaussians.rotations[rows], 1, axis=1)  # xyzw to wxyz
@@ -158,7 +154,7 @@ def best_degree(sh: NDArray[np.floating]) -> int:
     errors = []
     for fewer in range(degree + 1):
         light = linear_harmonics(some, fewer)
-        light[:, 1:] = harmonics_bytes(light[:, 1:]) * (2 * _SH_RANGE / 255) - _SH_RANGE
+        light[:, 1:] = harmonics_bytes(light[:, 1:]) * (2 * SH_RANGE / 255) - SH_RANGE
         shown = to_display(np.einsum("dk,nkc->ndc", sh_basis(around, fewer), light).clip(0, 1))
         errors.append(float(((shown - true) ** 2).mean()))
     return int(np.argmin(errors))
@@ -166,20 +162,14 @@ def best_degree(sh: NDArray[np.floating]) -> int:
 
 def harmonics_bytes(coefficients: NDArray[np.floating]) -> NDArray[np.uint8]:
     """Quantize coefficients to the format's bytes, clipped to its range."""
-    return np.rint((coefficients + _SH_RANGE) * (255 / (2 * _SH_RANGE))).clip(0, 255).astype(np.uint8)
+    return np.rint((coefficients + SH_RANGE) * (255 / (2 * SH_RANGE))).clip(0, 255).astype(np.uint8)
 
 
 def _frame(view: InitialView) -> Any:
     """Name the axes of the file that are nearest to up and ahead."""
     import fourdgs
 
-    up = _axis(view.up)
-    ahead = _axis(view.camera.T_cam_world[2, :3] * (np.arange(3) != up % 3))
+    up = AXES.index(nearest_axis(view.up))
+    ahead = AXES.index(nearest_axis(view.camera.T_cam_world[2, :3] * (np.arange(3) != up % 3)))
     frame = fourdgs.CoordinateFrame(handedness=1, up_axis=up, forward_axis=ahead)  # right-handed, of no unit
     return fourdgs.Provenance(frames=[frame])
-
-
-def _axis(direction: NDArray[np.floating]) -> int:
-    """Return the index of the nearest of +x +y +z -x -y -z."""
-    largest = int(np.abs(direction).argmax())
-    return largest + (3 if direction[largest] < 0 else 0)

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.motion.playback.playback import playback_of
-from lapgs_wgpu.motion.scene_file import SceneFile
+from lapgs_wgpu.motion.playback.playback import Playback
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.constants import CONSTANTS
 from lapgs_wgpu.splat.gaussians import Gaussians
@@ -47,14 +46,15 @@ class Loss(NamedTuple):
     reason: str
 
 
-def measure(scene: LoadedScene, written: Written, time: float | None = None) -> Loss:
+def measure(scene: LoadedScene, written: Written, time: float | None = None, frames: int | None = None) -> Loss:
     """Compare small pictures from around the focus. time: of all, in [0, 1]; by default from the clip's start to its
-    end."""
+    end. frames: of a sequence, whose times the pictures have then."""
     rasterizer = Rasterizer(scene.playback.device)
     if time is None and not scene.playback.moves:
         time = 0.0
     pictures = []
     for camera, t in orbit_views(scene.camera(), _SIZE, _PICTURES, time, scene.initial_view.arc):
+        t = t if frames is None else round(t * (frames - 1)) / max(1, frames - 1)
         wanted = _draw(rasterizer, scene, scene.playback.at(t), camera)
         psnr = _psnr(wanted, _draw(rasterizer, scene, written(camera, t)[0], camera))
         pictures.append((psnr, camera, t, wanted))
@@ -62,9 +62,8 @@ def measure(scene: LoadedScene, written: Written, time: float | None = None) -> 
     return Loss(psnr, "" if psnr >= _VISIBLE else _reason(rasterizer, scene, written, camera, t, wanted))
 
 
-def of_scene(file: SceneFile, device: Device, rows: Rows | None = None) -> Written:
-    """Draw what a file holds. rows: Gaussians of the scene that are in it, where not all."""
-    playback = playback_of(file, device)
+def of_playback(playback: Playback, rows: Rows | None = None) -> Written:
+    """Draw what an opened file holds. rows: Gaussians of the scene that are in it, where not all."""
     held = np.arange(playback.count) if rows is None else rows
     return lambda camera, t: (playback.at(t), held)
 

@@ -11,14 +11,18 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lapgs_wgpu.data.stamps import natural_key
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.motion.playback.playback import Playback, playback_of
 from lapgs_wgpu.motion.scene_file import SceneFile, read_scene
 from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.viewer import moving_files
 from lapgs_wgpu.viewer.camera import ViewCamera
 from lapgs_wgpu.viewer.clock import Clock
+from lapgs_wgpu.viewer.options import USD
 from lapgs_wgpu.viewer.render_modes import AHEAD, BACKGROUNDS
+from lapgs_wgpu.viewer.usd_file import read_usd
 
 _ELEVATION = math.radians(35)  # of the guessed camera above the middle
 _FLAT = 0.5  # of the extents along x and y: what is lower lies on the ground
@@ -27,7 +31,7 @@ _FRAMES = 150  # of a clip whose file does not say how many it has
 
 class LoadedScene(NamedTuple):
     """path: where it came from, None for a training under way. initial_view: camera, focus, up and frames to
-    begin with. file: its content, None for a training."""
+    begin with. file: its content, None for a training, and for moving files of others."""
 
     path: Path | None
     playback: Playback
@@ -40,7 +44,8 @@ class LoadedScene(NamedTuple):
 
     def clock(self) -> Clock:
         """Make the clock of the clip, at its start."""
-        return Clock(self.initial_view.frames if self.playback.moves else 1)
+        fps = float(self.playback.metadata.get("fps", 30))
+        return Clock(self.initial_view.frames if self.playback.moves else 1, fps=fps)
 
     @property
     def background(self) -> tuple[float, float, float]:
@@ -51,21 +56,42 @@ class LoadedScene(NamedTuple):
 def load_scene(
     path: Path, device: Callable[[], Device], *, up: str | None = None, antialiased: bool | None = None
 ) -> LoadedScene:
-    """Open a checkpoint, a compact scene, or any 3DGS .ply. Raises InputError.
+    """Open a checkpoint, a compact scene, any 3DGS .ply, or a moving file of others. Raises InputError.
 
     device: is asked for when the file has been read. up: axis of AHEAD that points up, antialiased: how the Gaussians
     are drawn; both otherwise as the file says.
     """
-    file = read_scene(path)
-    if antialiased is not None:
-        file = dataclasses.replace(file, antialiased=antialiased)
-    playback = playback_of(file, device())
+    playback: Playback
+    moving, file = open_moving(path), None
+    if moving is not None:
+        playback, frames = moving_files.SampledPlayback(device(), moving, antialiased), moving.frames
+    else:
+        file = read_scene(path)
+        if antialiased is not None:
+            file = dataclasses.replace(file, antialiased=antialiased)
+        playback, frames = playback_of(file, device()), None
     initial_view = InitialView.from_json(playback.metadata.get("view", ""))
     if initial_view is None:
-        initial_view = guess_view(playback, up or file.metadata.get("up"))
+        initial_view = guess_view(playback, up or playback.metadata.get("up"))
     elif up is not None:
         initial_view = guess_view(playback, up)._replace(frames=initial_view.frames)
-    return LoadedScene(path, playback, initial_view, file)
+    return LoadedScene(path, playback, initial_view._replace(frames=frames or initial_view.frames), file)
+
+
+def open_moving(path: Path) -> moving_files.MovingFile | None:
+    """Open a moving file of others; None where it is none. Raises InputError where it is damaged or needs a package."""
+    ending = path.suffix.lower()
+    if path.is_dir() and (path / moving_files.MANIFEST).is_file():
+        return moving_files.read_sequence(path / moving_files.MANIFEST)
+    if path.is_dir() and not (path / "checkpoint.ply").exists():
+        files = sorted(path.glob("*.ply"), key=lambda file: natural_key(file.name))
+        return moving_files.read_frames(files, {}) if len(files) > 1 else None
+    if ending == ".ply" and path.is_file():
+        return moving_files.read_spacetime_ply(path)
+    if ending in USD:
+        return read_usd(path)
+    read = {".json": moving_files.read_sequence, ".splatv": moving_files.read_splatv, ".4dgs": moving_files.read_4dgs}
+    return read[ending](path) if ending in read else None
 
 
 def guess_view(playback: Playback, axis: str | None = None) -> InitialView:
@@ -83,7 +109,7 @@ def guess_view(playback: Playback, axis: str | None = None) -> InitialView:
     flat = extent[2] < _FLAT * min(extent[0], extent[1])
     if axis in AHEAD:
         up, ahead = direction(axis), direction(AHEAD[axis])
-    elif playback.metadata.keys() - {"antialiased", "up", "offset"}:  # of a checkpoint
+    elif playback.metadata.keys() - {"antialiased", "up", "offset", "fps"}:  # of a checkpoint
         up, ahead = direction("z"), direction("y")
     elif flat:
         up, ahead = direction("z"), direction("-y")  # y points down in pictures
@@ -99,3 +125,9 @@ def direction(axis: str) -> NDArray[np.float64]:
     vector = np.zeros(3)
     vector["xyz".index(axis[-1])] = -1.0 if axis.startswith("-") else 1.0
     return vector
+
+
+def nearest_axis(vector: NDArray[np.floating]) -> str:
+    """Return the name of the axis, such as "x" or "-y", that is nearest to a vector (3,)."""
+    largest = int(np.abs(vector).argmax())
+    return "-" * bool(vector[largest] < 0) + "xyz"[largest]

@@ -27,8 +27,8 @@ Without a display:
   lapgs-view CHECKPOINT.ply --video a.mp4 --path both --seconds 10    one orbit while the clip plays
   lapgs-view CHECKPOINT.ply --export still.ply --time 0.5             static .ply for other splat viewers
   lapgs-view CHECKPOINT.ply --export frames --frames 60               sequence of static .ply files for SuperSplat
+  lapgs-view CHECKPOINT.ply --export scene.usdz                       OpenUSD with time samples (Houdini, Omniverse)
   lapgs-view CHECKPOINT.ply --export scene.html                       web page that plays the scene on the visitor's GPU
-  lapgs-view CHECKPOINT.ply --export scene.lapgs                      compact scene for such a page, or for lapgs-view
   lapgs-view CHECKPOINT.ply --export scene.4dgs                       motion as straight lines, for players of .4dgs
 
 [Values in brackets] are defaults.
@@ -47,8 +47,10 @@ _TAKES = {
     "--export FILE.lapgs": {"up", "antialiased", "overwrite"},
     "--export FILE.html": {"up", "antialiased", "overwrite"},
     "--export FILE.4dgs": {"up", "max_error", "overwrite"},
-    "--export DIR": {"frames", "antialiased", "overwrite"},
+    "--export FILE.usd": {"frames", "up", "antialiased", "overwrite"},
+    "--export DIR": {"frames", "up", "antialiased", "overwrite"},
 }
+USD = (".usd", ".usda", ".usdc", ".usdz")
 _JOBS = ("list_devices", "screenshot", "video", "export")
 
 
@@ -69,10 +71,11 @@ def parse_options(arguments: Sequence[str]) -> tuple[Any, str]:
     place = _option(job) if jobs else "--backend http" if given.backend == "http" else "a window"
     if job == "export":
         ending = PurePath(given.export).suffix.lower()
+        ending = ".usd" if ending in USD else ending
         place = f"--export FILE{ending}" if f"--export FILE{ending}" in _TAKES else "--export DIR"
         if place == "--export DIR" and given.frames is None:
             raise InputError(
-                f"--export {given.export}: name a .ply, .lapgs, .html or .4dgs file, or a folder and its --frames."
+                f"--export {given.export}: name a .ply, .lapgs, .html, .4dgs, .usd, or a folder and its --frames."
             )
     for name, value in vars(given).items():
         if value is not None and name not in {"file", "device", job} | _TAKES[place]:
@@ -89,7 +92,8 @@ def _parse(arguments: Sequence[str]) -> Any:
     # fmt: off
     add = parser.add_argument
     # All defaults are None, which tells given options from others.
-    add("file", nargs="?", metavar="FILE.ply", help="checkpoint, compact scene (.lapgs), or any 3DGS .ply file")
+    add("file", nargs="?", metavar="FILE", help="checkpoint, compact scene (.lapgs), any 3DGS .ply file; .4dgs, "
+        ".usd, .splatv, Spacetime Gaussians' .ply; a folder of .ply frames or its sequence.json")
     add("--device", metavar="NAME", help=DEVICE_HELP)
     add("--list-devices", action="store_const", const=True, help=LIST_DEVICES_HELP)
 
@@ -127,12 +131,14 @@ def _parse(arguments: Sequence[str]) -> Any:
         "view]")
 
     add = parser.add_argument_group("export (no window)").add_argument
-    add("--export", metavar="FILE.ply|.lapgs|.html|.4dgs|DIR", help=".ply: static 3DGS file at --time; "
+    add("--export", metavar="FILE|DIR", help=".ply: static 3DGS file at --time; "
         ".lapgs: compact scene with its motion; .html: web page that plays it; .4dgs: motion as straight lines (pip "
-        "install 'lapgs-wgpu[export]'); DIR: a static file for each of --frames")
+        "install 'lapgs-wgpu[export]'); .usd, .usda, .usdz: OpenUSD with time samples (pip install "
+        "'lapgs-wgpu[usd]'); DIR: a static .ply for each of --frames, and their manifest")
     add("--max-error", type=_number(0.01, 100.0), metavar="PX", help="of a .4dgs: how far lines may be off the learned "
         "motion, pixels of the captured images at the focus [0.5]")
-    add("--frames", type=_whole(1, 100_000), metavar="N", help="number of files in DIR, at times evenly from 0 to 1")
+    add("--frames", type=_whole(1, 100_000), metavar="N", help="of DIR and .usd: times, evenly from 0 to 1 [of .usd: "
+        "those of the clip, at least 61]")
     add("--overwrite", action="store_const", const=True, help="replace an existing file, or the frame_*.ply in DIR")
     # fmt: on
     arguments = list(arguments)

@@ -26,7 +26,7 @@ Floats = NDArray[np.float32]
 
 BAD_SHARE = 0.01  # of all rows: up to it rows with NaN are left out, above it a file is damaged
 LFS_POINTER = b"version https://git-lfs"  # begins what a clone without Git LFS holds in place of a file
-SPLATS = (".splat", ".ksplat", ".spz", ".sog")  # formats of splats that editors convert to .ply
+SPLATS = (".spz", ".sog", ".splat", ".ksplat", ".lcc")  # formats of stills that others convert to .ply
 MAX_HEADER_BYTES = 64 * 1024
 _BLOCK_BYTES = 1 << 20  # rows are converted in blocks that stay in the cache
 _BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
@@ -139,7 +139,7 @@ def _advice(folder: Path) -> str:
         return " without a .ply file; give the .ply file itself"
     if "checkpoint.ply" in names or len(names) == 1:
         return f"; give the file {'checkpoint.ply' if 'checkpoint.ply' in names else names[0]} in it"
-    return f" of {len(names)} .ply files; a sequence of stills is not played: give one of them, such as {names[0]}"
+    return f" of {len(names)} .ply files; give one of them, such as {names[0]}, or look at all by lapgs-view"
 
 
 def _read_header(file: BinaryIO, path: PathLike) -> PlyFile:
@@ -151,13 +151,16 @@ def _read_header(file: BinaryIO, path: PathLike) -> PlyFile:
             raise InputError(f"{path}: is empty (0 bytes); copy or write it again.")
         if head.startswith(LFS_POINTER):
             raise InputError(f"{path}: is a pointer of Git LFS in place of the file; fetch it by git lfs pull.")
-        splats = Path(path).suffix.lower() in SPLATS
-        if head.startswith(b"\x1f\x8b") and not splats:
+        ending = Path(path).suffix.lower()
+        if ending in SPLATS:
+            raise InputError(
+                f"{path}: is a {ending} file, which is not read; splat-transform or SuperSplat converts it."
+            )
+        if head.startswith(b"\x1f\x8b"):
             raise InputError(f"{path}: is packed by gzip; unpack it.")
-        advice = "splats with SuperSplat or splat-transform" if splats else "a cloud of points with CloudCompare"
         raise InputError(
-            f"{path}: begins with {head[:8]!r}, where a PLY file begins with the line 'ply'; convert it to .ply, "
-            f"{advice} for example."
+            f"{path}: begins with {head[:8]!r}, where a PLY file begins with the line 'ply'; convert it to .ply, a "
+            "cloud of points with CloudCompare for example."
         )
     end = re.search(rb"^end_header\r?\n", head, re.MULTILINE)
     if end is None:

@@ -41,7 +41,7 @@ def read_foreign(ply: PlyFile) -> tuple[GaussianSnapshot, dict[str, str]]:
     if moving:
         raise InputError(
             f"{ply.path}: its Gaussians move (properties {', '.join(moving[:5])}, {len(moving)} in all), as in "
-            "Spacetime Gaussians, in a way that is not played; give a .ply that its program exports at one time"
+            "Spacetime Gaussians, of which no still is read; lapgs-view plays those with a cubic motion"
         )
     held, missing = set(vertex.properties), dict[str, Floats | float]()
     scales = held & _SCALES

@@ -91,7 +91,7 @@ class Scene4D:
 
         Args:
             parameters: as the attribute; copied.
-            field_config, device, sh_degree, antialiased: as the attributes.
+            field_config: as the attribute, as are device, sh_degree and antialiased.
             seed: of the field's initial parameters.
             own_field: a module in place of the configured field (docs/api.md).
         """

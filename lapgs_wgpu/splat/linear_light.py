@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -51,10 +53,21 @@ def to_display(linear: Floats) -> Floats:
 
 def linear_harmonics(sh: Floats, degree: int) -> Floats:
     """Return harmonics (N, (degree + 1)^2, 3) of linear light, without offset, that fit the colors of sh (N, K, 3)."""
+    return _fitted(sh, degree, lambda block, basis: to_linear(display_colors(block, basis)))
+
+
+def display_harmonics(light: Floats) -> Floats:
+    """Return harmonics (N, K, 3) of displayed colors that fit those of linear light (N, K, 3), without offset."""
+
+    def shown(block: Floats, basis: Floats) -> Floats:
+        return to_display(np.einsum("dk,nkc->ndc", basis, block).clip(0, 1)) - CONSTANTS["SH_OFFSET"]
+
+    return _fitted(light, int(light.shape[1] ** 0.5) - 1, shown)
+
+
+def _fitted(sh: Floats, degree: int, colors: Callable[[Floats, Floats], Floats]) -> Floats:
+    """Fit colors (N, D, 3) of blocks of harmonics in the directions of a basis."""
     around = directions(64)
     seen, fit = sh_basis(around, int(sh.shape[1] ** 0.5) - 1), np.linalg.pinv(sh_basis(around, degree))
-    found = [
-        np.einsum("kd,ndc->nkc", fit, to_linear(display_colors(sh[first : first + _BLOCK], seen)))
-        for first in range(0, len(sh), _BLOCK)
-    ]
-    return np.concatenate(found)
+    blocks = (sh[first : first + _BLOCK] for first in range(0, len(sh), _BLOCK))
+    return np.concatenate([np.einsum("kd,ndc->nkc", fit, colors(block, seen)) for block in blocks])

@@ -15,7 +15,7 @@ from lapgs_wgpu.gpu.device import Device, open_device
 from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.constants import CONSTANTS
-from lapgs_wgpu.splat.drawing import Drawing
+from lapgs_wgpu.splat.drawing import Drawing, camera_gradient
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 from lapgs_wgpu.splat.splat_layout import COLOR, MEAN, OPACITY, RADIUS
@@ -82,39 +82,53 @@ def rasterize(
     Raises:
         ValueError: shapes do not match.
     """
-    n = means.shape[0]
-    expected = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,)}
-    for name, tensor in (("means", means), ("quats", quats), ("scales", scales), ("opacities", opacities)):
-        if tuple(tensor.shape) != expected[name]:
-            raise ValueError(f"rasterize: {name} must have shape {expected[name]}, got {tuple(tensor.shape)}")
-    if sh_degree is None:
-        if tuple(colors.shape) != (n, 3):
-            raise ValueError(f"rasterize: colors must have shape {(n, 3)} without sh_degree, got {tuple(colors.shape)}")
-    elif not 0 <= sh_degree <= 3:
-        raise ValueError(f"rasterize: sh_degree must be 0 to 3, got {sh_degree}")
-    elif colors.ndim != 3 or colors.shape[0] != n or colors.shape[2] != 3 or colors.shape[1] < (sh_degree + 1) ** 2:
-        raise ValueError(
-            f"rasterize: colors must have shape ({n}, K >= {(sh_degree + 1) ** 2}, 3) for sh_degree {sh_degree}, "
-            f"got {tuple(colors.shape)}"
-        )
+    check_shapes("rasterize", means, quats, scales, opacities, colors, sh_degree)
     if background is None:
         background = means.new_zeros(3)
     elif tuple(background.shape) != (3,):
         raise ValueError(f"rasterize: background must have shape (3,), got {tuple(background.shape)}")
     sh = colors if sh_degree is None else colors[:, : (sh_degree + 1) ** 2]
-    probe = means.new_empty((n, 2)).requires_grad_(torch.is_grad_enabled())
-    image, alpha, z, radii, centres = _Rasterize.apply(
-        means, quats, scales, opacities, sh, background, probe, camera, antialiased, depth, device or open_device()
+    probe = means.new_empty((len(means), 2)).requires_grad_(torch.is_grad_enabled())
+    image, alpha, z, splats = Rasterize.apply(
+        means, quats, scales, opacities, sh, background, probe, None, camera, antialiased, depth, device
     )
-    probe.data = centres
+    radii, probe.data = radii_and_centres(splats.numpy(), means.device)
     return Rendering(image, alpha, z, radii, probe)
 
 
-class _Rasterize(torch.autograd.Function):
+def check_shapes(
+    caller: str, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, sh_degree: int | None
+) -> None:
+    """Raise ValueError, in the name of `caller`, unless the tensors have the shapes that `rasterize` lists."""
+    n = means.shape[0]
+    expected = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,)}
+    for name, tensor in (("means", means), ("quats", quats), ("scales", scales), ("opacities", opacities)):
+        if tuple(tensor.shape) != expected[name]:
+            raise ValueError(f"{caller}: {name} must have shape {expected[name]}, got {tuple(tensor.shape)}")
+    if sh_degree is None:
+        if tuple(colors.shape) != (n, 3):
+            raise ValueError(f"{caller}: colors must have shape {(n, 3)} without sh_degree, got {tuple(colors.shape)}")
+    elif not 0 <= sh_degree <= 3:
+        raise ValueError(f"{caller}: sh_degree must be 0 to 3, got {sh_degree}")
+    elif colors.ndim != 3 or colors.shape[0] != n or colors.shape[2] != 3 or colors.shape[1] < (sh_degree + 1) ** 2:
+        raise ValueError(
+            f"{caller}: colors must have shape ({n}, K >= {(sh_degree + 1) ** 2}, 3) for sh_degree {sh_degree}, "
+            f"got {tuple(colors.shape)}"
+        )
+
+
+class Rasterize(torch.autograd.Function):
+    """The drawing of `rasterize`.
+
+    apply(means, quats, scales, opacities, sh, background, probe, viewmat, camera, antialiased, depth, device): probe
+    (N, 2) takes the gradient by the projected means, viewmat (4, 4), where not None, that of `camera` by rigid changes.
+    Returns image, alpha, depth, and the projected Gaussians (N, SPLAT_FLOATS), on the host and without a gradient.
+    """
+
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
-        *tensors, background, probe, camera, antialiased, depth, device = arguments
-        rasterizer = rasterizer_of(device)
+        *tensors, background, probe, _, camera, antialiased, depth, device = arguments
+        rasterizer = rasterizer_of(device or open_device())
         ctx.camera, ctx.antialiased, ctx.depth, ctx.rasterizer = camera, antialiased, depth, rasterizer
         gaussians = Gaussians(*tensors, antialiased=antialiased)
         ctx.drawing, planes, splats = _draw(
@@ -126,9 +140,9 @@ class _Rasterize(torch.autograd.Function):
         image, alpha, z = (torch.from_numpy(array).to(probe.device) for array in (rgb, 1 - planes[3], z))
         ctx.save_for_backward(*tensors, background, torch.from_numpy(planes[3]).to(probe.device))
         ctx.set_materialize_grads(False)
-        radii, centres = radii_and_centres(splats, probe.device)
-        ctx.mark_non_differentiable(radii, centres)
-        return image, alpha, z, radii, centres
+        projected = torch.from_numpy(splats)
+        ctx.mark_non_differentiable(projected)
+        return image, alpha, z, projected
 
     @staticmethod
     def backward(ctx: Any, *d_outputs: Any) -> tuple[Tensor | None, ...]:
@@ -148,9 +162,27 @@ class _Rasterize(torch.autograd.Function):
             planes[3] = d_alpha.numpy(force=True)
         if ctx.depth and d_depth is not None:
             planes[4] = d_depth.numpy(force=True)
-        gradients = rasterizer.backward(ctx.drawing, rasterizer.pool.upload("d_image", planes))
+        d_planes = rasterizer.pool.upload("d_image", planes)
+        gradients = rasterizer.backward(ctx.drawing, d_planes, camera=ctx.needs_input_grad[7])
+        d_viewmat = None
+        if gradients.camera is not None:
+            d_viewmat = _viewmat_gradient(gradients.camera.read(), ctx.camera).to(background)
         by_gaussians, d_means2d = gradient_tensors(read_all(gradients.arrays()), tensors[3])
-        return (*by_gaussians, d_background, d_means2d, *[None] * 4)
+        return (*by_gaussians, d_background, d_means2d, d_viewmat, *[None] * 4)
+
+
+def _viewmat_gradient(sums: NDArray[np.float32], camera: Camera) -> Tensor:
+    """Gradient (4, 4) by the matrix from world to camera, the part of it along rigid changes.
+
+    A turn by the vector v about the world's axes changes R by R [v] and t by -R (v x center), a shift of the center by
+    s changes t by -R s; [v] is the matrix of the cross product. sums: GaussianGradients.camera, read back.
+    """
+    turn, shift = (-part for part in camera_gradient(sums))  # of all Gaussians instead of the camera
+    x, y, z = turn + np.cross(camera.position, shift)
+    R, gradient = camera.T_cam_world[:3, :3], np.zeros((4, 4))
+    gradient[:3, :3] = R @ (0.5 * np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]))
+    gradient[:3, 3] = R @ shift
+    return torch.from_numpy(gradient)
 
 
 def _draw(

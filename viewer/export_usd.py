@@ -1,0 +1,132 @@
+"""Export to OpenUSD, through usd-core: a ParticleField3DGaussianSplat (OpenUSD 26.03) with time samples."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lapgs_wgpu.gpu.array import read_all
+from lapgs_wgpu.io.atomic import atomic_write
+from lapgs_wgpu.progress import Progress
+from lapgs_wgpu.viewer.export import check_free
+from lapgs_wgpu.viewer.export_loss import Loss, measure, of_playback
+from lapgs_wgpu.viewer.loaded_scene import LoadedScene, direction, nearest_axis
+from lapgs_wgpu.viewer.moving_files import SampledPlayback
+from lapgs_wgpu.viewer.usd_file import HARMONICS, KIND, load_pxr, read_usd
+
+Floats = NDArray[np.float32]
+_TYPES = {
+    "positions": "Point3fArray", "orientations": "QuatfArray", "scales": "Float3Array", "opacities": "FloatArray",
+    HARMONICS: "Float3Array", "extent": "Float3Array",
+}  # fmt: skip
+
+
+def export_usd(scene: LoadedScene, file: Path, frames: int, *, overwrite: bool = False) -> Loss:
+    """Write Gaussians at `frames` times evenly from 0 to 1, and compare what usd-core reads with the scene. Atomic.
+
+    Coordinates are the scene's, below a transform that turns its up axis to z where it is neither y nor z. Values that
+    do not change have one sample.
+    Raises InputError where the file cannot be written or is there already, or usd-core is missing.
+    """
+    pxr = load_pxr()
+    check_free(scene, file, overwrite)
+    with atomic_write(file) as target, tempfile.TemporaryDirectory() as folder:
+        made = Path(folder) / f"{file.stem}{'.usdc' if file.suffix.lower() == '.usdz' else file.suffix.lower()}"
+        stage = pxr.Usd.Stage.CreateNew(str(made))
+        _write(pxr, stage, scene, frames if scene.playback.moves else 1)
+        stage.Save()
+        del stage
+        if file.suffix.lower() == ".usdz":
+            packed = made.with_suffix(".usdz")
+            pxr.UsdUtils.CreateNewUsdzPackage(pxr.Sdf.AssetPath(str(made)), str(packed))
+            made = packed
+        with made.open("rb") as source:
+            shutil.copyfileobj(source, target)
+    return measure(scene, of_playback(SampledPlayback(scene.playback.device, read_usd(file))))
+
+
+def _write(pxr: Any, stage: Any, scene: LoadedScene, frames: int) -> None:
+    antialiased = {"antialiased": "true"} if scene.playback.at(0.0).antialiased else {}
+    view = scene.initial_view._replace(frames=frames).to_json()
+    stage.GetRootLayer().customLayerData = {"view": view} | antialiased
+    axis, tokens = nearest_axis(scene.initial_view.up), pxr.UsdGeom.Tokens
+    pxr.UsdGeom.SetStageUpAxis(stage, tokens.y if axis == "y" else tokens.z)  # it knows these two
+    pxr.UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    rate = max(1, frames - 1) / scene.clock().seconds
+    stage.SetTimeCodesPerSecond(rate)
+    stage.SetFramesPerSecond(rate)
+    stage.SetStartTimeCode(0)
+    stage.SetEndTimeCode(frames - 1)
+    world = pxr.UsdGeom.Xform.Define(stage, "/World")
+    stage.SetDefaultPrim(world.GetPrim())
+    turn = np.eye(4)
+    turn[:3, :3] = np.eye(3) if axis == "y" else _onto_z(direction(axis))
+    world.AddTransformOp().Set(pxr.Gf.Matrix4d(turn.T))  # USD multiplies rows
+    _write_camera(pxr, stage, scene)
+    prim = stage.DefinePrim("/World/Splats", KIND)
+    pxr.Usd.ColorSpaceAPI.Apply(prim).CreateColorSpaceNameAttr("srgb_rec709_display")
+    types = pxr.Sdf.ValueTypeNames
+    uniform = {"custom": False, "variability": pxr.Sdf.VariabilityUniform}
+    prim.CreateAttribute("radiance:sphericalHarmonicsDegree", types.Int, **uniform).Set(scene.playback.sh_degree)
+    attributes = {name: prim.CreateAttribute(name, getattr(types, kind), custom=False) for name, kind in _TYPES.items()}
+    last: dict[str, tuple[int, Floats]] = {}  # what was written, and for which frame
+    with Progress(frames, "frames") as progress:
+        for number, t in enumerate(np.linspace(0, 1, frames).tolist()):
+            for name, values in _values(scene, t).items():
+                if name == "orientations" and name in last:  # -q turns as q does, but not what lies between frames
+                    values[(values * last[name][1]).sum(axis=1) < 0] *= -1
+                if name in last and np.array_equal(values, last[name][1]):
+                    continue
+                if name in last and last[name][0] < number - 1:
+                    attributes[name].Set(_vt(pxr, name, last[name][1]), number - 1)
+                value = _vt(pxr, name, values)
+                if name not in last:
+                    attributes[name].Set(value)  # for programs that ask for no time
+                attributes[name].Set(value, number)
+                last[name] = number, values
+            progress.step()
+
+
+def _values(scene: LoadedScene, t: float) -> dict[str, Floats]:
+    """The attributes' values at a time."""
+    now = scene.playback.at(t)
+    means, quats, scales, opacities, sh = read_all([now.means, now.quats, now.scales, now.opacities, now.sh])
+    quats = quats / np.linalg.norm(quats, axis=1, keepdims=True)
+    reach = 3 * scales.max(axis=1, keepdims=True)
+    extent = np.stack([(means - reach).min(axis=0), (means + reach).max(axis=0)])
+    arrays = (means, quats, scales, opacities, sh.reshape(-1, 3), extent)
+    return dict(zip(_TYPES, arrays, strict=True))
+
+
+def _vt(pxr: Any, name: str, values: Floats) -> Any:
+    if name == "orientations":  # in memory the real part is last
+        return pxr.Vt.QuatfArray.FromNumpy(np.ascontiguousarray(np.roll(values, -1, axis=1)))
+    kind = pxr.Vt.FloatArray if values.ndim == 1 else pxr.Vt.Vec3fArray
+    return kind.FromNumpy(np.ascontiguousarray(values))
+
+
+def _write_camera(pxr: Any, stage: Any, scene: LoadedScene) -> None:
+    """The camera where the viewer begins."""
+    view = scene.camera().camera(640, 480)
+    camera = pxr.UsdGeom.Camera.Define(stage, "/World/Camera")
+    pose = np.linalg.inv(view.T_cam_world) @ np.diag([1.0, -1, -1, 1])  # USD's cameras look along -z, with y up
+    camera.AddTransformOp().Set(pxr.Gf.Matrix4d(pose.T))
+    camera.CreateFocalLengthAttr(50.0)
+    camera.CreateHorizontalApertureAttr(50.0 * view.width / view.K[0, 0])
+    camera.CreateVerticalApertureAttr(50.0 * view.height / view.K[1, 1])
+    distance = scene.camera().distance
+    camera.CreateClippingRangeAttr(pxr.Gf.Vec2f(0.01 * distance, 100 * distance))
+
+
+def _onto_z(up: NDArray[np.floating]) -> NDArray[np.floating]:
+    """(3, 3) the smallest rotation that takes an axis to z (Rodrigues)."""
+    x, y, z = up
+    if z < 0:
+        return np.diag([1.0, -1, -1])
+    cross = np.array([[0, 0, -x], [0, 0, -y], [x, y, 0]])
+    return np.asarray(np.eye(3) + cross + cross @ cross / (1 + z))

@@ -1,0 +1,259 @@
+"""Moving scenes in files of others: .ply sequences, Spacetime Gaussians (.ply, .splatv), .4dgs; and their playback."""
+
+from __future__ import annotations
+
+import json
+import struct
+import sys
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lapgs_wgpu.errors import InputError, pip_install
+from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.pool import BufferPool
+from lapgs_wgpu.io.initial_view import InitialView
+from lapgs_wgpu.io.ply import GaussianSnapshot, vertex_of
+from lapgs_wgpu.io.ply_elements import open_ply
+from lapgs_wgpu.io.safe_json_toml import parse_json, read_json
+from lapgs_wgpu.motion.fields.config import FieldConfig
+from lapgs_wgpu.motion.playback.playback import activate
+from lapgs_wgpu.motion.scene_file import SceneFile, read_scene
+from lapgs_wgpu.motion.timing import EVEN
+from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.splat.constants import CONSTANTS
+from lapgs_wgpu.splat.gaussians import Gaussians
+from lapgs_wgpu.splat.linear_light import display_harmonics
+
+Floats = NDArray[np.float32]
+MANIFEST = "sequence.json"
+SH_RANGE = 4.0  # of .4dgs: a coefficient is a byte from -this to +this (section 6.5 of the specification)
+LAST = 1 - 1e-6  # time in the clip of a .4dgs at which its last pieces are still there
+_SPLATV = 0x674B  # the first word of a .splatv
+AXES = ("x", "y", "z", "-x", "-y", "-z")  # as .4dgs numbers them
+_POLYNOMIAL = [
+    "x", "y", "z", *(f"motion_{i}" for i in range(9)), *(f"rot_{i}" for i in range(4)),
+    *(f"omega_{i}" for i in range(4)), *(f"scale_{i}" for i in range(3)), "opacity", *(f"f_dc_{i}" for i in range(3)),
+    "trbf_center", "trbf_scale",
+]  # fmt: skip
+
+
+class MovingFile(NamedTuple):
+    """sample: Gaussians at a time in [0, 1], activated, in every call as many; those that are absent have an opacity of
+    0. frames: of the clip, None where the file does not say. metadata: as a checkpoint's, with `fps` where known."""
+
+    sample: Callable[[float], Gaussians[Floats]]
+    frames: int | None
+    metadata: dict[str, str]
+
+
+class SampledPlayback:
+    """The Playback of a moving file. antialiased: how Gaussians are drawn, None for what the file says."""
+
+    field_config = FieldConfig(kind="static")
+    moves, timing = True, EVEN
+
+    def __init__(self, device: Device, file: MovingFile, antialiased: bool | None = None) -> None:
+        self.device, self.metadata = device, file.metadata
+        self._sample, self._pool, self._antialiased = file.sample, BufferPool(device), antialiased
+        self._time: float | None = None
+        first = file.sample(0.0)
+        self.count, self.sh_degree = len(first), first.sh_degree or 0
+
+    def at(self, t: float) -> Gaussians[DeviceArray]:
+        if self._time != t:
+            now = self._sample(t)
+            arrays = {name: self._pool.upload(name, values) for name, values in now.arrays().items()}
+            antialiased = now.antialiased if self._antialiased is None else self._antialiased
+            self._now, self._time = Gaussians(**arrays, antialiased=antialiased), t
+        return self._now
+
+    def means(self, t: float) -> Floats:
+        return self._sample(t).means
+
+    def dynamics(self) -> None:
+        return None
+
+    def snapshot(self, t: float) -> GaussianSnapshot:
+        now = self._sample(t)
+        inside = np.clip(now.opacities.astype(np.float64), 1e-7, 1 - 1e-7)
+        logits = np.log(inside / (1 - inside)).astype(np.float32)
+        return GaussianSnapshot(now.means, now.sh, logits, np.log(now.scales), now.quats)
+
+
+def read_sequence(path: Path) -> MovingFile:
+    """Read the manifest of a sequence (docs/pipelines.md). Raises InputError."""
+    manifest = read_json(path)
+    files = manifest.get("frames") if isinstance(manifest, dict) else None
+    if not (
+        isinstance(files, list) and files and all(isinstance(name, str) and Path(name).name == name for name in files)
+    ):
+        raise InputError(f"{path}: its `frames` are not names of .ply files beside it.")
+    names, fps = ("fps", "up", "view"), manifest.get("fps", 30)
+    if not (isinstance(fps, int | float) and 0 < fps < 1e4):
+        raise InputError(f"{path}: its `fps` is {str(fps)[:40]!r}, not a number above 0 and below 10000.")
+    return read_frames([path.parent / name for name in files], {n: str(manifest[n]) for n in names if n in manifest})
+
+
+def read_frames(files: list[Path], metadata: dict[str, str]) -> MovingFile:
+    """A still a frame; between two frames the nearest is shown."""
+    counts = []
+    for file in files:
+        with open_ply(file) as ply:
+            counts.append(vertex_of(ply).count)
+    first = read_scene(files[0])
+    start = _offset(first)
+
+    @lru_cache(maxsize=4)
+    def frame(number: int) -> Gaussians[Floats]:
+        file = read_scene(files[number])
+        now = activate(file.gaussians, first.sh_degree)
+        present = np.arange(max(counts)) < len(now["means"])
+        rows = np.where(present, np.arange(max(counts)), 0)
+        names = ("means", "quats", "scales", "opacities", "colors")
+        means, quats, scales, opacities, colors = (now[name][rows] for name in names)
+        means += (_offset(file) - start).astype(np.float32)
+        return Gaussians(means, quats, scales, opacities * present, colors, antialiased=file.antialiased)
+
+    metadata = {name: text for name, text in first.metadata.items() if name == "up"} | metadata
+    return MovingFile(lambda t: frame(round(t * (len(files) - 1))), len(files), metadata)
+
+
+def _offset(file: SceneFile) -> NDArray[np.float64]:
+    return np.array(json.loads(file.metadata.get("offset", "[0, 0, 0]")), np.float64)
+
+
+def read_spacetime_ply(path: Path) -> MovingFile | None:
+    """Spacetime Gaussians (arXiv 2312.16812): a cubic of time a mean, a line a quaternion, a bell an opacity."""
+    with open_ply(path) as ply:
+        vertex = ply.elements.get("vertex")
+        if vertex is None or not set(_POLYNOMIAL) <= vertex.properties.keys():
+            return None
+        values = _finite(ply.columns(vertex, _POLYNOMIAL), path)
+        decoded = "f_dc_3" in vertex.properties
+    means, motion, quats, omega, scales, opacity, colors, time = np.split(values, [3, 12, 16, 20, 23, 24, 27], axis=1)
+    if decoded:  # features: the first three are the color that the network beside the file adds to
+        print(
+            f"note: {path}: its colors come from a network beside it; shown are those that it adds to.", file=sys.stderr
+        )
+        colors = _sigmoid(colors)
+    scales, width = np.exp(scales), np.exp(time[:, 1])
+    return _polynomial(means, motion, quats, omega, scales, _sigmoid(opacity[:, 0]), colors, time[:, 0], width, {})
+
+
+def read_splatv(path: Path) -> MovingFile:
+    """The same in halves and bytes, 64 of them a Gaussian, behind a list of parts in JSON (antimatter15/splaTV)."""
+    data = path.read_bytes()
+    magic, length = struct.unpack("<II", data[:8].ljust(8, b"\0"))
+    if magic != _SPLATV or 8 + length > len(data):
+        raise InputError(f"{path}: begins with {data[:4]!r} and has {len(data)} bytes; it is no whole .splatv.")
+    parts, at = parse_json(data[8 : 8 + length].decode(errors="replace"), str(path)), 8 + length
+    try:
+        for part in parts:
+            size = int(part["size"])
+            if part["type"] == "splat" and size % 64 == 0 and 0 < size <= len(data) - at:
+                words = np.frombuffer(data[at : at + size], "<u4").reshape(-1, 16)
+                break
+            at += size
+        else:
+            raise ValueError("no part `splat` lies whole in the file")
+        view = _view(part.get("cameras") or [])
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+        raise InputError(f"{path}: its parts cannot be read ({type(error).__name__}: {error}).") from None
+    words = words[words[:, 7] >> 24 > 0]  # rows that pad the texture are invisible
+    halves = words.view("<f2").astype(np.float32)
+    rgba = (words[:, 7:8].copy().view(np.uint8) / 255).astype(np.float32)
+    means = words[:, :3].copy().view("<f4")
+    if not len(words):
+        raise InputError(f"{path}: holds no Gaussians that can be seen.")
+    _finite(np.concatenate([means, halves[:, 6:13], halves[:, 16:25], halves[:, 26:32]], axis=1), path)
+    return _polynomial(
+        means, halves[:, 16:25], halves[:, 6:10], halves[:, 26:30], halves[:, 10:13], rgba[:, 3], rgba[:, :3],
+        halves[:, 30], halves[:, 31], view,
+    )  # fmt: skip
+
+
+def _view(cameras: list[Any]) -> dict[str, str]:
+    """The first camera of a list as in Inria's cameras.json, as metadata."""
+    for camera in cameras:
+        R, position = np.array(camera["rotation"], float), np.array(camera["position"], float)  # camera to world
+        fx, fy, width, height = (float(camera[name]) for name in ("fx", "fy", "width", "height"))
+        K, T = np.array([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]]), np.eye(4)
+        T[:3, :3], T[:3, 3] = R.T, -R.T @ position
+        view = InitialView(Camera(K, T, int(width), int(height)), position + 4 * R[:, 2], -R[:, 1], 150)
+        return {"view": view.to_json()}
+    return {}
+
+
+def _polynomial(
+    means: Floats, motion: Floats, quats: Floats, omega: Floats, scales: Floats, opacities: Floats, colors: Floats,
+    center: Floats, width: Floats, metadata: dict[str, str],
+) -> MovingFile:  # fmt: skip
+    """motion: (N, 9) by the powers of time since `center`. omega: (N, 4) change of quats a clip. width: of the bell."""
+    sh = ((colors - np.float32(0.5)) / np.float32(CONSTANTS["SH_C0"]))[:, None]
+    scales = np.maximum(scales, np.float32(1e-7))
+
+    def sample(t: float) -> Gaussians[Floats]:
+        since = (np.float32(t) - center)[:, None]
+        powers = np.concatenate([since, since**2, since**3], axis=1)
+        moved = means + np.einsum("np,npc->nc", powers, motion.reshape(-1, 3, 3))
+        fade = np.exp(-((since[:, 0] / np.maximum(width, np.float32(1e-6))) ** 2))
+        return Gaussians(moved, quats + since * omega, scales, opacities * fade, sh)
+
+    return MovingFile(sample, None, metadata)
+
+
+def read_4dgs(path: Path) -> MovingFile:
+    """Read straight pieces of motion by the format's library. Raises InputError."""
+    try:
+        import fourdgs
+    except ImportError:
+        raise InputError(f"reading .4dgs needs fourdgs: {pip_install('export')}") from None
+    data = path.read_bytes()
+    try:
+        scene = fourdgs.read(data)
+    except (fourdgs.FourdgsError, ValueError, OverflowError, MemoryError) as error:
+        raise InputError(f"{path}: cannot be read as .4dgs ({str(error)[:200]}).") from None
+    g, seconds = scene.gaussians, scene.duration_sec
+    if not len(g.positions):
+        raise InputError(f"{path}: holds 0 Gaussians; at least 1 is needed")
+    sh = display_harmonics(harmonics_4dgs(g)).astype(np.float32)
+    quats, scales = np.roll(g.rotations, 1, axis=1).astype(np.float32), g.scales.astype(np.float32)  # xyzw to wxyz
+
+    def sample(t: float) -> Gaussians[Floats]:
+        now = g.state_at(min(t, LAST) * seconds)
+        means, opacities = g.positions.astype(np.float32), np.zeros(len(quats), np.float32)
+        means[now["indices"]], opacities[now["indices"]] = now["centers"], now["opacity"]
+        return Gaussians(means, quats, scales, opacities, sh)
+
+    metadata = {"fps": "30"}
+    if scene.provenance.frames and 0 <= scene.provenance.frames[0].up_axis < 6:
+        metadata["up"] = AXES[scene.provenance.frames[0].up_axis]
+    return MovingFile(sample, max(2, round(30 * seconds) + 1), metadata)
+
+
+def harmonics_4dgs(gaussians: Any) -> NDArray[np.floating]:
+    """Return the harmonics (N, K, 3) of linear light, without offset, of the library's Gaussians."""
+    light: NDArray[np.floating] = gaussians.colors[:, None, :3] / CONSTANTS["SH_C0"]
+    if gaussians.sh_degree:
+        others = gaussians.sh.reshape(len(light), 3, -1).transpose(0, 2, 1) * (2 * SH_RANGE / 255) - SH_RANGE
+        light = np.concatenate([light, others], axis=1)
+    return light
+
+
+def _finite(values: Floats, path: Path) -> Floats:
+    bad = int((~np.isfinite(values).all(axis=1)).sum())
+    if bad or not len(values):
+        raise InputError(
+            f"{path}: {bad} of {len(values)} Gaussians hold NaN or infinite values; at least 1 must be whole."
+        )
+    return values
+
+
+def _sigmoid(values: Floats) -> Floats:
+    return (0.5 + 0.5 * np.tanh(0.5 * values)).astype(np.float32)
