@@ -111,9 +111,6 @@ def test_a_state_of_other_pictures_is_refused(name: str) -> None:
             exposures.restore({**state, name: bad})
 
 
-# In a training
-
-
 def test_each_camera_of_a_rig_has_one_correction(dataset: Dataset, device: Device) -> None:
     """Images of cameras that move have one each."""
     few = [dataclasses.replace(view, time=0.0) for view in dataset.train[:3]]

@@ -172,14 +172,14 @@ class ResidentStep:
         """Draw for a step."""
         step, draws, frequencies = scheduled.step, self._draws, self._learners.frequencies
         before, (view, background), drawn = draws.mark(), draws.next(), draws.mark()
-        sample = self.draw(view, background, step, draws.generator, moving=scheduled.moving)
+        sample = self._draw(view, background, step, draws.generator, moving=scheduled.moving)
         self._truth.prefetch([view, *draws.order.coming(AHEAD)])
         rates = self._learners.optimizer.rates_at(step, scheduled.share)
         frequency_rate = frequencies.rate.at(step) if frequencies else 0.0
         time = self._scene.timing(view.time)
         return Task(scheduled, before, drawn, sample, time, sh_degree, rates, frequency_rate)
 
-    def draw(
+    def _draw(
         self, view: View, background: Tensor, step: int, generator: torch.Generator, *, moving: bool
     ) -> ResidentSample:
         """Draw what a step, counted from 1, looks at."""
