@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,29 +30,37 @@ def mover_cube(cloud: Cloud, seen: Sequence[tuple[Camera, Callable[[], Mask]]]) 
     from scipy import ndimage  # slow to import
 
     points = cloud.points.astype(np.float64)
-    boxes = [box for camera, mask in evenly(seen, IMAGES) if (box := _box(camera, mask(), points)) is not None]
+    boxes = [found for camera, mask in evenly(seen, IMAGES) if (found := _box(camera, mask(), points)) is not None]
     if not boxes:
         return None
-    depths = ndimage.median_filter([depth for _, _, depth in boxes], MEDIAN, mode="nearest")
+    depths = ndimage.median_filter(np.array([box.depth for box in boxes]), MEDIAN, mode="nearest")
     corners = []
-    for (camera, box, _), depth in zip(boxes, depths, strict=True):
-        rays = np.linalg.solve(camera.K, np.array([[x, y, 1.0] for x in box[:2] for y in box[2:]]).T)
+    for box, depth in zip(boxes, depths, strict=True):
+        camera = box.camera
+        rays = np.linalg.solve(camera.K, np.array([[x, y, 1.0] for x in box.sides for y in box.ends]).T)
         corners.append((depth * rays - camera.T_cam_world[:3, 3:]).T @ camera.T_cam_world[:3, :3])
     low, high = np.min(np.concatenate(corners), axis=0), np.max(np.concatenate(corners), axis=0)
     return Cube((low + high) / 2, float(max(ROOM * (high - low).max() / 2, 1e-6)))
 
 
-def _box(
-    camera: Camera, mask: Mask, points: NDArray[np.float64]
-) -> tuple[Camera, tuple[float, float, float, float], float] | None:
-    """The largest thing that moves in an image: left, right, top and bottom, pixels, and its depth."""
+class _Box(NamedTuple):
+    """What moves in the image of a camera. sides, ends: left and right, top and bottom, pixels."""
+
+    camera: Camera
+    sides: tuple[float, float]
+    ends: tuple[float, float]
+    depth: float
+
+
+def _box(camera: Camera, mask: Mask, points: NDArray[np.float64]) -> _Box | None:
+    """The largest thing that moves in an image; None where nothing does, or no point tells its depth."""
     from scipy import ndimage  # slow to import
 
     labels, count = ndimage.label(mask)
     if not count:
         return None
     rows, columns = np.nonzero(labels == 1 + np.argmax(np.bincount(labels.ravel())[1:]))
-    left, right, top, bottom = columns.min(), columns.max() + 1, rows.min(), rows.max() + 1
+    left, right, top, bottom = (float(v) for v in (columns.min(), columns.max() + 1, rows.min(), rows.max() + 1))
     width, height = right - left, bottom - top
     depth, inside = in_view(points, camera)
     x, y = camera.project(points[inside])[0].T
@@ -66,4 +75,4 @@ def _box(
     foot &= depth < np.median(depth[around])  # what a wet road mirrors lies beyond
     if foot.any():
         found = min(found, float(np.median(depth[foot])))
-    return camera, (left, right, top, bottom), found
+    return _Box(camera, (left, right), (top, bottom), found)

@@ -91,10 +91,10 @@ def cutout_tracks(
     number = np.repeat(np.arange(len(parts)), [len(colors) for _, colors in parts])
     paths = np.concatenate([paths for paths, _ in parts], axis=1)
     seen = np.stack([cutout.seen for cutout in cutouts], axis=1)[:, number]
-    key = np.array([cutout.key for cutout in cutouts])[number]
+    keys_of = np.array([cutout.key for cutout in cutouts])[number]
     ahead = np.mean([each.camera.T_cam_world[2, :3] for each in residuals], axis=0).astype(np.float32)
     apart = np.linspace(*APART, len(parts), dtype=np.float32)[np.argsort(np.argsort([c.key for c in cutouts]))]
-    positions = paths[key, np.arange(len(key))] - half_side * apart[number][:, None] * ahead
+    positions = paths[keys_of, np.arange(len(keys_of))] - half_side * apart[number][:, None] * ahead
     tracks = Tracks(positions, np.concatenate([colors for _, colors in parts]), number, paths, seen)
     return tracks, float(share)
 
@@ -220,14 +220,14 @@ def _placed(cutout: _Cutout, images: Sequence[_Image], depths: Sequence[Floats])
     at = np.einsum("tij,jn->tin", cutout.maps[:, :, :2], chosen.T) + cutout.maps[:, :, 2:]
     times = np.flatnonzero(cutout.seen)
     depth = np.full(len(images), np.nan)
-    for t in times:
+    for t in times.tolist():
         height, width = depths[t].shape
         column, row = np.rint(at[t]).astype(np.int64).clip(0, [[width - 1], [height - 1]])
         near = depths[t][row, column]
         depth[t] = np.median(near[np.isfinite(near)]) if np.isfinite(near).any() else np.nan
     depth = _smooth(depth)
     paths = np.zeros((len(images), len(chosen), 3), np.float32)
-    for t in times:
+    for t in times.tolist():
         camera = images[t].residual.camera
         ray = np.linalg.solve(camera.K, np.stack([at[t, 0] + 0.5, at[t, 1] + 0.5, np.ones(len(chosen))]))
         paths[t] = (depth[t] * ray - camera.T_cam_world[:3, 3:]).T @ camera.T_cam_world[:3, :3]
