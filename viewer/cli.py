@@ -174,7 +174,7 @@ def _export(given: Any, scene: LoadedScene) -> None:
     elif ending in USD:
         from lapgs_wgpu.viewer.export_usd import export_usd
 
-        frames = given.frames or max(61, scene.clock().frames)  # between samples programs go straight
+        frames = given.frames or max(61, scene.clock().frames) if scene.playback.moves else 1
         loss = export_usd(scene, file, frames, overwrite=overwrite)
         line = f"{count} Gaussians at {frames} times"
     elif ending in (".lapgs", ".html"):

@@ -38,7 +38,7 @@ def export_usd(scene: LoadedScene, file: Path, frames: int, *, overwrite: bool =
     with atomic_write(file) as target, tempfile.TemporaryDirectory() as folder:
         made = Path(folder) / f"{file.stem}{'.usdc' if file.suffix.lower() == '.usdz' else file.suffix.lower()}"
         stage = pxr.Usd.Stage.CreateNew(str(made))
-        _write(pxr, stage, scene, frames if scene.playback.moves else 1)
+        _write(pxr, stage, scene, frames)
         stage.Save()
         del stage
         if file.suffix.lower() == ".usdz":
