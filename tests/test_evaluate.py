@@ -172,8 +172,7 @@ def test_what_moves_is_measured_by_itself_and_drawn_from_beside(scene: Scene4D, 
     assert metrics["ssim_moving"] < metrics["ssim_still"]
     assert metrics["explained"] < 0.2
     with Image.open(tmp_path / "off_lost.png") as picture:
-        left, right = np.split(np.asarray(picture), 2, axis=1)
-    assert not np.array_equal(left, right)
+        assert not np.array_equal(*np.split(np.asarray(picture), 2, axis=1))
     write_metrics(tmp_path, metrics)
     last = result_text(tmp_path).splitlines()
     assert last[0].startswith("warning: ")
