@@ -17,7 +17,6 @@ from lapgs_wgpu.train.presets import ABLATIONS, REMOVED, config_keys, load_confi
 SHORTCUTS = {
     "data.path": "--data",
     "schedule.steps": "--steps",
-    "schedule.batch": "--batch",
     "data.cache_gb": "--cache-gb",
 }
 USAGE = "lapgs-train PRESET --data DIR [--out RUN] [--KEY VALUE ...]"

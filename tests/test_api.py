@@ -116,7 +116,7 @@ def test_values_of_python_are_overrides() -> None:
 
 
 def test_terms_add_up_to_the_loss(dataset: Dataset, device: Device) -> None:
-    with Trainer(configure(schedule__batch="2"), dataset, device) as trainer:
+    with Trainer(configure(), dataset, device) as trainer:
         results = list(trainer)
     for result in results:
         assert sum(result.terms.values()) == pytest.approx(result.loss, rel=1e-5)

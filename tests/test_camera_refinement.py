@@ -227,8 +227,8 @@ def test_test_time_alignment_finds_the_camera(refined_walk: tuple[Trainer, list[
 def test_an_interrupted_run_goes_on_to_the_same_bytes(
     device: Device, dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With corrected colors, too, and two images a step."""
-    given = {"cameras__refine": "on", "cameras__start": "5", "exposure__enabled": "true", "schedule__batch": "2"}
+    """With corrected colors, too."""
+    given = {"cameras__refine": "on", "cameras__start": "5", "exposure__enabled": "true"}
     config = configure(schedule__save_interval="12", schedule__steps="24", **given)
     train(config, dataset, tmp_path / "one", device=device)
     with monkeypatch.context() as patched:

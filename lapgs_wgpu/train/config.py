@@ -66,7 +66,6 @@ class ScheduleConfig(Options):
     """Lengths and intervals, in steps."""
 
     steps: int = option("number of training steps; no other key changes with it", at_least=1)
-    batch: int = option("images per step; their gradients are averaged", at_least=1)
     warm_up: int = option(
         "steps in which only static Gaussians are trained; with discovery: over which learning rates rise from 0"
     )
@@ -280,6 +279,6 @@ class Config(Options):
     step_place: StepPlace = option(
         "where a training step is computed; resident: on the device from end to end, where its parameters stay; "
         "exchange: by torch, which exchanges buffers with the device; auto: exchange on CPU devices and for what only "
-        "torch computes (fields other than static, grid4d and laplacian, --batch), else resident",
+        "torch computes (fields other than static, grid4d and laplacian), else resident",
         "auto",
     )

@@ -45,20 +45,12 @@ class Statistics:
         """Nothing was seen yet."""
         return Statistics(*torch.zeros(2, count, device=device).unbind())
 
-    def add(self, radii: Tensor, d_means2d: Tensor, camera: Camera, *, scale: float = 1.0) -> None:
-        """Take in a view: radii (N,), 0 of what it does not show, and gradients (N, 2) by the centers, per pixel.
-
-        scale: of the gradients, where the view's loss had a share in a sum.
-        """
+    def add(self, radii: Tensor, d_means2d: Tensor, camera: Camera) -> None:
+        """Take in a view: radii (N,), 0 of what it does not show, and gradients (N, 2) by the centers, per pixel."""
         to_ndc = d_means2d.new_tensor([camera.width / 2, camera.height / 2])
         visible = radii > 0
-        self.gradients += torch.where(visible, (d_means2d * (scale * to_ndc)).norm(dim=1), 0.0)
+        self.gradients += torch.where(visible, (d_means2d * to_ndc).norm(dim=1), 0.0)
         self.views += visible
-
-    def merge(self, other: Statistics) -> None:
-        """Take in what another has seen of the same Gaussians."""
-        self.gradients += other.gradients
-        self.views += other.views
 
     def of(self, keep: Tensor) -> Statistics:
         """The statistics of the Gaussians of a mask (N,)."""

@@ -4,7 +4,6 @@ shared, and wherever torch computes a part of the step, such as a field or a los
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Callable
 
 from lapgs_wgpu.train.density_control import DensityControl
@@ -25,20 +24,13 @@ class ExchangeStep:
         density: whose statistics take the views in.
         truth: of the views.
         draws: of the training.
-        batch: number of views of a step, whose losses count as their mean.
     """
 
     def __init__(
-        self,
-        objective: Objective,
-        learners: Learners,
-        density: DensityControl,
-        truth: GroundTruth,
-        draws: Draws,
-        batch: int,
+        self, objective: Objective, learners: Learners, density: DensityControl, truth: GroundTruth, draws: Draws
     ) -> None:
         self._objective, self._learners, self._density = objective, learners, density
-        self._truth, self._draws, self._batch = truth, draws, batch
+        self._truth, self._draws = truth, draws
 
     @property
     def dead_scales(self) -> float:
@@ -52,53 +44,44 @@ class ExchangeStep:
         Raises NumericalError where a parameter is not finite.
         """
         step, draws = scheduled.step, self._draws
-        chosen = [draws.next() for _ in range(self._batch)]
-        drawn = draws.mark()
-        samples = [self._objective.sample(*each, step, draws.generator, moving=scheduled.moving) for each in chosen]
-        self._truth.prefetch([*(sample.view for sample in samples), *draws.order.coming(AHEAD)])
+        chosen, drawn = draws.next(), draws.mark()
+        sample = self._objective.sample(*chosen, step, draws.generator, moving=scheduled.moving)
+        self._truth.prefetch([sample.view, *draws.order.coming(AHEAD)])
         self._learners.zero_grad()
-        statistics = self._density.nothing_seen()
-        results, totals = [], Counter[str]()
-        for sample in samples:
-            result = self._descend(sample, step, share=len(samples))
-            statistics.add(result.radii, result.d_means2d, sample.view.camera, scale=len(samples))
-            results.append(result)
-            totals.update({"loss": result.loss, "psnr": result.psnr, **result.terms})
-        means = {name: total / len(samples) for name, total in totals.items()}
-        loss, psnr = means.pop("loss"), means.pop("psnr")
-        what = self._not_finite(results, loss, began)
-        skipped = Skipped(step, ", ".join(sample.view.name for sample in samples), what) if what else None
+        result = self._descend(sample, step)
+        what = self._not_finite(result, began)
+        skipped = Skipped(step, sample.view.name, what) if what else None
         began()
         if skipped is None:
             self._learners.step(step, scheduled.share)
             # After the optimizer's step, so that no gradient is lost with the rows that change.
             if scheduled.seen:
-                self._density.statistics.merge(statistics)
+                self._density.statistics.add(result.radii, result.d_means2d, sample.view.camera)
         else:
             self._learners.zero_grad()
             draws.go_back(drawn)
-        measured = Measured(loss, psnr, skipped, means)
+        measured = Measured(result.loss, result.psnr, skipped, result.terms)
         return lambda: measured
 
-    def _descend(self, sample: Sample, step: int, *, share: int) -> ViewResult:
+    def _descend(self, sample: Sample, step: int) -> ViewResult:
         """`Objective.descend` for a view, as its camera and its colors are corrected."""
         view = sample.view
         truth, camera = self._truth.on_device(view), self._learners.refined_camera(view)
         correction = self._learners.exposure(view)
-        return self._objective.descend(sample, step, truth, camera, correction, share=share)
+        return self._objective.descend(sample, step, truth, camera, correction)
 
-    def _not_finite(self, results: list[ViewResult], loss: float, began: Callable[[], None]) -> str:
+    def _not_finite(self, result: ViewResult, began: Callable[[], None]) -> str:
         """What is not finite in the loss and gradients of a step, for which it is skipped; "" where all is well.
 
         Raises NumericalError for a parameter, whose values a step cannot mend.
         """
         parameters, gradients = self._learners.parameters(), self._learners.gradients()
-        gradients["the places in the image"] = [result.d_means2d for result in results]
-        if math.isfinite(loss) and finite(parameters, gradients):
+        gradients["the places in the image"] = [result.d_means2d]
+        if math.isfinite(result.loss) and finite(parameters, gradients):
             return ""
         try:
             check_parameters(parameters)
         except Exception:
             began()
             raise
-        return cause([result.terms for result in results], gradients)
+        return cause([result.terms], gradients)

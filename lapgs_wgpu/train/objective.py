@@ -108,8 +108,6 @@ class Objective:
         truth: DeviceArray,
         camera: RefinedCamera,
         correction: Tensor | None,
-        *,
-        share: int,
     ) -> ViewResult:
         """Add the gradients of a view's loss to those of all parameters that it depends on.
 
@@ -119,7 +117,6 @@ class Objective:
             truth: (H, W) of `upload_rgba`, the view's image.
             camera: that sees it.
             correction: (3, 4) of the image's colors; None where they are taken as they are.
-            share: number of views whose mean loss the step lowers.
         """
         config, scene, time = self._config, self._scene, sample.view.time
         if sample.moving:
@@ -157,7 +154,7 @@ class Objective:
         loss = rendering.loss
         for value in of_motion.values():
             loss = loss + value
-        (loss / share).backward()
+        loss.backward()
         assert rendering.means2d.grad is not None
         factors = {**weights._asdict(), **{term.name: weight for term, weight in of_image}}
         terms = {name: factors[name] * value for name, value in rendering.terms.items() if name in factors}

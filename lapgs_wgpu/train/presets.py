@@ -51,6 +51,7 @@ REMOVED = {
     "loss.dynamics_mode": "the regularization is that of the paper's equation; loss.dynamics 0 turns it off",
     "points.opacity": "it is 0.1",
     "precision": "it is float32",
+    "schedule.batch": "a step takes one image",
 }
 
 _SCENES = "published-scenes"  # the file with presets of single scenes

@@ -66,6 +66,4 @@ def why_exchange(config: Config, dataset: Dataset, parts: Parts) -> str:
         return f"there are no kernels for the field {config.field.kind} in this shape"
     if parts.losses:
         return "losses of one's own are torch's"
-    if config.schedule.batch > 1:
-        return f"a step takes {config.schedule.batch} images"
     return ""

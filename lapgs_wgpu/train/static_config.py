@@ -23,7 +23,7 @@ def static_config(config: Config) -> Config:
         config,
         field=dataclasses.replace(config.field, kind="static"),
         schedule=dataclasses.replace(
-            config.schedule, steps=steps, batch=1, warm_up=steps, sh_interval=max(1, round(SH_INTERVAL * steps))
+            config.schedule, steps=steps, warm_up=steps, sh_interval=max(1, round(SH_INTERVAL * steps))
         ),
         rates=dataclasses.replace(
             config.rates,

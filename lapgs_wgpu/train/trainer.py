@@ -133,7 +133,7 @@ class Trainer:
         self._timing_steps = config.timing.corrections(config.schedule.steps) if self.timing else []
         self._skips = SkipCounter()
         shared = self._learners, self._density, self._truth, self._draws
-        self._exchange = ExchangeStep(self._objective, *shared, config.schedule.batch)
+        self._exchange = ExchangeStep(self._objective, *shared)
         self._resident = None
         if config.step_place == "resident":
             self._resident = ResidentStep(config, scene, *shared, dataset.moments)
@@ -222,7 +222,7 @@ class Trainer:
         self.scene.save(path, metadata)
 
     def step(self) -> StepResult:
-        """One step of the optimizer, on `schedule.batch` pictures, whose losses count as their mean; then callbacks.
+        """One step of the optimizer, on one picture; then callbacks.
 
         A step whose loss or gradients are not finite moves nothing: parameters, the optimizers' and the density
         control's state stay as they were; what the schedule plans for this step is done. Raises NumericalError where
