@@ -206,7 +206,7 @@ def test_the_resident_step_trains_as_well_and_repeats(
         ({"method": "static"}, False, "resident"),
         ({"method": "hexplane"}, False, "exchange"),
         ({"field__depth": "1"}, False, "exchange"),
-        ({"cameras__refine": "on"}, False, "exchange"),
+        ({"cameras__refine": "on"}, False, "resident"),
         ({"step_place": "exchange"}, False, "exchange"),
         ({"step_place": "resident"}, True, "resident"),
     ],
