@@ -88,7 +88,7 @@ def by_torch(trainer: Trainer, sample: ResidentSample, *, moving: bool) -> dict[
     if sample.even is not None:
         times = TimeSamples(sampled_rows.rows(sample.even), sample.even_times)
     given = Sample(sample.view, torch.tensor(sample.background), moving, nearby, times)
-    trainer._exchange._descend(given, 4, share=1)
+    trainer._exchange._descend(given, 4)
     scene = trainer.scene
     named = {**scene.parameters, **(dict(scene.field.named_parameters()) if scene.field else {})}
     gradients = {name: torch.zeros_like(p) if p.grad is None else p.grad for name, p in named.items()}

@@ -129,9 +129,12 @@ class Scene4D:
             points: (N, 3) means, world units.
             colors: (N, 3) in [0, 1].
             scales: (N,) standard deviations, world units.
+            field_config: as for `Scene4D`.
             opacity: of all Gaussians, in (0, 1).
+            antialiased: as for `Scene4D`.
             device: None for the default adapter.
-            field_config, antialiased, seed, own_field: as for `Scene4D`.
+            seed: as for `Scene4D`.
+            own_field: as for `Scene4D`.
         """
         parameters = isotropic_rows(points, colors, scales, opacity)
         parameters["dynamics"] = torch.zeros(len(points), field_config.dynamics_size)
@@ -318,6 +321,9 @@ def load(path: str | os.PathLike[str], device: Device | None = None, *, field: n
         path: of the file.
         device: None for the default adapter.
         field: the module of a scene that was trained with a field of one's own, which takes the file's parameters.
+
+    Returns:
+        The scene.
 
     Raises:
         InputError: not such a file; or a compact scene that moves, which lacks the static grid (`lapgs-view` shows it).

@@ -49,7 +49,7 @@ def rasterization(
     """Render N Gaussians with C cameras, as gsplat's function of this name (version 1.6); its defaults.
 
     Differentiable in all tensors but Ks; in viewmats along rigid changes, so a pose made of a rotation and a shift
-    learns as with gsplat. tile_size, channel_chunk and segmented change no result and are ignored.
+    learns as with gsplat.
 
     Args:
         means: (N, 3) world units. All tensors are float32, on any torch device.
@@ -59,11 +59,26 @@ def rasterization(
         colors: (N, 3) or (C, N, 3); with sh_degree (N, K, 3) or (C, N, K, 3). None where only depth is rendered.
         viewmats: (C, 4, 4) from world to camera, OpenCV axes.
         Ks: (C, 3, 3) intrinsics, pixels.
-        near_plane: depth from which Gaussians are drawn, world units.
+        width: of the images, pixels.
+        height: of the images, pixels.
+        near_plane: depth from which Gaussians are drawn, world units; 0.01 at least.
         far_plane: depth up to which they are.
+        radius_clip: 0 alone is supported.
+        eps2d: 0.3 alone is supported.
+        sh_degree: of the harmonics in colors; None for colors.
         packed: how the dictionary lists projected Gaussians: rows of visible ones only, or all of every camera.
+        tile_size: changes no result.
         backgrounds: (C, 3).
         render_mode: one of RGB, D (sum of weight times depth), ED (D divided by alpha), RGB+D, RGB+ED.
+        sparse_grad: not supported.
+        absgrad: not supported.
+        rasterize_mode: classic or antialiased.
+        channel_chunk: changes no result.
+        distributed: not supported.
+        camera_model: pinhole alone is supported.
+        segmented: changes no result.
+        covars: not supported.
+        others: further arguments of gsplat's; their defaults alone are supported.
 
     Returns:
         Colors (C, height, width, X), alphas (C, height, width, 1), and a dictionary: batch_ids, camera_ids and
