@@ -30,7 +30,7 @@ Train a 4D Gaussian splatting model of a moving scene on a folder of images, on 
   lapgs-train hypernerf --data DIR              Nerfies or HyperNeRF capture; for a CPU: hypernerf-tiny
   lapgs-train neu3d --data DIR                  several static cameras; for a CPU: neu3d-tiny
   lapgs-train rig --data DIR                    calibrated cameras around what moves, for a CPU
-  lapgs-train hypernerf-tiny --data DIR         your own film, converted by lapgs-prepare (see its --help)
+  lapgs-train film --data DIR                   your own film and its masks/, converted by lapgs-prepare
   lapgs-train RUN/config.toml --out RUN2        repeat a run
   lapgs-train --resume RUN                      continue an interrupted training
   lapgs-train --eval RUN                        evaluate RUN/checkpoint.ply on the test views again

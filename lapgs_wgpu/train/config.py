@@ -81,7 +81,8 @@ class DensityConfig(Options):
     stop: int = option("densify, prune and reset opacities only before this step, except for min_contribution")
     interval: int = option("densify and prune every N steps", at_least=1)
     gradient: float = option(
-        "densify Gaussians with at least this mean gradient norm of the 2-D mean (image 2 units wide)"
+        "densify Gaussians whose projected center has at least this gradient, its mean length over the images (an "
+        "image is 2 units wide)"
     )
     split_size: float = option(
         "clone Gaussians up to this standard deviation, split larger ones; relative to the cameras' extent", above=0
@@ -107,7 +108,8 @@ class DensityConfig(Options):
     reset_opacity: float = option("an opacity reset lowers all larger opacities to this value", above=0, below=1)
     limit: int = option("densification adds no Gaussians beyond this number; 0: no limit", 0)
     min_contribution: float = option(
-        "prune Gaussians whose blending weights sum to less in each of 50 training images, pixels; 0: off",
+        "prune Gaussians that contribute less than this to each of 50 training images: blending weights summed over "
+        "the pixels, 1 is a whole pixel; 0: off",
         0.0,
         at_least=0,
     )
