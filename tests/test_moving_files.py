@@ -1,4 +1,4 @@
-"""Moving scenes to and from files of others: what was written is read back, and by a foreign reader where one is."""
+"""Moving scenes in files of other programs: what was written is read back, by a foreign reader where there is one."""
 
 from __future__ import annotations
 

@@ -81,7 +81,7 @@ def check_plausible(frames: Sequence[Frame]) -> list[str]:
         bits = highest.bit_length()
         warnings.append(f"{text}, so they seem to use {8 + bits} bits; multiply them by {2 ** (8 - bits)}.")
     if told := _low_levels(transparent, slice(3, 4), "images are nearly transparent", "alpha"):
-        warnings.append(f"{told[0]}, and what is transparent is the background; save them without alpha.")
+        warnings.append(f"{told[0]}, and transparent pixels count as background; save the images without alpha.")
     return warnings
 
 

@@ -194,16 +194,13 @@ class Scene4D:
         *,
         timing: Timing | None = None,
     ) -> Deformed:
-        """The Gaussians at time t in [0, 1], with what the losses of motion compare.
+        """The Gaussians at time t, with what the losses of motion compare; differentiable as those of `at`.
 
         Args:
             t: time in [0, 1].
             nearby: where the smoothness loss looks; None without it.
             time_samples: some of the Gaussians and further times of the field.
             timing: takes the place of the scene's; None for the scene's.
-
-        Returns:
-            Deformed. Differentiable in `parameters` and the field's parameters.
         """
         t = (timing or self.timing)(t)
         if self.on_device is not None and not torch.is_grad_enabled() and nearby is None and time_samples is None:

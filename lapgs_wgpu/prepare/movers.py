@@ -206,7 +206,7 @@ def _cut(image: NDArray[np.uint8], vote: Plane, limit: float) -> Mask:
 def without(
     matches: Match, places: Mapping[str, NDArray[np.float32]], masks: Mapping[str, Mask], size: Size
 ) -> dict[tuple[str, str], Any]:
-    """The matches of which neither feature lies in a mask. size: (width, height) of the images."""
+    """The matches whose two features lie outside the masks. size: (width, height) of the images."""
     free = {name: ~in_mask(masks.get(name), at[:, :2], size) for name, at in places.items()}
     return {(a, b): m[free[a][m[:, 0]] & free[b][m[:, 1]]] for (a, b), m in matches.items()}
 

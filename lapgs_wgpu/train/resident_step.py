@@ -212,7 +212,7 @@ class ResidentStep:
     def _settle_first(self) -> None:
         """Wait for the step that was submitted first, and mend what it asks for.
 
-        After an error all is as after the step `settled`, and `broken` is told so.
+        After an error the parameters are those after the step `settled`, which `broken` is called with.
         """
         tasks = [each.task for each in self._flying]
         try:
