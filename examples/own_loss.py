@@ -1,14 +1,13 @@
-"""Loss terms of one's own: one in torch of the image, one as a compute shader, one of the Gaussians.
+"""Loss terms of one's own: one of the image, one of the Gaussians.
 
 python examples/own_loss.py
 """
 
 import argparse
-from pathlib import Path
 
 from torch import Tensor
 
-from lapgs_wgpu import Gaussians, Parts, Regularizer, Scene4D, TorchLoss, WgslLoss, load_config, start_training
+from lapgs_wgpu import Gaussians, Parts, Regularizer, Scene4D, TorchLoss, load_config, start_training
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--data", default="synthetic", help="folder of a capture, or a built-in scene")
@@ -31,7 +30,6 @@ def main() -> dict[str, float]:
     config = load_config("demo", {"data.path": given.data, "schedule.steps": given.steps, "schedule.warm_up": 50})
     losses = [
         TorchLoss("edges", edges, weight=0.1),
-        WgslLoss("charbonnier", Path(__file__).with_name("own_loss.wgsl"), weight=0.2),
         Regularizer("needles", needles, weight=lambda step: 0.01 if step > 50 else 0.0),  # from step 51 on
     ]
     with start_training(config, parts=Parts(losses=losses)) as trainer:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from lapgs_wgpu.splat.rasterization import rasterization
     from lapgs_wgpu.splat.rasterize import Rendering, rasterize
     from lapgs_wgpu.train.densify import Change, DensityState, published_rule
-    from lapgs_wgpu.train.loss_terms import Regularizer, TorchLoss, WgslLoss
+    from lapgs_wgpu.train.loss_terms import Regularizer, TorchLoss
     from lapgs_wgpu.train.parts import Parts
     from lapgs_wgpu.train.presets import load_config
     from lapgs_wgpu.train.step_result import StepResult
@@ -47,14 +47,13 @@ _HOMES = {
     "Deformation": "motion.fields.deformation",
     "Regularizer": "train.loss_terms",
     "TorchLoss": "train.loss_terms",
-    "WgslLoss": "train.loss_terms",
     "DensityState": "train.densify",
     "Change": "train.densify",
     "published_rule": "train.densify",
 }
 __all__ = [
     "Camera", "Change", "Deformation", "DensityState", "Gaussians", "Parts", "Regularizer", "Rendering", "Scene4D",
-    "StepResult", "TorchLoss", "Trainer", "WgslLoss", "list_devices", "load", "load_config", "load_dataset",
+    "StepResult", "TorchLoss", "Trainer", "list_devices", "load", "load_config", "load_dataset",
     "open_device", "published_rule", "rasterization", "rasterize", "start_training",
 ]  # fmt: skip
 

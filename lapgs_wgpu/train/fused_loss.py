@@ -21,7 +21,7 @@ from lapgs_wgpu.train.config import LossWeights
 from lapgs_wgpu.train.exposure import ExposurePasses
 from lapgs_wgpu.train.image_loss import ImageLoss
 from lapgs_wgpu.train.image_metrics import psnr_of
-from lapgs_wgpu.train.loss_terms import TorchLoss, WgslLoss, torch_loss
+from lapgs_wgpu.train.loss_terms import TorchLoss, torch_loss
 
 
 class RenderLoss(NamedTuple):
@@ -56,7 +56,7 @@ class _Comparison(NamedTuple):
     background: tuple[float, float, float]
     weights: LossWeights
     device: Device
-    own: Sequence[tuple[TorchLoss | WgslLoss, float]]
+    own: Sequence[tuple[TorchLoss, float]]
     wanted: bool
 
 
@@ -72,7 +72,7 @@ def render_loss(
     weights: LossWeights,
     device: Device,
     correction: Tensor | None = None,
-    own: Sequence[tuple[TorchLoss | WgslLoss, float]] = (),
+    own: Sequence[tuple[TorchLoss, float]] = (),
     camera_change: Tensor | None = None,
     camera_unit: float = 1.0,
 ) -> RenderLoss:
@@ -148,7 +148,7 @@ class _FusedLoss(torch.autograd.Function):
             with Commands(device) as commands:
                 image = drawing.image if corrections is None else exposing.record(commands, drawing.image, corrections)
                 terms, d_image = losses.record(commands, image, truth, background, weights, gradient=wanted)
-            own_values, pixels = _own_terms(own, image, truth, background, losses, d_image)
+            own_values = _own_terms(own, image, truth, background, d_image)
             if d_image is not None and corrections is not None:
                 with Commands(device) as commands:
                     d_image, d_correction = exposing.record_bwd(commands, drawing.image, d_image, corrections)
@@ -157,10 +157,9 @@ class _FusedLoss(torch.autograd.Function):
                 back = rasterizer.backward(drawing, d_image, camera=change is not None)
                 d_gaussians = back.arrays()
                 d_rows += [] if back.camera is None else [back.camera]
-            found = iter(read_all([terms, drawing.splats, *d_gaussians, *d_rows, *pixels.values(), *drawing.needed]))
+            found = iter(read_all([terms, drawing.splats, *d_gaussians, *d_rows, *drawing.needed]))
             values, splats, gradients = next(found), next(found), [next(found) for _ in d_gaussians]
             rows = [next(found) for _ in d_rows]
-            own_values |= {name: float(next(found).mean(dtype=np.float64)) for name in pixels}
             # Where the intersections did not fit, none of this is right, and all of it is done again.
             if not rasterizer.grow_on_overflow(drawing, list(found)):
                 break
@@ -173,7 +172,7 @@ class _FusedLoss(torch.autograd.Function):
                 by = camera_gradient(rows[-1])
                 by_camera = change.new_tensor([*by.rotation, *(unit * by.position)])
             ctx.gradients = (*by_gaussians, by_correction, by_camera, d_means2d)
-        computed = torch.from_numpy(np.append(values.astype(np.float64), [own_values[t.name] for t, _ in own]))
+        computed = torch.from_numpy(np.append(values.astype(np.float64), own_values))
         radii, centres = radii_and_centres(splats, probe.device)
         ctx.mark_non_differentiable(computed, radii, centres)
         factors = [weights.l1, 0, weights.ssim, weights.pyramid, weights.ncc, *(weight for _, weight in own)]
@@ -186,24 +185,17 @@ class _FusedLoss(torch.autograd.Function):
 
 
 def _own_terms(
-    own: Sequence[tuple[TorchLoss | WgslLoss, float]],
+    own: Sequence[tuple[TorchLoss, float]],
     image: DeviceArray,
     truth: DeviceArray,
     background: tuple[float, float, float],
-    losses: ImageLoss,
     d_image: DeviceArray | None,
-) -> tuple[dict[str, float], dict[str, DeviceArray]]:
-    """By name of each further term of an image its value, or the values of the pixels, whose mean it is, on the device.
-    Their weighted gradients are added to d_image (4, H, W)."""
-    values: dict[str, float] = {}
-    pixels: dict[str, DeviceArray] = {}
+) -> list[float]:
+    """The values of the further terms of an image, whose weighted gradients are added to d_image (4, H, W)."""
+    values = []
     for term, weight in own:
-        if isinstance(term, WgslLoss):
-            gradient = d_image or losses.pool.array("d_image", image.shape)  # where nobody wants it
-            with Commands(losses.device) as commands:
-                pixels[term.name] = term.record(commands, image, truth, background, weight, gradient)
-        else:
-            values[term.name], gradients = torch_loss(term, image, truth, background, weight)
-            if d_image is not None:
-                d_image.write(d_image.read() + gradients)
-    return values, pixels
+        value, gradient = torch_loss(term, image, truth, background, weight)
+        values.append(value)
+        if d_image is not None:
+            d_image.write(d_image.read() + gradient)
+    return values

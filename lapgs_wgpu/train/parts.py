@@ -15,7 +15,7 @@ from torch import nn
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.train.densify import DensityRule, published_rule
 from lapgs_wgpu.train.learning_rate import Rate
-from lapgs_wgpu.train.loss_terms import TAKEN_NAMES, LossTerm, Regularizer, WgslLoss
+from lapgs_wgpu.train.loss_terms import TAKEN_NAMES, LossTerm, Regularizer
 from lapgs_wgpu.train.optimizer import FrequencyOptimizer
 from lapgs_wgpu.train.step_result import StepResult
 
@@ -56,15 +56,12 @@ class Parts:
         names = Counter(TAKEN_NAMES)
         for term in self.losses:
             if not isinstance(term, LossTerm):
-                raise InputError(
-                    f"Parts(losses=...) must list Regularizer, TorchLoss and WgslLoss, got a {type(term).__name__}."
-                )
+                raise InputError(f"Parts(losses=...) must list Regularizer and TorchLoss, got a {type(term).__name__}.")
             names[term.name] += 1
             if names[term.name] > 1:
                 raise InputError(f"there are two loss terms named {term.name!r}; give each a name of its own.")
-            if not isinstance(term, WgslLoss):
-                arguments = "scene, gaussians, t" if isinstance(term, Regularizer) else "image, truth"
-                _check_call(term.function, f"the function of the loss {term.name!r}", arguments)
+            arguments = "scene, gaussians, t" if isinstance(term, Regularizer) else "image, truth"
+            _check_call(term.function, f"the function of the loss {term.name!r}", arguments)
         for callback in self.callbacks:
             _check_call(callback, "a callback", "trainer, result")
         _check_call(self.density, "the rule of density control", "state")
