@@ -18,7 +18,7 @@ from lapgs_wgpu.data import Dataset
 from lapgs_wgpu.errors import NumericalError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.run import resume, train
-from lapgs_wgpu.train import objective
+from lapgs_wgpu.train import exchange_step
 from lapgs_wgpu.train.fused_loss import RenderLoss
 from lapgs_wgpu.train.nonfinite import LIMIT, SKIPPED, SkipCounter, Skipped
 from lapgs_wgpu.train.run_folder import STATE, load_state
@@ -44,7 +44,7 @@ class Spoiled(torch.autograd.Function):
 
 def spoil(monkeypatch: pytest.MonkeyPatch, when: Callable[[int], bool], bad: float) -> None:
     """Put a bad value into the gradient of the scales at the steps of these numbers, counted from 1."""
-    original, calls = objective.render_loss, 0
+    original, calls = exchange_step.render_loss, 0
 
     def render(gaussians: Any, *rest: Any) -> RenderLoss:
         nonlocal calls
@@ -53,7 +53,7 @@ def spoil(monkeypatch: pytest.MonkeyPatch, when: Callable[[int], bool], bad: flo
             object.__setattr__(gaussians, "scales", Spoiled.apply(gaussians.scales, bad))
         return original(gaussians, *rest)
 
-    monkeypatch.setattr(objective, "render_loss", render)
+    monkeypatch.setattr(exchange_step, "render_loss", render)
 
 
 def same(a: dict[str, Any], b: dict[str, Any]) -> set[str]:
@@ -92,13 +92,13 @@ def test_a_bad_gradient_skips_the_step_and_leaves_everything_as_it_was(
 
 
 def test_a_bad_loss_is_named_by_its_term(dataset: Dataset, device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    original = objective.render_loss
+    original = exchange_step.render_loss
 
     def render(*arguments: Any) -> RenderLoss:
         done = original(*arguments)
         return done._replace(loss=done.loss * math.nan, terms={**done.terms, "ssim": math.nan})
 
-    monkeypatch.setattr(objective, "render_loss", render)
+    monkeypatch.setattr(exchange_step, "render_loss", render)
     with closing(Trainer(configure(), dataset, device)) as training:
         skipped = training.step().skipped
     assert skipped is not None
@@ -130,7 +130,7 @@ def test_a_bad_parameter_stops_the_training_and_leaves_the_older_state(
     dataset: Dataset, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Nobody else would see it: the rasterizer culls such a Gaussian, and it has no gradient."""
-    original, calls = objective.render_loss, 0
+    original, calls = exchange_step.render_loss, 0
 
     def render(gaussians: Any, *rest: Any) -> RenderLoss:
         nonlocal calls
@@ -148,7 +148,7 @@ def test_a_bad_parameter_stops_the_training_and_leaves_the_older_state(
         prepare(self, *given)
 
     monkeypatch.setattr(Trainer, "_prepare", note)
-    monkeypatch.setattr(objective, "render_loss", render)
+    monkeypatch.setattr(exchange_step, "render_loss", render)
     out = tmp_path / "run"
     with pytest.raises(
         NumericalError, match=r"^1 of \d+ values of the parameters of means are not finite; .* saved last"

@@ -28,7 +28,7 @@ from lapgs_wgpu.splat.drawing import Drawing
 from lapgs_wgpu.splat.rasterize import rasterizer_of
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 from lapgs_wgpu.train.config import Config
-from lapgs_wgpu.train.objective import Sample
+from lapgs_wgpu.train.exchange_step import Sample
 from lapgs_wgpu.train.resident_step import Pending
 from lapgs_wgpu.train.resident_task import ResidentSample, Task
 from lapgs_wgpu.train.run_folder import load_state

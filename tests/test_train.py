@@ -25,7 +25,7 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.checkpoint import read_checkpoint
 from lapgs_wgpu.motion.scene import Scene4D, load
 from lapgs_wgpu.run import train
-from lapgs_wgpu.train import objective
+from lapgs_wgpu.train import exchange_step
 from lapgs_wgpu.train.config import LossWeights
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
 from lapgs_wgpu.train.log import Log
@@ -70,12 +70,11 @@ def test_a_run_is_whole(trained_run: Path, data: Path, dataset: Dataset) -> None
     assert all(f"\n{key} = " in record for key in ("lapgs_wgpu", "torch", "adapter", "driver"))
     (last,) = lines(trained_run)
     assert set(last) == {
-        "step", "loss", "psnr", "terms", "gaussians", "pruned", "dead_scales", "frequencies", "amplitudes", "memory",
+        "step", "loss", "psnr", "terms", "gaussians", "pruned", "frequencies", "amplitudes", "memory",
         "timing",
     }  # fmt: skip
     assert set(last["terms"]) == {"l1", "ssim", "pyramid", "ncc", "smoothness", "acceleration", "dynamics"}
     assert sum(last["terms"].values()) == pytest.approx(last["loss"], rel=1e-5)
-    assert 0 <= last["dead_scales"] <= 1
     assert all(last["memory"][name] > 1e5 for name in ("host_bytes", "device_bytes"))
     assert len(last["frequencies"]) == len(last["amplitudes"]) == 4
     assert last["frequencies"] != list(range(4))  # they are learnt
@@ -246,7 +245,7 @@ def test_cross_correlation_counts_once_the_warm_up_is_over(
         seen.append((arguments[4], render_loss(*arguments)))
         return seen[-1][1]
 
-    monkeypatch.setattr(objective, "render_loss", spy)
+    monkeypatch.setattr(exchange_step, "render_loss", spy)
     options = {"loss__pyramid": "0.2", "loss__ncc": "0.05", "data__background": "random"}
     config = configure(schedule__steps="4", schedule__warm_up="2", **options)
     train(config, dataset, tmp_path / "run", device=device)

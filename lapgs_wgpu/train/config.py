@@ -170,7 +170,7 @@ class SmoothnessConfig(Options):
 
 @dataclass(frozen=True)
 class AccelerationConfig(Options):
-    """The acceleration loss (train/acceleration.py). Has defaults, since older config.toml files lack it."""
+    """The acceleration loss (train/motion_losses.py). Has defaults, since older config.toml files lack it."""
 
     weight: float = option(
         "weight of the acceleration loss: distance of means and scales from the straight line between those shortly "

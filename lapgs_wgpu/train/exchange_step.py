@@ -4,38 +4,78 @@ shared, and wherever torch computes a part of the step, such as a field or a los
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
+from torch import Tensor
+
+from lapgs_wgpu.data.views import Dataset, View
+from lapgs_wgpu.motion.fields.deformation import Nearby, TimeSamples
+from lapgs_wgpu.motion.fields.dynamics import dynamics_loss
+from lapgs_wgpu.motion.scene import Deformed, Scene4D
+from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.density_control import DensityControl
+from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
 from lapgs_wgpu.train.ground_truth import AHEAD, GroundTruth
 from lapgs_wgpu.train.learners import Learners
+from lapgs_wgpu.train.loss_terms import LossTerm, Regularizer, weight_at
+from lapgs_wgpu.train.motion_losses import acceleration_loss, draw_nearby, draw_times
 from lapgs_wgpu.train.nonfinite import Skipped, cause, check_parameters, finite
-from lapgs_wgpu.train.objective import Objective, Sample, ViewResult
 from lapgs_wgpu.train.step_result import Measured, Scheduled
 from lapgs_wgpu.train.view_order import Draws
 
 
+class Sample(NamedTuple):
+    """A view of a step, and what the losses of motion compare there.
+
+    Attributes:
+        view: of the training.
+        background: (3,) that its image lies on.
+        moving: whether the field moves the Gaussians.
+        nearby: the places that the smoothness loss compares; None in steps without it.
+        time_samples: the times that the acceleration loss compares; None in steps without it.
+    """
+
+    view: View
+    background: Tensor
+    moving: bool
+    nearby: Nearby | None
+    time_samples: TimeSamples | None
+
+
 class ExchangeStep:
-    """Takes the steps of a training: the gradients of its views, then the optimizers.
+    """Takes the steps of a training: the gradients of a view's loss, then the optimizers.
 
     Args:
-        objective: whose loss is lowered.
+        config: resolved for the dataset.
+        scene: that is trained.
+        own_terms: of the loss, beside those of the configuration (docs/api.md).
+        dataset: the capture.
         learners: that are moved.
         density: whose statistics take the views in.
         truth: of the views.
         draws: of the training.
+
+    Attributes:
+        field_fitted: whether discovery has fitted the field to nearly all that moves. Its depth is known from there,
+            and the acceleration loss is left out.
     """
 
     def __init__(
-        self, objective: Objective, learners: Learners, density: DensityControl, truth: GroundTruth, draws: Draws
+        self,
+        config: Config,
+        scene: Scene4D,
+        own_terms: Sequence[LossTerm],
+        dataset: Dataset,
+        learners: Learners,
+        density: DensityControl,
+        truth: GroundTruth,
+        draws: Draws,
     ) -> None:
-        self._objective, self._learners, self._density = objective, learners, density
-        self._truth, self._draws = truth, draws
-
-    @property
-    def dead_scales(self) -> float:
-        """`Objective.dead_scales`."""
-        return self._objective.dead_scales
+        self._config, self._scene, self._own_terms = config, scene, own_terms
+        self._time_count, self._extent = dataset.moments, dataset.extent
+        self._learners, self._density, self._truth, self._draws = learners, density, truth, draws
+        self.field_fitted = False
 
     def take(self, scheduled: Scheduled, began: Callable[[], None]) -> Callable[[], Measured]:
         """Take a step; gives what it told.
@@ -44,44 +84,93 @@ class ExchangeStep:
         Raises NumericalError where a parameter is not finite.
         """
         step, draws = scheduled.step, self._draws
-        chosen, drawn = draws.next(), draws.mark()
-        sample = self._objective.sample(*chosen, step, draws.generator, moving=scheduled.moving)
-        self._truth.prefetch([sample.view, *draws.order.coming(AHEAD)])
+        (view, background), drawn = draws.next(), draws.mark()
+        sample = self._sample(view, background, step, moving=scheduled.moving)
+        self._truth.prefetch([view, *draws.order.coming(AHEAD)])
         self._learners.zero_grad()
-        result = self._descend(sample, step)
-        what = self._not_finite(result, began)
-        skipped = Skipped(step, sample.view.name, what) if what else None
+        measured, rendering = self._descend(sample, step)
+        d_means2d = rendering.means2d.grad
+        assert d_means2d is not None
+        what = self._not_finite(measured, d_means2d, began)
         began()
-        if skipped is None:
+        if what:
+            self._learners.zero_grad()
+            draws.go_back(drawn)
+            measured = measured._replace(skipped=Skipped(step, view.name, what))
+        else:
             self._learners.step(step, scheduled.share)
             # After the optimizer's step, so that no gradient is lost with the rows that change.
             if scheduled.seen:
-                self._density.statistics.add(result.radii, result.d_means2d, sample.view.camera)
-        else:
-            self._learners.zero_grad()
-            draws.go_back(drawn)
-        measured = Measured(result.loss, result.psnr, skipped, result.terms)
+                self._density.statistics.add(rendering.radii, d_means2d, view.camera)
         return lambda: measured
 
-    def _descend(self, sample: Sample, step: int) -> ViewResult:
-        """`Objective.descend` for a view, as its camera and its colors are corrected."""
-        view = sample.view
-        truth, camera = self._truth.on_device(view), self._learners.refined_camera(view)
-        correction = self._learners.exposure(view)
-        return self._objective.descend(sample, step, truth, camera, correction)
+    def _sample(self, view: View, background: Tensor, step: int, *, moving: bool) -> Sample:
+        """Draw what the losses of motion compare in a step, counted from 1."""
+        config, count, generator = self._config, len(self._scene), self._draws.generator
+        nearby = time_samples = None
+        if moving and step > config.smoothness.start:
+            t = self._scene.timing(view.time)
+            nearby = draw_nearby(config.smoothness, count, t, generator)
+            left_out = self.field_fitted or step % config.acceleration.interval
+            if not left_out and self._scene.field is not None:
+                time_samples = draw_times(config.acceleration, count, t, self._time_count, generator)
+        return Sample(view, background, moving, nearby, time_samples)
 
-    def _not_finite(self, result: ViewResult, began: Callable[[], None]) -> str:
+    def _descend(self, sample: Sample, step: int) -> tuple[Measured, RenderLoss]:
+        """Add the gradients of a view's loss, in a step counted from 1, to those of all that learns."""
+        config, scene, view = self._config, self._scene, sample.view
+        camera, correction = self._learners.refined_camera(view), self._learners.exposure(view)
+        if sample.moving:
+            now = scene.deformed(view.time, sample.nearby, sample.time_samples)
+        else:
+            now = Deformed(scene.canonical(), None, [])
+        weights = config.loss.weights(warm=sample.moving)
+        weighted = [(term, weight) for term in self._own_terms if (weight := weight_at(term, step))]
+        of_image = [(term, weight) for term, weight in weighted if not isinstance(term, Regularizer)]
+        rendering = render_loss(
+            now.gaussians,
+            camera.camera,
+            self._truth.on_device(view),
+            sample.background,
+            weights,
+            scene.device,
+            correction,
+            of_image,
+            camera.change,
+            self._extent,
+        )
+        of_motion: dict[str, Tensor] = {}
+        if now.smoothness is not None:
+            of_motion["smoothness"] = now.smoothness
+        if sample.time_samples is not None:
+            weight = config.acceleration.weight * config.acceleration.interval
+            of_motion["acceleration"] = weight * acceleration_loss(now, scene.timing(view.time), sample.time_samples)
+        if sample.moving and config.loss.dynamics and "dynamics" in scene.parameters:
+            of_motion["dynamics"] = config.loss.dynamics * dynamics_loss(scene.parameters["dynamics"])
+        for term, weight in weighted:
+            if isinstance(term, Regularizer):
+                of_motion[term.name] = weight * term.function(scene, now.gaussians, view.time)
+        loss = rendering.loss
+        for value in of_motion.values():
+            loss = loss + value
+        loss.backward()
+        factors = {**weights._asdict(), **{term.name: weight for term, weight in of_image}}
+        terms = {name: factors[name] * value for name, value in rendering.terms.items() if name in factors}
+        terms |= {name: value.item() for name, value in of_motion.items()}
+        return Measured(loss.item(), rendering.psnr, terms=terms), rendering
+
+    def _not_finite(self, measured: Measured, d_means2d: Tensor, began: Callable[[], None]) -> str:
         """What is not finite in the loss and gradients of a step, for which it is skipped; "" where all is well.
 
         Raises NumericalError for a parameter, whose values a step cannot mend.
         """
         parameters, gradients = self._learners.parameters(), self._learners.gradients()
-        gradients["the places in the image"] = [result.d_means2d]
-        if math.isfinite(result.loss) and finite(parameters, gradients):
+        gradients["the places in the image"] = [d_means2d]
+        if math.isfinite(measured.loss) and finite(parameters, gradients):
             return ""
         try:
             check_parameters(parameters)
         except Exception:
             began()
             raise
-        return cause([result.terms], gradients)
+        return cause([measured.terms], gradients)

@@ -170,12 +170,11 @@ def _continued(path: Path, done: int) -> tuple[BinaryIO, float]:
 
 
 def _now(trainer: Trainer) -> dict[str, Any]:
-    """Of the scene after a step: the share of dead scales, the motion's spectrum where there is one, and memory."""
+    """Of the scene after a step: the motion's spectrum where there is one, and memory."""
     values = trainer.spectrum()
     spectrum = {name: [round(value, 6) for value in tensor.tolist()] for name, tensor in values.items()}
     memory = {"host_bytes": resident_bytes(), "device_bytes": trainer.scene.device.allocated_bytes}
     return {
-        "dead_scales": round(trainer.dead_scales, 6),
         **spectrum,
         "memory": {name: value for name, value in memory.items() if value is not None},
     }

@@ -27,17 +27,16 @@ from lapgs_wgpu.motion.passes.samples import Samples
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.drawing import Drawing
 from lapgs_wgpu.splat.gaussians import Gaussians
-from lapgs_wgpu.train.acceleration import even_times
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.density_control import DensityControl
 from lapgs_wgpu.train.ground_truth import AHEAD, GroundTruth
 from lapgs_wgpu.train.image_metrics import psnr_of
 from lapgs_wgpu.train.learners import Learners
+from lapgs_wgpu.train.motion_losses import even_times, near_time
 from lapgs_wgpu.train.nonfinite import Skipped, cause, check_parameters
 from lapgs_wgpu.train.resident_parameters import PARTS
 from lapgs_wgpu.train.resident_passes import ResidentPasses
 from lapgs_wgpu.train.resident_task import ResidentSample, Task
-from lapgs_wgpu.train.smoothness import near_time
 from lapgs_wgpu.train.step_result import Measured, Scheduled
 from lapgs_wgpu.train.view_order import Draws
 

@@ -28,7 +28,6 @@ from lapgs_wgpu.train.ground_truth import GroundTruth
 from lapgs_wgpu.train.host_threads import step_threads, torch_threads
 from lapgs_wgpu.train.learners import Learners
 from lapgs_wgpu.train.nonfinite import SkipCounter
-from lapgs_wgpu.train.objective import Objective
 from lapgs_wgpu.train.parts import Parts
 from lapgs_wgpu.train.resident_step import ResidentStep
 from lapgs_wgpu.train.resolve_config import why_exchange
@@ -110,7 +109,6 @@ class Trainer:
         self._truth = GroundTruth(scene.device, color, int(config.data.cache_gb * 1e9))
         self._draws = Draws(dataset.train, self._generator, color)
         self._learners = Learners(config, dataset, self.parts, start)
-        self._objective = Objective(config, scene, self.parts.losses, dataset.moments, extent)
         self._density = DensityControl(
             config,
             scene,
@@ -133,7 +131,7 @@ class Trainer:
         self._timing_steps = config.timing.corrections(config.schedule.steps) if self.timing else []
         self._skips = SkipCounter()
         shared = self._learners, self._density, self._truth, self._draws
-        self._exchange = ExchangeStep(self._objective, *shared)
+        self._exchange = ExchangeStep(config, scene, self.parts.losses, dataset, *shared)
         self._resident = None
         if config.step_place == "resident":
             self._resident = ResidentStep(config, scene, *shared, dataset.moments)
@@ -146,7 +144,7 @@ class Trainer:
 
     def _set_field_fitted(self, field_fitted: bool) -> None:
         """Say whether discovery has fitted the field to nearly all that moves."""
-        self._objective.field_fitted = field_fitted
+        self._exchange.field_fitted = field_fitted
         if self._resident is not None:
             self._resident.field_fitted = field_fitted
         self._learners.limit_field_rates(field_fitted=field_fitted)
@@ -182,11 +180,6 @@ class Trainer:
         """Take the steps that are left, one at a time."""
         while self.done < self.config.schedule.steps:
             yield self.step()
-
-    @property
-    def dead_scales(self) -> float:
-        """The share of the Gaussians' scales in the last view that are at the floor, where they get no gradient."""
-        return (self._resident or self._exchange).dead_scales
 
     def spectrum(self) -> dict[str, Tensor]:
         """The motion's frequencies (K,), cycles over the clip, and amplitudes (K,); nothing for a field without one."""
@@ -301,7 +294,7 @@ class Trainer:
                 "done": torch.tensor(self.done),
                 "warm_up": torch.tensor(self.warm_up_steps),
                 "rising": torch.tensor(self._ramp_steps),
-                "field_fitted": torch.tensor(int(self._objective.field_fitted)),
+                "field_fitted": torch.tensor(int(self._exchange.field_fitted)),
                 "sh_degree": torch.tensor(scene.sh_degree),
                 "random": self._generator.get_state(),
                 "order": torch.tensor(self._draws.order.left, dtype=torch.int64),

@@ -1,7 +1,9 @@
-"""The acceleration loss: how far Gaussians are from where and how large they would be if they moved evenly.
+"""The losses of motion, smoothness and acceleration: what they compare in a step, and the latter itself.
 
-A time that one camera sees says nothing of how far away things are; its neighbours in time, seen from elsewhere, do.
-Distances saturate, so that what really turns quickly is not held back.
+Smoothness (of Grid4D; each field computes its own) compares the field's features at nearby places and times.
+Acceleration is how far Gaussians are from where and how large they would be if they moved evenly. A time that one
+camera sees says nothing of how far away things are; its neighbours in time, seen from elsewhere, do. Distances
+saturate, so that what really turns quickly is not held back.
 """
 
 from __future__ import annotations
@@ -9,14 +11,29 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from lapgs_wgpu.motion.fields.deformation import TimeSamples
+from lapgs_wgpu.motion.fields.deformation import Nearby, TimeSamples
 from lapgs_wgpu.motion.scene import Deformed
-from lapgs_wgpu.train.config import AccelerationConfig
+from lapgs_wgpu.train.config import AccelerationConfig, SmoothnessConfig
 
 WOBBLE = 1e-2  # world units: distances far below it count as they are, those far above it all as much as it
 EPSILON = 1e-12  # world units squared: keeps the gradient of a distance of 0 finite
 # Largest distance of the two times from the view's, in distances of two images; drawn between half of it and all.
 LARGEST_DISTANCE = 2.0
+
+
+def draw_nearby(config: SmoothnessConfig, count: int, t: float, generator: torch.Generator) -> Nearby | None:
+    """Where the field of `count` Gaussians is compared with itself in a step at time t; None where it is not."""
+    chosen = round(config.share * count)
+    if chosen == 0 or config.static == config.temporal == 0:
+        return None
+    rows = torch.randint(count, (chosen,), generator=generator)
+    offsets = config.reach * (2 * torch.rand(chosen, 3, generator=generator) - 1)
+    return Nearby(rows, offsets, near_time(config, t, generator), config.static, config.temporal)
+
+
+def near_time(config: SmoothnessConfig, t: float, generator: torch.Generator) -> float:
+    """Draw the other time at which the field is looked at."""
+    return min(max(t + config.time_reach * (2 * float(torch.rand((), generator=generator)) - 1), 0.0), 1.0)
 
 
 def draw_times(

@@ -13,8 +13,8 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.fields.deformation import Deformation, TimeSamples
 from lapgs_wgpu.motion.scene import Scene4D
-from lapgs_wgpu.train.acceleration import WOBBLE, acceleration_loss, draw_times
 from lapgs_wgpu.train.config import AccelerationConfig
+from lapgs_wgpu.train.motion_losses import WOBBLE, acceleration_loss, draw_times
 from lapgs_wgpu.train.trainer import Trainer
 
 CONFIG = AccelerationConfig(weight=1.0, share=0.5)
@@ -102,7 +102,7 @@ def test_it_rests_where_discovery_explains_what_moves(dataset: Dataset, device: 
         configure(acceleration__weight="1", acceleration__interval="1", schedule__warm_up="0"), dataset, device
     ) as training:
         assert training.step().terms["acceleration"] > 0
-        training._objective.field_fitted = True
+        training._exchange.field_fitted = True
         assert "acceleration" not in training.step().terms
 
 
