@@ -95,7 +95,7 @@ def draw(folder: Path, cache_gb: float, steps: int, step: float) -> dict[str, fl
     from lapgs_wgpu.gpu.device import open_device
     from lapgs_wgpu.train.ground_truth import GroundTruth
     from lapgs_wgpu.train.trainer import AHEAD
-    from lapgs_wgpu.train.view_order import ViewOrder
+    from lapgs_wgpu.train.view_order import Draws
 
     start = time.perf_counter()
     data = load_dataset(folder)
@@ -104,13 +104,13 @@ def draw(folder: Path, cache_gb: float, steps: int, step: float) -> dict[str, fl
     for frame in data.train[:: len(data.times)]:
         frame.load()
     unpacking, after_unpacking = time.perf_counter() - start, megabytes()
-    order = ViewOrder(data.train, torch.Generator().manual_seed(0))
+    draws = Draws(data.train, torch.Generator().manual_seed(0), torch.zeros(3))
     with closing(GroundTruth(open_device(), torch.zeros(3), int(cache_gb * 1e9))) as truth:
         waits = []
         for _ in range(steps):
             start = time.perf_counter()
-            view = order.next()
-            truth.prefetch([view, *order.coming(AHEAD)])
+            view, _ = draws.next()
+            truth.prefetch([view, *draws.coming(AHEAD)])
             truth.on_device(view)
             waits.append(1e3 * (time.perf_counter() - start))
             time.sleep(step)

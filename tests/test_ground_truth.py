@@ -14,7 +14,7 @@ from lapgs_wgpu.data import Dataset, View, composite
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.train.ground_truth import LEFT_OUT, GroundTruth, marked_pixels
-from lapgs_wgpu.train.view_order import ViewOrder
+from lapgs_wgpu.train.view_order import Draws
 
 BLACK = torch.zeros(3)
 
@@ -109,10 +109,10 @@ def test_ignored_pixels_are_marked_and_transparent_ones_count() -> None:
 
 
 def test_every_view_is_drawn_once_an_epoch(dataset: Dataset) -> None:
-    order = ViewOrder(dataset.train, torch.Generator().manual_seed(3))
-    epochs = [[order.next().name for _ in dataset.train] for _ in range(3)]
+    draws = Draws(dataset.train, torch.Generator().manual_seed(3), BLACK)
+    epochs = [[draws.next()[0].name for _ in dataset.train] for _ in range(3)]
     assert all(sorted(epoch) == sorted(view.name for view in dataset.train) for epoch in epochs)
     assert epochs[0] != epochs[1]
-    first = order.next()
-    assert [view.name for view in order.coming(3)] == [order.next().name for _ in range(3)]
-    assert first.name not in [view.name for view in order.coming(100)]
+    first, _ = draws.next()
+    assert [view.name for view in draws.coming(3)] == [draws.next()[0].name for _ in range(3)]
+    assert first.name not in [view.name for view in draws.coming(100)]

@@ -14,7 +14,7 @@ import pytest
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.learning_rate import Rate
 from lapgs_wgpu.train.presets import load_config
-from lapgs_wgpu.train.resolve_config import resolve_for_dataset
+from lapgs_wgpu.train.setup import resolve_for_dataset
 
 POSITION_RATE = (8e-4, 8e-6)  # 1.6e-4 to 1.6e-6, times Grid4D's spatial_lr_scale of 5
 SCALES = (0.09, 1.0, 2.4)  # world units per unit of a capture

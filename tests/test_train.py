@@ -31,7 +31,7 @@ from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.parts import Parts
 from lapgs_wgpu.train.presets import load_config
-from lapgs_wgpu.train.resolve_config import resolve_for_dataset, resolve_step
+from lapgs_wgpu.train.setup import resolve_for_dataset, resolve_step
 from lapgs_wgpu.train.start import initial_points
 from lapgs_wgpu.train.step_result import Measured, StepResult
 
@@ -211,11 +211,11 @@ def test_the_resident_step_trains_as_well_and_repeats(
     ],
 )
 def test_where_the_step_is_computed(
-    given: dict[str, str], is_cpu: bool, place: str, dataset: Dataset, device: Device, monkeypatch: pytest.MonkeyPatch
+    given: dict[str, str], is_cpu: bool, place: str, device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(device, "is_cpu", is_cpu)
     config = configure(**given)
-    assert resolve_step(config, dataset, device, Parts()) == dataclasses.replace(config, step_place=place)
+    assert resolve_step(config, device, Parts()) == dataclasses.replace(config, step_place=place)
 
 
 def test_nothing_moves_during_the_warm_up(dataset: Dataset, device: Device, tmp_path: Path) -> None:

@@ -86,7 +86,7 @@ class ExchangeStep:
         step, draws = scheduled.step, self._draws
         (view, background), drawn = draws.next(), draws.mark()
         sample = self._sample(view, background, step, moving=scheduled.moving)
-        self._truth.prefetch([view, *draws.order.coming(AHEAD)])
+        self._truth.prefetch([view, *draws.coming(AHEAD)])
         self._learners.zero_grad()
         measured, rendering = self._descend(sample, step)
         d_means2d = rendering.means2d.grad

@@ -15,7 +15,7 @@ from lapgs_wgpu.train.exposure import Exposures
 from lapgs_wgpu.train.nonfinite import Tensors
 from lapgs_wgpu.train.optimizer import FrequencyOptimizer, Optimizer
 from lapgs_wgpu.train.parts import Parts
-from lapgs_wgpu.train.resolve_config import nyquist_frequency
+from lapgs_wgpu.train.setup import nyquist_frequency
 from lapgs_wgpu.train.start import Start, max_field_rates
 
 Refiner = FrequencyOptimizer | Exposures | CameraRefinement

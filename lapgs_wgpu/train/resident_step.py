@@ -172,7 +172,7 @@ class ResidentStep:
         step, draws, frequencies = scheduled.step, self._draws, self._learners.frequencies
         before, (view, background), drawn = draws.mark(), draws.next(), draws.mark()
         sample = self._draw(view, background, step, draws.generator, moving=scheduled.moving)
-        self._truth.prefetch([view, *draws.order.coming(AHEAD)])
+        self._truth.prefetch([view, *draws.coming(AHEAD)])
         rates = self._learners.optimizer.rates_at(step, scheduled.share)
         frequency_rate = frequencies.rate.at(step) if frequencies else 0.0
         time = self._scene.timing(view.time)

@@ -1,35 +1,19 @@
-"""What a training is given, checked against each other and resolved: its configuration, its data and its device."""
+"""What a training is given, checked against each other, and what its configuration leaves to the data and the device."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from pathlib import Path
-from typing import NamedTuple
 
 from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device, open_device
 from lapgs_wgpu.motion.scene import Scene4D
+from lapgs_wgpu.motion.timing import MOST_TIMES
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.open_dataset import open_dataset, resolve_data
 from lapgs_wgpu.train.parts import Parts
-from lapgs_wgpu.train.resolve_config import resolve_for_dataset, resolve_step
-
-
-class Setup(NamedTuple):
-    """What a training works with.
-
-    Attributes:
-        user_config: with its field and the place of its steps decided, as config.toml holds it.
-        config: the same resolved for the data, too.
-        dataset: the capture.
-        device: that trains.
-    """
-
-    user_config: Config
-    config: Config
-    dataset: Dataset
-    device: Device
 
 
 def set_up(
@@ -38,10 +22,15 @@ def set_up(
     device: Device | None,
     parts: Parts,
     scene: Scene4D | None = None,
-) -> Setup:
+) -> tuple[Config, Config, Dataset, Device]:
     """Check the arguments of a `Trainer`, open what they leave out, and resolve the configuration.
 
-    The field is that of the scene or of the parts, where they bring one. Raises InputError.
+    Returns:
+        The configuration with its field, that of the scene or of the parts where they bring one, and the place of its
+        steps decided, as config.toml holds it; the same resolved for the data, too; the capture; the device that trains.
+
+    Raises:
+        InputError: the arguments do not fit each other.
     """
     for name, kind, value in (("config", Config, config), ("dataset", Dataset | None, dataset)):
         if not isinstance(value, kind):
@@ -64,8 +53,64 @@ def set_up(
             config = dataclasses.replace(config, field=dataclasses.replace(config.field, kind="own"))
         except ValueError as error:
             raise InputError(f"{error}.") from None
-    user_config = resolve_step(config, dataset, device, parts)
+    user_config = resolve_step(config, device, parts)
     resolved = resolve_for_dataset(user_config, dataset)
     if scene is not None:  # whose field does not change its shape any more
         resolved = dataclasses.replace(resolved, field=scene.field_config)
-    return Setup(user_config, resolved, dataset, device)
+    return user_config, resolved, dataset, device
+
+
+def resolve_for_dataset(config: Config, dataset: Dataset) -> Config:
+    """The configuration with lengths in world units, and no more frequencies than the training times can tell apart.
+
+    Raises InputError where the data do not allow it.
+    """
+    if config.timing.refine and len(dataset.times) > MOST_TIMES:
+        raise InputError(
+            f"{dataset.name} has {len(dataset.times)} times, and timing.refine takes {MOST_TIMES} at most; give "
+            "--timing.refine false."
+        )
+    field = config.field
+    if config.data.units == "capture":
+        scale, means = dataset.scale, config.rates.means
+        field = dataclasses.replace(field, bound=scale * field.bound, unit=scale * field.unit)
+        config = dataclasses.replace(
+            config,
+            data=dataclasses.replace(config.data, units="world"),
+            rates=dataclasses.replace(
+                config.rates, means=dataclasses.replace(means, start=scale * means.start, end=scale * means.end)
+            ),
+            smoothness=dataclasses.replace(config.smoothness, reach=scale * config.smoothness.reach),
+        )
+    # All frequencies above the limit would end there.
+    most = 1 + math.floor(nyquist_frequency(dataset) / field.frequency_step + 1e-9)
+    return dataclasses.replace(config, field=dataclasses.replace(field, components=min(field.components, most)))
+
+
+def nyquist_frequency(dataset: Dataset) -> float:
+    """Half the rate of the training times, cycles over the clip: above it a frequency looks like one below."""
+    times = dataset.times
+    return (len(times) - 1) / 2 / float(times[-1] - times[0]) if len(times) > 1 else 0.0
+
+
+def resolve_step(config: Config, device: Device, parts: Parts) -> Config:
+    """The configuration with the place of the step, which "auto" leaves open, decided.
+
+    No trial decides, since the place changes the last bits, and near a tie two runs would differ. Raises InputError
+    where it is to be resident and cannot be.
+    """
+    reason = why_exchange(config, parts)
+    if config.step_place == "resident" and reason:
+        raise InputError(f"the step cannot be resident: {reason}; give --step_place auto.")
+    if config.step_place != "auto":
+        return config
+    return dataclasses.replace(config, step_place="exchange" if reason or device.is_cpu else "resident")
+
+
+def why_exchange(config: Config, parts: Parts) -> str:
+    """What of a training only torch can compute; "" where there is nothing."""
+    if config.field.kind != "static" and not config.field.decodes_on_device:
+        return f"there are no kernels for the field {config.field.kind} in this shape"
+    if parts.losses:
+        return "losses of one's own are torch's"
+    return ""

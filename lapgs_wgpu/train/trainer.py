@@ -30,8 +30,7 @@ from lapgs_wgpu.train.learners import Learners
 from lapgs_wgpu.train.nonfinite import SkipCounter
 from lapgs_wgpu.train.parts import Parts
 from lapgs_wgpu.train.resident_step import ResidentStep
-from lapgs_wgpu.train.resolve_config import why_exchange
-from lapgs_wgpu.train.setup import set_up
+from lapgs_wgpu.train.setup import set_up, why_exchange
 from lapgs_wgpu.train.start import Start, start_from_points
 from lapgs_wgpu.train.step_result import Scheduled, StepResult
 from lapgs_wgpu.train.timing_refinement import KeptTiming, TimingRefinement
@@ -163,7 +162,7 @@ class Trainer:
         """Where the steps are computed, and why, in words."""
         if self._resident is not None:
             return "resident: on the device from end to end"
-        reason = why_exchange(self.config, self.dataset, self.parts) or "the device is a CPU"
+        reason = why_exchange(self.config, self.parts) or "the device is a CPU"
         return f"exchange: by torch, since {reason}"
 
     def close(self) -> None:
@@ -297,7 +296,7 @@ class Trainer:
                 "field_fitted": torch.tensor(int(self._exchange.field_fitted)),
                 "sh_degree": torch.tensor(scene.sh_degree),
                 "random": self._generator.get_state(),
-                "order": torch.tensor(self._draws.order.left, dtype=torch.int64),
+                "order": torch.tensor(self._draws.left, dtype=torch.int64),
                 "bands": torch.tensor(self._plans.bands(self._drawn)),
             },
         }
@@ -334,5 +333,5 @@ class Trainer:
             raise ValueError("its rates rise over a negative number of steps")
         self._set_field_fitted(bool(own.get("field_fitted", False)))
         self._generator.set_state(own["random"])
-        self._draws.order.left = own["order"].tolist()
+        self._draws.left = own["order"].tolist()
         self._plans.set_bands(self._drawn, int(own.get("bands", 1)))

@@ -11,28 +11,6 @@ from torch import Tensor
 from lapgs_wgpu.data.views import View
 
 
-class ViewOrder:
-    """Views in random order without replacement, epoch after epoch.
-
-    Attributes:
-        left: the numbers of the views that are still to come in this epoch.
-    """
-
-    def __init__(self, views: Sequence[View], generator: torch.Generator) -> None:
-        self._views, self._generator = views, generator
-        self.left: list[int] = []
-
-    def next(self) -> View:
-        """The next view, which is not to come any more."""
-        if not self.left:
-            self.left = torch.randperm(len(self._views), generator=self._generator).tolist()
-        return self._views[self.left.pop(0)]
-
-    def coming(self, count: int) -> list[View]:
-        """At most so many views that come after it in this epoch."""
-        return [self._views[number] for number in self.left[:count]]
-
-
 class Mark(NamedTuple):
     """Where the draws stand: the generator's state, and the views that are left of an epoch."""
 
@@ -41,27 +19,34 @@ class Mark(NamedTuple):
 
 
 class Draws:
-    """What the steps of a training draw.
+    """What the steps of a training draw: views in random order without replacement, epoch after epoch.
 
     Attributes:
-        order: of the views.
         generator: of all random numbers.
         background: (3,) under every image; None for a new one in each step.
+        left: the numbers of the views that are still to come in this epoch.
     """
 
     def __init__(self, views: Sequence[View], generator: torch.Generator, background: Tensor | None) -> None:
-        self.order, self.generator, self.background = ViewOrder(views, generator), generator, background
+        self._views, self.generator, self.background = views, generator, background
+        self.left: list[int] = []
 
     def next(self) -> tuple[View, Tensor]:
         """The next view, and the background (3,) that its image lies on."""
-        view = self.order.next()
+        if not self.left:
+            self.left = torch.randperm(len(self._views), generator=self.generator).tolist()
+        view = self._views[self.left.pop(0)]
         return view, torch.rand(3, generator=self.generator) if self.background is None else self.background
+
+    def coming(self, count: int) -> list[View]:
+        """At most so many views that come after it in this epoch."""
+        return [self._views[number] for number in self.left[:count]]
 
     def mark(self) -> Mark:
         """Where they stand, for `go_back`."""
-        return Mark(self.generator.get_state(), list(self.order.left))
+        return Mark(self.generator.get_state(), list(self.left))
 
     def go_back(self, mark: Mark) -> None:
         """Draw again what was drawn since."""
         self.generator.set_state(mark.random)
-        self.order.left = list(mark.left)
+        self.left = list(mark.left)
