@@ -13,11 +13,12 @@ gradient (CamP, Park et al. 2023).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
 from lapgs_wgpu.splat.camera import Camera
@@ -200,24 +201,20 @@ class CameraRefinement:
         for row in rows:
             whiten = whitening(image_motion(self.camera(row), points, self.extent), damping)
             change = self._descent.change(row, gradient[row].double().numpy(), whiten, rate)
-            before = rotation_of(self._learnt[row, :3].numpy())
-            self._learnt[row, :3] = torch.from_numpy(rotation_vector(rotation_of(change[:3]) @ before))
+            turned = Rotation.from_rotvec(change[:3]) * Rotation.from_rotvec(self._learnt[row, :3].numpy())
+            self._learnt[row, :3] = torch.from_numpy(turned.as_rotvec())
             self._learnt[row, 3:] += torch.from_numpy(change[3:])
         self._learnt[rows] *= kept
         flat = self._learnt.view(-1)
         flat -= self.common @ (self.common.T @ flat)
 
-    def report(self) -> dict[str, Any]:
+    def report(self) -> dict[str, dict[str, float]]:
         """How far the cameras went: degrees, and per cent of their extent."""
         turns = np.degrees(self._learnt[:, :3].norm(dim=1).numpy())
         shifts = 100 * self._learnt[:, 3:].norm(dim=1).numpy()
         return {
-            "rotation_degrees": _summary(turns),
-            "shift_percent": _summary(shifts),
-            "cameras": [
-                {"rotation_degrees": round(float(turn), 4), "shift_percent": round(float(shift), 4)}
-                for turn, shift in zip(turns, shifts, strict=True)
-            ],
+            name: {"median": float(np.median(values)), "largest": float(values.max())}
+            for name, values in (("rotation_degrees", turns), ("shift_percent", shifts))
         }
 
     def summary(self) -> str:
@@ -244,24 +241,9 @@ def changed_camera(camera: Camera, change: Array) -> Camera:
     change: (6,) rotation vector along the world's axes, radians, and shift, world units.
     """
     T = camera.T_cam_world.copy()
-    T[:3, :3] = T[:3, :3] @ rotation_of(change[:3]).T
+    T[:3, :3] = T[:3, :3] @ Rotation.from_rotvec(change[:3]).as_matrix().T
     T[:3, 3] = -T[:3, :3] @ (camera.position + change[3:])
     return Camera(camera.K, T, camera.width, camera.height, camera.near)
-
-
-def rotation_of(vector: Array) -> Array:
-    """(3, 3) rotation by a vector's length, radians, about its direction (Rodrigues)."""
-    angle = float(np.sqrt(vector @ vector))
-    x, y, z = vector
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + np.sinc(angle / np.pi) * cross + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * cross @ cross
-
-
-def rotation_vector(R: Array) -> Array:
-    """(3,) of a rotation by less than a right angle."""
-    axis = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])  # its length is the angle's sine
-    sine = min(float(np.sqrt(axis @ axis)), 1.0)
-    return axis * (np.arcsin(sine) / sine if sine > 1e-12 else 1.0)
 
 
 def _common_motions(cameras: Sequence[Camera], extent: float) -> Array:
@@ -280,7 +262,3 @@ def _common_motions(cameras: Sequence[Camera], extent: float) -> Array:
 def _units(length: float) -> Array:
     """(6,) factors of a rotation vector and a shift that change the unit of the shift."""
     return np.repeat([1.0, length], 3)
-
-
-def _summary(values: Array) -> dict[str, float]:
-    return {"median": float(np.median(values)), "largest": float(values.max())}

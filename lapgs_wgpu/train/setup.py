@@ -1,4 +1,4 @@
-"""What a training is given, checked against each other, and what its configuration leaves to the data and the device."""
+"""What a training is given, checked; and what its configuration leaves to the data and the device."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def set_up(
 
     Returns:
         The configuration with its field, that of the scene or of the parts where they bring one, and the place of its
-        steps decided, as config.toml holds it; the same resolved for the data, too; the capture; the device that trains.
+        steps decided, as config.toml holds it; the same resolved for the data, too; the capture; the device.
 
     Raises:
         InputError: the arguments do not fit each other.

@@ -7,12 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 from helpers.films import Board, drawn, room_cloud, walk
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from lapgs_wgpu.data.cloud import Cloud
 from lapgs_wgpu.data.normalize import Normalization
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.splat.camera import Camera
-from lapgs_wgpu.train.camera_refinement import _common_motions, changed_camera, rotation_vector
+from lapgs_wgpu.train.camera_refinement import _common_motions, changed_camera
 
 SCALE, CENTER = 0.4, np.array([0.5, 0.3, 0.4])  # the room fills the presets' cube
 CLOUD_NOISE = 0.01  # of the cameras' extent
@@ -36,6 +37,11 @@ def extent_of(cameras: Sequence[Camera]) -> float:
     return 1.1 * float(np.linalg.norm(places - places.mean(axis=0), axis=1).max())
 
 
+def turn_between(a: Camera, b: Camera) -> NDArray[np.float64]:
+    """(3,) rotation vector, radians."""
+    return Rotation.from_matrix(a.T_cam_world[:3, :3].T @ b.T_cam_world[:3, :3]).as_rotvec()
+
+
 def pose_errors(cameras: Sequence[Camera], true: Sequence[Camera]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Of each camera the turn, degrees, and the shift, per cent of the extent, by which it is off.
 
@@ -43,10 +49,7 @@ def pose_errors(cameras: Sequence[Camera], true: Sequence[Camera]) -> tuple[NDAr
     """
     extent = extent_of(true)
     off = np.concatenate(
-        [
-            [*rotation_vector(a.T_cam_world[:3, :3].T @ b.T_cam_world[:3, :3]), *((a.position - b.position) / extent)]
-            for a, b in zip(cameras, true, strict=True)
-        ]
+        [[*turn_between(a, b), *((a.position - b.position) / extent)] for a, b in zip(cameras, true, strict=True)]
     )
     common = _common_motions(true, extent)
     off = (off - common @ (common.T @ off)).reshape(-1, 6)
