@@ -78,12 +78,7 @@ def test_a_bad_gradient_skips_the_step_and_leaves_everything_as_it_was(
         assert progress.skipped is not None
         assert progress.skipped.step == at
         assert progress.skipped.view == dataset.train[before["training.order"][0]].name
-        expected = (
-            "the gradient of log_scales is too large"
-            if bad == 1e25
-            else "1 of 900 values of the gradient of log_scales are not finite"
-        )
-        assert expected in progress.skipped.what
+        assert "the gradient of log_scales is not finite, or too large" in progress.skipped.what
         after = {name: value.copy() for name, value in training.state().items()}
         assert same(before, after) == {"training.done", "training.order"}
         np.testing.assert_array_equal(after["training.order"], before["training.order"][1:])
@@ -150,9 +145,7 @@ def test_a_bad_parameter_stops_the_training_and_leaves_the_older_state(
     monkeypatch.setattr(Trainer, "_prepare", note)
     monkeypatch.setattr(exchange_step, "render_loss", render)
     out = tmp_path / "run"
-    with pytest.raises(
-        NumericalError, match=r"^1 of \d+ values of the parameters of means are not finite; .* saved last"
-    ):
+    with pytest.raises(NumericalError, match=r"^the parameters means are not finite, or too large; .* saved last"):
         train(configure(schedule__save_interval="10"), dataset, out, device=device)
     state = load_state(out)
     assert state is not None

@@ -173,4 +173,4 @@ class ExchangeStep:
         except Exception:
             began()
             raise
-        return cause([measured.terms], gradients)
+        return cause(measured.terms, gradients)

@@ -38,28 +38,21 @@ def finite(*groups: Tensors) -> bool:
     return not tensors or math.isfinite(torch.nn.utils.get_total_norm(tensors).item())
 
 
-def describe(kind: str, group: Tensors) -> list[str]:
-    """A clause for each name whose values are not finite, or too large to be squared."""
-    found = []
-    for name, tensors in group.items():
-        count = sum(int((~tensor.detach().isfinite()).sum()) for tensor in tensors)
-        if count:
-            found.append(f"{count} of {sum(t.numel() for t in tensors)} values of the {kind} of {name} are not finite")
-        elif not finite({name: tensors}):
-            found.append(f"the {kind} of {name} is too large")
-    return found
-
-
-def cause(terms: Sequence[Mapping[str, float]], gradients: Tensors) -> str:
-    """What is not finite in a step: of the terms of each view's loss, and of the gradients."""
-    bad = [f"the loss term {name} is {value}" for of in terms for name, value in of.items() if not math.isfinite(value)]
-    return "; ".join([*bad, *describe("gradient", gradients)] or ["the loss or all gradients together are too large"])
+def cause(terms: Mapping[str, float], gradients: Tensors) -> str:
+    """What is not finite in a step: of the terms of its loss, and of the gradients."""
+    bad = [f"the loss term {name} is {value}" for name, value in terms.items() if not math.isfinite(value)]
+    bad += [f"the gradient of {name} is not finite, or too large" for name in _not_finite(gradients)]
+    return "; ".join(bad or ["the loss or all gradients together are too large"])
 
 
 def check_parameters(parameters: Tensors) -> None:
     """Raises NumericalError where a parameter is not finite: no step can come from it."""
-    if not finite(parameters):
-        raise NumericalError("; ".join(describe("parameters", parameters)))
+    if names := _not_finite(parameters):
+        raise NumericalError(f"the parameters {', '.join(names)} are not finite, or too large")
+
+
+def _not_finite(groups: Tensors) -> list[str]:
+    return [name for name, tensors in groups.items() if not finite({name: tensors})]
 
 
 class SkipCounter:

@@ -255,7 +255,7 @@ class ResidentStep:
             raise
         self._passes.word("guard").write(np.zeros(1, np.uint32))
         values = self._terms(flying.task, terms, totals)
-        what = cause([values], gradients)
+        what = cause(values, gradients)
         skipped = Skipped(flying.task.scheduled.step, flying.task.sample.view.name, what)
         flying.result.value = self._measured(flying.task, terms, totals, skipped)
         self.settled = flying.task.scheduled.step

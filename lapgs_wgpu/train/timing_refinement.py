@@ -9,16 +9,15 @@ field. Images that are measured have the timing between those of the training.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from lapgs_wgpu.data.views import View
 from lapgs_wgpu.motion.scene import Scene4D
-from lapgs_wgpu.motion.timing import EVEN, Timing, checked_timing
+from lapgs_wgpu.motion.timing import EVEN, Timing
 from lapgs_wgpu.train.ground_truth import HostImage
 
 # Distances in time are in gaps between images (the usual one).
@@ -50,28 +49,33 @@ class TimingRefinement:
         self._scene, self._truth, self._picture, self._gap = scene, truth, picture, gap
         self._times = np.unique([view.time for view in views])
         self._views = [[view for view in views if view.time == t] for t in self._times.tolist()]
-        self._field_times = np.array([scene.timing(t) for t in self._times.tolist()])
+
+    @property
+    def _field_times(self) -> NDArray[np.float64]:
+        """(T,) of the field, at the times of the images."""
+        timing = self._scene.timing
+        if np.array_equal(timing.times, self._times):
+            return timing.moments
+        return np.array([timing(t) for t in self._times.tolist()])
 
     def fitted(self, number: int) -> NDArray[np.float64]:
         """(T,) all field times a step on. number: of the step, from 0 on: of several views of a time, it takes one.
 
         The same bits on every run of one adapter and driver. Raises InputError where an image cannot be read.
         """
-        fits = [
-            self._fit(views[number % len(views)], now)
-            for views, now in zip(self._views, self._field_times.tolist(), strict=True)
-        ]
+        before = self._field_times
+        pairs = zip(self._views, before.tolist(), strict=True)
+        fits = [self._fit(views[number % len(views)], now) for views, now in pairs]
         shifts, gains = np.array(fits).T
         shifts = shifts - running_median(shifts, AROUND)
         shifts[shifts**2 * gains < LEAST_GAIN] = 0.0
-        moved = self._field_times + self._gap * shifts.clip(-LARGEST_SHIFT, LARGEST_SHIFT)
+        moved = before + self._gap * shifts.clip(-LARGEST_SHIFT, LARGEST_SHIFT)
         farthest = FARTHEST * self._gap
         moved = np.clip(moved, self._times - farthest, self._times + farthest)
         return np.maximum.accumulate(np.clip(moved, 0.0, 1.0))
 
     def set(self, field_times: NDArray[np.float64]) -> None:
         """Give the scene its timing. field_times: (T,), never descending."""
-        self._field_times = field_times
         self._scene.timing = EVEN if (field_times == self._times).all() else Timing(self._times, field_times)
 
     def _fit(self, view: View, now: float) -> tuple[float, float]:
@@ -99,30 +103,6 @@ class TimingRefinement:
             f"the times of the training images were corrected by {report['frames']:.2f} of the distance of two images "
             f"(root mean square; at most {report['frames_most']:.2f})."
         )
-
-    def state(self) -> dict[str, Tensor]:
-        """Everything that the next step depends on."""
-        return {"moments": torch.from_numpy(self._field_times)}
-
-    def restore(self, state: Mapping[str, Tensor]) -> None:
-        """Go on from what `state` gave. Raises ValueError where it is of another capture."""
-        self.set(checked_timing(self._times, state["moments"].numpy()).moments)
-
-
-class KeptTiming:
-    """The timing of a scene that this training does not change: part of the state where the scene began with one."""
-
-    def __init__(self, scene: Scene4D) -> None:
-        self._scene = scene
-
-    def state(self) -> dict[str, Tensor]:
-        """Times and field times; nothing where the timing is even."""
-        return {name: torch.from_numpy(values) for name, values in vars(self._scene.timing).items() if len(values)}
-
-    def restore(self, state: Mapping[str, Tensor]) -> None:
-        """Take over what `state` gave. Raises ValueError where it is no timing."""
-        if state:
-            self._scene.timing = checked_timing(state["times"].numpy(), state["moments"].numpy())
 
 
 def running_median(values: NDArray[np.float64], around: int) -> NDArray[np.float64]:

@@ -16,7 +16,7 @@ from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.initial_view import InitialView, captured_arc
 from lapgs_wgpu.motion.scene import Scene4D
-from lapgs_wgpu.motion.timing import Timing
+from lapgs_wgpu.motion.timing import Timing, checked_timing
 from lapgs_wgpu.splat.rasterize import rasterizer_of
 from lapgs_wgpu.train.camera_refinement import CameraRefinement
 from lapgs_wgpu.train.config import BACKGROUND_LEVELS, Config
@@ -33,7 +33,7 @@ from lapgs_wgpu.train.resident_step import ResidentStep
 from lapgs_wgpu.train.setup import set_up, why_exchange
 from lapgs_wgpu.train.start import Start, start_from_points
 from lapgs_wgpu.train.step_result import Scheduled, StepResult
-from lapgs_wgpu.train.timing_refinement import KeptTiming, TimingRefinement
+from lapgs_wgpu.train.timing_refinement import TimingRefinement
 from lapgs_wgpu.train.view_order import Draws
 
 MAX_SH_DEGREE = 3
@@ -287,7 +287,7 @@ class Trainer:
             "gaussians": scene.parameters,
             "field": scene.field.state_dict() if scene.field else {},
             **self._learners.state(),
-            "timing": (self.timing or KeptTiming(scene)).state(),
+            "timing": {name: torch.from_numpy(array) for name, array in vars(scene.timing).items() if len(array)},
             "statistics": vars(self._density.statistics),
             "training": {
                 "done": torch.tensor(self.done),
@@ -323,7 +323,8 @@ class Trainer:
         if scene.field is not None:
             scene.field.load_state_dict(parts["field"])
         self._learners.restore(parts)
-        (self.timing or KeptTiming(scene)).restore(parts.get("timing", {}))
+        if timing := {name: value.numpy() for name, value in parts.get("timing", {}).items()}:
+            scene.timing = checked_timing(timing.get("times", self.dataset.times), timing["moments"])  # older: no times
         self._density.statistics = Statistics(**parts["statistics"])
         own = parts["training"]
         self.done, scene.sh_degree = int(own["done"]), int(own["sh_degree"])
