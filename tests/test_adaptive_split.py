@@ -27,7 +27,7 @@ EXTENT = 1.0
 
 
 def make_rows(count: int, seed: int = 0) -> dict[str, Tensor]:
-    """Gaussians of many shapes, all of them larger than split_size."""
+    """Gaussians of many shapes, all of them larger than SPLIT_SIZE."""
     generator = torch.Generator().manual_seed(seed)
     return {
         "means": torch.randn(count, 3, generator=generator),
@@ -70,10 +70,10 @@ def test_fewer_gaussians_than_neighbours(count: int) -> None:
     found = nearest(rows["means"], torch.arange(count), 10)
     assert found.shape == (count, count - 1)
     assert all(sorted([i, *row]) == list(range(count)) for i, row in enumerate(found.tolist()))
-    scores = split_scores(rows, torch.arange(count), 10, 0.5)
+    scores = split_scores(rows, torch.arange(count))
     assert scores.isfinite().all()
     assert count > 1 or scores.tolist() == [0.0]
-    assert adaptive_split(rows, everyone(rows), CONFIG).any(), "the highest score reaches every quantile"
+    assert adaptive_split(rows, everyone(rows)).any(), "the highest score reaches every quantile"
 
 
 # Shapes
@@ -102,9 +102,9 @@ def test_divergence_is_zero_for_uniform_and_one_for_one_hot() -> None:
 def test_dynamics_count_where_shapes_are_equal() -> None:
     rows = equals(12)
     of = torch.tensor([0, 11])
-    assert split_scores(rows, of, 3, 0.5).tolist() == pytest.approx([0, 0], abs=1e-12)
+    assert split_scores(rows, of, 3).tolist() == pytest.approx([0, 0], abs=1e-12)
     rows["dynamics"][2, 0] += 1.0  # a neighbour of the first alone
-    high, low = split_scores(rows, of, 3, 0.5).tolist()
+    high, low = split_scores(rows, of, 3).tolist()
     expected = divergence(probabilities(torch.tensor([[0.0, 1.0, 0.0]]))).item()
     assert expected > 0.8
     assert high == pytest.approx(0.5 * expected, rel=1e-5)
@@ -115,10 +115,10 @@ def test_without_dynamics_the_distances_between_means_count() -> None:
     rows = equals(12)
     del rows["dynamics"]
     # Neighbours of the first are 1, 2 and 3 away; of one in the middle 1, 1 and 2.
-    first, middle = split_scores(rows, torch.tensor([0, 5]), 3, 1.0).tolist()
-    assert first == pytest.approx(divergence(probabilities(torch.tensor([[1.0, 2.0, 3.0]]))).item(), rel=1e-5)
-    assert middle == pytest.approx(divergence(probabilities(torch.tensor([[1.0, 1.0, 2.0]]))).item(), rel=1e-5)
-    assert adaptive_split(rows, everyone(rows), CONFIG).any()
+    first, middle = split_scores(rows, torch.tensor([0, 5]), 3).tolist()
+    assert first == pytest.approx(0.5 * divergence(probabilities(torch.tensor([[1.0, 2.0, 3.0]]))).item(), rel=1e-5)
+    assert middle == pytest.approx(0.5 * divergence(probabilities(torch.tensor([[1.0, 1.0, 2.0]]))).item(), rel=1e-5)
+    assert adaptive_split(rows, everyone(rows)).any()
 
 
 # Which candidates are split
@@ -130,7 +130,8 @@ def test_scores_from_the_quantile_on_are_split(monkeypatch: pytest.MonkeyPatch, 
     candidates = torch.tensor([True, False, True, True, False, True, True, False])
     scores = torch.tensor([0.3, 0.1, 0.5, 0.2, 0.4], dtype=torch.float64)
     monkeypatch.setattr(module, "split_scores", lambda rows, of, *_: scores)
-    split = adaptive_split(rows, candidates, dataclasses.replace(CONFIG, split_quantile=quantile))
+    monkeypatch.setattr(module, "SPLIT_QUANTILE", quantile)
+    split = adaptive_split(rows, candidates)
     highest_first = [3, 6, 0, 5, 2]
     assert split.nonzero()[:, 0].tolist() == sorted(highest_first[:count])
 
@@ -139,26 +140,27 @@ def test_outliers_are_split_whatever_their_score() -> None:
     rows = make_rows(100)
     rows["dynamics"] *= 0
     candidates = torch.arange(100) % 2 == 0
-    before = adaptive_split(rows, candidates, CONFIG)
-    lowest = int(split_scores(rows, torch.arange(0, 100, 2), 10, 0.5).argmin()) * 2
+    before = adaptive_split(rows, candidates)
+    lowest = int(split_scores(rows, torch.arange(0, 100, 2)).argmin()) * 2
     assert not before[lowest]
     rows["dynamics"][[lowest, lowest + 1]] = 100.0
-    after = adaptive_split(rows, candidates, CONFIG)
+    after = adaptive_split(rows, candidates)
     assert after[lowest]
     assert not after[lowest + 1], "an outlier that is no candidate"
-    without = adaptive_split({name: row for name, row in rows.items() if name != "dynamics"}, candidates, CONFIG)
+    without = adaptive_split({name: row for name, row in rows.items() if name != "dynamics"}, candidates)
     assert not without[lowest]
 
 
 # In density control
 
 
-def test_quantile_zero_is_the_plain_split() -> None:
+def test_quantile_zero_is_the_plain_split(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "SPLIT_QUANTILE", 0.0)
     rows, statistics = make_rows(30), Statistics.zeros(30, torch.device("cpu"))
     statistics.gradients, statistics.views = torch.ones(30), torch.ones(30)
     changes = [
         published_rule(DensityState(1, rows, statistics, config, EXTENT, torch.Generator().manual_seed(0)))
-        for config in (dataclasses.replace(CONFIG, split="plain"), dataclasses.replace(CONFIG, split_quantile=0.0))
+        for config in (dataclasses.replace(CONFIG, split="plain"), CONFIG)
     ]
     assert not changes[0].keep.any()
     assert len(changes[0].added["means"]) == 60

@@ -30,9 +30,7 @@ def test_dnerf_is_the_papers_schedule() -> None:
     assert (rates.log_scales, rates.quats) == (5e-3, 1e-3)
     density = config.density
     assert (density.start, density.stop, density.interval, density.gradient) == (500, 15_000, 100, 2e-4)
-    assert (density.min_opacity, density.max_world_size) == (0.005, 0.1)
-    assert (density.reset_interval, density.reset_opacity) == (3000, 0.01)
-    assert (density.neighbours, density.divergence_weight, density.split_quantile) == (10, 0.5, 0.4)
+    assert (density.min_opacity, density.max_world_size, density.reset_interval) == (0.005, 0.1, 3000)
     assert (config.points.count, config.points.box) == (100_000, 1.3)
     assert (config.data.background, config.seed, config.loss.ssim) == ("black", 0, 0.2)
     assert (config.loss.pyramid, config.loss.ncc) == (0.2, 0.05)
@@ -46,6 +44,16 @@ def test_configuration_survives_toml(name: str, tmp_path: Path) -> None:
     again = load_config(write(tmp_path / "config.toml", write_toml(table)))
     assert again == config
     assert again.field.static.base == (3, 4, 5)
+
+
+def test_learning_rates_that_do_not_follow_the_steps_are_named(capsys: pytest.CaptureFixture) -> None:
+    load_config("demo", {"schedule.steps": 300, "rates.means.steps": 300})
+    assert "schedule.steps is 300, and other keys" in (told := capsys.readouterr().err)
+    assert "rates.hash.steps 1500" in told
+    assert "means" not in told
+    load_config("demo", {"schedule.steps": 1500})
+    load_config("dnerf")
+    assert not capsys.readouterr().err
 
 
 def test_every_key_can_be_overridden_and_has_a_help_text() -> None:

@@ -17,7 +17,7 @@ from lapgs_wgpu.train.presets import load_config
 
 CONFIG = load_config("dnerf").density
 EXTENT = 4.0
-SMALL, LARGE = 0.02, 0.2  # standard deviations on either side of split_size times the extent
+SMALL, LARGE = 0.02, 0.2  # standard deviations on either side of SPLIT_SIZE times the extent
 
 
 def make_rows(scales: list[float], opacities: list[float] | None = None) -> dict[str, Tensor]:
@@ -118,7 +118,7 @@ def test_sizes_are_bounded_from_the_first_reset_on() -> None:
 
 def test_reset_lowers_only() -> None:
     logits = torch.tensor([0.9, 0.009, 0.01]).logit()
-    assert reset_opacities(logits, 0.01).sigmoid().tolist() == pytest.approx([0.01, 0.009, 0.01], rel=1e-5)
+    assert reset_opacities(logits).sigmoid().tolist() == pytest.approx([0.01, 0.009, 0.01], rel=1e-5)
 
 
 def test_schedule() -> None:

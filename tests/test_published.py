@@ -108,7 +108,7 @@ def test_a_preset_is_what_was_published_times_the_captures_scale(name: str, scal
     assert (config.schedule.steps, config.schedule.warm_up) == (known.steps, known.warm_up)
     assert (density.stop, density.reset_interval) == (known.densify_until, known.reset)
     assert (density.interval, density.max_world_size) == (known.interval, 0.1 if known.world_size_prune else 0)
-    assert (density.gradient, density.split_size, density.min_opacity) == (2e-4, 0.01, 0.005)
+    assert (density.gradient, density.min_opacity) == (2e-4, 0.005)
     assert config.loss.ssim == known.dssim
     assert config.data.undistort == (not name.startswith("hypernerf"))
     assert config.data.size == (960 if name.startswith("hypernerf") else 1352)

@@ -16,38 +16,34 @@ from torch import Tensor
 
 from lapgs_wgpu.motion.fields.dynamics import outliers
 from lapgs_wgpu.splat.rotation import rotation_matrices
-from lapgs_wgpu.train.config import DensityConfig
 
+NEIGHBOURS = 10  # that a Gaussian is compared with
+DIVERGENCE_WEIGHT = 0.5  # of the differences in dynamics, relative to those in shape
+SPLIT_QUANTILE = 0.4  # fraction of the candidates that are not split
 LEAST_SHARE = 1e-2  # added to each neighbour's weight, in mean weights, so that none has the probability zero
 TINY_WEIGHT = 1e-8  # and this, so that equal neighbours, whose weights are all zero, have equal probabilities
 TINY_NORM = 1e-30  # only keeps 0 / 0 away, whatever the unit of the world is
 
 
 @torch.no_grad()
-def adaptive_split(rows: Mapping[str, Tensor], candidates: Tensor, config: DensityConfig) -> Tensor:
+def adaptive_split(rows: Mapping[str, Tensor], candidates: Tensor) -> Tensor:
     """(N,) bool: the candidates whose score tau reaches a quantile of all candidates' scores, and the outliers in d.
 
     rows: means (N, 3), log_scales (N, 3), quats (N, 4) wxyz, dynamics (N, D); without dynamics (an ablation) there are
-    no outliers. candidates: (N,) bool. A Gaussian with values that are not finite is never split.
+    no outliers. candidates: (N,) bool.
     """
     of = candidates.nonzero()[:, 0]
     if len(of) == 0:
         return candidates
-    looked_at = (rows[name] for name in ("means", "log_scales", "quats", "dynamics") if name in rows)
-    sound = torch.stack([row.isfinite().flatten(1).all(dim=1) for row in looked_at]).all(dim=0)
-    if not bool(sound.all()):  # which neither have neighbours nor are any
-        split = torch.zeros_like(candidates)
-        split[sound] = adaptive_split({name: row[sound] for name, row in rows.items()}, candidates[sound], config)
-        return split
-    scores = split_scores(rows, of, config.neighbours, config.divergence_weight)
+    scores = split_scores(rows, of)
     split = torch.zeros_like(candidates)
-    split[of] = scores >= torch.quantile(scores, config.split_quantile)
+    split[of] = scores >= torch.quantile(scores, SPLIT_QUANTILE)
     if "dynamics" in rows:
         split |= candidates & outliers(rows["dynamics"])
     return split
 
 
-def split_scores(rows: Mapping[str, Tensor], of: Tensor, count: int, divergence_weight: float) -> Tensor:
+def split_scores(rows: Mapping[str, Tensor], of: Tensor, count: int = NEIGHBOURS) -> Tensor:
     """tau (C,) of the Gaussians `of` (C,), by number (equation 17): how little they resemble their nearest neighbours.
 
     count: of neighbours; where there are fewer Gaussians, all others are. Zero for a Gaussian that is alone.
@@ -56,7 +52,7 @@ def split_scores(rows: Mapping[str, Tensor], of: Tensor, count: int, divergence_
     shapes = covariances(rows["log_scales"].double(), rows["quats"].double())
     features = rows["dynamics" if "dynamics" in rows else "means"].double()
     weights = (features[of][:, None] - features[others]).norm(dim=2)
-    return shape_difference(shapes[of], shapes[others]) + divergence_weight * divergence(probabilities(weights))
+    return shape_difference(shapes[of], shapes[others]) + DIVERGENCE_WEIGHT * divergence(probabilities(weights))
 
 
 def nearest(means: Tensor, of: Tensor, count: int) -> Tensor:

@@ -6,7 +6,6 @@ Each key carries the text that lapgs-train --help shows of it. No torch here, wh
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -65,7 +64,9 @@ class PointsConfig(Options):
 class ScheduleConfig(Options):
     """Lengths and intervals, in steps."""
 
-    steps: int = option("number of training steps; no other key changes with it", at_least=1)
+    steps: int = option(
+        "number of training steps; the keys that count steps, rates.KEY.steps among them, stay", at_least=1
+    )
     warm_up: int = option(
         "steps in which only static Gaussians are trained; with discovery: over which learning rates rise from 0"
     )
@@ -84,20 +85,8 @@ class DensityConfig(Options):
         "densify Gaussians whose projected center has at least this gradient, its mean length over the images (an "
         "image is 2 units wide)"
     )
-    split_size: float = option(
-        "clone Gaussians up to this standard deviation, split larger ones; relative to the cameras' extent", above=0
-    )
     split: Split = option(
         "which large Gaussians are split; plain: all; adaptive: those that differ most from their neighbors (the paper)"
-    )
-    neighbours: int = option("adaptive split: number of neighbors that a Gaussian is compared with", at_least=1)
-    divergence_weight: float = option(
-        "adaptive split: weight of the differences in dynamics, relative to those in shape",
-        at_least=0,
-        below=math.inf,
-    )
-    split_quantile: float = option(
-        "adaptive split: fraction of the candidates that are not split", at_least=0, at_most=1
     )
     min_opacity: float = option("prune Gaussians with a lower opacity", at_least=0, below=1)
     max_world_size: float = option(
@@ -105,7 +94,6 @@ class DensityConfig(Options):
         "reset; 0: no limit"
     )
     reset_interval: int = option("reset the opacities every N steps; density.stop or more: never", at_least=1)
-    reset_opacity: float = option("an opacity reset lowers all larger opacities to this value", above=0, below=1)
     limit: int = option("densification adds no Gaussians beyond this number; 0: no limit", 0)
     min_contribution: float = option(
         "prune Gaussians that contribute less than this to each of 50 training images: blending weights summed over "
@@ -161,7 +149,10 @@ class SmoothnessConfig(Options):
     """The smoothness loss: squared differences of the field's features at nearby points (Grid4D)."""
 
     static: float = option("weight of squared feature differences at nearby points, spatial grid")
-    temporal: float = option("the same, space-time grids; both 0: the smoothness loss of hexplane is off, too")
+    temporal: float = option(
+        "weight of squared feature differences at nearby points and times, space-time grids; both weights 0: no "
+        "smoothness loss, that of hexplane's planes included"
+    )
     share: float = option("fraction of the Gaussians that are sampled in each step; 0: off", at_most=1)
     reach: float = option("largest offset between the two sampled positions along each axis, world units")
     time_reach: float = option("largest offset between the two sampled times, as a fraction of the clip")
@@ -217,7 +208,9 @@ class CamerasConfig(Options):
         "nerfstudio, Polycam, Record3D)",
         "off",
     )
-    rate: Rate = option("camera corrections, radians of image motion per step", Rate(4e-3, 2e-4, 3_000))
+    rate: Rate = option(
+        "how far a step moves a camera, as the angle by which its image then moves, radians", Rate(4e-3, 2e-4, 3_000)
+    )
     pull: float = option("weight decay of the corrections, relative to the learning rate", 0.1, at_least=0)
     start: int = option("first step that corrects cameras", 300, at_least=1)
 

@@ -21,6 +21,8 @@ from lapgs_wgpu.train.adaptive_split import adaptive_split
 from lapgs_wgpu.train.config import DensityConfig
 
 CHILDREN = 2  # of a split Gaussian
+SPLIT_SIZE = 0.01  # of the cameras' extent; smaller Gaussians are cloned
+RESET_OPACITY = 0.01
 # The most opaque Gaussians stay, these many or a quarter of all: where images show little but the background, all
 # become faint together, and nothing could come back without any.
 LEAST_KEPT = 256
@@ -133,10 +135,10 @@ def published_rule(state: DensityState) -> Change:
     faint, oversized = _faint(rows, config), _oversized(state, rows)
     # Clones and children of faint ones are faint: they would go at once, and a split parent with them.
     wanted = (gradients >= config.gradient) & ~faint
-    large = rows["log_scales"].amax(dim=1) > math.log(config.split_size * state.extent)
+    large = rows["log_scales"].amax(dim=1) > math.log(SPLIT_SIZE * state.extent)
     clone, split = wanted & ~large, wanted & large
     if config.split == "adaptive":
-        split = adaptive_split(rows, split, config)
+        split = adaptive_split(rows, split)
     prune = (faint & ~largest(rows["opacity_logits"], min(LEAST_KEPT, len(faint) // 4))) | oversized
     if config.limit:
         room = config.limit - int((~prune).sum())
@@ -179,9 +181,9 @@ def largest(values: Tensor, count: int) -> Tensor:
 
 
 @torch.no_grad()
-def reset_opacities(opacity_logits: Tensor, limit: float) -> Tensor:
-    """Opacity logits (N,) lowered to those of `limit` where they are above."""
-    return opacity_logits.clamp(max=_logit(limit))
+def reset_opacities(opacity_logits: Tensor) -> Tensor:
+    """Opacity logits (N,) lowered to that of RESET_OPACITY where they are above."""
+    return opacity_logits.clamp(max=_logit(RESET_OPACITY))
 
 
 def _logit(opacity: float) -> float:

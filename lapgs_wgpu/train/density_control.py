@@ -67,7 +67,7 @@ class DensityControl:
         if self._config.changes_at(step):
             self._apply_rule(step)
         if self._config.resets_at(step):
-            logits = reset_opacities(self._scene.parameters["opacity_logits"], self._config.reset_opacity)
+            logits = reset_opacities(self._scene.parameters["opacity_logits"])
             self._optimizer.reset("opacity_logits", logits)
         return pruned
 

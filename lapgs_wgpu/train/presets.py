@@ -20,6 +20,7 @@ from lapgs_wgpu.io.dataclass_table import build_dataclass, checked, did_you_mean
 from lapgs_wgpu.io.safe_json_toml import read_toml
 from lapgs_wgpu.motion.fields.config import Method
 from lapgs_wgpu.train.config import Config
+from lapgs_wgpu.train.learning_rate import Rate
 
 Table = dict[str, Any]
 ADVICE = '; add it, or start the file with base = "dnerf"'
@@ -44,7 +45,12 @@ REMOVED = {
     "cameras.focal": "focal lengths are taken as they are",
     "data.split": "a run is measured on its test views",
     "decoder": "it is in torch where the step is, and on the device where that is; step_place says which",
+    "density.divergence_weight": "it is 0.5",
     "density.max_screen_radius": "density.max_world_size bounds sizes",
+    "density.neighbours": "it is 10",
+    "density.reset_opacity": "it is 0.01",
+    "density.split_quantile": "it is 0.4",
+    "density.split_size": "it is 0.01",
     "eval.snapshots": "only the last model is saved",
     "eval.tensorboard": "log.jsonl has the figures",
     "eval.views": "the validation views are measured, or 8 training views if there are none",
@@ -86,13 +92,23 @@ def load_config(
     preset = os.fspath(preset)
     known = config_keys()
     base = _read(preset)
-    for key, value in {**_shorthands(method, ablate), **(overrides or {})}.items():
+    given = {**_shorthands(method, ablate), **(overrides or {})}
+    for key, value in given.items():
         if key not in known:
             hint = f" any more: {REMOVED[key]}." if key in REMOVED else did_you_mean(key, known)
             raise InputError(f"there is no key {key!r}{hint}")
         texts = isinstance(value, str) or (isinstance(value, list) and all(isinstance(each, str) for each in value))
         _set(base, key, from_text(value, known[key]) if texts else value)
-    return build_dataclass(Config, base, preset, advice=ADVICE)
+    config = build_dataclass(Config, base, preset, advice=ADVICE)
+    fixed = [
+        f"rates.{name}.steps {rate.steps}"
+        for name, rate in vars(config.rates).items()
+        if isinstance(rate, Rate) and rate.steps != config.schedule.steps and f"rates.{name}.steps" not in given
+    ]
+    if "schedule.steps" in given and fixed:
+        told = f"{config.schedule.steps}, and other keys that count steps stay as they are: {', '.join(fixed)}"
+        print(f"note: schedule.steps is {told}.", file=sys.stderr)
+    return config
 
 
 def _shorthands(method: str | None, ablate: Iterable[str]) -> dict[str, Any]:

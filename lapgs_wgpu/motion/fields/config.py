@@ -49,7 +49,7 @@ class FieldConfig(Options):
     )
     bound: float = option("half side length of the field's cube, world units", 1.6, above=0, below=1e6)
     unit: float = option(
-        "length unit of the decoder's translations and changes of scale, world units: how fast things learn to move",
+        "how fast things learn to move and to change their size: the length that an output of 1 moves, world units",
         1.0,
         above=0,
         below=1e6,
@@ -60,9 +60,14 @@ class FieldConfig(Options):
     temporal: HashConfig = option(
         "space-time hash grids, two axes and time (grid4d, laplacian)", HashConfig(32, (8, 8, 8), (32, 32, 16))
     )
-    planes: PlaneConfig = option("feature planes (hexplane)", PlaneConfig())
+    planes: PlaneConfig = option("feature planes of hexplane: xy, xz, yz, and each axis with time", PlaneConfig())
     width: int = option("width of the decoder's layers; of all layers of the field mlp", 256, at_least=1, at_most=4096)
-    depth: int = option("number of further hidden layers of the decoder (not mlp)", 0, at_least=0, at_most=16)
+    depth: int = option(
+        "number of hidden layers between the decoder's first layers and its outputs (grid4d, laplacian, hexplane)",
+        0,
+        at_least=0,
+        at_most=16,
+    )
     time_scale: float = option(
         "fraction of the space-time grids' time axis that the clip takes, in its middle", 0.9, above=0, at_most=1
     )
@@ -81,7 +86,12 @@ class FieldConfig(Options):
     frequency_step: float = option(
         "initial spacing of the spectrum's frequencies, which start at 0, cycles per clip", 1.0, above=0, below=1e6
     )
-    amplitude: float = option("initial standard deviation of the spectrum's sum", 0.3, above=0, below=1e6)
+    amplitude: float = option(
+        "how strongly the spectrum acts at first: standard deviation of its sum of sinusoids over time",
+        0.3,
+        above=0,
+        below=1e6,
+    )
     dynamics: int = option(
         "length of each Gaussian's dynamics attribute, a learned motion code (laplacian, own); 0: none",
         16,
@@ -89,7 +99,9 @@ class FieldConfig(Options):
         at_most=256,
     )
     negative_scales: NegativeScales = option(
-        "scales that the field takes below 0; mirror: count as their magnitude (Grid4D); floor: become 1e-7", "floor"
+        "what becomes of a Gaussian's size that motion makes negative; mirror: its magnitude counts (Grid4D); floor: "
+        "1e-7 does",
+        "floor",
     )
     appearance: Appearance = option("what laplacian changes over time besides geometry", "color")
 
