@@ -92,23 +92,28 @@ def load_config(
     preset = os.fspath(preset)
     known = config_keys()
     base = _read(preset)
-    given = {**_shorthands(method, ablate), **(overrides or {})}
-    for key, value in given.items():
+    for key, value in {**_shorthands(method, ablate), **(overrides or {})}.items():
         if key not in known:
             hint = f" any more: {REMOVED[key]}." if key in REMOVED else did_you_mean(key, known)
             raise InputError(f"there is no key {key!r}{hint}")
         texts = isinstance(value, str) or (isinstance(value, list) and all(isinstance(each, str) for each in value))
         _set(base, key, from_text(value, known[key]) if texts else value)
-    config = build_dataclass(Config, base, preset, advice=ADVICE)
+    return build_dataclass(Config, base, preset, advice=ADVICE)
+
+
+def rates_that_stay(config: Config, given: Mapping[str, Any]) -> str:
+    """A note where schedule.steps is among the values that were given, and learning rates do not follow it; else ""."""
     fixed = [
         f"rates.{name}.steps {rate.steps}"
         for name, rate in vars(config.rates).items()
         if isinstance(rate, Rate) and rate.steps != config.schedule.steps and f"rates.{name}.steps" not in given
     ]
-    if "schedule.steps" in given and fixed:
-        told = f"{config.schedule.steps}, and other keys that count steps stay as they are: {', '.join(fixed)}"
-        print(f"note: schedule.steps is {told}.", file=sys.stderr)
-    return config
+    if "schedule.steps" not in given or not fixed:
+        return ""
+    return (
+        f"schedule.steps is {config.schedule.steps}, and other keys that count steps stay as they are: "
+        f"{', '.join(fixed)}."
+    )
 
 
 def _shorthands(method: str | None, ablate: Iterable[str]) -> dict[str, Any]:
